@@ -1,0 +1,1 @@
+"""Calibration: fixed parameters of a pair, labels of its windows, and their cache."""

@@ -1,0 +1,80 @@
+"""What every component is: a class with typed settings, found by kind and name through an entry point."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from cfx.errors import ConfigError, nearest
+
+Schema = TypeVar("Schema", bound=BaseModel)
+
+
+class Settings(BaseModel):
+    """Base of every component's settings: frozen, no unknown keys, no NaN or infinity.
+
+    Give each field a `Field(description=...)` with its unit: the text becomes the comment in the config
+    node and the line in `python -m cfx plugins show`.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
+
+
+class Component:
+    """Base of every dataset, model, optimizer, policy, learner and protocol.
+
+    Life cycle: the registry imports the class when a config names it, validates the config node against
+    its `schema`, and calls the class with the result. Nothing else happens at construction: reading files,
+    compiling and training wait for the first method call.
+    """
+
+    kind: ClassVar[str]
+    schema: ClassVar[type[Settings]] = Settings
+    settings: Settings
+
+    def __init__(self, settings: Settings | None = None, **options: Any) -> None:
+        """Takes either a ready `Settings` object or its fields as keywords.
+
+        Raises:
+            ConfigError: a key is unknown or a value is wrong.
+        """
+        if settings is not None and options:
+            raise TypeError("give either a Settings object or keyword options, not both")
+        self.settings = settings if settings is not None else validate(self.schema, options, where=self.kind)
+
+
+def validate(schema: type[Schema], values: Any, *, where: str) -> Schema:
+    """Validates `values` against `schema`.
+
+    Args:
+        where: the config path that the error message starts with, such as `model`.
+
+    Raises:
+        ConfigError: one sentence for each wrong key, joined by newlines.
+    """
+    try:
+        return schema.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError("\n".join(_sentence(schema, problem, where) for problem in error.errors())) from None
+
+
+def _sentence(schema: type[BaseModel], problem: Any, where: str) -> str:
+    location = [str(part) for part in problem["loc"]]
+    path = ".".join(part for part in [where, *location] if part)
+    if problem["type"] == "extra_forbidden":
+        known = sorted(_fields_at(schema, location[:-1]))
+        listed = f" Known keys: {', '.join(known)}." if known else ""
+        return f"{path}: unknown key.{nearest(location[-1], known)}{listed}"
+    if problem["type"] == "missing":
+        return f"{path}: a value is required; give one as {path}=..."
+    message = str(problem["msg"]).removeprefix("Value error, ").removeprefix("Input ")
+    return f"{path}={problem['input']!r}: {message}."
+
+
+def _fields_at(schema: type[BaseModel], location: list[str]) -> list[str]:
+    current: Any = schema
+    for part in location:
+        field = getattr(current, "model_fields", {}).get(part)
+        current = field.annotation if field is not None else None
+    return list(getattr(current, "model_fields", {}))

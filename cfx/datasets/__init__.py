@@ -1,0 +1,1 @@
+"""Datasets: recordings in, pairs out."""

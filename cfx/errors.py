@@ -1,0 +1,42 @@
+"""What a user can mend: every error here is one sentence that says what is wrong, where, and what to write instead."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class CfxError(Exception):
+    """A user's mistake. The command line prints its text alone, on stderr, and exits with `exit_code`."""
+
+    exit_code = 2
+
+
+class ConfigError(CfxError):
+    """A value or a key of the configuration is wrong."""
+
+
+class DataError(CfxError):
+    """A data file is missing, cannot be read, or holds what no recording can hold."""
+
+
+class PluginError(CfxError):
+    """A component cannot be found, cannot be imported, or breaks its contract."""
+
+
+class ParameterError(CfxError):
+    """A model parameter lies outside its bounds or its specification is contradictory."""
+
+
+class TrackingError(CfxError):
+    """The MLflow store cannot be reached or is not one of ours."""
+
+
+class OutputError(CfxError):
+    """A result cannot be written."""
+
+
+def nearest(name: str, choices: Iterable[str]) -> str:
+    """Returns " Did you mean 'x'?" for the nearest of `choices`, or "" if none is near."""
+    close = difflib.get_close_matches(name, list(choices), n=1, cutoff=0.5)
+    return f" Did you mean '{close[0]}'?" if close else ""

@@ -1,0 +1,1 @@
+"""Learners: they train policies."""

@@ -1,0 +1,1 @@
+"""Driving models: pure, batched, differentiable steps."""

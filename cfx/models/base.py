@@ -1,0 +1,120 @@
+"""The contract of a driving model.
+
+A model is a pure function of (follower state, leader state, parameters, time step), batched over any leading
+dimensions, differentiable almost everywhere, on any device and dtype. It never integrates: `cfx.simulation` does.
+
+Letters: `*batch` are the leading dimensions; leader tensors and parameters may have fewer of them and broadcast.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import ClassVar, NamedTuple
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from cfx.component import Component, Settings
+from cfx.parameters import ParameterOverride, ParameterSpace
+
+
+class Follower(NamedTuple):
+    """The simulated vehicle at one instant; all tensors `(*batch,)`.
+
+    Attributes:
+        position: front bumper, m.
+        speed: m/s.
+        acceleration: the last *realised* one, `(v(t) - v(t - dt)) / dt`, m/s2.
+        memory: `(*batch, m)`, what the model itself remembers; m = `DrivingModel.memory_size`.
+    """
+
+    position: Tensor
+    speed: Tensor
+    acceleration: Tensor
+    memory: Tensor
+
+
+class Leader(NamedTuple):
+    """The vehicle ahead at the same instant; all tensors broadcast to `(*batch,)`.
+
+    Attributes:
+        position: front bumper, m.
+        speed: m/s.
+        acceleration: m/s2.
+        length: m.
+    """
+
+    position: Tensor
+    speed: Tensor
+    acceleration: Tensor
+    length: Tensor
+
+
+class ModelSettings(Settings):
+    """Settings that every model has."""
+
+    parameters: dict[str, ParameterOverride] = Field(
+        default_factory=dict, description="changes to the model's parameters: bounds, default, tuned or constant"
+    )
+
+
+class DrivingModel(Component):
+    """Base of every driving model.
+
+    Life cycle: constructed once per job; `next_speed` (and `next_memory`, if the model has a memory) is called once per
+    time step for all rollouts at once, possibly inside `torch.compile` and under autograd.
+
+    A subclass declares `parameters` and implements `next_speed`. That is all.
+
+    Attributes:
+        parameters: the full specification, constants included.
+        memory_size: m, the width of the model's own memory; 0 for most.
+        differentiable: `next_speed` has useful gradients with respect to states and parameters. Tested.
+        collision_free: with its default parameters the model does not hit a leader that brakes as hard as the model
+            expects of it. Tested.
+        reference: where the equations come from.
+        revision: raise it when the equations change; cached calibrations of older revisions are then not used.
+    """
+
+    kind = "model"
+    schema: ClassVar[type[Settings]] = ModelSettings
+    settings: ModelSettings
+
+    parameters: ClassVar[ParameterSpace]
+    memory_size: ClassVar[int] = 0
+    differentiable: ClassVar[bool] = True
+    collision_free: ClassVar[bool] = False
+    reference: ClassVar[str] = ""
+    revision: ClassVar[int] = 1
+
+    def __init__(self, settings: Settings | None = None, **options: object) -> None:
+        super().__init__(settings, **options)
+        self.space = self.parameters.override(self.settings.parameters)
+
+    @abstractmethod
+    def next_speed(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float) -> Tensor:
+        """Returns the follower's speed one time step later.
+
+        Args:
+            follower, leader: states at time t.
+            p: one tensor per parameter, by name, each broadcasting to `(*batch,)`.
+            dt: time step, s.
+
+        Returns:
+            `(*batch,)`, m/s, not negative, in the dtype of the states.
+        """
+
+    def next_memory(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float, speed: Tensor) -> Tensor:
+        """Returns the memory `(*batch, m)` one time step later; `speed` is what `next_speed` returned."""
+        return follower.memory
+
+    def initial_memory(self, speed: Tensor) -> Tensor:
+        """Returns the memory `(*batch, m)` at the start of a rollout, given the speed `(*batch,)`."""
+        return torch.zeros((*speed.shape, self.memory_size), dtype=speed.dtype, device=speed.device)
+
+
+def bumper_gap(follower: Follower, leader: Leader) -> Tensor:
+    """Net gap `(*batch,)`, m: leader's rear bumper to follower's front bumper; negative after a collision."""
+    return leader.position - leader.length - follower.position

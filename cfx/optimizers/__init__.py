@@ -1,0 +1,1 @@
+"""Optimizers: many independent bounded problems at once."""

@@ -1,0 +1,244 @@
+"""Leader-follower pairs: what every dataset delivers and everything else reads.
+
+Glossary (SI units everywhere): *leader* drives ahead of *follower*; *position* is the front bumper's, along the lane;
+*gap* is bumper to bumper, `leader position - leader length - follower position`; *relative speed* is leader minus follower.
+Shapes: P pairs, T frames of the longest pair.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfx.errors import DataError
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+Array = NDArray[np.float64]
+SIGNALS = (
+    "leader_position",
+    "leader_speed",
+    "leader_acceleration",
+    "follower_position",
+    "follower_speed",
+    "follower_acceleration",
+)
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One follower behind one leader over consecutive frames; the arrays are `(T,)` float64.
+
+    Attributes:
+        pair_id: unique within a `PairSet`.
+        recording: name of the recording; vehicle ids are unique only within one.
+        first_frame: frame number of the first row in the source.
+        dt: time step, s.
+        leader_length: m.
+        lane: lane number, None where the source has none.
+        truth: true parameters over time, name -> `(T,)`, known only for synthetic pairs.
+        truth_model: name of the model these parameters belong to.
+    """
+
+    pair_id: str
+    recording: str
+    leader_id: str
+    follower_id: str
+    first_frame: int
+    dt: float
+    leader_length: float
+    leader_position: Array
+    leader_speed: Array
+    leader_acceleration: Array
+    follower_position: Array
+    follower_speed: Array
+    follower_acceleration: Array
+    lane: int | None = None
+    truth: Mapping[str, Array] = field(default_factory=dict)
+    truth_model: str = ""
+
+    def __post_init__(self) -> None:
+        shapes = {name: getattr(self, name).shape for name in SIGNALS}
+        if len(set(shapes.values())) != 1 or len(shapes["leader_position"]) != 1:
+            raise DataError(f"pair {self.pair_id}: all signals must have the same length, got {shapes}")
+        if not self.dt > 0:
+            raise DataError(f"pair {self.pair_id}: the time step must be positive, got {self.dt} s")
+
+    def __len__(self) -> int:
+        return len(self.leader_position)
+
+    @property
+    def driver(self) -> str:
+        """The follower, unique across recordings."""
+        return f"{self.recording}/{self.follower_id}"
+
+    @property
+    def gap(self) -> Array:
+        """Bumper-to-bumper gap `(T,)`, m."""
+        return self.leader_position - self.leader_length - self.follower_position
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 of everything that calibration and learning read."""
+        digest = hashlib.sha256(f"{self.pair_id}|{self.recording}|{self.dt!r}|{self.leader_length!r}".encode())
+        for name in SIGNALS:
+            digest.update(np.ascontiguousarray(getattr(self, name), dtype=np.float64).tobytes())
+        return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """A count of what a dataset left out, and why. `unit` says what was counted: rows, pairs, vehicles."""
+
+    reason: str
+    count: int
+    unit: str = "pairs"
+
+
+@dataclass(frozen=True)
+class PairSet(Sequence[Pair]):
+    """Pairs in a fixed order, where they came from, and a count of everything that was left out."""
+
+    pairs: tuple[Pair, ...]
+    source: str
+    dropped: tuple[Dropped, ...] = ()
+
+    def __post_init__(self) -> None:
+        seen: set[str] = set()
+        for pair in self.pairs:
+            if pair.pair_id in seen:
+                raise DataError(f"{self.source}: pair id '{pair.pair_id}' stands for two pairs")
+            seen.add(pair.pair_id)
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self.pairs[index]
+
+    def __iter__(self) -> Iterator[Pair]:
+        return iter(self.pairs)
+
+    def select(self, keep: Sequence[bool], reason: str) -> PairSet:
+        """Keeps the pairs marked True and counts the others under `reason`."""
+        kept = tuple(pair for pair, wanted in zip(self.pairs, keep, strict=True) if wanted)
+        lost = len(self.pairs) - len(kept)
+        return replace(self, pairs=kept, dropped=(*self.dropped, Dropped(reason, lost)) if lost else self.dropped)
+
+    @property
+    def dt(self) -> float:
+        """The common time step, s.
+
+        Raises:
+            DataError: the pairs have different time steps.
+        """
+        steps = sorted({round(pair.dt, 9) for pair in self.pairs})
+        if len(steps) != 1:
+            raise DataError(
+                f"{self.source}: the pairs have different time steps ({', '.join(f'{step:g} s' for step in steps)});"
+                " a job needs one: split the file, or resample it"
+            )
+        return steps[0]
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 over all pairs, in order."""
+        return hashlib.sha256("".join(pair.fingerprint for pair in self.pairs).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class PairBatch:
+    """Pairs as padded tensors.
+
+    Beyond its end a pair is continued at its last speed with zero acceleration, so that a rollout stays finite there;
+    `mask` says what is real. Positions are relative to the follower's first position, so that float32 resolves
+    millimetres on a road of any length.
+
+    Attributes:
+        leader_position ... follower_acceleration: `(P, T)`, SI units.
+        leader_length: `(P,)`, m.
+        lengths: `(P,)` int64, frames of each pair.
+        mask: `(P, T)` bool, True within the pair.
+        dt: time step, s.
+    """
+
+    leader_position: Tensor
+    leader_speed: Tensor
+    leader_acceleration: Tensor
+    follower_position: Tensor
+    follower_speed: Tensor
+    follower_acceleration: Tensor
+    leader_length: Tensor
+    lengths: Tensor
+    mask: Tensor
+    dt: float
+
+    @classmethod
+    def of(
+        cls,
+        pairs: PairSet | Sequence[Pair],
+        *,
+        dtype: torch.dtype | None = None,
+        device: torch.device | str | None = None,
+    ) -> PairBatch:
+        """Stacks pairs; float64 on the CPU unless told otherwise.
+
+        Raises:
+            DataError: there are no pairs, or their time steps differ.
+        """
+        import torch
+
+        if not len(pairs):
+            raise DataError("no pairs to stack")
+        pair_set = pairs if isinstance(pairs, PairSet) else PairSet(tuple(pairs), "pairs")
+        dt = pair_set.dt
+        length = max(len(pair) for pair in pair_set)
+        stacked = {name: np.stack([_extend(pair, name, length) for pair in pair_set]) for name in SIGNALS}
+        lengths = torch.tensor([len(pair) for pair in pair_set])
+        tensors = {
+            name: torch.as_tensor(values).to(device=device, dtype=dtype or torch.float64) for name, values in stacked.items()
+        }
+        return cls(
+            **tensors,
+            leader_length=torch.tensor([pair.leader_length for pair in pair_set], dtype=dtype or torch.float64, device=device),
+            lengths=lengths.to(device),
+            mask=(torch.arange(length) < lengths[:, None]).to(device),
+            dt=dt,
+        )
+
+    def __len__(self) -> int:
+        return len(self.lengths)
+
+    @property
+    def gap(self) -> Tensor:
+        """Bumper-to-bumper gap `(P, T)`, m."""
+        return self.leader_position - self.leader_length[:, None] - self.follower_position
+
+    def __getitem__(self, index: Any) -> PairBatch:
+        """Selects pairs (a slice, an index tensor or a boolean mask over P); time stays whole."""
+        changed = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "dt"}
+        return replace(self, **changed)
+
+
+def _extend(pair: Pair, name: str, length: int) -> Array:
+    """Returns a signal continued to `length` frames at constant speed, positions relative to the follower's first."""
+    values = np.asarray(getattr(pair, name), dtype=np.float64)
+    missing = length - len(values)
+    tail: Array
+    if name.endswith("position"):
+        speed = getattr(pair, name.replace("position", "speed"))[-1]
+        tail = values[-1] + speed * pair.dt * np.arange(1, missing + 1)
+        origin = float(pair.follower_position[0])
+    else:
+        tail = np.full(missing, values[-1] if name.endswith("speed") else 0.0)
+        origin = 0.0
+    extended: Array = np.concatenate([values, tail]) - origin
+    return extended

@@ -1,0 +1,172 @@
+"""Parameters of driving models: one frozen specification that feeds everything else.
+
+Calibration bounds, policy outputs, config nodes, the documentation table and the contract tests all read the
+same `ParameterSpace`. A *tuned* parameter is calibrated and adapted; the others are constants of the config
+that a user may set, or turn into tuned ones (`model.parameters.a.tuned=true`).
+
+Shape convention used throughout: a parameter tensor is `(*batch, n)` with n the number of *tuned* parameters, in
+the order of `ParameterSpace.names`. *Unit space* is the same tensor mapped linearly so that each bound is 0 or 1.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+from pydantic import Field
+
+from cfx.component import Settings
+from cfx.errors import ParameterError, nearest
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of a driving model.
+
+    Attributes:
+        name: short name, the key in configs and columns.
+        unit: SI unit, "1" for a pure number.
+        low, high: bounds in that unit; calibration and policies never leave them.
+        default: the value of the method `default`, within the bounds.
+        meaning: one line.
+        source: where default and bounds come from.
+        tuned: whether calibration and policies choose it; a constant otherwise.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    default: float
+    meaning: str
+    source: str = ""
+    tuned: bool = True
+
+    def __post_init__(self) -> None:
+        if not all(math.isfinite(value) for value in (self.low, self.high, self.default)):
+            raise ParameterError(f"parameter {self.name}: bounds and default must be finite numbers")
+        if not self.low < self.high:
+            raise ParameterError(f"parameter {self.name}: low ({self.low}) must be below high ({self.high})")
+        if not self.low <= self.default <= self.high:
+            raise ParameterError(
+                f"parameter {self.name}: default {self.default} lies outside its bounds [{self.low}, {self.high}] {self.unit};"
+                f" give a value within them, or move model.parameters.{self.name}.low or .high"
+            )
+
+
+class ParameterOverride(Settings):
+    """What a config may change of one parameter; what it leaves out stays as the model declares it."""
+
+    low: float | None = Field(None, description="lower bound")
+    high: float | None = Field(None, description="upper bound")
+    default: float | None = Field(None, description="value of the method 'default', and of a parameter that is not tuned")
+    tuned: bool | None = Field(None, description="whether calibration and policies choose it")
+
+
+@dataclass(frozen=True)
+class ParameterSpace:
+    """An ordered set of parameters.
+
+    Example:
+        >>> space = ParameterSpace.of(Parameter("tau", "s", 0.5, 3.0, 1.0, "time headway"))
+        >>> space.names
+        ('tau',)
+    """
+
+    parameters: tuple[Parameter, ...]
+    _by_name: dict[str, Parameter] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        by_name = {parameter.name: parameter for parameter in self.parameters}
+        if len(by_name) != len(self.parameters):
+            raise ParameterError("a parameter space names each parameter once")
+        object.__setattr__(self, "_by_name", by_name)
+
+    @classmethod
+    def of(cls, *parameters: Parameter) -> ParameterSpace:
+        return cls(parameters)
+
+    def __iter__(self) -> Iterator[Parameter]:
+        return iter(self.parameters)
+
+    def __len__(self) -> int:
+        """The number of tuned parameters, n."""
+        return len(self.tuned)
+
+    def __getitem__(self, name: str) -> Parameter:
+        if name not in self._by_name:
+            raise ParameterError(f"unknown parameter '{name}'.{nearest(name, self._by_name)} Known: {', '.join(self._by_name)}.")
+        return self._by_name[name]
+
+    @property
+    def tuned(self) -> tuple[Parameter, ...]:
+        return tuple(parameter for parameter in self.parameters if parameter.tuned)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the tuned parameters, in tensor order."""
+        return tuple(parameter.name for parameter in self.tuned)
+
+    def override(self, changes: Mapping[str, ParameterOverride]) -> ParameterSpace:
+        """Returns a space with the config's changes.
+
+        Raises:
+            ParameterError: an unknown name, or bounds and default that contradict each other.
+        """
+        for name in changes:
+            self[name]
+        merged = tuple(
+            replace(parameter, **changes[parameter.name].model_dump(exclude_none=True))
+            if parameter.name in changes
+            else parameter
+            for parameter in self.parameters
+        )
+        space = ParameterSpace(merged)
+        if not space.tuned:
+            raise ParameterError("no parameter is tuned; set model.parameters.NAME.tuned=true for at least one")
+        return space
+
+    def bounds(self, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Tensor:
+        """Returns `(2, n)`: lower bounds, upper bounds."""
+        import torch
+
+        rows = [[p.low for p in self.tuned], [p.high for p in self.tuned]]
+        return torch.tensor(rows, dtype=dtype or torch.float64, device=device)
+
+    def defaults(self, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Tensor:
+        """Returns `(n,)`: the default of each tuned parameter."""
+        import torch
+
+        return torch.tensor([p.default for p in self.tuned], dtype=dtype or torch.float64, device=device)
+
+    def to_unit(self, values: Tensor) -> Tensor:
+        """Maps `(*batch, n)` from SI units to unit space."""
+        low, high = self.bounds(dtype=values.dtype, device=values.device).unbind(0)
+        return (values - low) / (high - low)
+
+    def from_unit(self, unit: Tensor) -> Tensor:
+        """Maps `(*batch, n)` from unit space to SI units; 0 and 1 give the bounds exactly."""
+        low, high = self.bounds(dtype=unit.dtype, device=unit.device).unbind(0)
+        return (low + unit * (high - low)).clamp(low, high)
+
+    def unpack(self, values: Tensor) -> dict[str, Tensor]:
+        """Splits `(*batch, n)` into one tensor `(*batch,)` per parameter, constants (0-dimensional) included."""
+        if values.shape[-1] != len(self):
+            raise ParameterError(f"expected {len(self)} parameters ({', '.join(self.names)}), got {values.shape[-1]}")
+        tuned = dict(zip(self.names, values.unbind(-1), strict=True))
+        return {p.name: tuned[p.name] if p.tuned else values.new_tensor(p.default) for p in self.parameters}
+
+    def check(self, values: Mapping[str, float]) -> None:
+        """Raises ParameterError if a value lies outside its parameter's bounds or its name is unknown."""
+        for name, value in values.items():
+            parameter = self[name]
+            if not parameter.low <= value <= parameter.high:
+                raise ParameterError(
+                    f"parameter {name}={value} lies outside its bounds [{parameter.low}, {parameter.high}] {parameter.unit}"
+                )

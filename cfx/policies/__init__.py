@@ -1,0 +1,1 @@
+"""Policies: recent states in, parameters out."""

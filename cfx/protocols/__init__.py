@@ -1,0 +1,1 @@
+"""Protocols: who is calibrated, trained and tested on what."""

@@ -1,0 +1,1 @@
+"""Driving style: entropy weights, scores, clusters."""

@@ -1,0 +1,1 @@
+"""Tracking: what MLflow keeps of a job."""
