@@ -1,0 +1,97 @@
+"""cfx: calibrate driving models to real drivers, train policies that adapt their parameters, and see whether it helps.
+
+    result = cfx.run(["data=tidy", "data.path=pairs.parquet", "model=w99", "policy=gru"])
+    result.metrics["rmse_improvement/mean"]
+
+The names below, `cfx.errors` and `cfx.testing` are the public API; everything else may change. Importing cfx imports nothing heavy:
+each name is loaded when it is first used.
+"""
+
+from __future__ import annotations
+
+import os
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from cfx import errors as errors
+    from cfx.application import run as run
+    from cfx.component import Settings as Settings
+    from cfx.datasets.base import Dataset as Dataset
+    from cfx.job import JobResult as JobResult
+    from cfx.job import load as load
+    from cfx.learners.base import Learner as Learner
+    from cfx.models.base import DrivingModel as DrivingModel
+    from cfx.models.base import Follower as Follower
+    from cfx.models.base import Leader as Leader
+    from cfx.optimizers.base import Optimizer as Optimizer
+    from cfx.pairs import Pair as Pair
+    from cfx.pairs import PairBatch as PairBatch
+    from cfx.pairs import PairSet as PairSet
+    from cfx.parameters import Parameter as Parameter
+    from cfx.parameters import ParameterSpace as ParameterSpace
+    from cfx.policies.base import Policy as Policy
+    from cfx.protocols.base import Protocol as Protocol
+    from cfx.registry import get as get
+    from cfx.simulation.rollout import Start as Start
+    from cfx.simulation.rollout import simulate as simulate
+
+    __version__: str
+
+# MLflow reports its use to its makers unless told not to; nothing goes to the network unasked.
+os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+
+_HOMES = {
+    "run": "cfx.application",
+    "get": "cfx.registry",
+    "simulate": "cfx.simulation.rollout",
+    "load": "cfx.job",
+    "JobResult": "cfx.job",
+    "Dataset": "cfx.datasets.base",
+    "DrivingModel": "cfx.models.base",
+    "Follower": "cfx.models.base",
+    "Leader": "cfx.models.base",
+    "Start": "cfx.simulation.rollout",
+    "Optimizer": "cfx.optimizers.base",
+    "Policy": "cfx.policies.base",
+    "Learner": "cfx.learners.base",
+    "Protocol": "cfx.protocols.base",
+    "Parameter": "cfx.parameters",
+    "ParameterSpace": "cfx.parameters",
+    "Settings": "cfx.component",
+    "Pair": "cfx.pairs",
+    "PairSet": "cfx.pairs",
+    "PairBatch": "cfx.pairs",
+}
+
+__all__ = [  # noqa: PLE0604 - the public names, from the one table that also says where they live
+    *_HOMES,
+    "errors",
+    "__version__",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        value = getattr(import_module(_HOMES[name]), name)
+    elif name == "errors":
+        value = import_module("cfx.errors")
+    elif name == "__version__":
+        value = _version()
+    else:
+        raise AttributeError(f"module 'cfx' has no attribute '{name}'")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("cfx-driving")
+    except PackageNotFoundError:  # a checkout that nobody installed
+        return "0+unknown"

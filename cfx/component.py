@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+import hashlib
+import inspect
+from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -42,6 +46,28 @@ class Component:
         if settings is not None and options:
             raise TypeError("give either a Settings object or keyword options, not both")
         self.settings = settings if settings is not None else validate(self.schema, options, where=self.kind)
+
+    def identity(self) -> dict[str, Any]:
+        """Returns what results of this component depend on: its class, its settings and its code.
+
+        Cached results carry it. The code is every source file beside the one that defines the class, so that a changed equation
+        is never answered from the cache.
+        """
+        return {
+            "class": f"{type(self).__module__}.{type(self).__qualname__}",
+            "settings": self.settings.model_dump(mode="json"),
+            "code": folder_hash(inspect.getfile(type(self))),
+        }
+
+
+@functools.cache
+def folder_hash(module_file: str) -> str:
+    """Returns the SHA-256 of the Python files in the folder of a module."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(module_file).parent.glob("*.py")):
+        digest.update(path.name.encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def validate(schema: type[Schema], values: Any, *, where: str) -> Schema:

@@ -1,12 +1,17 @@
-"""Fixtures that every test may use."""
+"""Fixtures and settings for every test."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parent.parent
+
+# A slow machine is no failure, and a failure must come again on the next run.
+settings.register_profile("cfx", deadline=None, derandomize=True, max_examples=50)
+settings.load_profile("cfx")
 
 
 @pytest.fixture(scope="session")

@@ -75,7 +75,6 @@ class DrivingModel(Component):
         collision_free: with its default parameters the model does not hit a leader that brakes as hard as the model
             expects of it. Tested.
         reference: where the equations come from.
-        revision: raise it when the equations change; cached calibrations of older revisions are then not used.
     """
 
     kind = "model"
@@ -87,7 +86,6 @@ class DrivingModel(Component):
     differentiable: ClassVar[bool] = True
     collision_free: ClassVar[bool] = False
     reference: ClassVar[str] = ""
-    revision: ClassVar[int] = 1
 
     def __init__(self, settings: Settings | None = None, **options: object) -> None:
         super().__init__(settings, **options)

@@ -15,6 +15,8 @@ from torch import Tensor
 
 from cfx.component import Settings
 from cfx.models.base import DrivingModel, Follower, Leader, ModelSettings, bumper_gap
+from cfx.models.guarded import root
+from cfx.models.sumo_step import sumo_speed
 from cfx.parameters import Parameter, ParameterSpace
 
 _PAPER = "Yang et al. (2021); bounds: wide enough for drivers who stay far behind"
@@ -73,28 +75,9 @@ class Krauss(DrivingModel):
         v, v_l = follower.speed, leader.speed
         lag = p["t_r"] + 0.5 * p["t_i"]
         radicand = b * b * lag * lag + b * (v_l * p["t_i"] + v_l * v_l / b_l + 2.0 * g)
-        open_road = radicand > 0
-        # The inner `where` keeps sqrt's infinite slope at 0 out of the gradient of the branch not taken.
-        root = torch.where(open_road, torch.sqrt(torch.where(open_road, radicand, 1.0)), 0.0)
-        v_safe = root - b * lag
+        v_safe = root(radicand) - b * lag
         if self.settings.variant == "paper":
             return torch.minimum(torch.minimum(v + p["a"] * dt, p["v_max"]), v_safe).clamp(min=0.0)
         creep = torch.where(g <= b * dt, torch.minimum(b * dt, g / dt), v_safe)
         v_safe = torch.where(v_l == 0, torch.where(g < 0.01, 0.0, creep), v_safe)
         return sumo_speed(v, v_safe, accel=p["a"], decel=b, emergency_decel=p["b_max"], v_max=p["v_max"], dt=dt)
-
-
-def sumo_speed(
-    v: Tensor, wanted: Tensor, *, accel: Tensor, decel: Tensor, emergency_decel: Tensor, v_max: Tensor, dt: float
-) -> Tensor:
-    """Returns the speed `(*batch,)` that SUMO realises when a car-following model wants `wanted`, both m/s.
-
-    Acceleration is capped at `accel`, braking at `emergency_decel`, and speeds below 1e-5 m/s become 0. The lane's limit is taken
-    to be above `v_max`.
-    """
-    top = torch.minimum(v + accel * dt, v_max)
-    comfortable = (v - decel * dt).clamp(min=0.0)
-    plan = torch.minimum(top, wanted)
-    hard = torch.maximum(plan, (v - emergency_decel * dt).clamp(min=0.0))
-    speed = torch.where(plan >= comfortable, plan, hard)
-    return torch.where(speed.abs() < 1e-5, 0.0, speed)

@@ -15,11 +15,13 @@ from torch import Tensor
 
 from cfx.component import Settings
 from cfx.models.base import DrivingModel, Follower, Leader, ModelSettings, bumper_gap
-from cfx.models.krauss import sumo_speed
+from cfx.models.guarded import divisor, root
+from cfx.models.sumo_step import sumo_speed
 from cfx.parameters import Parameter, ParameterSpace
 
 _VISSIM = "default: Vissim and SUMO; bounds: the ranges used in the calibration literature"
 _SUMO = "SUMO's default passenger car"
+_RESERVE = 0.1  # share of CC0 that is never given up (SUMO's collisionMinGapFactor)
 _CC9_SPEED = 22.2  # m/s (80 km/h): where CC9 applies
 
 
@@ -90,16 +92,16 @@ class W99(DrivingModel):
         closing_threshold = torch.where(v > 0, cc4 - spread, 0.0)
         opening_threshold = torch.where(v_l > cc5, spread + cc5, spread)
 
-        # 1. Too close. `_nonzero` and the inner `where`s keep 1/0 and sqrt's slope at 0 out of branches not taken.
+        # 1. Too close. One step more at this speed ends less than a tenth of CC0 behind where the leader is now: brake.
+        held = torch.where(dx < v * dt + _RESERVE * cc0, -p["b_max"], 0.0)
         beyond = dx > cc0
-        brake = a_l + torch.where(beyond, dv * dv / _nonzero(cc0 - dx, beyond), 0.5 * (dv - opening_threshold))
-        brake = torch.where(dv < 0, brake.clamp(max=0.0), 0.0)
-        root = torch.where(v > 0, torch.sqrt(torch.where(v > 0, v, 1.0)), 0.0)
-        brake = torch.where(brake > -cc7, -cc7, torch.maximum(brake, 0.5 * root - 10.0))
-        too_close = torch.where(v_l > 0, brake, 0.0)
+        brake = a_l + torch.where(beyond, dv * dv / divisor(cc0 - dx, beyond), 0.5 * (dv - opening_threshold))
+        brake = torch.where(dv < 0, brake.clamp(max=0.0), held)
+        brake = torch.where(brake > -cc7, -cc7, torch.maximum(brake, 0.5 * root(v) - 10.0))
+        too_close = torch.where(v_l > 0, brake, held)
         # 2. Approaching.
         room = near - dx - 0.1
-        approaching = 0.5 * dv * dv / _nonzero(room, room.abs() > 0)
+        approaching = 0.5 * dv * dv / divisor(room, room.abs() > 0)
         # 3. Following, unconsciously.
         following = torch.where(a_old <= 0, torch.minimum(a_old, -cc7), torch.maximum(a_old, cc7))
         # 4. Free, or closing the gap.
@@ -110,7 +112,7 @@ class W99(DrivingModel):
             a_max = cc8 + (p["cc9"] - cc8) * speed_share / _CC9_SPEED
             cap = a_max
         inside = dx < far
-        free = torch.where(inside, torch.minimum(dv * dv / _nonzero(far - dx, inside), a_max), a_max)
+        free = torch.where(inside, torch.minimum(dv * dv / divisor(far - dx, inside), a_max), a_max)
         free = torch.where(dx > near, free, 0.0)
 
         is_too_close = (dv < opening_threshold) & (dx <= near)
@@ -121,8 +123,3 @@ class W99(DrivingModel):
         )
         wanted = v + acceleration * dt
         return sumo_speed(v, wanted, accel=cap, decel=p["b"], emergency_decel=p["b_max"], v_max=p["v_max"], dt=dt)
-
-
-def _nonzero(value: Tensor, used: Tensor) -> Tensor:
-    """Returns `value` where `used`, 1 elsewhere: a divisor that is finite in the branch not taken."""
-    return torch.where(used, value, 1.0)

@@ -1,0 +1,209 @@
+"""The calibrator: fixed parameters of each pair, and the labels of each window.
+
+Both are the same thing to an optimizer: independent problems, each a drive from a measured state. Pairs are solved in groups and each
+pair's result is cached on its own, so an interrupted calibration goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from cfx import simulation
+from cfx.calibration.cache import Arrays, Cache, content_key
+from cfx.calibration.objective import DriveObjective
+from cfx.calibration.windows import Windows
+from cfx.component import folder_hash
+from cfx.optimizers.base import Optimizer, Progress
+from cfx.pairs import PairBatch, PairSet
+from cfx.progress import Task
+from cfx.simulation.rollout import Simulator
+
+_FORMAT = 1
+"""Raise it when the meaning of a cached array changes."""
+
+_GROUP = 1024
+"""Problems solved together: enough to fill the batch, few enough that an interruption loses little."""
+
+
+@dataclass(frozen=True)
+class Labels:
+    """The best parameters of each window.
+
+    Attributes:
+        windows: which windows.
+        parameters: `(W, n)`, SI units; where nothing tells candidates apart they are the pair's fixed parameters.
+        loss: `(W,)`, RMSE of speed, m/s.
+        spread: `(W,)`, how much the choice of parameters matters there: median minus minimum loss of the space-filling candidates,
+            m/s. 0 where every candidate drives alike: such a label is arbitrary.
+        diverged: `(W,)` int64, candidates whose loss was not a number.
+    """
+
+    windows: Windows
+    parameters: Tensor
+    loss: Tensor
+    spread: Tensor
+    diverged: Tensor
+
+
+class Calibrator:
+    """Calibrates one model with one optimizer.
+
+    Args:
+        simulator: the model and its time step.
+        optimizer: solves the problems.
+        seed: the same seed gives the same parameters.
+        cache: where results are kept.
+        memory: bound for one chunk, bytes.
+        progress: makes a progress display, given a description and a total.
+    """
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        optimizer: Optimizer,
+        *,
+        seed: int,
+        cache: Cache,
+        memory: int,
+        progress: Callable[[str, int], Task],
+    ) -> None:
+        self.simulator = simulator
+        self.optimizer = optimizer
+        self.seed = seed
+        self.cache = cache
+        self.memory = memory
+        self.progress = progress
+
+    @property
+    def space(self) -> Any:
+        """The model's parameter space."""
+        return self.simulator.model.space
+
+    def fixed(self, pairs: PairSet, batch: PairBatch, last: Tensor) -> Tensor:
+        """Finds one parameter set per pair.
+
+        Args:
+            pairs: P pairs.
+            batch: the same as tensors.
+            last: `(P,)`, the last frame that may be used; the drive is simulated from frame 0 to it as one closed loop.
+
+        Returns:
+            `(P, n)`, SI units.
+        """
+        device = batch.lengths.device
+        last = last.to(device)
+        keys = [self._key("fixed", pair.fingerprint, frames=int(end)) for pair, end in zip(pairs, last, strict=True)]
+        guess = self.space.to_unit(self.space.defaults(device=device))[None, None, :]
+
+        def solve(chosen: Tensor, report: Progress) -> list[Arrays]:
+            chosen = chosen.to(device)
+            objective = DriveObjective.of_segments(self.simulator, batch, chosen, torch.zeros_like(chosen), last[chosen])
+            found = self._minimize(objective, guess.expand(len(chosen), 1, -1), report)
+            return [{name: values[i] for name, values in found.items()} for i in range(len(chosen))]
+
+        results = self._cached("Fixed parameters", keys, [1] * len(pairs), solve)
+        return torch.stack([torch.as_tensor(entry["parameters"], device=device) for entry in results])
+
+    def labels(self, pairs: PairSet, batch: PairBatch, windows: Windows, fixed: Tensor) -> Labels:
+        """Finds the parameters of each window; ties go to the pair's fixed parameters.
+
+        Args:
+            pairs: P pairs.
+            batch: the same as tensors.
+            windows: W windows of these pairs.
+            fixed: `(P, n)`, SI units: the first guess in each window, before the model's defaults.
+        """
+        device = batch.lengths.device
+        counts = torch.bincount(windows.pair, minlength=len(pairs))
+        description = windows.settings.model_dump()
+        keys = [
+            self._key("labels", pair.fingerprint, windows=int(count), fixed=row.tolist(), **description)
+            for pair, count, row in zip(pairs, counts, fixed, strict=True)
+        ]
+        guesses = self.space.to_unit(torch.stack([fixed, self.space.defaults(device=device).expand_as(fixed)], dim=1))
+
+        def solve(chosen: Tensor, report: Progress) -> list[Arrays]:
+            own = torch.isin(windows.pair, chosen)
+            pair, first = windows.pair[own].to(device), windows.first[own].to(device)
+            objective = DriveObjective.of_segments(
+                self.simulator, batch, pair, first, torch.full_like(first, windows.settings.length)
+            )
+            found = self._minimize(objective, guesses[pair], report)
+            return [{name: values[windows.pair[own] == p] for name, values in found.items()} for p in chosen]
+
+        results = self._cached("Window labels", keys, counts.tolist(), solve)
+        joined = {name: torch.cat([torch.as_tensor(entry[name]) for entry in results]).to(device) for name in results[0]}
+        return Labels(windows=windows, **joined)
+
+    def _minimize(self, objective: DriveObjective, guesses: Tensor, report: Progress) -> Arrays:
+        solution = self.optimizer.minimize(
+            objective,
+            guesses,
+            seed=self.seed,
+            objective_bytes=objective.bytes_per_candidate,
+            memory=self.memory,
+            progress=report,
+        )
+        found = {
+            "parameters": self.space.from_unit(solution.best),
+            "loss": solution.loss,
+            "spread": solution.spread,
+            "diverged": solution.diverged,
+        }
+        return {name: values.cpu().numpy() for name, values in found.items()}
+
+    def _cached(
+        self, what: str, keys: list[str], problems: list[int], solve: Callable[[Tensor, Progress], list[Arrays]]
+    ) -> list[Arrays]:
+        """Returns one entry per pair, solving in groups what the cache does not hold."""
+        entries = [self.cache.get(key) for key in keys]
+        missing = [index for index, entry in enumerate(entries) if entry is None]
+        todo = sum(problems[index] for index in missing)
+        with self.progress(f"{what} ({self.optimizer_name}, {todo} problems)", todo * self.optimizer.evaluations()) as task:
+            for group in _groups(missing, problems):
+                for index, entry in zip(group, solve(torch.tensor(group), task.advance), strict=True):
+                    self.cache.put(keys[index], entry)
+                    entries[index] = entry
+        return [entry for entry in entries if entry is not None]
+
+    @functools.cached_property
+    def optimizer_name(self) -> str:
+        """The optimizer's class name, for people."""
+        return type(self.optimizer).__name__
+
+    def _key(self, what: str, pair: str, **details: Any) -> str:
+        model = self.simulator.model
+        return content_key(
+            {
+                "format": _FORMAT,
+                "what": what,
+                "pair": pair,
+                "dt": self.simulator.dt,
+                "simulation": folder_hash(simulation.__file__),
+                "model": model.identity(),
+                "parameters": [(p.name, p.low, p.high, p.default, p.tuned) for p in self.space],
+                "optimizer": self.optimizer.identity(),
+                "seed": self.seed,
+                **details,
+            }
+        )
+
+
+def _groups(indices: list[int], problems: list[int]) -> Iterator[list[int]]:
+    """Yields runs of indices with at most `_GROUP` problems together, or one index if it alone has more."""
+    group: list[int] = []
+    size = 0
+    for index in indices:
+        if group and size + problems[index] > _GROUP:
+            yield group
+            group, size = [], 0
+        group.append(index)
+        size += problems[index]
+    if group:
+        yield group

@@ -1,0 +1,109 @@
+"""Windows: the short stretches of a drive for which one set of parameters holds.
+
+A window starts at a measured state and spans `length` steps; one starts every `stride` steps. Window k of a pair starts at frame `k
+stride` and is compared at the `length` frames after it. Letters: P pairs, W windows of all pairs together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor
+
+from cfx.component import Settings
+from cfx.errors import DataError
+from cfx.pairs import PairSet
+
+
+class WindowSettings(Settings):
+    """How drives are cut; both 5 steps (0.5 s at NGSIM's 0.1 s) in the paper."""
+
+    length: int = Field(5, ge=1, description="steps that a window simulates")
+    stride: int = Field(5, ge=1, description="steps from one window's start to the next; parameters change this often")
+
+    @model_validator(mode="after")
+    def _covers(self) -> WindowSettings:
+        if self.length < self.stride:
+            raise ValueError(f"windows.length={self.length} leaves frames between windows of stride {self.stride} out; give at least the stride")
+        return self
+
+    def count(self, frames: int) -> int:
+        """Returns how many whole windows fit a drive of `frames` frames."""
+        return max(0, (frames - 1 - self.length) // self.stride + 1)
+
+
+@dataclass(frozen=True)
+class Split:
+    """Where each pair's training part ends: the frame of the last measured state that calibration and learning may use.
+
+    Attributes:
+        frame: `(P,)` int64; the test part starts from this frame's measured state and is compared after it.
+        windows: `(P,)` int64, whole windows up to that frame.
+    """
+
+    frame: Tensor
+    windows: Tensor
+
+    @classmethod
+    def of(cls, pairs: PairSet, settings: WindowSettings, share: float) -> Split:
+        """Splits each pair so that `share` of its windows come first.
+
+        Raises:
+            DataError: a pair is too short to have at least two windows for training and one for testing.
+        """
+        counts = [settings.count(len(pair)) for pair in pairs]
+        training = [int(share * count + 1e-9) for count in counts]
+        for pair, count, first in zip(pairs, counts, training, strict=True):
+            if first < 2 or first >= count:
+                needed = next(n for n in range(3, 10**6) if 2 <= int(share * n + 1e-9) < n)
+                frames = (needed - 1) * settings.stride + settings.length + 1
+                raise DataError(
+                    f"pair {pair.pair_id} has {len(pair)} frames, too few for windows of {settings.length} steps with split={share:g};"
+                    f" set data.min_frames to at least {frames}"
+                )
+        frame = torch.tensor([first * settings.stride for first in training])
+        whole = torch.tensor([settings.count(int(last) + 1) for last in frame])
+        return cls(frame, whole)
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Windows of several pairs, pair after pair, in time order.
+
+    Attributes:
+        pair: `(W,)` int64, index of the pair.
+        number: `(W,)` int64, number of the window in its pair, from 0.
+        settings: length and stride.
+    """
+
+    pair: Tensor
+    number: Tensor
+    settings: WindowSettings
+
+    @classmethod
+    def of(cls, counts: Tensor, settings: WindowSettings) -> Windows:
+        """Returns the first `counts[p]` windows of each pair p; `counts` is `(P,)`."""
+        pair = torch.repeat_interleave(torch.arange(len(counts)), counts)
+        starts = torch.cumsum(counts, 0) - counts
+        return cls(pair, torch.arange(len(pair)) - starts[pair], settings)
+
+    def __len__(self) -> int:
+        """W."""
+        return len(self.pair)
+
+    @property
+    def first(self) -> Tensor:
+        """Frame of the measured state that each window starts from, `(W,)`."""
+        return self.number * self.settings.stride
+
+    def to_grid(self, values: Tensor, pairs: int) -> tuple[Tensor, Tensor]:
+        """Arranges `(W, ...)` as `(P, windows, ...)`, zero where a pair has no such window; and the mask `(P, windows)`."""
+        width = int(self.number.max()) + 1
+        pair, number = self.pair.to(values.device), self.number.to(values.device)
+        grid = values.new_zeros((pairs, width, *values.shape[1:]))
+        mask = torch.zeros((pairs, width), dtype=torch.bool, device=values.device)
+        grid[pair, number] = values
+        mask[pair, number] = True
+        return grid, mask

@@ -1,0 +1,87 @@
+"""The configuration of a job as one frozen object. Nothing below the command line knows where it came from."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, field_validator
+
+from cfx.calibration.windows import WindowSettings
+from cfx.component import Settings, validate
+from cfx.errors import ConfigError
+from cfx.style.settings import StyleSettings
+
+Node = dict[str, Any]
+"""A component's node, `{name: ..., settings...}`: `cfx.registry.create` validates it against the component's own schema."""
+
+
+class SimulationSettings(Settings):
+    """How rollouts are computed."""
+
+    compile: Literal["auto", "always", "never"] = Field("auto", description="compile the model's step: auto: where it pays")
+    memory_mb: int = Field(1024, ge=16, description="bound for one chunk of problems, MB")
+
+
+class CacheSettings(Settings):
+    """Where calibrations are kept, so that each is done once."""
+
+    enabled: bool = Field(True, description="read and write the cache")
+    folder: Path = Field(Path("outputs/cache"), description="where it lies")
+
+
+class TrackingSettings(Settings):
+    """What MLflow keeps."""
+
+    enabled: bool = Field(True, description="log the job to MLflow")
+    uri: str | None = Field(None, description="tracking store; null: MLFLOW_TRACKING_URI, or SQLite beside the outputs")
+    experiment: str = Field("cfx", min_length=1, description="MLflow's experiment")
+    sweep: str | None = Field(None, description="name that the jobs of a multirun share: they get a common parent run")
+
+
+class FigureSettings(Settings):
+    """What is drawn."""
+
+    enabled: bool = Field(True, description="write figures")
+
+
+class JobConfig(Settings):
+    """Everything that one job needs to know; `conf/config.yaml` says the same in YAML."""
+
+    data: Node = Field(description="the dataset's node")
+    model: Node = Field(description="the driving model's node")
+    policy: Node = Field(description="the policy's node")
+    optimizer: Node = Field(description="the optimizer's node")
+    learner: Node = Field(description="the learner's node")
+    protocol: Node = Field(description="the protocol's node")
+    seed: int = Field(0, ge=0, lt=2**32, description="seed of everything random")
+    device: str = Field("auto", description="auto, cpu, cuda or cuda:N")
+    dtype: Literal["float32", "float64"] = Field("float64", description="precision of simulations")
+    threads: int | None = Field(None, ge=1, description="torch's threads; null: torch's own choice")
+    split: float = Field(0.8, gt=0, lt=1, description="share of each pair that is calibrated and learned on")
+    windows: WindowSettings = Field(WindowSettings(), description="how drives are cut")
+    style: StyleSettings = Field(StyleSettings(), description="driving style")
+    simulation: SimulationSettings = Field(SimulationSettings(), description="rollouts")
+    cache: CacheSettings = Field(CacheSettings(), description="cache of calibrations")
+    tracking: TrackingSettings = Field(TrackingSettings(), description="MLflow")
+    figures: FigureSettings = Field(FigureSettings(), description="figures")
+
+    @field_validator("device")
+    @classmethod
+    def _known(cls, device: str) -> str:
+        if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", device):
+            raise ValueError("choose auto, cpu, cuda or cuda:N")
+        return device
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> JobConfig:
+        """Validates a resolved configuration.
+
+        Raises:
+            ConfigError: one sentence for each key that is wrong, with its full path.
+        """
+        if not isinstance(values, Mapping):
+            raise ConfigError(f"a configuration is a mapping of keys to values, not {type(values).__name__}")
+        return validate(cls, values, where="")

@@ -1,0 +1,33 @@
+"""What a job says while it runs: plain messages, coloured by weight on a terminal."""
+
+from __future__ import annotations
+
+import logging
+import sys
+
+
+class ConsoleHandler(logging.Handler):
+    """Prints cfx's and Hydra's own messages, and warnings of everybody: warnings and errors on stderr, the rest on stdout.
+
+    The streams are looked up at each message, so that a progress bar or a notebook that replaces them is respected.
+    """
+
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            ours = record.name.partition(".")[0] in {"cfx", "hydra", "hydra_plugins"}
+            wanted = ours or record.levelno >= logging.WARNING or logging.getLogger().isEnabledFor(logging.DEBUG)
+            if wanted and not getattr(record, "file_only", False):
+                _say(self.format(record), record.levelno)
+        except Exception:  # logging's own rule: a handler never raises
+            self.handleError(record)
+
+
+def _say(message: str, level: int) -> None:
+    stream = sys.stderr if level >= logging.WARNING else sys.stdout
+    if not stream.isatty():
+        print(message, file=stream, flush=True)
+        return
+    from rich.console import Console
+
+    style = "red" if level >= logging.ERROR else "yellow" if level >= logging.WARNING else None
+    Console(file=stream).print(message, style=style, markup=False, highlight=False, soft_wrap=True)

@@ -1,0 +1,136 @@
+"""The contract of a dataset: recordings in, leader-follower pairs out."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+from pydantic import BeforeValidator, Field
+from pydantic_core import PydanticCustomError
+
+from cfx.component import Component, Settings
+from cfx.errors import DataError, nearest
+from cfx.pairs import Dropped, Pair, PairSet
+
+
+def _absolute(value: Any) -> Any:
+    """Returns an absolute path, so that a later change of the working directory changes nothing."""
+    if value is None or str(value).strip() in {"", "???"}:  # "???" is how a config file says that a value is missing
+        raise PydanticCustomError("missing", "a value is required")
+    return Path(value).expanduser().absolute() if isinstance(value, str | Path) else value
+
+
+FilePath = Annotated[Path, BeforeValidator(_absolute)]
+"""A path that a user writes: `~` is their home, a relative one starts at the working directory."""
+
+
+class DatasetSettings(Settings):
+    """What every dataset lets its user select."""
+
+    min_frames: int = Field(700, ge=2, description="shortest pair that is kept, frames; the paper keeps 700")
+    recording: str | None = Field(None, description="keep this recording alone; null: all")
+    lanes: list[int] | None = Field(None, description="keep pairs in these lanes alone; null: all")
+    max_pairs: int | None = Field(None, ge=1, description="keep the first so many pairs; null: all")
+
+
+class FileDatasetSettings(DatasetSettings):
+    """What every dataset that reads a file has."""
+
+    path: FilePath = Field(description="the file to read; ~ and relative paths work")
+
+
+class Dataset(Component):
+    """Base of every dataset.
+
+    Life cycle: constructed once per job; `load` is called once, calls `read`, and selects.
+
+    A subclass implements `read`. Its settings extend `DatasetSettings`.
+    """
+
+    kind = "dataset"
+    schema: ClassVar[type[Settings]] = DatasetSettings
+    settings: DatasetSettings
+
+    @abstractmethod
+    def read(self) -> PairSet:
+        """Returns every pair found, in a fixed order, with a count of whatever it had to leave out.
+
+        Raises:
+            DataError: the source is missing, cannot be read, or holds what no recording can hold.
+        """
+
+    def load(self) -> PairSet:
+        """Returns the pairs that the settings select: by recording, lane and length, then the first `max_pairs` of them.
+
+        Raises:
+            DataError: as `read`; or the recording is unknown, the source has no lanes, or fewer pairs remain than asked for.
+        """
+        pairs = self.read()
+        if not len(pairs):
+            raise DataError(f"{pairs.source}: no leader-follower pair found{_why(pairs.dropped)}")
+        if self.settings.recording is not None:
+            pairs = _select_recording(pairs, self.settings.recording)
+        if self.settings.lanes is not None:
+            pairs = _select_lanes(pairs, self.settings.lanes)
+        return _select_first(_select_long(pairs, self.settings.min_frames), self.settings)
+
+
+def _why(dropped: Sequence[Dropped]) -> str:
+    return f" (left out: {'; '.join(f'{d.count:,} {d.unit}: {d.reason}' for d in dropped)})" if dropped else ""
+
+
+def listed(values: Iterable[object], limit: int = 12) -> str:
+    """Returns the values separated by commas, cut off after `limit` of them."""
+    texts = [str(value) for value in values]
+    more = f", ... ({len(texts)} in all)" if len(texts) > limit else ""
+    return ", ".join(texts[:limit]) + more
+
+
+def _select_recording(pairs: PairSet, recording: str) -> PairSet:
+    known = list(dict.fromkeys(pair.recording for pair in pairs))
+    if recording not in known:
+        raise DataError(
+            f"data.recording={recording}: {pairs.source} has no such recording.{nearest(recording, known)}"
+            f" Known: {listed(known)}."
+        )
+    return pairs.select([pair.recording == recording for pair in pairs], f"other recordings than '{recording}'")
+
+
+def _select_lanes(pairs: PairSet, lanes: Sequence[int]) -> PairSet:
+    known = sorted({pair.lane for pair in pairs if pair.lane is not None})
+    if not known:
+        raise DataError(
+            f"data.lanes={list(lanes)}: {pairs.source} does not say in which lane its pairs are; leave data.lanes out"
+        )
+    strange = [lane for lane in lanes if lane not in known]
+    if strange or not lanes:
+        raise DataError(f"data.lanes={list(lanes)}: {pairs.source} has pairs in lanes {listed(known)} only; choose among these")
+    return pairs.select([pair.lane in lanes for pair in pairs], f"in other lanes than {listed(sorted(set(lanes)))}")
+
+
+def _select_long(pairs: PairSet, min_frames: int) -> PairSet:
+    long = pairs.select([len(pair) >= min_frames for pair in pairs], f"shorter than {min_frames} frames")
+    if not len(long):
+        longest: Pair = max(pairs, key=len)
+        raise DataError(
+            f"{pairs.source}: none of its {len(pairs)} pairs has at least {min_frames} frames, the longest has {len(longest)};"
+            f" lower data.min_frames"
+        )
+    return long
+
+
+def _select_first(pairs: PairSet, settings: DatasetSettings) -> PairSet:
+    wanted = settings.max_pairs
+    if wanted is None or len(pairs) == wanted:
+        return pairs
+    if len(pairs) < wanted:
+        raise DataError(
+            f"{pairs.source}: asked for {wanted} pairs but only {len(pairs)} have at least {settings.min_frames} frames"
+            f"{' in the selected recording and lanes' if settings.recording or settings.lanes else ''};"
+            " lower data.max_pairs or data.min_frames"
+        )
+    beyond = Dropped(f"beyond max_pairs ({wanted})", len(pairs) - wanted)
+    return replace(pairs, pairs=pairs.pairs[:wanted], dropped=(*pairs.dropped, beyond))

@@ -1,0 +1,289 @@
+"""Reading delimited text, plain or gzipped, column by column, with errors that name the row.
+
+Rows are numbered as an editor shows them: the header is row 1 (blank lines are not counted).
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple, cast
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv
+from numpy.typing import NDArray
+
+from cfx.errors import DataError
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_GZIP, _ZIP, PARQUET = b"\x1f\x8b", b"PK\x03\x04", b"PAR1"
+_HEAD = 1 << 16
+_BLOCK = 1 << 22
+_OTHER_SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "vertical bars"}
+
+
+class Labels(NamedTuple):
+    """A column of names: `codes` `(N,)` points into `names`; -1 is an empty cell."""
+
+    codes: Ints
+    names: list[str]
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A delimited text file whose first line has been looked at.
+
+    Attributes:
+        delimiter: "," or " ", the latter for any run of white space.
+        header: the column names as written; None if the first line holds data.
+        width: number of columns.
+    """
+
+    path: Path
+    delimiter: str
+    header: tuple[str, ...] | None
+    width: int
+
+    def row(self, index: int | np.integer[Any]) -> int:
+        """Returns the row number that an editor shows for the data row `index` (from 0)."""
+        return int(index) + (1 if self.header is None else 2)
+
+
+def magic(path: Path) -> bytes:
+    """Returns the first bytes of a file.
+
+    Raises:
+        DataError: the file is missing, a folder, unreadable or empty.
+    """
+    if not path.exists():
+        where = "" if path.parent.is_dir() else f" (nor is there a folder {path.parent})"
+        raise DataError(f"{path}: no such file{where}; set data.path to the file to read")
+    if path.is_dir():
+        raise DataError(f"{path}: is a folder; set data.path to one file in it")
+    try:
+        with path.open("rb") as file:
+            start = file.read(4)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
+    if not start:
+        raise DataError(f"{path}: the file is empty; download or write it again")
+    return start
+
+
+def open_text(path: Path) -> BinaryIO:
+    """Opens a text file, unpacking gzip by its content, whatever its name."""
+    start = magic(path)
+    if start.startswith(_ZIP):
+        raise DataError(f"{path}: is a zip archive; unpack it and set data.path to the file inside")
+    return cast(BinaryIO, gzip.open(path, "rb")) if start.startswith(_GZIP) else path.open("rb")
+
+
+def sniff(path: Path) -> TextTable:
+    """Looks at the beginning of a text file.
+
+    Raises:
+        DataError: it is no text, not in UTF-8, or its columns are separated by neither commas nor white space.
+    """
+    with open_text(path) as file:
+        head = _guarded(path, lambda: file.read(_HEAD))
+    if head.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise DataError(f"{path}: is in UTF-16; save it as UTF-8")
+    text = _decoded(path, head)
+    first = next((line for line in text.splitlines() if line.strip()), "")
+    if not first:
+        raise DataError(f"{path}: the file holds no rows")
+    has_header = any(character.isalpha() for character in first.lower().replace("e+", "").replace("e-", ""))
+    for separator, plural in _OTHER_SEPARATORS.items():
+        if "," not in first and separator in first and (has_header or separator != "\t"):
+            raise DataError(f"{path}: the columns are separated by {plural}; write the file with commas")
+    if "," in first:
+        cells = next(iter(pa.csv.read_csv(_one_line(first), read_options=_no_names()).to_pylist())).values()
+        names = tuple(str(cell).strip() for cell in cells)
+        return TextTable(path, ",", names if has_header else None, len(names))
+    names = tuple(first.split())
+    return TextTable(path, " ", names if has_header else None, len(names))
+
+
+def _one_line(line: str) -> io.BytesIO:
+    return io.BytesIO(line.encode() + b"\n")
+
+
+def _no_names() -> Any:
+    return pa.csv.ReadOptions(autogenerate_column_names=True)
+
+
+def _decoded(path: Path, head: bytes) -> str:
+    control = sum(byte < 32 and byte not in b"\t\n\r\f" for byte in head)
+    try:
+        text = head.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        if error.start < len(head) - 4:  # a character cut in two at the end of the block is none of the file's faults
+            control = len(head)
+        text = head.decode("utf-8-sig", errors="ignore")
+    if control:
+        raise DataError(f"{path}: is a binary file, not text; give a CSV or text file (gzip is fine), or parquet for data=tidy")
+    return text
+
+
+def _guarded(path: Path, read: Callable[[], Any]) -> Any:
+    """Calls `read` and turns what a damaged gzip file raises into one sentence."""
+    try:
+        return read()
+    except EOFError:
+        raise DataError(f"{path}: the gzip file is cut off; download or write it again") from None
+    except (gzip.BadGzipFile, zlib.error):
+        raise DataError(f"{path}: the gzip file is damaged; download or write it again") from None
+
+
+class _Lines(io.RawIOBase):
+    """Feeds pyarrow: whole lines, white space turned into commas where that separates the columns."""
+
+    def __init__(self, table: TextTable) -> None:
+        super().__init__()
+        self._table = table
+        self._file = open_text(table.path)
+        self._rest = b""
+        self._ready = b""
+        self._fresh = True
+
+    def readable(self) -> bool:
+        return True
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+    def readinto(self, buffer: Any) -> int:
+        while not self._ready:
+            block = _guarded(self._table.path, lambda: self._file.read(_BLOCK))
+            if not block and not self._rest:
+                return 0
+            self._take(block)
+        size = min(len(buffer), len(self._ready))
+        buffer[:size] = self._ready[:size]
+        self._ready = self._ready[size:]
+        return size
+
+    def _take(self, block: bytes) -> None:
+        cut = block.rfind(b"\n") + 1 if block else 0
+        text, self._rest = (self._rest + block[:cut], block[cut:]) if cut else (self._rest + block, b"")
+        if block and not cut:  # no line ends in this block: wait for more
+            text, self._rest = b"", text
+        if text and self._fresh:
+            text, self._fresh = text.removeprefix(b"\xef\xbb\xbf"), False
+        if self._table.delimiter == " ":
+            text = b"".join(b",".join(line.split()) + b"\n" for line in text.splitlines())
+        self._ready = text
+
+
+def read_columns(
+    table: TextTable, numbers: Mapping[str, int], labels: Mapping[str, int]
+) -> tuple[dict[str, Floats], dict[str, Labels]]:
+    """Reads the columns wanted, and only these.
+
+    Args:
+        numbers: name to report -> position of each column of numbers. Thousands separators ("1,113,433") are understood.
+        labels: name -> position of each column of text.
+
+    Returns:
+        Columns `(N,)`; an empty or NaN cell is NaN, or code -1. All have the same length, which may be 0.
+
+    Raises:
+        DataError: a row has another number of columns, or a cell that should be a number is none: with row and column.
+    """
+    try:
+        batches = _batches(table, numbers, labels, pa.float64())
+    except pa.ArrowInvalid:  # some cell is no plain number: read these columns as text and look closer
+        batches = _batches(table, numbers, labels, pa.string())
+    columns = {name: batches.column(f"c{at}") for name, at in (*numbers.items(), *labels.items())}
+    return {name: _as_floats(table, name, columns[name]) for name in numbers}, {name: as_labels(columns[name]) for name in labels}
+
+
+def _batches(table: TextTable, numbers: Mapping[str, int], labels: Mapping[str, int], number_type: Any) -> Any:
+    """Returns the columns as one pyarrow table with columns c0, c1, ..."""
+    broken: list[Any] = []
+
+    def note(row: Any) -> str:
+        broken.append(row)
+        return "error"
+
+    types = {f"c{at}": number_type for at in numbers.values()} | {
+        f"c{at}": pa.dictionary(pa.int32(), pa.string()) for at in labels.values()
+    }
+    try:
+        with _Lines(table) as lines, pa.PythonFile(lines, mode="r") as file:
+            reader = pa.csv.open_csv(
+                file,
+                read_options=pa.csv.ReadOptions(
+                    # One thread: only then does pyarrow know the number of a broken row.
+                    use_threads=False,
+                    block_size=_BLOCK,
+                    column_names=[f"c{at}" for at in range(table.width)],
+                    skip_rows=0 if table.header is None else 1,
+                ),
+                parse_options=pa.csv.ParseOptions(invalid_row_handler=note),
+                convert_options=pa.csv.ConvertOptions(column_types=types, include_columns=list(types)),
+            )
+            return reader.read_all()
+    except pa.ArrowInvalid as error:
+        if broken:
+            row = broken[0]
+            raise DataError(
+                f"{table.path}, row {row.number}: {row.actual_columns} columns instead of {table.width}; is the file cut off"
+                " there, or does a cell hold a separator?"
+            ) from None
+        if number_type == pa.string():
+            raise DataError(f"{table.path}: cannot be read as a table ({error})") from None
+        raise
+
+
+def _as_floats(table: TextTable, name: str, column: Any) -> Floats:
+    if pa.types.is_floating(column.type):
+        return cast(Floats, column.to_numpy().astype(np.float64, copy=False))
+    return parsed(
+        column, lambda index, cell: f"{table.path}, row {table.row(index)}, column {name}: '{cell}' is not a number; correct it"
+    )
+
+
+def parsed(column: Any, complaint: Callable[[int, str], str]) -> Floats:
+    """Turns a pyarrow column of text into numbers `(N,)`, reading "1,234" as 1234 and an empty cell as NaN.
+
+    Raises:
+        DataError: a cell is no number; `complaint(index, cell)` is the message.
+    """
+    text = pc.replace_substring(pc.utf8_trim_whitespace(column), ",", "").to_pandas()
+    values: Floats = pd.to_numeric(text, errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
+    absent = text.isna() | text.str.lower().isin(["", "nan", "na", "null", "none", "n/a", "#n/a"])
+    wrong = np.flatnonzero(np.isnan(values) & ~absent.to_numpy(dtype=bool))
+    if len(wrong):
+        raise DataError(complaint(int(wrong[0]), column[int(wrong[0])].as_py()))
+    return values
+
+
+def as_labels(column: Any) -> Labels:
+    """Turns a pyarrow column of text into codes and names; names keep the order in which they first appear."""
+    encoded = column if pa.types.is_dictionary(column.type) else pc.dictionary_encode(column.cast(pa.string()))
+    encoded = encoded.unify_dictionaries().combine_chunks() if isinstance(encoded, pa.ChunkedArray) else encoded
+    if isinstance(encoded, pa.ChunkedArray):  # no chunk at all
+        return Labels(np.zeros(0, np.int64), [])
+    written = [str(name).strip() for name in encoded.dictionary.to_pylist()]
+    merged, names = pd.factorize(np.array([name or None for name in written], dtype=object))  # an empty name has code -1
+    codes = pc.fill_null(encoded.indices, len(written)).to_numpy(zero_copy_only=False)
+    return Labels(np.append(merged, -1).astype(np.int64)[codes], list(names))
+
+
+def bad_cells(values: Floats) -> tuple[int, int, str] | None:
+    """Returns (index of the first cell that is no finite number, how many, what it is), or None if all are finite."""
+    wrong = np.flatnonzero(~np.isfinite(values))
+    if not len(wrong):
+        return None
+    return int(wrong[0]), len(wrong), "empty or NaN" if np.isnan(values[wrong[0]]) else "infinite"

@@ -1,0 +1,114 @@
+"""How installed components become Hydra config options: the config source `cfx://` and the search path.
+
+The search path is: Hydra's own, `conf/` of cfx, the `conf/` folder in each plugin's package, and last `cfx://`, which lists every
+component by the metadata of its distribution and imports only the one that is chosen. So a plugin's own YAML wins over the node
+written from its class. That node stays available as `_NAME` in a defaults list:
+
+    # my_package/conf/model/mine.yaml: the generated node with another default
+    defaults: [_mine, _self_]
+    parameters: {tau: {default: 1.2}}
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Sequence
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.object_type import ObjectType
+from hydra.core.plugins import Plugins
+from hydra.plugins.config_source import ConfigLoadError, ConfigResult, ConfigSource
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import DictConfig, OmegaConf
+
+from cfx import nodes, registry
+
+
+class ComponentSource(ConfigSource):
+    """Serves `cfx://`: one config group per kind, one option per component."""
+
+    @staticmethod
+    def scheme() -> str:
+        return "cfx"
+
+    def available(self) -> bool:
+        return True
+
+    def is_group(self, config_path: str) -> bool:
+        return config_path.strip("/") in {"", *registry.GROUPS}
+
+    def is_config(self, config_path: str) -> bool:
+        group, name = _split(config_path)
+        return group in registry.GROUPS and name.removeprefix("_") in registry.names(group)
+
+    def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
+        path = config_path.strip("/")
+        groups = sorted(registry.GROUPS) if path == "" and results_filter != ObjectType.CONFIG else []
+        configs = list(registry.names(path)) if path in registry.GROUPS and results_filter != ObjectType.GROUP else []
+        return groups + configs
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        """Imports the chosen component and writes its node.
+
+        Raises:
+            PluginError: the component cannot be loaded, or two distributions claim its name.
+        """
+        group, name = _split(config_path)
+        if not self.is_config(config_path):
+            raise ConfigLoadError(f"Config not found: {config_path}")
+        name = name.removeprefix("_")
+        text = nodes.render(registry.get(group, name), name)
+        return ConfigResult(provider=self.provider, path="cfx://", config=OmegaConf.create(text), header={"package": None})
+
+
+class ComponentSearchPath(SearchPathPlugin):
+    """Appends each plugin's `conf/` and then `cfx://` to Hydra's search path."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for package, folder in plugin_conf_dirs().items():
+            search_path.append(package, f"file://{folder}")
+        search_path.append("cfx", "cfx://")
+
+
+def plugin_conf_dirs() -> dict[str, Path]:
+    """Returns the `conf/` folder of every third party's top-level package that has one. Runs no code of theirs."""
+    found: dict[str, Path] = {}
+    packages = sorted({entry.package for kind in registry.KINDS for entry in registry.entries(kind)} - {"cfx"})
+    for package in packages:
+        try:
+            spec = importlib.util.find_spec(package)
+        except (ImportError, ValueError):  # a broken distribution harms nobody who does not ask for it
+            continue
+        for location in (spec.submodule_search_locations or []) if spec is not None else []:
+            folder = Path(location) / "conf"
+            if folder.is_dir():
+                found.setdefault(package, folder)
+    return found
+
+
+def register() -> None:
+    """Makes both known to Hydra; call it before Hydra composes anything. Doing it twice does no harm."""
+    plugins = Plugins.instance()
+    plugins.register(ComponentSource)
+    plugins.register(ComponentSearchPath)
+
+
+def composed(overrides: Sequence[str]) -> DictConfig:
+    """Composes a configuration as the command line does, Hydra's own node included. Leaves a running Hydra application alone.
+
+    Raises:
+        HydraException: an override fits nothing.
+        PluginError: a chosen component cannot be loaded.
+    """
+    with initialize_config_dir(config_dir=str(nodes.conf_dir()), job_name="cfx", version_base="1.3"):
+        return compose("config", overrides=list(overrides), return_hydra_config=True)
+
+
+def _split(config_path: str) -> tuple[str, str]:
+    group, _, name = config_path.strip("/").removesuffix(".yaml").rpartition("/")
+    return group, name
+
+
+register()  # a worker process imports this module with the sources that it is sent, and needs them registered too

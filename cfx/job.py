@@ -1,0 +1,296 @@
+"""One job: a dataset gives pairs; an optimizer calibrates a driving model on them; a learner trains a policy on the result; a protocol
+evaluates it; tracking keeps what came out.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import pandas as pd
+import torch
+import yaml
+from rich.console import Console
+from rich.table import Table
+
+from cfx import registry
+from cfx.calibration.cache import Cache
+from cfx.calibration.calibrator import Calibrator
+from cfx.component import Component
+from cfx.config import JobConfig
+from cfx.datasets.base import Dataset
+from cfx.datasets.tidy import write_tidy
+from cfx.errors import ConfigError, DataError, OutputError
+from cfx.evaluation.result import METHODS, Evaluation
+from cfx.learners.base import Learner
+from cfx.models.base import DrivingModel
+from cfx.optimizers.base import Optimizer
+from cfx.pairs import PairBatch, PairSet
+from cfx.policies.base import Policy
+from cfx.policies.trained import TrainedPolicy
+from cfx.progress import Task
+from cfx.protocols.base import Outcome, Protocol, Study
+from cfx.simulation.rollout import Simulator
+from cfx.style.entropy import measure_style, select_cluster
+from cfx.style.result import StyleResult
+
+if TYPE_CHECKING:
+    from cfx.tracking.tracker import Tracker
+
+log = logging.getLogger(__name__)
+
+Kind = TypeVar("Kind", bound=Component)
+
+
+@dataclass(frozen=True)
+class JobResult:
+    """What a job leaves behind; `cfx.load` reads it back from the job's folder.
+
+    Attributes:
+        metrics: under their MLflow names; NaN where a metric is not defined.
+        pairs: a row per pair and method.
+        policy: the policy that drove, ready to drive again.
+        figures: the figures' files.
+        folder: the job's output folder.
+        run_id: MLflow's id of the run; "" if it was not tracked.
+    """
+
+    metrics: dict[str, float]
+    pairs: pd.DataFrame
+    policy: TrainedPolicy
+    figures: tuple[Path, ...]
+    folder: Path
+    run_id: str = ""
+    evaluation: Evaluation | None = field(default=None, repr=False)
+    style: StyleResult | None = field(default=None, repr=False)
+
+
+def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> JobResult:
+    """Runs one job and writes its results into `folder`.
+
+    Args:
+        config: the validated configuration.
+        folder: the job's output folder; made if it is not there.
+        console: where the table goes; stdout unless given.
+
+    Raises:
+        CfxError: the user's mistake, in one sentence; nothing half-written is left.
+    """
+    from cfx.tracking.tracker import Tracker
+
+    console = console or Console()
+    if config.threads is not None:
+        torch.set_num_threads(config.threads)
+    device = _device(config.device)
+    parts = _Parts.of(config)
+    _writable(folder)
+    _write(folder / "config.yaml", yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
+    with Tracker.open(config, folder) as tracker:
+        pairs, style = _pairs(parts.dataset, config)
+        tracker.set_tags(
+            {"dataset.fingerprint": pairs.fingerprint, "dataset.source": pairs.source, "dataset.pairs": str(len(pairs))}
+        )
+        study = _study(config, parts, pairs, style, device)
+        outcome = parts.protocol.run(study)
+        result = _keep(config, folder, pairs, style, outcome, tracker)
+    report(result, outcome.evaluation, console, tracker)
+    return result
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """The components of a job; making them checks the whole configuration before any work begins."""
+
+    dataset: Dataset
+    model: DrivingModel
+    optimizer: Optimizer
+    policy: Policy
+    learner: Learner
+    protocol: Protocol
+
+    @classmethod
+    def of(cls, config: JobConfig) -> _Parts:
+        return cls(
+            dataset=_create(Dataset, config.data),
+            model=_create(DrivingModel, config.model),
+            optimizer=_create(Optimizer, config.optimizer),
+            policy=_create(Policy, config.policy),
+            learner=_create(Learner, config.learner),
+            protocol=_create(Protocol, config.protocol),
+        )
+
+
+def _create(base: type[Kind], node: Mapping[str, Any]) -> Kind:
+    component = registry.create(base.kind, node)
+    assert isinstance(component, base)
+    return component
+
+
+def _device(name: str) -> torch.device:
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("device=cuda: PyTorch finds no CUDA device here; write device=cpu or device=auto")
+    return torch.device(name)
+
+
+def _pairs(dataset: Dataset, config: JobConfig) -> tuple[PairSet, StyleResult]:
+    pairs = dataset.load()
+    log.info("%d pairs of %d drivers from %s", len(pairs), len({pair.driver for pair in pairs}), pairs.source)
+    style = measure_style(pairs, config.style)
+    pairs = select_cluster(pairs, style, config.style.cluster)
+    for drop in pairs.dropped:
+        log.info("Left out: %d %s (%s)", drop.count, drop.unit, drop.reason)
+    return pairs, style
+
+
+def _study(config: JobConfig, parts: _Parts, pairs: PairSet, style: StyleResult, device: torch.device) -> Study:
+    batch = PairBatch.of(pairs, dtype=getattr(torch, config.dtype), device=device)
+    simulator = Simulator(parts.model, batch.dt, compile=config.simulation.compile)
+    calibrator = Calibrator(
+        simulator,
+        parts.optimizer,
+        seed=config.seed,
+        cache=Cache(Path(config.cache.folder).expanduser() if config.cache.enabled else None),
+        memory=config.simulation.memory_mb * 2**20,
+        progress=Task,
+    )
+    return Study(
+        pairs=pairs,
+        batch=batch,
+        style=style,
+        simulator=simulator,
+        model_node=config.model,
+        policy_node=config.policy,
+        calibrator=calibrator,
+        policy=parts.policy,
+        learner=parts.learner,
+        windows=config.windows,
+        split=config.split,
+        seed=config.seed,
+    )
+
+
+def _keep(config: JobConfig, folder: Path, pairs: PairSet, style: StyleResult, outcome: Outcome, tracker: Tracker) -> JobResult:
+    """Writes everything into the folder, then into MLflow."""
+    evaluation = outcome.evaluation
+    metrics = evaluation.metrics()
+    written = _Output(folder)
+    written.file("pairs.csv", lambda path: evaluation.table.to_csv(path, index=False))
+    written.file("style.csv", lambda path: style.table.to_csv(path, index=False))
+    if any(pair.truth for pair in pairs):
+        written.file("data.parquet", lambda path: write_tidy(pairs, path))
+    written.run(lambda: outcome.policy.save(folder / "policy"))
+    figures: list[Path] = []
+    if config.figures.enabled:
+        from cfx.figures.write import write_figures
+
+        written.run(lambda: figures.extend(write_figures(folder / "figures", evaluation, style, outcome.curves)))
+    summary = {
+        "metrics": {name: value if math.isfinite(value) else None for name, value in metrics.items()},
+        "pairs": len(pairs),
+        "dropped": [{"reason": drop.reason, "count": drop.count, "unit": drop.unit} for drop in pairs.dropped],
+        "dataset": {"source": pairs.source, "fingerprint": pairs.fingerprint},
+    }
+    tracker.log_evaluation(evaluation)
+    tracker.log_curves(outcome.curves)
+    tracker.log_figures(figures)
+    tracker.log_policy(folder / "policy")
+    written.file("metrics.json", lambda path: path.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8"))
+    tracker.log_files([folder / name for name in ("config.yaml", "metrics.json", "pairs.csv", "style.csv")])
+    return JobResult(metrics, evaluation.table, outcome.policy, tuple(figures), folder, tracker.run_id, evaluation, style)
+
+
+def report(result: JobResult, evaluation: Evaluation, console: Console, tracker: Tracker) -> None:
+    """Prints the table, where the results are and how to open them."""
+    table = Table(title=f"{len(evaluation.drives)} pairs, test part in closed loop", title_justify="left")
+    table.add_column("method")
+    for heading in ("RMSE speed [m/s]", "RMSE gap [m]", "collisions"):
+        table.add_column(heading, justify="right")
+    m = result.metrics
+    for method in METHODS:
+        table.add_row(
+            method, f"{m[f'rmse_speed/{method}']:.3f}", f"{m[f'rmse_gap/{method}']:.3f}", f"{m[f'collisions/{method}']:.0f}"
+        )
+    console.print(table)
+    i = evaluation.improvement
+    console.print(
+        f"Improvement of policy over fixed, RMSE of speed: mean {i.mean:+.1%} (95 % interval {i.ci95_low:+.1%} to {i.ci95_high:+.1%}),"
+        f" trimmed mean {i.trimmed_mean:+.1%}, median {i.median:+.1%}; better for {i.win_rate:.0%} of {i.pairs} pairs;"
+        f" Wilcoxon p = {i.p_value:.2g}",
+        soft_wrap=True,
+        highlight=False,
+    )
+    if i.undefined:
+        console.print(f"{i.undefined} pairs have no improvement: a drive diverged, or fixed parameters drive without any error.")
+    console.print(f"Results: {result.folder}", soft_wrap=True, highlight=False)
+    for line in tracker.how_to_open():
+        console.print(line, soft_wrap=True, highlight=False)
+
+
+def load(folder_or_run: str | Path) -> JobResult:
+    """Reads a finished job back.
+
+    Args:
+        folder_or_run: a job's output folder, or the id of its MLflow run.
+
+    Raises:
+        DataError: there is no finished job.
+    """
+    folder = Path(folder_or_run).expanduser()
+    if not folder.is_dir():
+        from cfx.tracking.tracker import download_run
+
+        folder = download_run(str(folder_or_run))
+    try:
+        summary = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        pairs = pd.read_csv(folder / "pairs.csv", dtype={"leader_id": str, "follower_id": str})
+    except (OSError, ValueError, KeyError) as error:
+        raise DataError(f"{folder} holds no finished job ({error}); give the output folder that a job printed") from error
+    metrics = {name: math.nan if value is None else float(value) for name, value in summary["metrics"].items()}
+    figures = tuple(sorted((folder / "figures").glob("*.png")))
+    return JobResult(metrics, pairs, TrainedPolicy.load(folder / "policy"), figures, folder)
+
+
+class _Output:
+    """Writes a job's files; each appears whole or not at all."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def file(self, name: str, write: Callable[[Path], object]) -> None:
+        path = self.folder / name
+        temporary = path.with_name(f".{name}.tmp{path.suffix}")
+
+        def whole() -> None:
+            write(temporary)
+            os.replace(temporary, path)
+
+        self.run(whole)
+
+    def run(self, write: Callable[[], object]) -> None:
+        try:
+            write()
+        except OSError as error:
+            raise OutputError(
+                f"cannot write into {self.folder}: {error.strerror or error}; the calibration is cached, so run again"
+            ) from error
+
+
+def _write(path: Path, text: str) -> None:
+    _Output(path.parent).file(path.name, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def _writable(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"cannot make the output folder {folder}: {error.strerror}; set hydra.run.dir to a place that can be written"
+        ) from error

@@ -1,0 +1,92 @@
+"""The contract of a learner: it trains the networks that a policy builds.
+
+Letters: P pairs, N networks, W windows of the longest training part, n tuned parameters.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import pandas as pd
+from pydantic import Field
+from torch import Tensor
+
+from cfx.calibration.calibrator import Labels
+from cfx.calibration.windows import Split, WindowSettings
+from cfx.component import Component, Settings
+from cfx.pairs import PairBatch
+from cfx.policies.base import Policy, PolicyNetwork
+from cfx.policies.trained import Scaler
+from cfx.simulation.rollout import Simulator
+
+CURVE_COLUMNS = ["network", "epoch", "train_loss", "validation_loss"]
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """What a learner may see: the training part of some pairs.
+
+    Attributes:
+        simulator: the driving model and its time step.
+        batch: P pairs, whole; only frames up to `split.frame` may be read.
+        split: where each pair's training part ends.
+        windows: how drives are cut.
+        fixed: each pair's fixed parameters, `(P, n)`, SI units.
+        labels: window labels of the training parts; None if the learner does not need them.
+        network: which network learns from each pair, `(P,)` int64.
+        names: what each network is for, N of them.
+        seed: for initial weights and everything random.
+    """
+
+    simulator: Simulator
+    batch: PairBatch
+    split: Split
+    windows: WindowSettings
+    fixed: Tensor
+    labels: Labels | None
+    network: Tensor
+    names: tuple[str, ...]
+    seed: int
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What a learner returns.
+
+    Attributes:
+        network: N trained networks, in evaluation mode.
+        scaler: how their tokens are normalised.
+        curves: columns network, epoch, train_loss, validation_loss (NaN where not measured).
+    """
+
+    network: PolicyNetwork
+    scaler: Scaler
+    curves: pd.DataFrame
+
+
+class LearnerSettings(Settings):
+    """Settings that every learner has."""
+
+    scope: Literal["pair", "all"] = Field("pair", description="pair: a network for each pair; all: one network for all pairs")
+
+
+class Learner(Component):
+    """Base of every learner.
+
+    Life cycle: a protocol makes a `Lesson` (with window labels if `needs_labels`) and calls `fit` once. Networks are independent: what one
+    learns does not depend on which others are trained beside it.
+
+    Attributes:
+        needs_labels: whether the protocol must find window labels first.
+    """
+
+    kind = "learner"
+    schema: ClassVar[type[Settings]] = LearnerSettings
+    settings: LearnerSettings
+    needs_labels: ClassVar[bool] = False
+
+    @abstractmethod
+    def fit(self, policy: Policy, lesson: Lesson) -> Learned:
+        """Trains the networks of `policy` on `lesson`."""

@@ -1,0 +1,20 @@
+"""Learning curves of many networks as one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+
+def over_networks(curves: pd.DataFrame, column: str) -> pd.DataFrame:
+    """Returns one column per network and one row per epoch at which any was measured.
+
+    A network that was stopped early keeps its last loss: otherwise the average would jump whenever one leaves it.
+
+    Args:
+        curves: columns `network`, `epoch`, `train_loss`, `validation_loss`; NaN where not measured.
+        column: `train_loss` or `validation_loss`.
+    """
+    values = curves[column].astype(float)
+    measured = curves[np.isfinite(values)]
+    return measured.pivot_table(index="epoch", columns="network", values=column, aggfunc="last").sort_index().ffill()

@@ -1,0 +1,308 @@
+"""Imitation of window labels: the paper's way to train a policy.
+
+The policy reads the measured drive window by window and learns to answer the parameters that calibration found for each. All networks
+are trained at once as one batched network; the sum of their losses trains each as if it were alone.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import sys
+import warnings
+from typing import Any, ClassVar
+
+import lightning.pytorch as pl
+import pandas as pd
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+
+from cfx.component import Settings
+from cfx.errors import DataError
+from cfx.learners.base import CURVE_COLUMNS, Learned, Learner, LearnerSettings, Lesson
+from cfx.policies.base import Policy, PolicyNetwork
+from cfx.policies.features import token_width, tokens
+from cfx.policies.trained import Scaler, driver_places, measured_history
+
+log = logging.getLogger(__name__)
+
+
+class ImitationSettings(LearnerSettings):
+    """Settings of `imitation`."""
+
+    epochs: int = Field(200, ge=1, description="passes over the training windows at most; 500 in the paper")
+    batch_size: int | None = Field(
+        16, ge=1, description="consecutive windows per gradient step, the recurrent state carried on; null: the whole drive; 1 in the paper"
+    )
+    learning_rate: float = Field(3e-3, gt=0, description="of Adam")
+    weight_decay: float = Field(0.0, ge=0, description="of AdamW, decoupled")
+    validation: float = Field(0.1, ge=0, lt=1, description="share of the training windows, the last ones, kept for validation")
+    patience: int | None = Field(
+        30, ge=1, description="epochs without a better validation loss after which a network stops; null: never"
+    )
+    weight_by_spread: bool = Field(
+        True, description="weight each window by how much the choice of parameters matters in it; false in the paper"
+    )
+    gradient_clip: float | None = Field(1.0, gt=0, description="largest gradient norm of a network; null: none")
+
+
+class ImitationLearner(Learner):
+    """Learns window labels by mean squared error in unit space.
+
+    Differences from the paper: windows can be weighted by their loss spread, because the labels of windows that do not
+    determine the parameters are arbitrary (`weight_by_spread=false` gives the paper's plain error); the weights of the epoch with the
+    smallest validation loss are kept, for each network on its own.
+    """
+
+    schema: ClassVar[type[Settings]] = ImitationSettings
+    settings: ImitationSettings
+    needs_labels = True
+
+    def fit(self, policy: Policy, lesson: Lesson) -> Learned:
+        if lesson.labels is None:
+            raise TypeError("imitation needs window labels")
+        _quiet_lightning()
+        material = _Material.of(policy, lesson, self.settings)
+        generator = torch.Generator().manual_seed(lesson.seed)
+        space = lesson.simulator.model.space
+        unit_default = space.to_unit(space.defaults()).float()
+        unit_fixed = _mean_by_network(space.to_unit(lesson.fixed), lesson).float()
+        network = policy.build(material.tokens.shape[-1], unit_default, unit_fixed.cpu(), generator)
+        if not any(parameter.requires_grad for parameter in network.parameters()):
+            return Learned(network.eval(), material.scaler, pd.DataFrame(columns=CURVE_COLUMNS))
+        module = ImitationModule(network, material, self.settings, lesson.names)
+        data = SegmentData(material.windows, self.settings.batch_size)
+        device = material.tokens.device
+        with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+            torch.manual_seed(lesson.seed)  # dropout draws from the global generator
+            trainer = pl.Trainer(
+                max_epochs=self.settings.epochs,
+                accelerator="gpu" if device.type == "cuda" else "cpu",
+                devices=1,
+                logger=False,
+                enable_checkpointing=False,
+                enable_model_summary=False,
+                enable_progress_bar=sys.stderr.isatty(),
+                num_sanity_val_steps=0,
+                # Nothing random happens between batches, and the segments must come in order.
+                use_distributed_sampler=False,
+            )
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", module=r"lightning\.")
+                trainer.fit(module, datamodule=data)
+        if module.interrupted(trainer):
+            raise KeyboardInterrupt
+        module.restore_best()
+        return Learned(module.network.to(device).eval(), material.scaler.to(device), module.curves())
+
+
+class _Material(nn.Module):
+    """Training tensors as N networks by B drivers by W windows; buffers, so that Lightning moves them with the module."""
+
+    tokens: Tensor
+    labels: Tensor
+    train_weight: Tensor
+    validation_weight: Tensor
+
+    def __init__(self, scaler: Scaler, tokens: Tensor, labels: Tensor, train_weight: Tensor, validation_weight: Tensor) -> None:
+        super().__init__()
+        self.scaler = scaler
+        self.register_buffer("tokens", tokens)
+        self.register_buffer("labels", labels)
+        self.register_buffer("train_weight", train_weight)
+        self.register_buffer("validation_weight", validation_weight)
+
+    @property
+    def windows(self) -> int:
+        return self.tokens.shape[2]
+
+    @classmethod
+    def of(cls, policy: Policy, lesson: Lesson, settings: ImitationSettings) -> _Material:
+        assert lesson.labels is not None
+        labels, batch = lesson.labels, lesson.batch
+        device = batch.lengths.device
+        pairs = len(batch)
+        where = labels.windows
+        history = measured_history(batch[where.pair.to(device)], where.first.to(device), lesson.windows.length)
+        seen = tokens(history, policy.inputs, policy.summary).float()
+        assert seen.shape[-1] == token_width(policy.inputs, policy.summary, lesson.windows.length)
+        unit = lesson.simulator.model.space.to_unit(labels.parameters).float()
+        token_grid, mask = where.to_grid(seen, pairs)
+        label_grid, _ = where.to_grid(unit, pairs)
+        spread_grid, _ = where.to_grid(labels.spread.float(), pairs)
+        number = torch.arange(mask.shape[1], device=device)
+        counts = mask.sum(1)
+        kept = (counts * settings.validation).round().long()
+        if settings.validation > 0:
+            kept = kept.clamp(min=1)
+        if bool((counts - kept < 1).any()):
+            raise DataError(
+                f"a pair has only {int(counts.min())} training windows, too few to keep {settings.validation:g} of them for validation;"
+                " raise data.min_frames or set learner.validation=0"
+            )
+        train = mask & (number < (counts - kept)[:, None])
+        validation = mask & ~train
+        weight = _spread_weight(spread_grid, train) if settings.weight_by_spread else torch.ones_like(spread_grid)
+        grid = _Grid(lesson.network.to(device), len(lesson.names))
+        train_grid = grid.scatter(train)
+        scaler = Scaler.of(grid.scatter(token_grid), train_grid)
+        return cls(
+            scaler,
+            scaler(grid.scatter(token_grid)),
+            grid.scatter(label_grid),
+            grid.scatter(weight * train),
+            grid.scatter(weight * validation),
+        )
+
+
+class _Grid:
+    """Places P pairs as N networks by B drivers."""
+
+    def __init__(self, network: Tensor, networks: int) -> None:
+        self.network = network
+        self.place = driver_places(network)
+        self.shape = (networks, int(self.place.max()) + 1)
+
+    def scatter(self, values: Tensor) -> Tensor:
+        """Arranges `(P, ...)` as `(N, B, ...)`, zero where a network has fewer drivers."""
+        grid = values.new_zeros((*self.shape, *values.shape[1:]))
+        grid[self.network, self.place] = values
+        return grid
+
+
+def _spread_weight(spread: Tensor, train: Tensor) -> Tensor:
+    """Returns weights `(P, W)` in proportion to the loss spread, mean 1 over each pair's training windows; ones if all spreads are 0."""
+    count = train.sum(1, keepdim=True)
+    mean = (spread * train).sum(1, keepdim=True) / count
+    return torch.where(mean > 0, spread / mean.clamp(min=torch.finfo(spread.dtype).tiny), 1.0)
+
+
+def _mean_by_network(values: Tensor, lesson: Lesson) -> Tensor:
+    """Returns the mean of `(P, n)` over each network's pairs, `(N, n)`."""
+    network = lesson.network.to(values.device)
+    total = values.new_zeros((len(lesson.names), values.shape[1])).index_add_(0, network, values)
+    return total / torch.bincount(network, minlength=len(lesson.names))[:, None]
+
+
+class SegmentData(pl.LightningDataModule):
+    """Segments of consecutive windows, in order: a batch is (first window, last window, whether the drive begins)."""
+
+    def __init__(self, windows: int, batch_size: int | None) -> None:
+        super().__init__()
+        size = batch_size or windows
+        self.segments = [(first, min(first + size, windows)) for first in range(0, windows, size)]
+        self.windows = windows
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        return DataLoader(self.segments, batch_size=None, shuffle=False)  # type: ignore[arg-type]  # a list is a dataset
+
+    def val_dataloader(self) -> DataLoader[Any]:
+        return DataLoader([(0, self.windows)], batch_size=None)  # type: ignore[arg-type]  # a list is a dataset
+
+
+class ImitationModule(pl.LightningModule):
+    """Trains N networks on their segments, and keeps for each the weights of its best epoch."""
+
+    def __init__(self, network: PolicyNetwork, material: _Material, settings: ImitationSettings, names: tuple[str, ...]) -> None:
+        super().__init__()
+        self.network = network
+        self.material = material
+        self.settings = settings
+        self.names = names
+        count = len(names)
+        self.state: Tensor | None = None
+        self.best = {key: value.detach().clone() for key, value in network.named_parameters()}
+        self.best_loss = torch.full((count,), math.inf)
+        self.stale = torch.zeros(count, dtype=torch.int64)
+        self.train_sum = torch.zeros(count)
+        self.train_weight = torch.zeros(count)
+        self.rows: list[tuple[Tensor, Tensor]] = []
+
+    def training_step(self, segment: tuple[int, int], index: int) -> Tensor:
+        first, last = segment
+        networks, drivers = self.material.tokens.shape[:2]
+        if first == 0 or self.state is None:
+            self.state = self.network.initial_state(networks, drivers)
+        out, state = self.network(self.material.tokens[:, :, first:last], self.state)
+        self.state = state.detach()
+        weight = self.material.train_weight[:, :, first:last]
+        error = _weighted_error(out, self.material.labels[:, :, first:last], weight)
+        total = weight.sum((1, 2))
+        self.train_sum += error.detach().cpu()
+        self.train_weight += total.detach().cpu()
+        return (error / total.clamp(min=1e-9)).sum()
+
+    def configure_gradient_clipping(self, optimizer: Any, *args: Any, **kwargs: Any) -> None:
+        """Clips each network's gradient on its own: a norm over all would couple them."""
+        if self.settings.gradient_clip is None:
+            return
+        gradients = [parameter.grad for parameter in self.network.parameters() if parameter.grad is not None]
+        norm = torch.stack([gradient.square().flatten(1).sum(1) for gradient in gradients]).sum(0).sqrt()
+        scale = (self.settings.gradient_clip / norm.clamp(min=1e-12)).clamp(max=1.0)
+        for gradient in gradients:
+            gradient.mul_(scale.view(-1, *[1] * (gradient.dim() - 1)))
+
+    def validation_step(self, segment: tuple[int, int], index: int) -> None:
+        networks, drivers = self.material.tokens.shape[:2]
+        out, _ = self.network(self.material.tokens, self.network.initial_state(networks, drivers))
+        weight = self.material.validation_weight
+        total = weight.sum((1, 2))
+        loss = _weighted_error(out, self.material.labels, weight) / total.clamp(min=1e-9)
+        self.rows.append((self.train_sum / self.train_weight.clamp(min=1e-9), torch.where(total > 0, loss, math.nan).cpu()))
+        self.train_sum.zero_()
+        self.train_weight.zero_()
+        self._keep_best()
+
+    def _keep_best(self) -> None:
+        """Keeps the weights of each network's best epoch so far, and stops when no network has hope left.
+
+        A network without validation windows is judged by its training loss.
+        """
+        train, validation = self.rows[-1]
+        loss = torch.where(validation.isnan(), train, validation)
+        patience = self.settings.patience
+        active = torch.ones_like(self.stale, dtype=torch.bool) if patience is None else self.stale < patience
+        better = (loss < self.best_loss) & active
+        self.best_loss = torch.where(better, loss, self.best_loss)
+        self.stale = torch.where(better, 0, self.stale + active.long())
+        for key, value in self.network.named_parameters():
+            chosen = better.to(value.device).view(-1, *[1] * (value.dim() - 1))
+            self.best[key] = torch.where(chosen, value.detach(), self.best[key].to(value.device))
+        if patience is not None and not bool((self.stale < patience).any()):
+            self.trainer.should_stop = True
+
+    def restore_best(self) -> None:
+        """Puts each network's best weights back."""
+        with torch.no_grad():
+            for key, value in self.network.named_parameters():
+                value.copy_(self.best[key])
+
+    def curves(self) -> pd.DataFrame:
+        """Returns the learning curves in long form."""
+        frames = [
+            pd.DataFrame({"network": self.names, "epoch": epoch, "train_loss": train.numpy(), "validation_loss": validation.numpy()})
+            for epoch, (train, validation) in enumerate(self.rows)
+        ]
+        return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=CURVE_COLUMNS)
+
+    @staticmethod
+    def interrupted(trainer: pl.Trainer) -> bool:
+        """Says whether Ctrl-C ended the fit: Lightning swallows it."""
+        return trainer.interrupted
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.AdamW(
+            self.network.parameters(), lr=self.settings.learning_rate, weight_decay=self.settings.weight_decay
+        )
+
+
+def _weighted_error(out: Tensor, labels: Tensor, weight: Tensor) -> Tensor:
+    """Returns the weighted sum of squared errors of each network, `(N,)`; the mean over parameters."""
+    return ((out - labels).square().mean(-1) * weight).sum((1, 2))
+
+
+def _quiet_lightning() -> None:
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.ERROR)

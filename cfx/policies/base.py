@@ -1,0 +1,112 @@
+"""The contract of a policy: recent states in, parameters for the next window out.
+
+Letters: N independent networks, B drivers of each, W windows, f features of a token, n tuned parameters, s width of the state. N networks
+are trained and driven as one batched network: 94 pairs with a network each cost about as much as one.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from cfx.component import Component, Settings
+from cfx.policies.features import Summary, check_inputs
+
+
+class PolicyNetwork(nn.Module, ABC):
+    """N independent networks in one module; state is passed in and returned, never kept on self.
+
+    Every parameter and buffer has N as its first dimension, and network i reads only slice i of everything: so the sum of N
+    losses trains N networks independently.
+    """
+
+    @abstractmethod
+    def initial_state(self, networks: int, drivers: int) -> Tensor:
+        """Returns the state `(N, B, s)` before the first window; s may be 0."""
+
+    @abstractmethod
+    def forward(self, tokens: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Reads windows in order.
+
+        Args:
+            tokens: `(N, B, W, f)`, normalised.
+            state: `(N, B, s)`.
+
+        Returns:
+            Parameters in unit space `(N, B, W, n)`, within [0, 1], and the state after the last window. Reading W windows at once or one by
+            one gives the same.
+        """
+
+
+class PolicySettings(Settings):
+    """Settings of policies that read states."""
+
+    inputs: tuple[str, ...] = Field(
+        ("leader_speed", "follower_speed"),
+        description="signals that the policy sees; also: gap, relative_speed, time_headway, leader_acceleration,"
+        " follower_acceleration, inverse_time_to_collision",
+    )
+    summary: Summary = Field("frames", description="how a window's frames become features: frames (all), last, mean, mean_std")
+
+
+class Policy(Component):
+    """Base of every policy.
+
+    Life cycle: a protocol calls `build` once for N networks; if `trainable`, a learner then trains them; afterwards they drive in
+    closed loop, one window at a time. A subclass implements `build`.
+
+    Attributes:
+        trainable: whether a learner must train what `build` returns.
+    """
+
+    kind = "policy"
+    schema: ClassVar[type[Settings]] = PolicySettings
+    settings: PolicySettings
+    trainable: ClassVar[bool] = True
+
+    def __init__(self, settings: Settings | None = None, **options: object) -> None:
+        super().__init__(settings, **options)
+        if isinstance(self.settings, PolicySettings):
+            check_inputs(self.settings.inputs)
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """The signals that the policy sees."""
+        return self.settings.inputs if isinstance(self.settings, PolicySettings) else ("follower_speed",)
+
+    @property
+    def summary(self) -> Summary:
+        """How a window's frames become features."""
+        return self.settings.summary if isinstance(self.settings, PolicySettings) else "last"
+
+    @abstractmethod
+    def build(self, features: int, default: Tensor, fixed: Tensor, generator: torch.Generator) -> PolicyNetwork:
+        """Makes N networks.
+
+        Args:
+            features: f.
+            default: the model's default parameters in unit space, `(n,)`.
+            fixed: each network's fixed parameters in unit space, `(N, n)`; N is read from it.
+            generator: for the initial weights, on the CPU.
+        """
+
+
+class ConstantNetwork(PolicyNetwork):
+    """Answers the same parameters whatever it sees: the baselines `default` and `fixed`."""
+
+    def __init__(self, unit: Tensor) -> None:
+        """Takes `(N, n)` in unit space."""
+        super().__init__()
+        self.unit: Tensor
+        self.register_buffer("unit", unit.clone())
+
+    def initial_state(self, networks: int, drivers: int) -> Tensor:
+        return self.unit.new_zeros((networks, drivers, 0))
+
+    def forward(self, tokens: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        networks, drivers, windows, _ = tokens.shape
+        return self.unit[:, None, None, :].expand(networks, drivers, windows, -1), state

@@ -1,0 +1,71 @@
+"""What a policy sees: the recent states of leader and follower, one token per window.
+
+The token of a window holds the last `length` frames up to and including the window's first, so it never looks ahead.
+Letters: f features of a token.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from cfx.errors import ConfigError, nearest
+
+Summary = Literal["frames", "last", "mean", "mean_std"]
+
+
+class History(NamedTuple):
+    """Recent frames of leader and follower, oldest first; all `(*batch, length)`, SI units."""
+
+    leader_speed: Tensor
+    leader_acceleration: Tensor
+    follower_speed: Tensor
+    follower_acceleration: Tensor
+    gap: Tensor
+
+
+_STANDING = 1.0
+"""Speed in m/s below which time headway and inverse time to collision are taken at this speed: they have poles at 0."""
+
+INPUTS: dict[str, Callable[[History], Tensor]] = {
+    "leader_speed": lambda h: h.leader_speed,
+    "leader_acceleration": lambda h: h.leader_acceleration,
+    "follower_speed": lambda h: h.follower_speed,
+    "follower_acceleration": lambda h: h.follower_acceleration,
+    "gap": lambda h: h.gap,
+    "relative_speed": lambda h: h.leader_speed - h.follower_speed,
+    "time_headway": lambda h: h.gap / h.follower_speed.clamp(min=_STANDING),
+    "inverse_time_to_collision": lambda h: (h.follower_speed - h.leader_speed) / h.gap.clamp(min=_STANDING),
+}
+"""Signals that a policy may see, each `(*batch, length)`."""
+
+_SUMMARIES: dict[Summary, Callable[[Tensor], list[Tensor]]] = {
+    "frames": lambda x: list(x.unbind(-1)),
+    "last": lambda x: [x[..., -1]],
+    "mean": lambda x: [x.mean(-1)],
+    "mean_std": lambda x: [x.mean(-1), x.std(-1, correction=0)],
+}
+
+
+def check_inputs(names: tuple[str, ...]) -> None:
+    """Raises ConfigError if a name is no input or stands twice."""
+    if not names:
+        raise ConfigError(f"policy.inputs: give at least one of {', '.join(INPUTS)}")
+    for name in names:
+        if name not in INPUTS:
+            raise ConfigError(f"policy.inputs: unknown input '{name}'.{nearest(name, INPUTS)} Known: {', '.join(INPUTS)}.")
+    if len(set(names)) != len(names):
+        raise ConfigError(f"policy.inputs: an input stands twice in {', '.join(names)}")
+
+
+def token_width(names: tuple[str, ...], summary: Summary, length: int) -> int:
+    """Returns f."""
+    return len(names) * {"frames": length, "last": 1, "mean": 1, "mean_std": 2}[summary]
+
+
+def tokens(history: History, names: tuple[str, ...], summary: Summary) -> Tensor:
+    """Returns tokens `(*batch, f)`."""
+    return torch.stack([value for name in names for value in _SUMMARIES[summary](INPUTS[name](history))], dim=-1)

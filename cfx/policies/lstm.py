@@ -1,0 +1,38 @@
+"""Long short-term memory: S. Hochreiter and J. Schmidhuber (1997), Neural Computation 9(8); F. Gers et al. (2000)."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from cfx.component import Settings
+from cfx.policies.base import Policy, PolicyNetwork
+from cfx.policies.recurrent import RecurrentNetwork, RecurrentSettings, RecurrentLayer
+
+
+class LstmNetwork(RecurrentNetwork):
+    """N long short-term memories, in the form of `torch.nn.LSTM`; carries the output and the cell."""
+
+    gates = 4
+    states = 2
+
+    def cell(self, projected: Tensor, layer: RecurrentLayer, carried: Tensor) -> Tensor:
+        output, memory = carried.chunk(2, dim=-1)
+        h = self.hidden
+        gates = projected + layer.recur(output)
+        let_in, forget = gates[..., : 2 * h].sigmoid().chunk(2, dim=-1)
+        memory = forget * memory + let_in * gates[..., 2 * h : 3 * h].tanh()
+        return torch.cat([gates[..., 3 * h :].sigmoid() * memory.tanh(), memory], dim=-1)
+
+
+class LstmPolicy(Policy):
+    """As `gru`, with long short-term memories."""
+
+    schema: ClassVar[type[Settings]] = RecurrentSettings
+    settings: RecurrentSettings
+
+    def build(self, features: int, default: Tensor, fixed: Tensor, generator: torch.Generator) -> PolicyNetwork:
+        networks, parameters = fixed.shape
+        return LstmNetwork(networks, features, parameters, self.settings, generator)

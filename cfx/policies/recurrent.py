@@ -1,0 +1,88 @@
+"""N independent recurrent networks as one: batched matrix products instead of a loop over networks.
+
+The equations, gate order and initialisation are those of `torch.nn.GRU` and `torch.nn.LSTM` (which cannot be batched over their
+weights: `torch.func.vmap` has no rule for them); a test holds them equal.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from cfx.policies.base import PolicyNetwork, PolicySettings
+
+
+class RecurrentSettings(PolicySettings):
+    """Settings of the recurrent policies."""
+
+    hidden_size: int = Field(32, ge=1, description="units of each recurrent layer")
+    layers: int = Field(1, ge=1, description="recurrent layers")
+    dropout: float = Field(0.0, ge=0, lt=1, description="dropout before the output layer while training")
+
+
+def _uniform(shape: tuple[int, ...], width: int, generator: torch.Generator) -> nn.Parameter:
+    limit = 1 / math.sqrt(width)
+    return nn.Parameter((2 * torch.rand(shape, generator=generator) - 1) * limit)
+
+
+class RecurrentLayer(nn.Module):
+    """One recurrent layer of N networks with `gates` gates."""
+
+    def __init__(self, networks: int, inputs: int, hidden: int, gates: int, generator: torch.Generator) -> None:
+        super().__init__()
+        self.w_input = _uniform((networks, inputs, gates * hidden), hidden, generator)
+        self.w_hidden = _uniform((networks, hidden, gates * hidden), hidden, generator)
+        self.b_input = _uniform((networks, 1, gates * hidden), hidden, generator)
+        self.b_hidden = _uniform((networks, 1, gates * hidden), hidden, generator)
+
+    def project(self, x: Tensor) -> Tensor:
+        """Input part of all gates at all windows: `(N, B, W, i)` to `(N, B, W, gates * hidden)`."""
+        networks, drivers, windows, _ = x.shape
+        return torch.baddbmm(self.b_input, x.flatten(1, 2), self.w_input).unflatten(1, (drivers, windows))
+
+    def recur(self, h: Tensor) -> Tensor:
+        """Hidden part of all gates: `(N, B, hidden)` to `(N, B, gates * hidden)`."""
+        return torch.baddbmm(self.b_hidden, h, self.w_hidden)
+
+
+class RecurrentNetwork(PolicyNetwork):
+    """Stacked recurrent layers and a sigmoid output layer, N times; a subclass says what one cell does."""
+
+    gates: int
+    states: int
+    """Tensors of width `hidden` that one layer carries from window to window."""
+
+    def __init__(self, networks: int, features: int, parameters: int, settings: RecurrentSettings, generator: torch.Generator) -> None:
+        super().__init__()
+        self.hidden = settings.hidden_size
+        widths = [features, *[settings.hidden_size] * (settings.layers - 1)]
+        self.layers = nn.ModuleList(RecurrentLayer(networks, width, self.hidden, self.gates, generator) for width in widths)
+        self.dropout = nn.Dropout(settings.dropout)
+        self.w_out = _uniform((networks, self.hidden, parameters), self.hidden, generator)
+        self.b_out = nn.Parameter(torch.zeros((networks, 1, parameters)))
+
+    def initial_state(self, networks: int, drivers: int) -> Tensor:
+        return self.w_out.new_zeros((networks, drivers, self.hidden * self.states * len(self.layers)))
+
+    def forward(self, tokens: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        x = tokens
+        last = []
+        for layer, carried in zip(self.layers, state.chunk(len(self.layers), dim=-1), strict=True):
+            assert isinstance(layer, RecurrentLayer)
+            projected = layer.project(x)
+            outputs = []
+            for k in range(tokens.shape[2]):
+                carried = self.cell(projected[:, :, k], layer, carried)
+                outputs.append(carried[..., : self.hidden])
+            x = torch.stack(outputs, dim=2)
+            last.append(carried)
+        networks, drivers, windows, _ = x.shape
+        logits = torch.baddbmm(self.b_out, self.dropout(x).flatten(1, 2), self.w_out).unflatten(1, (drivers, windows))
+        return logits.sigmoid(), torch.cat(last, dim=-1)
+
+    def cell(self, projected: Tensor, layer: RecurrentLayer, carried: Tensor) -> Tensor:
+        """Returns what one layer carries after one window, `(N, B, states * hidden)`, its output first."""
+        raise NotImplementedError

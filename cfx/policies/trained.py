@@ -1,0 +1,257 @@
+"""A policy that is ready to drive: networks, what they read, and the model whose parameters they choose.
+
+Kept in a folder as `policy.pt` (a state dict, read with `weights_only=True`) and `policy.json` (everything else).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pandas as pd
+import torch
+from torch import Tensor, nn
+
+from cfx import registry
+from cfx.calibration.windows import WindowSettings
+from cfx.errors import DataError
+from cfx.pairs import PairBatch, PairSet
+from cfx.parameters import ParameterSpace
+from cfx.policies.base import Policy, PolicyNetwork
+from cfx.policies.features import History, token_width, tokens
+
+_FORMAT = 1
+
+
+class Scaler(nn.Module):
+    """Brings each network's tokens to mean 0 and standard deviation 1 over its training windows."""
+
+    def __init__(self, mean: Tensor, scale: Tensor) -> None:
+        """Takes `(N, f)` each."""
+        super().__init__()
+        self.mean: Tensor
+        self.scale: Tensor
+        self.register_buffer("mean", mean)
+        self.register_buffer("scale", scale)
+
+    @classmethod
+    def of(cls, values: Tensor, mask: Tensor) -> Scaler:
+        """Measures tokens `(N, B, W, f)` where `mask` `(N, B, W)`; a feature that does not vary keeps scale 1."""
+        weight = mask[..., None].to(values.dtype)
+        total = weight.sum((1, 2)).clamp(min=1.0)
+        mean = (values * weight).sum((1, 2)) / total
+        variance = ((values - mean[:, None, None]).square() * weight).sum((1, 2)) / total
+        scale = variance.sqrt()
+        return cls(mean, torch.where(scale > 1e-6, scale, 1.0))
+
+    def forward(self, values: Tensor) -> Tensor:
+        return (values - self.mean[:, None, None]) / self.scale[:, None, None]
+
+
+class PolicyState(NamedTuple):
+    """Where D drivers stand: which network drives each, its place among that network's drivers, and the networks' state.
+
+    Attributes:
+        network: `(D,)` int64.
+        place: `(D,)` int64.
+        state: `(N, B, s)`.
+    """
+
+    network: Tensor
+    place: Tensor
+    state: Tensor
+
+
+@dataclass(frozen=True)
+class TrainedPolicy:
+    """N networks that drive.
+
+    Attributes:
+        policy: the component that built the networks.
+        network: the networks themselves.
+        scaler: normalises tokens.
+        model_node: config node of the driving model.
+        space: the model's parameters.
+        windows: how often parameters change, and how many frames a token holds.
+        dt: time step, s.
+        names: what each network was trained for (a pair's id, or a group's name), N of them.
+    """
+
+    policy: Policy
+    network: PolicyNetwork
+    scaler: Scaler
+    model_node: Mapping[str, Any]
+    policy_node: Mapping[str, Any]
+    space: ParameterSpace
+    windows: WindowSettings
+    dt: float
+    names: tuple[str, ...]
+
+    def begin(self, network: Tensor) -> PolicyState:
+        """Returns the state of D drivers before their first window; `network` `(D,)` says which network drives each."""
+        place = driver_places(network)
+        drivers = int(place.max()) + 1
+        return PolicyState(network, place, self.network.initial_state(len(self.names), drivers))
+
+    @torch.no_grad()
+    def act(self, history: History, state: PolicyState) -> tuple[Tensor, PolicyState]:
+        """Chooses the parameters of the next window.
+
+        Args:
+            history: the last `windows.length` frames of D drivers, `(D, length)` each.
+            state: where they stand.
+
+        Returns:
+            Parameters `(D, n)` in SI units, in the dtype of the history, and where they stand now.
+        """
+        seen = tokens(history, self.policy.inputs, self.policy.summary)
+        networks, drivers, _ = state.state.shape
+        grid = seen.new_zeros((networks, drivers, 1, seen.shape[-1]), dtype=self.scaler.mean.dtype)
+        grid[state.network, state.place, 0] = seen.to(grid.dtype)
+        unit, after = self.network(self.scaler(grid), state.state)
+        chosen = unit[state.network, state.place, 0].to(seen.dtype)
+        return self.space.from_unit(chosen), state._replace(state=after)
+
+    def read(self, batch: PairBatch, until: Tensor, state: PolicyState) -> PolicyState:
+        """Lets D drivers read their measured history before they drive.
+
+        Args:
+            batch: their D pairs.
+            until: `(D,)`, the frame at which each will start to drive; windows that start before it are read.
+            state: where they stand.
+        """
+        stride = self.windows.stride
+        for first in range(0, int(until.max()), stride):
+            _, after = self.act(measured_history(batch, torch.full_like(until, first), self.windows.length), state)
+            reading = (first < until)[:, None]
+            merged = state.state.clone()
+            kept, new = state.state[state.network, state.place], after.state[state.network, state.place]
+            merged[state.network, state.place] = torch.where(reading, new, kept)
+            state = state._replace(state=merged)
+        return state
+
+    def predict_frame(self, frame: pd.DataFrame) -> pd.DataFrame:
+        """Chooses parameters for the end of each pair in a tidy table.
+
+        Args:
+            frame: measured history in the tidy pair layout, one or more pairs with the policy's time step.
+
+        Returns:
+            A row per pair: `pair_id` and one column per tuned parameter (SI units), for the window that starts at the
+            pair's last frame. A pair that the policy was trained for is driven by its own network; any other by the only network there is.
+
+        Raises:
+            DataError: the table is not in the tidy layout, its time step is another, or it is not clear which network to use.
+        """
+        from cfx.datasets.tidy import pairs_from_frame
+
+        pairs = pairs_from_frame(frame, source="the table given to the policy")
+        if abs(pairs.dt - self.dt) > 1e-6:
+            raise DataError(f"the policy was trained at time steps of {self.dt:g} s, the table has {pairs.dt:g} s; resample the table")
+        batch = PairBatch.of(pairs)
+        until = batch.lengths - 1
+        state = self.read(batch, until, self.begin(self.networks_for(pairs)))
+        chosen, _ = self.act(measured_history(batch, until, self.windows.length), state)
+        return pd.DataFrame({"pair_id": [pair.pair_id for pair in pairs], **dict(zip(self.space.names, chosen.T.tolist(), strict=True))})
+
+    def networks_for(self, pairs: PairSet) -> Tensor:
+        """Returns which network drives each pair, `(P,)`.
+
+        Raises:
+            DataError: a pair is none of those the networks were trained for, and there are several networks.
+        """
+        if len(self.names) == 1:
+            return torch.zeros(len(pairs), dtype=torch.int64)
+        number = {name: index for index, name in enumerate(self.names)}
+        unknown = [pair.pair_id for pair in pairs if pair.pair_id not in number]
+        if unknown:
+            raise DataError(
+                f"pair '{unknown[0]}' has no network of its own among the {len(self.names)} that were trained, one per pair;"
+                " train with learner.scope=all to drive others"
+            )
+        return torch.tensor([number[pair.pair_id] for pair in pairs])
+
+    def save(self, folder: Path) -> None:
+        """Writes `policy.pt` and `policy.json`; each appears whole."""
+        folder.mkdir(parents=True, exist_ok=True)
+        weights = {f"network.{key}": value.cpu() for key, value in self.network.state_dict().items()}
+        weights |= {f"scaler.{key}": value.cpu() for key, value in self.scaler.state_dict().items()}
+        temporary = folder / "policy.pt.tmp"
+        torch.save(weights, temporary)
+        os.replace(temporary, folder / "policy.pt")
+        description = {
+            "format": _FORMAT,
+            "policy": dict(self.policy_node),
+            "model": dict(self.model_node),
+            "parameters": list(self.space.names),
+            "windows": self.windows.model_dump(),
+            "dt": self.dt,
+            "names": list(self.names),
+        }
+        temporary = folder / "policy.json.tmp"
+        temporary.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
+        os.replace(temporary, folder / "policy.json")
+
+    @classmethod
+    def load(cls, folder: Path | str) -> TrainedPolicy:
+        """Reads what `save` wrote, on the CPU.
+
+        Raises:
+            DataError: the folder holds no policy, or one of another format.
+            PluginError: the model or the policy is not installed.
+        """
+        folder = Path(folder)
+        try:
+            description = json.loads((folder / "policy.json").read_text(encoding="utf-8"))
+            weights = torch.load(folder / "policy.pt", weights_only=True, map_location="cpu")
+        except (OSError, ValueError, RuntimeError) as error:
+            raise DataError(f"{folder} holds no policy that can be read ({error}); give a job's folder") from error
+        if description.get("format") != _FORMAT:
+            raise DataError(f"{folder}/policy.json has format {description.get('format')}; this version of cfx reads format {_FORMAT}")
+        policy = registry.create("policy", description["policy"])
+        model = registry.create("model", description["model"])
+        assert isinstance(policy, Policy)
+        space = model.space  # type: ignore[attr-defined]  # the registry has checked that it is a model
+        windows = WindowSettings(**description["windows"])
+        networks, features = weights["scaler.mean"].shape
+        width = token_width(policy.inputs, policy.summary, windows.length)
+        if features != width:
+            raise DataError(f"{folder}: the weights read {features} features, the policy's settings give {width}")
+        blank = torch.zeros((networks, len(space)), dtype=weights["scaler.mean"].dtype)
+        network = policy.build(features, blank[0], blank, torch.Generator().manual_seed(0)).to(blank.dtype)
+        network.load_state_dict({k.removeprefix("network."): v for k, v in weights.items() if k.startswith("network.")})
+        scaler = Scaler(weights["scaler.mean"], weights["scaler.scale"])
+        return cls(
+            policy=policy,
+            network=network.eval(),
+            scaler=scaler,
+            model_node=description["model"],
+            policy_node=description["policy"],
+            space=space,
+            windows=windows,
+            dt=description["dt"],
+            names=tuple(description["names"]),
+        )
+
+
+def measured_history(batch: PairBatch, frame: Tensor, length: int) -> History:
+    """Returns the last `length` measured frames up to `frame` `(D,)` of D pairs; the first frame stands for those before it."""
+    index = (frame[:, None] + torch.arange(1 - length, 1, device=frame.device)).clamp(min=0)
+    signals = (batch.leader_speed, batch.leader_acceleration, batch.follower_speed, batch.follower_acceleration, batch.gap)
+    return History(*(signal.gather(1, index) for signal in signals))
+
+
+def driver_places(network: Tensor) -> Tensor:
+    """Numbers the drivers of each network from 0, `(D,)`."""
+    same = network[:, None] == network[None, :]
+    return torch.tril(same, diagonal=-1).sum(1)
+
+
+def group_by(names: Sequence[str]) -> tuple[Tensor, tuple[str, ...]]:
+    """Returns for D drivers the number of their group `(D,)`, and the groups' names in order of appearance."""
+    order = {name: index for index, name in enumerate(dict.fromkeys(names))}
+    return torch.tensor([order[name] for name in names]), tuple(order)

@@ -1,0 +1,98 @@
+"""Where a result comes from: versions, commit, machine, process."""
+
+from __future__ import annotations
+
+import getpass
+import importlib.metadata
+import os
+import socket
+import subprocess
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import psutil  # type: ignore[import-untyped]  # it ships no types
+
+_GIT_SECONDS = 10.0
+
+
+def version() -> str:
+    """Returns cfx's version."""
+    return importlib.metadata.version("cfx-driving")
+
+
+def git_state(folder: Path) -> dict[str, str]:
+    """Returns commit and cleanliness of the git checkout that `folder` lies in; empty if it lies in none.
+
+    `cfx.git_dirty` counts changes of tracked files only: a new output folder does not make a commit dirty.
+    """
+    commit = _git(folder, "rev-parse", "HEAD")
+    if not commit:
+        return {}
+    changed = _git(folder, "status", "--porcelain", "--untracked-files=no")
+    dirty = "unknown" if changed is None else str(bool(changed)).lower()
+    return {"cfx.git_commit": commit, "cfx.git_dirty": dirty, "mlflow.source.git.commit": commit}
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    command = ["git", "-C", str(folder), *arguments]
+    try:
+        # `git` is the user's own, found on their PATH; no shell sees the arguments.
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_GIT_SECONDS, check=False)  # noqa: S603
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None
+
+
+def plugin_tags(distributions: Mapping[str, str]) -> dict[str, str]:
+    """Returns a tag per plugin distribution, and all of them in one, by which runs can be grouped."""
+    listed = ", ".join(f"{name} {found}" for name, found in sorted(distributions.items()))
+    return {"cfx.plugins": listed or "none"} | {f"cfx.plugin.{name}": found for name, found in sorted(distributions.items())}
+
+
+def process_tags() -> dict[str, str]:
+    """Returns tags that tell later whether the process that made a run is still there."""
+    process = psutil.Process()
+    return {"cfx.host": socket.gethostname(), "cfx.process": f"{process.pid}@{process.create_time():.0f}"}
+
+
+def is_alive(tags: Mapping[str, str]) -> bool:
+    """Says whether the process with these `process_tags` runs. One on another machine, or unknown, is taken to."""
+    if tags.get("cfx.host") != socket.gethostname() or "@" not in tags.get("cfx.process", ""):
+        return True
+    pid, started = tags["cfx.process"].split("@")
+    try:
+        return bool(abs(psutil.Process(int(pid)).create_time() - float(started)) < 2.0)
+    except psutil.NoSuchProcess:
+        return False
+    except (psutil.Error, ValueError):
+        return True
+
+
+def user() -> str:
+    """Returns the user's name, "" where the system knows none."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError, ImportError):
+        return os.environ.get("USER", "")
+
+
+def flatten(config: Mapping[str, Any]) -> dict[str, str]:
+    """Flattens a nested configuration: `{"model": {"name": "w99"}}` -> `{"model.name": "w99"}`; empty ones are kept."""
+    flat: dict[str, str] = {}
+    for path, value in _leaves(config, ""):
+        flat[path] = "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+    return flat
+
+
+def _leaves(value: Any, path: str) -> Iterable[tuple[str, Any]]:
+    items: Iterable[tuple[Any, Any]]
+    if isinstance(value, Mapping) and value:
+        items = value.items()
+    elif isinstance(value, list | tuple) and any(isinstance(part, Mapping | list | tuple) for part in value):
+        items = enumerate(value)
+    else:
+        yield path, value
+        return
+    for key, part in items:
+        yield from _leaves(part, f"{path}.{key}" if path else str(key))

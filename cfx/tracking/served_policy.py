@@ -1,0 +1,24 @@
+"""The code that MLflow keeps beside a policy's weights ("models from code"): loading it runs this file, never a pickle."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mlflow.models
+import pandas as pd
+from mlflow.pyfunc.model import PythonModel, PythonModelContext
+
+
+class ServedPolicy(PythonModel):
+    """Measured history in the tidy pair layout in; `pair_id` and the parameters of the next window out, a row per pair."""
+
+    def load_context(self, context: PythonModelContext) -> None:
+        from cfx.policies.trained import TrainedPolicy
+
+        self._policy = TrainedPolicy.load(context.artifacts["policy"])
+
+    def predict(self, context: Any, model_input: Any, params: Any = None) -> pd.DataFrame:  # noqa: ARG002 - MLflow's signature
+        return self._policy.predict_frame(pd.DataFrame(model_input))
+
+
+mlflow.models.set_model(ServedPolicy())

@@ -1,0 +1,278 @@
+"""The MLflow store: where it is, whether it is one of ours, and how to open it without harm.
+
+MLflow itself waits minutes for a database that cannot be opened, adds its tables to any SQLite file that it is pointed at, and
+crashes when several processes make a new database at once. So the file is looked at first, and made under a lock.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sqlite3
+import urllib.error
+import urllib.request
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from filelock import FileLock, Timeout
+
+from cfx.errors import TrackingError
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+
+LOCK_SECONDS = 15.0
+"""How long a job waits at its start for a database that another process holds. Jobs of a sweep hold it for milliseconds."""
+
+_PATIENCE_S = 60
+"""How long a later write waits: the work is done by then, and worth the wait."""
+
+_DATABASES = ("postgresql", "mysql", "mssql")
+_SERVERS = ("http", "https", "databricks", "databricks-uc", "uc")
+_HOW = "set tracking.uri=sqlite:///FILE to use another"
+
+
+@dataclass(frozen=True)
+class Store:
+    """An MLflow store that has been looked at and opened.
+
+    Attributes:
+        uri: absolute, as `mlflow ui --backend-store-uri` takes it.
+        client: MLflow's client for it; there is no global state.
+        experiment_id: the experiment that the jobs log to.
+        lock: held around what must not happen twice at once.
+    """
+
+    uri: str
+    client: MlflowClient
+    experiment_id: str
+    lock: FileLock
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Holds the lock.
+
+        Raises:
+            TrackingError: another process does not let go of it.
+        """
+        with _held(self.lock):
+            yield
+
+
+def default_store() -> Path:
+    """Returns where the database is if nobody says otherwise: beside the outputs."""
+    return Path("outputs/mlflow.db").absolute()
+
+
+def tracking_uri(configured: str | None, default: Path | None = None) -> str:
+    """Returns the tracking URI, always absolute: `MLFLOW_TRACKING_URI`, else the config's, else SQLite at `default`.
+
+    Raises:
+        TrackingError: it is neither a database nor a server.
+    """
+    said_by = "MLFLOW_TRACKING_URI" if os.environ.get("MLFLOW_TRACKING_URI") else "tracking.uri"
+    uri = os.environ.get("MLFLOW_TRACKING_URI") or configured or f"sqlite:///{default or default_store()}"
+    scheme = uri.split("://", 1)[0].split("+", 1)[0] if "://" in uri else uri
+    if scheme == "sqlite":
+        name = uri.removeprefix("sqlite:///")
+        if name == uri or name in {"", ":memory:"}:
+            raise TrackingError(f"{said_by}={uri}: an SQLite store is a file; write sqlite:///FILE")
+        return f"sqlite:///{Path(name).expanduser().absolute()}"
+    if scheme not in _DATABASES + _SERVERS:
+        raise TrackingError(f"{said_by}={uri}: MLflow needs a database or a server; write sqlite:///FILE or http://HOST:PORT")
+    return uri
+
+
+def open_store(uri: str, experiment: str, default: Path | None = None) -> Store:
+    """Opens a store, making database and experiment where they are not there yet; safe from many processes at once.
+
+    Args:
+        uri: as `tracking_uri` returns it.
+        experiment: the experiment's name.
+        default: path whose folder takes the lock and the artifacts where the store itself is not a file.
+
+    Raises:
+        TrackingError: the store is locked, foreign, of another MLflow version, unreachable, or cannot be written.
+    """
+    file = sqlite_file(uri)
+    home = (file or default or default_store()).parent
+    try:
+        home.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TrackingError(f"{home}: the folder of the MLflow store cannot be made ({error.strerror}); {_HOW}") from error
+    if not os.access(home, os.W_OK | os.X_OK):
+        raise TrackingError(f"{home}: the folder of the MLflow store cannot be written; {_HOW}")
+    lock = FileLock(home / f"{file.name if file else 'mlflow'}.lock", timeout=4 * LOCK_SECONDS)
+    with _held(lock):
+        if file is not None:
+            if _is_new(file):
+                _create(file, home)
+            else:
+                _check(file, uri)
+        else:
+            _answers(uri)
+        with told(f"open {uri}"):
+            from mlflow import MlflowClient
+
+            client = MlflowClient(tracking_uri=f"{uri}?timeout={_PATIENCE_S}" if file else uri)
+            experiment_id = _experiment(client, uri, experiment, None if uri.split("://", maxsplit=1)[0] in _SERVERS else home)
+    return Store(uri, client, experiment_id, lock)
+
+
+def sqlite_file(uri: str) -> Path | None:
+    """Returns the file of an SQLite URI, None for any other store."""
+    return Path(uri.removeprefix("sqlite:///")) if uri.startswith("sqlite:///") else None
+
+
+def artifact_folder(home: Path) -> Path:
+    """Returns where artifacts lie: beside the database."""
+    return home / "mlartifacts"
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keeps MLflow's and Alembic's messages and warnings off the terminal while it holds."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        _import_mlflow()
+        loggers = [logging.getLogger(name) for name in ("mlflow", "alembic")]
+        root = logging.getLogger()
+        levels, handlers, root_level = [logger.level for logger in loggers], root.handlers[:], root.level
+        for logger in loggers:
+            logger.setLevel(logging.CRITICAL)
+        try:
+            yield
+        finally:
+            for logger, level in zip(loggers, levels, strict=True):
+                logger.setLevel(level)
+            root.handlers[:] = handlers
+            root.setLevel(root_level)
+
+
+@contextmanager
+def told(doing: str) -> Iterator[None]:
+    """Runs MLflow quietly; what goes wrong becomes one sentence that says what it was doing.
+
+    Raises:
+        TrackingError: MLflow, the database or the file system refused.
+    """
+    with quiet():
+        from mlflow.exceptions import MlflowException
+        from sqlalchemy.exc import SQLAlchemyError
+
+        try:
+            yield
+        except (MlflowException, SQLAlchemyError, sqlite3.Error, OSError) as error:
+            reason = next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
+            if "database is locked" in str(error):
+                reason = "the database is locked by another process; close what holds it and run again"
+            raise TrackingError(f"MLflow could not {doing}: {reason[:300]}") from error
+
+
+def _import_mlflow() -> Any:
+    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+    import mlflow
+
+    return mlflow
+
+
+@contextmanager
+def _held(lock: FileLock) -> Iterator[None]:
+    try:
+        lock.acquire()
+    except Timeout as error:
+        raise TrackingError(f"{lock.lock_file}: another process holds the lock of the MLflow store; end it, or {_HOW}") from error
+    except OSError as error:
+        raise TrackingError(
+            f"{lock.lock_file}: the lock of the MLflow store cannot be made ({error.strerror}); {_HOW}"
+        ) from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _is_new(file: Path) -> bool:
+    if file.is_dir():
+        raise TrackingError(f"{file} is a folder, not an MLflow database; {_HOW}")
+    return not file.exists() or file.stat().st_size == 0
+
+
+def _create(file: Path, home: Path) -> None:
+    """Makes a new database under a name of its own and moves it into place: nobody ever meets a half-made one."""
+    partial = file.with_name(f".{file.name}.{os.getpid()}.part")
+    partial.unlink(missing_ok=True)
+    try:
+        with told(f"make the database {file}"):
+            from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
+
+            store = SqlAlchemyStore(f"sqlite:///{partial}", artifact_folder(home).as_uri())  # type: ignore[no-untyped-call]  # MLflow's
+            store.engine.dispose()
+            partial.replace(file)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _check(file: Path, uri: str) -> None:
+    """Looks at an existing SQLite file before MLflow does: is it free, and is it a database of this MLflow?"""
+    try:
+        # Autocommit mode: the transaction is this function's own.
+        connection = sqlite3.connect(file.as_uri() + "?mode=rw", uri=True, timeout=LOCK_SECONDS, isolation_level=None)
+        try:
+            connection.execute("BEGIN IMMEDIATE")
+            tables = {row[0] for row in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+            ours = {"alembic_version", "experiments", "runs"} <= tables
+            versions = [row[0] for row in connection.execute("SELECT version_num FROM alembic_version")] if ours else []
+            connection.execute("ROLLBACK")
+        finally:
+            connection.close()
+    except sqlite3.OperationalError as error:
+        if "locked" in str(error):
+            raise TrackingError(
+                f"{file}: the MLflow database is locked by another process; close what holds it and run again, or {_HOW}"
+            ) from error
+        raise TrackingError(f"{file}: the MLflow database cannot be opened for writing ({error}); {_HOW}") from error
+    except sqlite3.DatabaseError as error:
+        raise TrackingError(f"{file} is not an SQLite database ({error}); {_HOW}") from error
+    if not ours:
+        raise TrackingError(f"{file} is an SQLite database, but not MLflow's; {_HOW}")
+    with quiet():
+        import mlflow
+        from mlflow.store.db.utils import _get_latest_schema_revision
+
+        wanted = _get_latest_schema_revision()  # type: ignore[no-untyped-call]  # MLflow's
+    if versions != [wanted]:
+        raise TrackingError(
+            f"{file} was written by another version of MLflow (schema {versions[0] if versions else 'unknown'}, MLflow"
+            f" {mlflow.__version__} needs {wanted}); make a copy and run `mlflow db upgrade {uri}`, or {_HOW}"
+        )
+
+
+def _answers(uri: str) -> None:
+    """Asks a server for a sign of life: MLflow itself would try for minutes."""
+    if not uri.startswith(("http://", "https://")):
+        return
+    try:
+        with urllib.request.urlopen(f"{uri.rstrip('/')}/health", timeout=LOCK_SECONDS):  # noqa: S310 - http or https, the user's own
+            pass
+    except urllib.error.HTTPError:
+        pass  # it answers; whether it lets us in shows at the first call
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "reason", error)
+        raise TrackingError(f"no MLflow server answers at {uri} ({reason}); start it, or {_HOW}") from error
+
+
+def _experiment(client: MlflowClient, uri: str, name: str, home: Path | None) -> str:
+    found = client.get_experiment_by_name(name)
+    if found is None:
+        location = artifact_folder(home).as_uri() if home is not None else None
+        return str(client.create_experiment(name, artifact_location=location))
+    if found.lifecycle_stage != "active":
+        raise TrackingError(
+            f"the experiment '{name}' is deleted in {uri}; restore it there, or set tracking.experiment to another name"
+        )
+    return str(found.experiment_id)

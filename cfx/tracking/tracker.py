@@ -1,0 +1,441 @@
+"""A job's run in MLflow."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import re
+import shlex
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+from urllib.parse import quote, urlencode
+
+import numpy as np
+import pandas as pd
+
+from cfx.errors import TrackingError
+from cfx.evaluation.result import Evaluation
+from cfx.learners.curves import over_networks
+from cfx.tracking import provenance
+from cfx.tracking.store import Store, open_store, sqlite_file, told, tracking_uri
+
+if TYPE_CHECKING:
+    from cfx.config import JobConfig
+
+log = logging.getLogger(__name__)
+
+CURVE_POINTS = 200
+"""Most points that a learning curve has in MLflow; its first and last epoch are among them."""
+
+_PARAMETER_LENGTH = 6000  # MLflow's limit for a parameter's value
+_TAG_LENGTH = 5000  # what MLflow's servers of every version take
+_KEY_LENGTH = 250
+_SERVED = Path(__file__).with_name("served_policy.py")
+
+
+class Tracker:
+    """Keeps nothing: what a job talks to if tracking is off. `Tracker.open` gives the one that fits the configuration."""
+
+    run_id: str = ""
+    link: str = ""
+
+    @classmethod
+    @contextmanager
+    def open(cls, config: JobConfig, folder: Path) -> Iterator[Tracker]:
+        """Opens the run of a job, for as long as the job lasts.
+
+        A job that was broken off and starts again with the same configuration in the same folder goes on in its old run.
+
+        Args:
+            config: the job's configuration; logged whole, flattened.
+            folder: the job's output folder.
+
+        Raises:
+            TrackingError: the store cannot be used; raised before the job's work begins.
+        """
+        if not config.tracking.enabled:
+            yield cls()
+            return
+        values = config.model_dump(mode="json")
+        names = {
+            kind: str(values[kind].get("name", "")) for kind in ("data", "model", "policy", "optimizer", "learner", "protocol")
+        }
+        tags = {**names, "style.cluster": config.style.cluster, "seed": str(config.seed), "cfx.folder": str(folder.absolute())}
+        with MlflowTracker.run(
+            tracking_uri(config.tracking.uri),
+            experiment=config.tracking.experiment,
+            run_name="-".join(names[kind] for kind in ("model", "policy", "optimizer", "data")),
+            parameters=provenance.flatten(values),
+            tags=tags,
+            plugins=_distributions(values),
+            sweep=config.tracking.sweep,
+        ) as tracker:
+            yield tracker
+
+    def set_tags(self, tags: Mapping[str, str]) -> None:
+        """Adds tags to the run."""
+
+    def log_evaluation(self, evaluation: Evaluation) -> None:
+        """Logs `Evaluation.metrics()` and the table of all pairs."""
+
+    def log_curves(self, curves: pd.DataFrame) -> None:
+        """Logs `train_loss` and `validation_loss`, means over the networks, by epoch; at most `CURVE_POINTS` of each.
+
+        Args:
+            curves: columns `network`, `epoch`, `train_loss`, `validation_loss`; may be empty.
+        """
+
+    def log_table(self, table: pd.DataFrame, name: str) -> None:
+        """Logs a table that MLflow's pages show as one; `name` ends in `.json`. One of the same name is replaced."""
+
+    def log_figures(self, paths: Sequence[Path]) -> None:
+        """Logs image files under `figures/`."""
+
+    def log_files(self, paths: Sequence[Path]) -> None:
+        """Logs files at the top of the run's artifacts."""
+
+    def log_policy(self, folder: Path) -> None:
+        """Logs a saved policy as a model: `mlflow.pyfunc.load_model(tracker.model_uri).predict(frame)`.
+
+        Args:
+            folder: what `TrainedPolicy.save` wrote.
+        """
+
+    def how_to_open(self) -> tuple[str, ...]:
+        """Returns lines that tell a user where to look."""
+        return ()
+
+
+class MlflowTracker(Tracker):
+    """Keeps everything in one MLflow run.
+
+    Attributes:
+        store: the opened store.
+        run_id: MLflow's id of the run.
+        model_uri: address of the logged policy, "" before there is one.
+    """
+
+    def __init__(self, store: Store, run_id: str, sweep: str | None, parent_id: str | None, plugins: Mapping[str, str]) -> None:
+        self.store = store
+        self.run_id = run_id
+        self.model_uri = ""
+        self.link = f"#/experiments/{store.experiment_id}/runs/{run_id}"
+        self._sweep = sweep
+        self._parent_id = parent_id
+        self._plugins = plugins
+        self._tables: list[dict[str, str]] = []
+
+    @classmethod
+    @contextmanager
+    def run(
+        cls,
+        uri: str,
+        *,
+        experiment: str = "cfx",
+        run_name: str,
+        parameters: Mapping[str, str],
+        tags: Mapping[str, str] | None = None,
+        plugins: Mapping[str, str] | None = None,
+        sweep: str | None = None,
+    ) -> Iterator[Self]:
+        """Opens a run and closes it however its body ends: FINISHED, KILLED on Ctrl-C or exit, else FAILED; the reason is a tag.
+
+        Args:
+            uri: of the store, absolute.
+            parameters: flat; too long values are cut, and marked as cut.
+            tags: shown in the table of runs, which can be grouped by them.
+            plugins: distribution -> version.
+            sweep: name that the jobs of a multirun share; they get a common parent run.
+
+        Raises:
+            TrackingError: the store cannot be used.
+        """
+        store = open_store(uri, experiment)
+        known = _clean_parameters(parameters)
+        every = {
+            **provenance.git_state(Path.cwd()),
+            **provenance.plugin_tags(plugins or {}),
+            **provenance.process_tags(),
+            "cfx.version": provenance.version(),
+            "cfx.job": _fingerprint(known, tags or {}),
+            "mlflow.source.name": "cfx",
+            "mlflow.source.type": "LOCAL",
+            "mlflow.user": provenance.user(),
+            **(tags or {}),
+        }
+        with store.locked(), told("begin the run"):
+            _close_abandoned(store)
+            parent_id = None
+            if sweep is not None:
+                parent_id = _sweep_parent(store, sweep)
+                every |= {"cfx.sweep": _safe(sweep), "mlflow.parentRunId": parent_id}
+            run_id = _begin(store, run_name, known, every)
+        tracker = cls(store, run_id, sweep, parent_id, plugins or {})
+        try:
+            yield tracker
+        except BaseException as error:
+            tracker._end_badly(error)
+            raise
+        tracker._end("FINISHED")
+
+    def set_tags(self, tags: Mapping[str, str]) -> None:
+        with told("log tags"):
+            self.store.client.log_batch(self.run_id, tags=_tags(tags))
+
+    def log_evaluation(self, evaluation: Evaluation) -> None:
+        self._log_metrics([(name, value, 0) for name, value in evaluation.metrics().items()])
+        self.log_table(evaluation.table, "pairs.json")
+
+    def log_curves(self, curves: pd.DataFrame) -> None:
+        points = []
+        for column in ("train_loss", "validation_loss") if len(curves) else ():
+            means = over_networks(curves, column).mean(axis=1)
+            kept = np.unique(np.linspace(0, len(means) - 1, min(CURVE_POINTS, len(means))).round().astype(int))
+            points += [(column, float(means.iloc[k]), int(means.index[k])) for k in kept]
+        self._log_metrics(points)
+
+    def log_table(self, table: pd.DataFrame, name: str) -> None:
+        # MLflow's own log_table reads back and appends to a table that is there, and stumbles over pandas 3's strings.
+        text = table.to_json(orient="split", index=False, date_format="iso")
+        entry = {"path": name, "type": "table"}
+        if entry not in self._tables:
+            self._tables.append(entry)
+        with told(f"log the table {name}"):
+            self.store.client.log_text(self.run_id, text, name)
+            self.store.client.set_tag(self.run_id, "mlflow.loggedArtifacts", json.dumps(self._tables))
+
+    def log_figures(self, paths: Sequence[Path]) -> None:
+        self._log_artifacts(paths, "figures")
+
+    def log_files(self, paths: Sequence[Path]) -> None:
+        self._log_artifacts(paths, None)
+
+    def log_policy(self, folder: Path) -> None:
+        if not folder.is_dir():
+            raise TrackingError(f"{folder} holds no policy to log")
+        self._log_artifacts(sorted(folder.iterdir()), "policy")
+        with told("log the policy as a model"), tempfile.TemporaryDirectory() as temporary:
+            import mlflow
+            from mlflow.entities import LoggedModelOutput
+            from mlflow.models import Model
+
+            client = self.store.client
+            model = client.create_logged_model(
+                self.store.experiment_id, name="policy", source_run_id=self.run_id, model_type="cfx policy", tags=None
+            )
+            path = Path(temporary) / "model"
+            mlflow.pyfunc.save_model(
+                path,
+                python_model=str(_SERVED),
+                artifacts={"policy": str(folder.absolute())},
+                pip_requirements=[
+                    f"cfx-driving=={provenance.version()}",
+                    *(f"{name}=={found}" for name, found in self._plugins.items()),
+                ],
+                mlflow_model=Model(
+                    artifact_path=model.artifact_location, run_id=self.run_id, model_uuid=model.model_id, model_id=model.model_id
+                ),
+            )
+            client.log_model_artifacts(model.model_id, str(path))
+            client.finalize_logged_model(model.model_id, "READY")
+            client.log_outputs(self.run_id, [LoggedModelOutput(model.model_id, step=0)])
+            self.model_uri = f"models:/{model.model_id}"
+
+    def how_to_open(self) -> tuple[str, ...]:
+        address, first = _address(self.store.uri)
+        lines = [*first, f"MLflow: {address}/{self.link}"]
+        if self._sweep is not None:
+            lines.append(f"All jobs of this sweep: {address}/{sweep_link(self.store.experiment_id, self._sweep)}")
+        return tuple(lines)
+
+    def _log_metrics(self, points: Sequence[tuple[str, float, int]]) -> None:
+        from mlflow.entities import Metric
+
+        now = round(1000 * time.time())
+        metrics = [Metric(name, value, now, step) for name, value, step in points]
+        with told("log metrics"):
+            for first in range(0, len(metrics), 1000):  # MLflow's limit for a batch
+                self.store.client.log_batch(self.run_id, metrics=metrics[first : first + 1000])
+
+    def _log_artifacts(self, paths: Sequence[Path], place: str | None) -> None:
+        for path in paths:
+            with told(f"log {path}"):
+                self.store.client.log_artifact(self.run_id, str(path), place)
+
+    def _end_badly(self, error: BaseException) -> None:
+        """Closes the run after an error; that one is what the user must see, so a failure to close is only logged."""
+        killed = isinstance(error, KeyboardInterrupt | SystemExit)
+        text = " ".join(f"{type(error).__name__}: {error}".split())
+        try:
+            self._end("KILLED" if killed else "FAILED", text.removesuffix(": "))
+        except TrackingError as second:
+            log.warning("%s", second)
+
+    def _end(self, status: str, reason: str = "") -> None:
+        with told("close the run"):
+            if reason:
+                self.store.client.log_batch(self.run_id, tags=_tags({"cfx.failure": reason}))
+            self.store.client.set_terminated(self.run_id, status)
+            if self._parent_id is not None and self._sweep is not None:
+                with self.store.locked():
+                    _settle(self.store, self._parent_id, _safe(self._sweep))
+
+
+def sweep_link(experiment_id: str, sweep: str) -> str:
+    """Returns the part of the address after the server's that shows the jobs of a sweep side by side."""
+    return f"#/experiments/{experiment_id}/runs?" + urlencode(
+        {"searchFilter": f"tags.`cfx.sweep` = '{_safe(sweep)}'", "workflowType": "machine_learning"}, quote_via=quote
+    )
+
+
+def download_run(run_id: str, uri: str | None = None) -> Path:
+    """Returns a folder with the files of a tracked job: `metrics.json`, `pairs.csv`, `config.yaml`, `figures/`, `policy/`.
+
+    Args:
+        run_id: MLflow's id of the run.
+        uri: of the store; None for `MLFLOW_TRACKING_URI`, else the database beside the outputs.
+
+    Raises:
+        TrackingError: there is no such run, or its files are gone.
+    """
+    address = tracking_uri(uri)
+    file = sqlite_file(address)
+    if file is not None and not file.is_file():
+        raise TrackingError(f"'{run_id}' is no folder, and there is no MLflow database at {file} in which it could be a run")
+    if not re.fullmatch(r"[0-9a-f]{32}", run_id):
+        raise TrackingError(
+            f"'{run_id}' is neither a job's output folder nor the id of an MLflow run (32 digits and letters a to f)"
+        )
+    store = open_store(address, "cfx")
+    with told(f"read run {run_id} from {address}"):
+        return Path(store.client.download_artifacts(run_id, ""))
+
+
+def _begin(store: Store, name: str, parameters: Mapping[str, str], tags: Mapping[str, str]) -> str:
+    """Makes the run, or takes up the one that the same job left unfinished; returns its id."""
+    from mlflow.entities import Param
+
+    client = store.client
+    same = f"tags.`cfx.job` = '{tags['cfx.job']}' and attributes.status != 'FINISHED'"
+    left = [run for run in client.search_runs([store.experiment_id], same, max_results=10) if not _is_running(run)]
+    if left:
+        run = left[0]
+        client.update_run(run.info.run_id, status="RUNNING", name=name)
+        with suppress(KeyError):
+            client.delete_tag(run.info.run_id, "cfx.failure") if "cfx.failure" in run.data.tags else None
+        missing = {key: value for key, value in parameters.items() if key not in run.data.params}
+    else:
+        run = client.create_run(store.experiment_id, run_name=name, tags={"cfx.job": tags["cfx.job"]})
+        missing = dict(parameters)
+    entries = [Param(key, value) for key, value in missing.items()]
+    client.log_batch(run.info.run_id, params=entries, tags=_tags(tags))
+    folder = _local(run.info.artifact_uri)
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise OSError(f"the folder of its artifacts, {folder}, cannot be written")
+    return str(run.info.run_id)
+
+
+def _is_running(run: Any) -> bool:
+    return run.info.status == "RUNNING" and provenance.is_alive(run.data.tags)
+
+
+def _close_abandoned(store: Store) -> None:
+    """Marks runs KILLED whose process on this machine is gone: a killed process cannot do it itself."""
+    mine = f"attributes.status = 'RUNNING' and tags.`cfx.host` = '{_safe(provenance.process_tags()['cfx.host'])}'"
+    for run in store.client.search_runs([store.experiment_id], mine, max_results=1000):
+        if not provenance.is_alive(run.data.tags):
+            store.client.set_tag(run.info.run_id, "cfx.failure", "the process ended without closing the run")
+            store.client.set_terminated(run.info.run_id, "KILLED")
+            if "mlflow.parentRunId" in run.data.tags and "cfx.sweep" in run.data.tags:
+                _settle(store, run.data.tags["mlflow.parentRunId"], run.data.tags["cfx.sweep"])
+
+
+def _sweep_parent(store: Store, sweep: str) -> str:
+    """Returns the id of the sweep's parent run, made by whichever job comes first; call under the lock."""
+    client, name = store.client, _safe(sweep)
+    # The parent has not the children's tag: a table filtered by `cfx.sweep` shows the jobs alone, flat, and so do its charts.
+    found = client.search_runs([store.experiment_id], f"tags.`cfx.sweep_parent` = '{name}'", max_results=1)
+    if found:
+        client.update_run(found[0].info.run_id, status="RUNNING")
+        return str(found[0].info.run_id)
+    note = f"[All jobs of this sweep]({sweep_link(store.experiment_id, sweep)})"
+    tags = {"cfx.sweep_parent": name, "mlflow.note.content": note, "mlflow.source.name": "cfx", "mlflow.user": provenance.user()}
+    return str(client.create_run(store.experiment_id, run_name=f"sweep {name}", tags=tags).info.run_id)
+
+
+def _settle(store: Store, parent_id: str, sweep: str) -> None:
+    """Gives a sweep's parent the status of its jobs: RUNNING while one runs, else the worst; call under the lock."""
+    for status in ("RUNNING", "FAILED", "KILLED", "FINISHED"):
+        jobs = f"tags.`cfx.sweep` = '{sweep}' and attributes.status = '{status}'"
+        if store.client.search_runs([store.experiment_id], jobs, max_results=1):
+            if status == "RUNNING":
+                store.client.update_run(parent_id, status=status)
+            else:
+                store.client.set_terminated(parent_id, status)
+            return
+
+
+def _clean_parameters(parameters: Mapping[str, str]) -> dict[str, str]:
+    """Returns parameters that MLflow takes: other signs in a key become `_`, too long values end in an ellipsis."""
+    clean = {}
+    for key, value in parameters.items():
+        name = re.sub(r"[^\w\-. :/]", "_", key)[:_KEY_LENGTH]
+        clean[name] = value if len(value) <= _PARAMETER_LENGTH else value[: _PARAMETER_LENGTH - 1] + "…"
+    return clean
+
+
+def _tags(tags: Mapping[str, str]) -> list[Any]:
+    from mlflow.entities import RunTag
+
+    return [
+        RunTag(key[:_KEY_LENGTH], value if len(value) <= _TAG_LENGTH else value[: _TAG_LENGTH - 1] + "…")
+        for key, value in tags.items()
+    ]
+
+
+def _fingerprint(parameters: Mapping[str, str], tags: Mapping[str, str]) -> str:
+    """Returns what two starts of the same job in the same folder share."""
+    text = json.dumps([dict(sorted(parameters.items())), tags.get("cfx.folder", "")])
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def _distributions(values: Mapping[str, Any]) -> dict[str, str]:
+    """Returns the plugin distributions, and their versions, that the named components come from; cfx's own is none."""
+    from cfx import registry
+
+    found = {}
+    for kind in registry.KINDS.values():
+        node = values.get(kind.group)
+        if isinstance(node, Mapping) and "name" in node:
+            entry = registry.entry(kind.name, str(node["name"]))
+            if entry.distribution != "cfx-driving":
+                found[entry.distribution] = entry.version
+    return found
+
+
+def _safe(name: str) -> str:
+    """Returns a name that needs no quoting in MLflow's search language."""
+    return re.sub(r"[^\w./:+=,@-]", "_", name)
+
+
+def _local(artifact_uri: str) -> Path | None:
+    from mlflow.utils.file_utils import local_file_uri_to_path
+
+    path: str = local_file_uri_to_path(artifact_uri)  # type: ignore[no-untyped-call]  # MLflow's
+    return Path(path) if artifact_uri.startswith(("file:", "/")) else None
+
+
+def _address(uri: str) -> tuple[str, tuple[str, ...]]:
+    """Returns the address of MLflow's pages, and what to do first to have them."""
+    if uri.startswith(("http://", "https://")):
+        return uri.rstrip("/"), ()
+    where = "" if uri == tracking_uri(None) else f" --uri {shlex.quote(uri)}"
+    return "http://127.0.0.1:5000", (f"To see it in MLflow: python -m cfx ui{where}",)

@@ -1,0 +1,66 @@
+"""Opens the tracked jobs in MLflow's own user interface, reachable from this machine only."""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+from pathlib import Path
+
+from cfx.errors import ConfigError, TrackingError
+
+HOST = "127.0.0.1"
+
+
+def serve(uri: str | None, port: int) -> None:
+    """Starts MLflow's server on a tracking store and prints the links; this process becomes the server until Ctrl-C.
+
+    Raises:
+        ConfigError: the port is taken.
+        TrackingError: the store does not exist or cannot be read.
+    """
+    store = _store(uri)
+    if store.startswith(("http://", "https://")):
+        print(f"the tracking store is a server already; open {store}")
+        return
+    _check_port(port)
+    for line in _links(store, port):
+        print(line, flush=True)
+    environment = {**os.environ, "MLFLOW_DISABLE_TELEMETRY": "true", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
+    command = ["mlflow", "ui", "--host", HOST, "--port", str(port), "--workers", "1", "--backend-store-uri", store]
+    # The server takes this process's place, so that signals and exit codes are its own.
+    os.execve(sys.executable, [sys.executable, "-m", *command], environment)  # noqa: S606 - no shell is wanted
+
+
+def _store(uri: str | None) -> str:
+    from cfx.tracking.store import tracking_uri
+
+    store = tracking_uri(uri)
+    path = Path(store.removeprefix("sqlite:///"))
+    if store.startswith("sqlite:///") and not path.is_file():
+        raise TrackingError(f"{path} does not exist: no job has been tracked from here; run one, or name its store with --uri")
+    return store
+
+
+def _check_port(port: int) -> None:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, port))
+        except (OSError, OverflowError) as error:
+            raise ConfigError(f"--port {port} cannot be used ({error}); choose another") from None
+
+
+def _links(store: str, port: int) -> list[str]:
+    """Returns a line per experiment."""
+    import mlflow
+
+    try:
+        experiments = mlflow.MlflowClient(store).search_experiments()
+    except Exception as error:
+        raise TrackingError(f"{store} cannot be read as an MLflow store: {str(error).splitlines()[0]}") from error
+    address = f"http://{HOST}:{port}/#/experiments"
+    return [
+        f"{one.name}: {address}/{one.experiment_id}/runs?compareRunsMode=CHART&workflowType=machine_learning"
+        for one in experiments
+    ]

@@ -1,0 +1,55 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cfx.calibration.windows import Split, Windows, WindowSettings
+from cfx.component import validate
+from cfx.errors import ConfigError, DataError
+from tests.drives import straight_pairs
+
+
+def test_the_papers_pair_has_the_papers_windows() -> None:
+    assert WindowSettings().count(839) == 167
+
+
+@given(frames=st.integers(2, 400), length=st.integers(1, 30), stride=st.integers(1, 30))
+def test_windows_fit_and_none_is_missing(frames: int, length: int, stride: int) -> None:
+    settings = WindowSettings(length=max(length, stride), stride=stride)
+    count = settings.count(frames)
+    last_frame_of = [k * stride + settings.length for k in range(count + 1)]
+    assert all(last <= frames - 1 for last in last_frame_of[:count])
+    assert last_frame_of[count] > frames - 1
+
+
+@given(frames=st.lists(st.integers(60, 300), min_size=1, max_size=5), stride=st.integers(1, 6), share=st.floats(0.5, 0.9))
+def test_training_windows_stay_before_the_test_part(frames: list[int], stride: int, share: float) -> None:
+    settings = WindowSettings(length=stride + 2, stride=stride)
+    split = Split.of(straight_pairs(frames), settings, share)
+    windows = Windows.of(split.windows, settings)
+    assert bool((windows.first + settings.length <= split.frame[windows.pair]).all())
+    assert bool((split.frame < torch.tensor(frames) - 1).all())
+
+
+def test_windows_come_back_from_their_grid() -> None:
+    windows = Windows.of(torch.tensor([2, 3]), WindowSettings())
+    grid, mask = windows.to_grid(torch.arange(5.0), 2)
+    assert grid.tolist() == [[0, 1, 0], [2, 3, 4]]
+    assert mask.tolist() == [[True, True, False], [True, True, True]]
+
+
+def test_a_pair_that_is_too_short_says_how_long_it_must_be() -> None:
+    settings = WindowSettings()
+    with pytest.raises(DataError, match=r"pair p0 has 9 frames.*at least 16") as caught:
+        Split.of(straight_pairs([9]), settings, 0.8)
+    needed = int(str(caught.value).rsplit(" ", 1)[1])
+    Split.of(straight_pairs([needed]), settings, 0.8)
+    with pytest.raises(DataError):
+        Split.of(straight_pairs([needed - 1]), settings, 0.8)
+
+
+def test_windows_that_leave_frames_out_are_refused() -> None:
+    with pytest.raises(ConfigError, match="leaves frames between windows"):
+        validate(WindowSettings, {"length": 3, "stride": 5}, where="windows")

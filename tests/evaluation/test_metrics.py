@@ -1,0 +1,51 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from cfx.evaluation.metrics import improvement_statistics
+
+
+def test_the_papers_pair() -> None:
+    result = improvement_statistics(np.array([1.033]), np.array([0.666]), seed=0)
+    assert result.mean == pytest.approx(0.355, abs=5e-4)
+    assert math.isnan(result.ci95_low)
+
+
+def test_the_interval_is_scipys_and_holds_the_mean() -> None:
+    rng = np.random.default_rng(1)
+    fixed = rng.uniform(0.5, 1.5, 40)
+    policy = fixed * rng.uniform(0.7, 1.1, 40)
+    result = improvement_statistics(fixed, policy, seed=0)
+    assert result.ci95_low < result.mean < result.ci95_high
+    # The normal approximation is no different at 40 pairs.
+    gain = 1 - policy / fixed
+    margin = 1.96 * gain.std(ddof=1) / math.sqrt(40)
+    assert result.ci95_low == pytest.approx(gain.mean() - margin, abs=0.3 * margin)
+    assert result.p_value == stats.wilcoxon(fixed, policy, zero_method="zsplit").pvalue
+    assert result == improvement_statistics(fixed, policy, seed=0)
+
+
+def test_no_difference_is_no_evidence() -> None:
+    result = improvement_statistics(np.ones(10), np.ones(10), seed=0)
+    assert (result.mean, result.win_rate, result.p_value, result.ci95_low, result.ci95_high) == (0, 0, 1, 0, 0)
+
+
+def test_undefined_pairs_are_counted() -> None:
+    result = improvement_statistics(np.array([1.0, 0.0, np.nan, 2.0]), np.array([0.5, 0.1, 1.0, np.inf]), seed=0)
+    assert (result.pairs, result.undefined, result.mean) == (1, 3, 0.5)
+
+
+@given(st.lists(st.tuples(st.floats(0.01, 10), st.floats(0.01, 10)), min_size=2, max_size=12))
+def test_nothing_is_invented(values: list[tuple[float, float]]) -> None:
+    fixed, policy = np.array(values).T
+    result = improvement_statistics(fixed, policy, seed=0)
+    gain = (fixed - policy) / fixed
+    assert gain.min() - 1e-9 <= result.ci95_low <= result.ci95_high <= gain.max() + 1e-9
+    assert 0 <= result.p_value <= 1
+    assert result.win_rate == (gain > 0).mean()

@@ -1,0 +1,202 @@
+"""The figures draw whatever an evaluation can hold, without a warning, and show what they say."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+
+from cfx.errors import ConfigError, OutputError
+from cfx.figures.drives import chosen_parameters, drives
+from cfx.figures.improvement import improvement_per_driver
+from cfx.figures.learning import learning_curve
+from cfx.figures.look import COLOURS, percent, pretty_unit, short, unit_label
+from cfx.figures.style import style_distribution
+from cfx.figures.write import write_figures
+from cfx.learners.curves import over_networks
+from cfx.parameters import Parameter, ParameterSpace
+
+TEN = ParameterSpace.of(*(Parameter(f"p{k}", "m/s2", -2.0, 3.0 + k, 1.0, "made up") for k in range(10)))
+
+
+def texts(figure: Figure) -> str:
+    """Everything written in a figure."""
+    figure.canvas.draw()
+    return "\n".join(artist.get_text() for artist in figure.findobj(mpl.text.Text))
+
+
+def with_improvement(results: Any, values: dict[int, float]) -> Any:
+    """Returns results in which some pairs' improvements are replaced."""
+    table = results.evaluation.table.copy()
+    rows = table.index[table["method"] == "policy"]
+    for k, value in values.items():
+        table.loc[rows[k], "improvement"] = value
+    return dataclasses.replace(results.evaluation, table=table)
+
+
+@pytest.mark.parametrize(
+    ("options", "files"),
+    [
+        ({}, 5),
+        ({"space": TEN}, 5),
+        ({"pairs": 1, "epochs": 1}, 5),
+        ({"pairs": 94, "frames": 40, "space": TEN}, 5),
+        ({"pairs": 2, "frames": 1}, 5),
+        ({"pairs": 3, "networks": 0}, 4),
+    ],
+    ids=["krauss", "ten parameters", "one pair", "94 pairs", "one frame", "nothing learned"],
+)
+def test_every_size_of_job_is_drawn(
+    tmp_path: Path, fake_results: Callable[..., Any], options: dict[str, Any], files: int
+) -> None:
+    results = fake_results(**options)
+    paths = write_figures(tmp_path / "figures", results.evaluation, results.style, results.curves)
+    assert len(paths) == files == len(list((tmp_path / "figures").iterdir()))
+    for path in paths:
+        height, width = imread(path).shape[:2]
+        assert width == 1575
+        assert 300 < height < 1400
+
+
+@pytest.mark.parametrize("count", range(1, 11))
+def test_chosen_parameters_have_an_axis_each(fake_results: Callable[..., Any], count: int) -> None:
+    space = ParameterSpace(TEN.parameters[:count])
+    figure = chosen_parameters(fake_results(pairs=3, frames=20, space=space).evaluation)
+    assert len(figure.axes) == len(space.names) + 1
+    written = texts(figure)
+    assert all(f"{name} (m/s²)" in written for name in space.names)
+
+
+def test_undefined_improvements_are_counted_and_not_drawn(fake_results: Callable[..., Any]) -> None:
+    results = fake_results(pairs=5, frames=20)
+    some = improvement_per_driver(with_improvement(results, {1: np.nan, 2: -np.inf}))
+    assert "3 pairs" in texts(some)
+    assert "2 without a defined improvement" in texts(some)
+    none = with_improvement(results, dict.fromkeys(range(5), np.nan))
+    assert "no pair has a defined improvement" in texts(improvement_per_driver(none))
+    assert "improvement undefined" in texts(drives(none))
+    chosen_parameters(none)
+
+
+def test_an_outlier_is_labelled_and_does_not_shrink_the_others(fake_results: Callable[..., Any]) -> None:
+    results = fake_results(pairs=20, frames=20)
+    tame = with_improvement(results, {k: 0.3 - 0.02 * k for k in range(20)})
+    figure = improvement_per_driver(
+        dataclasses.replace(tame, table=with_improvement(dataclasses.replace(results, evaluation=tame), {19: -7.0}).table)
+    )
+    assert "\N{MINUS SIGN}700 %" in texts(figure)
+    assert figure.axes[0].get_ylim()[0] > -2.0
+
+
+def test_drives_shows_best_median_and_worst(fake_results: Callable[..., Any]) -> None:
+    results = fake_results(pairs=7, frames=20)
+    evaluation = with_improvement(results, {k: 0.1 * k for k in range(7)})
+    ids = [drive.pair_id for drive in evaluation.drives]
+    written = texts(drives(evaluation))
+    for rank, k in (("best", 6), ("median", 3), ("worst", 0)):
+        assert f"{rank} pair, {ids[k]}:  {percent(0.1 * k)}" in written
+    one = drives(evaluation, pair_id=ids[2])
+    assert len(one.axes) == 2
+    rows = evaluation.table[(evaluation.table["pair_id"] == ids[2]) & (evaluation.table["method"] == "fixed")]
+    assert f"fixed {float(rows['rmse_speed'].iloc[0]):.2f}" in texts(one)
+    colours = {line.get_color() for line in one.axes[0].lines}
+    assert colours == set(COLOURS.values())
+
+
+def test_an_unknown_pair_is_named_with_the_nearest(fake_results: Callable[..., Any]) -> None:
+    evaluation = fake_results(pairs=3, frames=20).evaluation
+    with pytest.raises(ConfigError, match=r"pair 'i80_0400_1000_99' is not .* Did you mean 'i80_0400_1000_990'"):
+        drives(evaluation, pair_id="i80_0400_1000_99")
+
+
+def test_a_default_driver_far_away_does_not_shrink_the_others(fake_results: Callable[..., Any]) -> None:
+    evaluation = fake_results(pairs=1, frames=50).evaluation
+    drive = evaluation.drives[0]
+    far = dataclasses.replace(drive, gap={**drive.gap, "default": drive.real_gap + np.linspace(0, 500, 51)})
+    figure = drives(dataclasses.replace(evaluation, drives=(far,)))
+    assert figure.axes[1].get_ylim()[1] < 120
+    assert "default up to" in texts(figure)
+
+
+def test_a_collision_is_marked_and_a_diverged_drive_is_survived(fake_results: Callable[..., Any]) -> None:
+    evaluation = fake_results(pairs=1, frames=50).evaluation
+    drive = evaluation.drives[0]
+    bad = dataclasses.replace(
+        drive,
+        gap={**drive.gap, "policy": drive.real_gap - np.linspace(0, 20, 51), "fixed": np.full(51, np.inf)},
+        speed={**drive.speed, "fixed": np.full(51, np.nan)},
+    )
+    assert "policy collides" in texts(drives(dataclasses.replace(evaluation, drives=(bad,))))
+
+
+def test_names_are_text_and_never_formulas(fake_results: Callable[..., Any], tmp_path: Path) -> None:
+    results = fake_results(pairs=1, frames=20)
+    name = "50$ \\frac{1}{0} $ 跟车 " + "x" * 80
+    table = results.evaluation.table.assign(pair_id=name)
+    evaluation = dataclasses.replace(
+        results.evaluation, table=table, drives=(dataclasses.replace(results.evaluation.drives[0], pair_id=name),)
+    )
+    assert len(write_figures(tmp_path, evaluation, results.style, results.curves)) == 5
+
+
+def test_cuts_and_cluster_sizes_stand_in_the_style_figure(fake_results: Callable[..., Any]) -> None:
+    style = fake_results(pairs=94, frames=5).style
+    written = texts(style_distribution(style))
+    for cut in style.cuts:
+        assert f"{cut:.3f}" in written
+    for name, count in style.table["cluster_name"].value_counts().items():
+        assert f"{name}: {count}" in written
+    lost = dataclasses.replace(style, table=style.table.assign(score=np.nan))
+    assert "94 drivers without a score" in texts(style_distribution(lost))
+
+
+def test_a_network_that_stopped_early_keeps_its_last_loss() -> None:
+    curves = pd.DataFrame(
+        {
+            "network": ["a", "a", "b", "b", "b"],
+            "epoch": [0, 1, 0, 1, 2],
+            "train_loss": [4.0, 2.0, 8.0, 6.0, 5.0],
+            "validation_loss": np.nan,
+        }
+    )
+    assert over_networks(curves, "train_loss").loc[2].tolist() == [2.0, 5.0]
+    assert over_networks(curves, "validation_loss").empty
+    assert "2 networks: median and quartiles" in texts(learning_curve(curves))
+
+
+@pytest.mark.parametrize("loss", [np.nan, 0.0, -1.0, np.inf])
+def test_a_loss_that_no_logarithm_takes_is_drawn(loss: float) -> None:
+    epochs = np.arange(5)
+    curves = pd.DataFrame(
+        {"network": "a", "epoch": epochs, "train_loss": np.where(epochs == 2, loss, 10.0**-epochs), "validation_loss": np.nan}
+    )
+    texts(learning_curve(curves))
+
+
+def test_figures_leave_the_readers_matplotlib_alone(fake_results: Callable[..., Any], tmp_path: Path) -> None:
+    before = dict(mpl.rcParams)
+    results = fake_results(pairs=2, frames=10)
+    write_figures(tmp_path, results.evaluation, results.style, results.curves)
+    assert dict(mpl.rcParams) == before
+
+
+def test_a_path_that_cannot_be_written_is_one_sentence(fake_results: Callable[..., Any], tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    results = fake_results(pairs=1, frames=10)
+    with pytest.raises(OutputError, match=r"improvement_per_driver\.png: this figure cannot be written"):
+        write_figures(tmp_path / "file" / "figures", results.evaluation, results.style, results.curves)
+
+
+def test_labels() -> None:
+    assert percent(-0.1234, 1) == "\N{MINUS SIGN}12.3 %"
+    assert pretty_unit("1e-4/(m s)") == "10⁻⁴/(m s)"
+    assert unit_label("k", "1") == "k"
+    assert short("abcdefghij", 7) == "abc…hij"

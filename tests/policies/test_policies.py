@@ -1,0 +1,76 @@
+"""Every built-in policy holds the contract, and the batched recurrent networks are torch's."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from cfx.errors import ConfigError
+from cfx.policies.base import Policy
+from cfx.policies.default import DefaultPolicy
+from cfx.policies.features import INPUTS, History, token_width, tokens
+from cfx.policies.fixed import FixedPolicy
+from cfx.policies.gru import GruPolicy
+from cfx.policies.lstm import LstmPolicy
+from cfx.policies.recurrent import RecurrentNetwork
+from cfx.testing.policies import PolicyContract
+
+
+class TestDefault(PolicyContract):
+    @pytest.fixture
+    def policy(self) -> Policy:
+        return DefaultPolicy()
+
+
+class TestFixed(PolicyContract):
+    @pytest.fixture
+    def policy(self) -> Policy:
+        return FixedPolicy()
+
+
+class TestGru(PolicyContract):
+    @pytest.fixture(params=[1, 2])
+    def policy(self, request: pytest.FixtureRequest) -> Policy:
+        return GruPolicy(layers=request.param, hidden_size=8)
+
+
+class TestLstm(PolicyContract):
+    @pytest.fixture(params=[1, 2])
+    def policy(self, request: pytest.FixtureRequest) -> Policy:
+        return LstmPolicy(layers=request.param, hidden_size=8, inputs=("gap", "relative_speed"), summary="mean_std")
+
+
+@pytest.mark.parametrize(("component", "reference"), [(GruPolicy, torch.nn.GRU), (LstmPolicy, torch.nn.LSTM)])
+def test_recurrent_networks_are_torchs(component: type[Policy], reference: type[torch.nn.RNNBase]) -> None:
+    policy = component(layers=2, hidden_size=6)
+    network = policy.build(5, torch.zeros(3), torch.zeros((2, 3)), torch.Generator().manual_seed(0)).double()
+    assert isinstance(network, RecurrentNetwork)
+    x = torch.randn((2, 3, 9, 5), dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    ours, _ = network(x, network.initial_state(2, 3))
+    for i in range(2):
+        theirs = reference(5, 6, num_layers=2, batch_first=True).double()
+        with torch.no_grad():
+            for k, layer in enumerate(network.layers):
+                getattr(theirs, f"weight_ih_l{k}").copy_(layer.w_input[i].T)
+                getattr(theirs, f"weight_hh_l{k}").copy_(layer.w_hidden[i].T)
+                getattr(theirs, f"bias_ih_l{k}").copy_(layer.b_input[i, 0])
+                getattr(theirs, f"bias_hh_l{k}").copy_(layer.b_hidden[i, 0])
+            expected = (theirs(x[i])[0] @ network.w_out[i] + network.b_out[i]).sigmoid()
+        torch.testing.assert_close(ours[i], expected)
+
+
+def test_tokens_have_the_declared_width_and_are_finite_at_standstill() -> None:
+    history = History(*(torch.zeros((2, 5)) for _ in range(5)))
+    for summary in ("frames", "last", "mean", "mean_std"):
+        names = tuple(INPUTS)
+        out = tokens(history, names, summary)
+        assert out.shape == (2, token_width(names, summary, 5))
+        assert bool(out.isfinite().all())
+
+
+@pytest.mark.parametrize(
+    ("inputs", "message"), [(("leader_sped",), "Did you mean 'leader_speed'"), ((), "give at least one"), (("gap", "gap"), "stands twice")]
+)
+def test_wrong_inputs_are_named(inputs: tuple[str, ...], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        GruPolicy(inputs=inputs)
