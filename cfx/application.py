@@ -104,7 +104,8 @@ class JobFunction:
 
     def _attempt(self, config: DictConfig, folder: Path) -> tuple[float, int, str, str]:
         try:
-            result = _call(self.target, config, folder)
+            values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+            result = _call(self.target, values, folder)
         except (CfxError, OmegaConfBaseException) as error:
             return float("nan"), 2, explain(error, ()), traceback.format_exc().rstrip() if self.show_traceback else ""
         except SystemExit as error:
@@ -179,18 +180,14 @@ def run(overrides: Sequence[str] = (), *, target: str = JOB) -> JobResult:
         raise ConfigError(f"give a list of overrides: cfx.run({overrides.split()!r})")
     try:
         config = hydra_source.composed(overrides)
+        values = hydra_source.plain(config)
+        folder = _fresh(Path(str(config.hydra.run.dir)).absolute())
     except Exception as error:
         if is_mistake(error) and not isinstance(error, CfxError):
             raise ConfigError(explain(error, overrides)) from None
         raise
-    with _hydra_config(config):
-        folder = _fresh(Path(str(config.hydra.run.dir)).absolute())
-        del config["hydra"]
-        with _log_file(folder / "cfx.log"):
-            try:
-                return cast("JobResult", _call(target, config, folder))
-            except OmegaConfBaseException as error:
-                raise ConfigError(explain(error, overrides)) from None
+    with _log_file(folder / "cfx.log"):
+        return cast("JobResult", _call(target, values, folder))
 
 
 def wants_traceback(arguments: Sequence[str]) -> bool:
@@ -199,11 +196,10 @@ def wants_traceback(arguments: Sequence[str]) -> bool:
     return asked or any(one.startswith("hydra.verbose=") and not one.lower().endswith("=false") for one in arguments)
 
 
-def _call(target: str, config: DictConfig, folder: Path) -> Any:
-    values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+def _call(target: str, values: Any, folder: Path) -> Any:
     from cfx.config import JobConfig
 
-    job_config = JobConfig.of(values)  # type: ignore[arg-type]  # a mapping: `of` checks
+    job_config = JobConfig.of(values)
     module, _, function = target.partition(":")
     return getattr(import_module(module), function)(job_config, folder)
 
@@ -304,18 +300,6 @@ def _sigterm() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-@contextlib.contextmanager
-def _hydra_config(config: DictConfig) -> Iterator[None]:
-    """Lets `${hydra:...}` mean this configuration, and puts a running application's back."""
-    holder = HydraConfig.instance()
-    before = holder.cfg
-    holder.set_config(config)
-    try:
-        yield
-    finally:
-        holder.cfg = before
 
 
 @contextlib.contextmanager

@@ -14,9 +14,11 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, cast
 
 from hydra import compose, initialize_config_dir
 from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.object_type import ObjectType
 from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigLoadError, ConfigResult, ConfigSource
@@ -104,6 +106,24 @@ def composed(overrides: Sequence[str]) -> DictConfig:
     """
     with initialize_config_dir(config_dir=str(nodes.conf_dir()), job_name="cfx", version_base="1.3"):
         return compose("config", overrides=list(overrides), return_hydra_config=True)
+
+
+def plain(config: DictConfig) -> dict[str, Any]:
+    """Returns the job's part of a composed configuration as plain data, every interpolation resolved.
+
+    Raises:
+        OmegaConfBaseException: an interpolation leads nowhere, or a mandatory value is missing.
+    """
+    holder = HydraConfig.instance()
+    before = holder.cfg
+    holder.set_config(config)  # `${hydra:...}` shall mean this configuration
+    try:
+        values = OmegaConf.to_container(
+            OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"]), resolve=True
+        )
+    finally:
+        holder.cfg = before
+    return cast("dict[str, Any]", values)
 
 
 def _split(config_path: str) -> tuple[str, str]:

@@ -53,6 +53,8 @@ def _reworded(error: BaseException, overrides: Sequence[str]) -> str:
     several = re.search(r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?:\n| requires)", text)
     if several:
         return f"{several[1]}: several values need a multirun; add -m (or write key=[a,b] for a list)"
+    if text.startswith("Config group override must be"):
+        return f"{text}; choose an option by its name, such as model=w99"
     return _plain(error)
 
 

@@ -100,7 +100,7 @@ def _settings(schema: type[BaseModel], values: Mapping[str, Any], skip: set[str]
         note = " ".join(part for part in ("required:" if blank else "", field.description or "") if part)
         if isinstance(value, BaseModel):
             yield from _comment(note)
-            yield f"{name}:"
+            yield f"{_scalar(name)}:"
             yield from (
                 f"  {line}" for line in _settings(type(value), {key: getattr(value, key) for key in type(value).model_fields})
             )
@@ -111,11 +111,14 @@ def _settings(schema: type[BaseModel], values: Mapping[str, Any], skip: set[str]
 def _parameter(parameter: Parameter) -> list[str]:
     source = f" ({parameter.source})" if parameter.source else ""
     node = {"low": parameter.low, "high": parameter.high, "default": parameter.default, "tuned": parameter.tuned}
-    return [*_comment(f"{parameter.name}, {parameter.unit}: {parameter.meaning}{source}"), f"{parameter.name}: {_value(node)}"]
+    return [
+        *_comment(f"{parameter.name}, {parameter.unit}: {parameter.meaning}{source}"),
+        f"{_scalar(parameter.name)}: {_value(node)}",
+    ]
 
 
 def _line(name: str, value: str, note: str) -> list[str]:
-    line = f"{name}: {value}"
+    line = f"{_scalar(name)}: {value}"
     if not note:
         return [line]
     short = f"{line}  # {note}"

@@ -43,7 +43,8 @@ class Cache:
         if path is None or not path.is_file():
             return None
         try:
-            with np.load(path, allow_pickle=False) as archive:
+            # A file of our own: NumPy leaves the one it opens behind when the archive is damaged.
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
                 return {name: archive[name] for name in archive.files}
         except (OSError, ValueError, zipfile.BadZipFile, EOFError):
             log.warning("The cached calibration %s is damaged; it is computed again.", path)

@@ -16,6 +16,7 @@ from cfx.pairs import PairBatch
 from cfx.policies.features import History
 from cfx.policies.trained import TrainedPolicy
 from cfx.simulation.rollout import Simulator, Start
+from cfx.simulation.threads import one_thread
 
 
 class ClosedLoop(NamedTuple):
@@ -34,6 +35,7 @@ class ClosedLoop(NamedTuple):
 
 
 @torch.no_grad()
+@one_thread()
 def drive(simulator: Simulator, policy: TrainedPolicy, batch: PairBatch, first: Tensor, network: Tensor) -> ClosedLoop:
     """Lets a policy drive the test part of P pairs.
 

@@ -25,6 +25,7 @@ from cfx.learners.base import CURVE_COLUMNS, Learned, Learner, LearnerSettings, 
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import token_width, tokens
 from cfx.policies.trained import Scaler, driver_places, measured_history
+from cfx.simulation.threads import one_thread
 
 log = logging.getLogger(__name__)
 
@@ -89,7 +90,7 @@ class ImitationLearner(Learner):
                 # Nothing random happens between batches, and the segments must come in order.
                 use_distributed_sampler=False,
             )
-            with warnings.catch_warnings():
+            with warnings.catch_warnings(), one_thread():
                 warnings.filterwarnings("ignore", module=r"lightning\.")
                 trainer.fit(module, datamodule=data)
         if module.interrupted(trainer):

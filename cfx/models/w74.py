@@ -21,7 +21,9 @@ from cfx.parameters import Parameter, ParameterSpace
 
 _NEAREST_ROOM = 1e-3  # m: bounds quotients (and their gradients) beside a threshold; the brake cap acts long before
 
-_VISSIM = "default: PTV Vissim's Wiedemann 74 (ax 2 m, bx 2 + 3 z with z = 0.5); bounds: wide enough for drivers who stay far behind"
+_VISSIM = (
+    "default: PTV Vissim's Wiedemann 74 (ax 2 m, bx 2 + 3 z with z = 0.5); bounds: wide enough for drivers who stay far behind"
+)
 _REITER = "default: Wiedemann and Reiter (1992), the middle of the drivers; bounds: wide"
 
 
@@ -75,7 +77,9 @@ class W74(DrivingModel):
         Parameter("sdx_mult", "1", 1.05, 4.0, 1.5, "spacing at which following ends, as a multiple of ABX", _REITER),
         Parameter("cx", "(m s)^0.5", 10.0, 120.0, 50.0, "perception of speed differences; larger notices smaller ones", _REITER),
         Parameter("opdv_add", "1", 0.1, 5.0, 1.5, "how much larger an opening speed must be to be noticed", _REITER),
-        Parameter("b_max", "m/s2", 0.5, 6.0, 2.6, "free acceleration from standstill", "SUMO's default passenger car", tuned=False),
+        Parameter(
+            "b_max", "m/s2", 0.5, 6.0, 2.6, "free acceleration from standstill", "SUMO's default passenger car", tuned=False
+        ),
         Parameter("v_desired", "m/s", 5.0, 70.0, 33.3, "speed wanted on a free road", "120 km/h", tuned=False),
         Parameter("b_null", "m/s2", 0.01, 1.0, 0.25, "acceleration while following", "Vissim's CC7", tuned=False),
         Parameter("b_min", "m/s2", -20.0, -1.0, -9.0, "hardest braking (negative)", "SUMO's emergencyDecel", tuned=False),

@@ -1,6 +1,6 @@
 """The contract of an optimizer: many independent bounded problems in one call.
 
-Letters: P problems, q candidates for each, n parameters, e evaluations of each problem in all.
+Letters: P problems, q candidates for each in one call, n parameters, g guesses, e evaluations of each problem in all.
 Everything here is float64: Gaussian processes need it, and losses of neighbouring candidates differ by little.
 """
 
@@ -15,9 +15,13 @@ import torch
 from torch import Tensor
 
 from cfx.component import Component
+from cfx.errors import PluginError
 
 Progress = Callable[[int], None]
-"""Told how many more problems' evaluations are done (problems times evaluations)."""
+"""Told how many more evaluations are done; in all they sum to problems times evaluations."""
+
+TIE_RELATIVE, TIE_ABSOLUTE = 1e-6, 1e-9
+"""Losses within `TIE_ABSOLUTE + TIE_RELATIVE * best` of the best one count as equal: above rounding, below anything that matters."""
 
 
 class Objective(Protocol):
@@ -42,41 +46,51 @@ class Solution:
     """What an optimizer found.
 
     Attributes:
-        best: `(P, n)` in unit space.
-        loss: `(P,)`, its loss; infinity if every candidate of a problem diverged (then `best` is the first guess).
-        candidates: `(P, e, n)`, everything that was evaluated, in order.
-        losses: `(P, e)`; diverged candidates are infinity.
+        best: `(P, n)` in unit space: of the candidates whose loss ties with the lowest, the one nearest to the problem's first guess.
+            The first guess itself if every candidate diverged.
+        loss: `(P,)`, the loss of `best`; infinity if every candidate diverged.
+        filling: `(P, 3)`, lowest, median and highest finite loss of the space-filling candidates (`Optimizer.space_filling`; guesses and
+            what an optimizer chose by looking at losses do not count). The median of an even number is the lower of the middle two.
+            NaN if none is finite.
+        diverged: `(P,)` int64, number of candidates whose loss was NaN or infinite.
     """
 
     best: Tensor
     loss: Tensor
-    candidates: Tensor
-    losses: Tensor
+    filling: Tensor
+    diverged: Tensor
+
+    @property
+    def spread(self) -> Tensor:
+        """How much the choice of parameters matters, `(P,)`: the median loss of the space-filling candidates minus `loss`.
+
+        In the unit of the loss, never negative; 0 where nothing tells candidates apart or every candidate diverged.
+        """
+        return (self.filling[:, 1] - self.loss).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0).clamp(min=0.0)
 
 
 class Optimizer(Component):
     """Base of every optimizer.
 
-    Life cycle: calibration calls `minimize` once per group of problems; `minimize` cuts it into chunks that respect the memory
-    bound, calls `solve` for each, and checks what comes back. A subclass implements `solve` and
-    `bytes_per_problem`. The result for a problem must not depend on which other problems stand beside it, beyond rounding.
+    Life cycle: calibration calls `minimize` once per group of problems; `minimize` cuts the group into chunks that respect the memory
+    bound, calls `solve` for each, checks what comes back and reduces it to a `Solution`. A subclass implements `solve`,
+    `evaluations` and `bytes_per_problem`. It keeps no state between calls, and the result for a problem must not depend on which
+    other problems stand beside it, beyond rounding. `cfx.testing.optimizers.OptimizerContract` tests all this.
     """
 
     kind = "optimizer"
 
     @abstractmethod
-    def solve(self, objective: Objective, guesses: Tensor, *, n: int, seed: int, progress: Progress) -> tuple[Tensor, Tensor]:
+    def solve(self, objective: Objective, guesses: Tensor, *, seed: int) -> tuple[Tensor, Tensor]:
         """Evaluates candidates of all problems of one chunk.
 
         Args:
-            objective: returns finite losses or infinity, never NaN.
-            guesses: `(P, g, n)` in unit space, candidates worth trying first; they count as evaluations.
-            n: number of parameters.
-            seed: the same for every chunk.
-            progress: to be told of each evaluation: `progress(problems * evaluations)`.
+            objective: takes candidates within [0, 1]; returns finite losses or infinity, never NaN. Counts evaluations for progress.
+            guesses: `(P, g, n)` in unit space, g >= 1: candidates to evaluate first; they count as evaluations.
+            seed: the same for every chunk; 0 is a seed like any other.
 
         Returns:
-            Candidates `(P, e, n)` within [0, 1] and their losses `(P, e)`.
+            Candidates `(P, e, n)` and their losses `(P, e)` in the order of evaluation; may be expanded views.
         """
 
     @abstractmethod
@@ -85,7 +99,15 @@ class Optimizer(Component):
 
     @abstractmethod
     def bytes_per_problem(self, n: int) -> int:
-        """Returns an upper estimate of the memory that one problem needs in `solve`, without the objective's own."""
+        """Returns an upper estimate of the memory that `solve` needs for one problem, without what it returns and the objective's own."""
+
+    def evaluations_at_once(self) -> int:
+        """Returns how many candidates of one problem `solve` hands to the objective in one call at most; 1 unless overridden."""
+        return 1
+
+    def space_filling(self) -> int:
+        """Returns how many of the first evaluations, guesses included, are chosen without looking at losses; all unless overridden."""
+        return self.evaluations()
 
     def minimize(
         self,
@@ -103,41 +125,80 @@ class Optimizer(Component):
             guesses: `(P, g, n)` in unit space, g >= 1.
             seed: the same seed gives the same result.
             objective_bytes: memory that the objective needs for one candidate of one problem.
-            memory: bound in bytes for one chunk.
-            progress: called with the number of evaluations done.
+            memory: bound in bytes for one chunk; a chunk holds at least one problem.
+            progress: called with the number of evaluations done since the last call.
+
+        Raises:
+            PluginError: the optimizer asks for a candidate outside [0, 1], or returns another number of evaluations than it says.
         """
-        n = guesses.shape[-1]
-        each = self.bytes_per_problem(n) + objective_bytes * self.evaluations_at_once()
-        chunk = max(1, min(objective.problems, memory // max(1, each)))
+        problems, _, n = guesses.shape
+        returned = 8 * self.evaluations() * (2 * n + 4)
+        each = self.bytes_per_problem(n) + returned + objective_bytes * self.evaluations_at_once()
+        chunk = max(1, min(problems, memory // each))
+        guesses = guesses.double().clamp(0.0, 1.0)
         pieces = []
-        for first in range(0, objective.problems, chunk):
-            last = min(first + chunk, objective.problems)
-            safe = _Finite(objective.select(first, last))
-            candidates, losses = self.solve(safe, guesses[first:last].double(), n=n, seed=seed, progress=progress)
-            pieces.append((candidates.clamp(0.0, 1.0), losses))
-        candidates = torch.cat([piece[0] for piece in pieces])
-        losses = torch.cat([piece[1] for piece in pieces])
-        loss, index = losses.min(dim=1)
-        best = candidates.gather(1, index[:, None, None].expand(-1, 1, n)).squeeze(1)
-        return Solution(best, loss, candidates, losses)
+        for first in range(0, problems, chunk):
+            last = min(first + chunk, problems)
+            guarded = _Guarded(objective.select(first, last), progress, type(self).__name__)
+            own = guesses[first:last]
+            candidates, losses = self.solve(guarded, own, seed=seed)
+            self._check(candidates, losses, own)
+            pieces.append(_reduce(candidates, losses, own, self.space_filling()))
+        best, loss, filling, diverged = (torch.cat(parts) for parts in zip(*pieces, strict=True))
+        return Solution(best, loss, filling, diverged)
 
-    def evaluations_at_once(self) -> int:
-        """Returns how many candidates of one problem `solve` hands to the objective in one call; 1 unless overridden."""
-        return 1
+    def _check(self, candidates: Tensor, losses: Tensor, guesses: Tensor) -> None:
+        problems, _, n = guesses.shape
+        expected = (problems, self.evaluations())
+        if losses.shape != expected or candidates.shape != (*expected, n):
+            raise PluginError(
+                f"optimizer {type(self).__name__}: solve must return candidates {(*expected, n)} and losses {expected}"
+                f" as evaluations() says, but returned {tuple(candidates.shape)} and {tuple(losses.shape)}"
+            )
 
 
-class _Finite:
-    """An objective whose NaN losses are infinity."""
+def _reduce(candidates: Tensor, losses: Tensor, guesses: Tensor, space_filling: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Reduces a chunk to best `(P, n)`, loss `(P,)`, filling `(P, 3)` and diverged `(P,)`."""
+    problems, g, n = guesses.shape
+    finite = losses.isfinite()
+    lowest = losses.min(dim=1, keepdim=True).values
+    ties = finite & (losses <= lowest + TIE_ABSOLUTE + TIE_RELATIVE * lowest.abs())
+    distance = torch.linalg.vector_norm(candidates - guesses[:, :1], dim=-1)
+    index = distance.where(ties, torch.inf).argmin(dim=1, keepdim=True)
+    best = candidates.gather(1, index[..., None].expand(-1, 1, n)).squeeze(1)
+    some = finite.any(dim=1)
+    best = best.where(some[:, None], guesses[:, 0])
+    loss = losses.gather(1, index).squeeze(1).where(some, torch.inf)
+    # An optimizer whose initial design is all guesses still says something about the spread through them.
+    first = g if space_filling > g else 0
+    filled = losses[:, first:space_filling]
+    filled = filled.where(filled.isfinite(), torch.nan)
+    usable = filled.isnan().logical_not().any(dim=1)
+    low = filled.nan_to_num(nan=torch.inf).amin(dim=1)
+    high = filled.nan_to_num(nan=-torch.inf).amax(dim=1)
+    filling = torch.stack([low, filled.nanmedian(dim=1).values, high], dim=1).where(usable[:, None], torch.nan)
+    return best, loss, filling, (~finite).sum(dim=1)
 
-    def __init__(self, objective: Objective) -> None:
+
+class _Guarded:
+    """An objective whose NaN losses are infinity, that counts evaluations and refuses candidates outside the bounds."""
+
+    def __init__(self, objective: Objective, progress: Progress, optimizer: str) -> None:
         self._objective = objective
+        self._progress = progress
+        self._optimizer = optimizer
 
     @property
     def problems(self) -> int:
         return self._objective.problems
 
     def __call__(self, candidates: Tensor) -> Tensor:
-        return self._objective(candidates).double().nan_to_num(nan=torch.inf, posinf=torch.inf)
+        # Written so that NaN fails too.
+        if not bool(((candidates >= 0) & (candidates <= 1)).all()):
+            raise PluginError(f"optimizer {self._optimizer}: it asked for a candidate outside the bounds [0, 1] of unit space")
+        losses = self._objective(candidates).to(torch.float64)
+        self._progress(losses.numel())
+        return losses.nan_to_num(nan=torch.inf, posinf=torch.inf, neginf=torch.inf)
 
     def select(self, first: int, last: int) -> Objective:
-        return _Finite(self._objective.select(first, last))
+        return _Guarded(self._objective.select(first, last), self._progress, self._optimizer)

@@ -10,7 +10,7 @@ leaders broadcast: a leader `(pairs, 1)` drives ahead of followers `(pairs, cand
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Literal, NamedTuple
 
 import torch
@@ -20,13 +20,20 @@ from cfx.errors import ParameterError
 from cfx.models.base import DrivingModel, Follower, Leader
 
 Compile = Literal["auto", "always", "never"]
+_Parameters = dict[str, Tensor]
+_Step = Callable[[Follower, Leader, _Parameters], tuple[Follower, Tensor, Tensor]]
 
 _BLOCK = 5
-"""Steps that one compiled call takes: a window of the paper, and enough to hide the call's overhead."""
+"""Steps that one compiled call takes: a window of the paper. State and parameters stay in registers meanwhile; longer blocks were not
+faster and take long to compile."""
 
 _WORTH_COMPILING = 20_000_000
-"""Vehicle steps in one call from which compiling pays: about two seconds of eager work. The rule looks at the call alone, so that
+"""Vehicle steps in one call from which compiling pays: about a second of eager work. The rule looks at the call alone, so that
 the same call gives the same bits whatever came before it."""
+
+_TILE_BYTES = 1 << 16
+"""What one tile of followers takes for each value and CPU thread. A tile does all its steps before the next begins, so that the twenty or so
+values that a model reads and writes stay in a core's second-level cache; otherwise memory, not arithmetic, sets the speed."""
 
 
 class Start(NamedTuple):
@@ -44,7 +51,8 @@ class Trajectory(NamedTuple):
         position: front bumper, m.
         speed: m/s.
         gap: bumper to bumper, m; negative from a collision on.
-        collided: bool, the gap is negative. A rollout goes on after a collision: nothing is hidden.
+        collided: bool, the gap is negative. A rollout goes on after a collision: nothing is hidden. Where parameters or
+            data are NaN, speed and gap are NaN and `collided` is False.
     """
 
     position: Tensor
@@ -56,15 +64,15 @@ class Trajectory(NamedTuple):
 class Simulator:
     """Advances followers of one model at one time step.
 
-    Compiles the model's step once that pays (`compile="auto"`), where a C++ compiler is found; runs it eagerly otherwise and
-    whenever gradients are wanted. Both give the same numbers to the last few bits. Its only state is the compiled function.
+    Compiles the model's step once that pays (`compile="auto"`), where a compiler is found; runs it eagerly otherwise and
+    whenever gradients are wanted. Both give the same numbers to the last few bits. A simulator has no state: compiled code
+    is kept for the process, and simulators of equal models share it.
     """
 
     def __init__(self, model: DrivingModel, dt: float, *, compile: Compile = "auto") -> None:
         self.model = model
         self.dt = dt
         self._mode: Compile = compile
-        self._compiled: Callable[..., tuple[Tensor, ...]] | None = None
 
     def begin(self, start: Start) -> Follower:
         """Returns the follower at the start of a rollout."""
@@ -81,59 +89,154 @@ class Simulator:
         Returns:
             The follower at frame K, and positions and speeds `(K, *batch)` of frames 1 to K.
         """
+        steps, batch = len(leader.position), follower.speed.shape
+        if steps == 0:
+            nothing = follower.speed.new_empty((0, *batch))
+            return follower, nothing, nothing
+        eager = _stepper(self.model, self.dt)
+        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (*follower, *leader, *p.values())):
+            return eager(follower, leader, dict(p))
+        with torch.no_grad():
+            compiled = self._compiles(steps, follower.speed)
+            size = _tile_size(follower.speed)
+            if not compiled and follower.speed.numel() <= size:
+                return eager(follower, leader, dict(p))
+            end = Follower(*(torch.empty_like(state, memory_format=torch.contiguous_format) for state in follower))
+            position, speed = (follower.speed.new_empty((steps, *batch)) for _ in range(2))
+            for tile in _tiles(batch, size):
+                part = tile.follower(follower), tile.leader(leader), tile.parameters(p)
+                last, at, fast = self._compiled_drive(*part) if compiled else eager(*part)
+                tile.put(end, last)
+                tile.rows(position).copy_(at.view(steps, *tile.shape))
+                tile.rows(speed).copy_(fast.view(steps, *tile.shape))
+        return end, position, speed
+
+    def _compiles(self, steps: int, like: Tensor) -> bool:
+        worth_it = self._mode == "always" or (self._mode == "auto" and steps * like.numel() >= _WORTH_COMPILING)
+        return worth_it and can_compile(like.device)
+
+    def _compiled_drive(self, follower: Follower, leader: Leader, p: _Parameters) -> tuple[Follower, Tensor, Tensor]:
+        """Takes all steps of one tile, in blocks; what is left over goes step by step."""
+        if follower.speed.numel() == 1:  # a batch of one would be compiled for itself
+            return _stepper(self.model, self.dt)(follower, leader, p)
         steps = len(leader.position)
-        take = self._stepper(follower, steps)
+        cuts = [*range(0, steps - _BLOCK + 1, _BLOCK)]
+        cuts = [*cuts, *range(_BLOCK * len(cuts), steps), steps]
         positions, speeds = [], []
-        done = 0
-        while done < steps:
-            size = _BLOCK if steps - done >= _BLOCK else 1
-            block = slice(done, done + size)
-            out = take(*follower, leader.position[block], leader.speed[block], leader.acceleration[block], leader.length, dict(p))
-            follower = Follower(*out[:4])
-            positions.append(out[4])
-            speeds.append(out[5])
-            done += size
+        for first, last in zip(cuts, cuts[1:], strict=False):
+            take = _compiled_stepper(self.model, self.dt, last - first)
+            follower, position, speed = take(follower, _frames(leader, first, last), p)
+            positions.append(position)
+            speeds.append(speed)
         return follower, torch.cat(positions), torch.cat(speeds)
 
-    def _stepper(self, follower: Follower, steps: int) -> Callable[..., tuple[Tensor, ...]]:
-        worth_it = self._mode == "always" or (self._mode == "auto" and steps * follower.speed.numel() >= _WORTH_COMPILING)
-        if not worth_it or torch.is_grad_enabled() or not can_compile(follower.speed.device):
-            return self._take
-        if self._compiled is None:
-            self._compiled = torch.compile(self._take, dynamic=True)
-        return self._compiled
 
-    def _take(
-        self,
-        position: Tensor,
-        speed: Tensor,
-        acceleration: Tensor,
-        memory: Tensor,
-        leader_position: Tensor,
-        leader_speed: Tensor,
-        leader_acceleration: Tensor,
-        leader_length: Tensor,
-        p: dict[str, Tensor],
-    ) -> tuple[Tensor, ...]:
-        follower = Follower(position, speed, acceleration, memory)
+def _stepper(model: DrivingModel, dt: float) -> _Step:
+    """Returns the function that takes all steps of a leader's frames; `advance` without its layout."""
+
+    def take(follower: Follower, leader: Leader, p: _Parameters) -> tuple[Follower, Tensor, Tensor]:
         positions, speeds = [], []
-        for k in range(leader_position.shape[0]):
-            leader = Leader(leader_position[k], leader_speed[k], leader_acceleration[k], leader_length)
-            next_speed = self.model.next_speed(follower, leader, p, self.dt)
-            next_memory = self.model.next_memory(follower, leader, p, self.dt, next_speed)
-            follower = Follower(
-                follower.position + next_speed * self.dt, next_speed, (next_speed - follower.speed) / self.dt, next_memory
-            )
+        for k in range(leader.position.shape[0]):
+            now = Leader(leader.position[k], leader.speed[k], leader.acceleration[k], leader.length)
+            next_speed = model.next_speed(follower, now, p, dt)
+            next_memory = model.next_memory(follower, now, p, dt, next_speed)
+            follower = Follower(follower.position + next_speed * dt, next_speed, (next_speed - follower.speed) / dt, next_memory)
             positions.append(follower.position)
             speeds.append(next_speed)
-        return (*follower, torch.stack(positions), torch.stack(speeds))
+        return follower, torch.stack(positions), torch.stack(speeds)
+
+    return take
+
+
+_COMPILED: dict[tuple[type[DrivingModel], str, float, int], _Step] = {}
+
+
+def _compiled_stepper(model: DrivingModel, dt: float, steps: int) -> _Step:
+    """Returns `_stepper`, compiled for a number of steps; equal models share it."""
+    key = (type(model), model.settings.model_dump_json(), dt, steps)
+    if key not in _COMPILED:
+        # Each model and block has a cache of its own: torch counts recompilations per function, and gives up after eight.
+        _COMPILED[key] = torch.compile(_stepper(model, dt), dynamic=True, isolate_recompiles=True)
+    return _COMPILED[key]
 
 
 def can_compile(device: torch.device) -> bool:
     """Says whether `torch.compile` has what it needs here: a C++ compiler for the CPU, Triton for CUDA."""
     if device.type == "cuda":
         return torch.utils._triton.has_triton()
-    return any(shutil.which(name) for name in ("g++", "clang++", "c++"))
+    return device.type == "cpu" and any(shutil.which(name) for name in ("g++", "clang++", "c++"))
+
+
+class _Tile:
+    """A rectangle of a batch that is seen as rows and columns, `(prod(batch[:-1]), batch[-1])`.
+
+    Everything inside a tile is one-dimensional and contiguous, whatever the caller's batch looks like: one compiled function
+    serves all of them.
+    """
+
+    def __init__(self, batch: torch.Size, rows: slice, columns: slice) -> None:
+        self._batch = batch
+        self._grid = (batch[:-1].numel(), batch[-1]) if batch else (1, 1)
+        self._rows, self._columns = rows, columns
+        self.shape = (rows.stop - rows.start, columns.stop - columns.start)
+
+    def rows(self, whole: Tensor) -> Tensor:
+        """Returns the tile of a contiguous `(time, *batch)` as a view `(time, rows, columns)`."""
+        return whole.view(-1, *self._grid)[:, self._rows, self._columns]
+
+    def follower(self, follower: Follower) -> Follower:
+        return Follower(*(self._flat(state) for state in follower[:3]), self._flat_memory(follower.memory))
+
+    def leader(self, leader: Leader) -> Leader:
+        moving = (self._flat_frames(signal) for signal in leader[:3])
+        return Leader(*moving, self._flat(leader.length))
+
+    def parameters(self, p: Mapping[str, Tensor]) -> _Parameters:
+        """Constants stay 0-dimensional: they cost no memory traffic."""
+        return {name: value if value.dim() == 0 else self._flat(value) for name, value in p.items()}
+
+    def put(self, end: Follower, last: Follower) -> None:
+        """Writes the tile's last state into the whole batch's."""
+        for whole, part in zip(end[:3], last[:3], strict=True):
+            self.rows(whole[None])[0].copy_(part.view(self.shape))
+        if end.memory.shape[-1]:
+            whole = end.memory.view(*self._grid, -1)
+            whole[self._rows, self._columns].copy_(last.memory.view(*self.shape, -1))
+
+    def _flat(self, value: Tensor) -> Tensor:
+        return value.expand(self._batch).reshape(self._grid)[self._rows, self._columns].reshape(-1)
+
+    def _flat_frames(self, signal: Tensor) -> Tensor:
+        frames = len(signal)
+        lead = (1,) * (len(self._batch) - signal.dim() + 1)
+        whole = signal.reshape(frames, *lead, *signal.shape[1:]).expand(frames, *self._batch).reshape(frames, *self._grid)
+        return whole[:, self._rows, self._columns].reshape(frames, -1)
+
+    def _flat_memory(self, memory: Tensor) -> Tensor:
+        width = memory.shape[-1]
+        whole = memory.reshape(*self._grid, width)[self._rows, self._columns]
+        return whole.reshape(self.shape[0] * self.shape[1], width)
+
+
+def _tile_size(like: Tensor) -> int:
+    """Returns how many followers one tile holds; on an accelerator, all."""
+    if like.device.type != "cpu":
+        return max(1, like.numel())
+    return _TILE_BYTES * torch.get_num_threads() // like.element_size()
+
+
+def _tiles(batch: torch.Size, size: int) -> Iterator[_Tile]:
+    """Cuts a batch into tiles of at most `size` followers: whole rows, or parts of one."""
+    rows, columns = (batch[:-1].numel(), batch[-1]) if batch else (1, 1)
+    width = min(size, columns)
+    height = max(1, size // max(1, width)) if width == columns else 1
+    for top in range(0, rows, height):
+        for left in range(0, columns, width):
+            yield _Tile(batch, slice(top, min(top + height, rows)), slice(left, min(left + width, columns)))
+
+
+def _frames(leader: Leader, first: int, last: int) -> Leader:
+    return Leader(leader.position[first:last], leader.speed[first:last], leader.acceleration[first:last], leader.length)
 
 
 def simulate(
@@ -153,33 +256,36 @@ def simulate(
         parameters: `(*batch, n)` tuned parameters, constant; or `(*batch, windows, n)` with `window` given, one set for each
             `window` steps (the last set is kept if the drive is longer); or a mapping name -> value, the others at their
             defaults; or None for all defaults.
-        leader: `(*batch, time)` each, its length `(*batch,)`; broadcasts over the followers' batch.
+        leader: `(*batch, time)` each, its length `(*batch,)`.
         start: the followers at frame 0, `(*batch,)`.
         dt: time step, s.
         window: steps for which one set of parameters holds.
+        compile: `auto` compiles where that pays.
+
+    The leading dimensions of `parameters`, `leader` and `start` broadcast: a leader `(pairs, 1, time)` drives ahead of
+    candidates `(pairs, candidates, n)`.
 
     Returns:
         Frames 0 to time - 1, `(*batch, time)`.
 
     Raises:
-        ParameterError: the number of parameters, a name or a value does not fit the model.
+        ParameterError: the number of parameters or a name does not fit the model, or `window` does not fit their shape. Values
+            outside the bounds are simulated as they are.
     """
+    windows = _windows(model, parameters, start.speed, leader.position.shape[-1] - 1, window)
+    shapes = [leader.position.shape[:-1], leader.length.shape, *(state.shape for state in start)]
+    batch = torch.broadcast_shapes(*shapes, *(value.shape for _, _, p in windows for value in p.values()))
     simulator = Simulator(model, dt, compile=compile)
-    follower = simulator.begin(start)
-    frames = leader.position.shape[-1]
-    windows = _windows(model, parameters, start.speed, frames - 1, window)
+    follower = simulator.begin(Start(*(state.expand(batch) for state in start)))
     in_time = Leader(_time_first(leader.position), _time_first(leader.speed), _time_first(leader.acceleration), leader.length)
-    positions, speeds = [start.position[None]], [start.speed[None]]
+    positions, speeds = [follower.position[None]], [follower.speed[None]]
     for first, last, p in windows:
-        step = slice(first, last)
-        ahead = Leader(in_time.position[step], in_time.speed[step], in_time.acceleration[step], leader.length)
-        follower, position, speed = simulator.advance(follower, ahead, p)
+        follower, position, speed = simulator.advance(follower, _frames(in_time, first, last), p)
         positions.append(position)
         speeds.append(speed)
-    position = torch.cat([piece.expand(-1, *follower.speed.shape) for piece in positions]).movedim(0, -1)
-    speed = torch.cat([piece.expand(-1, *follower.speed.shape) for piece in speeds]).movedim(0, -1)
+    position = torch.cat(positions).movedim(0, -1)
     gap = leader.position - leader.length[..., None] - position
-    return Trajectory(position, speed, gap, gap < 0)
+    return Trajectory(position, torch.cat(speeds).movedim(0, -1), gap, gap < 0)
 
 
 def _time_first(signal: Tensor) -> Tensor:
@@ -192,22 +298,17 @@ def _windows(
     like: Tensor,
     steps: int,
     window: int | None,
-) -> list[tuple[int, int, dict[str, Tensor]]]:
+) -> list[tuple[int, int, _Parameters]]:
     """Returns (first step, last step, parameters by name) of each stretch with constant parameters."""
     space = model.space
     if not isinstance(parameters, Tensor):
         given = dict(parameters or {})
         for name in given:
             space[name]
-        return [
-            (
-                0,
-                steps,
-                {p.name: torch.as_tensor(given.get(p.name, p.default), dtype=like.dtype, device=like.device) for p in space},
-            )
-        ]
+        named = {p.name: torch.as_tensor(given.get(p.name, p.default), dtype=like.dtype, device=like.device) for p in space}
+        return [(0, steps, named)]
     if window is None:
-        return [(0, steps, space.unpack(parameters))]
+        return [(0, steps, space.unpack(_columns(parameters)))]
     if window < 1 or parameters.dim() < 2:
         raise ParameterError(
             f"window={window}: parameters per window need a window of at least one step and shape (*batch, windows, n)"
@@ -217,4 +318,10 @@ def _windows(
         raise ParameterError("parameters per window: got no window")
     cuts = [*range(0, min(steps, count * window), window)]
     ends = [*cuts[1:], steps]
-    return [(a, b, space.unpack(parameters[..., k, :])) for k, (a, b) in enumerate(zip(cuts, ends, strict=True))]
+    columns = _columns(parameters)
+    return [(a, b, space.unpack(columns[..., k, :])) for k, (a, b) in enumerate(zip(cuts, ends, strict=True))]
+
+
+def _columns(parameters: Tensor) -> Tensor:
+    """Returns the same tensor with each parameter contiguous in memory, as a step reads them."""
+    return parameters.movedim(-1, 0).contiguous().movedim(0, -1)

@@ -17,8 +17,8 @@ class ServedPolicy(PythonModel):
 
         self._policy = TrainedPolicy.load(context.artifacts["policy"])
 
-    def predict(self, context: Any, model_input: Any, params: Any = None) -> pd.DataFrame:  # noqa: ARG002 - MLflow's signature
-        return self._policy.predict_frame(pd.DataFrame(model_input))
+    def predict(self, context: Any, model_input: pd.DataFrame, params: Any = None) -> pd.DataFrame:  # noqa: ARG002 - MLflow's
+        return self._policy.predict_frame(model_input)
 
 
 mlflow.models.set_model(ServedPolicy())

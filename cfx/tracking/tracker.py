@@ -121,14 +121,17 @@ class MlflowTracker(Tracker):
         model_uri: address of the logged policy, "" before there is one.
     """
 
-    def __init__(self, store: Store, run_id: str, sweep: str | None, parent_id: str | None, plugins: Mapping[str, str]) -> None:
+    def __init__(
+        self, store: Store, run_id: str, name: str, sweep: str | None, parent_id: str | None, plugins: Mapping[str, str]
+    ) -> None:
         self.store = store
         self.run_id = run_id
         self.model_uri = ""
-        self.link = f"#/experiments/{store.experiment_id}/runs/{run_id}"
+        self.link = f"#/experiments/{store.experiment_id}/runs/{run_id}?workflowType=machine_learning"
         self._sweep = sweep
         self._parent_id = parent_id
         self._plugins = plugins
+        self._model_name = re.sub(r"[^\w -]", "-", name) or "policy"
         self._tables: list[dict[str, str]] = []
 
     @classmethod
@@ -176,7 +179,7 @@ class MlflowTracker(Tracker):
                 parent_id = _sweep_parent(store, sweep)
                 every |= {"cfx.sweep": _safe(sweep), "mlflow.parentRunId": parent_id}
             run_id = _begin(store, run_name, known, every)
-        tracker = cls(store, run_id, sweep, parent_id, plugins or {})
+        tracker = cls(store, run_id, run_name, sweep, parent_id, plugins or {})
         try:
             yield tracker
         except BaseException as error:
@@ -227,7 +230,7 @@ class MlflowTracker(Tracker):
 
             client = self.store.client
             model = client.create_logged_model(
-                self.store.experiment_id, name="policy", source_run_id=self.run_id, model_type="cfx policy", tags=None
+                self.store.experiment_id, name=self._model_name, source_run_id=self.run_id, model_type="cfx policy"
             )
             path = Path(temporary) / "model"
             mlflow.pyfunc.save_model(
@@ -288,10 +291,16 @@ class MlflowTracker(Tracker):
 
 
 def sweep_link(experiment_id: str, sweep: str) -> str:
-    """Returns the part of the address after the server's that shows the jobs of a sweep side by side."""
-    return f"#/experiments/{experiment_id}/runs?" + urlencode(
-        {"searchFilter": f"tags.`cfx.sweep` = '{_safe(sweep)}'", "workflowType": "machine_learning"}, quote_via=quote
-    )
+    """Returns the part of the address after the server's that shows the jobs of a sweep side by side, the best first."""
+    asked = {
+        "searchFilter": f"tags.`cfx.sweep` = '{_safe(sweep)}'",
+        # Sorted by date, MLflow's page would fold the jobs away under their parent, and draw no charts.
+        "orderByKey": "metrics.`rmse_improvement/mean`",
+        "orderByAsc": "false",
+        "compareRunsMode": "CHART",
+        "workflowType": "machine_learning",
+    }
+    return f"#/experiments/{experiment_id}/runs?" + urlencode(asked, quote_via=quote)
 
 
 def download_run(run_id: str, uri: str | None = None) -> Path:

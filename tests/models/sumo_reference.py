@@ -76,7 +76,9 @@ def _network(runs: list[Job]) -> str:
     for i in range(len(runs)):
         y = 100 * i
         lines.append(f'<junction id="from{i}" type="dead_end" x="0" y="{y}" incLanes="" intLanes="" shape="0,{y}"/>')
-        lines.append(f'<junction id="to{i}" type="dead_end" x="{length}" y="{y}" incLanes="road{i}_0" intLanes="" shape="{length},{y}"/>')
+        lines.append(
+            f'<junction id="to{i}" type="dead_end" x="{length}" y="{y}" incLanes="road{i}_0" intLanes="" shape="{length},{y}"/>'
+        )
     return "\n".join([*lines, "</net>"])
 
 
@@ -84,7 +86,9 @@ def _routes(runs: list[Job]) -> str:
     lines = ["<routes>"]
     for i, run in enumerate(runs):
         given = " ".join(f'{name}="{value!r}"' for name, value in run["parameters"].items())
-        lines.append(f'<vType id="lead{i}" length="{run["leader_length"]!r}" maxSpeed="{_FAST}" sigma="0" speedFactor="1" speedDev="0"/>')
+        lines.append(
+            f'<vType id="lead{i}" length="{run["leader_length"]!r}" maxSpeed="{_FAST}" sigma="0" speedFactor="1" speedDev="0"/>'
+        )
         lines.append(f'<vType id="drive{i}" carFollowModel="{run["model"]}" sigma="0" speedFactor="1" speedDev="0" {given}/>')
         lines.append(f'<route id="route{i}" edges="road{i}"/>')
     for i, run in enumerate(runs):

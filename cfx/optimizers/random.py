@@ -1,0 +1,66 @@
+"""Random search over a scrambled Sobol sequence: the yardstick of every optimizer, and nearly free where simulation is batched.
+
+I. M. Sobol' (1967), *On the distribution of points in a cube and the approximate evaluation of integrals*; scrambling after
+A. B. Owen (1998) and J. Matousek (1998), as PyTorch implements it.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from cfx.component import Settings
+from cfx.errors import ConfigError
+from cfx.optimizers.base import Objective, Optimizer
+
+_AT_ONCE = 512
+"""Candidates of one problem in one call of the objective: its intermediate values then stay small whatever `samples` is."""
+
+
+class RandomSettings(Settings):
+    samples: int = Field(4096, ge=1, description="evaluations of each problem, guesses included")
+
+
+class RandomSearch(Optimizer):
+    """Evaluates the guesses and the same scrambled Sobol points in every problem.
+
+    The points are the same for every problem, so that neighbouring windows are compared on the same ground, and a problem's
+    result does not depend on its companions.
+    """
+
+    schema: ClassVar[type[Settings]] = RandomSettings
+    settings: RandomSettings
+
+    def evaluations(self) -> int:
+        return self.settings.samples
+
+    def evaluations_at_once(self) -> int:
+        return min(_AT_ONCE, self.settings.samples)
+
+    def bytes_per_problem(self, n: int) -> int:
+        return 8 * self.evaluations_at_once() * (n + 2)
+
+    def solve(self, objective: Objective, guesses: Tensor, *, seed: int) -> tuple[Tensor, Tensor]:
+        problems, g, n = guesses.shape
+        points = sobol(self.settings.samples - g, n, seed=seed, like=guesses, key="samples", guesses=g)
+        losses = [objective(guesses)]
+        losses += [objective(block.expand(problems, -1, -1)) for block in points.split(_AT_ONCE)]
+        return torch.cat([guesses, points.expand(problems, -1, -1)], dim=1), torch.cat(losses, dim=1)
+
+
+def sobol(count: int, n: int, *, seed: int, like: Tensor, key: str, guesses: int) -> Tensor:
+    """Returns `count` scrambled Sobol points `(count, n)` within [0, 1], float64, on the device of `like`.
+
+    Args:
+        key: setting that has to be raised if `guesses` leave no room, for the error message.
+
+    Raises:
+        ConfigError: `count` is negative.
+    """
+    if count < 0:
+        raise ConfigError(f"optimizer.{key}={count + guesses}: the {guesses} first guesses alone are more; set optimizer.{key} >= {guesses}")
+    points = torch.quasirandom.SobolEngine(n, scramble=True, seed=seed).draw(count, dtype=torch.float64)
+    return points.to(like.device)

@@ -1,0 +1,198 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from cfx.calibration.cache import Cache
+from cfx.calibration.calibrator import Calibrator
+from cfx.calibration.objective import DriveObjective
+from cfx.calibration.windows import Windows, WindowSettings
+from cfx.errors import OutputError
+from cfx.models.base import DrivingModel
+from cfx.models.krauss import Krauss
+from cfx.models.w99 import W99
+from cfx.optimizers.base import Objective
+from cfx.optimizers.random import RandomSearch
+from cfx.pairs import PairBatch, PairSet
+from cfx.progress import Task
+from cfx.simulation.rollout import Simulator
+from tests.drives import straight_pairs, wavy_pairs
+
+SETTINGS = WindowSettings()
+TRUE = torch.tensor([[1.2, 0.1], [2.0, 0.4], [3.0, 0.8]], dtype=torch.float64)
+
+
+class Counting(RandomSearch):
+    """Counts the problems it is given, and may be interrupted."""
+
+    def __init__(self, samples: int = 64, stop_after: int = 10**9) -> None:
+        super().__init__(samples=samples)
+        self.solved = 0
+        self.stop_after = stop_after
+
+    def solve(self, objective: Objective, guesses: Tensor, *, seed: int) -> tuple[Tensor, Tensor]:
+        if self.solved + len(guesses) > self.stop_after:
+            raise KeyboardInterrupt
+        self.solved += len(guesses)
+        return super().solve(objective, guesses, seed=seed)
+
+
+def calibrator(optimizer: RandomSearch, folder: Path | None = None, model: DrivingModel | None = None, **changes: object) -> Calibrator:
+    arguments = {"seed": 0, "cache": Cache(folder), "memory": 1 << 28, "progress": Task} | changes
+    return Calibrator(Simulator(model or Krauss(), 0.1), optimizer, **arguments)  # type: ignore[arg-type]  # the test's own mix
+
+
+def everything(tool: Calibrator, pairs: PairSet) -> tuple[Tensor, Tensor]:
+    batch = PairBatch.of(pairs)
+    last = torch.full((len(pairs),), 200)
+    fixed = tool.fixed(pairs, batch, last)
+    windows = Windows.of(torch.full((len(pairs),), 40), SETTINGS)
+    return fixed, tool.labels(pairs, batch, windows, fixed).parameters
+
+
+@pytest.mark.parametrize(
+    ("model", "true", "tolerance"),
+    [
+        # The brake build-up time acts only while the leader brakes: it is found, but less sharply.
+        (Krauss(), TRUE, {"t_r": 0.01, "t_i": 0.1}),
+        # Only what the drive excites can be found: the gap kept, not thresholds that were never crossed.
+        (W99(parameters={name: {"tuned": False} for name in ("cc3", "cc4", "cc5", "cc6", "cc7", "cc9")}),
+         torch.tensor([[2.0, 1.0, 6.0, 2.0], [3.0, 1.5, 4.0, 3.0]], dtype=torch.float64), {"cc1": 0.04}),
+    ],
+    ids=["krauss", "w99"],
+)  # fmt: skip
+def test_constant_true_parameters_are_recovered(model: DrivingModel, true: Tensor, tolerance: dict[str, float]) -> None:
+    pairs = wavy_pairs(model, true, frames=400)
+    tool = calibrator(RandomSearch(samples=4096), model=model)
+    fixed = tool.fixed(pairs, PairBatch.of(pairs), torch.full((len(pairs),), 320))
+    low, high = model.space.bounds()
+    error = dict(zip(model.space.names, ((fixed - true).abs() / (high - low)).amax(0).tolist(), strict=True))
+    assert all(error[name] < limit for name, limit in tolerance.items()), error
+
+
+def test_labels_of_a_driver_who_changes_follow_him() -> None:
+    model = Krauss()
+    first, second = (wavy_pairs(model, torch.tensor([[t_r, 0.1]], dtype=torch.float64), seed=3) for t_r in (1.0, 2.5))
+    pairs = PairSet((first[0], replace(second[0], pair_id="p1")), "test")
+    batch = PairBatch.of(pairs)
+    windows = Windows.of(torch.tensor([40, 40]), SETTINGS)
+    labels = calibrator(RandomSearch(samples=1024)).labels(pairs, batch, windows, torch.tensor([[1.7, 0.1], [1.7, 0.1]]).double())
+    told = labels.spread > labels.spread.median()
+    medians = [float(labels.parameters[(windows.pair == p) & told, 0].median()) for p in (0, 1)]
+    assert medians[0] == pytest.approx(1.0, abs=0.3)
+    assert medians[1] == pytest.approx(2.5, abs=0.3)
+    assert float(labels.loss.max()) < 0.05
+
+
+def test_windows_that_determine_nothing_get_the_fixed_parameters() -> None:
+    """Far behind its leader every candidate drives alike at the maximum speed."""
+    model = Krauss(parameters={"v_max": {"default": 10.0}})
+    pairs = straight_pairs([100])
+    far = replace(pairs[0], leader_position=pairs[0].leader_position + 1e5)
+    pairs = PairSet((far,), "test")
+    fixed = torch.tensor([[2.345, 0.678]], dtype=torch.float64)
+    windows = Windows.of(torch.tensor([10]), SETTINGS)
+    labels = calibrator(RandomSearch(samples=256), model=model).labels(pairs, PairBatch.of(pairs), windows, fixed)
+    torch.testing.assert_close(labels.parameters, fixed.expand(10, 2))
+    assert float(labels.spread.max()) == 0
+
+
+def test_the_second_time_nothing_is_calibrated_again(tmp_path: Path) -> None:
+    pairs = wavy_pairs(Krauss(), TRUE)
+    first = Counting()
+    before = everything(calibrator(first, tmp_path), pairs)
+    assert first.solved == 3 + 120
+    second = Counting()
+    after = everything(calibrator(second, tmp_path), pairs)
+    assert second.solved == 0
+    for one, two in zip(before, after, strict=True):
+        assert torch.equal(one, two)
+
+
+@pytest.mark.parametrize(
+    ("model", "changes", "samples"),
+    [
+        (Krauss(parameters={"t_r": {"high": 6.0}}), {}, 64),
+        (Krauss(parameters={"b": {"default": 3.0}}), {}, 64),
+        (Krauss(), {"seed": 1}, 64),
+        (Krauss(), {}, 65),
+        (Krauss(variant="sumo"), {}, 64),
+    ],
+    ids=["bounds", "constant", "seed", "optimizer", "settings"],
+)
+def test_whatever_matters_makes_a_new_entry(tmp_path: Path, model: DrivingModel, changes: dict[str, object], samples: int) -> None:
+    pairs = wavy_pairs(Krauss(), TRUE)
+    everything(calibrator(Counting(), tmp_path), pairs)
+    again = Counting(samples)
+    everything(calibrator(again, tmp_path, model, **changes), pairs)
+    assert again.solved == 123
+
+
+def test_other_data_is_not_mistaken(tmp_path: Path) -> None:
+    pairs = wavy_pairs(Krauss(), TRUE)
+    everything(calibrator(Counting(), tmp_path), pairs)
+    nudged = replace(pairs[1], follower_speed=pairs[1].follower_speed + 1e-9)
+    again = Counting()
+    everything(calibrator(again, tmp_path), PairSet((pairs[0], nudged, pairs[2]), "test"))
+    assert again.solved == 1 + 40
+
+
+def test_an_interrupted_calibration_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cfx.calibration.calibrator._GROUP", 40)
+    pairs = wavy_pairs(Krauss(), TRUE)
+    whole = everything(calibrator(Counting()), pairs)
+    interrupted = Counting(stop_after=3 + 80)
+    with pytest.raises(KeyboardInterrupt):
+        everything(calibrator(interrupted, tmp_path), pairs)
+    rest = Counting()
+    resumed = everything(calibrator(rest, tmp_path), pairs)
+    assert rest.solved == 40
+    for one, two in zip(whole, resumed, strict=True):
+        assert torch.equal(one, two)
+
+
+def test_a_damaged_entry_is_computed_again(tmp_path: Path) -> None:
+    pairs = wavy_pairs(Krauss(), TRUE)
+    everything(calibrator(Counting(), tmp_path), pairs)
+    entries = sorted(tmp_path.rglob("*.npz"))
+    assert len(entries) == 6
+    entries[0].write_bytes(entries[0].read_bytes()[:50])
+    entries[1].write_bytes(b"")
+    np.savez(entries[2], parameters=np.array([object()], dtype=object), allow_pickle=True)
+    again = Counting()
+    everything(calibrator(again, tmp_path), pairs)
+    assert again.solved > 0
+    assert not list(tmp_path.rglob("*.tmp"))
+
+
+def test_a_cache_that_cannot_be_written_is_said(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match=r"cannot write the calibration cache.*cache\.enabled=false"):
+        everything(calibrator(Counting(), tmp_path / "file"), wavy_pairs(Krauss(), TRUE))
+
+
+def test_the_objective_is_the_rmse_of_the_rollout() -> None:
+    from cfx.models.base import Leader
+    from cfx.simulation.rollout import Start, simulate
+
+    model = Krauss()
+    pairs = wavy_pairs(model, TRUE)
+    batch = PairBatch.of(pairs)
+    pair, first, steps = torch.tensor([0, 2]), torch.tensor([10, 50]), torch.tensor([7, 20])
+    objective = DriveObjective.of_segments(Simulator(model, 0.1), batch, pair, first, steps)
+    candidates = torch.rand((2, 5, 2), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    losses = objective(candidates)
+    for i in range(2):
+        frames = slice(int(first[i]), int(first[i] + steps[i]) + 1)
+        leader = Leader(*(x[pair[i], frames] for x in (batch.leader_position, batch.leader_speed, batch.leader_acceleration)), batch.leader_length[pair[i]])
+        begin = Start(*(x[pair[i], first[i]] for x in (batch.follower_position, batch.follower_speed, batch.follower_acceleration)))
+        for j in range(5):
+            drive = simulate(model, model.space.from_unit(candidates[i, j]), leader, begin, 0.1)
+            expected = (drive.speed[1:] - batch.follower_speed[pair[i], frames][1:]).square().mean().sqrt()
+            torch.testing.assert_close(losses[i, j], expected)
+    torch.testing.assert_close(objective.select(1, 2)(candidates[1:]), losses[1:])

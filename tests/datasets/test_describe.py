@@ -1,0 +1,54 @@
+"""`data describe`: what a file holds, in words."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from cfx.datasets.describe import describe
+from cfx.datasets.synthetic import SyntheticDataset
+from cfx.datasets.tidy import write_tidy
+from cfx.errors import DataError
+
+
+def test_describes_real_tidy_pairs(shared_data: Path) -> None:
+    text = describe(shared_data / "i80_reconstructed_pairs.parquet")
+    for words in ("147,521", "i80-0400 (113 pairs), i80-0500 (116 pairs)", "229 of 221 drivers", "0.1 s", "Left out: nothing"):
+        assert words in text
+    line = next(line for line in text.splitlines() if "at least 700" in line)
+    assert line.split()[-1] == "71"
+
+
+def test_describes_a_real_raw_recording(shared_data: Path) -> None:
+    text = describe(shared_data / "i80_0400_raw_sample.csv.gz")
+    for words in ("NGSIM (feet)", "110,905", "222", "145 of 142 drivers", "42,566 rows: no vehicle ahead", "data=ngsim"):
+        assert words in text
+
+
+def test_describes_synthetic_pairs_with_their_truth(tmp_path: Path) -> None:
+    write_tidy(SyntheticDataset(pairs=2, frames=50).load(), tmp_path / "s.csv")
+    text = describe(tmp_path / "s.csv")
+    assert "known, of krauss" in text
+    assert "Problems: none found" in text
+
+
+def test_points_at_what_looks_wrong(tmp_path: Path) -> None:
+    pairs = SyntheticDataset(pairs=2, frames=50, noise_position_m=1.0).load()
+    write_tidy(pairs, tmp_path / "s.csv")
+    assert "position moves 1 m more or less" in describe(tmp_path / "s.csv")
+
+
+def test_a_file_that_cannot_be_used_says_why(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no such file"):
+        describe(tmp_path / "none.csv")
+    (tmp_path / "x.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(DataError, match="is missing"):
+        describe(tmp_path / "x.csv")
+
+
+def test_needs_no_torch() -> None:
+    code = "import sys, cfx.datasets.describe, cfx.datasets.synthetic; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

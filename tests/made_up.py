@@ -1,0 +1,144 @@
+"""Results of a job that never ran: made up, but shaped like the real thing. For tests of figures and tracking."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from cfx.evaluation.result import METHODS, Drive, Evaluation, Improvement
+from cfx.parameters import Parameter, ParameterSpace
+from cfx.style.result import CLUSTERS, StyleResult
+
+TWO = ParameterSpace.of(
+    Parameter("t_r", "s", 0.1, 10.0, 1.5, "reaction time"), Parameter("t_i", "s", 0.0, 2.0, 0.15, "brake build-up time")
+)
+INDICATORS = (
+    "mean_speed",
+    "variance_speed",
+    "mean_acceleration",
+    "variance_acceleration",
+    "mean_space_headway",
+    "mean_time_headway",
+)
+
+
+@dataclass(frozen=True)
+class MadeUp:
+    evaluation: Evaluation
+    style: StyleResult
+    curves: pd.DataFrame
+
+
+def make_results(
+    pairs: int = 26,
+    frames: int = 150,
+    space: ParameterSpace = TWO,
+    seed: int = 0,
+    epochs: int = 60,
+    networks: int | None = None,
+) -> MadeUp:
+    """Makes up an evaluation, a style and learning curves (one network per pair unless told)."""
+    rng = np.random.default_rng(seed)
+    drives = tuple(make_drive(k, frames, space, rng) for k in range(pairs))
+    table = pd.DataFrame([row for k, drive in enumerate(drives) for row in rows_of(k, drive, space)])
+    bounds = np.array([[p.low for p in space.tuned], [p.high for p in space.tuned]])
+    evaluation = Evaluation(table, summarize(table), drives, space.names, tuple(p.unit for p in space.tuned), bounds)
+    curves = make_curves(pairs if networks is None else networks, epochs, seed)
+    return MadeUp(evaluation, make_style([drive.driver for drive in drives], rng), curves)
+
+
+def make_drive(k: int, frames: int, space: ParameterSpace, rng: np.random.Generator) -> Drive:
+    low, high = np.array([p.low for p in space.tuned]), np.array([p.high for p in space.tuned])
+    time = 56.0 + 0.1 * np.arange(frames + 1)
+    leader = np.clip(8 + 5 * np.sin(0.25 * time + k) + 2.0 * np.sin(0.9 * time + 2 * k), 0, None)
+    smooth = np.convolve(np.pad(leader, (12, 0), mode="edge"), np.ones(13) / 13, "valid")
+    real = np.clip(smooth + 0.15 * np.sin(2 * time), 0, None)
+    real_gap = 12 + 2 * (k % 4) + 0.1 * np.cumsum(leader - real)
+    size = {"default": 2.6 * (1 + k % 3), "fixed": 0.9 * rng.uniform(0.6, 1.4), "policy": 0.75 * rng.uniform(0.5, 1.6)}
+    wave = np.sin(0.45 * (time - time[0]) * (1 + 0.05 * k)) * (1 - np.exp(-(time - time[0]) / 2))
+    speed = {method: np.clip(real + error * wave, 0, None) for method, error in size.items()}
+    gap = {method: real_gap - 0.1 * np.cumsum(speed[method] - real) for method in size}
+    best = low + (high - low) * rng.uniform(0.1, 0.5, len(low))
+    windows = np.arange(frames + 1) // 5
+    wander = np.cumsum(rng.normal(0, 0.012, (windows[-1] + 1, len(low))), axis=0)[windows]
+    parameters = {
+        "default": np.tile([p.default for p in space.tuned], (frames + 1, 1)),
+        "fixed": np.tile(best, (frames + 1, 1)),
+        "policy": np.clip(best + wander * (high - low), low, high),
+    }
+    number = 1000 + 7 * k
+    return Drive(f"i80-0400-{number}-{number - 10}", f"i80-0400/{number}", time, leader, real, real_gap, speed, gap, parameters)
+
+
+def rows_of(k: int, drive: Drive, space: ParameterSpace) -> list[dict[str, object]]:
+    rmse = {method: float(np.sqrt(np.mean((drive.speed[method] - drive.real_speed) ** 2))) for method in METHODS}
+    follower, leader = drive.pair_id.split("-")[-2:]
+    return [
+        {
+            "pair_id": drive.pair_id,
+            "recording": "i80-0400",
+            "leader_id": leader,
+            "follower_id": follower,
+            "driver": drive.driver,
+            "cluster": k % 3,
+            "style_score": 0.2 + 0.005 * k,
+            "method": method,
+            "rmse_speed": rmse[method],
+            "rmse_gap": float(np.sqrt(np.mean((drive.gap[method] - drive.real_gap) ** 2))),
+            "improvement": (rmse["fixed"] - rmse[method]) / rmse["fixed"],
+            "collisions": int((drive.gap[method] < 0).any()),
+            "frames": len(drive.time) - 1,
+            "fold": 0,
+            **{f"parameter_{p.name}": float(drive.parameters[method][:, j].mean()) for j, p in enumerate(space.tuned)},
+        }
+        for method in METHODS
+    ]
+
+
+def make_style(drivers: list[str], rng: np.random.Generator) -> StyleResult:
+    scores = np.clip(rng.normal(0.47, 0.13, len(drivers)), 0.02, 0.98)
+    cuts = (float(np.quantile(scores, 0.25)), float(np.quantile(scores, 0.75)))
+    cluster = np.digitize(scores, cuts)
+    table = pd.DataFrame(
+        {"driver": drivers, "score": scores, "cluster": cluster, "cluster_name": [CLUSTERS[c] for c in cluster]}
+        | {name: rng.uniform(0.1, 5, len(drivers)) for name in INDICATORS}
+    )
+    return StyleResult(table, dict(zip(INDICATORS, rng.dirichlet(np.full(6, 4.0)), strict=True)), cuts)
+
+
+def summarize(table: pd.DataFrame) -> Improvement:
+    """A plain stand-in for the evaluation's statistics."""
+    values = table.loc[table["method"] == "policy", "improvement"].to_numpy(dtype=float)
+    finite = np.sort(values[np.isfinite(values)])
+    undefined = len(values) - len(finite)
+    if not len(finite):
+        return Improvement(*[float("nan")] * 7, pairs=0, undefined=undefined)
+    cut, mean = len(finite) // 10, float(finite.mean())
+    half = 1.96 * float(finite.std()) / len(finite) ** 0.5
+    return Improvement(
+        mean=mean,
+        trimmed_mean=float(finite[cut : len(finite) - cut].mean()),
+        median=float(np.median(finite)),
+        ci95_low=mean - half,
+        ci95_high=mean + half,
+        win_rate=float((finite > 0).mean()),
+        p_value=0.03 if len(finite) > 1 else float("nan"),
+        pairs=len(finite),
+        undefined=undefined,
+    )
+
+
+def make_curves(networks: int, epochs: int, seed: int = 0) -> pd.DataFrame:
+    """Learning curves; validation every second epoch, and some networks stopped early."""
+    rng = np.random.default_rng(seed)
+    frames = [pd.DataFrame({"network": [], "epoch": [], "train_loss": [], "validation_loss": []})][: 0 if networks else 1]
+    for k in range(networks):
+        stop = epochs if k % 3 else max(1, epochs * 2 // 3)
+        epoch = np.arange(stop)
+        train = rng.uniform(0.02, 0.05) + rng.uniform(0.3, 0.7) * np.exp(-epoch / rng.uniform(6, 12))
+        train *= rng.lognormal(0, 0.05, stop)
+        validation = np.where(epoch % 2 == 0, 1.2 * train + 0.0004 * epoch, np.nan)
+        frames.append(pd.DataFrame({"network": f"pair {k}", "epoch": epoch, "train_loss": train, "validation_loss": validation}))
+    return pd.concat(frames, ignore_index=True)

@@ -1,0 +1,396 @@
+"""The command line: exit codes, one clear message, multiruns that go on, and plain sub-commands."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import cfx
+from cfx import application, cli, ui
+from cfx.errors import CfxError, ConfigError, DataError
+
+JOB = """
+    import logging, os, signal, sys, time
+    from dataclasses import dataclass
+    from cfx.errors import DataError
+
+    log = logging.getLogger("cfx.jobs_stub")
+
+    @dataclass
+    class Result:
+        metrics: dict
+        folder: object
+        config: object
+
+    def run_job(config, folder):
+        log.info("driving %s", config.model["name"])
+        if config.seed == 1:
+            raise DataError("pairs.csv, row 3: the gap is negative")
+        if config.seed == 2:
+            raise ZeroDivisionError("a bug")
+        if config.seed == 3:
+            raise KeyboardInterrupt
+        if config.seed == 4:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(5)
+        if config.seed == 5:
+            try:
+                raise KeyboardInterrupt
+            except KeyboardInterrupt:
+                sys.exit(1)
+        (folder / "metrics.json").write_text(str(os.getpid()))
+        return Result({"rmse_speed/policy": 0.5}, folder, config)
+"""
+
+Run = Callable[..., int]
+
+
+@pytest.fixture
+def run(install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Returns the application with a job that does what its seed says, started in an empty folder."""
+    install("jobs-stub", {}, {"jobs_stub.py": JOB})
+    monkeypatch.chdir(tmp_path)
+    return lambda *arguments: application.start(arguments, target="jobs_stub:run_job")
+
+
+def outputs(folder: Path) -> list[Path]:
+    """Returns the job folders below, in order."""
+    return sorted(path.parent for path in folder.rglob("metrics.json"))
+
+
+def test_a_job_that_ends_well_exits_with_0_and_leaves_its_log(run: Run, tmp_path: Path, capsys) -> None:
+    assert run("model=w99") == 0
+    (folder,) = outputs(tmp_path)
+    assert folder.name.endswith("-w99-gru")
+    assert "INFO cfx.jobs_stub: driving w99" in (folder / "cfx.log").read_text(encoding="utf-8")
+    printed = capsys.readouterr()
+    assert printed.out == "driving w99\n"
+    assert printed.err == ""
+
+
+def test_a_users_mistake_in_a_job_is_one_sentence_on_stderr_and_in_the_log(run: Run, tmp_path: Path, capsys) -> None:
+    assert run("seed=1") == 2
+    assert capsys.readouterr().err == "pairs.csv, row 3: the gap is negative\n"
+    (log,) = tmp_path.rglob("cfx.log")
+    assert "pairs.csv, row 3: the gap is negative" in log.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("how", ["hydra.verbose=true", "CFX_TRACEBACK", "HYDRA_FULL_ERROR"])
+def test_the_whole_traceback_is_shown_on_request(run: Run, how: str, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    arguments = [how] if "=" in how else []
+    if not arguments:
+        monkeypatch.setenv(how, "1")
+    assert run("seed=1", *arguments) == 2
+    assert "Traceback" in capsys.readouterr().err
+    assert os.environ.get("HYDRA_FULL_ERROR", "") == ("1" if how == "HYDRA_FULL_ERROR" else "")
+
+
+def test_a_bug_shows_its_traceback_and_exits_with_1(run: Run, tmp_path: Path, capsys) -> None:
+    assert run("seed=2") == 1
+    printed = capsys.readouterr().err
+    assert printed.count("Traceback") == 1
+    assert "ZeroDivisionError: a bug" in printed
+    (log,) = tmp_path.rglob("cfx.log")
+    assert "ZeroDivisionError: a bug" in log.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(("seed", "code"), [(3, 130), (5, 130), (4, 143)])
+def test_ctrl_c_and_sigterm_have_their_exit_codes(run: Run, seed: int, code: int, capsys) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    assert run(f"seed={seed}") == code
+    assert "Traceback" not in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["modle=w99"], "modle=w99: there is no key 'modle'. Did you mean 'model'? Known keys: cache"),
+        (["model=kraus"], "model=kraus: there is no model 'kraus'. Did you mean 'krauss'? Known: krauss"),
+        (["policy.hiden_size=3"], "'policy.hiden_size'. Did you mean 'policy.hidden_size'? Known keys of policy: "),
+        (["modl.parameters.t_r.low=3"], "'modl.parameters.t_r.low'. Did you mean 'model.parameters.t_r.low'?"),
+        (["modle=w99", "policy=nope"], "policy=nope: there is no policy 'nope'."),
+        (["seed=-1"], "seed=-1: should be greater than or equal to 0."),
+        (["+sede=1"], "sede: unknown key. Did you mean 'seed'?"),
+        (["plugin"], "plugin: neither key=value nor a sub-command. Did you mean 'plugins'? See cfx --help."),
+        (["model=krauss,w99"], "model=krauss,w99: several values need a multirun; add -m"),
+        (["seed=choice(1,2)"], "seed=choice(1,2): several values need a multirun; add -m"),
+        (["seed=[1"], "seed=[1: cannot be read as key=value (no viable alternative at input '[1')"),
+        (["model=3"], "choose an option by its name, such as model=w99"),
+        (["seed=${nowhere}"], "Interpolation key 'nowhere' not found"),
+        (["hydra.run.dir=outputs/${nowhere}"], "Interpolation key 'nowhere' not found"),
+        (["hydra/launcher=jobli"], "hydra/launcher=jobli: there is no hydra/launcher 'jobli'. Did you mean 'joblib'?"),
+        (["--config-name", "nope"], "Cannot find primary config 'nope'"),
+        (["--config-dir", "nope"], "Additional config directory"),
+        (["--cfg", "job", "--multirun"], "Only one of --run, --multirun, --cfg"),
+        (["-m", "model=krauss,nope"], "model=nope: there is no model 'nope'."),
+        (["--cfg", "job", "-p", "modl"], "package 'modl' not found in config"),
+    ],
+    ids=" ".join,
+)
+def test_a_wrong_command_line_is_one_sentence_and_exit_code_2(run: Run, arguments: list[str], message: str, capsys) -> None:
+    assert run(*arguments) == 2
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert len(printed.splitlines()) == 1
+    assert os.environ.get("HYDRA_FULL_ERROR") is None
+
+
+def test_a_flag_that_does_not_exist_exits_with_2(run: Run, capsys) -> None:
+    assert run("--mulitrun") == 2
+    assert "usage: cfx" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("key", ["hydra.run.dir", "hydra.sweep.dir"])
+def test_an_output_folder_that_cannot_be_written_is_a_sentence(run: Run, tmp_path: Path, key: str, capsys) -> None:
+    (tmp_path / "file").write_text("here already")
+    several = ["-m", "seed=7,8"] if key == "hydra.sweep.dir" else []
+    assert run(*several, f"{key}={tmp_path}/file/below") == 2
+    printed = capsys.readouterr().err
+    assert f"{tmp_path}/file/below: Not a directory; choose an output folder" in printed
+    assert "Traceback" not in printed
+
+
+def test_a_users_yaml_that_is_no_yaml_is_named(run: Run, tmp_path: Path, capsys) -> None:
+    (tmp_path / "mine" / "experiment").mkdir(parents=True)
+    (tmp_path / "mine" / "experiment" / "broken.yaml").write_text("a: [1, 2\nb: 3\n")
+    assert run("--config-dir", "mine", "experiment=broken") == 2
+    printed = capsys.readouterr().err
+    assert "broken.yaml" in printed
+    assert "Traceback" not in printed
+
+
+def test_a_broken_plugin_stops_only_the_job_that_names_it(run: Run, install, capsys) -> None:
+    install("bad-models", {"cfx.models": {"bad": "bad_models:Bad"}}, {"bad_models.py": "raise SystemExit(0)"})
+    assert run("model=bad") == 2
+    assert "bad-models 1.0 cannot be imported: SystemExit: 0" in capsys.readouterr().err
+    assert run("model=krauss") == 0
+    assert run("--help") == 0
+    assert "bad" in capsys.readouterr().out
+
+
+def test_a_multirun_goes_on_after_a_failed_job_and_tells_all_failures(run: Run, tmp_path: Path, capsys) -> None:
+    assert run("-m", "seed=0,1,2,7") == 1
+    printed = capsys.readouterr()
+    assert len(outputs(tmp_path)) == 2
+    assert "2 of 4 jobs done" in printed.out
+    assert "job 1 (seed=1) failed: pairs.csv, row 3: the gap is negative" in printed.err
+    assert "job 2 (seed=2) failed: ZeroDivisionError: a bug" in printed.err
+    summary = [line for line in printed.err.splitlines() if line.startswith("failed: ")]
+    assert [line.partition(" (")[0] for line in summary] == [
+        "failed: seed=1: pairs.csv, row 3: the gap is negative",
+        "failed: seed=2: ZeroDivisionError: a bug",
+    ]
+
+
+def test_a_multirun_whose_failures_are_all_mistakes_exits_with_2(run: Run) -> None:
+    assert run("-m", "seed=0,1") == 2
+
+
+def test_a_multirun_in_small_batches_goes_on_too(run: Run, tmp_path: Path) -> None:
+    assert run("-m", "seed=1,0,7", "hydra.sweeper.max_batch_size=1") == 2
+    assert len(outputs(tmp_path)) == 2
+
+
+def test_outcomes_of_an_earlier_multirun_in_the_same_folder_do_not_count(run: Run, tmp_path: Path, capsys) -> None:
+    again = f"hydra.sweep.dir={tmp_path}/sweep"
+    assert run("-m", "seed=0,1,1", again) == 2
+    assert run("-m", "seed=0", again) == 0
+    assert "1 of 1 jobs done" in capsys.readouterr().out
+
+
+PLUGIN = """
+    from cfx import DrivingModel, Parameter, ParameterSpace
+
+    class Mine(DrivingModel):
+        parameters = ParameterSpace.of(Parameter("tau", "s", 0.5, 3.0, 1.0, "time headway"))
+
+        def next_speed(self, follower, leader, p, dt):
+            return follower.speed
+"""
+
+
+def test_a_multirun_in_worker_processes_composes_a_plugins_model_and_reports_failures(run: Run, install, tmp_path: Path) -> None:
+    install("mine-models", {"cfx.models": {"mine": "mine_models:Mine"}}, {"mine_models.py": PLUGIN})
+    script = "import sys; from cfx.application import start; sys.exit(start(sys.argv[1:], target='jobs_stub:run_job'))"
+    arguments = ["-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "model=mine,krauss", "seed=0,1"]
+    environment = {**os.environ, "PYTHONPATH": str(install.folder)}  # joblib's workers outlive the call: a process of its own
+    command = [sys.executable, "-c", script, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 2, done.stderr
+    assert "2 of 4 jobs done" in done.stdout
+    assert sum(line.startswith("failed: model=") for line in done.stderr.splitlines()) == 2
+    assert len(outputs(tmp_path)) == 2
+    assert all(int((folder / "metrics.json").read_text()) != os.getpid() for folder in outputs(tmp_path))
+
+
+def test_help_lists_the_groups_and_names_only_keys_that_exist(run: Run, capsys) -> None:
+    assert run("--help") == 0
+    printed = capsys.readouterr().out
+    assert "model: krauss, w74, w99" in printed
+    assert "policy: default, fixed, gru, lstm" in printed
+    for override in ("style.cluster=aggressive", "model.parameters.t_r.high=12", "seed=1", "device=cuda", "split=0.7"):
+        assert override in printed
+        assert run("--cfg", "job", override) == 0
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--cfg", "job"], ["--info", "searchpath"], ["--info", "defaults"], ["--hydra-help"]], ids=" ".join
+)
+def test_hydras_own_flags_work(run: Run, arguments: list[str], capsys) -> None:
+    assert run(*arguments) == 0
+    assert capsys.readouterr().out
+
+
+def test_tab_completion_knows_plugins(run: Run, install, capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+    install("mine-models", {"cfx.models": {"mine": "mine_models:Mine"}}, {"mine_models.py": PLUGIN})
+    monkeypatch.setenv("COMP_LINE", "cfx model=")
+    monkeypatch.setenv("COMP_POINT", "10")
+    assert run("-sc", "query=bash") == 0
+    assert "model=mine" in capsys.readouterr().out.split()
+
+
+def test_the_process_is_left_as_it_was(run: Run) -> None:
+    import logging
+
+    before = sys.argv, list(logging.getLogger().handlers), os.getcwd()
+    assert run() == 0
+    assert (sys.argv, list(logging.getLogger().handlers), os.getcwd()) == before
+
+
+def test_cfx_run_runs_the_same_job_into_a_fresh_folder(run: Run, tmp_path: Path) -> None:
+    first = application.run(["model=w99", "seed=7"], target="jobs_stub:run_job")
+    again = application.run(["model=w99", f"hydra.run.dir={first.folder}"], target="jobs_stub:run_job")
+    assert first.config.model["name"] == "w99"  # type: ignore[attr-defined]  # the stub's result
+    assert first.folder.is_relative_to(tmp_path)
+    assert again.folder == first.folder.with_name(f"{first.folder.name}-2")
+    assert "driving w99" in (first.folder / "cfx.log").read_text(encoding="utf-8")
+    assert run("seed=7") == 0  # Hydra is free again
+
+
+@pytest.mark.parametrize(
+    ("overrides", "error", "message"),
+    [
+        (["modle=w99"], ConfigError, "Did you mean 'model'"),
+        (["model=kraus"], ConfigError, "Did you mean 'krauss'"),
+        (["seed=-1"], ConfigError, "seed=-1"),
+        (["seed=1"], DataError, "row 3"),
+        (["hydra.run.dir=file/below"], ConfigError, "choose an output folder"),
+        ("model=w99 policy=gru", ConfigError, r"cfx\.run\(\['model=w99', 'policy=gru'\]\)"),
+    ],
+)
+def test_cfx_run_raises_what_the_command_line_would_print(
+    run: Run, tmp_path: Path, overrides: list[str], error: type[CfxError], message: str
+) -> None:
+    (tmp_path / "file").write_text("here already")
+    with pytest.raises(error, match=message):
+        application.run(overrides, target="jobs_stub:run_job")
+    assert cfx.run is application.run
+
+
+def test_main_takes_its_arguments_from_the_command_line(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", ["cfx", "plugins"])
+    assert cli.main() == 0
+    assert "krauss" in capsys.readouterr().out
+
+
+def test_plugins_lists_metadata_and_loads_nothing(install, capsys) -> None:
+    install("bad-models", {"cfx.models": {"bad": "bad_models:Bad"}}, {"bad_models.py": "raise SystemExit(0)"}, version="3.1")
+    install("twin-models", {"cfx.models": {"krauss": "twin_models:Twin"}}, {"twin_models.py": ""})
+    assert cli.main(["plugins"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    (bad,) = [line for line in lines if " bad " in line]
+    assert bad.split() == ["model", "bad", "bad-models", "3.1", str(install.folder), "not", "loaded"]
+    assert sum("named twice" in line for line in lines) == 2
+    assert "bad_models" not in sys.modules
+
+
+def test_plugins_check_loads_everything_and_exits_with_1_if_one_is_broken(install, capsys) -> None:
+    assert cli.main(["plugins", "check"]) == 0
+    install("bad-models", {"cfx.models": {"bad": "bad_models:Bad"}}, {"bad_models.py": "raise SystemExit(0)"})
+    assert cli.main(["plugins", "check"]) == 1
+    printed = capsys.readouterr()
+    assert "broken: model 'bad'" in printed.out
+    assert "1 broken" in printed.err
+
+
+def test_plugins_show_tells_parameters_settings_and_reference(capsys) -> None:
+    assert cli.main(["plugins", "show", "model", "w99"]) == 0
+    printed = capsys.readouterr().out
+    (row,) = [line for line in printed.splitlines() if line.strip().startswith("cc1 ")]
+    assert "time gap kept above cc0" in row
+    assert "Reference: Wiedemann" in printed
+    assert "sumo: CC8 caps" in printed
+    assert cli.main(["plugins", "show", "data", "tidy"]) == 0
+    assert "required" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["plugins", "show", "model", "w98"], "Did you mean 'w99'"),
+        (["plugins", "show", "mdl", "w99"], "Did you mean 'model'"),
+        (["data", "describe", "nowhere.csv"], "nowhere.csv"),
+    ],
+    ids=" ".join,
+)
+def test_a_sub_commands_mistake_is_one_sentence_and_exit_code_2(arguments: list[str], message: str, capsys) -> None:
+    assert cli.main(arguments) == 2
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert len(printed.splitlines()) == 1
+
+
+def test_data_describe_prints_what_a_recording_holds(shared_data: Path, capsys) -> None:
+    assert cli.main(["data", "describe", str(shared_data / "i80_reconstructed_pairs.parquet")]) == 0
+    assert "71" in capsys.readouterr().out or "pairs" in capsys.readouterr().out
+
+
+def test_ui_starts_mlflow_on_this_machine_only_and_prints_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    started: list[tuple[list[str], dict[str, str]]] = []
+    monkeypatch.setattr(os, "execve", lambda path, command, environment: started.append((command, environment)))
+    monkeypatch.setattr(ui, "_links", lambda store, port: [f"links for {store}"])
+    (tmp_path / "mlflow.db").write_text("")
+    store = f"sqlite:///{tmp_path}/mlflow.db"
+    assert cli.main(["ui", "--uri", store, "--port", "5793"]) == 0
+    ((command, environment),) = started
+    assert command[1:] == [
+        "-m",
+        "mlflow",
+        "ui",
+        "--host",
+        "127.0.0.1",
+        "--port",
+        "5793",
+        "--workers",
+        "1",
+        "--backend-store-uri",
+        store,
+    ]
+    assert environment["MLFLOW_DISABLE_TELEMETRY"] == "true"
+    assert f"links for {store}" in capsys.readouterr().out
+
+
+def test_ui_without_any_tracked_job_or_with_a_taken_port_says_so(tmp_path: Path, capsys) -> None:
+    import socket
+
+    assert cli.main(["ui", "--uri", f"sqlite:///{tmp_path}/none.db"]) == 2
+    assert "no job has been tracked" in capsys.readouterr().err
+    (tmp_path / "mlflow.db").write_text("")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert cli.main(["ui", "--uri", f"sqlite:///{tmp_path}/mlflow.db", "--port", str(port)]) == 2
+    assert f"--port {port} cannot be used" in capsys.readouterr().err
+
+
+def test_ui_on_a_server_says_where_it_is(capsys) -> None:
+    assert cli.main(["ui", "--uri", "http://127.0.0.1:5999"]) == 0
+    assert "http://127.0.0.1:5999" in capsys.readouterr().out

@@ -1,0 +1,136 @@
+"""The house: every module imports from clean, imports go one way, and what must be light stays light."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+import cfx
+
+PACKAGE = Path(cfx.__file__).parent
+
+FLOORS = (
+    ("errors",),
+    ("component",),
+    ("parameters", "pairs", "progress", "console"),
+    ("registry",),
+    ("models",),
+    ("simulation",),
+    ("datasets", "style", "optimizers", "calibration"),
+    ("policies", "learners"),
+    ("evaluation",),
+    ("protocols",),
+    ("tracking", "figures"),
+    ("config", "nodes", "ui", "testing"),
+    ("job", "hydra_source", "mistakes", "application", "cli"),
+)
+"""From the ground up; a room may use rooms on its own floor and below."""
+
+HEIGHT = {room: height for height, floor in enumerate(FLOORS) for room in floor}
+
+HEAVY = ("torch", "lightning", "botorch", "gpytorch", "mlflow", "pandas", "matplotlib", "scipy")
+
+
+def modules() -> list[str]:
+    """Returns the names of all modules of the package."""
+    names = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+        if parts[-1] != "__main__":
+            names.append(".".join(parts[:-1] if parts[-1] == "__init__" else parts))
+    return names
+
+
+def room(module: str) -> str:
+    """Returns the first name below `cfx`, "" for cfx itself."""
+    return [*module.split("."), ""][1]
+
+
+def imported_by(path: Path) -> set[str]:
+    """Returns the rooms that a file imports when it runs, also inside functions; annotations alone do not count."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+            node.body = []
+    rooms = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            rooms |= {room(alias.name) for alias in node.names if alias.name.partition(".")[0] == "cfx"}
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "cfx":
+            rooms |= {room(f"{node.module}.{alias.name}") for alias in node.names}
+    return rooms - {""}
+
+
+def test_every_module_has_its_floor() -> None:
+    assert {room(name) for name in modules()} - {""} == set(HEIGHT)
+
+
+def test_imports_go_one_way() -> None:
+    wrong = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        here = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+        if here in {"__init__", "__main__"}:
+            continue
+        wrong += [
+            f"{path.relative_to(PACKAGE)} imports cfx.{there}"
+            for there in imported_by(path)
+            if there in HEIGHT and HEIGHT[there] > HEIGHT[here]
+        ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_every_module_imports_from_clean() -> None:
+    """A fork for each module, after the heavy libraries are in: circular imports show, and it takes seconds."""
+    script = f"""
+        import importlib, os, sys
+        for heavy in {HEAVY!r}:
+            importlib.import_module(heavy)
+        failed = []
+        for name in {modules()!r}:
+            child = os.fork()
+            if child == 0:
+                try:
+                    importlib.import_module(name)
+                except BaseException as error:
+                    print(f"{{name}}: {{type(error).__name__}}: {{error}}", flush=True)
+                    os._exit(1)
+                os._exit(0)
+            if os.waitpid(child, 0)[1]:
+                failed.append(name)
+        sys.exit(f"cannot be imported alone: {{failed}}" if failed else 0)
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import cfx, cfx.errors, cfx.component, cfx.parameters, cfx.pairs, cfx.registry, cfx.cli",
+        "import cfx.application, cfx.nodes",
+        "from cfx.cli import main; main(['plugins'])",
+        "from cfx.cli import main; main(['--help'])",
+        "from cfx.cli import main; main(['--cfg', 'job', 'model=w99', 'policy=lstm', 'data=ngsim'])",
+        "from cfx.cli import main; main(['modle=w99'])",
+    ],
+)
+def test_what_must_answer_at_once_imports_nothing_heavy(code: str) -> None:
+    heavy = tuple(set(HEAVY) - {"pandas", "scipy"})
+    script = f"{code}\nimport sys\nloaded = sys.modules.keys() & set({heavy!r})\nsys.exit(str(loaded) if loaded else 0)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_public_names_are_there_and_an_unknown_one_is_not() -> None:
+    for name in cfx.__all__:
+        assert getattr(cfx, name) is not None
+    assert set(cfx.__all__) <= set(dir(cfx))
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        _ = cfx.nonsense
+    assert cfx.get("model", "krauss").__name__ == "Krauss"
+    assert cfx.__version__[0].isdigit()
