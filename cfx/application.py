@@ -15,7 +15,7 @@ import signal
 import sys
 import traceback
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
@@ -87,7 +87,8 @@ class JobFunction:
         folder = Path(hydra_config.runtime.output_dir)
         given: Any = OmegaConf.to_container(hydra_config.overrides.task, resolve=False)  # as typed, `${...}` included
         overrides = tuple(given)
-        metric, code, message, detail = self._attempt(config, folder)
+        sweep = str(hydra_config.sweep.dir) if several else ""
+        metric, code, message, detail = self._attempt(config, folder, sweep)
         self.outcome = Outcome(code, message, detail, overrides, self.multirun)
         if several:
             text = json.dumps(asdict(self.outcome), indent=2)
@@ -102,9 +103,11 @@ class JobFunction:
             )
         return metric
 
-    def _attempt(self, config: DictConfig, folder: Path) -> tuple[float, int, str, str]:
+    def _attempt(self, config: DictConfig, folder: Path, sweep: str) -> tuple[float, int, str, str]:
         try:
-            values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+            values: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+            if sweep and values.get("tracking", {}).get("sweep", "") is None:
+                values["tracking"]["sweep"] = sweep
             result = _call(self.target, values, folder)
         except (CfxError, OmegaConfBaseException) as error:
             return float("nan"), 2, explain(error, ()), traceback.format_exc().rstrip() if self.show_traceback else ""
@@ -156,11 +159,13 @@ def start(arguments: Sequence[str], *, target: str = JOB) -> int:
     except _Terminated:
         print("terminated; what was finished is kept", file=sys.stderr)
         code = TERMINATED
+    except BrokenPipeError:
+        raise  # the reader of stdout has gone; `cfx.cli.main` knows what that means
     except Exception as error:  # everything ends as an exit code
         code = _report(error, overrides, show_traceback)
     sweep = SweepFolder.take()
     if sweep is not None:
-        return max(_summary(sweep, job.multirun), code, key=_weight)
+        return max(_summary(_outcomes(sweep, job.multirun), sweep, code), code, key=_weight)
     if job.outcome is not None and job.outcome.code:
         print(job.outcome.detail or job.outcome.message, file=sys.stderr)
         return job.outcome.code
@@ -181,7 +186,8 @@ def run(overrides: Sequence[str] = (), *, target: str = JOB) -> JobResult:
     try:
         config = hydra_source.composed(overrides)
         values = hydra_source.plain(config)
-        folder = _fresh(Path(str(config.hydra.run.dir)).absolute())
+        with hydra_source.resolving(config):
+            folder = _fresh(Path(str(config.hydra.run.dir)).absolute())
     except Exception as error:
         if is_mistake(error) and not isinstance(error, CfxError):
             raise ConfigError(explain(error, overrides)) from None
@@ -213,15 +219,16 @@ def _report(error: Exception, overrides: Sequence[str], show_traceback: bool) ->
     return 2 if mistake else 1
 
 
-def _summary(folder: Path, multirun: str) -> int:
+def _summary(outcomes: Mapping[Path, Outcome], folder: Path, code: int) -> int:
     """Prints which jobs of a multirun failed and why; returns the exit code."""
-    outcomes = _outcomes(folder, multirun)
+    if not outcomes:
+        if not code:
+            print(f"no job left its outcome in {folder}; see the launcher's own logs", file=sys.stderr)
+        return code or 1
     failed = {path: outcome for path, outcome in outcomes.items() if outcome.code}
     print(f"{len(outcomes) - len(failed)} of {len(outcomes)} jobs done; their folders: {folder}")
     for path, outcome in failed.items():
         print(f"failed: {' '.join(outcome.overrides)}: {outcome.message} ({path})", file=sys.stderr)
-    if not outcomes:
-        return 1
     return max((outcome.code for outcome in failed.values()), key=_weight, default=0)
 
 

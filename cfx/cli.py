@@ -54,32 +54,32 @@ def _list(*, load: bool) -> int:
     from cfx import registry
 
     table = _table("kind", "name", "distribution", "version", "from", "state")
-    broken = 0
+    complaints = []
     for kind in registry.KINDS:
         entries = registry.entries(kind)
         for entry in entries:
+            complaint = _complaint(kind, entry.name) if load else ""
             twice = sum(one.name == entry.name for one in entries) > 1
-            state = "named twice" if twice else "loaded" if registry.is_loaded(entry) else "not loaded"
-            if load:
-                state = _check(entry.kind, entry.name)
-                broken += state != "ok"
+            state = "broken" if complaint else "named twice" if twice else "loaded" if registry.is_loaded(entry) else "not loaded"
             table.add_row(kind, entry.name, entry.distribution, entry.version, entry.location, state)
+            complaints += [complaint] if complaint else []
     _print(table)
-    if broken:
-        print(f"{broken} broken", file=sys.stderr)
-    return 1 if broken else 0
+    for complaint in dict.fromkeys(complaints):
+        print(complaint, file=sys.stderr)
+    return 1 if complaints else 0
 
 
-def _check(kind: str, name: str) -> str:
+def _complaint(kind: str, name: str) -> str:
+    """Loads a component and writes its config node; returns what is wrong with it, "" if nothing is."""
     from cfx import nodes, registry
 
     try:
         nodes.render(registry.get(kind, name), name)
     except CfxError as error:
-        return f"broken: {error}"
+        return str(error)
     except Exception as error:  # a plugin's schema may raise anything when its defaults are asked for
-        return f"broken: {type(error).__name__}: {error}"
-    return "ok"
+        return f"{registry.entry(kind, name)} has no config node: {type(error).__name__}: {error}"
+    return ""
 
 
 def _show(kind: str, name: str) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import inspect
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -95,6 +96,8 @@ def _sentence(schema: type[BaseModel], problem: Any, where: str) -> str:
     if problem["type"] == "missing":
         return f"{path}: a value is required; give one as {path}=..."
     message = str(problem["msg"]).removeprefix("Value error, ").removeprefix("Input ")
+    if isinstance(problem["input"], Mapping):  # several settings contradict each other; the message names them
+        return f"{message if message.startswith(path) else f'{path}: {message}'}."
     return f"{path}={problem['input']!r}: {message}."
 
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator
 
-from cfx.calibration.windows import WindowSettings
+from cfx.calibration.settings import WindowSettings
 from cfx.component import Settings, validate
 from cfx.errors import ConfigError
 from cfx.style.settings import StyleSettings

@@ -12,7 +12,8 @@ written from its class. That node stays available as `_NAME` in a defaults list:
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -108,22 +109,27 @@ def composed(overrides: Sequence[str]) -> DictConfig:
         return compose("config", overrides=list(overrides), return_hydra_config=True)
 
 
+@contextmanager
+def resolving(config: DictConfig) -> Iterator[None]:
+    """Lets `${hydra:...}` mean this configuration, and puts a running application's back."""
+    holder = HydraConfig.instance()
+    before = holder.cfg
+    holder.set_config(config)
+    try:
+        yield
+    finally:
+        holder.cfg = before
+
+
 def plain(config: DictConfig) -> dict[str, Any]:
     """Returns the job's part of a composed configuration as plain data, every interpolation resolved.
 
     Raises:
-        OmegaConfBaseException: an interpolation leads nowhere, or a mandatory value is missing.
+        OmegaConfBaseException: an interpolation leads nowhere.
     """
-    holder = HydraConfig.instance()
-    before = holder.cfg
-    holder.set_config(config)  # `${hydra:...}` shall mean this configuration
-    try:
-        values = OmegaConf.to_container(
-            OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"]), resolve=True
-        )
-    finally:
-        holder.cfg = before
-    return cast("dict[str, Any]", values)
+    job = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    with resolving(config):
+        return cast("dict[str, Any]", OmegaConf.to_container(job, resolve=True))
 
 
 def _split(config_path: str) -> tuple[str, str]:

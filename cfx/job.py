@@ -192,18 +192,21 @@ def _keep(config: JobConfig, folder: Path, pairs: PairSet, style: StyleResult, o
         from cfx.figures.write import write_figures
 
         written.run(lambda: figures.extend(write_figures(folder / "figures", evaluation, style, outcome.curves)))
-    summary = {
-        "metrics": {name: value if math.isfinite(value) else None for name, value in metrics.items()},
+    provenance = {
+        "source": pairs.source,
+        "fingerprint": pairs.fingerprint,
         "pairs": len(pairs),
         "dropped": [{"reason": drop.reason, "count": drop.count, "unit": drop.unit} for drop in pairs.dropped],
-        "dataset": {"source": pairs.source, "fingerprint": pairs.fingerprint},
     }
+    written.file("data.json", lambda path: _dump(provenance, path))
+    defined = {name: value if math.isfinite(value) else None for name, value in metrics.items()}
+    # Last in the folder, so that a folder with a metrics.json is complete; before MLflow, so that no failure there loses it.
+    written.file("metrics.json", lambda path: _dump(defined, path))
     tracker.log_evaluation(evaluation)
     tracker.log_curves(outcome.curves)
     tracker.log_figures(figures)
     tracker.log_policy(folder / "policy")
-    written.file("metrics.json", lambda path: path.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8"))
-    tracker.log_files([folder / name for name in ("config.yaml", "metrics.json", "pairs.csv", "style.csv")])
+    tracker.log_files([folder / name for name in ("config.yaml", "metrics.json", "pairs.csv", "style.csv", "data.json")])
     return JobResult(metrics, evaluation.table, outcome.policy, tuple(figures), folder, tracker.run_id, evaluation, style)
 
 
@@ -249,11 +252,11 @@ def load(folder_or_run: str | Path) -> JobResult:
 
         folder = download_run(str(folder_or_run))
     try:
-        summary = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        defined = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
         pairs = pd.read_csv(folder / "pairs.csv", dtype={"leader_id": str, "follower_id": str})
     except (OSError, ValueError, KeyError) as error:
         raise DataError(f"{folder} holds no finished job ({error}); give the output folder that a job printed") from error
-    metrics = {name: math.nan if value is None else float(value) for name, value in summary["metrics"].items()}
+    metrics = {name: math.nan if value is None else float(value) for name, value in defined.items()}
     figures = tuple(sorted((folder / "figures").glob("*.png")))
     return JobResult(metrics, pairs, TrainedPolicy.load(folder / "policy"), figures, folder)
 
@@ -281,6 +284,10 @@ class _Output:
             raise OutputError(
                 f"cannot write into {self.folder}: {error.strerror or error}; the calibration is cached, so run again"
             ) from error
+
+
+def _dump(values: Mapping[str, Any], path: Path) -> None:
+    path.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
 
 
 def _write(path: Path, text: str) -> None:

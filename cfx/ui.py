@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import socket
 import sys
-from pathlib import Path
 
 from cfx.errors import ConfigError, TrackingError
 
@@ -33,12 +32,12 @@ def serve(uri: str | None, port: int) -> None:
 
 
 def _store(uri: str | None) -> str:
-    from cfx.tracking.store import tracking_uri
+    from cfx.tracking.store import sqlite_file, tracking_uri
 
-    store = tracking_uri(uri)
-    path = Path(store.removeprefix("sqlite:///"))
-    if store.startswith("sqlite:///") and not path.is_file():
-        raise TrackingError(f"{path} does not exist: no job has been tracked from here; run one, or name its store with --uri")
+    store = uri or tracking_uri(None)
+    file = sqlite_file(store)
+    if file is not None and not file.is_file():
+        raise TrackingError(f"{file} does not exist: no job has been tracked from here; run one, or name its store with --uri")
     return store
 
 
@@ -53,14 +52,12 @@ def _check_port(port: int) -> None:
 
 def _links(store: str, port: int) -> list[str]:
     """Returns a line per experiment."""
-    import mlflow
+    from cfx.tracking.store import told
 
-    try:
-        experiments = mlflow.MlflowClient(store).search_experiments()
-    except Exception as error:
-        raise TrackingError(f"{store} cannot be read as an MLflow store: {str(error).splitlines()[0]}") from error
+    with told(f"read {store}"):
+        from mlflow import MlflowClient
+
+        experiments = MlflowClient(store).search_experiments()
     address = f"http://{HOST}:{port}/#/experiments"
-    return [
-        f"{one.name}: {address}/{one.experiment_id}/runs?compareRunsMode=CHART&workflowType=machine_learning"
-        for one in experiments
-    ]
+    charts = "runs?compareRunsMode=CHART&workflowType=machine_learning"
+    return [f"{one.name}: {address}/{one.experiment_id}/{charts}" for one in experiments]

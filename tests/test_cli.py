@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hydra.core.hydra_config import HydraConfig
 
 import cfx
 from cfx import application, cli, ui
@@ -132,7 +133,7 @@ def test_ctrl_c_and_sigterm_have_their_exit_codes(run: Run, seed: int, code: int
         (["-m", "model=krauss,nope"], "model=nope: there is no model 'nope'."),
         (["--cfg", "job", "-p", "modl"], "package 'modl' not found in config"),
     ],
-    ids=" ".join,
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_a_wrong_command_line_is_one_sentence_and_exit_code_2(run: Run, arguments: list[str], message: str, capsys) -> None:
     assert run(*arguments) == 2
@@ -206,26 +207,24 @@ def test_outcomes_of_an_earlier_multirun_in_the_same_folder_do_not_count(run: Ru
 
 
 PLUGIN = """
-    from cfx import DrivingModel, Parameter, ParameterSpace
+    from cfx import Dataset
 
-    class Mine(DrivingModel):
-        parameters = ParameterSpace.of(Parameter("tau", "s", 0.5, 3.0, 1.0, "time headway"))
-
-        def next_speed(self, follower, leader, p, dt):
-            return follower.speed
+    class Mine(Dataset):
+        def read(self):
+            return None
 """
 
 
-def test_a_multirun_in_worker_processes_composes_a_plugins_model_and_reports_failures(run: Run, install, tmp_path: Path) -> None:
-    install("mine-models", {"cfx.models": {"mine": "mine_models:Mine"}}, {"mine_models.py": PLUGIN})
+def test_a_multirun_in_worker_processes_composes_a_plugin_and_reports_failures(run: Run, install, tmp_path: Path) -> None:
+    install("mine-data", {"cfx.datasets": {"mine": "mine_data:Mine"}}, {"mine_data.py": PLUGIN})
     script = "import sys; from cfx.application import start; sys.exit(start(sys.argv[1:], target='jobs_stub:run_job'))"
-    arguments = ["-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "model=mine,krauss", "seed=0,1"]
+    arguments = ["-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "data=mine,synthetic", "seed=0,1"]
     environment = {**os.environ, "PYTHONPATH": str(install.folder)}  # joblib's workers outlive the call: a process of its own
     command = [sys.executable, "-c", script, *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     assert done.returncode == 2, done.stderr
     assert "2 of 4 jobs done" in done.stdout
-    assert sum(line.startswith("failed: model=") for line in done.stderr.splitlines()) == 2
+    assert sum(line.startswith("failed: data=") for line in done.stderr.splitlines()) == 2
     assert len(outputs(tmp_path)) == 2
     assert all(int((folder / "metrics.json").read_text()) != os.getpid() for folder in outputs(tmp_path))
 
@@ -249,22 +248,23 @@ def test_hydras_own_flags_work(run: Run, arguments: list[str], capsys) -> None:
 
 
 def test_tab_completion_knows_plugins(run: Run, install, capsys, monkeypatch: pytest.MonkeyPatch) -> None:
-    install("mine-models", {"cfx.models": {"mine": "mine_models:Mine"}}, {"mine_models.py": PLUGIN})
-    monkeypatch.setenv("COMP_LINE", "cfx model=")
-    monkeypatch.setenv("COMP_POINT", "10")
+    install("mine-data", {"cfx.datasets": {"mine": "mine_data:Mine"}}, {"mine_data.py": PLUGIN})
+    monkeypatch.setenv("COMP_LINE", "cfx data=")
+    monkeypatch.setenv("COMP_POINT", "9")
     assert run("-sc", "query=bash") == 0
-    assert "model=mine" in capsys.readouterr().out.split()
+    assert "data=mine" in capsys.readouterr().out.split()
 
 
 def test_the_process_is_left_as_it_was(run: Run) -> None:
     import logging
 
-    before = sys.argv, list(logging.getLogger().handlers), os.getcwd()
+    before = sys.argv, list(logging.getLogger().handlers), Path.cwd()
     assert run() == 0
-    assert (sys.argv, list(logging.getLogger().handlers), os.getcwd()) == before
+    assert (sys.argv, list(logging.getLogger().handlers), Path.cwd()) == before
 
 
-def test_cfx_run_runs_the_same_job_into_a_fresh_folder(run: Run, tmp_path: Path) -> None:
+def test_cfx_run_runs_the_same_job_into_a_fresh_folder(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", None)  # as in a process where Hydra never ran
     first = application.run(["model=w99", "seed=7"], target="jobs_stub:run_job")
     again = application.run(["model=w99", f"hydra.run.dir={first.folder}"], target="jobs_stub:run_job")
     assert first.config.model["name"] == "w99"  # type: ignore[attr-defined]  # the stub's result
@@ -316,8 +316,11 @@ def test_plugins_check_loads_everything_and_exits_with_1_if_one_is_broken(instal
     install("bad-models", {"cfx.models": {"bad": "bad_models:Bad"}}, {"bad_models.py": "raise SystemExit(0)"})
     assert cli.main(["plugins", "check"]) == 1
     printed = capsys.readouterr()
-    assert "broken: model 'bad'" in printed.out
-    assert "1 broken" in printed.err
+    (row,) = [line for line in printed.out.splitlines() if " bad " in line]
+    assert row.split()[-1] == "broken"
+    assert printed.err.startswith(
+        "model 'bad' (bad_models:Bad) of the distribution bad-models 1.0 cannot be imported: SystemExit: 0"
+    )
 
 
 def test_plugins_show_tells_parameters_settings_and_reference(capsys) -> None:
@@ -338,7 +341,7 @@ def test_plugins_show_tells_parameters_settings_and_reference(capsys) -> None:
         (["plugins", "show", "mdl", "w99"], "Did you mean 'model'"),
         (["data", "describe", "nowhere.csv"], "nowhere.csv"),
     ],
-    ids=" ".join,
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_a_sub_commands_mistake_is_one_sentence_and_exit_code_2(arguments: list[str], message: str, capsys) -> None:
     assert cli.main(arguments) == 2
@@ -349,7 +352,7 @@ def test_a_sub_commands_mistake_is_one_sentence_and_exit_code_2(arguments: list[
 
 def test_data_describe_prints_what_a_recording_holds(shared_data: Path, capsys) -> None:
     assert cli.main(["data", "describe", str(shared_data / "i80_reconstructed_pairs.parquet")]) == 0
-    assert "71" in capsys.readouterr().out or "pairs" in capsys.readouterr().out
+    assert "pairs" in capsys.readouterr().out
 
 
 def test_ui_starts_mlflow_on_this_machine_only_and_prints_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:

@@ -90,7 +90,14 @@ def test_seed_zero_is_a_seed() -> None:
     assert JobConfig.of(values_of("seed=0")).seed == 0
 
 
-OPTIONS = sorted((path.parent.relative_to(CONF).as_posix(), path.stem) for path in CONF.rglob("*.yaml") if path.parent != CONF)
+def _option(path: Path) -> tuple[str, str]:
+    """Returns the config group of a file in conf/ and the option that chooses it."""
+    parts = path.relative_to(CONF).with_suffix("").parts
+    depth = 2 if parts[0] == "hydra" else 1
+    return "/".join(parts[:depth]), "/".join(parts[depth:])
+
+
+OPTIONS = sorted(_option(path) for path in CONF.rglob("*.yaml") if path.parent != CONF)
 
 
 @pytest.mark.parametrize(("group", "name"), OPTIONS, ids=[f"{group}={name}" for group, name in OPTIONS])

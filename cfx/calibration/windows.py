@@ -9,29 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from pydantic import Field, model_validator
 from torch import Tensor
 
-from cfx.component import Settings
+from cfx.calibration.settings import WindowSettings
 from cfx.errors import DataError
 from cfx.pairs import PairSet
 
-
-class WindowSettings(Settings):
-    """How drives are cut; both 5 steps (0.5 s at NGSIM's 0.1 s) in the paper."""
-
-    length: int = Field(5, ge=1, description="steps that a window simulates")
-    stride: int = Field(5, ge=1, description="steps from one window's start to the next; parameters change this often")
-
-    @model_validator(mode="after")
-    def _covers(self) -> WindowSettings:
-        if self.length < self.stride:
-            raise ValueError(f"windows.length={self.length} leaves frames between windows of stride {self.stride} out; give at least the stride")
-        return self
-
-    def count(self, frames: int) -> int:
-        """Returns how many whole windows fit a drive of `frames` frames."""
-        return max(0, (frames - 1 - self.length) // self.stride + 1)
+__all__ = ["Split", "WindowSettings", "Windows"]
 
 
 @dataclass(frozen=True)

@@ -131,9 +131,7 @@ def _mean(parameters: Tensor, counted: Tensor) -> NDArray[np.float64]:
     return np.asarray((torch.where(weight, parameters, 0.0).sum(1) / weight.sum(1)).double().cpu().numpy())
 
 
-def _drives(
-    pairs: PairSet, batch: PairBatch, first: Tensor, index: Tensor, loops: Mapping[str, ClosedLoop]
-) -> tuple[Drive, ...]:
+def _drives(pairs: PairSet, batch: PairBatch, first: Tensor, index: Tensor, loops: Mapping[str, ClosedLoop]) -> tuple[Drive, ...]:
     def rows(values: Tensor) -> list[NDArray[np.float64]]:
         ends = (batch.lengths - first).tolist()
         return [row[:end].double().cpu().numpy() for row, end in zip(values, ends, strict=True)]

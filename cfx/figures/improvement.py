@@ -52,7 +52,9 @@ def improvement_per_driver(evaluation: Evaluation) -> Figure:
         *_statistics(axes, evaluation.improvement, low),
     ]
     axes.set_ylim(low, high)
-    axes.set_xlim(-0.8, max(len(shown), 6) - 0.2)
+    # A few bars stand in the middle, and no broader than those of a larger job.
+    middle, half = (len(shown) - 1) / 2, max(len(shown), 8) / 2 + 0.3
+    axes.set_xlim(middle - half, middle + half)
     axes.grid(visible=False, axis="x")
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: percent(value) if value else "0 %"))
     axes.set_ylabel("improvement of the RMSE of speed\nover fixed parameters (%)")

@@ -35,7 +35,9 @@ class ImitationSettings(LearnerSettings):
 
     epochs: int = Field(200, ge=1, description="passes over the training windows at most; 500 in the paper")
     batch_size: int | None = Field(
-        16, ge=1, description="consecutive windows per gradient step, the recurrent state carried on; null: the whole drive; 1 in the paper"
+        16,
+        ge=1,
+        description="consecutive windows per gradient step, the recurrent state carried on; null: the whole drive; 1 in the paper",
     )
     learning_rate: float = Field(3e-3, gt=0, description="of Adam")
     weight_decay: float = Field(0.0, ge=0, description="of AdamW, decoupled")
@@ -92,9 +94,7 @@ class ImitationLearner(Learner):
             )
             with warnings.catch_warnings(), one_thread():
                 warnings.filterwarnings("ignore", module=r"lightning\.")
-                trainer.fit(module, datamodule=data)
-        if module.interrupted(trainer):
-            raise KeyboardInterrupt
+                _fit(trainer, module, data)
         module.restore_best()
         return Learned(module.network.to(device).eval(), material.scaler.to(device), module.curves())
 
@@ -283,15 +283,12 @@ class ImitationModule(pl.LightningModule):
     def curves(self) -> pd.DataFrame:
         """Returns the learning curves in long form."""
         frames = [
-            pd.DataFrame({"network": self.names, "epoch": epoch, "train_loss": train.numpy(), "validation_loss": validation.numpy()})
+            pd.DataFrame(
+                {"network": self.names, "epoch": epoch, "train_loss": train.numpy(), "validation_loss": validation.numpy()}
+            )
             for epoch, (train, validation) in enumerate(self.rows)
         ]
         return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=CURVE_COLUMNS)
-
-    @staticmethod
-    def interrupted(trainer: pl.Trainer) -> bool:
-        """Says whether Ctrl-C ended the fit: Lightning swallows it."""
-        return trainer.interrupted
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         return torch.optim.AdamW(
@@ -302,6 +299,16 @@ class ImitationModule(pl.LightningModule):
 def _weighted_error(out: Tensor, labels: Tensor, weight: Tensor) -> Tensor:
     """Returns the weighted sum of squared errors of each network, `(N,)`; the mean over parameters."""
     return ((out - labels).square().mean(-1) * weight).sum((1, 2))
+
+
+def _fit(trainer: pl.Trainer, module: ImitationModule, data: SegmentData) -> None:
+    """Fits; Ctrl-C, which Lightning turns into an exit, stays what it is."""
+    try:
+        trainer.fit(module, datamodule=data)
+    except SystemExit as error:
+        if isinstance(error.__context__, KeyboardInterrupt):
+            raise KeyboardInterrupt from None
+        raise
 
 
 def _quiet_lightning() -> None:

@@ -24,6 +24,8 @@ _SUMO = "SUMO's default passenger car"
 
 
 class KraussSettings(ModelSettings):
+    """Settings of `krauss`."""
+
     variant: Literal["paper", "sumo"] = Field(
         "paper",
         description="paper: the equations as derived; sumo: with KraussOrig1's brake cap, standing-leader rule and rounding",
@@ -46,8 +48,8 @@ class Krauss(DrivingModel):
 
     At equilibrium (v = v_l) the gap is `v t_r + min_gap` whatever t_i, if b_l = b.
 
-    Differences from the paper: the printed v_safe is dimensionally wrong (`v_i t_i * v_t^2 / a` for `v_l t_i + v_l^2 / b_l`, and 2 g
-    outside the product with b). A negative radicand (the gap is gone) gives v_safe = -b T, hence a stop.
+    Differences from the paper: the printed v_safe is dimensionally wrong (`v_i t_i * v_t^2 / a` for `v_l t_i + v_l^2 / b_l`, and
+    2 g outside the product with b). A negative radicand (the gap is gone) gives v_safe = -b T, hence a stop.
 
     Differences from SUMO: with t_i = 0 and `variant=sumo` the model is SUMO's KraussOrig1 with tau = t_r, sigma = 0 and
     minGap = min_gap, but for a negative radicand, where SUMO gets NaN and ignores the leader.

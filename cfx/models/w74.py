@@ -1,9 +1,9 @@
 """Wiedemann's 1974 model (`w74`): four regimes between perception thresholds.
 
-R. Wiedemann (1974), *Simulation des Strassenverkehrsflusses*, Schriftenreihe des Instituts für Verkehrswesen, Universität
-Karlsruhe, Heft 8: the thresholds and the regimes. R. Wiedemann and U. Reiter (1992), *Microscopic traffic simulation: the simulation
-system MISSION, background and actual state*, CEC Project ICARUS (V1052), final report, vol. 2, appendix A: the accelerations, as
-J. Janson Olstam and A. Tapani (2004), *Comparison of car-following models*, VTI meddelande 960A, section 2.3, restate them.
+R. Wiedemann (1974), *Simulation des Straßenverkehrsflusses*, Schriftenreihe des Instituts für Verkehrswesen, Universität
+Karlsruhe, Heft 8: the thresholds and the regimes. R. Wiedemann and U. Reiter (1992), *Microscopic traffic simulation: the
+simulation system MISSION, background and actual state*, CEC Project ICARUS (V1052), final report, vol. 2, appendix A: the
+accelerations, as J. Janson Olstam and A. Tapani (2004), *Comparison of car-following models*, VTI meddelande 960A, restate them.
 The thresholds' form with five tuned parameters is that of Yang, Masuda and Tatsubori (2021).
 """
 
@@ -42,8 +42,8 @@ class W74(DrivingModel):
 
     The first case that holds decides on the acceleration:
 
-    1. *Emergency*, s <= ABX: `min(0, c^2 / (2 (AX - s)) + a_l + b_min (ABX - s) / BX)`, with c = 0 where the gap opens; b_min where
-       s <= AX.
+    1. *Emergency*, s <= ABX: `min(0, c^2 / (2 (AX - s)) + a_l + b_min (ABX - s) / BX)`, with c = 0 where the gap opens; b_min
+       where s <= AX.
     2. *Approaching*, c > SDV: `c^2 / (2 (ABX - s)) + a_l`: uniform braking that reaches ABX as the speeds become equal.
     3. *Following*, c > OPDV and s < SDX: `+b_null` if the last acceleration was positive, else `-b_null`. Free driving leads into
        this case accelerating and the two braking cases lead into it braking, so the last acceleration says which
@@ -55,14 +55,17 @@ class W74(DrivingModel):
     Units: SDV is a speed, so cx is a length over the root of a speed, (m s)^0.5; so is bx_add.
 
     Differences from the paper: it drops the root in BX. Everything that Wiedemann draws at random for each driver and each
-    decision (estimation errors, driver types) is at its mean, in the parameters. Differences from Wiedemann and Reiter: the paper's SDX is
-    a multiple of ABX, theirs AX + EX BX; their threshold CLDV for closing in while already following is SDV; there is no
-    largest distance (150 m) for approaching; `FAKTORV` is `v_max / v_desired`, so that v_max cancels out of the free acceleration; an
-    emergency uses the speed difference only where the gap closes, and never accelerates.
+    decision (estimation errors, driver types) is at its mean, in the parameters.
 
-    Differences from SUMO's `Wiedemann`: that one has two parameters (`security`, `estimation`), which stand for
-    `ax_add = 1 + 2 security`, `bx_add = 1 + 7 security`, `cx = 25 (1 + security + estimation)`; its BX takes the follower's own speed, it draws OPDV at
-    random, ignores a_l, accelerates freely by another rule, and its `b_null` is a fifth of the maximum acceleration.
+    Differences from Wiedemann and Reiter: the paper's SDX is a multiple of ABX, theirs is AX + EX BX; their threshold CLDV for
+    closing in while already following is SDV; there is no largest distance (150 m) for approaching; their FAKTORV is v_max /
+    v_desired, so that v_max cancels out of the free acceleration, whose b_max is their BMAXmult v_max; an emergency counts
+    the speed difference only where the gap closes, and never accelerates.
+
+    Differences from SUMO's `Wiedemann`: that one has two parameters, security and estimation, which stand for
+    ax_add = 1 + 2 security, bx_add = 1 + 7 security and cx = 25 (1 + security + estimation). Its BX takes the follower's own
+    speed; it draws OPDV at random, ignores a_l, accelerates freely by another rule, and its b_null is a fifth of its largest
+    acceleration.
 
     Not differentiable in the thresholds themselves: gradients are those of the case that holds; while following they are those of
     b_null alone.
@@ -77,12 +80,10 @@ class W74(DrivingModel):
         Parameter("sdx_mult", "1", 1.05, 4.0, 1.5, "spacing at which following ends, as a multiple of ABX", _REITER),
         Parameter("cx", "(m s)^0.5", 10.0, 120.0, 50.0, "perception of speed differences; larger notices smaller ones", _REITER),
         Parameter("opdv_add", "1", 0.1, 5.0, 1.5, "how much larger an opening speed must be to be noticed", _REITER),
-        Parameter(
-            "b_max", "m/s2", 0.5, 6.0, 2.6, "free acceleration from standstill", "SUMO's default passenger car", tuned=False
-        ),
+        Parameter("b_max", "m/s2", 0.5, 6.0, 2.6, "free acceleration from standstill", "SUMO's passenger car", tuned=False),
         Parameter("v_desired", "m/s", 5.0, 70.0, 33.3, "speed wanted on a free road", "120 km/h", tuned=False),
         Parameter("b_null", "m/s2", 0.01, 1.0, 0.25, "acceleration while following", "Vissim's CC7", tuned=False),
-        Parameter("b_min", "m/s2", -20.0, -1.0, -9.0, "hardest braking (negative)", "SUMO's emergencyDecel", tuned=False),
+        Parameter("b_min", "m/s2", -20.0, -1.0, -9.0, "hardest braking, negative", "SUMO's emergencyDecel", tuned=False),
     )
 
     def next_speed(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float) -> Tensor:
@@ -104,10 +105,8 @@ class W74(DrivingModel):
         emergency = a_l - 0.5 * closing.clamp(min=0.0).square() / (s - ax).clamp(min=_NEAREST_ROOM) + b_min * lack
         emergency = torch.where(s <= ax, b_min, emergency.clamp(max=0.0))
 
-        acceleration = torch.where(
-            s <= abx,
-            emergency,
-            torch.where(closing > sdv, approaching, torch.where((closing > opdv) & (s < sdx), following, free)),
-        )
+        # Nested, not joined by `&`, as in w99: masks of doubles are slow to join.
+        calm = torch.where(closing > opdv, torch.where(s < sdx, following, free), free)
+        acceleration = torch.where(s <= abx, emergency, torch.where(closing > sdv, approaching, calm))
         acceleration = torch.maximum(torch.minimum(acceleration, torch.maximum(free, b_null)), b_min)
         return (v + acceleration * dt).clamp(min=0.0)

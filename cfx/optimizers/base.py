@@ -21,7 +21,7 @@ Progress = Callable[[int], None]
 """Told how many more evaluations are done; in all they sum to problems times evaluations."""
 
 TIE_RELATIVE, TIE_ABSOLUTE = 1e-6, 1e-9
-"""Losses within `TIE_ABSOLUTE + TIE_RELATIVE * best` of the best one count as equal: above rounding, below anything that matters."""
+"""Losses within `TIE_ABSOLUTE + TIE_RELATIVE * best` of the best count as equal: above rounding, below anything that matters."""
 
 
 class Objective(Protocol):
@@ -46,12 +46,12 @@ class Solution:
     """What an optimizer found.
 
     Attributes:
-        best: `(P, n)` in unit space: of the candidates whose loss ties with the lowest, the one nearest to the problem's first guess.
-            The first guess itself if every candidate diverged.
+        best: `(P, n)` in unit space: of the candidates whose loss ties with the lowest, the one nearest to the problem's first
+            guess; the first guess itself if every candidate diverged.
         loss: `(P,)`, the loss of `best`; infinity if every candidate diverged.
-        filling: `(P, 3)`, lowest, median and highest finite loss of the space-filling candidates (`Optimizer.space_filling`; guesses and
-            what an optimizer chose by looking at losses do not count). The median of an even number is the lower of the middle two.
-            NaN if none is finite.
+        filling: `(P, 3)`, lowest, median and highest finite loss of the space-filling candidates (`Optimizer.space_filling`;
+            neither guesses nor what an optimizer chose by looking at losses count). The median of an even number is the lower of
+            the middle two. NaN if none is finite.
         diverged: `(P,)` int64, number of candidates whose loss was NaN or infinite.
     """
 
@@ -72,8 +72,8 @@ class Solution:
 class Optimizer(Component):
     """Base of every optimizer.
 
-    Life cycle: calibration calls `minimize` once per group of problems; `minimize` cuts the group into chunks that respect the memory
-    bound, calls `solve` for each, checks what comes back and reduces it to a `Solution`. A subclass implements `solve`,
+    Life cycle: calibration calls `minimize` once per group of problems; `minimize` cuts the group into chunks that respect the
+    memory bound, calls `solve` for each, checks what comes back and reduces it to a `Solution`. A subclass implements `solve`,
     `evaluations` and `bytes_per_problem`. It keeps no state between calls, and the result for a problem must not depend on which
     other problems stand beside it, beyond rounding. `cfx.testing.optimizers.OptimizerContract` tests all this.
     """
@@ -85,7 +85,7 @@ class Optimizer(Component):
         """Evaluates candidates of all problems of one chunk.
 
         Args:
-            objective: takes candidates within [0, 1]; returns finite losses or infinity, never NaN. Counts evaluations for progress.
+            objective: takes candidates within [0, 1]; returns finite losses or infinity, never NaN. It counts evaluations.
             guesses: `(P, g, n)` in unit space, g >= 1: candidates to evaluate first; they count as evaluations.
             seed: the same for every chunk; 0 is a seed like any other.
 
@@ -99,14 +99,14 @@ class Optimizer(Component):
 
     @abstractmethod
     def bytes_per_problem(self, n: int) -> int:
-        """Returns an upper estimate of the memory that `solve` needs for one problem, without what it returns and the objective's own."""
+        """Returns an upper estimate of the memory that `solve` needs for one problem, besides its result and the objective's own."""
 
     def evaluations_at_once(self) -> int:
         """Returns how many candidates of one problem `solve` hands to the objective in one call at most; 1 unless overridden."""
         return 1
 
     def space_filling(self) -> int:
-        """Returns how many of the first evaluations, guesses included, are chosen without looking at losses; all unless overridden."""
+        """Returns how many first evaluations, guesses included, are chosen without looking at losses; all unless overridden."""
         return self.evaluations()
 
     def minimize(
@@ -117,7 +117,7 @@ class Optimizer(Component):
         seed: int,
         objective_bytes: int = 0,
         memory: int = 1 << 30,
-        progress: Progress = lambda done: None,
+        progress: Progress = lambda _: None,
     ) -> Solution:
         """Solves all problems of `objective`.
 
@@ -159,7 +159,7 @@ class Optimizer(Component):
 
 def _reduce(candidates: Tensor, losses: Tensor, guesses: Tensor, space_filling: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Reduces a chunk to best `(P, n)`, loss `(P,)`, filling `(P, 3)` and diverged `(P,)`."""
-    problems, g, n = guesses.shape
+    g, n = guesses.shape[1:]
     finite = losses.isfinite()
     lowest = losses.min(dim=1, keepdim=True).values
     ties = finite & (losses <= lowest + TIE_ABSOLUTE + TIE_RELATIVE * lowest.abs())

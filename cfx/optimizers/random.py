@@ -16,11 +16,13 @@ from cfx.component import Settings
 from cfx.errors import ConfigError
 from cfx.optimizers.base import Objective, Optimizer
 
-_AT_ONCE = 512
+AT_ONCE = 512
 """Candidates of one problem in one call of the objective: its intermediate values then stay small whatever `samples` is."""
 
 
 class RandomSettings(Settings):
+    """Settings of `RandomSearch`."""
+
     samples: int = Field(4096, ge=1, description="evaluations of each problem, guesses included")
 
 
@@ -38,7 +40,7 @@ class RandomSearch(Optimizer):
         return self.settings.samples
 
     def evaluations_at_once(self) -> int:
-        return min(_AT_ONCE, self.settings.samples)
+        return min(AT_ONCE, self.settings.samples)
 
     def bytes_per_problem(self, n: int) -> int:
         return 8 * self.evaluations_at_once() * (n + 2)
@@ -46,9 +48,13 @@ class RandomSearch(Optimizer):
     def solve(self, objective: Objective, guesses: Tensor, *, seed: int) -> tuple[Tensor, Tensor]:
         problems, g, n = guesses.shape
         points = sobol(self.settings.samples - g, n, seed=seed, like=guesses, key="samples", guesses=g)
-        losses = [objective(guesses)]
-        losses += [objective(block.expand(problems, -1, -1)) for block in points.split(_AT_ONCE)]
-        return torch.cat([guesses, points.expand(problems, -1, -1)], dim=1), torch.cat(losses, dim=1)
+        candidates = torch.cat([guesses, points.expand(problems, -1, -1)], dim=1)
+        return candidates, evaluate_in_blocks(objective, candidates)
+
+
+def evaluate_in_blocks(objective: Objective, candidates: Tensor) -> Tensor:
+    """Returns losses `(P, q)` of candidates `(P, q, n)`, at most `AT_ONCE` of each problem in one call."""
+    return torch.cat([objective(block) for block in torch.split(candidates, AT_ONCE, dim=1)], dim=1)
 
 
 def sobol(count: int, n: int, *, seed: int, like: Tensor, key: str, guesses: int) -> Tensor:
@@ -61,6 +67,9 @@ def sobol(count: int, n: int, *, seed: int, like: Tensor, key: str, guesses: int
         ConfigError: `count` is negative.
     """
     if count < 0:
-        raise ConfigError(f"optimizer.{key}={count + guesses}: the {guesses} first guesses alone are more; set optimizer.{key} >= {guesses}")
-    points = torch.quasirandom.SobolEngine(n, scramble=True, seed=seed).draw(count, dtype=torch.float64)
+        raise ConfigError(
+            f"optimizer.{key}={count + guesses}: there are {guesses} first guesses; set optimizer.{key} >= {guesses}"
+        )
+    engine = torch.quasirandom.SobolEngine(n, scramble=True, seed=seed)  # type: ignore[no-untyped-call]  # torch leaves it untyped
+    points: Tensor = engine.draw(count, dtype=torch.float64)
     return points.to(like.device)

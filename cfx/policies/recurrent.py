@@ -55,7 +55,9 @@ class RecurrentNetwork(PolicyNetwork):
     states: int
     """Tensors of width `hidden` that one layer carries from window to window."""
 
-    def __init__(self, networks: int, features: int, parameters: int, settings: RecurrentSettings, generator: torch.Generator) -> None:
+    def __init__(
+        self, networks: int, features: int, parameters: int, settings: RecurrentSettings, generator: torch.Generator
+    ) -> None:
         super().__init__()
         self.hidden = settings.hidden_size
         widths = [features, *[settings.hidden_size] * (settings.layers - 1)]

@@ -151,12 +151,16 @@ class TrainedPolicy:
 
         pairs = pairs_from_frame(frame, source="the table given to the policy")
         if abs(pairs.dt - self.dt) > 1e-6:
-            raise DataError(f"the policy was trained at time steps of {self.dt:g} s, the table has {pairs.dt:g} s; resample the table")
+            raise DataError(
+                f"the policy was trained at time steps of {self.dt:g} s, the table has {pairs.dt:g} s; resample the table"
+            )
         batch = PairBatch.of(pairs)
         until = batch.lengths - 1
         state = self.read(batch, until, self.begin(self.networks_for(pairs)))
         chosen, _ = self.act(measured_history(batch, until, self.windows.length), state)
-        return pd.DataFrame({"pair_id": [pair.pair_id for pair in pairs], **dict(zip(self.space.names, chosen.T.tolist(), strict=True))})
+        return pd.DataFrame(
+            {"pair_id": [pair.pair_id for pair in pairs], **dict(zip(self.space.names, chosen.T.tolist(), strict=True))}
+        )
 
     def networks_for(self, pairs: PairSet) -> Tensor:
         """Returns which network drives each pair, `(P,)`.
@@ -211,7 +215,9 @@ class TrainedPolicy:
         except (OSError, ValueError, RuntimeError) as error:
             raise DataError(f"{folder} holds no policy that can be read ({error}); give a job's folder") from error
         if description.get("format") != _FORMAT:
-            raise DataError(f"{folder}/policy.json has format {description.get('format')}; this version of cfx reads format {_FORMAT}")
+            raise DataError(
+                f"{folder}/policy.json has format {description.get('format')}; this version of cfx reads format {_FORMAT}"
+            )
         policy = registry.create("policy", description["policy"])
         model = registry.create("model", description["model"])
         assert isinstance(policy, Policy)

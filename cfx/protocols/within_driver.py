@@ -43,7 +43,9 @@ class WithinDriver(Protocol):
                 windows = Windows.of(split.windows, study.windows)
                 labels = study.calibrator.labels(pairs, batch, windows, fixed)
                 told = float((labels.spread > 0).double().mean())
-                log.info("Window labels: %d windows; the choice of parameters matters in %.0f %% of them", len(windows), 100 * told)
+                log.info(
+                    "Window labels: %d windows; the choice of parameters matters in %.0f %% of them", len(windows), 100 * told
+                )
             if study.learner.settings.scope == "all":
                 network, groups = group_by(["all"] * len(pairs))
                 network = network.to(device)

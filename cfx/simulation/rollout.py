@@ -9,6 +9,8 @@ leaders broadcast: a leader `(pairs, 1)` drives ahead of followers `(pairs, cand
 
 from __future__ import annotations
 
+import importlib.util
+import itertools
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from typing import Literal, NamedTuple
@@ -24,16 +26,16 @@ _Parameters = dict[str, Tensor]
 _Step = Callable[[Follower, Leader, _Parameters], tuple[Follower, Tensor, Tensor]]
 
 _BLOCK = 5
-"""Steps that one compiled call takes: a window of the paper. State and parameters stay in registers meanwhile; longer blocks were not
-faster and take long to compile."""
+"""Steps that one compiled call takes: a window of the paper. State and parameters stay in registers meanwhile; longer blocks
+were not faster and take long to compile."""
 
 _WORTH_COMPILING = 20_000_000
 """Vehicle steps in one call from which compiling pays: about a second of eager work. The rule looks at the call alone, so that
 the same call gives the same bits whatever came before it."""
 
 _TILE_BYTES = 1 << 16
-"""What one tile of followers takes for each value and CPU thread. A tile does all its steps before the next begins, so that the twenty or so
-values that a model reads and writes stay in a core's second-level cache; otherwise memory, not arithmetic, sets the speed."""
+"""What one tile of followers takes for each value and CPU thread. A tile does all its steps before the next begins, so that the
+twenty or so values that a model reads and writes stay in a core's second-level cache; otherwise memory sets the speed."""
 
 
 class Start(NamedTuple):
@@ -123,7 +125,7 @@ class Simulator:
         cuts = [*range(0, steps - _BLOCK + 1, _BLOCK)]
         cuts = [*cuts, *range(_BLOCK * len(cuts), steps), steps]
         positions, speeds = [], []
-        for first, last in zip(cuts, cuts[1:], strict=False):
+        for first, last in itertools.pairwise(cuts):
             take = _compiled_stepper(self.model, self.dt, last - first)
             follower, position, speed = take(follower, _frames(leader, first, last), p)
             positions.append(position)
@@ -153,17 +155,19 @@ _COMPILED: dict[tuple[type[DrivingModel], str, float, int], _Step] = {}
 
 def _compiled_stepper(model: DrivingModel, dt: float, steps: int) -> _Step:
     """Returns `_stepper`, compiled for a number of steps; equal models share it."""
-    key = (type(model), model.settings.model_dump_json(), dt, steps)
+    key = (type(model), model.settings.model_dump_json(exclude={"parameters"}), dt, steps)
     if key not in _COMPILED:
         # Each model and block has a cache of its own: torch counts recompilations per function, and gives up after eight.
-        _COMPILED[key] = torch.compile(_stepper(model, dt), dynamic=True, isolate_recompiles=True)
+        _COMPILED[key] = torch.compile(  # type: ignore[call-overload]  # torch's overloads leave isolate_recompiles out
+            _stepper(model, dt), dynamic=True, isolate_recompiles=True
+        )
     return _COMPILED[key]
 
 
 def can_compile(device: torch.device) -> bool:
     """Says whether `torch.compile` has what it needs here: a C++ compiler for the CPU, Triton for CUDA."""
     if device.type == "cuda":
-        return torch.utils._triton.has_triton()
+        return importlib.util.find_spec("triton") is not None
     return device.type == "cpu" and any(shutil.which(name) for name in ("g++", "clang++", "c++"))
 
 
@@ -185,11 +189,12 @@ class _Tile:
         return whole.view(-1, *self._grid)[:, self._rows, self._columns]
 
     def follower(self, follower: Follower) -> Follower:
-        return Follower(*(self._flat(state) for state in follower[:3]), self._flat_memory(follower.memory))
+        position, speed, acceleration = (self._flat(state) for state in follower[:3])
+        return Follower(position, speed, acceleration, self._flat_memory(follower.memory))
 
     def leader(self, leader: Leader) -> Leader:
-        moving = (self._flat_frames(signal) for signal in leader[:3])
-        return Leader(*moving, self._flat(leader.length))
+        position, speed, acceleration = (self._flat_frames(signal) for signal in leader[:3])
+        return Leader(position, speed, acceleration, self._flat(leader.length))
 
     def parameters(self, p: Mapping[str, Tensor]) -> _Parameters:
         """Constants stay 0-dimensional: they cost no memory traffic."""
@@ -274,7 +279,8 @@ def simulate(
     """
     windows = _windows(model, parameters, start.speed, leader.position.shape[-1] - 1, window)
     shapes = [leader.position.shape[:-1], leader.length.shape, *(state.shape for state in start)]
-    batch = torch.broadcast_shapes(*shapes, *(value.shape for _, _, p in windows for value in p.values()))
+    shapes += [value.shape for _, _, p in windows for value in p.values()]
+    batch = torch.broadcast_shapes(*shapes)  # type: ignore[no-untyped-call]  # torch leaves it untyped
     simulator = Simulator(model, dt, compile=compile)
     follower = simulator.begin(Start(*(state.expand(batch) for state in start)))
     in_time = Leader(_time_first(leader.position), _time_first(leader.speed), _time_first(leader.acceleration), leader.length)

@@ -33,12 +33,18 @@ class PolicyContract:
     @pytest.fixture
     def tokens(self, features: int) -> Tensor:
         """Returns random tokens."""
-        return 3 * torch.randn((NETWORKS, DRIVERS, WINDOWS, features), generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+        return 3 * torch.randn(
+            (NETWORKS, DRIVERS, WINDOWS, features), generator=torch.Generator().manual_seed(2), dtype=torch.float64
+        )
 
     def test_outputs_lie_within_the_bounds(self, network: PolicyNetwork, tokens: Tensor) -> None:
         out, _ = network(1e3 * tokens, network.initial_state(NETWORKS, DRIVERS))
-        assert out.shape == (NETWORKS, DRIVERS, WINDOWS, PARAMETERS), "a policy answers one parameter vector per network, driver and window"
-        assert bool(((out >= 0) & (out <= 1)).all()), "a policy answers in unit space: nothing outside the model's bounds ever drives"
+        assert out.shape == (NETWORKS, DRIVERS, WINDOWS, PARAMETERS), (
+            "a policy answers one parameter vector per network, driver and window"
+        )
+        assert bool(((out >= 0) & (out <= 1)).all()), (
+            "a policy answers in unit space: nothing outside the model's bounds ever drives"
+        )
 
     def test_streaming_equals_the_whole_sequence(self, network: PolicyNetwork, tokens: Tensor) -> None:
         whole, last = network(tokens, network.initial_state(NETWORKS, DRIVERS))
@@ -66,7 +72,9 @@ class PolicyContract:
         after, _ = network(changed, network.initial_state(NETWORKS, DRIVERS))
         torch.testing.assert_close(before[1:], after[1:], msg="network i must read only slice i of its tokens")
         for name, value in [*network.named_parameters(), *network.named_buffers()]:
-            assert value.shape[0] == NETWORKS, f"the first dimension of {name} must be the networks, so that the learner can treat each on its own"
+            assert value.shape[0] == NETWORKS, (
+                f"the first dimension of {name} must be the networks, so that the learner can treat each on its own"
+            )
 
     def test_state_is_passed_not_kept(self, network: PolicyNetwork, tokens: Tensor) -> None:
         first, _ = network(tokens, network.initial_state(NETWORKS, DRIVERS))
@@ -89,7 +97,9 @@ class PolicyContract:
         assert bool(parameters) == policy.trainable, "`trainable` must say whether there is anything to train"
         if policy.trainable:
             network(tokens, network.initial_state(NETWORKS, DRIVERS))[0].square().sum().backward()
-            assert all(p.grad is not None and bool(p.grad.isfinite().all()) for p in parameters), "every weight needs a finite gradient"
+            assert all(p.grad is not None and bool(p.grad.isfinite().all()) for p in parameters), (
+                "every weight needs a finite gradient"
+            )
 
 
 def _build(policy: Policy, features: int, *, seed: int) -> PolicyNetwork:

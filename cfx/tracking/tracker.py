@@ -11,7 +11,7 @@ import shlex
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 from urllib.parse import quote, urlencode
@@ -274,9 +274,9 @@ class MlflowTracker(Tracker):
     def _end_badly(self, error: BaseException) -> None:
         """Closes the run after an error; that one is what the user must see, so a failure to close is only logged."""
         killed = isinstance(error, KeyboardInterrupt | SystemExit)
-        text = " ".join(f"{type(error).__name__}: {error}".split())
+        text = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
         try:
-            self._end("KILLED" if killed else "FAILED", text.removesuffix(": "))
+            self._end("KILLED" if killed else "FAILED", text)
         except TrackingError as second:
             log.warning("%s", second)
 
@@ -334,22 +334,25 @@ def _begin(store: Store, name: str, parameters: Mapping[str, str], tags: Mapping
     same = f"tags.`cfx.job` = '{tags['cfx.job']}' and attributes.status != 'FINISHED'"
     left = [run for run in client.search_runs([store.experiment_id], same, max_results=10) if not _is_running(run)]
     if left:
-        run = left[0]
+        run, known = left[0], left[0].data.params
         client.update_run(run.info.run_id, status="RUNNING", name=name)
-        with suppress(KeyError):
-            client.delete_tag(run.info.run_id, "cfx.failure") if "cfx.failure" in run.data.tags else None
-        missing = {key: value for key, value in parameters.items() if key not in run.data.params}
+        if "cfx.failure" in run.data.tags:
+            client.delete_tag(run.info.run_id, "cfx.failure")
     else:
-        run = client.create_run(store.experiment_id, run_name=name, tags={"cfx.job": tags["cfx.job"]})
-        missing = dict(parameters)
-    entries = [Param(key, value) for key, value in missing.items()]
-    client.log_batch(run.info.run_id, params=entries, tags=_tags(tags))
-    folder = _local(run.info.artifact_uri)
-    if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-        if not os.access(folder, os.W_OK | os.X_OK):
-            raise OSError(f"the folder of its artifacts, {folder}, cannot be written")
-    return str(run.info.run_id)
+        run, known = client.create_run(store.experiment_id, run_name=name), {}
+    run_id = str(run.info.run_id)
+    try:
+        missing = [Param(key, value) for key, value in parameters.items() if key not in known]
+        client.log_batch(run_id, params=missing, tags=_tags(tags))
+        folder = _local(run.info.artifact_uri)
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            if not os.access(folder, os.W_OK | os.X_OK):
+                raise OSError(f"the folder of its artifacts, {folder}, cannot be written")
+    except BaseException:
+        client.set_terminated(run_id, "FAILED")
+        raise
+    return run_id
 
 
 def _is_running(run: Any) -> bool:

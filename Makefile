@@ -1,0 +1,81 @@
+# Everything a fresh machine needs is Python 3.11 or newer, make and git.
+#
+#   make run [ARGS="model=w99 policy=lstm"]   set up .venv, then run one job
+#   make test                                 set up .venv, then ruff, mypy and the fast tests: what CI runs
+#   make test-slow | make bench               the tests that take minutes | the benchmarks
+#   make conf                                 write conf/<group>/<name>.yaml anew from the built-in classes
+#   make lock                                 write constraints.txt anew from what resolves today
+#   make clean                                remove .venv and every cache; outputs/ stays
+
+PYTHON ?= python3
+VENV ?= .venv
+ARGS ?=
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+
+# PyTorch for Linux comes from PyPI with CUDA, several GB; a CPU build says so in its version (2.13.0+cpu) and satisfies the same
+# pin. So the first step looks for a CPU build: in the sources that pip is set up with, then on PyTorch's own index, which has a few
+# seconds to answer. Without either, pip takes what PyPI has. For a GPU: make run TORCH_INDEX= (empty: the step is left out).
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+TORCH = $(shell sed -n 's/^torch==//p' constraints.txt)
+
+.PHONY: run test test-slow bench conf lock clean
+
+run: $(VENV)/.ready
+	$(BIN)/python -m cfx $(ARGS)
+
+test: $(VENV)/.ready-test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest
+
+test-slow: $(VENV)/.ready-test
+	$(BIN)/python -m pytest -m slow
+
+bench: $(VENV)/.ready-test
+	$(BIN)/python -m pytest tests/benchmarks -m "" --override-ini addopts="--import-mode=importlib" --benchmark-only
+
+conf: $(VENV)/.ready
+	$(BIN)/python -m cfx.nodes
+
+# The stamps are made again when what they were made from changes, so a second `make run` installs nothing.
+$(VENV)/.ready: pyproject.toml constraints.txt $(VENV)/.torch
+	$(PIP) install --quiet --constraint constraints.txt --editable .
+	touch $@
+
+$(VENV)/.ready-test: pyproject.toml constraints.txt $(VENV)/.torch
+	$(PIP) install --quiet --constraint constraints.txt --editable '.[test]'
+	touch $(VENV)/.ready $@
+
+$(VENV)/.torch: constraints.txt | $(BIN)/python
+ifneq ($(TORCH_INDEX),)
+	@if [ "$$(uname -s)" = Linux ] && ! $(BIN)/python -c "import torch" 2>/dev/null; then \
+	  echo "installing torch $(TORCH), CPU build"; \
+	  $(PIP) install --quiet --no-deps "torch==$(TORCH)+cpu" 2>/dev/null \
+	  || $(PIP) install --quiet --no-deps --isolated --retries 0 --timeout 5 --index-url "$(TORCH_INDEX)" "torch==$(TORCH)+cpu" 2>/dev/null \
+	  || echo "no CPU build within reach; the next step takes the one that PyPI has"; \
+	fi
+endif
+	touch $@
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+	  || { echo "cfx needs Python 3.11 or newer; name one with make PYTHON=/path/to/python3" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+# Local versions (+cpu) and cfx itself stay out, so that the pins hold for every build and every checkout. torch keeps its pin: raise it
+# by hand first.
+lock:
+	rm -rf .venv-lock
+	$(PYTHON) -m venv .venv-lock
+	$(MAKE) VENV=.venv-lock .venv-lock/.torch
+	.venv-lock/bin/python -m pip install --quiet --upgrade --editable '.[test]'
+	{ echo "# Versions that were tested together; make lock writes this file. pip install --constraint constraints.txt ..."; \
+	  .venv-lock/bin/python -m pip freeze --exclude-editable | sed 's/+cpu$$//'; } > constraints.new
+	mv constraints.new constraints.txt
+	rm -rf .venv-lock
+
+clean:
+	rm -rf $(VENV) .venv-lock .mypy_cache .ruff_cache .pytest_cache .hypothesis .benchmarks dist
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,26 @@
+"""What a user may choose about windows; imports no torch, so that a wrong configuration is answered at once."""
+
+from __future__ import annotations
+
+from pydantic import Field, model_validator
+
+from cfx.component import Settings
+
+
+class WindowSettings(Settings):
+    """How drives are cut; both 5 steps (0.5 s at NGSIM's 0.1 s) in the paper."""
+
+    length: int = Field(5, ge=1, description="steps that a window simulates")
+    stride: int = Field(5, ge=1, description="steps from one window's start to the next; parameters change this often")
+
+    @model_validator(mode="after")
+    def _covers(self) -> WindowSettings:
+        if self.length < self.stride:
+            raise ValueError(
+                f"windows.length={self.length} leaves frames out between windows of stride {self.stride}; give at least that"
+            )
+        return self
+
+    def count(self, frames: int) -> int:
+        """Returns how many whole windows fit a drive of `frames` frames."""
+        return max(0, (frames - 1 - self.length) // self.stride + 1)
