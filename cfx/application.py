@@ -125,7 +125,7 @@ class SweepFolder(Callback):
 
     _current: ClassVar[Path | None] = None
 
-    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:  # noqa: ARG002 - Hydra's signature
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         SweepFolder._current = Path(str(config.hydra.sweep.dir)).absolute()
 
     @classmethod

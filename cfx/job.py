@@ -1,4 +1,6 @@
-"""One job: a dataset gives pairs; an optimizer calibrates a driving model on them; a learner trains a policy on the result; a protocol
+"""One job, from the data to the figures.
+
+A dataset gives pairs; an optimizer calibrates a driving model on them; a learner trains a policy on the result; a protocol
 evaluates it; tracking keeps what came out.
 """
 
@@ -7,11 +9,10 @@ from __future__ import annotations
 import json
 import logging
 import math
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, cast
 
 import pandas as pd
 import torch
@@ -22,7 +23,6 @@ from rich.table import Table
 from cfx import registry
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
-from cfx.component import Component
 from cfx.config import JobConfig
 from cfx.datasets.base import Dataset
 from cfx.datasets.tidy import write_tidy
@@ -44,8 +44,6 @@ if TYPE_CHECKING:
     from cfx.tracking.tracker import Tracker
 
 log = logging.getLogger(__name__)
-
-Kind = TypeVar("Kind", bound=Component)
 
 
 @dataclass(frozen=True)
@@ -105,7 +103,10 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
 
 @dataclass(frozen=True)
 class _Parts:
-    """The components of a job; making them checks the whole configuration before any work begins."""
+    """The components of a job; making them checks the whole configuration before any work begins.
+
+    The registry has checked that each is what its kind promises.
+    """
 
     dataset: Dataset
     model: DrivingModel
@@ -117,19 +118,13 @@ class _Parts:
     @classmethod
     def of(cls, config: JobConfig) -> _Parts:
         return cls(
-            dataset=_create(Dataset, config.data),
-            model=_create(DrivingModel, config.model),
-            optimizer=_create(Optimizer, config.optimizer),
-            policy=_create(Policy, config.policy),
-            learner=_create(Learner, config.learner),
-            protocol=_create(Protocol, config.protocol),
+            dataset=cast(Dataset, registry.create("dataset", config.data)),
+            model=cast(DrivingModel, registry.create("model", config.model)),
+            optimizer=cast(Optimizer, registry.create("optimizer", config.optimizer)),
+            policy=cast(Policy, registry.create("policy", config.policy)),
+            learner=cast(Learner, registry.create("learner", config.learner)),
+            protocol=cast(Protocol, registry.create("protocol", config.protocol)),
         )
-
-
-def _create(base: type[Kind], node: Mapping[str, Any]) -> Kind:
-    component = registry.create(base.kind, node)
-    assert isinstance(component, base)
-    return component
 
 
 def _device(name: str) -> torch.device:
@@ -224,7 +219,8 @@ def report(result: JobResult, evaluation: Evaluation, console: Console, tracker:
     console.print(table)
     i = evaluation.improvement
     console.print(
-        f"Improvement of policy over fixed, RMSE of speed: mean {i.mean:+.1%} (95 % interval {i.ci95_low:+.1%} to {i.ci95_high:+.1%}),"
+        f"Improvement of policy over fixed, RMSE of speed: mean {i.mean:+.1%} (95 % interval {i.ci95_low:+.1%} to"
+        f" {i.ci95_high:+.1%}),"
         f" trimmed mean {i.trimmed_mean:+.1%}, median {i.median:+.1%}; better for {i.win_rate:.0%} of {i.pairs} pairs;"
         f" Wilcoxon p = {i.p_value:.2g}",
         soft_wrap=True,
@@ -273,7 +269,7 @@ class _Output:
 
         def whole() -> None:
             write(temporary)
-            os.replace(temporary, path)
+            temporary.replace(path)
 
         self.run(whole)
 

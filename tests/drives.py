@@ -29,17 +29,35 @@ def wavy_pairs(model: DrivingModel, parameters: torch.Tensor, frames: int = 300,
     count = len(parameters)
     time = np.arange(frames) * 0.1
     phase, period = generator.uniform(0, 6, (count, 1)), generator.uniform(12, 25, (count, 1))
-    leader_speed = np.clip(9 + 6 * np.sin(2 * np.pi * time / period + phase) + 2 * np.sin(2 * np.pi * time / 7 + phase), 0.2, None)
+    leader_speed = np.clip(
+        9 + 6 * np.sin(2 * np.pi * time / period + phase) + 2 * np.sin(2 * np.pi * time / 7 + phase), 0.2, None
+    )
     position = np.concatenate([np.zeros((count, 1)), np.cumsum(leader_speed[:, 1:] * 0.1, axis=1)], axis=1) + 30
     acceleration = np.gradient(leader_speed, 0.1, axis=1)
-    leader = Leader(*(torch.as_tensor(x) for x in (position, leader_speed, acceleration)), torch.full((count,), 5.0, dtype=torch.float64))
+    leader = Leader(
+        *(torch.as_tensor(x) for x in (position, leader_speed, acceleration)), torch.full((count,), 5.0, dtype=torch.float64)
+    )
     zeros = torch.zeros(count, dtype=torch.float64)
     out = simulate(model, parameters, leader, Start(zeros, torch.as_tensor(leader_speed[:, 0]), zeros), 0.1)
     speed = out.speed.numpy()
     own = np.diff(speed, axis=1, prepend=speed[:, :1]) / 0.1
     return PairSet(
         tuple(
-            Pair(f"p{i}", "test", "0", str(i), 0, 0.1, 5.0, position[i], leader_speed[i], acceleration[i], out.position[i].numpy(), speed[i], own[i])
+            Pair(
+                f"p{i}",
+                "test",
+                "0",
+                str(i),
+                0,
+                0.1,
+                5.0,
+                position[i],
+                leader_speed[i],
+                acceleration[i],
+                out.position[i].numpy(),
+                speed[i],
+                own[i],
+            )
             for i in range(count)
         ),
         "test",

@@ -1,7 +1,8 @@
 """A cache of calibration results, by content.
 
-An entry's name is the SHA-256 of everything that the result depends on, so a hit is always the right answer and nothing ever needs to be
-invalidated. Entries are NumPy archives read without pickle; each appears whole or not at all, and a damaged one is computed again.
+An entry's name is the SHA-256 of everything that the result depends on, so a hit is always the right answer and nothing ever
+needs to be invalidated. Entries are NumPy archives read without pickle; each appears whole or not at all, and a damaged one is
+computed again.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
 import tempfile
 import zipfile
 from collections.abc import Mapping
@@ -62,11 +62,12 @@ class Cache:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
-                np.savez(file, **dict(arrays))
-            os.replace(file.name, path)
+                np.savez(file, **arrays)  # type: ignore[arg-type]  # the stubs take every name for `allow_pickle`
+            Path(file.name).replace(path)
         except OSError as error:
             raise OutputError(
-                f"cannot write the calibration cache {self.folder}: {error.strerror}; set cache.folder to a folder that can be written,"
+                f"cannot write the calibration cache {self.folder}: {error.strerror}; set cache.folder to a folder that can"
+                f" be written,"
                 " or cache.enabled=false"
             ) from error
 

@@ -1,7 +1,7 @@
 """The calibrator: fixed parameters of each pair, and the labels of each window.
 
-Both are the same thing to an optimizer: independent problems, each a drive from a measured state. Pairs are solved in groups and each
-pair's result is cached on its own, so an interrupted calibration goes on where it stopped.
+Both are the same thing to an optimizer: independent problems, each a drive from a measured state. Pairs are solved in groups and
+each pair's result is cached on its own, so an interrupted calibration goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -37,10 +37,11 @@ class Labels:
 
     Attributes:
         windows: which windows.
-        parameters: `(W, n)`, SI units; where nothing tells candidates apart they are the pair's fixed parameters.
-        loss: `(W,)`, RMSE of speed, m/s.
-        spread: `(W,)`, how much the choice of parameters matters there: median minus minimum loss of the space-filling candidates,
-            m/s. 0 where every candidate drives alike: such a label is arbitrary.
+        parameters: `(W, n)`, SI units: of those whose loss is within `windows.tie_tolerance` of the lowest, the nearest to the pair's
+            fixed parameters; so where nothing tells candidates apart they are the fixed parameters.
+        loss: `(W,)`, RMSE of speed with these parameters, m/s.
+        spread: `(W,)`, how much the choice of parameters matters there: median minus minimum loss of the space-filling
+            candidates, m/s. 0 where every candidate drives alike: such a label is arbitrary.
         diverged: `(W,)` int64, candidates whose loss was not a number.
     """
 
@@ -134,14 +135,14 @@ class Calibrator:
             objective = DriveObjective.of_segments(
                 self.simulator, batch, pair, first, torch.full_like(first, windows.settings.length)
             )
-            found = self._minimize(objective, guesses[pair], report)
+            found = self._minimize(objective, guesses[pair], report, windows.settings.tie_tolerance)
             return [{name: values[windows.pair[own] == p] for name, values in found.items()} for p in chosen]
 
         results = self._cached("Window labels", keys, counts.tolist(), solve)
         joined = {name: torch.cat([torch.as_tensor(entry[name]) for entry in results]).to(device) for name in results[0]}
         return Labels(windows=windows, **joined)
 
-    def _minimize(self, objective: DriveObjective, guesses: Tensor, report: Progress) -> Arrays:
+    def _minimize(self, objective: DriveObjective, guesses: Tensor, report: Progress, tolerance: float = 0.0) -> Arrays:
         solution = self.optimizer.minimize(
             objective,
             guesses,
@@ -149,6 +150,7 @@ class Calibrator:
             objective_bytes=objective.bytes_per_candidate,
             memory=self.memory,
             progress=report,
+            tolerance=tolerance,
         )
         found = {
             "parameters": self.space.from_unit(solution.best),

@@ -12,6 +12,12 @@ class WindowSettings(Settings):
 
     length: int = Field(5, ge=1, description="steps that a window simulates")
     stride: int = Field(5, ge=1, description="steps from one window's start to the next; parameters change this often")
+    tie_tolerance: float = Field(
+        0.05,
+        ge=0,
+        description="m/s: losses in a window this close to the lowest count as equal, and the label is what is nearest to the"
+        " pair's fixed parameters; about what a speed in NGSIM is accurate to; 0 in the paper",
+    )
 
     @model_validator(mode="after")
     def _covers(self) -> WindowSettings:

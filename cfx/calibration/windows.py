@@ -1,7 +1,7 @@
 """Windows: the short stretches of a drive for which one set of parameters holds.
 
-A window starts at a measured state and spans `length` steps; one starts every `stride` steps. Window k of a pair starts at frame `k
-stride` and is compared at the `length` frames after it. Letters: P pairs, W windows of all pairs together.
+A window starts at a measured state and spans `length` steps; one starts every `stride` steps. Window k of a pair starts at frame
+`k stride` and is compared at the `length` frames after it. Letters: P pairs, W windows of all pairs together.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ class Split:
                 needed = next(n for n in range(3, 10**6) if 2 <= int(share * n + 1e-9) < n)
                 frames = (needed - 1) * settings.stride + settings.length + 1
                 raise DataError(
-                    f"pair {pair.pair_id} has {len(pair)} frames, too few for windows of {settings.length} steps with split={share:g};"
+                    f"pair {pair.pair_id} has {len(pair)} frames, too few for windows of {settings.length} steps with"
+                    f" split={share:g};"
                     f" set data.min_frames to at least {frames}"
                 )
         frame = torch.tensor([first * settings.stride for first in training])

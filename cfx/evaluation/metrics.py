@@ -33,7 +33,8 @@ def improvement_statistics(fixed: NDArray[np.float64], policy: NDArray[np.float6
     counts = np.isfinite(fixed) & np.isfinite(policy) & (fixed > 0)
     before, after = fixed[counts], policy[counts]
     if not counts.any():
-        return Improvement(*[float("nan")] * 7, pairs=0, undefined=len(fixed))
+        nan = float("nan")
+        return Improvement(nan, nan, nan, nan, nan, nan, nan, pairs=0, undefined=len(fixed))
     gain = (before - after) / before
     low = high = float("nan")
     if len(gain) > 1:
@@ -86,12 +87,13 @@ def evaluate(
     rmse_gap = {m: _rmse(loop.gap, real_gap, counted) for m, loop in loops.items()}
     collided = {m: ((loop.gap < 0) & counted).any(1).cpu().numpy() for m, loop in loops.items()}
     means = {m: _mean(loop.parameters, counted) for m, loop in loops.items()}
-    by_driver = style.table.set_index("driver")
+    drivers = style.table["driver"]
+    cluster = dict(zip(drivers, style.table["cluster"], strict=True))
+    score = dict(zip(drivers, style.table["score"], strict=True))
     rows = []
     for i, pair in enumerate(pairs):
         for method in METHODS:
             before, after = rmse_speed["fixed"][i], rmse_speed[method][i]
-            cluster = int(by_driver.loc[pair.driver, "cluster"])
             rows.append(
                 {
                     "pair_id": pair.pair_id,
@@ -99,8 +101,8 @@ def evaluate(
                     "leader_id": pair.leader_id,
                     "follower_id": pair.follower_id,
                     "driver": pair.driver,
-                    "cluster": CLUSTERS[cluster],
-                    "style_score": float(by_driver.loc[pair.driver, "score"]),
+                    "cluster": CLUSTERS[cluster[pair.driver]],
+                    "style_score": float(score[pair.driver]),
                     "fold": 0,
                     "method": method,
                     "frames": int(counted[i].sum()),
@@ -143,7 +145,7 @@ def _drives(pairs: PairSet, batch: PairBatch, first: Tensor, index: Tensor, loop
         Drive(
             pair_id=pair.pair_id,
             driver=pair.driver,
-            time=(int(first[i]) + np.arange(len(speed[i]))) * pair.dt,
+            time=(int(first[i]) + np.arange(len(speed[i]), dtype=np.float64)) * pair.dt,
             leader_speed=leader[i],
             real_speed=speed[i],
             real_gap=gap[i],

@@ -75,8 +75,8 @@ class LearnerSettings(Settings):
 class Learner(Component):
     """Base of every learner.
 
-    Life cycle: a protocol makes a `Lesson` (with window labels if `needs_labels`) and calls `fit` once. Networks are independent: what one
-    learns does not depend on which others are trained beside it.
+    Life cycle: a protocol makes a `Lesson` (with window labels if `needs_labels`) and calls `fit` once. Networks are
+    independent: what one learns does not depend on which others are trained beside it.
 
     Attributes:
         needs_labels: whether the protocol must find window labels first.

@@ -1,7 +1,7 @@
 """Imitation of window labels: the paper's way to train a policy.
 
-The policy reads the measured drive window by window and learns to answer the parameters that calibration found for each. All networks
-are trained at once as one batched network; the sum of their losses trains each as if it were alone.
+The policy reads the measured drive window by window and learns to answer the parameters that calibration found for each. All
+networks are trained at once as one batched network; the sum of their losses trains each as if it were alone.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ class ImitationSettings(LearnerSettings):
     batch_size: int | None = Field(
         16,
         ge=1,
-        description="consecutive windows per gradient step, the recurrent state carried on; null: the whole drive; 1 in the paper",
+        description="consecutive windows per gradient step, the recurrent state carried on; null: the whole drive; 1 in the"
+        " paper",
     )
     learning_rate: float = Field(3e-3, gt=0, description="of Adam")
     weight_decay: float = Field(0.0, ge=0, description="of AdamW, decoupled")
@@ -55,8 +56,8 @@ class ImitationLearner(Learner):
     """Learns window labels by mean squared error in unit space.
 
     Differences from the paper: windows can be weighted by their loss spread, because the labels of windows that do not
-    determine the parameters are arbitrary (`weight_by_spread=false` gives the paper's plain error); the weights of the epoch with the
-    smallest validation loss are kept, for each network on its own.
+    determine the parameters are arbitrary (`weight_by_spread=false` gives the paper's plain error); the weights of the epoch
+    with the smallest validation loss are kept, for each network on its own.
     """
 
     schema: ClassVar[type[Settings]] = ImitationSettings
@@ -140,7 +141,8 @@ class _Material(nn.Module):
             kept = kept.clamp(min=1)
         if bool((counts - kept < 1).any()):
             raise DataError(
-                f"a pair has only {int(counts.min())} training windows, too few to keep {settings.validation:g} of them for validation;"
+                f"a pair has only {int(counts.min())} training windows, too few to keep {settings.validation:g} of them for"
+                f" validation;"
                 " raise data.min_frames or set learner.validation=0"
             )
         train = mask & (number < (counts - kept)[:, None])
@@ -174,7 +176,10 @@ class _Grid:
 
 
 def _spread_weight(spread: Tensor, train: Tensor) -> Tensor:
-    """Returns weights `(P, W)` in proportion to the loss spread, mean 1 over each pair's training windows; ones if all spreads are 0."""
+    """Returns weights `(P, W)` in proportion to the loss spread.
+
+    Their mean is 1 over each pair's training windows; they are ones if all spreads are 0.
+    """
     count = train.sum(1, keepdim=True)
     mean = (spread * train).sum(1, keepdim=True) / count
     return torch.where(mean > 0, spread / mean.clamp(min=torch.finfo(spread.dtype).tiny), 1.0)

@@ -99,7 +99,7 @@ class Optimizer(Component):
 
     @abstractmethod
     def bytes_per_problem(self, n: int) -> int:
-        """Returns an upper estimate of the memory that `solve` needs for one problem, besides its result and the objective's own."""
+        """Returns an upper estimate of the memory that `solve` needs for one problem, besides its result and the objective."""
 
     def evaluations_at_once(self) -> int:
         """Returns how many candidates of one problem `solve` hands to the objective in one call at most; 1 unless overridden."""
@@ -118,6 +118,7 @@ class Optimizer(Component):
         objective_bytes: int = 0,
         memory: int = 1 << 30,
         progress: Progress = lambda _: None,
+        tolerance: float = 0.0,
     ) -> Solution:
         """Solves all problems of `objective`.
 
@@ -127,6 +128,7 @@ class Optimizer(Component):
             objective_bytes: memory that the objective needs for one candidate of one problem.
             memory: bound in bytes for one chunk; a chunk holds at least one problem.
             progress: called with the number of evaluations done since the last call.
+            tolerance: losses this close to the lowest, in their unit, count as equal besides those that rounding makes equal.
 
         Raises:
             PluginError: the optimizer asks for a candidate outside [0, 1], or returns another number of evaluations than it says.
@@ -143,7 +145,7 @@ class Optimizer(Component):
             own = guesses[first:last]
             candidates, losses = self.solve(guarded, own, seed=seed)
             self._check(candidates, losses, own)
-            pieces.append(_reduce(candidates, losses, own, self.space_filling()))
+            pieces.append(_reduce(candidates, losses, own, self.space_filling(), tolerance))
         best, loss, filling, diverged = (torch.cat(parts) for parts in zip(*pieces, strict=True))
         return Solution(best, loss, filling, diverged)
 
@@ -157,12 +159,14 @@ class Optimizer(Component):
             )
 
 
-def _reduce(candidates: Tensor, losses: Tensor, guesses: Tensor, space_filling: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _reduce(
+    candidates: Tensor, losses: Tensor, guesses: Tensor, space_filling: int, tolerance: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Reduces a chunk to best `(P, n)`, loss `(P,)`, filling `(P, 3)` and diverged `(P,)`."""
     g, n = guesses.shape[1:]
     finite = losses.isfinite()
     lowest = losses.min(dim=1, keepdim=True).values
-    ties = finite & (losses <= lowest + TIE_ABSOLUTE + TIE_RELATIVE * lowest.abs())
+    ties = finite & (losses <= lowest + tolerance + TIE_ABSOLUTE + TIE_RELATIVE * lowest.abs())
     distance = torch.linalg.vector_norm(candidates - guesses[:, :1], dim=-1)
     index = distance.where(ties, torch.inf).argmin(dim=1, keepdim=True)
     best = candidates.gather(1, index[..., None].expand(-1, 1, n)).squeeze(1)

@@ -87,8 +87,8 @@ class BotorchOptimizer(Optimizer):
     - Noise is fixed at almost nothing: the prior on noise that suits experiments blurs a simulation's narrow valleys.
 
     What makes it fast: one model with a batch of P Gaussian processes; marginal variances only; a few steps of Adam from the last
-    lengthscales instead of a fit from scratch (BoTorch's batched L-BFGS costs ten times as much and finds no better losses). Every
-    sum over problems separates, and the numbers of steps are fixed, so problems do not influence each other.
+    lengthscales instead of a fit from scratch (BoTorch's batched L-BFGS costs ten times as much and finds no better losses).
+    Every sum over problems separates, and the numbers of steps are fixed, so problems do not influence each other.
 
     Robust by construction: diverged candidates count as the worst finite loss of their problem; a constant objective standardises
     to zeros; duplicates are carried by the noise; candidates are clamped.

@@ -70,6 +70,8 @@ def sobol(count: int, n: int, *, seed: int, like: Tensor, key: str, guesses: int
         raise ConfigError(
             f"optimizer.{key}={count + guesses}: there are {guesses} first guesses; set optimizer.{key} >= {guesses}"
         )
+    if count == 0:
+        return like.new_empty((0, n))
     engine = torch.quasirandom.SobolEngine(n, scramble=True, seed=seed)  # type: ignore[no-untyped-call]  # torch leaves it untyped
     points: Tensor = engine.draw(count, dtype=torch.float64)
     return points.to(like.device)

@@ -1,7 +1,7 @@
 """The contract of a policy: recent states in, parameters for the next window out.
 
-Letters: N independent networks, B drivers of each, W windows, f features of a token, n tuned parameters, s width of the state. N networks
-are trained and driven as one batched network: 94 pairs with a network each cost about as much as one.
+Letters: N independent networks, B drivers of each, W windows, f features of a token, n tuned parameters, s width of the state. N
+networks are trained and driven as one batched network: 94 pairs with a network each cost about as much as one.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class PolicyNetwork(nn.Module, ABC):
             state: `(N, B, s)`.
 
         Returns:
-            Parameters in unit space `(N, B, W, n)`, within [0, 1], and the state after the last window. Reading W windows at once or one by
-            one gives the same.
+            Parameters in unit space `(N, B, W, n)`, within [0, 1], and the state after the last window. Reading W windows at
+            once or one by one gives the same.
         """
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from cfx.component import Settings
 from cfx.policies.base import Policy, PolicyNetwork
-from cfx.policies.recurrent import RecurrentNetwork, RecurrentSettings, RecurrentLayer
+from cfx.policies.recurrent import RecurrentLayer, RecurrentNetwork, RecurrentSettings
 
 
 class LstmNetwork(RecurrentNetwork):

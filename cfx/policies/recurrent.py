@@ -40,8 +40,8 @@ class RecurrentLayer(nn.Module):
 
     def project(self, x: Tensor) -> Tensor:
         """Input part of all gates at all windows: `(N, B, W, i)` to `(N, B, W, gates * hidden)`."""
-        networks, drivers, windows, _ = x.shape
-        return torch.baddbmm(self.b_input, x.flatten(1, 2), self.w_input).unflatten(1, (drivers, windows))
+        projected = torch.baddbmm(self.b_input, x.flatten(1, 2), self.w_input)
+        return projected.view(*x.shape[:3], -1)
 
     def recur(self, h: Tensor) -> Tensor:
         """Hidden part of all gates: `(N, B, hidden)` to `(N, B, gates * hidden)`."""
@@ -72,8 +72,9 @@ class RecurrentNetwork(PolicyNetwork):
     def forward(self, tokens: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         x = tokens
         last = []
-        for layer, carried in zip(self.layers, state.chunk(len(self.layers), dim=-1), strict=True):
+        for layer, before in zip(self.layers, state.chunk(len(self.layers), dim=-1), strict=True):
             assert isinstance(layer, RecurrentLayer)
+            carried = before
             projected = layer.project(x)
             outputs = []
             for k in range(tokens.shape[2]):
@@ -81,9 +82,8 @@ class RecurrentNetwork(PolicyNetwork):
                 outputs.append(carried[..., : self.hidden])
             x = torch.stack(outputs, dim=2)
             last.append(carried)
-        networks, drivers, windows, _ = x.shape
-        logits = torch.baddbmm(self.b_out, self.dropout(x).flatten(1, 2), self.w_out).unflatten(1, (drivers, windows))
-        return logits.sigmoid(), torch.cat(last, dim=-1)
+        logits = torch.baddbmm(self.b_out, self.dropout(x).flatten(1, 2), self.w_out)
+        return logits.view(*x.shape[:3], -1).sigmoid(), torch.cat(last, dim=-1)
 
     def cell(self, projected: Tensor, layer: RecurrentLayer, carried: Tensor) -> Tensor:
         """Returns what one layer carries after one window, `(N, B, states * hidden)`, its output first."""

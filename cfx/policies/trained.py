@@ -6,7 +6,6 @@ Kept in a folder as `policy.pt` (a state dict, read with `weights_only=True`) an
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -142,7 +141,8 @@ class TrainedPolicy:
 
         Returns:
             A row per pair: `pair_id` and one column per tuned parameter (SI units), for the window that starts at the
-            pair's last frame. A pair that the policy was trained for is driven by its own network; any other by the only network there is.
+            pair's last frame. A pair that the policy was trained for is driven by its own network; any other by the only network
+            there is.
 
         Raises:
             DataError: the table is not in the tidy layout, its time step is another, or it is not clear which network to use.
@@ -186,7 +186,7 @@ class TrainedPolicy:
         weights |= {f"scaler.{key}": value.cpu() for key, value in self.scaler.state_dict().items()}
         temporary = folder / "policy.pt.tmp"
         torch.save(weights, temporary)
-        os.replace(temporary, folder / "policy.pt")
+        temporary.replace(folder / "policy.pt")
         description = {
             "format": _FORMAT,
             "policy": dict(self.policy_node),
@@ -198,7 +198,7 @@ class TrainedPolicy:
         }
         temporary = folder / "policy.json.tmp"
         temporary.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
-        os.replace(temporary, folder / "policy.json")
+        temporary.replace(folder / "policy.json")
 
     @classmethod
     def load(cls, folder: Path | str) -> TrainedPolicy:

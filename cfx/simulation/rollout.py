@@ -12,6 +12,7 @@ from __future__ import annotations
 import importlib.util
 import itertools
 import shutil
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from typing import Literal, NamedTuple
 
@@ -53,8 +54,8 @@ class Trajectory(NamedTuple):
         position: front bumper, m.
         speed: m/s.
         gap: bumper to bumper, m; negative from a collision on.
-        collided: bool, the gap is negative. A rollout goes on after a collision: nothing is hidden. Where parameters or
-            data are NaN, speed and gap are NaN and `collided` is False.
+        collided: bool, the gap is negative. A rollout goes on after a collision: nothing is hidden. False where the
+            gap is NaN.
     """
 
     position: Tensor
@@ -158,9 +159,11 @@ def _compiled_stepper(model: DrivingModel, dt: float, steps: int) -> _Step:
     key = (type(model), model.settings.model_dump_json(exclude={"parameters"}), dt, steps)
     if key not in _COMPILED:
         # Each model and block has a cache of its own: torch counts recompilations per function, and gives up after eight.
-        _COMPILED[key] = torch.compile(  # type: ignore[call-overload]  # torch's overloads leave isolate_recompiles out
-            _stepper(model, dt), dynamic=True, isolate_recompiles=True
-        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # torch's own, about itself, as it imports its compiler
+            _COMPILED[key] = torch.compile(  # type: ignore[call-overload]  # torch's overloads leave isolate_recompiles out
+                _stepper(model, dt), dynamic=True, isolate_recompiles=True
+            )
     return _COMPILED[key]
 
 

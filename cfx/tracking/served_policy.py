@@ -17,7 +17,7 @@ class ServedPolicy(PythonModel):
 
         self._policy = TrainedPolicy.load(context.artifacts["policy"])
 
-    def predict(self, context: Any, model_input: pd.DataFrame, params: Any = None) -> pd.DataFrame:  # noqa: ARG002 - MLflow's
+    def predict(self, context: Any, model_input: pd.DataFrame, params: Any = None) -> pd.DataFrame:
         return self._policy.predict_frame(model_input)
 
 

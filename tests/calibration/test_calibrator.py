@@ -42,7 +42,9 @@ class Counting(RandomSearch):
         return super().solve(objective, guesses, seed=seed)
 
 
-def calibrator(optimizer: RandomSearch, folder: Path | None = None, model: DrivingModel | None = None, **changes: object) -> Calibrator:
+def calibrator(
+    optimizer: RandomSearch, folder: Path | None = None, model: DrivingModel | None = None, **changes: object
+) -> Calibrator:
     arguments = {"seed": 0, "cache": Cache(folder), "memory": 1 << 28, "progress": Task} | changes
     return Calibrator(Simulator(model or Krauss(), 0.1), optimizer, **arguments)  # type: ignore[arg-type]  # the test's own mix
 
@@ -125,7 +127,9 @@ def test_the_second_time_nothing_is_calibrated_again(tmp_path: Path) -> None:
     ],
     ids=["bounds", "constant", "seed", "optimizer", "settings"],
 )
-def test_whatever_matters_makes_a_new_entry(tmp_path: Path, model: DrivingModel, changes: dict[str, object], samples: int) -> None:
+def test_whatever_matters_makes_a_new_entry(
+    tmp_path: Path, model: DrivingModel, changes: dict[str, object], samples: int
+) -> None:
     pairs = wavy_pairs(Krauss(), TRUE)
     everything(calibrator(Counting(), tmp_path), pairs)
     again = Counting(samples)
@@ -189,8 +193,13 @@ def test_the_objective_is_the_rmse_of_the_rollout() -> None:
     losses = objective(candidates)
     for i in range(2):
         frames = slice(int(first[i]), int(first[i] + steps[i]) + 1)
-        leader = Leader(*(x[pair[i], frames] for x in (batch.leader_position, batch.leader_speed, batch.leader_acceleration)), batch.leader_length[pair[i]])
-        begin = Start(*(x[pair[i], first[i]] for x in (batch.follower_position, batch.follower_speed, batch.follower_acceleration)))
+        leader = Leader(
+            *(x[pair[i], frames] for x in (batch.leader_position, batch.leader_speed, batch.leader_acceleration)),
+            batch.leader_length[pair[i]],
+        )
+        begin = Start(
+            *(x[pair[i], first[i]] for x in (batch.follower_position, batch.follower_speed, batch.follower_acceleration))
+        )
         for j in range(5):
             drive = simulate(model, model.space.from_unit(candidates[i, j]), leader, begin, 0.1)
             expected = (drive.speed[1:] - batch.follower_speed[pair[i], frames][1:]).square().mean().sqrt()

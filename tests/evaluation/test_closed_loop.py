@@ -24,7 +24,7 @@ from cfx.style.result import StyleResult
 from tests.drives import wavy_pairs
 
 
-def constant(model: DrivingModel, parameters: Tensor, windows: WindowSettings = WindowSettings()) -> TrainedPolicy:
+def constant(model: DrivingModel, parameters: Tensor) -> TrainedPolicy:
     unit = model.space.to_unit(parameters)
     count = len(unit)
     return TrainedPolicy(
@@ -34,17 +34,24 @@ def constant(model: DrivingModel, parameters: Tensor, windows: WindowSettings = 
         {"name": "krauss"},
         {"name": "fixed"},
         model.space,
-        windows,
+        WindowSettings(),
         0.1,
         tuple(f"p{i}" for i in range(count)),
     )
 
 
 def adaptive(model: DrivingModel, policy: Policy, networks: int, features: int) -> TrainedPolicy:
-    network = policy.build(features, model.space.to_unit(model.space.defaults()), torch.rand((networks, len(model.space))), torch.Generator().manual_seed(0))
+    network = policy.build(
+        features,
+        model.space.to_unit(model.space.defaults()),
+        torch.rand((networks, len(model.space))),
+        torch.Generator().manual_seed(0),
+    )
     scaler = Scaler(torch.full((networks, features), 8.0), torch.full((networks, features), 3.0))
     names = tuple(f"p{i}" for i in range(networks))
-    return TrainedPolicy(policy, network.eval(), scaler, {"name": "krauss"}, {"name": "gru"}, model.space, WindowSettings(), 0.1, names)
+    return TrainedPolicy(
+        policy, network.eval(), scaler, {"name": "krauss"}, {"name": "gru"}, model.space, WindowSettings(), 0.1, names
+    )
 
 
 @pytest.mark.parametrize("model", [Krauss(), W99()])
@@ -68,7 +75,9 @@ def test_constant_parameters_are_the_plain_rollout() -> None:
     batch = PairBatch.of(wavy_pairs(model, torch.tensor([[1.5, 0.1], [3.0, 0.5]], dtype=torch.float64)))
     first = torch.tensor([150, 150])
     loop = drive(Simulator(model, 0.1), constant(model, parameters), batch, first, torch.arange(2))
-    leader = Leader(batch.leader_position[:, 150:], batch.leader_speed[:, 150:], batch.leader_acceleration[:, 150:], batch.leader_length)
+    leader = Leader(
+        batch.leader_position[:, 150:], batch.leader_speed[:, 150:], batch.leader_acceleration[:, 150:], batch.leader_length
+    )
     start = Start(batch.follower_position[:, 150], batch.follower_speed[:, 150], batch.follower_acceleration[:, 150])
     plain = simulate(model, parameters, leader, start, 0.1)
     torch.testing.assert_close(loop.speed, plain.speed)
@@ -90,7 +99,10 @@ def test_the_policy_never_sees_the_measured_follower_of_the_test_part() -> None:
     hidden = frame > first[:, None]
     changed = replace(
         batch,
-        **{name: torch.where(hidden, 99.0, getattr(batch, name)) for name in ("follower_position", "follower_speed", "follower_acceleration")},
+        **{
+            name: torch.where(hidden, 99.0, getattr(batch, name))
+            for name in ("follower_position", "follower_speed", "follower_acceleration")
+        },
     )
     after = closed_loop_of(changed, model, first)
     torch.testing.assert_close(before, after)
@@ -135,10 +147,14 @@ def test_the_table_says_what_the_loops_did() -> None:
     simulator = Simulator(model, 0.1)
     loops = {
         "default": drive(simulator, constant(model, model.space.defaults().expand(2, 2)), batch, first, torch.arange(2)),
-        "fixed": drive(simulator, constant(model, torch.tensor([[4.0, 0.1], [4.0, 0.1]]).double()), batch, first, torch.arange(2)),
+        "fixed": drive(
+            simulator, constant(model, torch.tensor([[4.0, 0.1], [4.0, 0.1]]).double()), batch, first, torch.arange(2)
+        ),
         "policy": drive(simulator, constant(model, true), batch, first, torch.arange(2)),
     }
-    style = StyleResult(pd.DataFrame({"driver": [p.driver for p in pairs], "score": [0.2, 0.8], "cluster": [0, 2]}), {}, (0.3, 0.7))
+    style = StyleResult(
+        pd.DataFrame({"driver": [p.driver for p in pairs], "score": [0.2, 0.8], "cluster": [0, 2]}), {}, (0.3, 0.7)
+    )
     result = evaluate(pairs, batch, first, loops, model.space, style, seed=0)
     table = result.table.set_index(["pair_id", "method"])
     assert table.loc[("p0", "policy"), "rmse_speed"] == pytest.approx(0, abs=1e-9)

@@ -73,7 +73,9 @@ def test_the_same_seed_gives_the_same_weights_and_another_does_not() -> None:
 
 def test_the_best_epoch_is_kept() -> None:
     material = lesson(1)
-    learned = ImitationLearner(epochs=60, learning_rate=0.05, patience=None, gradient_clip=None, batch_size=4).fit(GruPolicy(), material)
+    learned = ImitationLearner(epochs=60, learning_rate=0.05, patience=None, gradient_clip=None, batch_size=4).fit(
+        GruPolicy(), material
+    )
     best = learned.curves.validation_loss.min()
     # One epoch without learning measures the weights that were kept.
     kept = ImitationLearner(epochs=1, learning_rate=1e-12)

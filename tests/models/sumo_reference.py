@@ -3,9 +3,10 @@
 Runs as a process of its own, because libsumo and pyarrow do not get on in one. All followers of a job drive at once, each on
 its own road behind its own leader.
 
-Job: `{"dt": s, "runs": [run, ...]}`. Run: `model` (SUMO's name), `parameters` (SUMO's vType attributes), `leader_speed` (frames 0 to
-T - 1), `leader_position`, `leader_acceleration`, `leader_length` (frame 0), `position`, `speed`, `acceleration` (follower, frame 0). SI units.
-Answer: `{"runs": [{"speed": [...], "position": [...], "leader_position": [...]}, ...]}`, T frames each.
+Job: `{"dt": s, "runs": [run, ...]}`. Run: `model` (SUMO's name), `parameters` (SUMO's vType attributes), `leader_speed` (frames
+0 to T - 1), `leader_position`, `leader_acceleration` (frame 0), `leader_length`, and `position`, `speed`, `acceleration` of the
+follower at frame 0. SI units. Answer: `{"runs": [{"speed": [...], "position": [...], "leader_position": [...]}, ...]}`, T frames
+each.
 """
 
 from __future__ import annotations

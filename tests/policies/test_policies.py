@@ -69,7 +69,8 @@ def test_tokens_have_the_declared_width_and_are_finite_at_standstill() -> None:
 
 
 @pytest.mark.parametrize(
-    ("inputs", "message"), [(("leader_sped",), "Did you mean 'leader_speed'"), ((), "give at least one"), (("gap", "gap"), "stands twice")]
+    ("inputs", "message"),
+    [(("leader_sped",), "Did you mean 'leader_speed'"), ((), "give at least one"), (("gap", "gap"), "stands twice")],
 )
 def test_wrong_inputs_are_named(inputs: tuple[str, ...], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
