@@ -83,9 +83,9 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
     from cfx.tracking.tracker import Tracker
 
     console = console or Console()
+    device = _device(config.device)
     if config.threads is not None:
         torch.set_num_threads(config.threads)
-    device = _device(config.device)
     parts = _Parts.of(config)
     _writable(folder)
     _write(folder / "config.yaml", yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
@@ -130,9 +130,11 @@ class _Parts:
 def _device(name: str) -> torch.device:
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    if name == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("device=cuda: PyTorch finds no CUDA device here; write device=cpu or device=auto")
-    return torch.device(name)
+    device = torch.device(name)
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        found = torch.cuda.device_count()
+        raise ConfigError(f"device={name}: PyTorch finds {found} CUDA devices here; write device=cpu or device=auto")
+    return device
 
 
 def _pairs(dataset: Dataset, config: JobConfig) -> tuple[PairSet, StyleResult]:

@@ -32,12 +32,14 @@ def serve(uri: str | None, port: int) -> None:
 
 
 def _store(uri: str | None) -> str:
-    from cfx.tracking.store import sqlite_file, tracking_uri
+    from cfx.tracking.store import check_database, sqlite_file, tracking_uri
 
     store = uri or tracking_uri(None)
     file = sqlite_file(store)
     if file is not None and not file.is_file():
         raise TrackingError(f"{file} does not exist: no job has been tracked from here; run one, or name its store with --uri")
+    if file is not None:
+        check_database(file, store)
     return store
 
 
@@ -52,9 +54,9 @@ def _check_port(port: int) -> None:
 
 def _links(store: str, port: int) -> list[str]:
     """Returns a line per experiment."""
-    from cfx.tracking.store import told
+    from cfx.tracking.store import quiet, told
 
-    with told(f"read {store}"):
+    with quiet(), told(f"read {store}"):
         from mlflow import MlflowClient
 
         experiments = MlflowClient(store).search_experiments()

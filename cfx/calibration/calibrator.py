@@ -37,8 +37,8 @@ class Labels:
 
     Attributes:
         windows: which windows.
-        parameters: `(W, n)`, SI units: of those whose loss is within `windows.tie_tolerance` of the lowest, the nearest to the pair's
-            fixed parameters; so where nothing tells candidates apart they are the fixed parameters.
+        parameters: `(W, n)`, SI units: of those with a loss within `windows.tie_tolerance` of the lowest, the nearest to
+            the pair's fixed parameters; so where nothing tells candidates apart they are the fixed parameters.
         loss: `(W,)`, RMSE of speed with these parameters, m/s.
         spread: `(W,)`, how much the choice of parameters matters there: median minus minimum loss of the space-filling
             candidates, m/s. 0 where every candidate drives alike: such a label is arbitrary.

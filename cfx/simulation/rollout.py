@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import importlib.util
 import itertools
+import math
 import shutil
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -107,31 +108,36 @@ class Simulator:
             end = Follower(*(torch.empty_like(state, memory_format=torch.contiguous_format) for state in follower))
             position, speed = (follower.speed.new_empty((steps, *batch)) for _ in range(2))
             for tile in _tiles(batch, size):
-                part = tile.follower(follower), tile.leader(leader), tile.parameters(p)
-                last, at, fast = self._compiled_drive(*part) if compiled else eager(*part)
-                tile.put(end, last)
-                tile.rows(position).copy_(at.view(steps, *tile.shape))
-                tile.rows(speed).copy_(fast.view(steps, *tile.shape))
+                drive = self._compiled_drive if compiled and len(tile) > 1 else self._eager_drive
+                tile.put(end, drive(tile, follower, leader, tile.parameters(p), tile.rows(position), tile.rows(speed)))
         return end, position, speed
 
     def _compiles(self, steps: int, like: Tensor) -> bool:
         worth_it = self._mode == "always" or (self._mode == "auto" and steps * like.numel() >= _WORTH_COMPILING)
         return worth_it and can_compile(like.device)
 
-    def _compiled_drive(self, follower: Follower, leader: Leader, p: _Parameters) -> tuple[Follower, Tensor, Tensor]:
-        """Takes all steps of one tile, in blocks; what is left over goes step by step."""
-        if follower.speed.numel() == 1:  # a batch of one would be compiled for itself
-            return _stepper(self.model, self.dt)(follower, leader, p)
-        steps = len(leader.position)
-        cuts = [*range(0, steps - _BLOCK + 1, _BLOCK)]
-        cuts = [*cuts, *range(_BLOCK * len(cuts), steps), steps]
-        positions, speeds = [], []
+    def _eager_drive(
+        self, tile: _Tile, follower: Follower, leader: Leader, p: _Parameters, position: Tensor, speed: Tensor
+    ) -> Follower:
+        """Takes all steps of one tile; writes positions and speeds `(time, rows, columns)`."""
+        last, at, fast = _stepper(self.model, self.dt)(tile.follower(follower), tile.leader(leader, 0, len(position)), p)
+        position.copy_(at.view_as(position))
+        speed.copy_(fast.view_as(speed))
+        return last
+
+    def _compiled_drive(
+        self, tile: _Tile, follower: Follower, leader: Leader, p: _Parameters, position: Tensor, speed: Tensor
+    ) -> Follower:
+        """As `_eager_drive`, in compiled blocks; what is left over goes step by step."""
+        steps = len(position)
+        cuts = [*range(0, steps - steps % _BLOCK, _BLOCK), *range(steps - steps % _BLOCK, steps + 1)]
+        current = tile.follower(follower)
         for first, last in itertools.pairwise(cuts):
             take = _compiled_stepper(self.model, self.dt, last - first)
-            follower, position, speed = take(follower, _frames(leader, first, last), p)
-            positions.append(position)
-            speeds.append(speed)
-        return follower, torch.cat(positions), torch.cat(speeds)
+            current, at, fast = take(current, tile.leader(leader, first, last), p)
+            position[first:last].copy_(at.view(-1, *tile.shape))
+            speed[first:last].copy_(fast.view(-1, *tile.shape))
+        return current
 
 
 def _stepper(model: DrivingModel, dt: float) -> _Step:
@@ -177,8 +183,9 @@ def can_compile(device: torch.device) -> bool:
 class _Tile:
     """A rectangle of a batch that is seen as rows and columns, `(prod(batch[:-1]), batch[-1])`.
 
-    Everything inside a tile is one-dimensional and contiguous, whatever the caller's batch looks like: one compiled function
-    serves all of them.
+    What goes into a step is copied into new one-dimensional tensors (`(time, n)` for the leader), whatever the caller's batch
+    looks like: the compiler makes other code for other strides, offsets and views, and this way all batches share one. The
+    copies stay in the cache.
     """
 
     def __init__(self, batch: torch.Size, rows: slice, columns: slice) -> None:
@@ -187,43 +194,51 @@ class _Tile:
         self._rows, self._columns = rows, columns
         self.shape = (rows.stop - rows.start, columns.stop - columns.start)
 
+    def __len__(self) -> int:
+        """The number of followers, n."""
+        return math.prod(self.shape)
+
     def rows(self, whole: Tensor) -> Tensor:
         """Returns the tile of a contiguous `(time, *batch)` as a view `(time, rows, columns)`."""
-        return whole.view(-1, *self._grid)[:, self._rows, self._columns]
+        return whole.view(len(whole), *self._grid)[:, self._rows, self._columns]
 
     def follower(self, follower: Follower) -> Follower:
         position, speed, acceleration = (self._flat(state) for state in follower[:3])
-        return Follower(position, speed, acceleration, self._flat_memory(follower.memory))
+        width = follower.memory.shape[-1]
+        memory = follower.memory.new_empty((len(self), width))
+        memory.view(*self.shape, width).copy_(follower.memory.reshape(*self._grid, width)[self._rows, self._columns])
+        return Follower(position, speed, acceleration, memory)
 
-    def leader(self, leader: Leader) -> Leader:
-        position, speed, acceleration = (self._flat_frames(signal) for signal in leader[:3])
+    def leader(self, leader: Leader, first: int, last: int) -> Leader:
+        position, speed, acceleration = (self._flat_frames(signal[first:last]) for signal in leader[:3])
         return Leader(position, speed, acceleration, self._flat(leader.length))
 
     def parameters(self, p: Mapping[str, Tensor]) -> _Parameters:
         """Constants stay 0-dimensional: they cost no memory traffic."""
-        return {name: value if value.dim() == 0 else self._flat(value) for name, value in p.items()}
+        return {name: value.clone() if value.dim() == 0 else self._flat(value) for name, value in p.items()}
 
     def put(self, end: Follower, last: Follower) -> None:
         """Writes the tile's last state into the whole batch's."""
         for whole, part in zip(end[:3], last[:3], strict=True):
             self.rows(whole[None])[0].copy_(part.view(self.shape))
-        if end.memory.shape[-1]:
-            whole = end.memory.view(*self._grid, -1)
-            whole[self._rows, self._columns].copy_(last.memory.view(*self.shape, -1))
+        width = end.memory.shape[-1]
+        end.memory.view(*self._grid, width)[self._rows, self._columns].copy_(last.memory.view(*self.shape, width))
 
     def _flat(self, value: Tensor) -> Tensor:
-        return value.expand(self._batch).reshape(self._grid)[self._rows, self._columns].reshape(-1)
+        return self._copy(value.expand(self._batch).reshape(self._grid))
 
     def _flat_frames(self, signal: Tensor) -> Tensor:
         frames = len(signal)
-        lead = (1,) * (len(self._batch) - signal.dim() + 1)
-        whole = signal.reshape(frames, *lead, *signal.shape[1:]).expand(frames, *self._batch).reshape(frames, *self._grid)
-        return whole[:, self._rows, self._columns].reshape(frames, -1)
+        missing = (1,) * (len(self._batch) - signal.dim() + 1)
+        whole = signal.reshape(frames, *missing, *signal.shape[1:]).expand(frames, *self._batch)
+        return self._copy(whole.reshape(frames, *self._grid))
 
-    def _flat_memory(self, memory: Tensor) -> Tensor:
-        width = memory.shape[-1]
-        whole = memory.reshape(*self._grid, width)[self._rows, self._columns]
-        return whole.reshape(self.shape[0] * self.shape[1], width)
+    def _copy(self, grid: Tensor) -> Tensor:
+        """Copies the tile out of `(*time, all rows, all columns)` into a new `(*time, n)`."""
+        time = grid.shape[:-2]
+        copy = grid.new_empty((*time, len(self)))
+        copy.view(*time, *self.shape).copy_(grid[..., self._rows, self._columns])
+        return copy
 
 
 def _tile_size(like: Tensor) -> int:

@@ -113,7 +113,7 @@ def open_store(uri: str, experiment: str, default: Path | None = None) -> Store:
             if _is_new(file):
                 _create(file, home)
             else:
-                _check(file, uri)
+                check_database(file, uri)
         else:
             _answers(uri)
         with told(f"open {uri}"):
@@ -244,7 +244,7 @@ def _unsynchronised() -> Iterator[None]:
         event.remove(Engine, "connect", relax)
 
 
-def _check(file: Path, uri: str) -> None:
+def check_database(file: Path, uri: str) -> None:
     """Looks at an existing SQLite file before MLflow does: is it free, and is it a database of this MLflow?"""
     try:
         # Autocommit mode: the transaction is this function's own.

@@ -273,7 +273,7 @@ def test_compiled_equals_eager_and_shapes_do_not_recompile(monkeypatch: pytest.M
             assert_same(eager, compiled)
     assert len(rollout._COMPILED) == 2, "one function for a block of five steps, one for the steps left over"
     counters = torch._dynamo.utils.counters
-    assert counters["stats"]["unique_graphs"] <= 3, "a job's shapes must share their compiled code"
+    assert counters["stats"]["unique_graphs"] == 2, "a job's shapes must share their compiled code"
 
 
 def test_gradients_bypass_the_compiler() -> None:

@@ -1,0 +1,91 @@
+"""Labels per second: all windows as one batch against the plain BoTorch loop of its tutorials, window by window, in the same run.
+
+`pytest tests/benchmarks --benchmark-only`. What counts are the ratios in `extra_info`: they compare runs on one machine.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from typing import Any
+
+import pytest
+import torch
+from botorch.acquisition.analytic import LogExpectedImprovement
+from botorch.fit import fit_gpytorch_mll
+from botorch.models import SingleTaskGP
+from botorch.optim import optimize_acqf
+from gpytorch.mlls import ExactMarginalLogLikelihood
+from torch import Tensor
+
+from cfx.calibration.objective import DriveObjective
+from cfx.models.base import DrivingModel, Leader
+from cfx.models.krauss import Krauss
+from cfx.models.w99 import W99
+from cfx.optimizers.base import Optimizer
+from cfx.optimizers.botorch import BotorchOptimizer
+from cfx.optimizers.random import RandomSearch
+from cfx.simulation.rollout import Simulator, Start
+
+WINDOWS, STEPS, DT, LOOPED = 128, 5, 0.1, 2
+
+
+def windows(model: DrivingModel) -> DriveObjective:
+    """Returns windows of drivers of this model whose parameters nobody knows, behind leaders that accelerate and brake."""
+    draw = torch.Generator().manual_seed(0)
+
+    def uniform(low: float, high: float) -> Tensor:
+        return low + (high - low) * torch.rand(WINDOWS, generator=draw, dtype=torch.float64)
+
+    speed, acceleration, gap = uniform(3.0, 18.0), uniform(-1.5, 1.5), uniform(5.0, 40.0)
+    leader_speed = (speed + uniform(-1.5, 1.5) + acceleration * DT * torch.arange(STEPS)[:, None]).clamp(min=0.0)
+    leader_position = gap + 4.5 + torch.cat([torch.zeros(1, WINDOWS), leader_speed[1:] * DT]).cumsum(0)
+    length = torch.full((WINDOWS,), 4.5, dtype=torch.float64)
+    leader = Leader(leader_position, leader_speed, acceleration.expand(STEPS, -1), length)
+    start = Start(torch.zeros_like(speed), speed, uniform(-1.0, 1.0))
+    simulator = Simulator(model, DT, compile="never")
+    truth = torch.rand(WINDOWS, len(model.space), generator=draw, dtype=torch.float64)
+    _, _, observed = simulator.advance(simulator.begin(start), leader, model.space.unpack(model.space.from_unit(truth)))
+    observed = observed + 0.02 * torch.randn(observed.shape, generator=draw, dtype=torch.float64)
+    return DriveObjective(simulator, *leader, *start, observed, torch.ones_like(observed))
+
+
+def plain_loop(objective: DriveObjective, guess: Tensor, *, initial: int, iterations: int) -> float:
+    """Returns the loss that BoTorch's tutorial reaches in one window."""
+    n = guess.shape[-1]
+    bounds = torch.tensor([[0.0], [1.0]], dtype=torch.float64).expand(2, n)
+    points = torch.quasirandom.SobolEngine(n, scramble=True, seed=0).draw(initial - 1, dtype=torch.float64)
+    tried = torch.cat([guess, points])
+    values = -objective(tried[None])[0][:, None]
+    for _ in range(iterations):
+        process = SingleTaskGP(tried, values)
+        fit_gpytorch_mll(ExactMarginalLogLikelihood(process.likelihood, process))
+        improvement = LogExpectedImprovement(process, best_f=values.max())
+        candidate, _ = optimize_acqf(improvement, bounds, q=1, num_restarts=10, raw_samples=512)
+        tried, values = torch.cat([tried, candidate]), torch.cat([values, -objective(candidate[None])[0][:, None]])
+    return -values.max().item()
+
+
+@pytest.mark.parametrize("model", [Krauss(), W99()], ids=["krauss", "w99"])
+@pytest.mark.parametrize("optimizer", [BotorchOptimizer(), RandomSearch()], ids=["botorch", "random"])
+def test_labels_per_second(benchmark: Any, model: DrivingModel, optimizer: Optimizer) -> None:
+    objective = windows(model)
+    guesses = model.space.to_unit(model.space.defaults()).expand(WINDOWS, 1, -1)
+    searched = RandomSearch().minimize(objective, guesses, seed=0)
+
+    found = benchmark.pedantic(optimizer.minimize, args=(objective, guesses), kwargs={"seed": 0}, rounds=1, iterations=1)
+
+    began = time.perf_counter()
+    with warnings.catch_warnings():
+        # The plain loop warns of fits and climbs that did not converge: part of what is compared.
+        warnings.simplefilter("ignore")
+        plain = [plain_loop(objective.select(i, i + 1), guesses[i], initial=10, iterations=30) for i in range(LOOPED)]
+    plain_seconds = (time.perf_counter() - began) / LOOPED
+    seconds = benchmark.stats.stats.mean / WINDOWS
+    benchmark.extra_info |= {
+        "labels_per_second": 1 / seconds,
+        "times_faster_than_plain_loop": plain_seconds / seconds,
+        "mean_loss_over_4096_random": (found.loss.mean() / searched.loss.mean()).item(),
+        "mean_loss_over_plain_loop": found.loss[:LOOPED].mean().item() / (sum(plain) / LOOPED),
+    }
+    assert bool((found.loss <= objective(guesses)[:, 0] * (1 + 1e-5)).all())

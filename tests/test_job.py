@@ -1,0 +1,312 @@
+"""Whole jobs: what they leave behind, that they repeat, and what they say when something is wrong."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import yaml
+
+import cfx
+from cfx import cli
+from cfx.datasets.synthetic import SyntheticDataset
+from cfx.datasets.tidy import write_tidy
+from cfx.errors import DataError
+
+QUICK = [
+    "debug=quick",
+    "data.pairs=3",
+    "data.frames=200",
+    "data.max_pairs=null",
+    "figures.enabled=false",
+    "tracking.enabled=false",
+]
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+
+
+def run(*overrides: str) -> cfx.JobResult:
+    return cfx.run([*QUICK, *overrides])
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> cfx.JobResult:
+    """A job with everything on, started as a program."""
+    folder = tmp_path_factory.mktemp("job")
+    command = [
+        sys.executable,
+        "-m",
+        "cfx",
+        "debug=quick",
+        "data.pairs=3",
+        "data.frames=200",
+        "data.max_pairs=null",
+        "hydra.run.dir=out",
+    ]
+    environment = {key: value for key, value in os.environ.items() if key != "MLFLOW_TRACKING_URI"}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    (folder / "stdout.txt").write_text(done.stdout)
+    (folder / "stderr.txt").write_text(done.stderr)
+    return cfx.load(folder / "out")
+
+
+def test_the_folder_holds_what_the_contract_says(finished: cfx.JobResult) -> None:
+    folder = finished.folder
+    names = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+    assert {"config.yaml", "metrics.json", "pairs.csv", "policy/policy.pt", "policy/policy.json", "cfx.log"} <= names
+    assert {path.name for path in finished.figures} >= {
+        "style_distribution.png", "drives.png", "chosen_parameters.png", "improvement_per_driver.png", "learning_curve.png"
+    }  # fmt: skip
+    assert not [name for name in names if "tmp" in name]
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    assert config["model"]["name"] == "krauss"
+    assert config["learner"]["epochs"] == 3
+    metrics = json.loads((folder / "metrics.json").read_text())
+    expected = {f"{what}/{method}" for what in ("rmse_speed", "rmse_gap") for method in ("default", "fixed", "policy")}
+    expected |= {
+        f"rmse_improvement/{name}" for name in ("mean", "trimmed_mean", "median", "ci95_low", "ci95_high", "win_rate", "p_value")
+    }
+    assert expected | {"collisions/policy"} <= set(metrics)
+
+
+def test_the_terminal_says_what_matters(finished: cfx.JobResult) -> None:
+    text = (finished.folder.parent / "stdout.txt").read_text()
+    for word in ("default", "fixed", "policy", "RMSE speed", "95 % interval", "Results:", "cfx ui", "http://127.0.0.1:5000"):
+        assert word in text, text
+    assert "Traceback" not in (finished.folder.parent / "stderr.txt").read_text()
+
+
+def test_a_row_per_pair_and_method(finished: cfx.JobResult) -> None:
+    assert len(finished.pairs) == 9
+    means = finished.pairs.groupby("method").rmse_speed.mean()
+    for method in ("default", "fixed", "policy"):
+        assert finished.metrics[f"rmse_speed/{method}"] == pytest.approx(means[method])
+
+
+def test_synthetic_data_keeps_its_truth(finished: cfx.JobResult) -> None:
+    table = pd.read_parquet(finished.folder / "data.parquet")
+    assert {"true_t_r", "true_t_i", "true_model"} <= set(table.columns)
+
+
+@pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy:sqlalchemy.exc.SADeprecationWarning")  # inside MLflow
+@pytest.mark.filterwarnings("ignore:.*Any type hint is inferred as AnyType:UserWarning")  # inside MLflow, at its import
+def test_the_policy_in_mlflow_predicts_the_same(finished: cfx.JobResult, monkeypatch: pytest.MonkeyPatch) -> None:
+    import mlflow
+
+    home = finished.folder.parent
+    uri = f"sqlite:///{home}/outputs/mlflow.db"
+    client = mlflow.MlflowClient(uri)
+    experiment = client.get_experiment_by_name("cfx-debug")
+    assert experiment is not None
+    (tracked,) = client.search_runs([experiment.experiment_id])
+    assert tracked.info.status == "FINISHED"
+    assert tracked.data.metrics["rmse_speed/fixed"] == pytest.approx(finished.metrics["rmse_speed/fixed"])
+    assert tracked.data.params["model.name"] == "krauss"
+    before = mlflow.get_tracking_uri()
+    mlflow.set_tracking_uri(uri)
+    try:
+        (model,) = client.search_logged_models([experiment.experiment_id])
+        served = mlflow.pyfunc.load_model(f"models:/{model.model_id}")
+    finally:
+        mlflow.set_tracking_uri(before)
+        os.environ.pop("MLFLOW_TRACKING_URI", None)  # MLflow sets it too
+    table = pd.read_parquet(finished.folder / "data.parquet")
+    pd.testing.assert_frame_equal(served.predict(table), finished.policy.predict_frame(table))
+    monkeypatch.chdir(home)
+    again = cfx.load(tracked.info.run_id)
+    assert again.metrics == finished.metrics
+
+
+def test_the_same_seed_gives_the_same_metrics() -> None:
+    one, two, other = run("cache.enabled=false"), run("cache.enabled=false"), run("seed=1", "cache.enabled=false")
+    texts = [(result.folder / "metrics.json").read_text() for result in (one, two, other)]
+    assert one.folder != two.folder
+    assert texts[0] == texts[1]
+    assert texts[0] != texts[2]
+
+
+@pytest.mark.parametrize("policy", ["fixed", "default"])
+def test_a_baseline_as_policy_equals_itself(policy: str) -> None:
+    result = run(f"policy={policy}")
+    assert result.metrics["rmse_speed/policy"] == result.metrics[f"rmse_speed/{policy}"]
+    if policy == "fixed":
+        assert result.metrics["rmse_improvement/mean"] == 0
+        assert result.metrics["rmse_improvement/p_value"] == 1
+
+
+@pytest.mark.parametrize("overrides", [["model=w99", "policy=lstm"], ["model=w74", "learner.scope=all"], ["dtype=float32"]])
+def test_other_components_run_too(overrides: list[str]) -> None:
+    result = run(*overrides)
+    assert all(math.isfinite(result.metrics[f"rmse_speed/{method}"]) for method in ("default", "fixed", "policy"))
+    loaded = cfx.load(result.folder)
+    table = pd.read_parquet(result.folder / "data.parquet")
+    pd.testing.assert_frame_equal(loaded.policy.predict_frame(table), result.policy.predict_frame(table))
+
+
+def test_two_policies_calibrate_once(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("INFO"):
+        run("policy=gru")
+        first = [message for message in caplog.messages if "problems" in message]
+        caplog.clear()
+        run("policy=lstm")
+    assert any("Window labels" in message for message in first)
+    assert not [message for message in caplog.messages if "problems): done" in message and "0 problems" not in message]
+
+
+def test_a_style_cluster_is_selected() -> None:
+    result = run("style.cluster=normal", "data.pairs=8")
+    assert set(result.pairs.cluster) == {"normal"}
+    assert result.pairs.pair_id.nunique() == 4
+
+
+def test_the_raw_sample_is_found(shared_data: Path) -> None:
+    path = shared_data / "i80_0400_raw_sample.csv.gz"
+    result = cfx.run(
+        [
+            *QUICK[4:],
+            "data=ngsim",
+            f"data.path={path}",
+            "data.min_frames=300",
+            "optimizer=random",
+            "optimizer.samples=16",
+            "learner.epochs=2",
+        ]
+    )
+    assert result.pairs.pair_id.nunique() == 142
+
+
+# ---- bad input: one sentence, exit code 2, nothing lost
+
+
+@pytest.fixture
+def tidy(tmp_path: Path) -> Path:
+    path = tmp_path / "pairs.csv"
+    write_tidy(SyntheticDataset(pairs=2, frames=120).load(), path)
+    return path
+
+
+Change = Callable[[pd.DataFrame], pd.DataFrame]
+
+
+def _set(row: int, column: str, value: object) -> Change:
+    def change(table: pd.DataFrame) -> pd.DataFrame:
+        table = table.astype({column: object})
+        table.loc[row, column] = value
+        return table
+
+    return change
+
+
+BROKEN_TABLES: dict[str, tuple[Change, str]] = {
+    "wrong column": (lambda t: t.rename(columns={"leader_speed_mps": "leader_sped_mps"}), "leader_speed_mps"),
+    "NaN": (_set(7, "follower_speed_mps", math.nan), "follower_speed_mps"),
+    "infinite": (_set(7, "leader_position_m", math.inf), "leader_position_m"),
+    "text": (_set(7, "leader_position_m", "far"), "leader_position_m"),
+    "duplicate": (lambda t: pd.concat([t, t.iloc[[5]]]), "frame"),
+    "gap in frames": (lambda t: t.drop(index=50), "frame"),
+    "leader behind": (_set(9, "leader_position_m", -1e4), "behind"),
+    "negative speed": (_set(9, "leader_speed_mps", -3.0), "leader_speed_mps"),
+    "wrong unit": (lambda t: t.assign(**{c: t[c] * 3.6 for c in ("leader_speed_mps", "follower_speed_mps")}), "km/h"),
+    "no rows": (lambda t: t.iloc[:0], "pairs.csv"),
+}
+
+
+def fails(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """Runs the program on a user's mistake; returns its one message."""
+    code = cli.main([*QUICK[4:], "optimizer=random", "optimizer.samples=8", *arguments])
+    captured = capsys.readouterr()
+    assert code == 2, captured
+    assert "Traceback" not in captured.err + captured.out
+    message = captured.err.strip()
+    assert message
+    return message
+
+
+@pytest.mark.parametrize("name", BROKEN_TABLES)
+def test_a_broken_table_is_told(name: str, tidy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    change, expected = BROKEN_TABLES[name]
+    change(pd.read_csv(tidy)).to_csv(tidy, index=False)
+    message = fails(capsys, "data=tidy", f"data.path={tidy}", "data.min_frames=50")
+    assert expected in message
+    assert "pairs.csv" in message
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("missing.csv", None),
+        ("empty.csv", b""),
+        ("binary.csv", bytes(range(256)) * 9),
+        ("cut.parquet", b"PAR1\x15\x04"),
+        ("cut.csv.gz", b"\x1f\x8b\x08\x00abc"),
+    ],
+)
+@pytest.mark.parametrize("dataset", ["tidy", "ngsim"])
+def test_an_unreadable_file_is_told(
+    name: str, content: bytes | None, dataset: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    assert name in fails(capsys, f"data={dataset}", f"data.path={tmp_path / name}")
+
+
+def test_a_wrong_separator_is_told(tidy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tidy.write_text(tidy.read_text().replace(",", ";"))
+    assert "separator" in fails(capsys, "data=tidy", f"data.path={tidy}")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["data=tidy"], "data.path"),
+        (["model=krause"], "krauss"),
+        (["model.variannt=paper"], "variant"),
+        (["learner.epoch=3"], "epochs"),
+        (["+model.parameters.kapa.low=1"], "kapa"),
+        (["model.parameters.t_r.default=99"], "outside its bounds"),
+        (["model.parameters.t_r.low=20"], "t_r"),
+        (["split=1.5"], "split"),
+        (["windows.length=2"], "windows"),
+        (["policy.inputs=[leader_sped]"], "leader_speed"),
+        (["learner.epochs=fast"], "learner.epochs"),
+        (["data.max_pairs=50"], "50"),
+        (["data.frames=9"], "min_frames"),
+        (["data.min_frames=5000"], "5000"),
+        (["style.cluster=agressive"], "aggressive"),
+        (["device=cuda:99"], "device"),
+    ],
+)  # fmt: skip
+def test_a_wrong_setting_is_told(arguments: list[str], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert expected in fails(capsys, *arguments)
+
+
+def test_an_output_folder_that_cannot_be_made_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("")
+    assert "file" in fails(capsys, f"hydra.run.dir={tmp_path}/file/out")
+
+
+def test_a_foreign_database_is_told_before_any_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "other.db"
+    with sqlite3.connect(path) as connection:
+        connection.execute("create table recipes (name text)")
+    connection.close()
+    message = fails(capsys, "tracking.enabled=true", f"tracking.uri=sqlite:///{path}")
+    assert "other.db" in message
+
+
+def test_loading_what_is_no_job_is_told(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="holds no finished job"):
+        cfx.load(tmp_path)
