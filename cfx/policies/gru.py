@@ -29,12 +29,13 @@ class GruNetwork(RecurrentNetwork):
 class GruPolicy(Policy):
     """The paper's policy: a recurrent network whose outputs are squashed into the parameters' bounds.
 
-    Differences from the paper: it does not say whether the network's memory outlives a window; here it does, for the whole drive.
+    Differences from the paper: it does not say whether the network's memory outlives a window; here it does, for the whole
+    drive. Training starts from the fixed parameters (`start=middle` does not): a network that learns little then does little
+    harm.
     """
 
     schema: ClassVar[type[Settings]] = RecurrentSettings
     settings: RecurrentSettings
 
     def build(self, features: int, default: Tensor, fixed: Tensor, generator: torch.Generator) -> PolicyNetwork:
-        networks, parameters = fixed.shape
-        return GruNetwork(networks, features, parameters, self.settings, generator)
+        return GruNetwork(features, fixed, self.settings, generator)

@@ -34,5 +34,4 @@ class LstmPolicy(Policy):
     settings: RecurrentSettings
 
     def build(self, features: int, default: Tensor, fixed: Tensor, generator: torch.Generator) -> PolicyNetwork:
-        networks, parameters = fixed.shape
-        return LstmNetwork(networks, features, parameters, self.settings, generator)
+        return LstmNetwork(features, fixed, self.settings, generator)

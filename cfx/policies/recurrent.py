@@ -7,12 +7,16 @@ weights: `torch.func.vmap` has no rule for them); a test holds them equal.
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 
 from cfx.policies.base import PolicyNetwork, PolicySettings
+
+_EDGE = 0.02
+"""How close to a bound an untrained network may start, in unit space."""
 
 
 class RecurrentSettings(PolicySettings):
@@ -21,6 +25,9 @@ class RecurrentSettings(PolicySettings):
     hidden_size: int = Field(32, ge=1, description="units of each recurrent layer")
     layers: int = Field(1, ge=1, description="recurrent layers")
     dropout: float = Field(0.0, ge=0, lt=1, description="dropout before the output layer while training")
+    start: Literal["fixed", "middle"] = Field(
+        "fixed", description="what an untrained network answers: the fixed parameters, or about the middle of the bounds (paper)"
+    )
 
 
 def _uniform(shape: tuple[int, ...], width: int, generator: torch.Generator) -> nn.Parameter:
@@ -55,16 +62,22 @@ class RecurrentNetwork(PolicyNetwork):
     states: int
     """Tensors of width `hidden` that one layer carries from window to window."""
 
-    def __init__(
-        self, networks: int, features: int, parameters: int, settings: RecurrentSettings, generator: torch.Generator
-    ) -> None:
+    def __init__(self, features: int, fixed: Tensor, settings: RecurrentSettings, generator: torch.Generator) -> None:
+        """Takes the networks' fixed parameters in unit space, `(N, n)`."""
         super().__init__()
+        networks, parameters = fixed.shape
         self.hidden = settings.hidden_size
         widths = [features, *[settings.hidden_size] * (settings.layers - 1)]
         self.layers = nn.ModuleList(RecurrentLayer(networks, width, self.hidden, self.gates, generator) for width in widths)
         self.dropout = nn.Dropout(settings.dropout)
-        self.w_out = _uniform((networks, self.hidden, parameters), self.hidden, generator)
-        self.b_out = nn.Parameter(torch.zeros((networks, 1, parameters)))
+        weights = _uniform((networks, self.hidden, parameters), self.hidden, generator)
+        if settings.start == "fixed":
+            # Away from the bounds, where a sigmoid learns nothing.
+            self.w_out = nn.Parameter(torch.zeros_like(weights))
+            self.b_out = nn.Parameter(torch.logit(fixed[:, None, :].to(weights.dtype), eps=_EDGE))
+        else:
+            self.w_out = weights
+            self.b_out = nn.Parameter(torch.zeros((networks, 1, parameters)))
 
     def initial_state(self, networks: int, drivers: int) -> Tensor:
         return self.w_out.new_zeros((networks, drivers, self.hidden * self.states * len(self.layers)))

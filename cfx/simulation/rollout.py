@@ -22,6 +22,7 @@ from torch import Tensor
 
 from cfx.errors import ParameterError
 from cfx.models.base import DrivingModel, Follower, Leader
+from cfx.simulation.threads import one_thread
 
 Compile = Literal["auto", "always", "never"]
 _Parameters = dict[str, Tensor]
@@ -35,9 +36,10 @@ _WORTH_COMPILING = 20_000_000
 """Vehicle steps in one call from which compiling pays: about a second of eager work. The rule looks at the call alone, so that
 the same call gives the same bits whatever came before it."""
 
-_TILE_BYTES = 1 << 16
-"""What one tile of followers takes for each value and CPU thread. A tile does all its steps before the next begins, so that the
-twenty or so values that a model reads and writes stay in a core's second-level cache; otherwise memory sets the speed."""
+_TILE_BYTES = 1 << 17
+"""What one tile of followers takes for each value. A tile does all its steps before the next begins, so that the twenty or so
+values that a model reads and writes stay in the cache; otherwise memory sets the speed. Tiles run on one thread: two would wait
+for each other after every small operation, thirty times as long where another program wants the core."""
 
 
 class Start(NamedTuple):
@@ -107,9 +109,10 @@ class Simulator:
                 return eager(follower, leader, dict(p))
             end = Follower(*(torch.empty_like(state, memory_format=torch.contiguous_format) for state in follower))
             position, speed = (follower.speed.new_empty((steps, *batch)) for _ in range(2))
-            for tile in _tiles(batch, size):
-                drive = self._compiled_drive if compiled and len(tile) > 1 else self._eager_drive
-                tile.put(end, drive(tile, follower, leader, tile.parameters(p), tile.rows(position), tile.rows(speed)))
+            with one_thread():
+                for tile in _tiles(batch, size):
+                    drive = self._compiled_drive if compiled and len(tile) > 1 else self._eager_drive
+                    tile.put(end, drive(tile, follower, leader, tile.parameters(p), tile.rows(position), tile.rows(speed)))
         return end, position, speed
 
     def _compiles(self, steps: int, like: Tensor) -> bool:
@@ -245,7 +248,7 @@ def _tile_size(like: Tensor) -> int:
     """Returns how many followers one tile holds; on an accelerator, all."""
     if like.device.type != "cpu":
         return max(1, like.numel())
-    return _TILE_BYTES * torch.get_num_threads() // like.element_size()
+    return _TILE_BYTES // like.element_size()
 
 
 def _tiles(batch: torch.Size, size: int) -> Iterator[_Tile]:

@@ -22,7 +22,6 @@ from cfx.calibration.objective import DriveObjective
 from cfx.models.base import DrivingModel, Leader
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
-from cfx.optimizers.base import Optimizer
 from cfx.optimizers.botorch import BotorchOptimizer
 from cfx.optimizers.random import RandomSearch
 from cfx.simulation.rollout import Simulator, Start
@@ -66,14 +65,16 @@ def plain_loop(objective: DriveObjective, guess: Tensor, *, initial: int, iterat
     return -values.max().item()
 
 
+@pytest.mark.timeout(1800)  # the plain loop takes a minute for a window of w99 on a busy machine
 @pytest.mark.parametrize("model", [Krauss(), W99()], ids=["krauss", "w99"])
-@pytest.mark.parametrize("optimizer", [BotorchOptimizer(), RandomSearch()], ids=["botorch", "random"])
-def test_labels_per_second(benchmark: Any, model: DrivingModel, optimizer: Optimizer) -> None:
+def test_labels_per_second(benchmark: Any, model: DrivingModel) -> None:
     objective = windows(model)
     guesses = model.space.to_unit(model.space.defaults()).expand(WINDOWS, 1, -1)
-    searched = RandomSearch().minimize(objective, guesses, seed=0)
 
-    found = benchmark.pedantic(optimizer.minimize, args=(objective, guesses), kwargs={"seed": 0}, rounds=1, iterations=1)
+    found = benchmark.pedantic(BotorchOptimizer().minimize, args=(objective, guesses), kwargs={"seed": 0})
+    began = time.perf_counter()
+    searched = RandomSearch().minimize(objective, guesses, seed=0)
+    random_seconds = (time.perf_counter() - began) / WINDOWS
 
     began = time.perf_counter()
     with warnings.catch_warnings():
@@ -84,6 +85,8 @@ def test_labels_per_second(benchmark: Any, model: DrivingModel, optimizer: Optim
     seconds = benchmark.stats.stats.mean / WINDOWS
     benchmark.extra_info |= {
         "labels_per_second": 1 / seconds,
+        "labels_per_second_random": 1 / random_seconds,
+        "labels_per_second_plain_loop": 1 / plain_seconds,
         "times_faster_than_plain_loop": plain_seconds / seconds,
         "mean_loss_over_4096_random": (found.loss.mean() / searched.loss.mean()).item(),
         "mean_loss_over_plain_loop": found.loss[:LOOPED].mean().item() / (sum(plain) / LOOPED),

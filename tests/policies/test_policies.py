@@ -42,7 +42,7 @@ class TestLstm(PolicyContract):
 
 @pytest.mark.parametrize(("component", "reference"), [(GruPolicy, torch.nn.GRU), (LstmPolicy, torch.nn.LSTM)])
 def test_recurrent_networks_are_torchs(component: type[Policy], reference: type[torch.nn.RNNBase]) -> None:
-    policy = component(layers=2, hidden_size=6)
+    policy = component(layers=2, hidden_size=6, start="middle")
     network = policy.build(5, torch.zeros(3), torch.zeros((2, 3)), torch.Generator().manual_seed(0)).double()
     assert isinstance(network, RecurrentNetwork)
     x = torch.randn((2, 3, 9, 5), dtype=torch.float64, generator=torch.Generator().manual_seed(1))
@@ -75,3 +75,12 @@ def test_tokens_have_the_declared_width_and_are_finite_at_standstill() -> None:
 def test_wrong_inputs_are_named(inputs: tuple[str, ...], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         GruPolicy(inputs=inputs)
+
+
+@pytest.mark.parametrize("component", [GruPolicy, LstmPolicy])
+def test_an_untrained_network_is_the_fixed_model(component: type[Policy]) -> None:
+    fixed = torch.tensor([[0.1, 0.5], [0.9, 0.0]])
+    network = component().build(4, torch.full((2,), 0.5), fixed, torch.Generator().manual_seed(0))
+    out, _ = network(torch.randn((2, 3, 5, 4)), network.initial_state(2, 3))
+    expected = fixed.clamp(0.02, 0.98)[:, None, None].expand_as(out)
+    torch.testing.assert_close(out, expected)
