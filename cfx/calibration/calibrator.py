@@ -40,8 +40,8 @@ class Labels:
         parameters: `(W, n)`, SI units: of those with a loss within `windows.tie_tolerance` of the lowest, the nearest to
             the pair's fixed parameters; so where nothing tells candidates apart they are the fixed parameters.
         loss: `(W,)`, RMSE of speed with these parameters, m/s.
-        spread: `(W,)`, how much the choice of parameters matters there: median minus minimum loss of the space-filling
-            candidates, m/s. 0 where every candidate drives alike: such a label is arbitrary.
+        spread: `(W,)`, how much the choice of parameters matters there: median loss of the space-filling candidates minus
+            `loss`, m/s. 0 where every candidate drives alike: such a label is arbitrary.
         diverged: `(W,)` int64, candidates whose loss was not a number.
     """
 

@@ -61,10 +61,10 @@ class BotorchSettings(Settings):
     initial: int = Field(10, ge=1, description="evaluations before the first Gaussian process: the guesses, then Sobol points")
     iterations: int = Field(30, ge=0, description="evaluations chosen by Gaussian process and LogEI, one after the other")
     screening: int = Field(
-        0,
+        2048,
         ge=0,
-        description="further Sobol points evaluated at the start; the first Gaussian process sees the best of them."
-        " Cheap where simulation is batched, and worth it in many dimensions (w99: 1024)",
+        description="further Sobol points evaluated at the start; the first Gaussian process sees the best of them. Nearly free"
+        " where simulation is batched, and w99 needs it; 0 where each evaluation is dear",
     )
     first_fit_steps: int = Field(60, ge=1, description="steps of Adam in the first fit of a Gaussian process")
     fit_steps: int = Field(10, ge=1, description="steps of Adam after each evaluation, from the last lengthscales on")

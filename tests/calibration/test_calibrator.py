@@ -88,7 +88,7 @@ def test_labels_of_a_driver_who_changes_follow_him() -> None:
     medians = [float(labels.parameters[(windows.pair == p) & told, 0].median()) for p in (0, 1)]
     assert medians[0] == pytest.approx(1.0, abs=0.3)
     assert medians[1] == pytest.approx(2.5, abs=0.3)
-    assert float(labels.loss.max()) < 0.05
+    assert float(labels.loss.max()) < 0.05 + SETTINGS.tie_tolerance
 
 
 def test_windows_that_determine_nothing_get_the_fixed_parameters() -> None:

@@ -51,5 +51,5 @@ def test_a_pair_that_is_too_short_says_how_long_it_must_be() -> None:
 
 
 def test_windows_that_leave_frames_out_are_refused() -> None:
-    with pytest.raises(ConfigError, match="leaves frames between windows"):
+    with pytest.raises(ConfigError, match="leaves frames out between windows"):
         validate(WindowSettings, {"length": 3, "stride": 5}, where="windows")

@@ -38,7 +38,8 @@ def test_forty_evaluations_beat_four_thousand_random_ones(function: Function) ->
     problems = Problems(function, optima)
     searched = RandomSearch(samples=4096).minimize(problems, guesses, seed=0)
     modelled = BotorchOptimizer().minimize(problems, guesses, seed=0)
-    assert BotorchOptimizer().evaluations() == 40
+    assert BotorchOptimizer(screening=0).evaluations() == 40
+    assert BotorchOptimizer().evaluations() == 40 + 2048
     assert modelled.loss.mean() <= 1.02 * searched.loss.mean()
 
 

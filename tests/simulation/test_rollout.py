@@ -251,6 +251,7 @@ def fresh_compiler() -> Iterator[None]:
     if not can_compile(torch.device("cpu")):
         pytest.skip("there is no C++ compiler here")
     torch.compiler.reset()
+    torch._dynamo.utils.counters.clear()
     rollout._COMPILED.clear()
     yield
     torch.compiler.reset()
