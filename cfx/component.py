@@ -46,7 +46,9 @@ class Component:
         """
         if settings is not None and options:
             raise TypeError("give either a Settings object or keyword options, not both")
-        self.settings = settings if settings is not None else validate(self.schema, options, where=self.kind)
+        # A dataset's config group is `data`, as Hydra users expect; every other kind's is its own name.
+        group = "data" if self.kind == "dataset" else self.kind
+        self.settings = settings if settings is not None else validate(self.schema, options, where=group)
 
     def identity(self) -> dict[str, Any]:
         """Returns what results of this component depend on: its class, its settings and its code.

@@ -44,7 +44,7 @@ def adaptive(model: DrivingModel, policy: Policy, networks: int, features: int) 
     network = policy.build(
         features,
         model.space.to_unit(model.space.defaults()),
-        torch.rand((networks, len(model.space))),
+        torch.full((networks, len(model.space)), 0.5),
         torch.Generator().manual_seed(0),
     )
     scaler = Scaler(torch.full((networks, features), 8.0), torch.full((networks, features), 3.0))
@@ -86,7 +86,7 @@ def test_constant_parameters_are_the_plain_rollout() -> None:
 
 
 def closed_loop_of(batch: PairBatch, model: DrivingModel, first: Tensor) -> ClosedLoop:
-    policy = adaptive(model, GruPolicy(inputs=("leader_speed", "follower_speed", "gap")), len(batch), 15)
+    policy = adaptive(model, GruPolicy(start="middle", inputs=("leader_speed", "follower_speed", "gap")), len(batch), 15)
     return drive(Simulator(model, 0.1), policy, batch, first, torch.arange(len(batch)))
 
 
@@ -122,7 +122,7 @@ def test_a_pair_drives_the_same_whatever_drives_beside_it() -> None:
     model = Krauss()
     true = torch.tensor([[1.5, 0.1], [3.0, 0.5], [2.0, 0.0]], dtype=torch.float64)
     batch = PairBatch.of(wavy_pairs(model, true))
-    policy = adaptive(model, GruPolicy(), 3, 10)
+    policy = adaptive(model, GruPolicy(start="middle"), 3, 10)
     together = drive(Simulator(model, 0.1), policy, batch, torch.tensor([150, 200, 100]), torch.arange(3))
     alone = drive(Simulator(model, 0.1), policy, batch[1:2], torch.tensor([200]), torch.tensor([1]))
     steps = alone.speed.shape[1]
@@ -132,7 +132,7 @@ def test_a_pair_drives_the_same_whatever_drives_beside_it() -> None:
 def test_several_drivers_share_one_network() -> None:
     model = Krauss()
     batch = PairBatch.of(wavy_pairs(model, torch.tensor([[1.5, 0.1], [3.0, 0.5]], dtype=torch.float64)))
-    shared = adaptive(model, GruPolicy(), 1, 10)
+    shared = adaptive(model, GruPolicy(start="middle"), 1, 10)
     both = drive(Simulator(model, 0.1), shared, batch, torch.tensor([150, 150]), torch.tensor([0, 0]))
     second = drive(Simulator(model, 0.1), shared, batch[1:2], torch.tensor([150]), torch.tensor([0]))
     torch.testing.assert_close(both.parameters[1:2], second.parameters, atol=1e-5, rtol=1e-5)
