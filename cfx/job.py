@@ -181,6 +181,9 @@ def _keep(config: JobConfig, folder: Path, pairs: PairSet, style: StyleResult, o
     written = _Output(folder)
     written.file("pairs.csv", lambda path: evaluation.table.to_csv(path, index=False))
     written.file("style.csv", lambda path: style.table.to_csv(path, index=False))
+    if outcome.labels is not None:
+        labels = outcome.labels.to_frame(pairs, evaluation.names)
+        written.file("labels.parquet", lambda path: labels.to_parquet(path, index=False))
     if any(pair.truth for pair in pairs):
         written.file("data.parquet", lambda path: write_tidy(pairs, path))
     written.run(lambda: outcome.policy.save(folder / "policy"))

@@ -96,6 +96,14 @@ def test_a_row_per_pair_and_method(finished: cfx.JobResult) -> None:
         assert finished.metrics[f"rmse_speed/{method}"] == pytest.approx(means[method])
 
 
+def test_every_window_has_its_label_and_spread(finished: cfx.JobResult) -> None:
+    labels = pd.read_parquet(finished.folder / "labels.parquet")
+    # 200 frames are 39 windows of 5 steps, of which the first 80 % are calibrated.
+    assert labels.groupby("pair_id").size().tolist() == [31, 31, 31]
+    assert {"time_s", "parameter_t_r", "parameter_t_i", "loss_mps", "spread_mps"} <= set(labels.columns)
+    assert bool((labels.spread_mps >= 0).all())
+
+
 def test_synthetic_data_keeps_its_truth(finished: cfx.JobResult) -> None:
     table = pd.read_parquet(finished.folder / "data.parquet")
     assert {"true_t_r", "true_t_i", "true_model"} <= set(table.columns)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
+import pandas as pd
 import torch
 from torch import Tensor
 
@@ -23,9 +24,6 @@ from cfx.optimizers.base import Optimizer, Progress
 from cfx.pairs import PairBatch, PairSet
 from cfx.progress import Task
 from cfx.simulation.rollout import Simulator
-
-_FORMAT = 1
-"""Raise it when the meaning of a cached array changes."""
 
 _GROUP = 1024
 """Problems solved together: enough to fill the batch, few enough that an interruption loses little."""
@@ -50,6 +48,22 @@ class Labels:
     loss: Tensor
     spread: Tensor
     diverged: Tensor
+
+    def to_frame(self, pairs: PairSet, names: tuple[str, ...]) -> pd.DataFrame:
+        """Returns a row per window: pair_id, window, time_s (its start), `parameter_NAME`, loss_mps, spread_mps, diverged."""
+        windows = self.windows
+        ids = [pair.pair_id for pair in pairs]
+        return pd.DataFrame(
+            {
+                "pair_id": [ids[index] for index in windows.pair.tolist()],
+                "window": windows.number.numpy(),
+                "time_s": windows.first.numpy() * pairs.dt,
+                **{f"parameter_{name}": column.cpu().numpy() for name, column in zip(names, self.parameters.T, strict=True)},
+                "loss_mps": self.loss.cpu().numpy(),
+                "spread_mps": self.spread.cpu().numpy(),
+                "diverged": self.diverged.cpu().numpy(),
+            }
+        )
 
 
 class Calibrator:
@@ -183,11 +197,11 @@ class Calibrator:
         model = self.simulator.model
         return content_key(
             {
-                "format": _FORMAT,
                 "what": what,
                 "pair": pair,
                 "dt": self.simulator.dt,
                 "simulation": folder_hash(simulation.__file__),
+                "calibration": folder_hash(__file__),
                 "model": model.identity(),
                 "parameters": [(p.name, p.low, p.high, p.default, p.tuned) for p in self.space],
                 "optimizer": self.optimizer.identity(),
