@@ -42,9 +42,12 @@ class WithinDriver(Protocol):
             if study.learner.needs_labels:
                 windows = Windows.of(split.windows, study.windows)
                 labels = study.calibrator.labels(pairs, batch, windows, fixed)
-                told = float((labels.spread > 0).double().mean())
+                told = float((labels.spread > study.windows.tie_tolerance).double().mean())
                 log.info(
-                    "Window labels: %d windows; the choice of parameters matters in %.0f %% of them", len(windows), 100 * told
+                    "Window labels: %d windows; parameters matter by more than %g m/s in %.0f %% of them",
+                    len(windows),
+                    study.windows.tie_tolerance,
+                    100 * told,
                 )
             if study.learner.settings.scope == "all":
                 network, groups = group_by(["all"] * len(pairs))

@@ -12,11 +12,13 @@ from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.objective import DriveObjective
 from cfx.calibration.windows import Windows, WindowSettings
+from cfx.datasets.synthetic import SyntheticDataset
 from cfx.errors import OutputError
 from cfx.models.base import DrivingModel
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.optimizers.base import Objective
+from cfx.optimizers.botorch import BotorchOptimizer
 from cfx.optimizers.random import RandomSearch
 from cfx.pairs import PairBatch, PairSet
 from cfx.progress import Task
@@ -205,3 +207,14 @@ def test_the_objective_is_the_rmse_of_the_rollout() -> None:
             expected = (drive.speed[1:] - batch.follower_speed[pair[i], frames][1:]).square().mean().sqrt()
             torch.testing.assert_close(losses[i, j], expected)
     torch.testing.assert_close(objective.select(1, 2)(candidates[1:]), losses[1:])
+
+
+def test_constant_drivers_of_the_synthetic_dataset_are_recovered() -> None:
+    pairs = SyntheticDataset(variation=0.0, pairs=6, frames=500, seed=3).load()
+    tool = calibrator(BotorchOptimizer(screening=256))
+    fixed = tool.fixed(pairs, PairBatch.of(pairs), torch.full((len(pairs),), 400))
+    true = torch.tensor([[pair.truth[name][0] for name in tool.space.names] for pair in pairs], dtype=torch.float64)
+    low, high = tool.space.bounds()
+    error = dict(zip(tool.space.names, ((fixed - true).abs() / (high - low)).amax(0).tolist(), strict=True))
+    assert error["t_r"] < 0.01, error
+    assert error["t_i"] < 0.15, error
