@@ -177,7 +177,8 @@ def _study(config: JobConfig, parts: _Parts, pairs: PairSet, style: StyleResult,
 def _keep(config: JobConfig, folder: Path, pairs: PairSet, style: StyleResult, outcome: Outcome, tracker: Tracker) -> JobResult:
     """Writes everything into the folder, then into MLflow."""
     evaluation = outcome.evaluation
-    metrics = evaluation.metrics()
+    of_labels = outcome.labels.metrics() if outcome.labels is not None else {}
+    metrics = evaluation.metrics() | of_labels
     written = _Output(folder)
     written.file("pairs.csv", lambda path: evaluation.table.to_csv(path, index=False))
     written.file("style.csv", lambda path: style.table.to_csv(path, index=False))
@@ -203,6 +204,7 @@ def _keep(config: JobConfig, folder: Path, pairs: PairSet, style: StyleResult, o
     # Last in the folder, so that a folder with a metrics.json is complete; before MLflow, so that no failure there loses it.
     written.file("metrics.json", lambda path: _dump(defined, path))
     tracker.log_evaluation(evaluation)
+    tracker.log_metrics(of_labels)
     tracker.log_curves(outcome.curves)
     tracker.log_figures(figures)
     tracker.log_policy(folder / "policy")

@@ -102,6 +102,7 @@ def test_every_window_has_its_label_and_spread(finished: cfx.JobResult) -> None:
     assert labels.groupby("pair_id").size().tolist() == [31, 31, 31]
     assert {"time_s", "parameter_t_r", "parameter_t_i", "loss_mps", "spread_mps"} <= set(labels.columns)
     assert bool((labels.spread_mps >= 0).all())
+    assert finished.metrics["labels/loss"] == pytest.approx(labels.loss_mps.mean())
 
 
 def test_synthetic_data_keeps_its_truth(finished: cfx.JobResult) -> None:

@@ -49,6 +49,10 @@ class Labels:
     spread: Tensor
     diverged: Tensor
 
+    def metrics(self) -> dict[str, float]:
+        """Returns the means over windows, m/s: `labels/loss` and `labels/spread`."""
+        return {"labels/loss": float(self.loss.mean()), "labels/spread": float(self.spread.mean())}
+
     def to_frame(self, pairs: PairSet, names: tuple[str, ...]) -> pd.DataFrame:
         """Returns a row per window: pair_id, window, time_s (its start), `parameter_NAME`, loss_mps, spread_mps, diverged."""
         windows = self.windows

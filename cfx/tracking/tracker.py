@@ -81,6 +81,9 @@ class Tracker:
     def set_tags(self, tags: Mapping[str, str]) -> None:
         """Adds tags to the run."""
 
+    def log_metrics(self, metrics: Mapping[str, float]) -> None:
+        """Logs further metrics."""
+
     def log_evaluation(self, evaluation: Evaluation) -> None:
         """Logs `Evaluation.metrics()` and the table of all pairs."""
 
@@ -191,8 +194,11 @@ class MlflowTracker(Tracker):
         with told("log tags"):
             self.store.client.log_batch(self.run_id, tags=_tags(tags))
 
+    def log_metrics(self, metrics: Mapping[str, float]) -> None:
+        self._log_metrics([(name, value, 0) for name, value in metrics.items()])
+
     def log_evaluation(self, evaluation: Evaluation) -> None:
-        self._log_metrics([(name, value, 0) for name, value in evaluation.metrics().items()])
+        self.log_metrics(evaluation.metrics())
         self.log_table(evaluation.table, "pairs.json")
 
     def log_curves(self, curves: pd.DataFrame) -> None:
