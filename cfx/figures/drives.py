@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from cfx.errors import ConfigError, nearest
@@ -109,6 +110,7 @@ def chosen_parameters(evaluation: Evaluation, pair_id: str | None = None) -> Fig
         axes = figure.add_subplot(grid[divmod(k + span, columns)], sharex=speeds)
         _parameter(axes, drive, k, name, unit, evaluation.bounds[:, k])
         panels.append(axes)
+    speeds.xaxis.set_major_locator(MaxNLocator(12 // columns, integer=True))  # shared by all; labels of small axes must not touch
     for axes in panels:
         axes.margins(x=0.01)
         axes.tick_params(labelbottom=axes in panels[-columns:])
