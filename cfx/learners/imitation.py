@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import logging
 import math
-import sys
 import warnings
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import lightning.pytorch as pl
@@ -25,6 +25,7 @@ from cfx.learners.base import CURVE_COLUMNS, Learned, Learner, LearnerSettings, 
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import token_width, tokens
 from cfx.policies.trained import Scaler, driver_places, measured_history
+from cfx.progress import Task
 from cfx.simulation.threads import one_thread
 
 log = logging.getLogger(__name__)
@@ -76,7 +77,8 @@ class ImitationLearner(Learner):
         network = policy.build(material.tokens.shape[-1], unit_default, unit_fixed.cpu(), generator)
         if not any(parameter.requires_grad for parameter in network.parameters()):
             return Learned(network.eval(), material.scaler, pd.DataFrame(columns=CURVE_COLUMNS))
-        module = ImitationModule(network, material, self.settings, lesson.names)
+        task = Task(f"Training ({len(lesson.names)} networks, at most {self.settings.epochs} epochs)", self.settings.epochs)
+        module = ImitationModule(network, material, self.settings, lesson.names, on_epoch=task.advance)
         data = SegmentData(material.windows, self.settings.batch_size)
         device = material.tokens.device
         with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
@@ -88,12 +90,12 @@ class ImitationLearner(Learner):
                 logger=False,
                 enable_checkpointing=False,
                 enable_model_summary=False,
-                enable_progress_bar=sys.stderr.isatty(),
+                enable_progress_bar=False,
                 num_sanity_val_steps=0,
                 # Nothing random happens between batches, and the segments must come in order.
                 use_distributed_sampler=False,
             )
-            with warnings.catch_warnings(), one_thread():
+            with warnings.catch_warnings(), one_thread(), task:
                 warnings.filterwarnings("ignore", module=r"lightning\.")
                 _fit(trainer, module, data)
         module.restore_best()
@@ -211,8 +213,16 @@ class SegmentData(pl.LightningDataModule):
 class ImitationModule(pl.LightningModule):
     """Trains N networks on their segments, and keeps for each the weights of its best epoch."""
 
-    def __init__(self, network: PolicyNetwork, material: _Material, settings: ImitationSettings, names: tuple[str, ...]) -> None:
+    def __init__(
+        self,
+        network: PolicyNetwork,
+        material: _Material,
+        settings: ImitationSettings,
+        names: tuple[str, ...],
+        on_epoch: Callable[[], None] = lambda: None,
+    ) -> None:
         super().__init__()
+        self.on_epoch = on_epoch
         self.network = network
         self.material = material
         self.settings = settings
@@ -260,6 +270,7 @@ class ImitationModule(pl.LightningModule):
         self.train_sum.zero_()
         self.train_weight.zero_()
         self._keep_best()
+        self.on_epoch()
 
     def _keep_best(self) -> None:
         """Keeps the weights of each network's best epoch so far, and stops when no network has hope left.
