@@ -40,7 +40,7 @@ from torch import Tensor
 
 from cfx.component import Settings
 from cfx.optimizers.base import Objective, Optimizer
-from cfx.optimizers.random import AT_ONCE, evaluate_in_blocks, sobol
+from cfx.optimizers.random import AT_ONCE, check_room, evaluate_in_blocks, sobol
 
 _NOISE = 1e-6
 """Variance of the standardised values: a simulation has no noise, this only keeps matrices positive definite."""
@@ -116,7 +116,8 @@ class BotorchOptimizer(Optimizer):
     def solve(self, objective: Objective, guesses: Tensor, *, seed: int) -> tuple[Tensor, Tensor]:
         settings = self.settings
         problems, g, n = guesses.shape
-        points = sobol(self.space_filling() - g, n, seed=seed, like=guesses, key="initial", guesses=g)
+        check_room(settings.initial, g, key="initial")
+        points = sobol(self.space_filling() - g, n, seed=seed, like=guesses)
         tried = torch.cat([guesses, points.expand(problems, -1, -1)], dim=1)
         losses = evaluate_in_blocks(objective, tried)
         search = _Search(settings, tried, losses, guesses=g, seed=seed)

@@ -47,7 +47,8 @@ class RandomSearch(Optimizer):
 
     def solve(self, objective: Objective, guesses: Tensor, *, seed: int) -> tuple[Tensor, Tensor]:
         problems, g, n = guesses.shape
-        points = sobol(self.settings.samples - g, n, seed=seed, like=guesses, key="samples", guesses=g)
+        check_room(self.settings.samples, g, key="samples")
+        points = sobol(self.settings.samples - g, n, seed=seed, like=guesses)
         candidates = torch.cat([guesses, points.expand(problems, -1, -1)], dim=1)
         return candidates, evaluate_in_blocks(objective, candidates)
 
@@ -57,19 +58,14 @@ def evaluate_in_blocks(objective: Objective, candidates: Tensor) -> Tensor:
     return torch.cat([objective(block) for block in torch.split(candidates, AT_ONCE, dim=1)], dim=1)
 
 
-def sobol(count: int, n: int, *, seed: int, like: Tensor, key: str, guesses: int) -> Tensor:
-    """Returns `count` scrambled Sobol points `(count, n)` within [0, 1], float64, on the device of `like`.
+def check_room(evaluations: int, guesses: int, *, key: str) -> None:
+    """Raises ConfigError if the setting `key` allows fewer evaluations than there are first guesses."""
+    if evaluations < guesses:
+        raise ConfigError(f"optimizer.{key}={evaluations}: there are {guesses} first guesses; set optimizer.{key} >= {guesses}")
 
-    Args:
-        key: setting that has to be raised if `guesses` leave no room, for the error message.
 
-    Raises:
-        ConfigError: `count` is negative.
-    """
-    if count < 0:
-        raise ConfigError(
-            f"optimizer.{key}={count + guesses}: there are {guesses} first guesses; set optimizer.{key} >= {guesses}"
-        )
+def sobol(count: int, n: int, *, seed: int, like: Tensor) -> Tensor:
+    """Returns `count` scrambled Sobol points `(count, n)` within [0, 1], float64, on the device of `like`."""
     if count == 0:
         return like.new_empty((0, n))
     engine = torch.quasirandom.SobolEngine(n, scramble=True, seed=seed)  # type: ignore[no-untyped-call]  # torch leaves it untyped
