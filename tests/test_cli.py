@@ -15,6 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 import cfx
 from cfx import application, cli, ui
 from cfx.errors import CfxError, ConfigError, DataError
+from cfx.tracking.store import open_store
 
 JOB = """
     import logging, os, signal, sys, time
@@ -359,8 +360,8 @@ def test_ui_starts_mlflow_on_this_machine_only_and_prints_links(tmp_path: Path, 
     started: list[tuple[list[str], dict[str, str]]] = []
     monkeypatch.setattr(os, "execve", lambda path, command, environment: started.append((command, environment)))
     monkeypatch.setattr(ui, "_links", lambda store, port: [f"links for {store}"])
-    (tmp_path / "mlflow.db").write_text("")
     store = f"sqlite:///{tmp_path}/mlflow.db"
+    open_store(store, "cfx")
     assert cli.main(["ui", "--uri", store, "--port", "5793"]) == 0
     ((command, environment),) = started
     assert command[1:] == [
@@ -385,13 +386,19 @@ def test_ui_without_any_tracked_job_or_with_a_taken_port_says_so(tmp_path: Path,
 
     assert cli.main(["ui", "--uri", f"sqlite:///{tmp_path}/none.db"]) == 2
     assert "no job has been tracked" in capsys.readouterr().err
-    (tmp_path / "mlflow.db").write_text("")
+    open_store(f"sqlite:///{tmp_path}/mlflow.db", "cfx")
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
         assert cli.main(["ui", "--uri", f"sqlite:///{tmp_path}/mlflow.db", "--port", str(port)]) == 2
     assert f"--port {port} cannot be used" in capsys.readouterr().err
+
+
+def test_ui_on_a_foreign_file_says_so(tmp_path: Path, capsys) -> None:
+    (tmp_path / "notes.db").write_text("not a database, but some text that is long enough to look like a file")
+    assert cli.main(["ui", "--uri", f"sqlite:///{tmp_path}/notes.db"]) == 2
+    assert "notes.db" in capsys.readouterr().err
 
 
 def test_ui_on_a_server_says_where_it_is(capsys) -> None:
