@@ -28,6 +28,7 @@ from cfx.datasets.base import Dataset
 from cfx.datasets.tidy import write_tidy
 from cfx.errors import ConfigError, DataError, OutputError
 from cfx.evaluation.result import METHODS, Evaluation
+from cfx.files import whole
 from cfx.learners.base import Learner
 from cfx.models.base import DrivingModel
 from cfx.optimizers.base import Optimizer
@@ -271,14 +272,11 @@ class _Output:
         self.folder = folder
 
     def file(self, name: str, write: Callable[[Path], object]) -> None:
-        path = self.folder / name
-        temporary = path.with_name(f".{name}.tmp{path.suffix}")
+        def write_whole() -> None:
+            with whole(self.folder / name) as temporary:
+                write(temporary)
 
-        def whole() -> None:
-            write(temporary)
-            temporary.replace(path)
-
-        self.run(whole)
+        self.run(write_whole)
 
     def run(self, write: Callable[[], object]) -> None:
         try:

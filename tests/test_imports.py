@@ -17,7 +17,7 @@ PACKAGE = Path(cfx.__file__).parent
 FLOORS = (
     ("errors",),
     ("component",),
-    ("parameters", "pairs", "progress", "console"),
+    ("parameters", "pairs", "progress", "console", "files"),
     ("registry",),
     ("models",),
     ("simulation",),

@@ -70,7 +70,7 @@ def test_the_folder_holds_what_the_contract_says(finished: cfx.JobResult) -> Non
     assert {path.name for path in finished.figures} >= {
         "style_distribution.png", "drives.png", "chosen_parameters.png", "improvement_per_driver.png", "learning_curve.png"
     }  # fmt: skip
-    assert not [name for name in names if "tmp" in name]
+    assert not [name for name in names if Path(name).name.startswith(".")]
     config = yaml.safe_load((folder / "config.yaml").read_text())
     assert config["model"]["name"] == "krauss"
     assert config["learner"]["epochs"] == 3

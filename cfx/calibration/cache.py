@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import tempfile
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfx.errors import OutputError
+from cfx.files import whole
 
 log = logging.getLogger(__name__)
 
@@ -61,9 +61,8 @@ class Cache:
             return
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
-                np.savez(file, **arrays)  # type: ignore[arg-type]  # the stubs take every name for `allow_pickle`
-            Path(file.name).replace(path)
+            with whole(path) as temporary:
+                np.savez(temporary, **arrays)  # type: ignore[arg-type]  # the stubs take every name for `allow_pickle`
         except OSError as error:
             raise OutputError(
                 f"cannot write the calibration cache {self.folder}: {error.strerror}; set cache.folder to a folder that can"

@@ -18,7 +18,6 @@ One row per pair and frame, SI units, a constant time step within a pair, no gap
 from __future__ import annotations
 
 import contextlib
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -36,6 +35,7 @@ from cfx.component import Settings
 from cfx.datasets.base import Dataset, FileDatasetSettings, listed
 from cfx.datasets.files import PARQUET, Floats, Ints, Labels, as_labels, bad_cells, magic, parsed, read_columns, sniff
 from cfx.errors import DataError, OutputError, nearest
+from cfx.files import whole
 from cfx.pairs import SIGNALS, Dropped, Pair, PairSet
 
 LABELS = ("recording", "pair_id", "leader_id", "follower_id")
@@ -425,14 +425,8 @@ def write_tidy(pairs: PairSet, path: Path | str) -> None:
         raise OutputError(f"{path}: a tidy file is named .parquet, .csv or .csv.gz")
     table = _as_table(pairs)
     try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
-            temporary = Path(file.name)
-        try:
+        with whole(path) as temporary:
             _write(table, temporary, path.name.lower())
-            temporary.chmod(0o644)
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(
             f"{path}: cannot be written ({error.strerror or error}); choose another folder or free some space"

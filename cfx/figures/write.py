@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +16,7 @@ from cfx.figures.improvement import improvement_per_driver
 from cfx.figures.learning import learning_curve
 from cfx.figures.look import DPI, look
 from cfx.figures.style import style_distribution
+from cfx.files import whole
 from cfx.style.result import StyleResult
 
 
@@ -48,18 +48,14 @@ def write_figure(figure: Figure, path: Path) -> Path:
     Raises:
         OutputError: the file cannot be written.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with look(), warnings.catch_warnings():
+        with whole(path) as partial, look(), warnings.catch_warnings():
             # A name in a script that the font lacks shows boxes; the names themselves are in pairs.csv.
             warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
             figure.savefig(partial, format="png", dpi=DPI, metadata={"Software": None})
-        partial.replace(path)
     except OSError as error:
         raise OutputError(
             f"{path}: this figure cannot be written ({error.strerror or error}); free the path or choose another folder"
         ) from error
-    finally:
-        partial.unlink(missing_ok=True) if partial.parent.is_dir() else None
     return path

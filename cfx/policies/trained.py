@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from cfx import registry
 from cfx.calibration.windows import WindowSettings
 from cfx.errors import DataError
+from cfx.files import whole
 from cfx.pairs import PairBatch, PairSet
 from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy, PolicyNetwork
@@ -181,12 +182,11 @@ class TrainedPolicy:
 
     def save(self, folder: Path) -> None:
         """Writes `policy.pt` and `policy.json`; each appears whole."""
-        folder.mkdir(parents=True, exist_ok=True)
         weights = {f"network.{key}": value.cpu() for key, value in self.network.state_dict().items()}
         weights |= {f"scaler.{key}": value.cpu() for key, value in self.scaler.state_dict().items()}
-        temporary = folder / "policy.pt.tmp"
-        torch.save(weights, temporary)
-        temporary.replace(folder / "policy.pt")
+        folder.mkdir(parents=True, exist_ok=True)
+        with whole(folder / "policy.pt") as temporary:
+            torch.save(weights, temporary)
         description = {
             "format": _FORMAT,
             "policy": dict(self.policy_node),
@@ -196,9 +196,8 @@ class TrainedPolicy:
             "dt": self.dt,
             "names": list(self.names),
         }
-        temporary = folder / "policy.json.tmp"
-        temporary.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
-        temporary.replace(folder / "policy.json")
+        with whole(folder / "policy.json") as temporary:
+            temporary.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
 
     @classmethod
     def load(cls, folder: Path | str) -> TrainedPolicy:
