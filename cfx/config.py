@@ -50,6 +50,7 @@ class FigureSettings(Settings):
 class JobConfig(Settings):
     """Everything that one job needs to know; `conf/config.yaml` says the same in YAML."""
 
+    preset: str | None = Field(None, description="the experiment that these settings come from; a report reads it")
     data: Node = Field(description="the dataset's node")
     model: Node = Field(description="the driving model's node")
     policy: Node = Field(description="the policy's node")

@@ -26,10 +26,11 @@ from cfx.calibration.calibrator import Calibrator
 from cfx.config import JobConfig
 from cfx.datasets.base import Dataset
 from cfx.datasets.tidy import write_tidy
-from cfx.errors import ConfigError, DataError, OutputError
-from cfx.evaluation.result import METHODS, Evaluation
+from cfx.errors import ConfigError, DataError, OutputError, PluginError
+from cfx.evaluation.result import Evaluation, Improvement
 from cfx.files import whole
 from cfx.learners.base import Learner
+from cfx.learners.curves import best_losses
 from cfx.models.base import DrivingModel
 from cfx.optimizers.base import Optimizer
 from cfx.pairs import PairBatch, PairSet
@@ -45,6 +46,9 @@ if TYPE_CHECKING:
     from cfx.tracking.tracker import Tracker
 
 log = logging.getLogger(__name__)
+
+_TRACKED = ("config.yaml", "metrics.json", "pairs.csv", "style.csv", "data.json", "drives.parquet", "curves.parquet")
+"""Files of a job's folder that MLflow keeps too, besides its figures and its policy."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +101,9 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
         )
         study = _study(config, parts, pairs, style, device)
         outcome = parts.protocol.run(study)
+        if not isinstance(outcome, Outcome):
+            origin = registry.origin(parts.protocol)
+            raise PluginError(f"{origin}: run must return a cfx.Outcome, but returned a {type(outcome).__name__}")
         result = _keep(config, folder, pairs, style, outcome, tracker)
     report(result, outcome.evaluation, console, tracker)
     return result
@@ -178,10 +185,12 @@ def _study(config: JobConfig, parts: _Parts, pairs: PairSet, style: StyleResult,
 def _keep(config: JobConfig, folder: Path, pairs: PairSet, style: StyleResult, outcome: Outcome, tracker: Tracker) -> JobResult:
     """Writes everything into the folder, then into MLflow."""
     evaluation = outcome.evaluation
-    of_labels = outcome.labels.metrics() if outcome.labels is not None else {}
-    metrics = evaluation.metrics() | of_labels
+    of_training = (outcome.labels.metrics() if outcome.labels is not None else {}) | best_losses(outcome.curves)
+    metrics = evaluation.metrics() | of_training
     written = _Output(folder)
     written.file("pairs.csv", lambda path: evaluation.table.to_csv(path, index=False))
+    written.file("drives.parquet", lambda path: evaluation.drives_table().to_parquet(path, index=False))
+    written.file("curves.parquet", lambda path: _curves(outcome.curves).to_parquet(path, index=False))
     written.file("style.csv", lambda path: style.table.to_csv(path, index=False))
     if outcome.labels is not None:
         labels = outcome.labels.to_frame(pairs, evaluation.names)
@@ -198,6 +207,7 @@ def _keep(config: JobConfig, folder: Path, pairs: PairSet, style: StyleResult, o
         "source": pairs.source,
         "fingerprint": pairs.fingerprint,
         "pairs": len(pairs),
+        "protocol": dict(outcome.notes),
         "dropped": [{"reason": drop.reason, "count": drop.count, "unit": drop.unit} for drop in pairs.dropped],
     }
     written.file("data.json", lambda path: _dump(provenance, path))
@@ -205,40 +215,58 @@ def _keep(config: JobConfig, folder: Path, pairs: PairSet, style: StyleResult, o
     # Last in the folder, so that a folder with a metrics.json is complete; before MLflow, so that no failure there loses it.
     written.file("metrics.json", lambda path: _dump(defined, path))
     tracker.log_evaluation(evaluation)
-    tracker.log_metrics(of_labels)
+    tracker.log_metrics(of_training)
     tracker.log_curves(outcome.curves)
     tracker.log_figures(figures)
     tracker.log_policy(folder / "policy")
-    tracker.log_files([folder / name for name in ("config.yaml", "metrics.json", "pairs.csv", "style.csv", "data.json")])
+    tracker.log_files([folder / name for name in _TRACKED])
     return JobResult(metrics, evaluation.table, outcome.policy, tuple(figures), folder, tracker.run_id, evaluation, style)
 
 
 def report(result: JobResult, evaluation: Evaluation, console: Console, tracker: Tracker) -> None:
     """Prints the table, where the results are and how to open them."""
-    table = Table(title=f"{len(evaluation.drives)} pairs, test part in closed loop", title_justify="left")
-    table.add_column("method")
-    for heading in ("RMSE speed [m/s]", "RMSE gap [m]", "collisions"):
-        table.add_column(heading, justify="right")
+    table = Table(
+        title=f"{len(evaluation.drives)} pair{'s' * (len(evaluation.drives) != 1)}, test part in closed loop",
+        title_justify="left",
+    )
     m = result.metrics
-    for method in METHODS:
-        table.add_row(
-            method, f"{m[f'rmse_speed/{method}']:.3f}", f"{m[f'rmse_gap/{method}']:.3f}", f"{m[f'collisions/{method}']:.0f}"
-        )
+    columns = {"RMSE speed [m/s]": "rmse_speed", "RMSE gap [m]": "rmse_gap"}
+    if evaluation.whole_improvements:
+        columns |= {"whole speed [m/s]": "whole/rmse_speed", "whole gap [m]": "whole/rmse_gap"}
+    table.add_column("method")
+    for heading in (*columns, "collisions"):
+        table.add_column(heading, justify="right")
+    for method in evaluation.methods:
+        values = [f"{m[f'{key}/{method}']:.3f}" if f"{key}/{method}" in m else "" for key in columns.values()]
+        table.add_row(method, *values, f"{m[f'collisions/{method}']:.0f}")
     console.print(table)
-    i = evaluation.improvement
+    _tell(evaluation.improvement, "fixed", console)
+    if "population" in evaluation.improvements:
+        _tell(evaluation.improvements["population"], "population", console)
+    if "population" in evaluation.whole_improvements:
+        _tell(evaluation.whole_improvements["population"], "population on whole drives", console)
+    console.print(f"Results: {result.folder}", soft_wrap=True, highlight=False)
+    for line in tracker.how_to_open():
+        console.print(line, soft_wrap=True, highlight=False)
+
+
+def _tell(i: Improvement, baseline: str, console: Console) -> None:
+    known = math.isfinite(i.ci95_low)
+    interval = f"95 % interval {i.ci95_low:+.1%} to {i.ci95_high:+.1%}" if known else "no interval: it needs two drivers"
     console.print(
-        f"Improvement of policy over fixed, RMSE of speed: mean {i.mean:+.1%} (95 % interval {i.ci95_low:+.1%} to"
-        f" {i.ci95_high:+.1%}),"
-        f" trimmed mean {i.trimmed_mean:+.1%}, median {i.median:+.1%}; better for {i.win_rate:.0%} of {i.pairs} pairs;"
-        f" Wilcoxon p = {i.p_value:.2g}",
+        f"Improvement of policy over {baseline}, RMSE of speed: mean {i.mean:+.1%} ({interval}), trimmed mean"
+        f" {i.trimmed_mean:+.1%}, median {i.median:+.1%}; better for {i.win_rate:.0%} of {i.pairs}"
+        f" {'pair' if i.pairs == 1 else 'pairs'}; Wilcoxon p = {i.p_value:.2g}",
         soft_wrap=True,
         highlight=False,
     )
     if i.undefined:
-        console.print(f"{i.undefined} pairs have no improvement: a drive diverged, or fixed parameters drive without any error.")
-    console.print(f"Results: {result.folder}", soft_wrap=True, highlight=False)
-    for line in tracker.how_to_open():
-        console.print(line, soft_wrap=True, highlight=False)
+        console.print(f"{i.undefined} pairs have no improvement: a drive diverged, or {baseline} drives without any error.")
+
+
+def _curves(curves: pd.DataFrame) -> pd.DataFrame:
+    """Returns learning curves with the same column types whether anything was learned or not."""
+    return curves.astype({"network": str, "epoch": "int64", "train_loss": float, "validation_loss": float})
 
 
 def load(folder_or_run: str | Path) -> JobResult:

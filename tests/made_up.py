@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from cfx.evaluation.result import METHODS, Drive, Evaluation, Improvement
+from cfx.evaluation.result import Drive, Evaluation, Improvement
 from cfx.parameters import Parameter, ParameterSpace
 from cfx.style.result import CLUSTERS, StyleResult
 
@@ -38,18 +38,26 @@ def make_results(
     seed: int = 0,
     epochs: int = 60,
     networks: int | None = None,
+    methods: tuple[str, ...] = ("default", "fixed", "policy"),
 ) -> MadeUp:
     """Makes up an evaluation, a style and learning curves (one network per pair unless told)."""
     rng = np.random.default_rng(seed)
-    drives = tuple(make_drive(k, frames, space, rng) for k in range(pairs))
+    drives = tuple(make_drive(k, frames, space, rng, methods) for k in range(pairs))
     table = pd.DataFrame([row for k, drive in enumerate(drives) for row in rows_of(k, drive, space)])
     bounds = np.array([[p.low for p in space.tuned], [p.high for p in space.tuned]])
-    evaluation = Evaluation(table, summarize(table), drives, space.names, tuple(p.unit for p in space.tuned), bounds)
+    improvements = {baseline: summarize(table) for baseline in methods if baseline != "policy"}
+    evaluation = Evaluation(table, improvements, drives, space.names, tuple(p.unit for p in space.tuned), bounds)
     curves = make_curves(pairs if networks is None else networks, epochs, seed)
     return MadeUp(evaluation, make_style([drive.driver for drive in drives], rng), curves)
 
 
-def make_drive(k: int, frames: int, space: ParameterSpace, rng: np.random.Generator) -> Drive:
+def make_drive(
+    k: int,
+    frames: int,
+    space: ParameterSpace,
+    rng: np.random.Generator,
+    methods: tuple[str, ...] = ("default", "fixed", "policy"),
+) -> Drive:
     low, high = np.array([p.low for p in space.tuned]), np.array([p.high for p in space.tuned])
     time = 56.0 + 0.1 * np.arange(frames + 1)
     leader = np.clip(8 + 5 * np.sin(0.25 * time + k) + 2.0 * np.sin(0.9 * time + 2 * k), 0, None)
@@ -57,6 +65,7 @@ def make_drive(k: int, frames: int, space: ParameterSpace, rng: np.random.Genera
     real = np.clip(smooth + 0.15 * np.sin(2 * time), 0, None)
     real_gap = 12 + 2 * (k % 4) + 0.1 * np.cumsum(leader - real)
     size = {"default": 2.6 * (1 + k % 3), "fixed": 0.9 * rng.uniform(0.6, 1.4), "policy": 0.75 * rng.uniform(0.5, 1.6)}
+    size = {method: size.get(method, 1.3) for method in methods}
     wave = np.sin(0.45 * (time - time[0]) * (1 + 0.05 * k)) * (1 - np.exp(-(time - time[0]) / 2))
     speed = {method: np.clip(real + error * wave, 0, None) for method, error in size.items()}
     gap = {method: real_gap - 0.1 * np.cumsum(speed[method] - real) for method in size}
@@ -67,13 +76,15 @@ def make_drive(k: int, frames: int, space: ParameterSpace, rng: np.random.Genera
         "default": np.tile([p.default for p in space.tuned], (frames + 1, 1)),
         "fixed": np.tile(best, (frames + 1, 1)),
         "policy": np.clip(best + wander * (high - low), low, high),
+        "population": np.tile(low + 0.3 * (high - low), (frames + 1, 1)),
     }
+    parameters = {method: parameters[method] for method in methods}
     number = 1000 + 7 * k
     return Drive(f"i80-0400-{number}-{number - 10}", f"i80-0400/{number}", time, leader, real, real_gap, speed, gap, parameters)
 
 
 def rows_of(k: int, drive: Drive, space: ParameterSpace) -> list[dict[str, object]]:
-    rmse = {method: float(np.sqrt(np.mean((drive.speed[method] - drive.real_speed) ** 2))) for method in METHODS}
+    rmse = {method: float(np.sqrt(np.mean((drive.speed[method] - drive.real_speed) ** 2))) for method in drive.speed}
     follower, leader = drive.pair_id.split("-")[-2:]
     return [
         {
@@ -93,7 +104,7 @@ def rows_of(k: int, drive: Drive, space: ParameterSpace) -> list[dict[str, objec
             "fold": 0,
             **{f"parameter_{p.name}": float(drive.parameters[method][:, j].mean()) for j, p in enumerate(space.tuned)},
         }
-        for method in METHODS
+        for method in drive.speed
     ]
 
 
@@ -114,7 +125,7 @@ def summarize(table: pd.DataFrame) -> Improvement:
     finite = np.sort(values[np.isfinite(values)])
     undefined = len(values) - len(finite)
     if not len(finite):
-        return Improvement(*[float("nan")] * 7, pairs=0, undefined=undefined)
+        return Improvement(*[float("nan")] * 7, pairs=0, undefined=undefined, drivers=0)
     cut, mean = len(finite) // 10, float(finite.mean())
     half = 1.96 * float(finite.std()) / len(finite) ** 0.5
     return Improvement(
@@ -127,6 +138,7 @@ def summarize(table: pd.DataFrame) -> Improvement:
         p_value=0.03 if len(finite) > 1 else float("nan"),
         pairs=len(finite),
         undefined=undefined,
+        drivers=len(finite),
     )
 
 

@@ -156,7 +156,7 @@ def test_a_baseline_as_policy_equals_itself(policy: str) -> None:
         assert result.metrics["rmse_improvement/p_value"] == 1
 
 
-@pytest.mark.parametrize("overrides", [["model=w99", "policy=lstm"], ["model=w74", "learner.scope=all"], ["dtype=float32"]])
+@pytest.mark.parametrize("overrides", [["model=w99", "policy=lstm"], ["model=w74", "protocol.networks=all"], ["dtype=float32"]])
 def test_other_components_run_too(overrides: list[str]) -> None:
     result = run(*overrides)
     assert all(math.isfinite(result.metrics[f"rmse_speed/{method}"]) for method in ("default", "fixed", "policy"))

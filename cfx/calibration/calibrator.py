@@ -17,7 +17,7 @@ from torch import Tensor
 
 from cfx import simulation
 from cfx.calibration.cache import Arrays, Cache, content_key
-from cfx.calibration.objective import DriveObjective
+from cfx.calibration.objective import DriveObjective, JointObjective
 from cfx.calibration.windows import Windows
 from cfx.component import folder_hash
 from cfx.optimizers.base import Optimizer, Progress
@@ -48,6 +48,12 @@ class Labels:
     loss: Tensor
     spread: Tensor
     diverged: Tensor
+
+    def select(self, pairs: Tensor) -> Labels:
+        """Returns the labels of some pairs, `(D,)` int64, which are numbered anew; a pair may stand there more than once."""
+        windows, places = self.windows.select(pairs.cpu())
+        places = places.to(self.loss.device)
+        return Labels(windows, self.parameters[places], self.loss[places], self.spread[places], self.diverged[places])
 
     def metrics(self) -> dict[str, float]:
         """Returns the means over windows, m/s: `labels/loss` and `labels/spread`."""
@@ -129,6 +135,36 @@ class Calibrator:
         results = self._cached("Fixed parameters", keys, [1] * len(pairs), solve)
         return torch.stack([torch.as_tensor(entry["parameters"], device=device) for entry in results])
 
+    def population(self, pairs: PairSet, batch: PairBatch, last: Tensor, members: Tensor) -> Tensor:
+        """Finds one parameter set for each of K groups of pairs, calibrated jointly: see `JointObjective`.
+
+        Args:
+            pairs: P pairs.
+            batch: the same as tensors.
+            last: `(P,)`, the last frame that may be used of each.
+            members: `(K, P)` bool, the pairs of each group; a pair may be in several.
+
+        Returns:
+            `(K, n)`, SI units.
+        """
+        device = batch.lengths.device
+        members, last = members.cpu(), last.to(device)
+        keys = [
+            self._key("population", "", pairs=sorted((pairs[i].fingerprint, int(last[i])) for i in row.nonzero()[:, 0].tolist()))
+            for row in members
+        ]
+        guess = self.space.to_unit(self.space.defaults(device=device))[None, None, :]
+
+        def solve(chosen: Tensor, report: Progress) -> list[Arrays]:
+            drives = torch.cat([members[k].nonzero()[:, 0] for k in chosen.cpu()]).to(device)
+            segments = DriveObjective.of_segments(self.simulator, batch, drives, torch.zeros_like(drives), last[drives])
+            objective = JointObjective(segments, members[chosen.cpu()].sum(1), self.memory)
+            found = self._minimize(objective, guess.expand(len(chosen), 1, -1), report)
+            return [{name: values[i] for name, values in found.items()} for i in range(len(chosen))]
+
+        results = self._cached("Population's parameters", keys, [1] * len(members), solve)
+        return torch.stack([torch.as_tensor(entry["parameters"], device=device) for entry in results])
+
     def labels(self, pairs: PairSet, batch: PairBatch, windows: Windows, fixed: Tensor) -> Labels:
         """Finds the parameters of each window; ties go to the pair's fixed parameters.
 
@@ -156,11 +192,13 @@ class Calibrator:
             found = self._minimize(objective, guesses[pair], report, windows.settings.tie_tolerance)
             return [{name: values[windows.pair[own] == p] for name, values in found.items()} for p in chosen]
 
-        results = self._cached("Window labels", keys, counts.tolist(), solve)
+        results = self._cached("Window labels", keys, counts.tolist(), solve, **description)
         joined = {name: torch.cat([torch.as_tensor(entry[name]) for entry in results]).to(device) for name in results[0]}
         return Labels(windows=windows, **joined)
 
-    def _minimize(self, objective: DriveObjective, guesses: Tensor, report: Progress, tolerance: float = 0.0) -> Arrays:
+    def _minimize(
+        self, objective: DriveObjective | JointObjective, guesses: Tensor, report: Progress, tolerance: float = 0.0
+    ) -> Arrays:
         solution = self.optimizer.minimize(
             objective,
             guesses,
@@ -179,17 +217,37 @@ class Calibrator:
         return {name: values.cpu().numpy() for name, values in found.items()}
 
     def _cached(
-        self, what: str, keys: list[str], problems: list[int], solve: Callable[[Tensor, Progress], list[Arrays]]
+        self,
+        what: str,
+        keys: list[str],
+        problems: list[int],
+        solve: Callable[[Tensor, Progress], list[Arrays]],
+        **scope: Any,
     ) -> list[Arrays]:
-        """Returns one entry per pair, solving in groups what the cache does not hold."""
+        """Returns one entry per key, solving in groups what neither the cache holds nor another process is solving.
+
+        Args:
+            problems: how many each entry stands for.
+            scope: settings that all keys share, besides those of the calibrator.
+        """
         entries = [self.cache.get(key) for key in keys]
         missing = [index for index, entry in enumerate(entries) if entry is None]
         todo = sum(problems[index] for index in missing)
-        with self.progress(f"{what} ({self.optimizer_name}, {todo} problems)", todo * self.optimizer.evaluations()) as task:
-            for group in _groups(missing, problems):
-                for index, entry in zip(group, solve(torch.tensor(group), task.advance), strict=True):
-                    self.cache.put(keys[index], entry)
-                    entries[index] = entry
+        each = self.optimizer.evaluations()
+        shares = self.cache.shares([keys[index] for index in missing], self._key(what, "", **scope))
+        wanted = {name: [missing[position] for position in positions] for name, positions in shares.items()}
+        with self.progress(f"{what} ({self.optimizer_name}, {todo} problems)", todo * each) as task:
+            while wanted:
+                sizes = {name: sum(problems[index] for index in indices) for name, indices in wanted.items()}
+                with self.cache.claim(sizes, _GROUP) as claimed:
+                    mine = sorted(index for name in claimed for index in wanted.pop(name))
+                    for index in mine:  # another process may have solved them before the claim
+                        entries[index] = self.cache.get(keys[index])
+                    task.advance(each * sum(problems[index] for index in mine if entries[index] is not None))
+                    for group in _groups([index for index in mine if entries[index] is None], problems):
+                        for index, entry in zip(group, solve(torch.tensor(group), task.advance), strict=True):
+                            self.cache.put(keys[index], entry)
+                            entries[index] = entry
         return [entry for entry in entries if entry is not None]
 
     @functools.cached_property

@@ -93,3 +93,50 @@ class DriveObjective:
         _, _, speed = self.simulator.advance(self.simulator.begin(start), leader, p)
         error = (speed - self.observed[..., None]).square_() * self.counted[..., None]
         return (error.sum(0) / self.counted.sum(0)[:, None]).sqrt()
+
+
+_TURN = 1 << 27
+"""Most bytes that a joint objective simulates at once: 1 GB took three times as long as 256 MB, all of it in fetching pages."""
+
+
+@dataclass(frozen=True)
+class JointObjective:
+    """One parameter set for many drives: the mean over the drives of each one's RMSE of speed.
+
+    The mean of RMSEs, not the RMSE over all frames: every driver counts alike, and it is what an evaluation reports.
+
+    Attributes:
+        drives: D drives, those of problem 0 first, then those of problem 1 ...
+        sizes: drives of each problem, `(K,)` int64, on the CPU; they sum to D.
+        memory: bound in bytes for what is simulated at once; candidates are taken in turns where all drives of all of them need
+            more.
+    """
+
+    drives: DriveObjective
+    sizes: Tensor
+    memory: int
+
+    @property
+    def problems(self) -> int:
+        """K."""
+        return len(self.sizes)
+
+    @property
+    def bytes_per_candidate(self) -> int:
+        """Memory that one candidate of the largest problem needs."""
+        return self.drives.bytes_per_candidate * int(self.sizes.max())
+
+    def select(self, first: int, last: int) -> JointObjective:
+        """Returns problems `first` to `last - 1`."""
+        ends = [0, *self.sizes.cumsum(0).tolist()]
+        return JointObjective(self.drives.select(ends[first], ends[last]), self.sizes[first:last], self.memory)
+
+    @torch.no_grad()
+    def __call__(self, candidates: Tensor) -> Tensor:
+        """Returns losses `(K, q)`, m/s, of candidates `(K, q, n)` in unit space."""
+        sizes = self.sizes.to(candidates.device)
+        owner = torch.repeat_interleave(torch.arange(len(sizes), device=candidates.device), sizes)
+        turn = max(1, min(self.memory, _TURN) // (self.drives.bytes_per_candidate * len(owner)))
+        losses = torch.cat([self.drives(block[owner]) for block in candidates.split(turn, dim=1)], dim=1)
+        total = losses.new_zeros((len(sizes), losses.shape[1])).index_add_(0, owner, losses)
+        return total / sizes[:, None]

@@ -52,6 +52,16 @@ class Split:
         whole = torch.tensor([settings.count(int(last) + 1) for last in frame])
         return cls(frame, whole)
 
+    @classmethod
+    def none(cls, pairs: PairSet, settings: WindowSettings) -> Split:
+        """Gives each pair whole to training: for drivers who are not tested."""
+        frame = torch.tensor([len(pair) - 1 for pair in pairs])
+        return cls(frame, torch.tensor([settings.count(len(pair)) for pair in pairs]))
+
+    def __getitem__(self, index: Tensor) -> Split:
+        """Selects pairs by their numbers, `(D,)`."""
+        return Split(self.frame[index], self.windows[index])
+
 
 @dataclass(frozen=True)
 class Windows:
@@ -82,6 +92,18 @@ class Windows:
     def first(self) -> Tensor:
         """Frame of the measured state that each window starts from, `(W,)`."""
         return self.number * self.settings.stride
+
+    def select(self, pairs: Tensor) -> tuple[Windows, Tensor]:
+        """Returns the windows of some pairs, which are numbered anew, and the places of these windows among all.
+
+        Args:
+            pairs: `(D,)` int64; a pair may stand there more than once.
+        """
+        counts = torch.bincount(self.pair, minlength=int(pairs.max()) + 1)
+        starts = torch.cumsum(counts, 0) - counts
+        chosen = Windows.of(counts[pairs], self.settings)
+        places = starts[pairs][chosen.pair] + chosen.number
+        return Windows(chosen.pair, self.number[places], self.settings), places
 
     def to_grid(self, values: Tensor, pairs: int) -> tuple[Tensor, Tensor]:
         """Arranges `(W, ...)` as `(P, windows, ...)`, zero where a pair has no such window; and the mask `(P, windows)`."""

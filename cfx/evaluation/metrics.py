@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -12,7 +13,7 @@ from scipy import stats
 from torch import Tensor
 
 from cfx.evaluation.closed_loop import ClosedLoop
-from cfx.evaluation.result import METHODS, Drive, Evaluation, Improvement
+from cfx.evaluation.result import METHODS, STATISTICS, Array, Drive, Evaluation, Improvement
 from cfx.pairs import PairBatch, PairSet
 from cfx.parameters import ParameterSpace
 from cfx.style.result import CLUSTERS, StyleResult
@@ -23,28 +24,29 @@ _TRIMMED = 0.1
 _RESAMPLES = 9_999
 
 
-def improvement_statistics(fixed: NDArray[np.float64], policy: NDArray[np.float64], *, seed: int) -> Improvement:
+def improvement_statistics(
+    baseline: NDArray[np.float64], policy: NDArray[np.float64], drivers: Sequence[str] | None = None, *, seed: int
+) -> Improvement:
     """Compares two methods over P pairs.
 
+    Pairs of one driver are not independent: the bootstrap draws drivers (a cluster bootstrap), and the test compares drivers.
+
     Args:
-        fixed, policy: RMSE of speed of each pair, `(P,)`, m/s; a pair counts where both are finite and `fixed` is positive.
+        baseline, policy: RMSE of speed of each pair, `(P,)`, m/s; a pair counts where both are finite and `baseline` is positive.
+        drivers: whose pair each is, `(P,)`; None if each is another's.
         seed: of the bootstrap.
     """
-    counts = np.isfinite(fixed) & np.isfinite(policy) & (fixed > 0)
-    before, after = fixed[counts], policy[counts]
+    counts = np.isfinite(baseline) & np.isfinite(policy) & (baseline > 0)
+    before, after = baseline[counts], policy[counts]
     if not counts.any():
-        nan = float("nan")
-        return Improvement(nan, nan, nan, nan, nan, nan, nan, pairs=0, undefined=len(fixed))
+        return Improvement(*[float("nan")] * len(STATISTICS), pairs=0, undefined=len(baseline), drivers=0)
+    who = np.unique(np.asarray(drivers)[counts], return_inverse=True)[1] if drivers is not None else np.arange(len(before))
     gain = (before - after) / before
-    low = high = float("nan")
-    if len(gain) > 1:
-        interval = stats.bootstrap(
-            (gain,), np.mean, n_resamples=_RESAMPLES, method="percentile", rng=np.random.default_rng(seed)
-        ).confidence_interval
-        low, high = float(interval.low), float(interval.high)
-    different = bool(np.any(before != after))
+    low, high = _interval(gain, who, seed)
+    number = np.bincount(who)
+    before, after = np.bincount(who, before) / number, np.bincount(who, after) / number
     # Without a single difference the test has nothing to rank.
-    p_value = float(stats.wilcoxon(before, after, zero_method="zsplit").pvalue) if different else 1.0
+    different = bool(np.any(before != after))
     return Improvement(
         mean=float(gain.mean()),
         trimmed_mean=float(stats.trim_mean(gain, _TRIMMED)),
@@ -52,10 +54,62 @@ def improvement_statistics(fixed: NDArray[np.float64], policy: NDArray[np.float6
         ci95_low=low,
         ci95_high=high,
         win_rate=float((gain > 0).mean()),
-        p_value=p_value,
+        p_value=float(stats.wilcoxon(before, after, zero_method="zsplit").pvalue) if different else 1.0,
         pairs=int(counts.sum()),
         undefined=int((~counts).sum()),
+        drivers=len(number),
     )
+
+
+def _interval(gain: NDArray[np.float64], who: NDArray[np.intp], seed: int) -> tuple[float, float]:
+    """Returns the 95 % interval of the mean gain, drawing drivers with all their pairs; NaN for a single driver."""
+    number = np.bincount(who).astype(float)
+    if len(number) < 2:
+        return float("nan"), float("nan")
+
+    def mean(total: NDArray[np.float64], pairs: NDArray[np.float64], axis: int = -1) -> NDArray[np.float64]:
+        return np.asarray(total.sum(axis) / pairs.sum(axis))
+
+    interval = stats.bootstrap(
+        (np.bincount(who, gain), number),
+        mean,
+        n_resamples=_RESAMPLES,
+        paired=True,
+        method="percentile",
+        rng=np.random.default_rng(seed),
+    ).confidence_interval
+    return float(interval.low), float(interval.high)
+
+
+@dataclass(frozen=True)
+class _Errors:
+    """RMSEs of each method over the frames that its closed loops have, `(P,)` each; `counted` as in `ClosedLoop`."""
+
+    speed: Mapping[str, Array]
+    gap: Mapping[str, Array]
+    counted: Tensor
+    index: Tensor
+
+    @classmethod
+    def of(cls, batch: PairBatch, first: Tensor, loops: Mapping[str, ClosedLoop]) -> _Errors:
+        counted = next(iter(loops.values())).counted
+        frames = first[:, None] + torch.arange(counted.shape[1], device=first.device)
+        index = frames.clamp(max=batch.mask.shape[1] - 1)
+        real_speed, real_gap = batch.follower_speed.gather(1, index), batch.gap.gather(1, index)
+        return cls(
+            {m: _rmse(loop.speed, real_speed, counted) for m, loop in loops.items()},
+            {m: _rmse(loop.gap, real_gap, counted) for m, loop in loops.items()},
+            counted,
+            index,
+        )
+
+    def improvements(self, drivers: Sequence[str], seed: int) -> dict[str, Improvement]:
+        """Returns the policy's improvement over every other method."""
+        return {
+            method: improvement_statistics(before, self.speed["policy"], drivers, seed=seed)
+            for method, before in self.speed.items()
+            if method != "policy"
+        }
 
 
 def evaluate(
@@ -67,6 +121,8 @@ def evaluate(
     style: StyleResult,
     *,
     seed: int,
+    fold: Tensor | None = None,
+    whole: Mapping[str, ClosedLoop] | None = None,
 ) -> Evaluation:
     """Measures closed loops against the recording.
 
@@ -74,53 +130,60 @@ def evaluate(
         pairs: P pairs.
         batch: the same as tensors.
         first: `(P,)`, the frame of the last measured state.
-        loops: the closed loops of each method, on the same frames.
+        loops: the closed loops of each method of `METHODS`, on the same frames; `fixed` and `policy` are among them.
         space: the model's parameters.
         style: score and cluster of each driver.
         seed: of the bootstrap.
+        fold: `(P,)`, in which fold each pair was tested; None if there was one.
+        whole: closed loops from frame 0 on, of methods that nothing of these drivers went into; None if there are none.
     """
-    counted = loops["fixed"].counted
-    steps = counted.shape[1]
-    index = (first[:, None] + torch.arange(steps, device=first.device)).clamp(max=batch.mask.shape[1] - 1)
-    real_speed, real_gap = batch.follower_speed.gather(1, index), batch.gap.gather(1, index)
-    rmse_speed = {m: _rmse(loop.speed, real_speed, counted) for m, loop in loops.items()}
-    rmse_gap = {m: _rmse(loop.gap, real_gap, counted) for m, loop in loops.items()}
-    collided = {m: ((loop.gap < 0) & counted).any(1).cpu().numpy() for m, loop in loops.items()}
-    means = {m: _mean(loop.parameters, counted) for m, loop in loops.items()}
-    drivers = style.table["driver"]
-    cluster = dict(zip(drivers, style.table["cluster"], strict=True))
-    score = dict(zip(drivers, style.table["score"], strict=True))
+    loops = {method: loops[method] for method in METHODS if method in loops}
+    errors = _Errors.of(batch, first, loops)
+    errors_whole = _Errors.of(batch, torch.zeros_like(first), whole) if whole else None
+    drivers = [pair.driver for pair in pairs]
+    collided = {m: ((loop.gap < 0) & errors.counted).any(1).cpu().numpy() for m, loop in loops.items()}
+    means = {m: _mean(loop.parameters, errors.counted) for m, loop in loops.items()}
+    by_driver = style.table.set_index("driver")
     rows = []
     for i, pair in enumerate(pairs):
-        for method in METHODS:
-            before, after = rmse_speed["fixed"][i], rmse_speed[method][i]
-            rows.append(
-                {
-                    "pair_id": pair.pair_id,
-                    "recording": pair.recording,
-                    "leader_id": pair.leader_id,
-                    "follower_id": pair.follower_id,
-                    "driver": pair.driver,
-                    "cluster": CLUSTERS[cluster[pair.driver]],
-                    "style_score": float(score[pair.driver]),
-                    "fold": 0,
-                    "method": method,
-                    "frames": int(counted[i].sum()),
-                    "rmse_speed": float(after),
-                    "rmse_gap": float(rmse_gap[method][i]),
-                    "improvement": float((before - after) / before) if before > 0 else float("nan"),
-                    "collisions": int(collided[method][i]),
-                    **{f"parameter_{name}": float(v) for name, v in zip(space.names, means[method][i], strict=True)},
-                }
-            )
+        for method in loops:
+            row = {
+                "pair_id": pair.pair_id,
+                "recording": pair.recording,
+                "leader_id": pair.leader_id,
+                "follower_id": pair.follower_id,
+                "driver": pair.driver,
+                "cluster": CLUSTERS[by_driver["cluster"][pair.driver]],
+                "style_score": float(by_driver["score"][pair.driver]),
+                "fold": int(fold[i]) if fold is not None else 0,
+                "method": method,
+                "frames": int(errors.counted[i].sum()),
+                "rmse_speed": float(errors.speed[method][i]),
+                "rmse_gap": float(errors.gap[method][i]),
+                "improvement": _gain(errors.speed["fixed"][i], errors.speed[method][i]),
+            }
+            for other in (name for name in loops if name not in {"fixed", "policy"}):
+                row[f"improvement_over_{other}"] = _gain(errors.speed[other][i], errors.speed[method][i])
+            row["collisions"] = int(collided[method][i])
+            row |= {f"parameter_{name}": float(v) for name, v in zip(space.names, means[method][i], strict=True)}
+            if errors_whole is not None:
+                known = method in errors_whole.speed
+                row["whole_rmse_speed"] = float(errors_whole.speed[method][i]) if known else float("nan")
+                row["whole_rmse_gap"] = float(errors_whole.gap[method][i]) if known else float("nan")
+            rows.append(row)
     return Evaluation(
         table=pd.DataFrame(rows),
-        improvement=improvement_statistics(rmse_speed["fixed"], rmse_speed["policy"], seed=seed),
-        drives=_drives(pairs, batch, first, index, loops),
+        improvements=errors.improvements(drivers, seed),
+        drives=_drives(pairs, batch, first, errors.index, loops),
         names=space.names,
         units=tuple(parameter.unit for parameter in space.tuned),
         bounds=space.bounds().numpy(),
+        whole_improvements=errors_whole.improvements(drivers, seed) if errors_whole is not None else {},
     )
+
+
+def _gain(before: float, after: float) -> float:
+    return float((before - after) / before) if before > 0 else float("nan")
 
 
 def _rmse(simulated: Tensor, real: Tensor, counted: Tensor) -> NDArray[np.float64]:

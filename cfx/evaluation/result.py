@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pandas as pd
@@ -11,8 +11,15 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-METHODS = ("default", "fixed", "policy")
-"""The methods that every evaluation compares, on the same frames from the same measured state."""
+METHODS = ("default", "population", "fixed", "policy")
+"""What an evaluation may compare, in the order in which it is shown; always on the same frames from the same measured state.
+
+`default`: the model's default parameters. `population`: one set calibrated jointly on the training drivers, none of whom is
+tested. `fixed`: the driver's own set, from the first part of the drive. `policy`: parameters that a policy chooses as it drives.
+"""
+
+STATISTICS = ("mean", "trimmed_mean", "median", "ci95_low", "ci95_high", "win_rate", "p_value")
+"""What metrics tell of an `Improvement`."""
 
 
 @dataclass(frozen=True)
@@ -41,15 +48,16 @@ class Drive:
 
 @dataclass(frozen=True)
 class Improvement:
-    """`(RMSE_fixed - RMSE_policy) / RMSE_fixed` of speed over the pairs, as fractions (0.1 is 10 %).
+    """`(RMSE_baseline - RMSE_policy) / RMSE_baseline` of speed over the pairs, as fractions (0.1 is 10 %).
 
     Attributes:
         mean, trimmed_mean, median: over pairs; the trimmed mean drops the top and the bottom 10 %.
-        ci95_low, ci95_high: bootstrap confidence interval of the mean.
+        ci95_low, ci95_high: bootstrap confidence interval of the mean; drivers are drawn, each with all his pairs.
         win_rate: share of pairs with a positive improvement.
-        p_value: two-sided Wilcoxon signed-rank test of RMSE_fixed against RMSE_policy.
+        p_value: two-sided Wilcoxon signed-rank test of RMSE_baseline against RMSE_policy, means over each driver's pairs.
         pairs: number of pairs that count.
-        undefined: number of pairs left out because RMSE_fixed is 0 or a rollout diverged.
+        undefined: number of pairs left out because RMSE_baseline is 0 or a rollout diverged.
+        drivers: number of drivers of the pairs that count.
     """
 
     mean: float
@@ -61,6 +69,11 @@ class Improvement:
     p_value: float
     pairs: int
     undefined: int
+    drivers: int
+
+    def metrics(self) -> dict[str, float]:
+        """Returns the statistics by name."""
+        return {name: float(getattr(self, name)) for name in STATISTICS}
 
 
 @dataclass(frozen=True)
@@ -68,31 +81,74 @@ class Evaluation:
     """The comparison of all methods.
 
     Attributes:
-        table: a row per pair and method: pair_id, recording, leader_id, follower_id, driver, cluster, style_score, method,
-            rmse_speed (m/s), rmse_gap (m), improvement (against fixed, a fraction), collisions (1 if the gap became negative),
-            frames, fold, and one column `parameter_NAME` with the mean of each tuned parameter.
-        improvement: statistics over pairs.
+        table: a row per pair and method: pair_id, recording, leader_id, follower_id, driver, cluster, style_score, fold, method,
+            frames, rmse_speed (m/s), rmse_gap (m), improvement (against fixed, a fraction), `improvement_over_BASELINE` for the
+            other baselines, collisions (1 if the gap became negative), and one column `parameter_NAME` with the mean of each
+            tuned parameter; where whole drives were driven too, `whole_rmse_speed` and `whole_rmse_gap`.
+        improvements: statistics of the policy's improvement over each baseline.
         drives: the closed loops themselves, in the order of the pairs.
         names: the tuned parameters' names.
         units: their units.
         bounds: `(2, n)`.
+        whole_improvements: as `improvements`, over whole drives of drivers that nothing was fitted to; empty if there were none.
     """
 
     table: pd.DataFrame
-    improvement: Improvement
+    improvements: Mapping[str, Improvement]
     drives: tuple[Drive, ...]
     names: tuple[str, ...]
     units: tuple[str, ...]
     bounds: Array
+    whole_improvements: Mapping[str, Improvement] = field(default_factory=dict)
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """The methods that were compared, in the order of `METHODS`."""
+        present = set(self.table["method"])
+        return tuple(method for method in METHODS if method in present)
+
+    @property
+    def improvement(self) -> Improvement:
+        """The policy's improvement over the driver's own fixed parameters."""
+        return self.improvements["fixed"]
 
     def metrics(self) -> dict[str, float]:
         """Returns the metrics under their MLflow names."""
+        by_method = self.table.groupby("method")
         values: dict[str, float] = {}
         for column in ("rmse_speed", "rmse_gap"):
-            means = self.table.groupby("method")[column].mean()
-            values |= {f"{column}/{method}": float(means[method]) for method in METHODS}
-        for name in ("mean", "trimmed_mean", "median", "ci95_low", "ci95_high", "win_rate", "p_value"):
-            values[f"rmse_improvement/{name}"] = float(getattr(self.improvement, name))
-        collisions = self.table.groupby("method")["collisions"].sum()
-        values |= {f"collisions/{method}": float(collisions[method]) for method in METHODS}
+            means = by_method[column].mean()
+            values |= {f"{column}/{method}": float(means[method]) for method in self.methods}
+        for baseline, improvement in self.improvements.items():
+            prefix = "rmse_improvement" if baseline == "fixed" else f"rmse_improvement/{baseline}"
+            values |= {f"{prefix}/{name}": value for name, value in improvement.metrics().items()}
+        collisions = by_method["collisions"].sum()
+        values |= {f"collisions/{method}": float(collisions[method]) for method in self.methods}
+        for baseline, improvement in self.whole_improvements.items():
+            values |= {f"whole/rmse_improvement/{baseline}/{name}": value for name, value in improvement.metrics().items()}
+        if self.whole_improvements:
+            for column in ("rmse_speed", "rmse_gap"):
+                means = by_method[f"whole_{column}"].mean()
+                values |= {f"whole/{column}/{m}": float(means[m]) for m in (*self.whole_improvements, "policy")}
         return values
+
+    def drives_table(self) -> pd.DataFrame:
+        """Returns the closed loops in long form, SI units.
+
+        Columns: pair_id, time_s, leader_speed, real_speed, real_gap; for each method speed_METHOD, gap_METHOD and, for each tuned
+        parameter, NAME_METHOD. A pair's first row is the last measured state before the simulation takes over.
+        """
+        return pd.concat([self._drive_table(drive) for drive in self.drives], ignore_index=True)
+
+    def _drive_table(self, drive: Drive) -> pd.DataFrame:
+        columns: dict[str, object] = {
+            "pair_id": drive.pair_id,
+            "time_s": drive.time,
+            "leader_speed": drive.leader_speed,
+            "real_speed": drive.real_speed,
+            "real_gap": drive.real_gap,
+        }
+        for method in self.methods:
+            columns |= {f"speed_{method}": drive.speed[method], f"gap_{method}": drive.gap[method]}
+            columns |= {f"{name}_{method}": drive.parameters[method][:, k] for k, name in enumerate(self.names)}
+        return pd.DataFrame(columns)

@@ -17,6 +17,7 @@ from cfx.figures.look import (
     BAND,
     COLOURS,
     INK,
+    LABELS,
     canvas,
     method_handles,
     method_line,
@@ -70,11 +71,45 @@ def drives(evaluation: Evaluation, pair_id: str | Sequence[str] | None = None, n
     for axes in grid[-1]:
         axes.set_xlabel("time from the start of the pair (s)")
     figure.legend(
-        handles=method_handles(("real", "leader", *METHODS)),
+        handles=method_handles(("real", "leader", *evaluation.methods)),
         loc="outside upper center",
-        ncols=5,
+        ncols=len(evaluation.methods) + 2,
         columnspacing=1.6,
         handlelength=2.4,
+    )
+    return figure
+
+
+@styled
+def speeds(evaluation: Evaluation, pair_id: str | None = None) -> Figure:
+    """The simulated speed of each method against the real driver's, an axis for each method: the paper's three speed plots.
+
+    Args:
+        pair_id: the pair to show; None for the one with the median improvement.
+
+    Raises:
+        ConfigError: the pair id is not in the evaluation.
+    """
+    ((_, drive),) = _choose(evaluation, pair_id, 1)
+    rows = _rows(evaluation, drive.pair_id)
+    figure = canvas(0.8 + 1.9 * len(evaluation.methods))
+    panels = figure.subplots(len(evaluation.methods), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, method in zip(panels, evaluation.methods, strict=True):
+        method_line(axes, "real", drive.time, drive.real_speed)
+        method_line(axes, method, drive.time, _finite(drive.speed[method]))
+        _frame(axes, [drive.real_speed, drive.speed[method]], None, "m/s")
+        _two_line_title(axes, "", f"{LABELS[method]}: RMSE of speed {rows[method]['rmse_speed']:.3f} m/s")
+        axes.set_ylabel("speed (m/s)")
+        axes.margins(x=0.01)
+    panels[-1].set_xlabel("time from the start of the pair (s)")
+    figure.legend(
+        handles=method_handles(("real", *evaluation.methods)),
+        loc="outside upper center",
+        ncols=len(evaluation.methods) + 1,
+        columnspacing=1.6,
+        handlelength=2.4,
+        title=f"pair {short(drive.pair_id, 60)}, test part",
+        title_fontsize=11,
     )
     return figure
 
@@ -116,9 +151,9 @@ def chosen_parameters(evaluation: Evaluation, pair_id: str | None = None) -> Fig
         axes.tick_params(labelbottom=axes in panels[-columns:])
     figure.supxlabel("time from the start of the pair (s)", fontsize=10.5, color=INK)
     figure.legend(
-        handles=method_handles(("real", "leader", *METHODS)),
+        handles=method_handles(("real", "leader", *evaluation.methods)),
         loc="outside upper center",
-        ncols=5,
+        ncols=len(evaluation.methods) + 2,
         columnspacing=1.6,
         title=f"pair {short(drive.pair_id, 60)}",
         title_fontsize=11,

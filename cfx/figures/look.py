@@ -1,7 +1,7 @@
 """One look for all figures: colours, fonts, canvas, labels.
 
-Colours are Okabe and Ito's (2008), told apart by readers with any colour vision; each method also has its own dash, so that a
-grey print can be read too. A method has one colour in every figure.
+Colours are Okabe and Ito's (2008), and Tol's purple, told apart by readers with any colour vision; each method also has its own
+dash, so that a grey print can be read too. A method has one colour in every figure.
 """
 
 from __future__ import annotations
@@ -21,20 +21,29 @@ DPI = 150
 WIDTH = 10.5
 """Inches: at 150 dpi twice the width of a README column, with text that is still read there."""
 
-COLOURS = {"real": "#000000", "leader": "#9a9a9a", "default": "#009e73", "fixed": "#0072b2", "policy": "#d55e00"}
+COLOURS = {
+    "real": "#000000",
+    "leader": "#9a9a9a",
+    "default": "#009e73",
+    "population": "#aa4499",
+    "fixed": "#0072b2",
+    "policy": "#d55e00",
+}
 DASHES: dict[str, Any] = {
     "real": "solid",
     "leader": "solid",
     "default": (0, (1.2, 1.4)),
+    "population": (0, (6.0, 1.5, 1.2, 1.5)),
     "fixed": (0, (5.0, 1.8)),
     "policy": "solid",
 }
-WIDTHS = {"real": 1.8, "leader": 1.0, "default": 1.6, "fixed": 1.6, "policy": 1.8}
+WIDTHS = {"real": 1.8, "leader": 1.0, "default": 1.6, "population": 1.6, "fixed": 1.6, "policy": 1.8}
 LABELS = {
     "real": "real driver",
     "leader": "leader",
     "default": "default parameters",
-    "fixed": "fixed parameters",
+    "population": "population's parameters",
+    "fixed": "own fixed parameters",
     "policy": "policy",
 }
 CLUSTER_COLOURS = ("#56b4e9", "#8c8c8c", "#e69f00")
@@ -95,7 +104,7 @@ def canvas(height: float, width: float = WIDTH) -> Figure:
 def method_line(axes: Axes, method: str, time: Any, values: Any, *, steps: bool = False) -> None:
     """Draws a method's signal in its colour and dash; `steps` for what holds until the next frame."""
     # The real driver lies on top of leader and baselines, and below the policy that is compared with it.
-    order = {"leader": 2.0, "default": 2.2, "fixed": 2.3, "real": 2.4, "policy": 2.5}[method]
+    order = {"leader": 2.0, "default": 2.2, "population": 2.25, "fixed": 2.3, "real": 2.4, "policy": 2.5}[method]
     axes.plot(
         time,
         values,

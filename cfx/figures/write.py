@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from cfx.errors import OutputError
 from cfx.evaluation.result import Evaluation
-from cfx.figures.drives import chosen_parameters, drives
+from cfx.figures.drives import chosen_parameters, drives, speeds
 from cfx.figures.improvement import improvement_per_driver
 from cfx.figures.learning import learning_curve
 from cfx.figures.look import DPI, look
@@ -34,6 +34,7 @@ def write_figures(folder: Path, evaluation: Evaluation, style: StyleResult, curv
     jobs: dict[str, Callable[[], Figure]] = {
         "improvement_per_driver": lambda: improvement_per_driver(evaluation),
         "drives": lambda: drives(evaluation),
+        "speeds": lambda: speeds(evaluation),
         "chosen_parameters": lambda: chosen_parameters(evaluation),
         "style_distribution": lambda: style_distribution(style),
     }

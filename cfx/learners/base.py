@@ -7,15 +7,14 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import pandas as pd
-from pydantic import Field
 from torch import Tensor
 
 from cfx.calibration.calibrator import Labels
 from cfx.calibration.windows import Split, WindowSettings
-from cfx.component import Component, Settings
+from cfx.component import Component
 from cfx.pairs import PairBatch
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.trained import Scaler
@@ -33,7 +32,8 @@ class Lesson:
         batch: P pairs, whole; only frames up to `split.frame` may be read.
         split: where each pair's training part ends.
         windows: how drives are cut.
-        fixed: each pair's fixed parameters, `(P, n)`, SI units.
+        fixed: the parameters that each pair's network starts from, `(P, n)`, SI units: the driver's own fixed set, or the
+            population's where networks are for drivers never seen.
         labels: window labels of the training parts; None if the learner does not need them.
         network: which network learns from each pair, `(P,)` int64.
         names: what each network is for, N of them.
@@ -66,12 +66,6 @@ class Learned:
     curves: pd.DataFrame
 
 
-class LearnerSettings(Settings):
-    """Settings that every learner has."""
-
-    scope: Literal["pair", "all"] = Field("pair", description="pair: a network for each pair; all: one network for all pairs")
-
-
 class Learner(Component):
     """Base of every learner.
 
@@ -83,8 +77,6 @@ class Learner(Component):
     """
 
     kind = "learner"
-    schema: ClassVar[type[Settings]] = LearnerSettings
-    settings: LearnerSettings
     needs_labels: ClassVar[bool] = False
 
     @abstractmethod

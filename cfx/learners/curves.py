@@ -18,3 +18,12 @@ def over_networks(curves: pd.DataFrame, column: str) -> pd.DataFrame:
     values = curves[column].astype(float)
     measured = curves[np.isfinite(values)]
     return measured.pivot_table(index="epoch", columns="network", values=column, aggfunc="last").sort_index().ffill()
+
+
+def best_losses(curves: pd.DataFrame) -> dict[str, float]:
+    """Returns the metric `validation_loss/best`: the mean over the networks of each one's lowest validation loss.
+
+    Hyper-parameters are chosen by it, never by what was tested. Empty if nothing was validated.
+    """
+    lowest = curves.groupby("network")["validation_loss"].min().astype(float).dropna()
+    return {"validation_loss/best": float(lowest.mean())} if len(lowest) else {}

@@ -21,7 +21,7 @@ from torch.utils.data import DataLoader
 
 from cfx.component import Settings
 from cfx.errors import DataError
-from cfx.learners.base import CURVE_COLUMNS, Learned, Learner, LearnerSettings, Lesson
+from cfx.learners.base import CURVE_COLUMNS, Learned, Learner, Lesson
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import token_width, tokens
 from cfx.policies.trained import Scaler, driver_places, measured_history
@@ -31,7 +31,7 @@ from cfx.simulation.threads import one_thread
 log = logging.getLogger(__name__)
 
 
-class ImitationSettings(LearnerSettings):
+class ImitationSettings(Settings):
     """Settings of `imitation`."""
 
     epochs: int = Field(200, ge=1, description="passes over the training windows at most; 500 in the paper")

@@ -26,6 +26,9 @@ from cfx.policies.features import History, token_width, tokens
 
 _FORMAT = 1
 
+ALL = "all"
+"""Name of the network that is for any driver."""
+
 
 class Scaler(nn.Module):
     """Brings each network's tokens to mean 0 and standard deviation 1 over its training windows."""
@@ -78,7 +81,7 @@ class TrainedPolicy:
         space: the model's parameters.
         windows: how often parameters change, and how many frames a token holds.
         dt: time step, s.
-        names: what each network was trained for (a pair's id, or a group's name), N of them.
+        names: what each network was trained for (a pair's id, a fold, or `ALL`), N of them.
     """
 
     policy: Policy
@@ -143,7 +146,7 @@ class TrainedPolicy:
         Returns:
             A row per pair: `pair_id` and one column per tuned parameter (SI units), for the window that starts at the
             pair's last frame. A pair that the policy was trained for is driven by its own network; any other by the only network
-            there is.
+            there is, or the one named `all`.
 
         Raises:
             DataError: the table is not in the tidy layout, its time step is another, or it is not clear which network to use.
@@ -173,12 +176,12 @@ class TrainedPolicy:
             return torch.zeros(len(pairs), dtype=torch.int64)
         number = {name: index for index, name in enumerate(self.names)}
         unknown = [pair.pair_id for pair in pairs if pair.pair_id not in number]
-        if unknown:
+        if unknown and ALL not in number:
             raise DataError(
                 f"pair '{unknown[0]}' has no network of its own among the {len(self.names)} that were trained, one per pair;"
-                " train with learner.scope=all to drive others"
+                " train with protocol.networks=all or protocol=across_drivers to drive others"
             )
-        return torch.tensor([number[pair.pair_id] for pair in pairs])
+        return torch.tensor([number.get(pair.pair_id, number.get(ALL, 0)) for pair in pairs])
 
     def save(self, folder: Path) -> None:
         """Writes `policy.pt` and `policy.json`; each appears whole."""

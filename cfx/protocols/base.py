@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
+import logging
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import pandas as pd
+import torch
+from torch import Tensor
 
+from cfx import registry
 from cfx.calibration.calibrator import Calibrator, Labels
-from cfx.calibration.windows import WindowSettings
+from cfx.calibration.windows import Windows, WindowSettings
 from cfx.component import Component
+from cfx.errors import PluginError
 from cfx.evaluation.result import Evaluation
-from cfx.learners.base import Learner
+from cfx.learners.base import CURVE_COLUMNS, Learned, Learner
 from cfx.pairs import PairBatch, PairSet
+from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy
-from cfx.policies.trained import TrainedPolicy
+from cfx.policies.features import token_width
+from cfx.policies.trained import Scaler, TrainedPolicy
 from cfx.simulation.rollout import Simulator
 from cfx.style.result import StyleResult
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -49,22 +58,103 @@ class Study:
     split: float
     seed: int
 
+    @property
+    def space(self) -> ParameterSpace:
+        """The driving model's parameters."""
+        return self.simulator.model.space
+
+    def labels(self, counts: Tensor, fixed: Tensor) -> Labels | None:
+        """Finds window labels, if the learner needs any.
+
+        Args:
+            counts: `(P,)`, how many windows of each pair, from its first.
+            fixed: `(P, n)`, each pair's own fixed parameters.
+        """
+        if not (self.policy.trainable and self.learner.needs_labels):
+            return None
+        labels = self.calibrator.labels(self.pairs, self.batch, Windows.of(counts, self.windows), fixed)
+        told = float((labels.spread > self.windows.tie_tolerance).double().mean())
+        log.info(
+            "Window labels: %d windows; parameters matter by more than %g m/s in %.0f %% of them",
+            len(labels.windows),
+            self.windows.tie_tolerance,
+            100 * told,
+        )
+        return labels
+
+    def constant(self, policy: Policy, parameters: Tensor) -> TrainedPolicy:
+        """Makes a policy drive as built, without training: the baselines.
+
+        Args:
+            policy: the component.
+            parameters: `(N, n)`, SI units: what `fixed` answers, and recurrent networks start from; one network for each row.
+        """
+        return self.ready(policy, self.untrained(policy, parameters), tuple(str(number) for number in range(len(parameters))))
+
+    def untrained(self, policy: Policy, parameters: Tensor) -> Learned:
+        """Returns a policy's networks as built, in float64, so that constants stay what calibration found; see `constant`."""
+        space = self.simulator.model.space
+        width = token_width(policy.inputs, policy.summary, self.windows.length)
+        unit = space.to_unit(parameters.cpu())
+        network = policy.build(width, space.to_unit(space.defaults()), unit, torch.Generator().manual_seed(self.seed))
+        scaler = Scaler(unit.new_zeros((len(unit), width)), unit.new_ones((len(unit), width)))
+        device = parameters.device
+        return Learned(network.to(device).eval(), scaler.to(device), pd.DataFrame(columns=CURVE_COLUMNS))
+
+    def ready(self, policy: Policy, learned: Learned, names: tuple[str, ...]) -> TrainedPolicy:
+        """Returns networks that are ready to drive; `names` says what each is for.
+
+        Raises:
+            PluginError: the learner or the policy did not deliver such networks.
+        """
+        _check_learned(registry.origin(self.learner if policy.trainable else policy), learned, len(names), len(self.space))
+        return TrainedPolicy(
+            policy=policy,
+            network=learned.network,
+            scaler=learned.scaler,
+            model_node=self.model_node,
+            policy_node=self.policy_node,
+            space=self.space,
+            windows=self.windows,
+            dt=self.simulator.dt,
+            names=names,
+        )
+
 
 @dataclass(frozen=True)
 class Outcome:
     """What a protocol delivers.
 
     Attributes:
-        evaluation: the comparison of default, fixed and policy.
+        evaluation: the comparison of all methods.
         policy: the policy that drove in it.
         curves: learning curves; empty if nothing was learned.
         labels: window labels; None if none were needed.
+        notes: what a reader of the results should know of the design, name -> a number or text; kept in `data.json`.
     """
 
     evaluation: Evaluation
     policy: TrainedPolicy
     curves: pd.DataFrame
     labels: Labels | None
+    notes: Mapping[str, Any] = field(default_factory=dict)
+
+
+@torch.no_grad()
+def _check_learned(who: str, learned: object, networks: int, parameters: int) -> None:
+    """Asks the networks about one window, so that a wrong shape or dtype ends in a sentence."""
+    if not isinstance(learned, Learned):
+        raise PluginError(f"{who}: fit must return a cfx.Learned, but returned a {type(learned).__name__}")
+    mean = learned.scaler.mean
+    expected = (networks, 1, 1, parameters)
+    if mean.shape[0] == networks:
+        answer, _ = learned.network(mean.new_zeros((networks, 1, 1, mean.shape[1])), learned.network.initial_state(networks, 1))
+        if answer.shape == expected and answer.dtype == mean.dtype:
+            return
+        got = f"its networks answer {tuple(answer.shape)} in {answer.dtype} where {expected} in {mean.dtype} are wanted"
+    else:
+        got = f"its scaler is for {mean.shape[0]} networks where {networks} are wanted"
+    raise PluginError(f"{who} breaks its contract: {got}")
 
 
 class Protocol(Component):

@@ -41,6 +41,28 @@ def test_undefined_pairs_are_counted() -> None:
     assert (result.pairs, result.undefined, result.mean) == (1, 3, 0.5)
 
 
+def test_pairs_of_one_driver_are_drawn_together() -> None:
+    rng = np.random.default_rng(2)
+    gain = rng.normal(0.1, 0.2, 12)
+    fixed = np.ones(12)
+    alone = improvement_statistics(fixed, 1 - gain, seed=0)
+    # Ten copies of every pair tell nothing new about the drivers; taken for independent pairs, they would narrow the interval.
+    drivers = [f"d{k}" for k in range(12)] * 10
+    copied = improvement_statistics(np.tile(fixed, 10), np.tile(1 - gain, 10), drivers, seed=0)
+    naive = improvement_statistics(np.tile(fixed, 10), np.tile(1 - gain, 10), seed=0)
+    assert (copied.pairs, copied.drivers) == (120, 12)
+    assert copied.mean == pytest.approx(alone.mean)
+    assert copied.p_value == pytest.approx(alone.p_value)
+    assert (copied.ci95_low, copied.ci95_high) == pytest.approx((alone.ci95_low, alone.ci95_high), abs=0.01)  # other draws
+    assert naive.ci95_high - naive.ci95_low < 0.5 * (copied.ci95_high - copied.ci95_low)
+
+
+def test_a_single_driver_has_no_interval() -> None:
+    result = improvement_statistics(np.ones(3), np.array([0.8, 0.9, 1.1]), ["a", "a", "a"], seed=0)
+    assert math.isnan(result.ci95_low)
+    assert (result.pairs, result.drivers) == (3, 1)
+
+
 @given(st.lists(st.tuples(st.floats(0.01, 10), st.floats(0.01, 10)), min_size=2, max_size=12))
 def test_nothing_is_invented(values: list[tuple[float, float]]) -> None:
     fixed, policy = np.array(values).T

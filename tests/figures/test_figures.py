@@ -15,7 +15,7 @@ from matplotlib.image import imread
 
 from cfx.errors import ConfigError, OutputError
 from cfx.evaluation.result import Evaluation
-from cfx.figures.drives import chosen_parameters, drives
+from cfx.figures.drives import chosen_parameters, drives, speeds
 from cfx.figures.improvement import improvement_per_driver
 from cfx.figures.learning import learning_curve
 from cfx.figures.look import COLOURS, percent, pretty_unit, short, unit_label
@@ -45,14 +45,15 @@ def with_improvement(results: MadeUp, values: dict[int, float]) -> Evaluation:
 @pytest.mark.parametrize(
     ("options", "files"),
     [
-        ({}, 5),
-        ({"space": TEN}, 5),
-        ({"pairs": 1, "epochs": 1}, 5),
-        ({"pairs": 94, "frames": 40, "space": TEN}, 5),
-        ({"pairs": 2, "frames": 1}, 5),
-        ({"pairs": 3, "networks": 0}, 4),
+        ({}, 6),
+        ({"space": TEN}, 6),
+        ({"pairs": 1, "epochs": 1}, 6),
+        ({"pairs": 94, "frames": 40, "space": TEN}, 6),
+        ({"pairs": 2, "frames": 1}, 6),
+        ({"pairs": 3, "networks": 0}, 5),
+        ({"pairs": 3, "methods": ("default", "population", "fixed", "policy")}, 6),
     ],
-    ids=["krauss", "ten parameters", "one pair", "94 pairs", "one frame", "nothing learned"],
+    ids=["krauss", "ten parameters", "one pair", "94 pairs", "one frame", "nothing learned", "four methods"],
 )
 def test_every_size_of_job_is_drawn(tmp_path: Path, options: dict[str, Any], files: int) -> None:
     results = make_results(**options)
@@ -110,7 +111,7 @@ def test_drives_shows_best_median_and_worst() -> None:
     rows = evaluation.table[(evaluation.table["pair_id"] == ids[2]) & (evaluation.table["method"] == "fixed")]
     assert f"fixed {float(rows['rmse_speed'].iloc[0]):.2f}" in texts(one)
     colours = {line.get_color() for line in one.axes[0].lines}
-    assert colours == set(COLOURS.values())
+    assert colours == {COLOURS[signal] for signal in ("real", "leader", *evaluation.methods)}
 
 
 def test_an_unknown_pair_is_named_with_the_nearest() -> None:
@@ -148,7 +149,7 @@ def test_names_are_text_and_never_formulas(tmp_path: Path) -> None:
     evaluation = dataclasses.replace(
         results.evaluation, table=table, drives=(dataclasses.replace(results.evaluation.drives[0], pair_id=name),)
     )
-    assert len(write_figures(tmp_path, evaluation, results.style, results.curves)) == 5
+    assert len(write_figures(tmp_path, evaluation, results.style, results.curves)) == 6
 
 
 def test_cuts_and_cluster_sizes_stand_in_the_style_figure() -> None:
@@ -204,3 +205,11 @@ def test_labels() -> None:
     assert pretty_unit("1e-4/(m s)") == "10⁻⁴/(m s)"
     assert unit_label("k", "1") == "k"
     assert short("abcdefghij", 7) == "abc…hij"
+
+
+def test_each_method_has_its_own_speed_plot() -> None:
+    evaluation = make_results(pairs=3, methods=("default", "population", "fixed", "policy")).evaluation
+    figure = speeds(evaluation)
+    assert len(figure.axes) == 4
+    row = evaluation.table[evaluation.table["method"] == "population"].sort_values("improvement")
+    assert any(f"{value:.3f} m/s" in texts(figure) for value in row["rmse_speed"])

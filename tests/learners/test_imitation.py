@@ -107,7 +107,7 @@ def test_without_validation_the_training_loss_decides() -> None:
 
 
 def test_one_network_for_all_pairs() -> None:
-    learned = ImitationLearner(scope="all", **QUICK).fit(GruPolicy(), lesson(3, scope="all"))
+    learned = ImitationLearner(**QUICK).fit(GruPolicy(), lesson(3, scope="all"))
     assert {value.shape[0] for value in learned.network.parameters()} == {1}
     assert set(learned.curves.network) == {"all"}
 

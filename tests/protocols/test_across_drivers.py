@@ -1,0 +1,215 @@
+"""Cross-validation over drivers: who is in which fold, what is trained on whom, and on which frames methods are compared."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+import cfx
+from cfx.calibration.cache import Cache
+from cfx.calibration.calibrator import Calibrator
+from cfx.calibration.objective import DriveObjective, JointObjective
+from cfx.calibration.windows import Split, WindowSettings
+from cfx.datasets.synthetic import SyntheticDataset
+from cfx.errors import DataError
+from cfx.models.krauss import Krauss
+from cfx.optimizers.random import RandomSearch
+from cfx.pairs import PairBatch, PairSet
+from cfx.progress import Task
+from cfx.protocols.across_drivers import AcrossDrivers
+from cfx.simulation.rollout import Simulator
+from tests.drives import straight_pairs, wavy_pairs
+
+QUICK = [
+    "debug=quick",
+    "data.max_pairs=null",
+    "data.pairs=6",
+    "data.frames=200",
+    "figures.enabled=false",
+    "tracking.enabled=false",
+]
+
+
+def chained(*followed: tuple[str, str]) -> PairSet:
+    """Pairs of (leader, follower)."""
+    pairs = straight_pairs([100] * len(followed))
+    return PairSet(
+        tuple(replace(pair, leader_id=leader, follower_id=own) for pair, (leader, own) in zip(pairs, followed, strict=True)),
+        "test",
+    )
+
+
+def test_no_driver_is_on_both_sides() -> None:
+    # Driver 3 follows three leaders.
+    pairs = chained(("1", "2"), ("2", "3"), ("8", "3"), ("9", "3"), ("3", "4"), ("4", "5"), ("5", "6"))
+    fold = AcrossDrivers(folds=3).folds(pairs, seed=0)
+    assert set(fold.tolist()) == {0, 1, 2}
+    assert len({int(k) for k, pair in zip(fold, pairs, strict=True) if pair.follower_id == "3"}) == 1
+
+
+def test_a_platoon_stays_together_if_wanted() -> None:
+    pairs = chained(("1", "2"), ("2", "3"), ("3", "4"), ("11", "12"), ("12", "13"), ("21", "22"))
+    fold = AcrossDrivers(folds=3, together="platoon").folds(pairs, seed=0).tolist()
+    assert len(set(fold[:3])) == len(set(fold[3:5])) == 1
+    assert len(set(fold)) == 3
+    apart = AcrossDrivers(folds=3).folds(pairs, seed=0).tolist()
+    assert len(set(apart[:3])) > 1
+
+
+def test_folds_follow_the_seed() -> None:
+    pairs = chained(*((str(k), str(k + 1)) for k in range(20)))
+    protocol = AcrossDrivers()
+    assert protocol.folds(pairs, seed=1).equal(protocol.folds(pairs, seed=1))
+    assert not protocol.folds(pairs, seed=1).equal(protocol.folds(pairs, seed=2))
+    assert np.bincount(protocol.folds(pairs, seed=1).numpy()).tolist() == [4] * 5
+
+
+def test_too_few_drivers_are_told() -> None:
+    with pytest.raises(DataError, match=r"protocol\.folds=5: test has only 3 drivers here; lower"):
+        AcrossDrivers().folds(chained(("1", "2"), ("2", "3"), ("3", "4"), ("9", "4")), seed=0)
+    with pytest.raises(DataError, match="only 1 platoon here"):
+        AcrossDrivers(folds=2, together="platoon").folds(chained(("1", "2"), ("2", "3")), seed=0)
+
+
+def calibrator(memory: int = 1 << 28, samples: int = 256) -> Calibrator:
+    return Calibrator(
+        Simulator(Krauss(), 0.1), RandomSearch(samples=samples), seed=0, cache=Cache(None), memory=memory, progress=Task
+    )
+
+
+def test_a_joint_objective_is_the_mean_of_its_drives() -> None:
+    truth = torch.tensor([[1.0, 0.1], [2.0, 0.4], [3.0, 0.8]], dtype=torch.float64)
+    batch = PairBatch.of(wavy_pairs(Krauss(), truth))
+    simulator = Simulator(Krauss(), 0.1)
+    index, steps = torch.tensor([0, 1, 0, 1, 2]), torch.full((5,), 150)
+    drives = DriveObjective.of_segments(simulator, batch, index, torch.zeros_like(index), steps)
+    candidates = torch.rand((2, 7, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    joint = JointObjective(drives, torch.tensor([2, 3]), memory=1 << 30)
+    single = torch.stack([drives(candidates[[k, k, 1, 1, 1]])[i] for i, k in enumerate([0, 0, 1, 1, 1])])
+    expected = torch.stack([single[:2].mean(0), single[2:].mean(0)])
+    torch.testing.assert_close(joint(candidates), expected)
+    torch.testing.assert_close(joint.select(1, 2)(candidates[1:]), expected[1:])
+    # One candidate at a time gives the same.
+    torch.testing.assert_close(JointObjective(drives, torch.tensor([2, 3]), memory=1)(candidates), expected)
+
+
+def test_the_populations_parameters_fit_all_their_drivers() -> None:
+    """Drivers who are all alike are found as one."""
+    truth = torch.tensor([[1.7, 0.3]] * 4 + [[4.0, 0.3]], dtype=torch.float64)
+    pairs = wavy_pairs(Krauss(), truth)
+    members = torch.tensor([[True] * 4 + [False], [False, False, False, False, True]])
+    last = torch.full((5,), 250)
+    found = calibrator(samples=2048).population(pairs, PairBatch.of(pairs), last, members)
+    assert found[:, 0].tolist() == pytest.approx([1.7, 4.0], abs=0.1)
+
+
+def test_whole_drives_belong_to_training() -> None:
+    pairs = straight_pairs([101, 83])
+    split = Split.none(pairs, WindowSettings())
+    assert split.frame.tolist() == [100, 82]
+    assert split.windows.tolist() == [20, 16]
+    assert split[torch.tensor([1, 1])].windows.tolist() == [16, 16]
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> cfx.JobResult:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("across"))
+        return cfx.run([*QUICK, "protocol=across_drivers", "protocol.folds=3", "learner.epochs=5"])
+
+
+def test_all_methods_drive_the_same_frames(result: cfx.JobResult) -> None:
+    methods = ["default", "population", "fixed", "policy"]
+    assert result.pairs.groupby("pair_id")["method"].apply(list).tolist() == [methods] * 6
+    by_pair = result.pairs.groupby("pair_id")[["frames", "fold"]]
+    assert by_pair.min().equals(by_pair.max())
+    assert set(result.pairs["fold"]) == {0, 1, 2}
+    population = result.pairs[result.pairs.method == "population"]
+    by_fold = population.groupby("fold")["parameter_t_r"]
+    assert by_fold.min().equals(by_fold.max()), "one set for all drivers of a fold"
+    assert len(set(population["parameter_t_r"])) > 1
+
+
+def test_every_baseline_has_its_improvement(result: cfx.JobResult) -> None:
+    policy = result.pairs[result.pairs.method == "policy"].set_index("pair_id")
+    for baseline, key in (("fixed", "rmse_improvement"), ("population", "rmse_improvement/population")):
+        before = result.pairs[result.pairs.method == baseline].set_index("pair_id")
+        gain = (before.rmse_speed - policy.rmse_speed) / before.rmse_speed
+        assert result.metrics[f"{key}/mean"] == pytest.approx(gain.mean())
+        column = "improvement" if baseline == "fixed" else f"improvement_over_{baseline}"
+        assert policy[column].to_numpy() == pytest.approx(gain.to_numpy())
+        whole = (before.whole_rmse_speed - policy.whole_rmse_speed) / before.whole_rmse_speed
+        if baseline == "population":
+            assert result.metrics["whole/rmse_improvement/population/mean"] == pytest.approx(whole.mean())
+        else:
+            assert whole.isna().all(), "his own parameters have seen the first part of the drive"
+    assert result.metrics["whole/rmse_gap/default"] > 0
+    assert "whole/rmse_speed/fixed" not in result.metrics
+
+
+def test_the_design_is_told(result: cfx.JobResult) -> None:
+    notes = json.loads((result.folder / "data.json").read_text())["protocol"]
+    assert (notes["folds"], notes["drivers"], notes["drivers_per_fold"]) == (3, 6, [2, 2, 2])
+    assert 0 < notes["test_pairs_behind_a_training_driver"] <= 6
+
+
+def test_drives_and_curves_are_kept(result: cfx.JobResult) -> None:
+    drives = pd.read_parquet(result.folder / "drives.parquet")
+    row = result.pairs[(result.pairs.method == "population")].iloc[0]
+    own = drives[drives.pair_id == row.pair_id].iloc[1:]
+    assert len(own) == row.frames
+    assert math.sqrt(((own.speed_population - own.real_speed) ** 2).mean()) == pytest.approx(row.rmse_speed)
+    assert {"t_r_policy", "t_i_fixed", "gap_default", "leader_speed", "real_gap"} <= set(own.columns)
+    curves = pd.read_parquet(result.folder / "curves.parquet")
+    assert set(curves.network) == {"fold 0", "fold 1", "fold 2", "all"}
+    assert result.metrics["validation_loss/best"] == pytest.approx(curves.groupby("network").validation_loss.min().mean())
+
+
+def test_the_saved_policy_drives_strangers(result: cfx.JobResult) -> None:
+    policy = cfx.load(result.folder).policy
+    strangers = SyntheticDataset(pairs=2, frames=100, seed=9).load()
+    assert policy.networks_for(strangers).tolist() == [3, 3]
+
+
+def test_what_a_test_driver_does_changes_nothing_that_is_learned_for_him(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Another drive of one driver changes the networks of other folds, and never that of his own."""
+    monkeypatch.chdir(tmp_path)
+    overrides = [*QUICK, "protocol=across_drivers", "protocol.folds=3", "policy.hidden_size=4", "cache.enabled=false"]
+    before = cfx.run(overrides)
+    load = SyntheticDataset.load
+
+    def changed(self: SyntheticDataset) -> PairSet:
+        pairs = load(self)
+        first = pairs[0]
+        slower: dict[str, Any] = {"follower_speed": first.follower_speed * 0.9}
+        return replace(pairs, pairs=(replace(first, **slower), *pairs.pairs[1:]))
+
+    monkeypatch.setattr(SyntheticDataset, "load", changed)
+    after = cfx.run(overrides)
+    fold = int(before.pairs.fold.iloc[0])
+    assert fold == int(after.pairs.fold.iloc[0])
+    one, two = before.policy.network.state_dict(), after.policy.network.state_dict()
+    assert all(torch.equal(one[key][fold], two[key][fold]) for key in one)
+    others = [k for k in range(3) if k != fold]
+    assert all(any(not torch.equal(one[key][k], two[key][k]) for key in one) for k in others)
+    same = before.pairs.method == "population"
+    columns = ["fold", "parameter_t_r"]
+    kept = before.pairs[same & (before.pairs.fold == fold)][columns]
+    pd.testing.assert_frame_equal(kept, after.pairs[same & (after.pairs.fold == fold)][columns])
+
+
+@pytest.mark.parametrize("policy", ["fixed", "default"])
+def test_a_baseline_as_policy_equals_itself(policy: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    metrics = cfx.run([*QUICK, "protocol=across_drivers", "protocol.folds=2", f"policy={policy}"]).metrics
+    same = {"fixed": "population", "default": "default"}[policy]
+    assert metrics["rmse_speed/policy"] == metrics[f"rmse_speed/{same}"]
+    assert metrics[f"rmse_improvement/{same}/mean"] == 0
