@@ -2,29 +2,29 @@
 
 Hydra's own error handling prints tracebacks and exits with 1, so `HYDRA_FULL_ERROR` is set for the time of the call: exceptions
 then reach this module. A job itself never raises into Hydra; it leaves an `Outcome`, in a multirun as `outcome.json` in its
-folder, which is how worker processes and other machines report too. So one failed job stops no other.
+folder, which is how worker processes and other machines report too. So one failed job stops no other, and a multirun that was
+broken off goes on where it stopped: see `cfx.sweep`.
 """
 
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import os
 import signal
 import sys
+import time
 import traceback
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -32,6 +32,7 @@ from omegaconf.errors import OmegaConfBaseException
 from cfx import hydra_source, nodes
 from cfx.errors import CfxError, ConfigError
 from cfx.mistakes import explain, is_mistake
+from cfx.sweep import OUTCOME, Outcome, Record, Refused, SweepFolder, fingerprint, metrics_of, only_one, worker_of
 
 if TYPE_CHECKING:
     from cfx.job import JobResult
@@ -44,28 +45,6 @@ JOB = "cfx.job:run_job"
 INTERRUPTED, TERMINATED = 130, 143
 """Exit codes after Ctrl-C and after SIGTERM."""
 
-OUTCOME = "outcome.json"
-"""What each job of a multirun leaves in its folder."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """How a job ended.
-
-    Attributes:
-        code: exit code: 0; 2 for a user's mistake; 1 for a bug.
-        message: one sentence for people, empty if all went well.
-        detail: the traceback of a bug.
-        overrides: what was asked for.
-        multirun: tells the jobs of one multirun from those of an earlier one in the same folder.
-    """
-
-    code: int
-    message: str
-    detail: str
-    overrides: tuple[str, ...]
-    multirun: str
-
 
 class JobFunction:
     """The function that Hydra calls for each job; it is pickled into worker processes."""
@@ -73,69 +52,76 @@ class JobFunction:
     def __init__(self, target: str, multirun: str, show_traceback: bool) -> None:
         self.target = target
         self.multirun = multirun
+        self.process = os.getpid()
         self.show_traceback = show_traceback
         self.outcome: Outcome | None = None
 
     def __call__(self, config: DictConfig) -> float:
-        """Runs one job.
+        """Runs one job; one of a multirun that was done before is not run again.
 
         Returns:
             The policy's RMSE of speed, m/s, for sweepers that optimise; NaN if the job failed.
         """
         hydra_config = HydraConfig.get()
-        several = hydra_config.mode == RunMode.MULTIRUN
         folder = Path(hydra_config.runtime.output_dir)
         given: Any = OmegaConf.to_container(hydra_config.overrides.task, resolve=False)  # as typed, `${...}` included
-        overrides = tuple(given)
-        sweep = str(hydra_config.sweep.dir) if several else ""
-        metric, code, message, detail = self._attempt(config, folder, sweep)
-        self.outcome = Outcome(code, message, detail, overrides, self.multirun)
-        if several:
-            text = json.dumps(asdict(self.outcome), indent=2)
-            (folder / OUTCOME).write_text(text + "\n", encoding="utf-8")
-        if code:
-            log.error(
-                "job %sfailed: %s%s",
-                f"{hydra_config.job.num} ({' '.join(overrides)}) " if several else "",
-                message,
-                f"\n{detail}" if detail else "",
-                extra={"file_only": not several},  # a single job's message is printed by `start`, once
+        if hydra_config.mode == RunMode.MULTIRUN:
+            record = Record.read(Path(str(hydra_config.sweep.dir)))
+            blank = Outcome(
+                0, "", "", tuple(given), self.multirun, record.command_hash if record else "", number=int(hydra_config.job.num)
             )
+            with worker_of(self.process), only_one(folder):
+                metric, self.outcome = self._attempt(config, folder, blank, record.name if record else str(folder.parent))
+                self.outcome.write(folder)
+            where = f"{blank.number} ({' '.join(given)}) "
+        else:
+            metric, self.outcome = self._attempt(config, folder, Outcome(0, "", "", tuple(given)), "")
+            where = ""
+        if self.outcome.code:
+            detail = f"\n{self.outcome.detail}" if self.outcome.detail else ""
+            # A single job's message is printed by `start`, once.
+            log.error("job %sfailed: %s%s", where, self.outcome.message, detail, extra={"file_only": not where})
         return metric
 
-    def _attempt(self, config: DictConfig, folder: Path, sweep: str) -> tuple[float, int, str, str]:
+    def _attempt(self, config: DictConfig, folder: Path, blank: Outcome, sweep: str) -> tuple[float, Outcome]:
+        """Runs a job, or finds that it was done.
+
+        Args:
+            blank: what is known of its outcome.
+            sweep: the multirun's name, "" for a single job.
+        """
+        began = time.monotonic()
+
+        def failed(code: int, message: str, *, show: bool = True) -> tuple[float, Outcome]:
+            detail = traceback.format_exc().rstrip() if show else ""
+            seconds = time.monotonic() - began
+            return float("nan"), replace(blank, code=code, message=message, detail=detail, seconds=seconds)
+
         try:
             values: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-            if sweep and values.get("tracking", {}).get("sweep", "") is None:
-                values["tracking"]["sweep"] = sweep
+            if sweep:
+                if values.get("tracking", {}).get("sweep", "") is None:
+                    values["tracking"]["sweep"] = sweep
+                blank = replace(blank, fingerprint=fingerprint(values))
+                earlier = Outcome.read(folder)
+                if earlier is not None and earlier.code == 0 and earlier.fingerprint == blank.fingerprint:
+                    log.info("job %d (%s) was done before", blank.number, " ".join(blank.overrides))
+                    return _metric(metrics_of(folder)), replace(blank, seconds=earlier.seconds, before=True)
+                (folder / OUTCOME).unlink(missing_ok=True)  # what it says is no longer so
             result = _call(self.target, values, folder)
-        except (CfxError, OmegaConfBaseException) as error:
-            return float("nan"), 2, explain(error, ()), traceback.format_exc().rstrip() if self.show_traceback else ""
-        except SystemExit as error:
-            if isinstance(error.__context__, KeyboardInterrupt):  # Lightning answers Ctrl-C with sys.exit
-                raise KeyboardInterrupt from None
-            return float("nan"), 1, f"the job called sys.exit({error.code!r})", traceback.format_exc().rstrip()
-        except Exception as error:  # a bug: its traceback is printed, and the other jobs go on
-            return float("nan"), 1, f"{type(error).__name__}: {error}", traceback.format_exc().rstrip()
-        return float(result.metrics.get("rmse_speed/policy", float("nan"))), 0, "", ""
+        except (Exception, SystemExit) as error:
+            signalled = _signal_behind(error)
+            if signalled is not None:
+                raise signalled from None
+            if isinstance(error, CfxError | OmegaConfBaseException):
+                return failed(2, explain(error, ()), show=self.show_traceback)
+            if isinstance(error, SystemExit):
+                return failed(1, f"the job called sys.exit({error.code!r})")
+            return failed(1, f"{type(error).__name__}: {error}")  # a bug: its traceback is printed, and the other jobs go on
+        return _metric(result.metrics), replace(blank, seconds=time.monotonic() - began)
 
 
-class SweepFolder(Callback):
-    """Learns where the jobs of a multirun leave their outcomes."""
-
-    _current: ClassVar[Path | None] = None
-
-    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        SweepFolder._current = Path(str(config.hydra.sweep.dir)).absolute()
-
-    @classmethod
-    def take(cls) -> Path | None:
-        """Returns the folder of the multirun that ran, if one did, and forgets it."""
-        folder, cls._current = cls._current, None
-        return folder
-
-
-class _Terminated(BaseException):
+class Terminated(BaseException):
     """SIGTERM arrived."""
 
 
@@ -153,19 +139,18 @@ def start(arguments: Sequence[str], *, target: str = JOB) -> int:
     except SystemExit as error:
         # Hydra exits with 0 after --help and the like, with 1 or argparse's 2 after a message about a wrong flag.
         code = 0 if not error.code else 2
-    except KeyboardInterrupt:
-        print("interrupted; what was finished is kept", file=sys.stderr)
-        code = INTERRUPTED
-    except _Terminated:
-        print("terminated; what was finished is kept", file=sys.stderr)
-        code = TERMINATED
+    except Refused as error:
+        code = _report(error.__cause__, overrides, show_traceback)
+    except (KeyboardInterrupt, Terminated) as error:
+        code = _interrupted(error)
     except BrokenPipeError:
         raise  # the reader of stdout has gone; `cfx.cli.main` knows what that means
     except Exception as error:  # everything ends as an exit code
-        code = _report(error, overrides, show_traceback)
+        signalled = _signal_behind(error)
+        code = _interrupted(signalled) if signalled is not None else _report(error, overrides, show_traceback)
     sweep = SweepFolder.take()
     if sweep is not None:
-        return max(_summary(_outcomes(sweep, job.multirun), sweep, code), code, key=_weight)
+        return sweep.close(job.multirun, code, interrupted=code in {INTERRUPTED, TERMINATED})
     if job.outcome is not None and job.outcome.code:
         print(job.outcome.detail or job.outcome.message, file=sys.stderr)
         return job.outcome.code
@@ -210,41 +195,43 @@ def _call(target: str, values: Any, folder: Path) -> Any:
     return getattr(import_module(module), function)(job_config, folder)
 
 
-def _report(error: Exception, overrides: Sequence[str], show_traceback: bool) -> int:
+def _interrupted(signalled: BaseException) -> int:
+    terminated = isinstance(signalled, Terminated)
+    print(f"{'terminated' if terminated else 'interrupted'}; what was finished is kept", file=sys.stderr)
+    return TERMINATED if terminated else INTERRUPTED
+
+
+def _signal_behind(error: BaseException) -> BaseException | None:
+    """Returns the Ctrl-C or SIGTERM that an error comes from.
+
+    Lightning answers Ctrl-C with sys.exit, and a library that a signal hits while it tidies up may raise an error of its own.
+    """
+    current: BaseException | None = error
+    while current is not None:
+        if isinstance(current, KeyboardInterrupt | Terminated):
+            return current
+        current = current.__context__
+    return None
+
+
+def _metric(metrics: Mapping[str, float]) -> float:
+    return float(metrics.get("rmse_speed/policy", float("nan")))
+
+
+def _report(error: BaseException | None, overrides: Sequence[str], show_traceback: bool) -> int:
+    assert error is not None
+    if type(error).__name__ in {"TerminatedWorkerError", "BrokenProcessPool"}:  # joblib's; importing it takes a while
+        print(
+            "a worker process was killed, perhaps because memory ran out: hydra.launcher.n_jobs=N makes fewer at a time",
+            file=sys.stderr,
+        )
+        return 1
     mistake = is_mistake(error)
     if show_traceback or not mistake:
         traceback.print_exception(error)
     if mistake:
         print(explain(error, overrides), file=sys.stderr)
     return 2 if mistake else 1
-
-
-def _summary(outcomes: Mapping[Path, Outcome], folder: Path, code: int) -> int:
-    """Prints which jobs of a multirun failed and why; returns the exit code."""
-    if not outcomes:
-        if not code:
-            print(f"no job left its outcome in {folder}; see the launcher's own logs", file=sys.stderr)
-        return code or 1
-    failed = {path: outcome for path, outcome in outcomes.items() if outcome.code}
-    print(f"{len(outcomes) - len(failed)} of {len(outcomes)} jobs done; their folders: {folder}")
-    for path, outcome in failed.items():
-        print(f"failed: {' '.join(outcome.overrides)}: {outcome.message} ({path})", file=sys.stderr)
-    return max((outcome.code for outcome in failed.values()), key=_weight, default=0)
-
-
-def _outcomes(folder: Path, multirun: str) -> dict[Path, Outcome]:
-    """Returns the outcome of each job of this multirun, by folder."""
-    found = {}
-    for path in sorted(folder.rglob(OUTCOME)):
-        values = json.loads(path.read_text(encoding="utf-8"))
-        if values["multirun"] == multirun:
-            found[path.parent] = Outcome(**{**values, "overrides": tuple(values["overrides"])})
-    return found
-
-
-def _weight(code: int) -> int:
-    """Orders exit codes: a bug outweighs a user's mistake."""
-    return {0: 0, 2: 1, 1: 2}.get(code, 3)
 
 
 def _fresh(folder: Path) -> Path:
@@ -296,7 +283,7 @@ def _process_state(arguments: Sequence[str]) -> Iterator[None]:
 @contextlib.contextmanager
 def _sigterm() -> Iterator[None]:
     def terminate(_number: int, _frame: FrameType | None) -> None:
-        raise _Terminated
+        raise Terminated
 
     try:
         before = signal.signal(signal.SIGTERM, terminate)

@@ -3,6 +3,9 @@
 An entry's name is the SHA-256 of everything that the result depends on, so a hit is always the right answer and nothing ever
 needs to be invalidated. Entries are NumPy archives read without pickle; each appears whole or not at all, and a damaged one is
 computed again.
+
+Processes that need the same entries share the work: each claims what it is about to compute, by a file lock, and leaves what
+another has claimed for later. The operating system frees a claim when its process ends, however it ends.
 """
 
 from __future__ import annotations
@@ -11,11 +14,13 @@ import hashlib
 import json
 import logging
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock, Timeout
 from numpy.typing import NDArray
 
 from cfx.errors import OutputError
@@ -24,6 +29,12 @@ from cfx.files import whole
 log = logging.getLogger(__name__)
 
 Arrays = dict[str, NDArray[Any]]
+
+_SHARES = 32
+"""Parts in which processes claim the entries of one calibration."""
+
+_POLL_S = 0.2
+"""Seconds between two looks at a claim of another process."""
 
 
 def content_key(parts: Mapping[str, Any]) -> str:
@@ -64,11 +75,68 @@ class Cache:
             with whole(path) as temporary:
                 np.savez(temporary, **arrays)  # type: ignore[arg-type]  # the stubs take every name for `allow_pickle`
         except OSError as error:
-            raise OutputError(
-                f"cannot write the calibration cache {self.folder}: {error.strerror}; set cache.folder to a folder that can"
-                f" be written,"
-                " or cache.enabled=false"
-            ) from error
+            raise self._unwritable(error) from error
+
+    def shares(self, keys: Sequence[str], scope: str) -> dict[str, list[int]]:
+        """Returns the parts in which entries are claimed: the part's name -> positions in `keys`.
+
+        Args:
+            scope: what all keys of one calibration have in common: calibrations that share no entry then share no claim, but
+                for a rare coincidence, which costs a little waiting and nothing else.
+        """
+        parts: dict[str, list[int]] = {}
+        for position, key in enumerate(keys):
+            share = int(key[:8], 16) % _SHARES if self.folder is not None else 0
+            # Three digits: there are never more than 4096 lock files, however many calibrations the cache sees.
+            parts.setdefault(hashlib.sha256(f"{scope} {share}".encode()).hexdigest()[:3], []).append(position)
+        return parts
+
+    @contextmanager
+    def claim(self, sizes: Mapping[str, int], enough: int) -> Iterator[list[str]]:
+        """Claims shares for as long as the block lasts; nothing is claimed while this waits, so there is no deadlock.
+
+        Args:
+            sizes: problems in each share that is wanted, at least one share.
+            enough: claims stop before they hold more problems than this, but at least one share is claimed.
+
+        Yields:
+            The shares' names: free ones if there are any, else the first one that another process lets go.
+
+        Raises:
+            OutputError: the folder cannot be written.
+        """
+        with ExitStack() as held:
+            claimed: list[str] = []
+            problems = 0
+            for name, size in sizes.items():
+                if (not claimed or problems + size <= enough) and self._acquire(held, name, wait=False):
+                    claimed.append(name)
+                    problems += size
+            if not claimed:
+                first = next(iter(sizes))
+                self._acquire(held, first, wait=True)
+                claimed.append(first)
+            yield claimed
+
+    def _acquire(self, held: ExitStack, name: str, *, wait: bool) -> bool:
+        if self.folder is None:
+            return True
+        lock = FileLock(self.folder / "claims" / f"{name}.lock")
+        try:
+            Path(lock.lock_file).parent.mkdir(parents=True, exist_ok=True)
+            held.enter_context(lock.acquire(timeout=-1 if wait else 0, poll_interval=_POLL_S))
+        except Timeout:
+            return False
+        except OSError as error:
+            raise self._unwritable(error) from error
+        return True
+
+    def _unwritable(self, error: OSError) -> OutputError:
+        return OutputError(
+            f"cannot write the calibration cache {self.folder}: {error.strerror}; set cache.folder to a folder that can"
+            f" be written,"
+            " or cache.enabled=false"
+        )
 
     def _path(self, key: str) -> Path | None:
         return None if self.folder is None else self.folder / key[:2] / f"{key}.npz"

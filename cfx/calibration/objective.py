@@ -137,6 +137,6 @@ class JointObjective:
         sizes = self.sizes.to(candidates.device)
         owner = torch.repeat_interleave(torch.arange(len(sizes), device=candidates.device), sizes)
         turn = max(1, min(self.memory, _TURN) // (self.drives.bytes_per_candidate * len(owner)))
-        losses = torch.cat([self.drives(block[owner]) for block in candidates.split(turn, dim=1)], dim=1)
+        losses = torch.cat([self.drives(block[owner]) for block in torch.split(candidates, turn, dim=1)], dim=1)
         total = losses.new_zeros((len(sizes), losses.shape[1])).index_add_(0, owner, losses)
         return total / sizes[:, None]

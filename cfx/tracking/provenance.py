@@ -50,6 +50,27 @@ def plugin_tags(distributions: Mapping[str, str]) -> dict[str, str]:
     return {"cfx.plugins": listed or "none"} | {f"cfx.plugin.{name}": found for name, found in sorted(distributions.items())}
 
 
+def distributions(values: Mapping[str, Any]) -> dict[str, str]:
+    """Returns the plugin distributions, and their versions, that the named components come from; cfx's own is none.
+
+    Args:
+        values: a job's configuration.
+
+    Raises:
+        PluginError: there is no component of that name.
+    """
+    from cfx import registry
+
+    found = {}
+    for kind in registry.KINDS.values():
+        node = values.get(kind.group)
+        if isinstance(node, Mapping) and "name" in node:
+            entry = registry.entry(kind.name, str(node["name"]))
+            if entry.distribution != "cfx-driving":
+                found[entry.distribution] = entry.version
+    return found
+
+
 def process_tags() -> dict[str, str]:
     """Returns tags that tell later whether the process that made a run is still there."""
     process = psutil.Process()
@@ -62,7 +83,10 @@ def is_alive(tags: Mapping[str, str]) -> bool:
         return True
     pid, started = tags["cfx.process"].split("@")
     try:
-        return bool(abs(psutil.Process(int(pid)).create_time() - float(started)) < 2.0)
+        process = psutil.Process(int(pid))
+        if process.status() == psutil.STATUS_ZOMBIE:  # killed, and its parent has not asked how it ended
+            return False
+        return bool(abs(process.create_time() - float(started)) < 2.0)
     except psutil.NoSuchProcess:
         return False
     except (psutil.Error, ValueError):

@@ -76,7 +76,18 @@ def tracking_uri(configured: str | None, default: Path | None = None) -> str:
         TrackingError: it is neither a database nor a server.
     """
     said_by = "MLFLOW_TRACKING_URI" if os.environ.get("MLFLOW_TRACKING_URI") else "tracking.uri"
-    uri = os.environ.get("MLFLOW_TRACKING_URI") or configured or f"sqlite:///{default or default_store()}"
+    return absolute_uri(os.environ.get("MLFLOW_TRACKING_URI") or configured or f"sqlite:///{default or default_store()}", said_by)
+
+
+def absolute_uri(uri: str, said_by: str) -> str:
+    """Returns a tracking URI with an absolute path.
+
+    Args:
+        said_by: where a user wrote it, for the message.
+
+    Raises:
+        TrackingError: it is neither a database nor a server.
+    """
     scheme = uri.split("://", 1)[0].split("+", 1)[0] if "://" in uri else uri
     if scheme == "sqlite":
         name = uri.removeprefix("sqlite:///")

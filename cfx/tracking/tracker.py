@@ -73,7 +73,7 @@ class Tracker:
             run_name="-".join(names[kind] for kind in ("model", "policy", "optimizer", "data")),
             parameters=provenance.flatten(values),
             tags=tags,
-            plugins=_distributions(values),
+            plugins=provenance.distributions(values),
             sweep=config.tracking.sweep,
         ) as tracker:
             yield tracker
@@ -176,12 +176,14 @@ class MlflowTracker(Tracker):
             **(tags or {}),
         }
         with store.locked(), told("begin the run"):
-            _close_abandoned(store)
+            close_abandoned(store)
             parent_id = None
             if sweep is not None:
                 parent_id = _sweep_parent(store, sweep)
                 every |= {"cfx.sweep": _safe(sweep), "mlflow.parentRunId": parent_id}
             run_id = _begin(store, run_name, known, every)
+            if sweep is not None:
+                _replace_earlier(store, run_id, every)
         tracker = cls(store, run_id, run_name, sweep, parent_id, plugins or {})
         try:
             yield tracker
@@ -279,7 +281,7 @@ class MlflowTracker(Tracker):
 
     def _end_badly(self, error: BaseException) -> None:
         """Closes the run after an error; that one is what the user must see, so a failure to close is only logged."""
-        killed = isinstance(error, KeyboardInterrupt | SystemExit)
+        killed = not isinstance(error, Exception)  # Ctrl-C, SIGTERM, exit
         text = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
         try:
             self._end("KILLED" if killed else "FAILED", text)
@@ -307,6 +309,30 @@ def sweep_link(experiment_id: str, sweep: str) -> str:
         "workflowType": "machine_learning",
     }
     return f"#/experiments/{experiment_id}/runs?" + urlencode(asked, quote_via=quote)
+
+
+def end_sweep(uri: str, experiment: str, sweep: str) -> tuple[str, ...]:
+    """Closes the runs that killed jobs left open, and gives the sweep's parent run the status of its jobs.
+
+    Args:
+        uri: of the store, absolute.
+        sweep: the name that the jobs share.
+
+    Returns:
+        Lines that tell a user where to look; none if no job of the sweep was tracked.
+
+    Raises:
+        TrackingError: the store cannot be used.
+    """
+    store = open_store(uri, experiment)
+    with store.locked(), told("close the sweep"):
+        close_abandoned(store)
+        parents = store.client.search_runs([store.experiment_id], f"tags.`cfx.sweep_parent` = '{_safe(sweep)}'", max_results=1)
+        if not parents:
+            return ()
+        _settle(store, str(parents[0].info.run_id), _safe(sweep))
+    address, first = _address(store.uri)
+    return (*first, f"All jobs of this sweep: {address}/{sweep_link(store.experiment_id, sweep)}")
 
 
 def download_run(run_id: str, uri: str | None = None) -> Path:
@@ -361,12 +387,29 @@ def _begin(store: Store, name: str, parameters: Mapping[str, str], tags: Mapping
     return run_id
 
 
+def _replace_earlier(store: Store, run_id: str, tags: Mapping[str, str]) -> None:
+    """Takes earlier runs of the same job out of its sweep: a job that runs again overwrites their folder.
+
+    They stay where they are, with the tag `cfx.replaced_by`.
+    """
+    folder = tags.get("cfx.folder", "")
+    mark = '"' if "'" in folder else "'"
+    if not folder or mark in folder:
+        return
+    same = f"tags.`cfx.sweep` = '{tags['cfx.sweep']}' and tags.`cfx.folder` = {mark}{folder}{mark}"
+    for run in store.client.search_runs([store.experiment_id], same):
+        if run.info.run_id != run_id and not _is_running(run):
+            store.client.set_tag(run.info.run_id, "cfx.replaced_by", run_id)
+            for tag in ("cfx.sweep", "mlflow.parentRunId"):
+                store.client.delete_tag(run.info.run_id, tag)
+
+
 def _is_running(run: Any) -> bool:
     return run.info.status == "RUNNING" and provenance.is_alive(run.data.tags)
 
 
-def _close_abandoned(store: Store) -> None:
-    """Marks runs KILLED whose process on this machine is gone: a killed process cannot do it itself."""
+def close_abandoned(store: Store) -> None:
+    """Marks an experiment's runs KILLED whose process on this machine is gone: a killed one cannot do it; call under the lock."""
     mine = f"attributes.status = 'RUNNING' and tags.`cfx.host` = '{_safe(provenance.process_tags()['cfx.host'])}'"
     for run in store.client.search_runs([store.experiment_id], mine, max_results=1000):
         if not provenance.is_alive(run.data.tags):
@@ -423,20 +466,6 @@ def _fingerprint(parameters: Mapping[str, str], tags: Mapping[str, str]) -> str:
     """Returns what two starts of the same job in the same folder share."""
     text = json.dumps([dict(sorted(parameters.items())), tags.get("cfx.folder", "")])
     return hashlib.sha256(text.encode()).hexdigest()[:32]
-
-
-def _distributions(values: Mapping[str, Any]) -> dict[str, str]:
-    """Returns the plugin distributions, and their versions, that the named components come from; cfx's own is none."""
-    from cfx import registry
-
-    found = {}
-    for kind in registry.KINDS.values():
-        node = values.get(kind.group)
-        if isinstance(node, Mapping) and "name" in node:
-            entry = registry.entry(kind.name, str(node["name"]))
-            if entry.distribution != "cfx-driving":
-                found[entry.distribution] = entry.version
-    return found
 
 
 def _safe(name: str) -> str:

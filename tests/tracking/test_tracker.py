@@ -25,7 +25,7 @@ from cfx.models.krauss import Krauss
 from cfx.policies.features import token_width
 from cfx.policies.gru import GruPolicy
 from cfx.policies.trained import Scaler, TrainedPolicy
-from cfx.tracking import provenance, tracker
+from cfx.tracking import provenance
 from cfx.tracking.store import quiet, told
 from cfx.tracking.tracker import CURVE_POINTS, MlflowTracker, Tracker, download_run, sweep_link
 from tests.drives import wavy_pairs
@@ -424,7 +424,7 @@ def test_plugins_are_named_with_their_versions(uri: str, client: Any, monkeypatc
         pass
     tags = client.get_run(run.run_id).data.tags
     assert (tags["cfx.plugins"], tags["cfx.plugin.cfx-idm"]) == ("cfx-idm 0.3", "0.3")
-    assert tracker._distributions({"model": {"name": "krauss"}}) == {"cfx-idm": "0.3"}
+    assert provenance.distributions({"model": {"name": "krauss"}}) == {"cfx-idm": "0.3"}
 
 
 def test_the_commit_of_the_users_checkout(tmp_path: Path) -> None:

@@ -1,0 +1,408 @@
+"""Sweeps: broken off and started again they run what is missing, harm nothing that is done, and say what came of it all."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from filelock import FileLock
+
+from cfx import application, sweep
+from cfx.tracking import provenance
+
+JOB = """
+    import json, os, time
+    from dataclasses import dataclass
+    from pathlib import Path
+    from cfx.errors import DataError
+
+    @dataclass
+    class Result:
+        metrics: dict
+
+    def run_job(config, folder):
+        with Path("ran").open("a") as file:
+            file.write(f"{config.seed}\\n")
+        if Path(f"fail-{config.seed}").exists():
+            raise DataError(f"drive {config.seed} is broken")
+        if Path(f"interrupt-{config.seed}").exists():
+            raise KeyboardInterrupt
+        if Path(f"muddle-{config.seed}").exists():
+            try:
+                raise KeyboardInterrupt
+            finally:
+                raise AttributeError("a library that was tidying up")
+        while Path(f"wait-{config.seed}").exists():
+            Path(f"waits-{config.seed}").touch()
+            time.sleep(0.02)
+        metrics = {f"rmse_speed/{method}": value + config.seed for method, value in
+                   (("default", 1.0), ("fixed", 0.5), ("policy", 0.25))}
+        metrics |= {"rmse_improvement/mean": 0.5, "rmse_improvement/ci95_low": 0.25, "rmse_improvement/ci95_high": None}
+        if config.model["name"] == "w99":
+            metrics |= {f"rmse_improvement/population/{name}": 0.125 for name in ("mean", "ci95_low", "ci95_high")}
+        (folder / "metrics.json").write_text(json.dumps(metrics))
+        (folder / "told").write_text(f"{config.tracking.sweep} {os.environ.get('OMP_NUM_THREADS')}")
+        return Result(metrics)
+"""
+
+Run = Callable[..., int]
+
+
+@pytest.fixture
+def run(install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Returns the application with a job that does what files in the current, empty folder say."""
+    install("sweep-stub", {}, {"sweep_stub.py": JOB})
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    return lambda *arguments: application.start(arguments, target="sweep_stub:run_job")
+
+
+def ran() -> list[str]:
+    """Returns the seeds of the jobs that ran since the last call, in order."""
+    path = Path("ran")
+    seeds = path.read_text().split() if path.exists() else []
+    path.unlink(missing_ok=True)
+    return seeds
+
+
+def sweeps() -> list[Path]:
+    return sorted(path.parent for path in Path().rglob(sweep.RECORD))
+
+
+def jobs(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.is_dir())
+
+
+def summary(folder: Path) -> list[dict[str, str]]:
+    with (folder / sweep.SUMMARY).open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.parametrize("how", ["interrupt", "muddle"])
+def test_an_interrupted_sweep_goes_on_whatever_the_order_of_its_overrides(run: Run, how: str, capsys) -> None:
+    Path(f"{how}-2").touch()
+    assert run("-m", "seed=0,1,2,3", "model=w99") == 130
+    assert ran() == ["0", "1", "2"]
+    printed = capsys.readouterr()
+    assert "2 of 4 jobs done" in printed.out
+    assert "The same command again" in printed.out
+    assert "Traceback" not in printed.err
+    Path(f"{how}-2").unlink()
+    assert run("-m", "model=w99", "seed=3,2,1,0") == 0
+    assert ran() == ["3", "2"]
+    (folder,) = sweeps()
+    printed = capsys.readouterr()
+    assert f"continuing sweep {folder}: 2 of 4 jobs are done\n" in printed.out
+    assert "4 of 4 jobs done" in printed.out
+    assert len(jobs(folder)) == 4
+    assert [(row["seed"], row["state"]) for row in summary(folder)] == [
+        ("3", "done"),
+        ("2", "done"),
+        ("1", "done before"),
+        ("0", "done before"),
+    ]
+    assert run("-m", "seed=0,1,2,3", "model=w99") == 0  # that one is complete: a fresh one
+    assert len(ran()) == 4
+    assert len(sweeps()) == 2
+
+
+def test_after_failures_only_the_failed_jobs_run_again_also_with_another_launcher(run: Run, capsys) -> None:
+    Path("fail-1").touch()
+    assert run("-m", "seed=0,1,2") == 2
+    assert "failed: seed=1: drive 1 is broken" in capsys.readouterr().err
+    assert ran() == ["0", "1", "2"]
+    assert run("-m", "seed=0,1,2", "hydra.verbose=false") == 2
+    assert ran() == ["1"]
+    Path("fail-1").unlink()
+    assert run("-m", "seed=0,1,2") == 0
+    assert ran() == ["1"]
+    assert len(sweeps()) == 1
+
+
+def test_other_commands_have_folders_of_their_own(run: Run) -> None:
+    for seed in (0, 1):
+        Path(f"fail-{seed}").touch()
+    for command in (["seed=0,1"], ["seed=0,1", "split=0.7"], ["seed=0"]):
+        assert run("-m", *command) == 2
+    assert len(sweeps()) == 3
+
+
+def test_a_sweep_that_an_experiment_file_asks_for_goes_on_too(run: Run) -> None:
+    Path("mine/experiment").mkdir(parents=True)
+    Path("mine/experiment/seeds.yaml").write_text(
+        "# @package _global_\nhydra:\n  mode: MULTIRUN\n  sweeper:\n    params:\n      seed: 0,1,2\n"
+    )
+    Path("interrupt-1").touch()
+    command = ["--config-dir", "mine", "experiment=seeds"]
+    assert run(*command) == 130
+    assert ran() == ["0", "1"]
+    Path("interrupt-1").unlink()
+    assert run(*command) == 0
+    assert ran() == ["1", "2"]
+    (folder,) = sweeps()
+    assert [row["state"] for row in summary(folder)] == ["done before", "done", "done"]
+
+
+def test_a_folder_that_was_asked_for_is_continued_even_if_complete(run: Run, tmp_path: Path, capsys) -> None:
+    assert run("-m", "seed=0,1", "hydra.sweep.dir=it's mine") == 2  # not Hydra's grammar
+    assert run("-m", "seed=0,1", "hydra.sweep.dir='my sweep'") == 0
+    assert ran() == ["0", "1"]
+    assert run("-m", "seed=0,1", f"hydra.sweep.dir='{tmp_path}/my sweep'") == 0
+    assert ran() == []
+    capsys.readouterr()
+    assert run("-m", "seed=1,2", "hydra.sweep.dir='my sweep'") == 0  # another command shares a job with it
+    assert ran() == ["2"]
+    assert "2 of 2 jobs done" in capsys.readouterr().out
+    told = {(folder / "told").read_text().split(" None")[0].split(" 1")[0] for folder in jobs(tmp_path / "my sweep")}
+    assert told == {"my sweep"}  # one name in MLflow, however the folder was written
+
+
+def test_a_job_runs_again_if_anything_differs_that_its_results_depend_on(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("drives.csv").write_text("a")
+    monkeypatch.setenv("CFX_FRAMES", "100")
+    command = ["-m", "seed=0,1", "data=tidy", "data.path=drives.csv", "data.min_frames=${oc.env:CFX_FRAMES}", "hydra.sweep.dir=s"]
+
+    def runs() -> int:
+        assert run(*command) == 0
+        return len(ran())
+
+    assert runs() == 2
+    assert runs() == 0
+    Path("drives.csv").write_text("ab")
+    assert runs() == 2
+    os.utime("drives.csv", ns=(1, 1))
+    assert runs() == 2
+    monkeypatch.setenv("CFX_FRAMES", "200")
+    assert runs() == 2
+    monkeypatch.setattr(provenance, "version", lambda: "99.0")
+    assert runs() == 2
+    monkeypatch.setattr(provenance, "distributions", lambda values: {"cfx-idm": "0.3"})
+    assert runs() == 2
+    assert runs() == 0
+    (jobs(Path("s"))[0] / sweep.OUTCOME).write_text('{"code": 0')
+    assert runs() == 1
+    assert len(jobs(Path("s"))) == 2
+
+
+def test_a_sweep_that_runs_is_left_alone(run: Run, capsys) -> None:
+    Path("fail-1").touch()
+    assert run("-m", "seed=0,1") == 2
+    assert run("-m", "seed=0,1", "hydra.sweep.dir=s") == 2
+    ran()
+    first = next(path for path in sweeps() if path != Path("s"))
+    capsys.readouterr()
+    with FileLock(first / ".lock"), FileLock("s/.lock"):
+        assert run("-m", "seed=0,1", "hydra.sweep.dir=s") == 2
+        assert capsys.readouterr().err == "s: another sweep runs in this folder; wait for it, or choose another hydra.sweep.dir\n"
+        assert ran() == []
+        assert run("-m", "seed=0,1") == 2
+        assert ran() == ["0", "1"]
+        assert len(sweeps()) == 3
+    assert len(jobs(first)) == 2
+
+
+def test_folders_that_are_named_by_number_are_never_overwritten(run: Run, capsys) -> None:
+    command = ["hydra.sweep.dir=s", "hydra.sweep.subdir=${hydra:job.num}"]
+    assert run("-m", "seed=0,1", *command) == 0
+    before = [(folder / "metrics.json").read_text() for folder in jobs(Path("s"))]
+    capsys.readouterr()
+    assert run("-m", "seed=1,0", *command) == 2
+    assert "jobs of another order would overwrite; end it with -${cfx_job:}" in capsys.readouterr().err
+    assert [(folder / "metrics.json").read_text() for folder in jobs(Path("s"))] == before
+
+
+def test_the_same_job_twice_in_a_sweep_runs_once(run: Run) -> None:
+    assert run("-m", "seed=0,0") == 0
+    assert ran() == ["0"]
+
+
+def test_a_job_that_a_process_of_a_killed_sweep_still_runs_is_waited_for(tmp_path: Path) -> None:
+    order: list[str] = []
+    held = threading.Event()
+
+    def other() -> None:
+        with FileLock(tmp_path / ".lock"):
+            held.set()
+            time.sleep(0.3)
+            order.append("other")
+
+    thread = threading.Thread(target=other)
+    thread.start()
+    held.wait()
+    with sweep.only_one(tmp_path):
+        order.append("mine")
+    thread.join()
+    assert order == ["other", "mine"]
+
+
+def test_the_summary_compares_jobs_by_what_differs(run: Run, capsys) -> None:
+    Path("fail-2").touch()
+    assert run("-m", "seed=0,2", "model=krauss,w99", "split=0.7") == 2
+    (folder,) = sweeps()
+    table = summary(folder)
+    assert [(row["seed"], row["model"], row["state"]) for row in table] == [
+        ("0", "krauss", "done"),
+        ("0", "w99", "done"),
+        ("2", "krauss", "failed"),
+        ("2", "w99", "failed"),
+    ]
+    assert "split" not in table[0]
+    assert [row["improvement_over"] for row in table] == ["fixed", "population", "", ""]
+    assert [row["improvement_mean"] for row in table] == ["0.5", "0.125", "", ""]
+    assert [row["improvement_ci95_high"] for row in table] == ["", "0.125", "", ""]
+    assert [row["rmse_speed_policy"] for row in table] == ["0.25", "0.25", "", ""]
+    assert table[2]["message"] == "drive 2 is broken"
+    assert {row["folder"] for row in table} == {path.name for path in jobs(folder)}
+    printed = capsys.readouterr().out
+    assert "+50.0% over fixed" in printed
+    assert "+12.5% (+12.5% to +12.5%) over population" in printed
+    assert f"python -m cfx report {folder}" in printed
+
+
+def test_a_wrong_command_line_leaves_no_folder(run: Run, tmp_path: Path) -> None:
+    assert run("-m", "model=krauss,nope") == 2
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--cfg", "job"], ["--cfg", "all", "-p", "hydra.sweep"], ["--help"], ["--info", "searchpath"]], ids=" ".join
+)
+def test_looking_makes_no_folder(run: Run, arguments: list[str], tmp_path: Path) -> None:
+    assert run(*arguments) == 0
+    assert not list(tmp_path.iterdir())
+
+
+# ---- processes that are killed
+
+
+def started(command: list[str], install_folder: Path, **environment: str) -> subprocess.Popen[str]:
+    kept = {key: value for key, value in os.environ.items() if not key.endswith(("_NUM_THREADS", "TRACKING_URI"))}
+    return subprocess.Popen(
+        [sys.executable, *command],
+        env={**kept, "PYTHONPATH": str(install_folder), **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+
+
+@pytest.fixture
+def processes() -> Iterator[list[subprocess.Popen[str]]]:
+    """Takes the processes that a test starts, and kills their groups when it ends."""
+    found: list[subprocess.Popen[str]] = []
+    yield found
+    for process in found:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.communicate()
+
+
+@pytest.mark.parametrize("killed", ["everything", "the main process"])
+def test_a_killed_sweep_of_worker_processes_is_made_up_for(run: Run, install, processes: list[Any], killed: str) -> None:
+    script = "import sys; from cfx.application import start; sys.exit(start(sys.argv[1:], target='sweep_stub:run_job'))"
+    command = ["-c", script, "-m", "seed=0,1,2,3,4", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
+    for seed in (1, 3):
+        Path(f"wait-{seed}").touch()
+    first = started(command, install.folder)
+    processes.append(first)
+    while not (Path("waits-1").exists() and Path("waits-3").exists()):
+        assert first.poll() is None, first.communicate()
+        time.sleep(0.02)
+    (os.killpg if killed == "everything" else os.kill)(first.pid, signal.SIGKILL)
+    first.wait()
+    for seed in (1, 3):
+        Path(f"wait-{seed}").unlink()
+    first.communicate(timeout=60)  # the workers of a main process that is gone end their jobs, and then themselves
+    assert sorted(ran()) == ["0", "1", "2", "3"]
+    second = started(command, install.folder)
+    processes.append(second)
+    out, _ = second.communicate(timeout=200)
+    assert second.returncode == 0, out
+    assert f"{2 if killed == 'everything' else 4} of 5 jobs are done" in out
+    assert sorted(ran()) == (["1", "3", "4"] if killed == "everything" else ["4"])
+    (folder,) = sweeps()
+    assert len(jobs(folder)) == len(list(folder.glob("*/metrics.json"))) == 5
+    # Together the workers have no more threads than there are cores.
+    threads = {int((job / "told").read_text().split()[-1]) for job in jobs(folder)}
+    assert all(2 * count <= max(2, os.cpu_count() or 1) for count in threads)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # inside MLflow
+@pytest.mark.filterwarnings("ignore::UserWarning")  # inside MLflow, at its import
+@pytest.mark.parametrize("launcher", ["basic", "joblib"])
+def test_twelve_jobs_killed_half_way_end_as_twelve(
+    launcher: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, processes: list[Any]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    command = [
+        "-m",
+        "cfx",
+        "-m",
+        "debug=quick",
+        "data.pairs=3",
+        "data.frames=200",
+        "data.max_pairs=null",
+        "figures.enabled=false",
+    ]
+    command += ["seed=0,1,2", "policy=gru,fixed", "model=krauss,w99", f"hydra/launcher={launcher}"]
+    first = started(command, tmp_path, OMP_NUM_THREADS="1")
+    processes.append(first)
+    while len(list(Path().glob("outputs/*/*-multirun/*/outcome.json"))) < 6:
+        assert first.poll() is None, first.communicate()
+        time.sleep(0.05)
+    os.killpg(first.pid, signal.SIGKILL)
+    first.communicate()
+    (folder,) = sweeps()
+    finished = {job.name: (job / "metrics.json").stat().st_mtime_ns for job in jobs(folder) if (job / sweep.OUTCOME).exists()}
+    assert 6 <= len(finished) < 12
+
+    assert continued(command, tmp_path, processes) == 0
+    assert sweeps() == [folder]
+    assert len(jobs(folder)) == 12
+    assert all((folder / name / "metrics.json").stat().st_mtime_ns == written for name, written in finished.items())
+    assert len(summary(folder)) == 12
+    assert statuses(folder) == ["FINISHED"] * 12
+
+    # A job whose marker was lost after its run was closed runs again, and is there once all the same.
+    (jobs(folder)[0] / sweep.OUTCOME).unlink()
+    assert continued([*command, f"hydra.sweep.dir={folder}"], tmp_path, processes) == 0
+    assert statuses(folder) == ["FINISHED"] * 12
+
+
+def continued(command: list[str], folder: Path, processes: list[Any]) -> int:
+    process = started(command, folder, OMP_NUM_THREADS="1")
+    processes.append(process)
+    out, _ = process.communicate(timeout=400)
+    assert "continuing sweep" in out, out
+    return int(process.returncode)
+
+
+def statuses(folder: Path) -> list[str]:
+    """Returns how the runs of a sweep ended; fails if any run at all is still open or two are of one job."""
+    import mlflow
+
+    client = mlflow.MlflowClient(f"sqlite:///{Path('outputs/mlflow.db').absolute()}")
+    experiment = client.get_experiment_by_name("cfx-debug")
+    assert experiment is not None
+    runs = client.search_runs([experiment.experiment_id], max_results=1000)
+    assert "RUNNING" not in {one.info.status for one in runs}
+    (parent,) = [one for one in runs if "cfx.sweep_parent" in one.data.tags]
+    assert parent.data.tags["cfx.sweep_parent"] == str(folder)
+    children = [one for one in runs if one.data.tags.get("cfx.sweep") == str(folder)]
+    assert {one.data.tags["mlflow.parentRunId"] for one in children} == {parent.info.run_id}
+    assert {Path(one.data.tags["cfx.folder"]).name for one in children} == {job.name for job in jobs(folder)}
+    assert json.loads((folder / sweep.RECORD).read_text())["completed"]
+    return [one.info.status for one in children]
