@@ -1,0 +1,299 @@
+"""What a report's page holds."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from cfx.report import paper
+from cfx.report.drive_plots import chosen_drives, drive
+from cfx.report.improvement_plots import per_driver
+from cfx.report.page import cluster_series, duration, render, summary
+from cfx.report.runs import read_runs
+from tests.report.folders import ACROSS, write_job
+
+HOSTILE = "</script><img src=x onerror=alert(1)>&\"'"
+SECTIONS = ("summary", "run", "results", "drivers", "clusters", "style", "drives", "learning", "configs")
+
+
+class Page(HTMLParser):
+    """Reads a page: its elements, its scripts, and the cells of its tables."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.scripts: list[str] = []
+        self.contents: dict[str, Any] = {}
+        self.tables: list[list[list[str]]] = []
+        self.words = ""
+        self._inside = ""
+        self._sort: str | None = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+        self._inside = tag
+        if tag == "table":
+            self.tables.append([])
+        elif tag == "tr":
+            self.tables[-1].append([])
+        elif tag in {"td", "th"}:
+            # A number is what it is sorted by, in full; a text is read from the page.
+            self._sort = dict(attrs).get("data-sort")
+            self.tables[-1][-1].append(self._sort or "")
+
+    def handle_endtag(self, tag: str) -> None:
+        self._inside = ""
+
+    def handle_data(self, data: str) -> None:
+        if self._inside == "script":
+            attributes = self.elements[-1][1]
+            if attributes.get("type") == "application/json":
+                self.contents[str(attributes["id"])] = json.loads(data)
+            else:
+                self.scripts.append(data)
+        elif self._inside != "style":
+            self.words += data
+            if self._inside in {"td", "th", "span"} and self._sort is None:
+                self.tables[-1][-1][-1] += data
+
+    def having(self, attribute: str) -> list[str]:
+        return [str(attributes[attribute]) for _, attributes in self.elements if attribute in attributes]
+
+
+Clusters = tuple[Path, dict[str, dict[str, float | None]], Page]
+
+
+def page_of(folder: Path) -> Page:
+    return Page(render(read_runs([str(folder)])))
+
+
+@pytest.fixture(scope="module")
+def clusters(tmp_path_factory: pytest.TempPathFactory) -> Clusters:
+    """Jobs of both models, one for each of two clusters, across drivers."""
+    folder, metrics = tmp_path_factory.mktemp("clusters"), {}
+    for model in ("krauss", "w99"):
+        for seed, cluster in enumerate(("conservative", "aggressive")):
+            name = f"{model} · {cluster}"
+            metrics[name] = write_job(
+                folder / f"{model}-{cluster}",
+                model=model,
+                methods=ACROSS,
+                cluster=cluster,
+                experiment="paper/clusters",
+                seed=seed,
+            )
+    return folder, metrics, page_of(folder)
+
+
+def test_the_page_has_every_section(clusters: Clusters) -> None:
+    _, _, page = clusters
+    ids = page.having("id")
+    assert set(SECTIONS) | {"paper"} <= set(ids)
+    assert len(ids) == len(set(ids))
+    assert {link.removeprefix("#") for link in page.having("href") if link != "data:,"} == {*SECTIONS, "paper"}
+    assert len(page.contents) == sum("plot" in (a.get("class") or "") for _, a in page.elements)
+    assert "12 pairs (fewer than 700 frames)" in page.words
+    assert "secret" not in page.words
+
+
+def test_the_page_asks_for_nothing_and_runs_only_its_own_scripts(
+    clusters: Clusters,
+) -> None:
+    _, _, page = clusters
+    for attribute in ("src", "href", "action", "srcset", "data", "poster"):
+        assert not [value for value in page.having(attribute) if not value.startswith(("#", "data:"))]
+    (policy,) = (a["content"] for tag, a in page.elements if a.get("http-equiv") == "Content-Security-Policy")
+    hashes = {f"'sha256-{base64.b64encode(hashlib.sha256(one.encode()).digest()).decode()}'" for one in page.scripts}
+    assert set(re.findall(r"'sha256-[^']+'", str(policy))) == hashes
+    assert len(page.scripts) == 4
+    assert str(policy).startswith("default-src 'none';")
+    assert "http" not in str(policy)
+
+
+def test_the_tables_hold_the_numbers_of_metrics_json(clusters: Clusters) -> None:
+    _, metrics, page = clusters
+    gains, errors = (next(table for table in page.tables if heading in table[0]) for heading in ("Policy against", "Method"))
+    assert len(errors) == 1 + 4 * 4
+    assert len(gains) == 1 + 4 * (3 + 2)
+    for name, values in metrics.items():
+        for method, shown in (("default", "default"), ("population", "population"), ("fixed", "own fixed"), ("policy", "policy")):
+            (row,) = (row for row in errors if row[:2] == [name, shown])
+            expected = [values[f"{column}/{method}"] for column in ("rmse_speed", "rmse_gap", "collisions")]
+            assert [float(cell) for cell in row[3:6]] == expected
+            whole = values.get(f"whole/rmse_speed/{method}")
+            assert row[6] == ("" if whole is None else repr(whole))
+        for prefix, shown, frames in (
+            ("rmse_improvement", "own fixed", "test part"),
+            ("rmse_improvement/default", "default", "test part"),
+            ("rmse_improvement/population", "population", "test part"),
+            ("whole/rmse_improvement/default", "default", "whole drive"),
+            ("whole/rmse_improvement/population", "population", "whole drive"),
+        ):
+            (row,) = (row for row in gains if row[:3] == [name, shown, frames.replace(" ", "\N{NO-BREAK SPACE}")])
+            names = ("mean", "ci95_low", "trimmed_mean", "median", "win_rate", "p_value")
+            assert [float(cell) for cell in row[3:9]] == [values[f"{prefix}/{one}"] for one in names]
+            low, high = (100 * (values[f"{prefix}/{end}"] or 0.0) for end in ("ci95_low", "ci95_high"))
+            assert f"{low:+.1f} % to {high:+.1f} %".replace("-", "\N{MINUS SIGN}") in page.words
+
+
+def test_names_from_data_are_text_and_nothing_else(tmp_path: Path) -> None:
+    write_job(tmp_path / "job", pairs=4, source=HOSTILE, overrides=[f"data.path={HOSTILE}"])
+    for file in ("pairs.csv", "style.csv"):
+        table = pd.read_csv(tmp_path / "job" / file)
+        table["driver"] = table["driver"].astype(str) + HOSTILE
+        if "pair_id" in table:
+            table["pair_id"] = table["pair_id"].astype(str) + HOSTILE
+        table.to_csv(tmp_path / "job" / file, index=False)
+    drives = pd.read_parquet(tmp_path / "job" / "drives.parquet")
+    drives["pair_id"] = drives["pair_id"].astype(str) + HOSTILE
+    drives.to_parquet(tmp_path / "job" / "drives.parquet")
+    page = page_of(tmp_path)
+    assert "img" not in {tag for tag, _ in page.elements}
+    assert HOSTILE in page.words
+    assert len(page.scripts) == 4
+    shown = json.dumps(
+        [[view["data"], view["layout"]] for content in page.contents.values() for view in content["views"].values()]
+    )
+    assert "&lt;img" in shown
+    assert "<img" not in shown
+    assert "</script" not in shown
+
+
+def test_few_very_bad_pairs_do_not_shrink_the_others(tmp_path: Path) -> None:
+    write_job(tmp_path / "job", pairs=12)
+    table = pd.read_csv(tmp_path / "job" / "pairs.csv")
+    worst = table.index[table["method"] == "policy"][3]
+    table.loc[worst, "improvement"] = -40.0
+    table.to_csv(tmp_path / "job" / "pairs.csv", index=False)
+    runs = read_runs([str(tmp_path)])
+    view = per_driver(runs.jobs).views["against own fixed parameters"]
+    assert view["layout"]["yaxis"]["range"][0] > -5
+    assert "1 of 12 improvements are lower" in view["note"]
+    assert "\N{MINUS SIGN}4000 %" in view["note"]
+    hover = "".join(text for trace in view["data"] for text in trace["text"])
+    assert "\N{MINUS SIGN}4000.0 %" in hover
+
+
+def test_the_pairs_can_be_ordered_by_driver_and_by_each_job(tmp_path: Path) -> None:
+    write_job(tmp_path / "0", pairs=6)
+    write_job(tmp_path / "1", model="w99", pairs=6, seed=1)
+    runs = read_runs([str(tmp_path)])
+    orders = per_driver(runs.jobs).orders
+    for job in runs.jobs:
+        gain = job.by_pair.set_index("pair_id")["improvement/fixed"]
+        assert orders[f"improvement over fixed, {job.name}"] == list(gain.sort_values(ascending=False).index)
+    assert orders["driver"] == sorted(runs.jobs[0].by_pair["pair_id"])
+
+
+def test_clusters_come_from_one_job_or_from_a_job_each(tmp_path: Path) -> None:
+    write_job(tmp_path / "all", pairs=9)
+    for cluster in ("aggressive", "conservative"):
+        write_job(tmp_path / cluster, pairs=4, cluster=cluster)
+    series = cluster_series(read_runs([str(tmp_path)]).jobs)
+    assert {name: list(found) for name, found in series.items()} == {
+        "krauss · all": ["conservative", "normal", "aggressive"],
+        "krauss, a job for each cluster": ["conservative", "aggressive"],
+    }
+    assert [len(table) for table in series["krauss · all"].values()] == [3, 3, 3]
+
+
+def test_best_median_and_worst_drives_alone_are_shown(tmp_path: Path) -> None:
+    write_job(tmp_path / "job", pairs=9)
+    (job,) = read_runs([str(tmp_path)]).jobs
+    gain = job.by_pair.set_index("pair_id")["improvement/fixed"].sort_values(ascending=False)
+    chosen = chosen_drives(job)
+    assert [(one.rank, one.pair_id) for one in chosen] == [
+        ("best", gain.index[0]),
+        ("median", gain.index[4]),
+        ("worst", gain.index[8]),
+    ]
+    view = drive(job, chosen[0].pair_id).views[""]
+    assert [note["text"] for note in view["layout"]["annotations"][:2]] == ["<b>t_r (s)</b>", "<b>t_i (s)</b>"]
+    bottom, top = view["layout"]["yaxis3"]["range"]
+    assert top - bottom >= 0.2 * (10.0 - 0.1)
+    assert len(view["data"]) == 2 + 3 + 1 + 3 + 2 * 3
+    shown = page_of(tmp_path).contents.values()
+    assert sum("yaxis3" in view["layout"] for content in shown for view in content["views"].values()) == 3
+
+
+@pytest.mark.parametrize("pairs", [1, 2])
+def test_a_job_of_very_few_pairs_and_of_a_model_that_is_not_installed_has_a_page(tmp_path: Path, pairs: int) -> None:
+    write_job(tmp_path / "job", model="not-installed-here", pairs=pairs)
+    assert set(SECTIONS) <= set(page_of(tmp_path).having("id"))
+
+
+def test_a_job_of_an_older_version_has_a_page_that_says_what_is_missing(tmp_path: Path) -> None:
+    write_job(tmp_path / "job", pairs=3)
+    for name in ("drives.parquet", "curves.parquet", "style.csv"):
+        (tmp_path / "job" / name).unlink()
+    words = page_of(tmp_path).words
+    for name in ("drives.parquet", "curves.parquet", "style.csv"):
+        assert f"this job has no {name}" in words
+
+
+def test_unfinished_jobs_are_named_in_the_page(tmp_path: Path) -> None:
+    write_job(tmp_path / "0", pairs=3)
+    (tmp_path / "1" / ".hydra").mkdir(parents=True)
+    words = page_of(tmp_path).words
+    assert str(tmp_path / "1") in words
+    assert "not finished: it has no metrics.json" in words
+
+
+def test_the_summary_answers_by_the_interval(tmp_path: Path) -> None:
+    write_job(tmp_path / "job", pairs=8)
+    path = tmp_path / "job" / "metrics.json"
+    metrics = json.loads(path.read_text(encoding="utf-8"))
+    for low, high, answer in ((0.1, 0.3, "yes"), (-0.3, -0.1, "no"), (-0.1, 0.1, "undecided")):
+        changed = {"rmse_improvement/mean": 0.123, "rmse_improvement/ci95_low": low, "rmse_improvement/ci95_high": high}
+        path.write_text(json.dumps(metrics | changed), encoding="utf-8")
+        question, said = summary(read_runs([str(tmp_path)]).jobs)
+        assert question.startswith("8 pairs of leader and follower from recording.parquet")
+        assert said.startswith(f"krauss: {answer}. Improvement of the RMSE of speed: +12.3 % on average")
+
+
+def test_the_papers_figures_stand_beside_those_of_its_experiments(tmp_path: Path, clusters: Clusters) -> None:
+    write_job(tmp_path / "pair", pairs=1, experiment="paper/pair")
+    write_job(tmp_path / "pairs", pairs=5, experiment="paper/pairs")
+    write_job(tmp_path / "own", pairs=5)
+    found = {one.heading: one for one in paper.comparisons(read_runs([str(tmp_path)]).jobs)}
+    assert len(found) == 2
+    pair = found["One pair: follower 11 behind leader 1"]
+    assert [cell.text for cell in pair.sheet.rows[0][1:]] == ["3.393", "1.033", "0.666", "+35.5 %"]
+    assert "this is another pair, follower 1000 and leader 990" in pair.verdicts[0]
+    pairs = found["A network for each pair"]
+    assert "the number of pairs (here 5 in a job; there 94 in all)" in pairs.explanation
+    assert "the search (here random; there Bayesian optimization)" in pairs.explanation
+    _, metrics, page = clusters
+    low, high = (metrics[f"w99 · {c}"]["rmse_improvement/population/mean"] or 0.0 for c in ("conservative", "aggressive"))
+    do = "improve" if high > low else "do not improve"
+    assert f"w99: aggressive drivers {do} more than conservative ones here; they do in the paper." in page.words
+
+
+def test_the_best_of_a_grid_search_is_chosen_by_the_validation_loss(tmp_path: Path) -> None:
+    for epochs, loss in ((100, 0.03), (500, 0.02)):
+        folder = tmp_path / str(epochs)
+        learner = {"name": "imitation", "epochs": epochs, "batch_size": 1}
+        metrics = write_job(folder, pairs=3, experiment="paper/grid", settings={"learner": learner})
+        (folder / "metrics.json").write_text(json.dumps(metrics | {"validation_loss/best": loss}), encoding="utf-8")
+    (grid,) = paper.comparisons(read_runs([str(tmp_path)]).jobs)
+    assert [row[1].text for row in grid.sheet.rows] == ["500", "500", "100"]
+    assert grid.verdicts == ("The smallest validation loss here: krauss · epochs=500.",)
+
+
+def test_durations_are_said_as_one_says_them() -> None:
+    assert [duration(value) for value in (None, 0.4, 59.6, 61, 7260)] == [
+        "not recorded",
+        "0 s",
+        "1 min 0 s",
+        "1 min 1 s",
+        "2 h 1 min",
+    ]
