@@ -3,106 +3,21 @@
 from __future__ import annotations
 
 import pytest
-import torch
-from torch import Tensor
 
-from cfx.policies.base import Policy, PolicyNetwork
-from cfx.policies.features import token_width
-
-NETWORKS, DRIVERS, WINDOWS, PARAMETERS, LENGTH = 3, 2, 7, 4, 5
+from cfx.policies.base import Policy
+from cfx.testing.checks.policies import CONTRACT
+from cfx.testing.contract import Check
+from cfx.testing.suite import hold, statements
 
 
 class PolicyContract:
-    """What every policy must hold. Letters as in `cfx.policies.base`."""
+    """What every policy must hold: each statement of `cfx.testing.checks.policies` is a test."""
 
     @pytest.fixture
     def policy(self) -> Policy:
         """Returns the policy under test."""
         raise NotImplementedError("the subclass of PolicyContract must define the fixture `policy`")
 
-    @pytest.fixture
-    def features(self, policy: Policy) -> int:
-        """Returns f for windows of five frames."""
-        return token_width(policy.inputs, policy.summary, LENGTH)
-
-    @pytest.fixture
-    def network(self, policy: Policy, features: int) -> PolicyNetwork:
-        """Returns freshly built networks in evaluation mode, float64."""
-        return _build(policy, features, seed=1).double().eval()
-
-    @pytest.fixture
-    def tokens(self, features: int) -> Tensor:
-        """Returns random tokens."""
-        return 3 * torch.randn(
-            (NETWORKS, DRIVERS, WINDOWS, features), generator=torch.Generator().manual_seed(2), dtype=torch.float64
-        )
-
-    def test_outputs_lie_within_the_bounds(self, network: PolicyNetwork, tokens: Tensor) -> None:
-        out, _ = network(1e3 * tokens, network.initial_state(NETWORKS, DRIVERS))
-        assert out.shape == (NETWORKS, DRIVERS, WINDOWS, PARAMETERS), (
-            "a policy answers one parameter vector per network, driver and window"
-        )
-        assert bool(((out >= 0) & (out <= 1)).all()), (
-            "a policy answers in unit space: nothing outside the model's bounds ever drives"
-        )
-
-    def test_streaming_equals_the_whole_sequence(self, network: PolicyNetwork, tokens: Tensor) -> None:
-        whole, last = network(tokens, network.initial_state(NETWORKS, DRIVERS))
-        state = network.initial_state(NETWORKS, DRIVERS)
-        pieces = []
-        for k in range(WINDOWS):
-            piece, state = network(tokens[:, :, k : k + 1], state)
-            pieces.append(piece)
-        message = "training reads whole sequences and driving reads one window at a time: both must give the same"
-        torch.testing.assert_close(torch.cat(pieces, dim=2), whole, msg=message)
-        torch.testing.assert_close(state, last, msg=message)
-
-    def test_a_policy_does_not_look_ahead(self, network: PolicyNetwork, tokens: Tensor) -> None:
-        changed = tokens.clone()
-        changed[:, :, WINDOWS // 2 :] += 1.0
-        before, _ = network(tokens, network.initial_state(NETWORKS, DRIVERS))
-        after, _ = network(changed, network.initial_state(NETWORKS, DRIVERS))
-        half = WINDOWS // 2
-        assert torch.equal(before[:, :, :half], after[:, :, :half]), "the parameters of a window depend on later windows"
-
-    def test_networks_are_independent(self, network: PolicyNetwork, tokens: Tensor) -> None:
-        changed = tokens.clone()
-        changed[0] += 1.0
-        before, _ = network(tokens, network.initial_state(NETWORKS, DRIVERS))
-        after, _ = network(changed, network.initial_state(NETWORKS, DRIVERS))
-        torch.testing.assert_close(before[1:], after[1:], msg="network i must read only slice i of its tokens")
-        for name, value in [*network.named_parameters(), *network.named_buffers()]:
-            assert value.shape[0] == NETWORKS, (
-                f"the first dimension of {name} must be the networks, so that the learner can treat each on its own"
-            )
-
-    def test_state_is_passed_not_kept(self, network: PolicyNetwork, tokens: Tensor) -> None:
-        first, _ = network(tokens, network.initial_state(NETWORKS, DRIVERS))
-        again, _ = network(tokens, network.initial_state(NETWORKS, DRIVERS))
-        assert torch.equal(first, again), "two calls with the same tokens and state differ: the network keeps state on itself"
-
-    def test_the_same_generator_gives_the_same_weights(self, policy: Policy, features: int) -> None:
-        one, two = _build(policy, features, seed=3).state_dict(), _build(policy, features, seed=3).state_dict()
-        assert all(torch.equal(one[key], two[key]) for key in one), "initial weights must come from the generator alone"
-
-    def test_saved_equals_loaded(self, policy: Policy, features: int, network: PolicyNetwork, tokens: Tensor) -> None:
-        other = _build(policy, features, seed=4).double().eval()
-        other.load_state_dict(network.state_dict())
-        mine, _ = network(tokens, network.initial_state(NETWORKS, DRIVERS))
-        theirs, _ = other(tokens, other.initial_state(NETWORKS, DRIVERS))
-        assert torch.equal(mine, theirs), "the state dict must hold everything that the answers depend on"
-
-    def test_a_trainable_policy_has_gradients(self, policy: Policy, network: PolicyNetwork, tokens: Tensor) -> None:
-        parameters = [parameter for parameter in network.parameters() if parameter.requires_grad]
-        assert bool(parameters) == policy.trainable, "`trainable` must say whether there is anything to train"
-        if policy.trainable:
-            network(tokens, network.initial_state(NETWORKS, DRIVERS))[0].square().sum().backward()
-            assert all(p.grad is not None and bool(p.grad.isfinite().all()) for p in parameters), (
-                "every weight needs a finite gradient"
-            )
-
-
-def _build(policy: Policy, features: int, *, seed: int) -> PolicyNetwork:
-    generator = torch.Generator().manual_seed(seed)
-    fixed = torch.rand((NETWORKS, PARAMETERS), generator=torch.Generator().manual_seed(0))
-    return policy.build(features, torch.full((PARAMETERS,), 0.5), fixed, generator)
+    @statements(CONTRACT)
+    def test_contract(self, check: Check, policy: Policy) -> None:
+        hold(check, policy)

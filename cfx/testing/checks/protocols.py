@@ -1,0 +1,242 @@
+"""The contract of a protocol, statement by statement.
+
+The study: six simulated drivers, each behind a leader of his own, a coarse search and a short training. Where frames of a test
+part are changed ("poisoned"), nothing that was found or learned before that part may change with them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+
+from cfx.calibration.cache import Cache
+from cfx.calibration.calibrator import Calibrator
+from cfx.calibration.windows import WindowSettings
+from cfx.datasets.synthetic import SyntheticDataset
+from cfx.evaluation.result import METHODS, Drive
+from cfx.learners.base import CURVE_COLUMNS, Learned, Learner, Lesson
+from cfx.learners.imitation import ImitationLearner
+from cfx.models.krauss import Krauss
+from cfx.optimizers.random import RandomSearch
+from cfx.pairs import Pair, PairBatch, PairSet
+from cfx.policies.base import Policy
+from cfx.policies.fixed import FixedPolicy
+from cfx.policies.gru import GruPolicy
+from cfx.progress import Task
+from cfx.protocols.base import Outcome, Protocol, Study
+from cfx.simulation.rollout import Simulator
+from cfx.style.entropy import measure_style
+from cfx.style.settings import StyleSettings
+from cfx.testing.contract import contract_of
+
+PAIRS, FRAMES = 6, 111
+
+_COLUMNS = (
+    "pair_id", "recording", "leader_id", "follower_id", "driver", "cluster", "style_score", "fold", "method", "frames",
+    "rmse_speed", "rmse_gap", "improvement", "collisions",
+)  # fmt: skip
+
+
+@cache
+def recording() -> PairSet:
+    """Returns the drives of the study."""
+    return SyntheticDataset(pairs=PAIRS, platoon_size=1, frames=FRAMES, heterogeneity=1.0).load()
+
+
+def study(pairs: PairSet, *, policy: Policy | None = None, learner: Learner | None = None, seed: int = 0) -> Study:
+    """Returns a study of some drives; its policy is a small recurrent network unless given."""
+    model = Krauss()
+    batch = PairBatch.of(pairs)
+    simulator = Simulator(model, pairs.dt)
+    return Study(
+        pairs=pairs,
+        batch=batch,
+        style=measure_style(pairs, StyleSettings()),
+        simulator=simulator,
+        model_node={"name": "krauss"},
+        policy_node={"name": "gru"},
+        calibrator=Calibrator(simulator, RandomSearch(samples=512), seed=seed, cache=Cache(None), memory=1 << 28, progress=Task),
+        policy=policy or GruPolicy(hidden_size=4),
+        learner=learner or ImitationLearner(epochs=3, learning_rate=0.02),
+        windows=WindowSettings(),
+        split=0.8,
+        seed=seed,
+    )
+
+
+def all_methods_drive_the_same_frames(protocol: Protocol) -> None:
+    outcome = _outcome(protocol)
+    assert isinstance(outcome, Outcome), f"`run` must return a cfx.Outcome, not a {type(outcome).__name__}"
+    for drive in outcome.evaluation.drives:
+        where = f"(pair {drive.pair_id})"
+        for method in outcome.evaluation.methods:
+            speed, gap = drive.speed[method], drive.gap[method]
+            assert len(speed) == len(gap) == len(drive.time) == len(drive.real_speed), (
+                f"every method drives the same frames, or their errors cannot be compared; {method} drives {len(speed)} of"
+                f" {len(drive.time)} {where}"
+            )
+            assert speed[0] == drive.real_speed[0] and gap[0] == drive.real_gap[0], (  # noqa: PT018 - one statement
+                f"every method starts from the last measured state; {method} does not {where}"
+            )
+            assert bool(np.isfinite(speed).all()), f"every frame of the test part is driven; {method} leaves some out {where}"
+    frames = outcome.evaluation.table.groupby("pair_id")["frames"].nunique()
+    assert bool((frames == 1).all()), "every method of a pair is measured over the same number of frames"
+
+
+def the_table_has_a_row_for_each_pair_and_method(protocol: Protocol) -> None:
+    evaluation = _outcome(protocol).evaluation
+    missing = [name for name in (*_COLUMNS, *(f"parameter_{name}" for name in evaluation.names)) if name not in evaluation.table]
+    assert not missing, f"reports, figures and `cfx show` read these columns of the table: {', '.join(missing)}"
+    assert {"default", "fixed", "policy"} <= set(evaluation.methods), (
+        f"the policy is compared with the model's defaults and with the driver's own fixed parameters; there are only"
+        f" {', '.join(evaluation.methods)}"
+    )
+    assert set(evaluation.table["method"]) <= set(METHODS), f"methods are named {', '.join(METHODS)}"
+    assert set(evaluation.improvements) == set(evaluation.methods) - {"policy"}, (
+        "the improvement of the policy is told over every baseline that drove"
+    )
+    counts = evaluation.table.groupby(["pair_id", "method"]).size()
+    assert bool((counts == 1).all()), "a pair is tested once by each method; twice would count it twice in every mean"
+    assert len(counts) == len(evaluation.methods) * evaluation.table["pair_id"].nunique(), "every method is tested on every pair"
+    assert {drive.pair_id for drive in evaluation.drives} == set(evaluation.table["pair_id"]), (
+        "the drives are those that the table measures"
+    )
+
+
+def no_method_sees_the_measured_follower_of_the_test_part(protocol: Protocol) -> None:
+    """The follower alone is changed: every method must drive exactly as before."""
+    pairs = recording()
+    before = _drives(_outcome(protocol))
+    tested = next(iter(before.values()))
+    after = _drives(protocol.run(study(_poisoned(pairs, tested, leader=False))))[tested.pair_id]
+    for method in tested.speed:
+        for what, one, two in (
+            ("parameters", tested.parameters[method], after.parameters[method]),
+            ("speeds", tested.speed[method], after.speed[method]),
+        ):
+            assert np.array_equal(one, two), (
+                f"the measured follower of a driver's test part was changed, and the {what} of method '{method}' in it changed:"
+                " it was calibrated on, learned from, or seen while driving, so the test proves nothing"
+            )
+
+
+def nothing_is_found_or_learned_from_the_test_part(protocol: Protocol) -> None:
+    """Leader and follower are changed: what holds at the first test frame must be as before."""
+    pairs = recording()
+    before = _drives(_outcome(protocol))
+    tested = list(before.values())[-1]
+    after = _drives(protocol.run(study(_poisoned(pairs, tested, leader=True))))[tested.pair_id]
+    for method in tested.parameters:
+        assert np.array_equal(tested.parameters[method][0], after.parameters[method][0]), (
+            f"a driver's test part was changed, and with it the parameters that method '{method}' begins it with: frames that"
+            " calibration or learning has read are no test"
+        )
+
+
+def the_same_seed_gives_the_same_outcome(protocol: Protocol) -> None:
+    with torch.random.fork_rng(devices=[]):
+        tables = []
+        for attempt in (1, 2):
+            torch.manual_seed(attempt)
+            outcome = protocol.run(study(recording())) if attempt == 2 else _outcome(protocol)
+            tables.append(outcome.evaluation.table)
+    assert tables[0].equals(tables[1]), "the same study twice gave two results: randomness must come from `study.seed` alone"
+
+
+def learners_get_only_what_they_may_use(protocol: Protocol) -> None:
+    watched = _Watched(ImitationLearner(epochs=1))
+    protocol.run(study(recording(), learner=watched))
+    assert watched.lessons, "a trainable policy must be trained by the study's learner"
+    for lesson in watched.lessons:
+        pairs = len(lesson.batch)
+        assert len(lesson.split.frame) == len(lesson.network) == len(lesson.fixed) == pairs, (
+            "split, network and fixed of a lesson have an entry for each of its pairs"
+        )
+        assert bool((lesson.split.frame < lesson.batch.lengths).all()), "`split.frame` is a frame of the pair"
+        assert set(lesson.network.tolist()) == set(range(len(lesson.names))), (
+            "every network of a lesson has a name and learns from at least one pair"
+        )
+        assert lesson.labels is not None, "the learner needs window labels: find them with `study.labels`"
+        windows = lesson.labels.windows
+        ends = windows.first + windows.settings.length
+        assert bool((ends <= lesson.split.frame[windows.pair]).all()), (
+            "a label's window must end within the training part: a label is a measurement like any other"
+        )
+
+
+def a_policy_without_training_is_not_trained(protocol: Protocol) -> None:
+    outcome = protocol.run(study(recording(), policy=FixedPolicy(), learner=_Refusing(epochs=1)))
+    assert outcome.labels is None, "labels cost most of a job's time: without a learner to read them, find none"
+    assert len(outcome.curves) == 0, "where nothing was learned the curves are empty"
+    assert list(outcome.curves.columns) == CURVE_COLUMNS, f"empty curves still have the columns {', '.join(CURVE_COLUMNS)}"
+
+
+_outcomes: WeakKeyDictionary[Protocol, Outcome] = WeakKeyDictionary()
+
+
+def _outcome(protocol: Protocol) -> Outcome:
+    """Runs the study as it is once for all checks of one protocol."""
+    if protocol not in _outcomes:
+        _outcomes[protocol] = protocol.run(study(recording()))
+    return _outcomes[protocol]
+
+
+class _Watched(Learner):
+    """A learner that remembers its lessons."""
+
+    schema = ImitationLearner.schema
+    needs_labels = True
+
+    def __init__(self, learner: ImitationLearner) -> None:
+        super().__init__(learner.settings)
+        self._learner = learner
+        self.lessons: list[Lesson] = []
+
+    def fit(self, policy: Policy, lesson: Lesson) -> Learned:
+        self.lessons.append(lesson)
+        return self._learner.fit(policy, lesson)
+
+
+class _Refusing(ImitationLearner):
+    def fit(self, policy: Policy, lesson: Lesson) -> Learned:
+        raise AssertionError("a policy that is not `trainable` must not be handed to a learner: there is nothing to train")
+
+
+def _drives(outcome: Outcome) -> dict[str, Drive]:
+    return {drive.pair_id: drive for drive in outcome.evaluation.drives}
+
+
+def _poisoned(pairs: PairSet, tested: Drive, *, leader: bool) -> PairSet:
+    """Changes one driver's frames after the last measured state that his test part starts from."""
+    return PairSet(
+        tuple(_changed(pair, tested, leader) if pair.pair_id == tested.pair_id else pair for pair in pairs), pairs.source
+    )
+
+
+def _changed(pair: Pair, tested: Drive, leader: bool) -> Pair:
+    first = len(pair) - (len(tested.time) - 1)
+    later = np.arange(len(pair)) >= first
+    ramp = np.where(later, np.arange(len(pair)) - first + 1.0, 0.0)
+    # The follower falls far back and the leader pulls away: whoever calibrates on this finds another driver.
+    values: dict[str, Any] = {
+        "follower_position": pair.follower_position - ramp,
+        "follower_speed": np.where(later, 0.3 * pair.follower_speed, pair.follower_speed),
+        "follower_acceleration": np.where(later, -1.0, pair.follower_acceleration),
+    }
+    if leader:
+        values |= {
+            "leader_position": pair.leader_position + ramp,
+            "leader_speed": np.where(later, 2.0 * pair.leader_speed + 3.0, pair.leader_speed),
+            "leader_acceleration": np.where(later, 1.0, pair.leader_acceleration),
+        }
+    return replace(pair, **values)
+
+
+CONTRACT = contract_of(
+    __name__, "protocol", slow=[the_same_seed_gives_the_same_outcome, no_method_sees_the_measured_follower_of_the_test_part]
+)

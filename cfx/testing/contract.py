@@ -1,0 +1,72 @@
+"""What the checks of every kind share. Nothing here or in `cfx.testing.checks` needs pytest."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from cfx.errors import PluginError
+
+Check = Callable[..., None]
+"""Takes a component, holds one statement of its kind's contract, and raises AssertionError with the contract and the reason."""
+
+
+class NotApplicable(Exception):  # noqa: N818 - nothing is wrong: the check has nothing to verify
+    """A component does not claim what a check would verify."""
+
+
+@dataclass(frozen=True)
+class Contract:
+    """The statements of one kind of component.
+
+    Attributes:
+        kind: as in `cfx.get(kind, name)`.
+        checks: every statement that needs nothing but the component.
+        slow: those of them that take more than a second or two; `quick` leaves them out.
+    """
+
+    kind: str
+    checks: tuple[Check, ...]
+    slow: frozenset[Check] = frozenset()
+
+    @property
+    def quick(self) -> tuple[Check, ...]:
+        """The statements that are checked in a second or two, with the component's default settings."""
+        return tuple(check for check in self.checks if check not in self.slow)
+
+
+def contract_of(module: str, kind: str, *, slow: Iterable[Check] = ()) -> Contract:
+    """Returns the contract that a module's public functions are: each takes the component first, named as its kind."""
+    import sys
+
+    functions = [
+        function
+        for name, function in vars(sys.modules[module]).items()
+        if inspect.isfunction(function) and function.__module__ == module and not name.startswith("_")
+    ]
+    return Contract(kind, tuple(f for f in functions if next(iter(inspect.signature(f).parameters), "") == kind), frozenset(slow))
+
+
+def violations(contract: Contract, component: Any, *, quick: bool = True) -> Iterator[tuple[str, str]]:
+    """Checks a component without pytest.
+
+    Yields:
+        For each statement that does not hold: the check's name, and what the contract is and why, in a sentence or two. A check
+        that ends in another error is reported with it: ordinary input must not make a component raise.
+
+    Raises:
+        RuntimeError: Python was started with -O, which removes the assertions that checks are made of.
+    """
+    if not __debug__:
+        raise RuntimeError("contract checks are made of assertions, which python -O removes; start python without -O")
+    for check in contract.quick if quick else contract.checks:
+        try:
+            check(component)
+        except NotApplicable:
+            continue
+        except (AssertionError, PluginError) as broken:
+            yield check.__name__, str(broken)
+        except Exception as error:  # a plugin may raise anything
+            yield check.__name__, f"the component raised {type(error).__name__}: {error}".rstrip(": ")

@@ -1,0 +1,23 @@
+"""The contract of a learner, as tests: subclass `LearnerContract`, fill in the fixture `learner`, and pytest does the rest."""
+
+from __future__ import annotations
+
+import pytest
+
+from cfx.learners.base import Learner
+from cfx.testing.checks.learners import CONTRACT
+from cfx.testing.contract import Check
+from cfx.testing.suite import hold, statements
+
+
+class LearnerContract:
+    """What every learner must hold: each statement of `cfx.testing.checks.learners` is a test."""
+
+    @pytest.fixture
+    def learner(self) -> Learner:
+        """Returns the learner under test; choose short trainings; a module-level instance saves time."""
+        raise NotImplementedError("the subclass of LearnerContract must define the fixture `learner`")
+
+    @statements(CONTRACT)
+    def test_contract(self, check: Check, learner: Learner) -> None:
+        hold(check, learner)

@@ -1,0 +1,26 @@
+"""Every built-in protocol holds the contract."""
+
+from __future__ import annotations
+
+import pytest
+
+from cfx.protocols.across_drivers import AcrossDrivers
+from cfx.protocols.base import Protocol
+from cfx.protocols.within_driver import WithinDriver
+from cfx.testing import ProtocolContract
+
+# Kept for all tests, which then share a run.
+WITHIN = {networks: WithinDriver(networks=networks) for networks in ("pair", "all")}
+ACROSS = AcrossDrivers(folds=3)
+
+
+class TestWithinDriver(ProtocolContract):
+    @pytest.fixture(params=WITHIN)
+    def protocol(self, request: pytest.FixtureRequest) -> Protocol:
+        return WITHIN[request.param]
+
+
+class TestAcrossDrivers(ProtocolContract):
+    @pytest.fixture
+    def protocol(self) -> Protocol:
+        return ACROSS
