@@ -44,8 +44,10 @@ $(VENV)/.ready: pyproject.toml constraints.txt $(VENV)/.torch
 	$(PIP) install --quiet --constraint constraints.txt --editable .
 	touch $@
 
-$(VENV)/.ready-test: pyproject.toml constraints.txt $(VENV)/.torch
+# The plugins in this repository are distributions of their own; what they need is in the test extra.
+$(VENV)/.ready-test: pyproject.toml constraints.txt $(wildcard plugins/*/pyproject.toml) $(VENV)/.torch
 	$(PIP) install --quiet --constraint constraints.txt --editable '.[test]'
+	$(PIP) install --quiet --no-deps $(addprefix --editable ,$(wildcard plugins/*/))
 	touch $(VENV)/.ready $@
 
 $(VENV)/.torch: constraints.txt | $(BIN)/python

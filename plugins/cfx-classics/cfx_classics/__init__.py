@@ -1,0 +1,1 @@
+"""Classic driving models for cfx: `gipps`, `ovm`, `fvdm` and `newell`."""

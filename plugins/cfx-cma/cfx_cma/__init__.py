@@ -1,0 +1,1 @@
+"""CMA-ES for cfx: `optimizer=cma`."""

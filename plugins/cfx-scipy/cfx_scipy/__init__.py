@@ -1,0 +1,1 @@
+"""SciPy's differential evolution for cfx: `optimizer=differential_evolution`."""

@@ -1,0 +1,132 @@
+"""The distributions in plugins/: they build offline, announce what they bring, and use nothing but the public API."""
+
+from __future__ import annotations
+
+import ast
+import configparser
+import subprocess
+import sys
+import tomllib
+import zipfile
+from email.parser import Parser
+from pathlib import Path
+
+import pytest
+
+import cfx
+from cfx import registry
+
+ROOT = Path(__file__).resolve().parent.parent
+PLUGINS = sorted(path.parent for path in (ROOT / "plugins").glob("*/pyproject.toml"))
+PUBLIC_MODULES = {"cfx", "cfx.errors"} | {kind.base.partition(":")[0] for kind in registry.KINDS.values()}
+"""What a plugin may import from: the top level, the errors, the base classes; and `cfx.testing`, whole."""
+
+BUILD = """
+import os, sys
+from hatchling.build import build_wheel
+for source in sys.argv[2:]:
+    os.chdir(source)
+    build_wheel(sys.argv[1])
+"""
+
+
+def project(plugin: Path) -> dict[str, object]:
+    """Returns the table `project` of a plugin's pyproject.toml."""
+    table: dict[str, object] = tomllib.loads((plugin / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    return table
+
+
+@pytest.fixture(scope="module")
+def wheels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Builds all wheels in one process, without isolation and so without the network; by distribution."""
+    folder = tmp_path_factory.mktemp("wheels")
+    done = subprocess.run([sys.executable, "-c", BUILD, folder, *PLUGINS], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return {path.name.split("-")[0].replace("_", "-"): path for path in folder.glob("*.whl")}
+
+
+def test_there_are_plugins_and_no_other_folders() -> None:
+    assert len(PLUGINS) >= 2
+    folders = {path for path in (ROOT / "plugins").iterdir() if path.is_dir() and path.name != "__pycache__"}
+    assert folders == set(PLUGINS), "a folder in plugins/ is a distribution, with a pyproject.toml"
+
+
+@pytest.mark.parametrize("plugin", PLUGINS, ids=lambda path: path.name)
+def test_the_wheel_holds_the_package_its_licence_and_its_entry_points(plugin: Path, wheels: dict[str, Path]) -> None:
+    declared = project(plugin)
+    assert declared["name"] == plugin.name
+    package = plugin.name.replace("-", "_")
+    with zipfile.ZipFile(wheels[plugin.name]) as archive:
+        names = set(archive.namelist())
+        info = next(name.partition("/")[0] for name in names if ".dist-info/" in name)
+        metadata = Parser().parsestr(archive.read(f"{info}/METADATA").decode("utf-8"))
+        points = configparser.ConfigParser(delimiters=("=",))
+        points.read_string(archive.read(f"{info}/entry_points.txt").decode("utf-8"))
+    source = {path.relative_to(plugin).as_posix() for path in (plugin / package).rglob("*") if path.suffix in {".py", ".yaml"}}
+    assert source <= names
+    assert {f"{package}/py.typed", f"{info}/licenses/LICENSE"} <= names
+    assert not [name for name in names if name.startswith("tests/")]
+    assert {group: dict(points[group]) for group in points.sections()} == declared["entry-points"]
+    assert metadata["Version"] == declared["version"]
+    assert any(text.replace(" ", "").startswith("cfx-driving") for text in metadata.get_all("Requires-Dist", []))
+    assert len(metadata.get_payload()) > 500, "the README is the page of the distribution"
+
+
+@pytest.mark.parametrize("plugin", PLUGINS, ids=lambda path: path.name)
+def test_what_it_announces_is_installed_here_and_loads(plugin: Path) -> None:
+    groups = {kind.entry_points: kind.name for kind in registry.KINDS.values()}
+    points = project(plugin)["entry-points"]
+    assert isinstance(points, dict)
+    points.pop(registry.API_GROUP, None)  # the version of the plugin API, which is no component
+    assert set(points) <= set(groups)
+    for group, announced in points.items():
+        for name, target in announced.items():
+            found = registry.entry(groups[group], name)
+            assert (found.distribution, found.target) == (plugin.name, target), "install again: make test"
+            assert registry.get(groups[group], name).kind == groups[group]
+
+
+def private_uses(path: Path) -> list[str]:
+    """Returns what a file uses of cfx that is not public, with the line."""
+    wrong = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        used: list[tuple[str, str]] = []
+        if isinstance(node, ast.Import):
+            used = [(alias.name, "") for alias in node.names if alias.name.partition(".")[0] == "cfx"]
+        elif isinstance(node, ast.ImportFrom) and node.module is not None and node.module.partition(".")[0] == "cfx":
+            used = [(node.module, alias.name) for alias in node.names]
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "cfx":
+            used = [("cfx", node.attr)]
+        wrong += [f"{path.name}:{node.lineno}: {module} {name}".rstrip() for module, name in used if not is_public(module, name)]  # type: ignore[attr-defined]  # statements and expressions have a line
+    return wrong
+
+
+def is_public(module: str, name: str) -> bool:
+    """Says whether a plugin may use `name` of `module`; "" is the module itself."""
+    if module == "cfx":
+        return name in {"", "testing", *cfx.__all__}
+    known = module in PUBLIC_MODULES or module == "cfx.testing" or module.startswith("cfx.testing.")
+    return known and not any(part.startswith("_") for part in (*module.split("."), name))
+
+
+@pytest.mark.parametrize("plugin", PLUGINS, ids=lambda path: path.name)
+def test_it_uses_the_public_api_alone(plugin: Path) -> None:
+    files = sorted(plugin.rglob("*.py"))
+    assert files
+    wrong = [text for path in files for text in private_uses(path)]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_the_check_of_imports_sees_what_is_private(tmp_path: Path) -> None:
+    path = tmp_path / "plugin.py"
+    path.write_text(
+        "import cfx\nimport cfx.registry\nfrom cfx import nodes, Settings\nfrom cfx.models.guarded import root\n"
+        "from cfx.models.base import DrivingModel, _x\nfrom cfx.testing.models import ModelContract\ncfx.job\ncfx.get\n"
+    )
+    assert [text.partition(": ")[2] for text in private_uses(path)] == [
+        "cfx.registry",
+        "cfx nodes",
+        "cfx.models.guarded root",
+        "cfx.models.base _x",
+        "cfx job",
+    ]
