@@ -16,14 +16,21 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from cfx import errors as errors
     from cfx.application import run as run
+    from cfx.component import API_VERSION as API_VERSION
     from cfx.component import Settings as Settings
     from cfx.datasets.base import Dataset as Dataset
+    from cfx.datasets.base import DatasetSettings as DatasetSettings
     from cfx.job import JobResult as JobResult
     from cfx.job import load as load
+    from cfx.learners.base import Learned as Learned
     from cfx.learners.base import Learner as Learner
+    from cfx.learners.base import Lesson as Lesson
     from cfx.models.base import DrivingModel as DrivingModel
     from cfx.models.base import Follower as Follower
     from cfx.models.base import Leader as Leader
+    from cfx.models.base import ModelSettings as ModelSettings
+    from cfx.models.base import bumper_gap as bumper_gap
+    from cfx.optimizers.base import Objective as Objective
     from cfx.optimizers.base import Optimizer as Optimizer
     from cfx.pairs import Pair as Pair
     from cfx.pairs import PairBatch as PairBatch
@@ -31,7 +38,11 @@ if TYPE_CHECKING:
     from cfx.parameters import Parameter as Parameter
     from cfx.parameters import ParameterSpace as ParameterSpace
     from cfx.policies.base import Policy as Policy
+    from cfx.policies.base import PolicyNetwork as PolicyNetwork
+    from cfx.policies.base import PolicySettings as PolicySettings
+    from cfx.protocols.base import Outcome as Outcome
     from cfx.protocols.base import Protocol as Protocol
+    from cfx.protocols.base import Study as Study
     from cfx.registry import get as get
     from cfx.simulation.rollout import Start as Start
     from cfx.simulation.rollout import simulate as simulate
@@ -48,17 +59,28 @@ _HOMES = {
     "load": "cfx.job",
     "JobResult": "cfx.job",
     "Dataset": "cfx.datasets.base",
+    "DatasetSettings": "cfx.datasets.base",
     "DrivingModel": "cfx.models.base",
     "Follower": "cfx.models.base",
     "Leader": "cfx.models.base",
+    "ModelSettings": "cfx.models.base",
+    "bumper_gap": "cfx.models.base",
     "Start": "cfx.simulation.rollout",
     "Optimizer": "cfx.optimizers.base",
+    "Objective": "cfx.optimizers.base",
     "Policy": "cfx.policies.base",
+    "PolicySettings": "cfx.policies.base",
+    "PolicyNetwork": "cfx.policies.base",
     "Learner": "cfx.learners.base",
+    "Lesson": "cfx.learners.base",
+    "Learned": "cfx.learners.base",
     "Protocol": "cfx.protocols.base",
+    "Study": "cfx.protocols.base",
+    "Outcome": "cfx.protocols.base",
     "Parameter": "cfx.parameters",
     "ParameterSpace": "cfx.parameters",
     "Settings": "cfx.component",
+    "API_VERSION": "cfx.component",
     "Pair": "cfx.pairs",
     "PairSet": "cfx.pairs",
     "PairBatch": "cfx.pairs",

@@ -15,6 +15,9 @@ from cfx.errors import ConfigError, nearest
 
 Schema = TypeVar("Schema", bound=BaseModel)
 
+API_VERSION = 1
+"""Version of what plugins may use. It rises only when a plugin that keeps to the public API would have to change."""
+
 
 class Settings(BaseModel):
     """Base of every component's settings: frozen, no unknown keys, no NaN or infinity.
@@ -32,9 +35,13 @@ class Component:
     Life cycle: the registry imports the class when a config names it, validates the config node against
     its `schema`, and calls the class with the result. Nothing else happens at construction: reading files,
     compiling and training wait for the first method call.
+
+    Attributes:
+        deprecated: what to use instead, where a component is on its way out; jobs that name it log a warning.
     """
 
     kind: ClassVar[str]
+    deprecated: ClassVar[str] = ""
     schema: ClassVar[type[Settings]] = Settings
     settings: Settings
 

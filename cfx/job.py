@@ -41,6 +41,7 @@ from cfx.protocols.base import Outcome, Protocol, Study
 from cfx.simulation.rollout import Simulator
 from cfx.style.entropy import measure_style, select_cluster
 from cfx.style.result import StyleResult
+from cfx.tracking.provenance import version
 
 if TYPE_CHECKING:
     from cfx.tracking.tracker import Tracker
@@ -100,10 +101,7 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
             {"dataset.fingerprint": pairs.fingerprint, "dataset.source": pairs.source, "dataset.pairs": str(len(pairs))}
         )
         study = _study(config, parts, pairs, style, device)
-        outcome = parts.protocol.run(study)
-        if not isinstance(outcome, Outcome):
-            origin = registry.origin(parts.protocol)
-            raise PluginError(f"{origin}: run must return a cfx.Outcome, but returned a {type(outcome).__name__}")
+        outcome = _outcome(parts.protocol, study)
         result = _keep(config, folder, pairs, style, outcome, tracker)
     report(result, outcome.evaluation, console, tracker)
     return result
@@ -182,6 +180,13 @@ def _study(config: JobConfig, parts: _Parts, pairs: PairSet, style: StyleResult,
     )
 
 
+def _outcome(protocol: Protocol, study: Study) -> Outcome:
+    outcome: object = protocol.run(study)
+    if not isinstance(outcome, Outcome):
+        raise PluginError(f"{registry.origin(protocol)}: run must return a cfx.Outcome, but returned a {type(outcome).__name__}")
+    return outcome
+
+
 def _keep(config: JobConfig, folder: Path, pairs: PairSet, style: StyleResult, outcome: Outcome, tracker: Tracker) -> JobResult:
     """Writes everything into the folder, then into MLflow."""
     evaluation = outcome.evaluation
@@ -209,6 +214,11 @@ def _keep(config: JobConfig, folder: Path, pairs: PairSet, style: StyleResult, o
         "pairs": len(pairs),
         "protocol": dict(outcome.notes),
         "dropped": [{"reason": drop.reason, "count": drop.count, "unit": drop.unit} for drop in pairs.dropped],
+        "parameters": [
+            {"name": name, "unit": unit, "low": float(low), "high": float(high)}
+            for name, unit, low, high in zip(evaluation.names, evaluation.units, *evaluation.bounds, strict=True)
+        ],
+        "cfx": version(),
     }
     written.file("data.json", lambda path: _dump(provenance, path))
     defined = {name: value if math.isfinite(value) else None for name, value in metrics.items()}

@@ -24,7 +24,7 @@ from cfx.component import Component
 from cfx.errors import CfxError
 from cfx.parameters import Parameter, ParameterSpace
 
-DISTRIBUTION = "cfx-driving"
+DISTRIBUTION = registry.OWN
 """The distribution whose components have their nodes as files."""
 
 _WIDTH = 130

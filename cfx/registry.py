@@ -1,7 +1,14 @@
 """One lazy registry for every kind of component; built-in and third-party components come in by the same entry points.
 
 `names` and `entries` read the metadata of installed distributions and import nothing. `get` imports the one component that is
-asked for, checks it, and only then keeps it. A broken plugin therefore never harms a run that does not name it.
+asked for, checks it, and only then keeps it; `create` probes it for some milliseconds before a job relies on it. A broken plugin
+therefore never harms a run that does not name it, and stops one that does with a sentence that names its distribution.
+
+A distribution says which version of the plugin API it was built for by an entry point of the group `cfx.api` whose name is the
+version, so that this is known without importing it:
+
+    [project.entry-points."cfx.api"]
+    1 = "my_package"
 """
 
 from __future__ import annotations
@@ -10,8 +17,9 @@ import functools
 import importlib
 import importlib.metadata
 import inspect
+import logging
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -20,8 +28,16 @@ from typing import Any, get_args
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from cfx.component import Component, Settings, validate
-from cfx.errors import ConfigError, PluginError, nearest
+from cfx.component import API_VERSION, Component, Settings, validate
+from cfx.errors import CfxError, ConfigError, PluginError, nearest
+
+log = logging.getLogger(__name__)
+
+OWN = "cfx-driving"
+"""The distribution whose components nobody else's can replace."""
+
+API_GROUP = "cfx.api"
+"""Entry-point group in which a distribution says what version of the plugin API it was built for."""
 
 
 @dataclass(frozen=True)
@@ -33,21 +49,23 @@ class Kind:
         group: its config group, the folder in `conf/` and the key in configs.
         entry_points: its entry-point group.
         base: module and class that its components extend.
+        probe: module and function that tries a new component for some milliseconds; "" where its base class checks what it gives.
     """
 
     name: str
     group: str
     entry_points: str
     base: str
+    probe: str = ""
 
 
 KINDS: dict[str, Kind] = {
     kind.name: kind
     for kind in (
         Kind("dataset", "data", "cfx.datasets", "cfx.datasets.base:Dataset"),
-        Kind("model", "model", "cfx.models", "cfx.models.base:DrivingModel"),
-        Kind("policy", "policy", "cfx.policies", "cfx.policies.base:Policy"),
-        Kind("optimizer", "optimizer", "cfx.optimizers", "cfx.optimizers.base:Optimizer"),
+        Kind("model", "model", "cfx.models", "cfx.models.base:DrivingModel", "cfx.probes:probe_model"),
+        Kind("policy", "policy", "cfx.policies", "cfx.policies.base:Policy", "cfx.probes:probe_policy"),
+        Kind("optimizer", "optimizer", "cfx.optimizers", "cfx.optimizers.base:Optimizer", "cfx.probes:probe_optimizer"),
         Kind("learner", "learner", "cfx.learners", "cfx.learners.base:Learner"),
         Kind("protocol", "protocol", "cfx.protocols", "cfx.protocols.base:Protocol"),
     )
@@ -66,6 +84,7 @@ class Entry:
         target: `module:Class`.
         distribution, version: who brings it.
         location: folder that the distribution's metadata lies in.
+        api: versions of the plugin API that the distribution declares; empty if it declares none.
     """
 
     kind: str
@@ -74,6 +93,7 @@ class Entry:
     distribution: str
     version: str
     location: str
+    api: tuple[str, ...] = ()
 
     @property
     def package(self) -> str:
@@ -85,6 +105,7 @@ class Entry:
 
 
 _loaded: dict[Entry, type[Component]] = {}
+_probed: set[tuple[Entry, str]] = set()
 
 
 def kind_of(kind: str) -> Kind:
@@ -117,18 +138,19 @@ def entry(kind: str, name: str) -> Entry:
     """Returns the one entry of that name. Imports nothing.
 
     Raises:
-        PluginError: the name is unknown, or two distributions claim it.
+        PluginError: the name is unknown, or two third parties claim it. A name of cfx's own always means cfx's own.
     """
-    group = kind_of(kind).group
+    group, what = kind_of(kind).group, kind_of(kind).name
     found = [candidate for candidate in entries(kind) if candidate.name == name]
+    found = [candidate for candidate in found if candidate.distribution == OWN] or found
     if not found:
         known = names(kind)
         if not known:
-            raise PluginError(f"{group}={name}: no {kind} is installed, not even cfx's own; run make run, or pip install -e .")
-        raise PluginError(f"{group}={name}: there is no {kind} '{name}'.{nearest(name, known)} Known: {', '.join(known)}.")
+            raise PluginError(f"{group}={name}: no {what} is installed, not even cfx's own; run make run, or pip install -e .")
+        raise PluginError(f"{group}={name}: there is no {what} '{name}'.{nearest(name, known)} Known: {', '.join(known)}.")
     if len(found) > 1:
         claims = " and ".join(f"{one.distribution} {one.version} ({one.target})" for one in found)
-        raise PluginError(f"{group}={name}: two distributions bring a {kind} '{name}': {claims}; uninstall one of them")
+        raise PluginError(f"{group}={name}: two distributions bring a {what} '{name}': {claims}; uninstall one of them")
     return found[0]
 
 
@@ -136,10 +158,14 @@ def get(kind: str, name: str) -> type[Component]:
     """Imports, checks and returns a component's class.
 
     Raises:
-        PluginError: the name is unknown or claimed twice; or the component cannot be imported or breaks the contract of its kind.
+        PluginError: the name is unknown or claimed twice; or the component was built for another version of the plugin API,
+            cannot be imported, or breaks the contract of its kind.
     """
     found = entry(kind, name)
     if found not in _loaded:
+        complaint = other_api(found)
+        if complaint:
+            raise PluginError(complaint)
         cls = _import(found)
         _check(found, cls)
         _loaded[found] = cls
@@ -150,7 +176,7 @@ def create(kind: str, node: Mapping[str, Any]) -> Component:
     """Creates a component from its config node: `name` and its settings.
 
     Raises:
-        PluginError: as `get`.
+        PluginError: as `get`; or it cannot be created, or breaks its contract when it is tried for a moment.
         ConfigError: the node has no name, an unknown key or a wrong value.
         ParameterError: a model's parameters contradict each other.
     """
@@ -160,14 +186,97 @@ def create(kind: str, node: Mapping[str, Any]) -> Component:
     name = node.get("name")
     if not isinstance(name, str):
         raise ConfigError(f"{group}.name: a value is required; choose a {kind}: {', '.join(names(kind))}")
-    cls = get(kind, name)
+    cls, found = get(kind, name), entry(kind, name)
     values = {key: value for key, value in node.items() if key != "name"}
-    return cls(validate(cls.schema, _without_blanks(cls.schema, values), where=group))
+    settings = validate(cls.schema, _without_blanks(cls.schema, values), where=group)
+    _warn_of_deprecated(found, cls, settings)
+    try:
+        component = cls(settings)
+    except CfxError:
+        raise
+    except Exception as error:
+        raise PluginError(f"{found} cannot be created: {in_words(error)}{_remedy(found)}") from error
+    _probe(found, component, settings)
+    return component
 
 
 def is_loaded(found: Entry) -> bool:
     """Says whether the component was imported and passed its checks."""
     return found in _loaded
+
+
+def rivals(found: Entry) -> tuple[Entry, ...]:
+    """Returns the entries of other distributions that keep this one from being used; empty for most. Imports nothing."""
+    if found.distribution == OWN:
+        return ()
+    others = [one for one in entries(found.kind) if one.name == found.name and one != found]
+    return tuple(one for one in others if one.distribution == OWN) or tuple(others)
+
+
+def other_api(found: Entry) -> str:
+    """Returns a sentence if the distribution was built for other versions of the plugin API only, "" if not. Imports nothing."""
+    if found.distribution == OWN or not found.api or str(API_VERSION) in found.api:
+        return ""
+    versions = [int(one) for one in found.api if one.isdecimal()]
+    if not versions:
+        return (
+            f"{found} declares '{found.api[0]}' as its version of cfx's plugin API, which is no number; its author must name the"
+            f" entry point of the group {API_GROUP} by one, such as {API_VERSION}"
+        )
+    newer = min(versions) > API_VERSION
+    advice = f"pip install --upgrade {OWN if newer else found.distribution}"
+    return (
+        f"{found} was built for version {' and '.join(found.api)} of cfx's plugin API, this cfx has version {API_VERSION};"
+        f" {advice}, or pip uninstall {found.distribution}"
+    )
+
+
+def origin(component: Component | type[Component]) -> str:
+    """Returns whose a component is, for messages: kind, name, class and distribution; the class alone if it is no plugin's."""
+    cls = component if isinstance(component, type) else type(component)
+    for found, loaded in _loaded.items():
+        if loaded is cls:
+            return str(found)
+    return f"{cls.kind} {cls.__name__}"
+
+
+def in_words(error: BaseException) -> str:
+    """Returns an error's type and the first line of its text."""
+    first = next(iter(str(error).splitlines()), "")
+    return f"{type(error).__name__}: {first}".rstrip(": ")
+
+
+def _probe(found: Entry, component: Component, settings: BaseModel) -> None:
+    """Tries a component once for each of its settings.
+
+    Raises:
+        PluginError: it breaks its contract; names the distribution.
+    """
+    kind = KINDS[found.kind]
+    key = (found, settings.model_dump_json())
+    if not kind.probe or key in _probed:
+        return
+    try:
+        _resolve(kind.probe)(component)
+    except PluginError as broken:
+        raise PluginError(f"{found} breaks its contract: {broken}{_remedy(found)}") from broken
+    except Exception as error:  # a plugin may raise anything
+        raise PluginError(f"{found} breaks its contract: trying it raised {in_words(error)}{_remedy(found)}") from error
+    _probed.add(key)
+
+
+def _remedy(found: Entry) -> str:
+    return f"; repair that distribution (cfx plugins check {found.kind} {found.name}), or pip uninstall {found.distribution}"
+
+
+def _warn_of_deprecated(found: Entry, cls: type[Component], settings: BaseModel) -> None:
+    """Logs a warning for a component that its class calls deprecated, and for each changed setting that its field calls so."""
+    if cls.deprecated:
+        log.warning("%s is deprecated: %s", found, cls.deprecated)
+    for name, field in cls.schema.model_fields.items():
+        if field.deprecated and settings.__dict__[name] != field.get_default(call_default_factory=True, validated_data={}):
+            path = f"{kind_of(found.kind).group}.{name}"
+            log.warning("%s of %s is deprecated: %s", path, found, field.deprecation_message)
 
 
 def _search_path() -> tuple[tuple[str, float], ...]:
@@ -177,19 +286,30 @@ def _search_path() -> tuple[tuple[str, float], ...]:
 
 @functools.lru_cache(maxsize=1)
 def _announced(search_path: tuple[tuple[str, float], ...]) -> dict[str, tuple[Entry, ...]]:  # noqa: ARG001 - the cache's key
-    points = importlib.metadata.entry_points()
-    return {name: tuple(sorted(_entries(kind, points), key=attrgetter("name", "distribution"))) for name, kind in KINDS.items()}
-
-
-def _entries(kind: Kind, points: Any) -> list[Entry]:
-    found = []
-    for point in points.select(group=kind.entry_points):
-        distribution = point.dist
-        if distribution is None:  # an entry point read from a bare file; importlib.metadata always knows the distribution
+    found: dict[str, list[Entry]] = {name: [] for name in KINDS}
+    seen = set()
+    for distribution in importlib.metadata.distributions():
+        try:
+            announced = list(_entries(distribution))
+        except Exception:  # noqa: S112 - metadata that cannot be read, whoever's it is, announces nothing and harms nobody
             continue
-        location = str(distribution.locate_file(""))
-        found.append(Entry(kind.name, point.name, point.value, distribution.name, distribution.version, location))
-    return found
+        if announced and announced[0].distribution not in seen:  # the first on the search path is the one that is imported
+            seen.add(announced[0].distribution)
+            for one in announced:
+                found[one.kind].append(one)
+    return {name: tuple(sorted(ones, key=attrgetter("name", "distribution"))) for name, ones in found.items()}
+
+
+def _entries(distribution: importlib.metadata.Distribution) -> Iterator[Entry]:
+    kinds = {kind.entry_points: kind.name for kind in KINDS.values()}
+    points = [point for point in distribution.entry_points if point.group in {*kinds, API_GROUP}]
+    api = tuple(sorted(point.name for point in points if point.group == API_GROUP))
+    for point in points:
+        if point.group != API_GROUP:
+            name, version = distribution.metadata["Name"], distribution.version
+            if not isinstance(name, str) or not isinstance(version, str):
+                raise ValueError("the metadata name no distribution, or no version")
+            yield Entry(kinds[point.group], point.name, point.value, name, version, str(distribution.locate_file("")), api)
 
 
 def _import(found: Entry) -> Any:
@@ -199,15 +319,14 @@ def _import(found: Entry) -> Any:
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # a plugin may raise anything, even SystemExit
-        what = f"{type(error).__name__}: {error}".rstrip(": ")
         raise PluginError(
-            f"{found} cannot be imported: {what}; repair that distribution, or pip uninstall {found.distribution}"
+            f"{found} cannot be imported: {in_words(error)}; repair that distribution, or pip uninstall {found.distribution}"
         ) from error
 
 
 def _check(found: Entry, cls: Any) -> None:
     """Raises PluginError unless `cls` keeps the contract of its kind."""
-    base = _base(KINDS[found.kind])
+    base = _resolve(KINDS[found.kind].base)
     if not inspect.isclass(cls):
         raise PluginError(f"{found} is no class but {type(cls).__name__}; point its entry point at a subclass of {base.__name__}")
     if not issubclass(cls, Component) or not issubclass(cls, base):
@@ -238,8 +357,8 @@ def _check_model(found: Entry, cls: Any, base: Any) -> None:
         raise PluginError(f"{found}: its schema must extend {base.schema.__module__}.{base.schema.__name__}")
 
 
-def _base(kind: Kind) -> Any:
-    module, _, attribute = kind.base.partition(":")
+def _resolve(target: str) -> Any:
+    module, _, attribute = target.partition(":")
     return getattr(importlib.import_module(module), attribute)
 
 

@@ -114,7 +114,7 @@ def test_ctrl_c_and_sigterm_have_their_exit_codes(run: Run, seed: int, code: int
     ("arguments", "message"),
     [
         (["modle=w99"], "modle=w99: there is no key 'modle'. Did you mean 'model'? Known keys: cache"),
-        (["model=kraus"], "model=kraus: there is no model 'kraus'. Did you mean 'krauss'? Known: krauss"),
+        (["model=kraus"], "model=kraus: there is no model 'kraus'. Did you mean 'krauss'? Known: "),
         (["policy.hiden_size=3"], "'policy.hiden_size'. Did you mean 'policy.hidden_size'? Known keys of policy: "),
         (["modl.parameters.t_r.low=3"], "'modl.parameters.t_r.low'. Did you mean 'model.parameters.t_r.low'?"),
         (["modle=w99", "policy=nope"], "policy=nope: there is no policy 'nope'."),
@@ -233,8 +233,10 @@ def test_a_multirun_in_worker_processes_composes_a_plugin_and_reports_failures(r
 def test_help_lists_the_groups_and_names_only_keys_that_exist(run: Run, capsys) -> None:
     assert run("--help") == 0
     printed = capsys.readouterr().out
-    assert "model: krauss, w74, w99" in printed
-    assert "policy: default, fixed, gru, lstm" in printed
+    lines = (line.partition(": ") for line in printed.splitlines())
+    listed = {group: set(names.split(", ")) for group, _, names in lines}
+    assert listed["model"] >= {"krauss", "w74", "w99"}  # and those of plugins
+    assert listed["policy"] >= {"default", "fixed", "gru", "lstm"}
     for override in ("style.cluster=aggressive", "model.parameters.t_r.high=12", "seed=1", "device=cuda", "split=0.7"):
         assert override in printed
         assert run("--cfg", "job", override) == 0
@@ -299,40 +301,6 @@ def test_main_takes_its_arguments_from_the_command_line(monkeypatch: pytest.Monk
     monkeypatch.setattr(sys, "argv", ["cfx", "plugins"])
     assert cli.main() == 0
     assert "krauss" in capsys.readouterr().out
-
-
-def test_plugins_lists_metadata_and_loads_nothing(install, capsys) -> None:
-    install("bad-models", {"cfx.models": {"bad": "bad_models:Bad"}}, {"bad_models.py": "raise SystemExit(0)"}, version="3.1")
-    install("twin-models", {"cfx.models": {"krauss": "twin_models:Twin"}}, {"twin_models.py": ""})
-    assert cli.main(["plugins"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    (bad,) = [line for line in lines if " bad " in line]
-    assert bad.split() == ["model", "bad", "bad-models", "3.1", str(install.folder), "not", "loaded"]
-    assert sum("named twice" in line for line in lines) == 2
-    assert "bad_models" not in sys.modules
-
-
-def test_plugins_check_loads_everything_and_exits_with_1_if_one_is_broken(install, capsys) -> None:
-    assert cli.main(["plugins", "check"]) == 0
-    install("bad-models", {"cfx.models": {"bad": "bad_models:Bad"}}, {"bad_models.py": "raise SystemExit(0)"})
-    assert cli.main(["plugins", "check"]) == 1
-    printed = capsys.readouterr()
-    (row,) = [line for line in printed.out.splitlines() if " bad " in line]
-    assert row.split()[-1] == "broken"
-    assert printed.err.startswith(
-        "model 'bad' (bad_models:Bad) of the distribution bad-models 1.0 cannot be imported: SystemExit: 0"
-    )
-
-
-def test_plugins_show_tells_parameters_settings_and_reference(capsys) -> None:
-    assert cli.main(["plugins", "show", "model", "w99"]) == 0
-    printed = capsys.readouterr().out
-    (row,) = [line for line in printed.splitlines() if line.strip().startswith("cc1 ")]
-    assert "time gap kept above cc0" in row
-    assert "Reference: Wiedemann" in printed
-    assert "sumo: CC8 caps" in printed
-    assert cli.main(["plugins", "show", "data", "tidy"]) == 0
-    assert "required" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

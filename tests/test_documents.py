@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
+import subprocess
+import sysconfig
+import venv
 from pathlib import Path
 
 import pytest
@@ -51,7 +55,7 @@ def test_the_readmes_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_the_model_in_contributing_drives() -> None:
-    (block,) = blocks("CONTRIBUTING.md", "python")
+    (block,) = [one for one in blocks("CONTRIBUTING.md", "python") if "class Pipes(DrivingModel)" in one]
     names: dict[str, object] = {"__name__": "example"}
     exec(block, names)  # noqa: S102 - it is our own document
     kind = names["Pipes"]
@@ -63,3 +67,49 @@ def test_the_model_in_contributing_drives() -> None:
     drive = cfx.simulate(kind(), {"headway": 2.0}, leader, start, batch.dt)
     assert not bool(drive.collided.any())
     torch.testing.assert_close(drive.gap[0, -1], torch.tensor(20.0, dtype=torch.float64), atol=0.5, rtol=0)
+
+
+def test_the_table_of_kinds_names_what_is_there() -> None:
+    import cfx.testing
+
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (\w+) \| `cfx\.(\w+)` \| .* \| `(\w+)` \|$", text, flags=re.MULTILINE)
+    assert [kind for kind, _, _ in rows] == ["dataset", "model", "optimizer", "policy", "learner", "protocol"]
+    for kind, base, suite in rows:
+        assert getattr(cfx, base).kind == kind
+        assert hasattr(getattr(cfx.testing, suite), kind)
+    assert f"`cfx.API_VERSION` ({cfx.API_VERSION})" in text
+    (declared,) = re.findall(r'^\[project\.entry-points\."cfx\.api"\]\n(\d+) = ', text, flags=re.MULTILINE)
+    assert int(declared) == cfx.API_VERSION
+
+
+def guide() -> list[tuple[str, str]]:
+    """Returns the shell and Python blocks of the guide, in order."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    section = text.partition("## Writing a plugin\n")[2].partition("\n## ")[0]
+    return re.findall(r"^```(sh|python)\n(.*?)^```$", section, flags=re.DOTALL | re.MULTILINE)
+
+
+@pytest.mark.slow
+def test_the_guide_to_a_plugin_works_as_printed(tmp_path: Path) -> None:
+    """In an environment of its own that sees this one's packages; pip is told by its variables to stay off the network."""
+    home = tmp_path / "env"
+    venv.create(home, with_pip=False, symlinks=True)
+    (site,) = home.glob("lib/python*/site-packages")
+    (site / "all.pth").write_text(f"import site; site.addsitedir({sysconfig.get_path('purelib')!r})\n", encoding="utf-8")
+    pip = home / "bin" / "pip"
+    pip.write_text(f'#!/bin/sh\nexec {home}/bin/python -m pip "$@"\n', encoding="utf-8")
+    pip.chmod(0o755)
+    offline = {"PIP_NO_INDEX": "1", "PIP_NO_DEPS": "1", "PIP_NO_BUILD_ISOLATION": "0", "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
+    search = f"{home / 'bin'}{os.pathsep}{os.environ['PATH']}"
+    environment = {**os.environ, **offline, "PATH": search, "MLFLOW_TRACKING_URI": f"sqlite:///{tmp_path}/mlflow.db"}
+    steps = guide()
+    assert [language for language, _ in steps] == ["sh", "python", "python", "sh"]
+    for language, block in steps:
+        if language == "python":
+            (tmp_path / block.partition("\n")[0].removeprefix("# ")).write_text(block, encoding="utf-8")
+            continue
+        done = subprocess.run(["sh", "-ec", block], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+    assert (tmp_path / "outputs" / "pipes" / "report.html").is_file()
+    assert "pipes" in (tmp_path / "outputs" / "pipes" / "report.html").read_text(encoding="utf-8")

@@ -23,17 +23,17 @@ FLOORS = (
     ("simulation",),
     ("datasets", "style", "optimizers", "calibration"),
     ("policies", "learners"),
-    ("evaluation",),
+    ("evaluation", "probes"),
     ("protocols",),
     ("tracking", "figures"),
-    ("config", "nodes", "ui", "testing"),
-    ("job", "hydra_source", "mistakes", "application", "cli"),
+    ("config", "nodes", "ui", "testing", "report"),
+    ("job", "hydra_source", "mistakes", "sweep", "application", "plugins", "cli"),
 )
 """From the ground up; a room may use rooms on its own floor and below."""
 
 HEIGHT = {room: height for height, floor in enumerate(FLOORS) for room in floor}
 
-HEAVY = ("torch", "lightning", "botorch", "gpytorch", "mlflow", "pandas", "matplotlib", "scipy")
+HEAVY = ("torch", "lightning", "botorch", "gpytorch", "mlflow", "pandas", "matplotlib", "scipy", "plotly")
 
 
 def modules() -> list[str]:

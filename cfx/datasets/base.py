@@ -8,12 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
+import numpy as np
 from pydantic import BeforeValidator, Field
 from pydantic_core import PydanticCustomError
 
+from cfx import registry
 from cfx.component import Component, Settings
-from cfx.errors import DataError, nearest
-from cfx.pairs import Dropped, Pair, PairSet
+from cfx.errors import DataError, PluginError, nearest
+from cfx.pairs import SIGNALS, Dropped, Pair, PairSet
 
 
 def _absolute(value: Any) -> Any:
@@ -33,6 +35,7 @@ class DatasetSettings(Settings):
     min_frames: int = Field(700, ge=2, description="shortest pair that is kept, frames; the paper keeps 700")
     recording: str | None = Field(None, description="keep this recording alone; null: all")
     lanes: list[int] | None = Field(None, description="keep pairs in these lanes alone; null: all")
+    pair_ids: list[str] | None = Field(None, description="keep these pairs alone, by their ids; null: all")
     max_pairs: int | None = Field(None, ge=1, description="keep the first so many pairs; null: all")
 
 
@@ -63,19 +66,34 @@ class Dataset(Component):
         """
 
     def load(self) -> PairSet:
-        """Returns the pairs that the settings select: by recording, lane and length, then the first `max_pairs` of them.
+        """Returns the pairs that the settings select: by recording, lane, id and length, then the first `max_pairs` of them.
 
         Raises:
-            DataError: as `read`; or the recording is unknown, the source has no lanes, or fewer pairs remain than asked for.
+            DataError: as `read`; or the recording or a pair id is unknown, the source has no lanes, or too few pairs remain.
+            PluginError: `read` gives anything but pairs of finite numbers.
         """
         pairs = self.read()
+        self._check(pairs)
         if not len(pairs):
             raise DataError(f"{pairs.source}: no leader-follower pair found{_why(pairs.dropped)}")
         if self.settings.recording is not None:
             pairs = _select_recording(pairs, self.settings.recording)
         if self.settings.lanes is not None:
             pairs = _select_lanes(pairs, self.settings.lanes)
+        if self.settings.pair_ids is not None:
+            pairs = _select_ids(pairs, self.settings.pair_ids)
         return _select_first(_select_long(pairs, self.settings.min_frames), self.settings)
+
+    def _check(self, pairs: Any) -> None:
+        if not isinstance(pairs, PairSet):
+            raise PluginError(f"{registry.origin(self)}: read must return a cfx.PairSet, but returned a {type(pairs).__name__}")
+        for pair in pairs:
+            for name in SIGNALS:
+                if not bool(np.isfinite(getattr(pair, name)).all()):
+                    raise PluginError(
+                        f"{registry.origin(self)}: pair {pair.pair_id} has a {name} that is not finite; a dataset splits or"
+                        " leaves out what has gaps"
+                    )
 
 
 def _why(dropped: Sequence[Dropped]) -> str:
@@ -109,6 +127,15 @@ def _select_lanes(pairs: PairSet, lanes: Sequence[int]) -> PairSet:
     if strange or not lanes:
         raise DataError(f"data.lanes={list(lanes)}: {pairs.source} has pairs in lanes {listed(known)} only; choose among these")
     return pairs.select([pair.lane in lanes for pair in pairs], f"in other lanes than {listed(sorted(set(lanes)))}")
+
+
+def _select_ids(pairs: PairSet, wanted: Sequence[str]) -> PairSet:
+    known = [pair.pair_id for pair in pairs]
+    strange = [name for name in wanted if name not in known]
+    if strange or not wanted:
+        what = f"there is no pair '{strange[0]}'.{nearest(strange[0], known)}" if strange else "the list is empty."
+        raise DataError(f"data.pair_ids={list(wanted)}: {pairs.source}: {what} Known: {listed(known)}.")
+    return pairs.select([name in wanted for name in known], "other pairs than data.pair_ids")
 
 
 def _select_long(pairs: PairSet, min_frames: int) -> PairSet:

@@ -13,7 +13,7 @@ from scipy import stats
 from torch import Tensor
 
 from cfx.evaluation.closed_loop import ClosedLoop
-from cfx.evaluation.result import METHODS, STATISTICS, Array, Drive, Evaluation, Improvement
+from cfx.evaluation.result import METHODS, Array, Drive, Evaluation, Improvement
 from cfx.pairs import PairBatch, PairSet
 from cfx.parameters import ParameterSpace
 from cfx.style.result import CLUSTERS, StyleResult
@@ -39,7 +39,8 @@ def improvement_statistics(
     counts = np.isfinite(baseline) & np.isfinite(policy) & (baseline > 0)
     before, after = baseline[counts], policy[counts]
     if not counts.any():
-        return Improvement(*[float("nan")] * len(STATISTICS), pairs=0, undefined=len(baseline), drivers=0)
+        nan = float("nan")
+        return Improvement(nan, nan, nan, nan, nan, nan, nan, pairs=0, undefined=len(baseline), drivers=0)
     who = np.unique(np.asarray(drivers)[counts], return_inverse=True)[1] if drivers is not None else np.arange(len(before))
     gain = (before - after) / before
     low, high = _interval(gain, who, seed)

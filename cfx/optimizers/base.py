@@ -14,6 +14,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from cfx import registry
 from cfx.component import Component
 from cfx.errors import PluginError
 
@@ -131,7 +132,8 @@ class Optimizer(Component):
             tolerance: losses this close to the lowest, in their unit, count as equal besides those that rounding makes equal.
 
         Raises:
-            PluginError: the optimizer asks for a candidate outside [0, 1], or returns another number of evaluations than it says.
+            PluginError: the optimizer asks for a candidate outside [0, 1], of another shape or not in float64; or it returns NaN,
+                anything of another shape or dtype, or another number of evaluations than it says.
         """
         problems, _, n = guesses.shape
         returned = 8 * self.evaluations() * (2 * n + 4)
@@ -141,7 +143,7 @@ class Optimizer(Component):
         pieces = []
         for first in range(0, problems, chunk):
             last = min(first + chunk, problems)
-            guarded = _Guarded(objective.select(first, last), progress, type(self).__name__)
+            guarded = _Guarded(objective.select(first, last), progress, n, registry.origin(self))
             own = guesses[first:last]
             candidates, losses = self.solve(guarded, own, seed=seed)
             self._check(candidates, losses, own)
@@ -154,8 +156,18 @@ class Optimizer(Component):
         expected = (problems, self.evaluations())
         if losses.shape != expected or candidates.shape != (*expected, n):
             raise PluginError(
-                f"optimizer {type(self).__name__}: solve must return candidates {(*expected, n)} and losses {expected}"
+                f"{registry.origin(self)}: solve must return candidates {(*expected, n)} and losses {expected}"
                 f" as evaluations() says, but returned {tuple(candidates.shape)} and {tuple(losses.shape)}"
+            )
+        if {candidates.dtype, losses.dtype} != {torch.float64}:
+            raise PluginError(
+                f"{registry.origin(self)}: solve must return float64, but returned candidates in {candidates.dtype} and losses in"
+                f" {losses.dtype}"
+            )
+        if bool(losses.isnan().any()) or not bool(((candidates >= 0) & (candidates <= 1)).all()):
+            raise PluginError(
+                f"{registry.origin(self)}: solve must return candidates within [0, 1] and losses that are numbers or infinity,"
+                " but returned NaN or a candidate outside"
             )
 
 
@@ -187,9 +199,10 @@ def _reduce(
 class _Guarded:
     """An objective whose NaN losses are infinity, that counts evaluations and refuses candidates outside the bounds."""
 
-    def __init__(self, objective: Objective, progress: Progress, optimizer: str) -> None:
+    def __init__(self, objective: Objective, progress: Progress, n: int, optimizer: str) -> None:
         self._objective = objective
         self._progress = progress
+        self._n = n
         self._optimizer = optimizer
 
     @property
@@ -197,12 +210,18 @@ class _Guarded:
         return self._objective.problems
 
     def __call__(self, candidates: Tensor) -> Tensor:
+        shape = tuple(candidates.shape)
+        if candidates.dtype != torch.float64 or len(shape) != 3 or (shape[0], shape[2]) != (self.problems, self._n):
+            raise PluginError(
+                f"{self._optimizer}: it asked for candidates {shape} in {candidates.dtype}; it must ask for"
+                f" ({self.problems}, q, {self._n}) in float64"
+            )
         # Written so that NaN fails too.
         if not bool(((candidates >= 0) & (candidates <= 1)).all()):
-            raise PluginError(f"optimizer {self._optimizer}: it asked for a candidate outside the bounds [0, 1] of unit space")
+            raise PluginError(f"{self._optimizer}: it asked for a candidate outside the bounds [0, 1] of unit space")
         losses = self._objective(candidates).to(torch.float64)
         self._progress(losses.numel())
         return losses.nan_to_num(nan=torch.inf, posinf=torch.inf, neginf=torch.inf)
 
     def select(self, first: int, last: int) -> Objective:
-        return _Guarded(self._objective.select(first, last), self._progress, self._optimizer)
+        return _Guarded(self._objective.select(first, last), self._progress, self._n, self._optimizer)

@@ -1,0 +1,127 @@
+"""`cfx plugins new`: a package for somebody's own component, complete and with tests that pass.
+
+The templates are files in `template/`: `common/` for every kind, and a folder for each. Copier renders them from there: no
+network, no git, no hooks.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import keyword
+import re
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from cfx import registry
+from cfx.component import API_VERSION
+from cfx.errors import ConfigError, OutputError, PluginError
+
+_TEMPLATE = Path(__file__).parent / "template"
+
+_RESERVED = {"null", "true", "false", "nan", "inf"}
+"""What Hydra does not read as a name."""
+
+
+def create(kind: str, name: str, folder: Path | None = None) -> Path:
+    """Writes a package and says what to do with it.
+
+    Args:
+        kind: what the component is.
+        name: its name, as in `model=NAME`.
+        folder: where; `cfx-NAME` in the working directory unless given.
+
+    Returns:
+        The folder, which appears whole or not at all.
+
+    Raises:
+        PluginError: there is no such kind, or the name is taken.
+        ConfigError: the name cannot be one.
+        OutputError: the folder exists or cannot be written.
+    """
+    found = registry.kind_of(kind)
+    _check_name(name)
+    _check_free(found, name)
+    words = _words(found, name)
+    target = (folder or Path(words["distribution"])).expanduser()
+    if target.exists():
+        raise OutputError(f"{target} exists already; choose another folder with --folder, or remove it")
+    try:
+        _write(found, words, target)
+    except OSError as error:
+        raise OutputError(
+            f"{target} cannot be written ({error.strerror or error}); choose another folder with --folder"
+        ) from error
+    print(_next_steps(found, name, target))
+    return target
+
+
+def _check_name(name: str) -> None:
+    if re.fullmatch(r"[a-z][a-z0-9_]*", name) and not keyword.iskeyword(name) and name not in _RESERVED:
+        return
+    better = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_0123456789")
+    advice = f", such as {better}" if better and better != name and not keyword.iskeyword(better) else ""
+    raise ConfigError(
+        f"'{name}' cannot be a component's name: it must be an identifier in lower-case letters, digits and _{advice}"
+    )
+
+
+def _check_free(kind: registry.Kind, name: str) -> None:
+    taken = [entry for entry in registry.entries(kind.name) if entry.name == name]
+    if taken:
+        raise PluginError(
+            f"the name '{name}' is taken by {taken[0]}: a second {kind.name} of that name would be shadowed; choose another name"
+        )
+    package = f"cfx_{name}"
+    if importlib.util.find_spec(package) is not None:
+        raise PluginError(f"a package {package} is installed already, so '{name}' would take its place; choose another name")
+
+
+def _words(kind: registry.Kind, name: str) -> dict[str, Any]:
+    """Returns what the templates call by name."""
+    return {
+        "kind": kind.name,
+        "group": kind.group,
+        "entry_points": kind.entry_points,
+        "suite": f"{kind.base.rpartition(':')[2].removeprefix('Driving')}Contract",
+        "name": name,
+        "class_name": "".join(part.capitalize() for part in name.split("_")),
+        "package": f"cfx_{name}",
+        "distribution": f"cfx-{name.replace('_', '-')}".rstrip("-"),
+        "api": API_VERSION,
+        "requires": _requires(),
+    }
+
+
+def _requires() -> str:
+    """Returns a range of cfx's versions from this one on; which of them fit is also the plugin API's to say."""
+    from packaging.version import InvalidVersion, Version
+
+    import cfx
+
+    try:
+        major, minor = Version(cfx.__version__).release[:2]
+    except (InvalidVersion, ValueError):  # a checkout that nobody installed
+        return registry.OWN
+    return f"{registry.OWN}>={major}.{minor},<{major + 1}"
+
+
+def _write(kind: registry.Kind, words: dict[str, Any], target: Path) -> None:
+    from copier import run_copy
+
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".cfx-new-") as temporary:
+        draft = Path(temporary) / "package"
+        for part in ("common", kind.name):
+            run_copy(str(_TEMPLATE / part), draft, data=words, defaults=True, overwrite=True, quiet=True)
+        draft.rename(target)
+
+
+def _next_steps(kind: registry.Kind, name: str, target: Path) -> str:
+    return (
+        f"Wrote {target}, a package with the {kind.name} '{name}'. Next:\n"
+        f"  pip install --editable {target}\n"
+        f"  python -m pytest {target}\n"
+        f"  python -m cfx plugins check {kind.name} {name}\n"
+        f"  python -m cfx {kind.group}={name}{' data.path=FILE.csv' if kind.name == 'dataset' else ''}"
+    )

@@ -1,0 +1,145 @@
+"""The tables of `cfx plugins` and `cfx plugins show`."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import sys
+from collections.abc import Collection, Iterator
+from typing import Any, cast, get_args
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from pydantic_core import to_jsonable_python
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from cfx import registry
+from cfx.component import Component
+
+
+def table(*columns: str, title: str | None = None) -> Table:
+    """Returns an empty table."""
+    made = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
+    for column in columns:
+        made.add_column(column, overflow="fold")
+    return made
+
+
+def put(rows: Table) -> None:
+    """Prints a table; in a file or a pipe nothing is folded, so that lines stay whole for grep."""
+    Console(width=None if sys.stdout.isatty() else 400, markup=False).print(rows)
+
+
+def overview() -> None:
+    """Prints a row for every component. Imports none."""
+    rows = table("kind", "name", "distribution", "version", "from", "state")
+    troubled = False
+    for kind in registry.KINDS:
+        for entry in registry.entries(kind):
+            now = state(entry)
+            troubled = troubled or now in {"broken", "shadowed"}
+            rows.add_row(kind, entry.name, entry.distribution, entry.version, entry.location, now)
+    put(rows)
+    if troubled:
+        print("cfx plugins check says what is wrong, and what to do.")
+
+
+def state(entry: registry.Entry) -> str:
+    """Returns what is known of a component without importing it: shadowed, broken, fine (used already) or not loaded."""
+    if registry.rivals(entry):
+        return "shadowed"
+    if registry.other_api(entry):
+        return "broken"
+    return "fine" if registry.is_loaded(entry) else "not loaded"
+
+
+def show(kind: str, name: str) -> None:
+    """Prints what a component is: where it comes from, what it does, its parameters and settings.
+
+    Raises:
+        PluginError: there is none of that name, or it cannot be loaded.
+    """
+    entry = registry.entry(kind, name)
+    cls: Any = registry.get(kind, name)
+    group = registry.kind_of(kind).group
+    print(f"{entry}\n{entry.location}\nChoose it with {group}={name}.\n")
+    if cls.deprecated:
+        print(f"Deprecated: {cls.deprecated}\n")
+    print(f"{inspect.getdoc(cls) or '(its class has no docstring)'}\n")
+    for line in _reference(cls):
+        print(f"{line}\n")
+    if entry.kind == "model":
+        put(_parameters(cls))
+    settings = table("setting", "default", "values", "meaning", title=f"Settings (set with {group}.SETTING=VALUE)")
+    for row in _settings(cls.schema, skip=["parameters"] if entry.kind == "model" else []):
+        settings.add_row(*row)
+    if settings.row_count:
+        put(settings)
+    else:
+        print("It has no settings.")
+
+
+def _reference(cls: type[Component]) -> Iterator[str]:
+    """Returns where a component comes from: a model says it itself, others in the docstring of their module."""
+    reference = getattr(cls, "reference", "")
+    if reference:
+        yield f"Reference: {reference}"
+        return
+    about = inspect.getdoc(inspect.getmodule(cls))
+    if about:
+        yield f"From its module: {about}"
+
+
+def _parameters(cls: Any) -> Table:
+    rows = table("parameter", "unit", "low", "high", "default", "tuned", "meaning", "source", title="Parameters")
+    for p in cls.parameters:
+        tuned = "yes" if p.tuned else "constant"
+        rows.add_row(p.name, p.unit, f"{p.low:g}", f"{p.high:g}", f"{p.default:g}", tuned, p.meaning, p.source)
+    rows.caption = "Change one with model.parameters.NAME.{low,high,default,tuned}=VALUE"
+    rows.caption_justify = "left"
+    return rows
+
+
+def _settings(schema: type[BaseModel], path: str = "", skip: Collection[str] = ()) -> Iterator[tuple[str, str, str, str]]:
+    for name, field in schema.model_fields.items():
+        if name in skip:
+            continue
+        default = None if field.is_required() else field.get_default(call_default_factory=True, validated_data={})
+        if isinstance(default, BaseModel):
+            yield from _settings(type(default), f"{path}{name}.")
+            continue
+        meaning = field.description or ""
+        if field.deprecated:
+            meaning = f"{meaning} (deprecated: {field.deprecation_message})".strip()
+        yield (
+            f"{path}{name}",
+            "required" if field.is_required() else json.dumps(to_jsonable_python(default)),
+            _values(field),
+            meaning,
+        )
+
+
+def _values(field: FieldInfo) -> str:
+    """Returns the type and the bounds that a setting must keep."""
+    kind: Any = field.annotation
+    words = " or ".join(_type(one) for one in get_args(kind)) if _is_union(kind) else _type(kind)
+    bounds = [f"{sign} {getattr(rule, key)}" for rule in field.metadata for key, sign in _SIGNS.items() if hasattr(rule, key)]
+    return ", ".join([words, *bounds])
+
+
+_SIGNS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
+
+
+def _is_union(kind: Any) -> bool:
+    return type(None) in get_args(kind)
+
+
+def _type(kind: Any) -> str:
+    if kind is type(None):
+        return "null"
+    choices = get_args(kind)
+    if choices and all(isinstance(choice, str) for choice in choices):
+        return "|".join(cast("tuple[str, ...]", choices))
+    return str(getattr(kind, "__name__", kind)) if not choices else str(kind).replace("typing.", "")

@@ -1,0 +1,193 @@
+"""What a new component must do before a job relies on it: a few steps on made-up input, some milliseconds, once.
+
+A probe catches what would otherwise end in a torch traceback, or in numbers that mean nothing, minutes later: the wrong shape or
+dtype, NaN, another number of parameters than declared. The whole contract of each kind is in `cfx.testing`; `cfx plugins check`
+runs its quick part. Datasets, learners and protocols have no probe: they do nothing before they are given something to work on,
+and their base classes check what they give.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NoReturn
+
+import torch
+from torch import Tensor
+
+from cfx.errors import PluginError
+from cfx.models.base import DrivingModel, Follower, Leader
+from cfx.optimizers.base import Optimizer
+from cfx.parameters import ParameterSpace
+from cfx.policies.base import Policy, PolicyNetwork
+from cfx.policies.features import token_width
+
+STATES = 24
+DT = 0.1
+NETWORKS, DRIVERS, WINDOWS, PARAMETERS, LENGTH = 3, 2, 4, 5, 5
+
+
+@torch.no_grad()
+def probe_model(model: DrivingModel) -> None:
+    """Takes one step from ordinary states, in double and in single precision, with parameters as the class declares them.
+
+    Raises:
+        PluginError: a speed or the memory has another shape or dtype than the states or is not finite, a speed is negative, or
+            the step reads other parameters than the class declares.
+    """
+    for dtype in (torch.float64, torch.float32):
+        follower, leader = _states(model, dtype)
+        p = _Noted(_values(model.parameters, dtype))
+        speed = model.next_speed(follower, leader, p, DT)
+        _require_tensor(speed, "next_speed", (STATES,), dtype, "(*batch,)")
+        wrong = ~(speed.isfinite() & (speed >= 0))
+        if bool(wrong.any()):
+            example = speed[wrong][0].item()
+            raise PluginError(
+                f"next_speed gives {example:g} m/s in {int(wrong.sum())} of {STATES} ordinary states; it must give finite speeds,"
+                " not negative"
+            )
+        memory = model.next_memory(follower, leader, p, DT, speed)
+        _require_tensor(memory, "next_memory", (STATES, model.memory_size), dtype, "(*batch, memory_size)")
+        if not bool(memory.isfinite().all()):
+            raise PluginError("next_memory gives a number that is not finite in an ordinary state")
+        _require_all_read(model, p)
+
+
+def _states(model: DrivingModel, dtype: torch.dtype) -> tuple[Follower, Leader]:
+    """Returns followers and leaders at a standstill, in a queue and on a free road."""
+    draw = torch.Generator().manual_seed(0)
+
+    def uniform(low: float, high: float) -> Tensor:
+        return low + (high - low) * torch.rand(STATES, generator=draw, dtype=torch.float64).to(dtype)
+
+    speed, leader_speed = uniform(0.0, 25.0), uniform(0.0, 25.0)
+    speed[:2] = 0.0
+    leader_speed[1:3] = 0.0
+    length = uniform(4.0, 6.0)
+    leader = Leader(uniform(100.0, 200.0), leader_speed, uniform(-1.0, 1.0), length)
+    memory = model.initial_memory(speed)
+    _require_tensor(memory, "initial_memory", (STATES, model.memory_size), dtype, "(*batch, memory_size)")
+    position = leader.position - length - 2.0 - 1.5 * speed - uniform(0.0, 30.0)
+    return Follower(position, speed, uniform(-1.0, 1.0), memory), leader
+
+
+def _values(space: ParameterSpace, dtype: torch.dtype) -> dict[str, Tensor]:
+    """Returns the defaults for the first half of the states, and values within the declared bounds for the others."""
+    unit = torch.rand((STATES, len(space)), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    unit[: STATES // 2] = space.to_unit(space.defaults())
+    return space.unpack(space.from_unit(unit).to(dtype))
+
+
+class _Noted(dict[str, Tensor]):
+    """Parameters by name, with a note of which were read; reading them all at once notes all."""
+
+    def __init__(self, values: dict[str, Tensor]) -> None:
+        super().__init__(values)
+        self.read: set[str] = set()
+
+    def __getitem__(self, name: str) -> Tensor:
+        self.read.add(name)
+        return super().__getitem__(name)
+
+    def __missing__(self, name: str) -> NoReturn:
+        raise PluginError(f"next_speed reads the parameter '{name}', which is not in its `parameters` ({', '.join(self)})")
+
+    def get(self, name: str, default: Any = None) -> Any:
+        self.read.add(name)
+        return super().get(name, default)
+
+    def __iter__(self) -> Iterator[str]:
+        self.read.update(super().keys())
+        return super().__iter__()
+
+    def keys(self) -> Any:
+        self.read.update(super().keys())
+        return super().keys()
+
+    def values(self) -> Any:
+        self.read.update(super().keys())
+        return super().values()
+
+    def items(self) -> Any:
+        self.read.update(super().keys())
+        return super().items()
+
+    def __or__(self, other: Any) -> Any:
+        self.read.update(super().keys())
+        return super().__or__(other)
+
+
+def _require_all_read(model: DrivingModel, p: _Noted) -> None:
+    """Holds a model in its default settings to the tuned parameters that it declares: each must matter."""
+    changed = [
+        name
+        for name, field in model.schema.model_fields.items()
+        if name != "parameters"
+        and (field.is_required() or model.settings.__dict__[name] != field.get_default(call_default_factory=True))
+    ]
+    if changed:  # a variant of a model may leave some out
+        return
+    unread = [name for name in model.parameters.names if name not in p.read]
+    if unread:
+        raise PluginError(
+            f"it declares {len(model.parameters)} tuned parameters ({', '.join(model.parameters.names)}), but next_speed never"
+            f" reads {', '.join(unread)}"
+        )
+
+
+@torch.no_grad()
+def probe_policy(policy: Policy) -> None:
+    """Builds a few networks and asks them about a few windows, in the precision in which a job uses them.
+
+    Raises:
+        PluginError: an answer or the state has another shape or dtype than it must have, or an answer is NaN or outside [0, 1].
+    """
+    # A learner trains in single precision; what needs no training drives in double, so that constants stay what they are.
+    dtype = torch.float32 if policy.trainable else torch.float64
+    draw = torch.Generator().manual_seed(0)
+    features = token_width(policy.inputs, policy.summary, LENGTH)
+    fixed = torch.rand((NETWORKS, PARAMETERS), generator=draw, dtype=dtype)
+    with torch.random.fork_rng(devices=[]):
+        network = policy.build(features, torch.full((PARAMETERS,), 0.5, dtype=dtype), fixed, draw)
+        if not isinstance(network, PolicyNetwork):
+            raise PluginError(f"build returns a {type(network).__name__} and no PolicyNetwork")
+        tokens = torch.randn((NETWORKS, DRIVERS, WINDOWS, features), generator=draw, dtype=dtype)
+        state = network.initial_state(NETWORKS, DRIVERS)
+        answer, after = network.eval()(tokens, state)
+    if not isinstance(state, Tensor) or state.dim() != 3 or state.shape[:2] != (NETWORKS, DRIVERS):
+        raise PluginError(f"initial_state gives {_shown(state)}; it must give (networks, drivers, s)")
+    _require_tensor(after, "the state after the last window", tuple(state.shape), state.dtype, "(networks, drivers, s)")
+    expected = (NETWORKS, DRIVERS, WINDOWS, PARAMETERS)
+    _require_tensor(answer, "forward", expected, dtype, "(networks, drivers, windows, parameters)")
+    if not bool(((answer >= 0) & (answer <= 1)).all()):  # written so that NaN fails too
+        raise PluginError("forward answers NaN or a number outside [0, 1]; parameters are chosen in unit space")
+
+
+def probe_optimizer(optimizer: Optimizer) -> None:
+    """Asks an optimizer for its numbers; what it finds is checked by `Optimizer.minimize`.
+
+    Raises:
+        PluginError: one of them is no whole number or out of range.
+    """
+    evaluations = _whole(optimizer.evaluations(), "evaluations()", least=1)
+    _whole(optimizer.evaluations_at_once(), "evaluations_at_once()", least=1)
+    _whole(optimizer.bytes_per_problem(PARAMETERS), "bytes_per_problem(n)", least=0)
+    if _whole(optimizer.space_filling(), "space_filling()", least=1) > evaluations:
+        raise PluginError(f"space_filling() gives more than the {evaluations} evaluations that evaluations() gives")
+
+
+def _whole(value: object, name: str, *, least: int) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+        raise PluginError(f"{name} gives {value!r}; it must give a whole number, at least {least}")
+    return value
+
+
+def _require_tensor(value: object, name: str, shape: tuple[int, ...], dtype: torch.dtype, letters: str) -> None:
+    if not isinstance(value, Tensor) or value.shape != shape:
+        raise PluginError(f"{name} gives {_shown(value)}; it must give {letters}, here {shape}")
+    if value.dtype != dtype:
+        raise PluginError(f"{name} gives {value.dtype} for {dtype}; a component computes in the dtype of what it is given")
+
+
+def _shown(value: object) -> str:
+    return f"the shape {tuple(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
