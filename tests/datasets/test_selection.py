@@ -58,6 +58,12 @@ def test_selects_a_recording_and_lanes() -> None:
     assert names(Ready(min_frames=2, lanes=[2, 3], recording="r")) == ["b", "c"]
 
 
+def test_selects_pairs_by_their_ids() -> None:
+    kept = Ready(min_frames=2, pair_ids=["d", "b"]).load()
+    assert [pair.pair_id for pair in kept] == ["b", "d"]
+    assert kept.dropped[-1] == Dropped("other pairs than data.pair_ids", 2)
+
+
 def test_every_pair_is_kept_or_counted() -> None:
     kept = Ready(min_frames=30, lanes=[3], max_pairs=1).load()
     assert len(kept) + sum(d.count for d in kept.dropped if d.unit == "pairs") == len(PAIRS)
@@ -71,6 +77,8 @@ def test_every_pair_is_kept_or_counted() -> None:
         ({"min_frames": 2, "recording": "othr"}, "no such recording. Did you mean 'other'? Known: r, other."),
         ({"min_frames": 2, "lanes": [9]}, "pairs in lanes 2, 3 only"),
         ({"min_frames": 2, "lanes": []}, "pairs in lanes 2, 3 only"),
+        ({"min_frames": 2, "pair_ids": ["bb"]}, "there is no pair 'bb'. Did you mean 'b'? Known: a, b, c, d."),
+        ({"min_frames": 2, "pair_ids": []}, "the list is empty. Known: a, b, c, d."),
     ],
 )
 def test_says_what_was_found_and_what_to_change(options: dict[str, object], said: str) -> None:
