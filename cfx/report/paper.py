@@ -175,13 +175,13 @@ def _cluster_verdicts(gains: Mapping[tuple[str, str], float]) -> list[str]:
     for model in dict.fromkeys(model for model, _ in known):
         low, high = known.get((model, CLUSTERS[0])), known.get((model, CLUSTERS[2]))
         if low is not None and high is not None:
-            do = "improve" if high > low else "do not improve"
-            verdicts.append(f"{model}: aggressive drivers {do} more than conservative ones here; they do in the paper.")
+            does = "fares better" if high > low else "fares no better"
+            verdicts.append(f"{model}: the policy {does} with aggressive than conservative drivers here; better in the paper.")
     for cluster in dict.fromkeys(cluster for _, cluster in known):
         krauss, w99 = known.get(("krauss", cluster)), known.get(("w99", cluster))
         if krauss is not None and w99 is not None:
-            does = "improves" if w99 > krauss else "does not improve"
-            verdicts.append(f"{cluster}: Wiedemann 99 {does} more than Krauss here; it does in the paper.")
+            does = "fares better" if w99 > krauss else "fares no better"
+            verdicts.append(f"{cluster}: the policy {does} with Wiedemann 99 than with Krauss here; better in the paper.")
     return verdicts
 
 

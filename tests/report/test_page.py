@@ -274,8 +274,8 @@ def test_the_papers_figures_stand_beside_those_of_its_experiments(tmp_path: Path
     assert "the search (here random; there Bayesian optimization)" in pairs.explanation
     _, metrics, page = clusters
     low, high = (metrics[f"w99 · {c}"]["rmse_improvement/population/mean"] or 0.0 for c in ("conservative", "aggressive"))
-    do = "improve" if high > low else "do not improve"
-    assert f"w99: aggressive drivers {do} more than conservative ones here; they do in the paper." in page.words
+    does = "fares better" if high > low else "fares no better"
+    assert f"w99: the policy {does} with aggressive than conservative drivers here; better in the paper." in page.words
 
 
 def test_the_best_of_a_grid_search_is_chosen_by_the_validation_loss(tmp_path: Path) -> None:
