@@ -138,7 +138,7 @@ def _content(runs: Runs, title: str | None) -> dict[str, Any]:
         "jobs": jobs,
         "common": common,
         "own": own,
-        "configs": [(job.name, job.place, yaml.safe_dump(dict(job.config), sort_keys=False, allow_unicode=True)) for job in jobs],
+        "configs": [(job.name, job.place, _configuration(job)) for job in jobs],
         "unfinished": runs.unfinished,
         "overview": overview(jobs),
         "errors": tables.errors(jobs),
@@ -240,7 +240,6 @@ def _facts(job: Job, jobs: Sequence[Job]) -> dict[str, str]:
     left_out = "; ".join(
         f"{one.get('count')} {one.get('unit')} ({one.get('reason')})" for one in dropped if isinstance(one, Mapping)
     )
-    notes = job.data.get("protocol")
     return {
         "Started": f"{job.started:%Y-%m-%d %H:%M}" if job.started else "not recorded",
         "Took": duration(job.seconds),
@@ -251,7 +250,7 @@ def _facts(job: Job, jobs: Sequence[Job]) -> dict[str, str]:
         "Left out": left_out or "nothing",
         "Test frames of a pair": _range(table["frames"]),
         "Drivers by style": str(job.setting("style.cluster") or NOTHING),
-        "Protocol": _protocol(job) + (f"; {_listed(notes)}" if isinstance(notes, Mapping) and notes else ""),
+        "Protocol": _protocol(job),
         "Driving model": job.component("model") or NOTHING,
         "Policy": f"{job.component('policy')}, learned by {job.component('learner')}",
         "Calibrated by": job.component("optimizer") or NOTHING,
@@ -291,14 +290,19 @@ def _protocol(job: Job) -> str:
     train, test = (f"{100 * share:.3g} %" for share in (job.split, 1 - job.split))
     said = {
         "within_driver": f"calibrated and learned on the first {train} of each pair, tested on the last {test}",
-        "across_drivers": f"trained on some drivers and tested on others, {job.setting('protocol.folds')} folds; the driver's own"
-        f" fixed parameters come from the first {train} of his drive, the test part is the last {test}",
+        "across_drivers": f"trained on some drivers and tested on others, none of whom is, as follower, in both;"
+        f" {job.setting('protocol.folds')} folds; the driver's own fixed parameters come from the first {train} of his drive,"
+        f" the test part is the last {test}",
     }
     return f"{name}: {said[name]}" if name in said else name
 
 
-def _listed(values: Mapping[str, Any]) -> str:
-    return ", ".join(f"{str(name).replace('_', ' ')}: {value}" for name, value in values.items())
+def _configuration(job: Job) -> str:
+    """Returns the configuration as YAML, after what the protocol noted of its design."""
+    notes = job.data.get("protocol")
+    noted = notes if isinstance(notes, Mapping) else {}
+    design = "".join(f"# {str(name).replace('_', ' ')}: {value}\n" for name, value in noted.items())
+    return design + str(yaml.safe_dump(dict(job.config), sort_keys=False, allow_unicode=True))
 
 
 def duration(seconds: float | None) -> str:
