@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import inspect
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -68,6 +69,11 @@ class Component:
             "settings": self.settings.model_dump(mode="json"),
             "code": folder_hash(inspect.getfile(type(self))),
         }
+
+
+def content_key(description: Any) -> str:
+    """Returns the SHA-256 of a description that JSON can say; other values count as what `str` makes of them."""
+    return hashlib.sha256(json.dumps(description, sort_keys=True, default=str).encode()).hexdigest()
 
 
 @functools.cache

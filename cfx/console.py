@@ -1,9 +1,13 @@
-"""What a job says while it runs: plain messages, coloured by weight on a terminal."""
+"""What a person reads: plain messages while a job runs, coloured by weight on a terminal, and tables."""
 
 from __future__ import annotations
 
 import logging
 import sys
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 
 class ConsoleHandler(logging.Handler):
@@ -31,3 +35,21 @@ def _say(message: str, level: int) -> None:
 
     style = "red" if level >= logging.ERROR else "yellow" if level >= logging.WARNING else None
     Console(file=stream).print(message, style=style, markup=False, highlight=False, soft_wrap=True)
+
+
+def blank_table(*columns: str, title: str | None = None) -> Table:
+    """Returns a table with these columns and no rows."""
+    from rich import box
+    from rich.table import Table
+
+    made = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
+    for column in columns:
+        made.add_column(column, overflow="fold")
+    return made
+
+
+def put(table: Table) -> None:
+    """Prints a table; in a file or a pipe nothing is folded, so that lines stay whole for grep."""
+    from rich.console import Console
+
+    Console(width=None if sys.stdout.isatty() else 400, markup=False).print(table)

@@ -15,7 +15,6 @@ import contextlib
 import copy
 import csv
 import glob
-import hashlib
 import json
 import logging
 import math
@@ -25,11 +24,11 @@ import shlex
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, ClassVar, Self, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
 
 from filelock import FileLock, Timeout
 from hydra.core.global_hydra import GlobalHydra
@@ -38,9 +37,14 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
+from cfx.component import content_key
+from cfx.console import blank_table, put
 from cfx.errors import ConfigError
 from cfx.files import whole
 from cfx.hydra_source import resolving
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 log = logging.getLogger(__name__)
 
@@ -222,8 +226,9 @@ class Sweep:
             lines = self._tracked() if outcomes or interrupted else ()
             if not outcomes:
                 return self._nothing(code, interrupted=interrupted)
-            write_summary(self.folder / SUMMARY, outcomes)
-            _print(summary_table(outcomes))
+            table = rows(outcomes)
+            write_summary(self.folder / SUMMARY, table)
+            put(summary_table(table))
             code = self._tell(outcomes, code)
             if any(outcome.code == 0 for outcome in outcomes.values()):
                 for line in (*lines, f"Report of the whole sweep: python -m cfx report {shlex.quote(str(self.folder))}"):
@@ -358,14 +363,14 @@ def fingerprint(values: Mapping[str, Any]) -> str:
             found = Path(str(path)).expanduser().stat()
             state = [found.st_size, found.st_mtime_ns]
     parts = {"config": values, "cfx": provenance.version(), "plugins": provenance.distributions(values), "data": state}
-    return _digest(parts)
+    return content_key(parts)
 
 
 def job_name(_root_: Any) -> str:
     """Returns the end of a job folder's name, the same for the same overrides in any order: `${cfx_job:}` in Hydra's config."""
     task: Any = OmegaConf.to_container(_root_.hydra.overrides.task, resolve=False)
     given = {one.partition("=")[0]: one for one in task}  # where a key is given twice the last one counts
-    return _digest([sorted(given.values()), *_sources(_root_)])[:8]
+    return content_key([sorted(given.values()), *_sources(_root_)])[:8]
 
 
 OmegaConf.register_new_resolver("cfx_job", job_name, replace=True)
@@ -409,27 +414,20 @@ def rows(outcomes: Mapping[Path, Outcome]) -> list[dict[str, Any]]:
     return table
 
 
-def write_summary(path: Path, outcomes: Mapping[Path, Outcome]) -> None:
+def write_summary(path: Path, table: Sequence[Mapping[str, Any]]) -> None:
     """Writes `rows` as CSV; a cell without a value is empty."""
-    table = rows(outcomes)
     with whole(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, list(table[0]))
         writer.writeheader()
         writer.writerows(table)
 
 
-def summary_table(outcomes: Mapping[Path, Outcome]) -> Any:
+def summary_table(table: Sequence[Mapping[str, Any]]) -> Table:
     """Returns `rows` as a rich table."""
-    from rich import box
-    from rich.table import Table
-
-    table = rows(outcomes)
     over = {row["improvement_over"] for row in table} - {""}
     several = len(over) > 1
     columns = [key for key in table[0] if key not in _FIXED_COLUMNS]
-    shown = Table(box=box.SIMPLE_HEAD, title="The sweep", title_justify="left")
-    for column in columns or ["job"]:
-        shown.add_column(column, overflow="fold")
+    shown = blank_table(*(columns or ["job"]), title="The sweep")
     heading = f"improvement over {min(over)}" if len(over) == 1 else "improvement"
     shown.add_column(f"{heading}\n(95 % interval)", justify="right")
     for name in ("default", "fixed", "policy"):
@@ -471,13 +469,6 @@ def _number(value: float | None) -> str:
     return "" if value is None else f"{value:.3f}"
 
 
-def _print(table: Any) -> None:
-    from rich.console import Console
-
-    # In a file or a pipe nothing is folded: lines stay whole for grep.
-    Console(width=None if sys.stdout.isatty() else 400, markup=False).print(table)
-
-
 def _command(config: DictConfig) -> tuple[tuple[str, ...], str, int | None]:
     """Returns what was asked for: as typed, as a hash that knows no order, and how many jobs that makes.
 
@@ -496,7 +487,7 @@ def _command(config: DictConfig) -> tuple[tuple[str, ...], str, int | None]:
             values[key] = [str(override.input_line)]
     basic = str(sweeper.get("_target_", "")).endswith(".BasicSweeper")
     jobs = math.prod(len(set(one)) for one in values.values()) if basic else None
-    return (*typed["task"], *typed["hydra"]), _digest([values, sweeper, *_sources(config)]), jobs
+    return (*typed["task"], *typed["hydra"]), content_key([values, sweeper, *_sources(config)]), jobs
 
 
 def _tracking(config: DictConfig) -> dict[str, Any]:
@@ -593,10 +584,6 @@ def _is_in(job: Path, sweep: Path) -> bool:
 
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="microseconds")
-
-
-def _digest(value: Any) -> str:
-    return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def _write_json(path: Path, values: Mapping[str, Any]) -> None:

@@ -11,7 +11,6 @@ another has claimed for later. The operating system frees a claim when its proce
 from __future__ import annotations
 
 import hashlib
-import json
 import logging
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -35,11 +34,6 @@ _SHARES = 32
 
 _POLL_S = 0.2
 """Seconds between two looks at a claim of another process."""
-
-
-def content_key(parts: Mapping[str, Any]) -> str:
-    """Returns the SHA-256 of a JSON-able description."""
-    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
 
 
 class Cache:

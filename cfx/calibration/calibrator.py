@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from cfx import simulation
-from cfx.calibration.cache import Arrays, Cache, content_key
+from cfx.calibration.cache import Arrays, Cache
 from cfx.calibration.objective import DriveObjective, JointObjective
 from cfx.calibration.windows import Windows
-from cfx.component import folder_hash
+from cfx.component import content_key, folder_hash
 from cfx.optimizers.base import Optimizer, Progress
 from cfx.pairs import PairBatch, PairSet
 from cfx.progress import Task

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from cfx import nodes, registry
 from cfx.component import API_VERSION
+from cfx.console import blank_table, put
 from cfx.errors import CfxError, ConfigError
-from cfx.plugins.tables import put, table
 from cfx.progress import Task
 
 
@@ -48,7 +48,7 @@ def check(kind: str | None = None, name: str | None = None) -> int:
         for entry in chosen:
             verdicts.append(examine(entry))
             task.advance()
-    rows = table("kind", "name", "distribution", "version", "from", "state")
+    rows = blank_table("kind", "name", "distribution", "version", "from", "state")
     for one in verdicts:
         entry = one.entry
         rows.add_row(entry.kind, entry.name, entry.distribution, entry.version, entry.location, one.state)

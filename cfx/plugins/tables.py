@@ -4,37 +4,22 @@ from __future__ import annotations
 
 import inspect
 import json
-import sys
 from collections.abc import Collection, Iterator
 from typing import Any, cast, get_args
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import to_jsonable_python
-from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from cfx import registry
 from cfx.component import Component
-
-
-def table(*columns: str, title: str | None = None) -> Table:
-    """Returns an empty table."""
-    made = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
-    for column in columns:
-        made.add_column(column, overflow="fold")
-    return made
-
-
-def put(rows: Table) -> None:
-    """Prints a table; in a file or a pipe nothing is folded, so that lines stay whole for grep."""
-    Console(width=None if sys.stdout.isatty() else 400, markup=False).print(rows)
+from cfx.console import blank_table, put
 
 
 def overview() -> None:
     """Prints a row for every component. Imports none."""
-    rows = table("kind", "name", "distribution", "version", "from", "state")
+    rows = blank_table("kind", "name", "distribution", "version", "from", "state")
     troubled = False
     for kind in registry.KINDS:
         for entry in registry.entries(kind):
@@ -72,7 +57,7 @@ def show(kind: str, name: str) -> None:
         print(f"{line}\n")
     if entry.kind == "model":
         put(_parameters(cls))
-    settings = table("setting", "default", "values", "meaning", title=f"Settings (set with {group}.SETTING=VALUE)")
+    settings = blank_table("setting", "default", "values", "meaning", title=f"Settings (set with {group}.SETTING=VALUE)")
     for row in _settings(cls.schema, skip=["parameters"] if entry.kind == "model" else []):
         settings.add_row(*row)
     if settings.row_count:
@@ -93,7 +78,7 @@ def _reference(cls: type[Component]) -> Iterator[str]:
 
 
 def _parameters(cls: Any) -> Table:
-    rows = table("parameter", "unit", "low", "high", "default", "tuned", "meaning", "source", title="Parameters")
+    rows = blank_table("parameter", "unit", "low", "high", "default", "tuned", "meaning", "source", title="Parameters")
     for p in cls.parameters:
         tuned = "yes" if p.tuned else "constant"
         rows.add_row(p.name, p.unit, f"{p.low:g}", f"{p.high:g}", f"{p.default:g}", tuned, p.meaning, p.source)

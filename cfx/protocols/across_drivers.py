@@ -79,19 +79,14 @@ class AcrossDrivers(Protocol):
         network = fold.to(device)
         own = torch.arange(len(pairs), device=device)
         first, start = split.frame.to(device), torch.zeros_like(own)
-        default = study.constant(DefaultPolicy(), population)
-        of_others = study.constant(FixedPolicy(), population)
-        loops = {
-            "default": drive(study.simulator, default, batch, first, network),
-            "population": drive(study.simulator, of_others, batch, first, network),
-            "fixed": drive(study.simulator, study.constant(FixedPolicy(), fixed), batch, first, own),
-            "policy": drive(study.simulator, policy, batch, first, network),
+        strangers = {
+            "default": study.constant(DefaultPolicy(), population),
+            "population": study.constant(FixedPolicy(), population),
+            "policy": policy,
         }
-        whole_loops = {
-            "default": drive(study.simulator, default, batch, start, network),
-            "population": drive(study.simulator, of_others, batch, start, network),
-            "policy": drive(study.simulator, policy, batch, start, network),
-        }
+        loops = {name: drive(study.simulator, one, batch, first, network) for name, one in strangers.items()}
+        loops["fixed"] = drive(study.simulator, study.constant(FixedPolicy(), fixed), batch, first, own)
+        whole_loops = {name: drive(study.simulator, one, batch, start, network) for name, one in strangers.items()}
         evaluation = evaluate(
             pairs, batch, first, loops, policy.space, study.style, seed=study.seed, fold=fold, whole=whole_loops
         )

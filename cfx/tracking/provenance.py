@@ -66,7 +66,7 @@ def distributions(values: Mapping[str, Any]) -> dict[str, str]:
         node = values.get(kind.group)
         if isinstance(node, Mapping) and "name" in node:
             entry = registry.entry(kind.name, str(node["name"]))
-            if entry.distribution != "cfx-driving":
+            if entry.distribution != registry.OWN:
                 found[entry.distribution] = entry.version
     return found
 

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from cfx.calibration.cache import Cache, content_key
+from cfx.calibration.cache import Cache
+from cfx.component import content_key
 from cfx.errors import OutputError
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -20,7 +20,7 @@ from cfx.datasets.synthetic import SyntheticDataset
 from cfx.evaluation.closed_loop import drive
 from cfx.learners.base import CURVE_COLUMNS, Learned, Learner, Lesson
 from cfx.models.krauss import Krauss
-from cfx.pairs import PairBatch, PairSet
+from cfx.pairs import SIGNALS, PairBatch, PairSet
 from cfx.policies.features import token_width
 from cfx.policies.gru import GruPolicy
 from cfx.policies.trained import TrainedPolicy, measured_history
@@ -30,15 +30,6 @@ from cfx.testing.contract import contract_of
 PAIRS, FRAMES = 3, 126
 WINDOWS = WindowSettings()
 _POLICY = GruPolicy(hidden_size=8)
-_SIGNALS = (
-    "leader_position",
-    "leader_speed",
-    "leader_acceleration",
-    "follower_position",
-    "follower_speed",
-    "follower_acceleration",
-    "gap",
-)
 
 
 @cache
@@ -143,8 +134,7 @@ def reads_no_frame_after_the_training_part(learner: Learner) -> None:
     frames = torch.arange(material.batch.mask.shape[1])
     secret = frames > material.split.frame[:, None]
     changed: dict[str, Any] = {
-        name: torch.where(secret, 3.0 + 0.5 * getattr(material.batch, name), getattr(material.batch, name))
-        for name in _SIGNALS[:-1]
+        name: torch.where(secret, 3.0 + 0.5 * getattr(material.batch, name), getattr(material.batch, name)) for name in SIGNALS
     }
     poisoned = replace(material, batch=replace(material.batch, **changed))
     one, two = _state(_fitted(learner, material)), _state(learner.fit(_POLICY, poisoned))
@@ -176,7 +166,7 @@ def the_lesson_stays_as_it_is(learner: Learner) -> None:
     material, untouched = lesson(needs_labels=learner.needs_labels), lesson(needs_labels=learner.needs_labels)
     learner.fit(_POLICY, material)
     message = "must not be changed in place: the protocol still needs it for the evaluation"
-    for name in _SIGNALS:
+    for name in (*SIGNALS, "gap"):
         torch.testing.assert_close(
             getattr(material.batch, name), getattr(untouched.batch, name), rtol=0, atol=0, msg=f"lesson.batch.{name} {message}"
         )
