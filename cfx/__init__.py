@@ -96,8 +96,8 @@ __all__ = [  # noqa: PLE0604 - the public names, from the one table that also sa
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
         value = getattr(import_module(_HOMES[name]), name)
-    elif name == "errors":
-        value = import_module("cfx.errors")
+    elif name in {"errors", "sumo"}:
+        value = import_module(f"cfx.{name}")
     elif name == "__version__":
         value = _version()
     else:

@@ -1,7 +1,7 @@
 """The command line: `cfx` and `python -m cfx`.
 
-`plugins`, `data`, `report` and `ui` are plain sub-commands; everything else goes to the Hydra application. Nothing heavy is
-imported here.
+`plugins`, `data`, `report`, `ui`, `drive` and `export` are plain sub-commands; everything else goes to the Hydra application.
+Nothing heavy is imported here.
 """
 
 from __future__ import annotations
@@ -109,4 +109,41 @@ def _report(arguments: Sequence[str]) -> int:
     return 0
 
 
-_COMMANDS = {"plugins": _plugins, "data": _data, "report": _report, "ui": _ui}
+def _drive(arguments: Sequence[str]) -> int:
+    parser = argparse.ArgumentParser(
+        "cfx drive",
+        description="Runs a SUMO scenario in which policies drive the vehicles of some vTypes.",
+        epilog="What follows -- goes to SUMO as it is: cfx drive city.sumocfg --drivers calm=RUN -- --step-length 0.1",
+    )
+    parser.add_argument("scenario", help="SUMO's configuration, .sumocfg")
+    parser.add_argument("--drivers", nargs="+", required=True, metavar="TYPE=RUN", help="a vType, and who drives it: a job")
+    parser.add_argument("--end", type=float, metavar="SECONDS", help="of simulated time; default: the scenario's")
+    parser.add_argument("--seed", type=int, help="SUMO's; default: the scenario's")
+    parser.add_argument("--output", metavar="FILE", help="CSV: where each driven vehicle is at each step, and its parameters")
+    parser.add_argument("--look-ahead", type=float, default=200.0, metavar="METRES", help="farther is no leader; default: 200")
+    parser.add_argument(
+        "--speed-mode", type=int, default=0, help="SUMO's bit set; 0 (default): exact; 31: SUMO's own checks bound each speed"
+    )
+    given = list(arguments)
+    cut = given.index("--") if "--" in given else len(given)
+    options = parser.parse_args(given[:cut])
+    from cfx.sumo.command import drive_scenario
+
+    drive_scenario(options, given[cut + 1 :])
+    return 0
+
+
+def _export(arguments: Sequence[str]) -> int:
+    parser = argparse.ArgumentParser("cfx export", description="Writes a job's fixed parameters for another program.")
+    parser.add_argument("run", metavar="RUN", help="output folder of a job, or id of its MLflow run")
+    parser.add_argument("--to", choices=["sumo"], required=True, help="sumo: a vType distribution for each cluster (.add.xml)")
+    parser.add_argument("--output", metavar="FILE", help="default: drivers.add.xml in the job's folder; for an MLflow run: here")
+    options = parser.parse_args(list(arguments))
+    from cfx.sumo.export import export
+
+    for line in export(options.run, options.output):
+        print(line)
+    return 0
+
+
+_COMMANDS = {"plugins": _plugins, "data": _data, "report": _report, "ui": _ui, "drive": _drive, "export": _export}

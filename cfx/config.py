@@ -11,7 +11,8 @@ from pydantic import Field, field_validator
 
 from cfx.calibration.settings import WindowSettings
 from cfx.component import Settings, validate
-from cfx.errors import ConfigError
+from cfx.errors import ConfigError, nearest
+from cfx.simulation.settings import SIMULATORS, MemorySettings, SumoSettings
 from cfx.style.settings import StyleSettings
 
 Node = dict[str, Any]
@@ -47,6 +48,17 @@ class FigureSettings(Settings):
     enabled: bool = Field(True, description="write figures")
 
 
+class DemoSettings(Settings):
+    """The demonstration in SUMO that follows a job."""
+
+    enabled: bool = Field(False, description="show the job's drives on a motorway in SUMO; into the folder `sumo` of the job's")
+    osm: Path | None = Field(
+        None,
+        description="an OpenStreetMap extract of your own (.osm.xml), or a SUMO network (.net.xml); null: a hand-made motorway",
+    )
+    pairs: int = Field(6, ge=1, description="pairs at most, spread evenly from the best to the worst improvement")
+
+
 class JobConfig(Settings):
     """Everything that one job needs to know; `conf/config.yaml` says the same in YAML."""
 
@@ -57,6 +69,7 @@ class JobConfig(Settings):
     optimizer: Node = Field(description="the optimizer's node")
     learner: Node = Field(description="the learner's node")
     protocol: Node = Field(description="the protocol's node")
+    simulator: MemorySettings | SumoSettings = Field(MemorySettings(), description="what takes the steps")
     seed: int = Field(0, ge=0, lt=2**32, description="seed of everything random")
     device: str = Field("auto", description="auto, cpu, cuda or cuda:N")
     dtype: Literal["float32", "float64"] = Field("float64", description="precision of simulations")
@@ -68,6 +81,7 @@ class JobConfig(Settings):
     cache: CacheSettings = Field(CacheSettings(), description="cache of calibrations")
     tracking: TrackingSettings = Field(TrackingSettings(), description="MLflow")
     figures: FigureSettings = Field(FigureSettings(), description="figures")
+    demo: DemoSettings = Field(DemoSettings(), description="demonstration in SUMO")
 
     @field_validator("device")
     @classmethod
@@ -75,6 +89,16 @@ class JobConfig(Settings):
         if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", device):
             raise ValueError("choose auto, cpu, cuda or cuda:N")
         return device
+
+    @field_validator("simulator", mode="before")
+    @classmethod
+    def _chosen(cls, node: Any) -> Any:
+        if not isinstance(node, Mapping):
+            return node
+        name = str(node.get("name"))
+        if name not in SIMULATORS:
+            raise ValueError(f"there is no simulator '{name}'.{nearest(name, SIMULATORS)} Known: {', '.join(SIMULATORS)}")
+        return validate(SIMULATORS[name], node, where="simulator")
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> JobConfig:

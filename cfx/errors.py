@@ -36,6 +36,10 @@ class OutputError(CfxError):
     """A result cannot be written."""
 
 
+class SumoError(CfxError):
+    """SUMO is missing, or does not do what is asked of it."""
+
+
 def nearest(name: str, choices: Iterable[str]) -> str:
     """Returns " Did you mean 'x'?" for the nearest of `choices`, or "" if none is near."""
     close = difflib.get_close_matches(name, list(choices), n=1, cutoff=0.5)

@@ -6,10 +6,12 @@ evaluates it; tracking keeps what came out.
 
 from __future__ import annotations
 
+import functools
 import json
 import logging
 import math
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -32,13 +34,16 @@ from cfx.files import whole
 from cfx.learners.base import Learner
 from cfx.learners.curves import best_losses
 from cfx.models.base import DrivingModel
+from cfx.models.vtype import SumoOnly
 from cfx.optimizers.base import Optimizer
 from cfx.pairs import PairBatch, PairSet
 from cfx.policies.base import Policy
 from cfx.policies.trained import TrainedPolicy
 from cfx.progress import Task
 from cfx.protocols.base import Outcome, Protocol, Study
+from cfx.simulation.base import BaseSimulator
 from cfx.simulation.rollout import Simulator
+from cfx.simulation.settings import SumoSettings
 from cfx.style.entropy import measure_style, select_cluster
 from cfx.style.result import StyleResult
 from cfx.tracking.provenance import version
@@ -97,13 +102,18 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
     _write(folder / "config.yaml", yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
     with Tracker.open(config, folder) as tracker:
         pairs, style = _pairs(parts.dataset, config)
+        if config.demo.enabled:
+            from cfx.sumo.demo import check_demo
+
+            check_demo(config.demo, pairs)
         tracker.set_tags(
             {"dataset.fingerprint": pairs.fingerprint, "dataset.source": pairs.source, "dataset.pairs": str(len(pairs))}
         )
         study = _study(config, parts, pairs, style, device)
-        outcome = _outcome(parts.protocol, study)
+        with closing(study.simulator):
+            outcome = _outcome(parts.protocol, study)
         result = _keep(config, folder, pairs, style, outcome, tracker)
-    report(result, outcome.evaluation, console, tracker)
+    report(result, outcome.evaluation, console, tracker, follows=parts.model.follows)
     return result
 
 
@@ -123,9 +133,11 @@ class _Parts:
 
     @classmethod
     def of(cls, config: JobConfig) -> _Parts:
+        model = cast(DrivingModel, registry.create("model", config.model))
+        check_simulator(config, model)
         return cls(
             dataset=cast(Dataset, registry.create("dataset", config.data)),
-            model=cast(DrivingModel, registry.create("model", config.model)),
+            model=model,
             optimizer=cast(Optimizer, registry.create("optimizer", config.optimizer)),
             policy=cast(Policy, registry.create("policy", config.policy)),
             learner=cast(Learner, registry.create("learner", config.learner)),
@@ -155,7 +167,7 @@ def _pairs(dataset: Dataset, config: JobConfig) -> tuple[PairSet, StyleResult]:
 
 def _study(config: JobConfig, parts: _Parts, pairs: PairSet, style: StyleResult, device: torch.device) -> Study:
     batch = PairBatch.of(pairs, dtype=getattr(torch, config.dtype), device=device)
-    simulator = Simulator(parts.model, batch.dt, compile=config.simulation.compile)
+    simulator = make_simulator(config, parts.model, batch.dt)
     calibrator = Calibrator(
         simulator,
         parts.optimizer,
@@ -177,7 +189,33 @@ def _study(config: JobConfig, parts: _Parts, pairs: PairSet, style: StyleResult,
         windows=config.windows,
         split=config.split,
         seed=config.seed,
+        workspace=Path(config.cache.folder).expanduser() / "training" if config.cache.enabled else None,
     )
+
+
+def check_simulator(config: JobConfig, model: DrivingModel) -> None:
+    """Checks that the chosen simulator can drive a model, before any work begins.
+
+    Raises:
+        ConfigError: it cannot; says what to choose.
+        SumoError: SUMO is not installed, or another version.
+    """
+    if isinstance(config.simulator, SumoSettings):
+        from cfx.sumo.simulator import require_in_sumo
+
+        require_in_sumo(model)
+    elif isinstance(model, SumoOnly):
+        name = config.model.get("name")
+        raise ConfigError(f"model={name} has no equations in Python, SUMO alone drives it; add simulator=sumo")
+
+
+def make_simulator(config: JobConfig, model: DrivingModel, dt: float) -> BaseSimulator:
+    """Returns the simulator that a configuration chooses."""
+    if isinstance(config.simulator, SumoSettings):
+        from cfx.sumo.simulator import SumoSimulator
+
+        return SumoSimulator(model, dt, config.simulator)
+    return Simulator(model, dt, compile=config.simulation.compile)
 
 
 def _outcome(protocol: Protocol, study: Study) -> Outcome:
@@ -202,12 +240,19 @@ def _keep(config: JobConfig, folder: Path, pairs: PairSet, style: StyleResult, o
         written.file("labels.parquet", lambda path: labels.to_parquet(path, index=False))
     if any(pair.truth for pair in pairs):
         written.file("data.parquet", lambda path: write_tidy(pairs, path))
+    further = _further(evaluation, written)
     written.run(lambda: outcome.policy.save(folder / "policy"))
     figures: list[Path] = []
     if config.figures.enabled:
         from cfx.figures.write import write_figures
 
         written.run(lambda: figures.extend(write_figures(folder / "figures", evaluation, style, outcome.curves)))
+    demo: list[Path] = []
+    if config.demo.enabled:
+        from cfx.sumo.demo import write_demo
+
+        saved = folder / "policy"
+        written.run(lambda: demo.extend(write_demo(folder / "sumo", saved, pairs, outcome.policy, evaluation, config)))
     provenance = {
         "source": pairs.source,
         "fingerprint": pairs.fingerprint,
@@ -218,6 +263,7 @@ def _keep(config: JobConfig, folder: Path, pairs: PairSet, style: StyleResult, o
             {"name": name, "unit": unit, "low": float(low), "high": float(high)}
             for name, unit, low, high in zip(evaluation.names, evaluation.units, *evaluation.bounds, strict=True)
         ],
+        "follows": cast(DrivingModel, registry.create("model", config.model)).follows,
         "cfx": version(),
     }
     written.file("data.json", lambda path: _dump(provenance, path))
@@ -229,12 +275,26 @@ def _keep(config: JobConfig, folder: Path, pairs: PairSet, style: StyleResult, o
     tracker.log_curves(outcome.curves)
     tracker.log_figures(figures)
     tracker.log_policy(folder / "policy")
-    tracker.log_files([folder / name for name in _TRACKED])
+    tracker.log_files([*(folder / name for name in _TRACKED), *further, *demo])
     return JobResult(metrics, evaluation.table, outcome.policy, tuple(figures), folder, tracker.run_id, evaluation, style)
 
 
-def report(result: JobResult, evaluation: Evaluation, console: Console, tracker: Tracker) -> None:
-    """Prints the table, where the results are and how to open them."""
+def _further(evaluation: Evaluation, written: _Output) -> list[Path]:
+    """Writes the tables that only some protocols deliver; returns their paths. Those that an earlier job left there go."""
+    platoon = evaluation.platoon.table if evaluation.platoon is not None else None
+    paths = []
+    for name, table in {"platoon.parquet": platoon, "history.parquet": evaluation.history}.items():
+        path = written.folder / name
+        if table is None:
+            written.run(functools.partial(path.unlink, missing_ok=True))
+        else:
+            written.file(name, functools.partial(table.to_parquet, index=False))
+            paths.append(path)
+    return paths
+
+
+def report(result: JobResult, evaluation: Evaluation, console: Console, tracker: Tracker, *, follows: bool = True) -> None:
+    """Prints the table, where the results are and how to open them; `follows` as `DrivingModel.follows`."""
     table = Table(
         title=f"{len(evaluation.drives)} pair{'s' * (len(evaluation.drives) != 1)}, test part in closed loop",
         title_justify="left",
@@ -250,11 +310,16 @@ def report(result: JobResult, evaluation: Evaluation, console: Console, tracker:
         values = [f"{m[f'{key}/{method}']:.3f}" if f"{key}/{method}" in m else "" for key in columns.values()]
         table.add_row(method, *values, f"{m[f'collisions/{method}']:.0f}")
     console.print(table)
-    _tell(evaluation.improvement, "fixed", console)
-    if "population" in evaluation.improvements:
-        _tell(evaluation.improvements["population"], "population", console)
-    if "population" in evaluation.whole_improvements:
-        _tell(evaluation.whole_improvements["population"], "population on whole drives", console)
+    if not follows:
+        text = "With constant parameters the model follows no leader: compare the policy's RMSE with other jobs'."
+        console.print(text, soft_wrap=True)
+    else:
+        _tell(evaluation.improvement, "fixed", console)
+        if "population" in evaluation.improvements:
+            _tell(evaluation.improvements["population"], "population", console)
+        if "population" in evaluation.whole_improvements:
+            _tell(evaluation.whole_improvements["population"], "population on whole drives", console)
+    _warn(evaluation, m, console)
     console.print(f"Results: {result.folder}", soft_wrap=True, highlight=False)
     for line in tracker.how_to_open():
         console.print(line, soft_wrap=True, highlight=False)
@@ -272,6 +337,20 @@ def _tell(i: Improvement, baseline: str, console: Console) -> None:
     )
     if i.undefined:
         console.print(f"{i.undefined} pairs have no improvement: a drive diverged, or {baseline} drives without any error.")
+
+
+def _warn(evaluation: Evaluation, metrics: Mapping[str, float], console: Console) -> None:
+    """Prints a line about what is not safe or not free in what was driven; nothing if there is nothing."""
+
+    def listed(name: str, least: float, form: str) -> str:
+        found = {method: metrics.get(f"{name}/{method}", 0.0) for method in evaluation.methods}
+        return ", ".join(f"{method} {value:{form}}" for method, value in found.items() if value >= least)
+
+    braking, stuck = listed("hard_braking", 1, ".0f"), metrics.get("at_bounds/policy", 0.0) >= 0.01
+    said = [f"Frames with an acceleration below -8 m/s2: {braking}."] if braking else []
+    said += [f"Parameters at their bounds: {listed('at_bounds', 0.01, '.0%')}."] if stuck else []
+    if said:
+        console.print(" ".join(said), soft_wrap=True, highlight=False)
 
 
 def _curves(curves: pd.DataFrame) -> pd.DataFrame:

@@ -47,7 +47,7 @@ def render(cls: type[Component], name: str) -> str:
     lines = [*_comment(_summary(cls)), f"name: {_scalar(name)}"]
     lines += _settings(cls.schema, {}, skip={"parameters"} if isinstance(space, ParameterSpace) else set())
     if isinstance(space, ParameterSpace):
-        lines.append("parameters:")
+        lines.append("parameters:" if space.parameters else "parameters: null  # required: {NAME: {low: , high: , default: }}")
         for parameter in space:
             lines += [f"  {line}" for line in _parameter(parameter)]
     return "\n".join(lines) + "\n"

@@ -73,6 +73,10 @@ class ParameterOverride(Settings):
 class ParameterSpace:
     """An ordered set of parameters.
 
+    Attributes:
+        parameters: in order.
+        open: a config may add parameters that it names, with both bounds and the default.
+
     Example:
         >>> space = ParameterSpace.of(Parameter("tau", "s", 0.5, 3.0, 1.0, "time headway"))
         >>> space.names
@@ -80,6 +84,7 @@ class ParameterSpace:
     """
 
     parameters: tuple[Parameter, ...]
+    open: bool = False
     _by_name: dict[str, Parameter] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -119,15 +124,19 @@ class ParameterSpace:
         Raises:
             ParameterError: an unknown name, or bounds and default that contradict each other.
         """
-        for name in changes:
-            self[name]
+        added = [name for name in changes if name not in self._by_name]
+        for name in added:
+            if not self.open:
+                self[name]
         merged = tuple(
             replace(parameter, **changes[parameter.name].model_dump(exclude_none=True))
             if parameter.name in changes
             else parameter
             for parameter in self.parameters
         )
-        space = ParameterSpace(merged)
+        space = ParameterSpace((*merged, *(_added(name, changes[name]) for name in added)))
+        if not space.parameters:
+            raise ParameterError("give the parameters, such as model.parameters='{tau: {low: 0.5, high: 3, default: 1}}'")
         if not space.tuned:
             raise ParameterError("no parameter is tuned; set model.parameters.NAME.tuned=true for at least one")
         return space
@@ -170,3 +179,11 @@ class ParameterSpace:
                 raise ParameterError(
                     f"parameter {name}={value} lies outside its bounds [{parameter.low}, {parameter.high}] {parameter.unit}"
                 )
+
+
+def _added(name: str, given: ParameterOverride) -> Parameter:
+    """Returns a parameter that a config adds to an open space."""
+    if given.low is None or given.high is None or given.default is None:
+        raise ParameterError(f"model.parameters.{name}: give low, high and default, as nobody else knows them")
+    tuned = given.tuned is not False
+    return Parameter(name, "", given.low, given.high, given.default, "as the model defines it", "configuration", tuned)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from cfx.errors import PluginError
 from cfx.models.base import DrivingModel, Follower, Leader
+from cfx.models.vtype import SumoOnly
 from cfx.optimizers.base import Optimizer
 from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy, PolicyNetwork
@@ -34,6 +35,8 @@ def probe_model(model: DrivingModel) -> None:
         PluginError: a speed or the memory has another shape or dtype than the states or is not finite, a speed is negative, or
             the step reads other parameters than the class declares.
     """
+    if isinstance(model, SumoOnly):  # it has no step to try
+        return
     for dtype in (torch.float64, torch.float32):
         follower, leader = _states(model, dtype)
         p = _Noted(_values(model.parameters, dtype))

@@ -351,7 +351,7 @@ def _check_model(found: Entry, cls: Any, base: Any) -> None:
     space = getattr(cls, "parameters", None)
     if not isinstance(space, ParameterSpace):
         raise PluginError(f"{found}: its attribute 'parameters' must be a cfx.ParameterSpace, not {type(space).__name__}")
-    if not space.tuned:
+    if not space.tuned and not space.open:
         raise PluginError(f"{found}: at least one of its parameters must be tuned")
     if not issubclass(cls.schema, base.schema):
         raise PluginError(f"{found}: its schema must extend {base.schema.__module__}.{base.schema.__name__}")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from cfx.evaluation.result import Drive, Evaluation, Improvement
+from cfx.evaluation.result import Drive, Evaluation, Improvement, Platoon
 from cfx.parameters import Parameter, ParameterSpace
 from cfx.style.result import CLUSTERS, StyleResult
 
@@ -81,6 +81,51 @@ def make_drive(
     parameters = {method: parameters[method] for method in methods}
     number = 1000 + 7 * k
     return Drive(f"i80-0400-{number}-{number - 10}", f"i80-0400/{number}", time, leader, real, real_gap, speed, gap, parameters)
+
+
+def make_platoon(networks: dict[str, int], seconds: float = 40.0) -> Platoon:
+    """Ten followers each that answer the leader's braking later and later, those of later networks more and more strongly.
+
+    Args:
+        networks: by method, how many.
+    """
+    time = np.round(np.arange(0, seconds, 0.5), 6)
+    tables, measures = [], []
+    for method, count in networks.items():
+        for k in range(count):
+            name, factor = f"fold {k}", 0.9 + 0.1 * k
+            for vehicle in range(11):
+                dip = (8.0 if vehicle == 0 else 8.0 * factor**vehicle) * np.exp(-(((time - 18 - vehicle) / 3) ** 2))
+                speed = 15.0 - np.where(time - vehicle > 12, dip, 0.0)
+                gap = np.full(len(time), np.nan if vehicle == 0 else 20.0 - 2.5 * k * vehicle)
+                about = {"method": method, "network": name, "vehicle": vehicle}
+                tables.append(pd.DataFrame({**about, "time_s": time, "speed": speed, "gap": gap}))
+            row = {"method": method, "network": name, "drop_leader": 8.0, "drop_first": 8 * factor, "drop_last": 8 * factor**10}
+            row |= {"amplification": factor**9, "head_to_tail": factor**10, "string_stable": float(k < 2), "settled": 1.0}
+            measures.append(row | {"min_gap": 20 - 25.0 * k, "collisions": 3.0 * (k > 0), "hard_braking": 2.0 * k})
+    return Platoon(pd.concat(tables, ignore_index=True), pd.DataFrame(measures))
+
+
+def make_history(drives: tuple[Drive, ...], gains: dict[tuple[str, str], float]) -> pd.DataFrame:
+    """What a policy gained, by base and amount of history."""
+    rows = [
+        {
+            "pair_id": drive.pair_id,
+            "driver": drive.driver,
+            "base": base,
+            "history_s": 50.0 + k if amount.endswith("%") else float(amount.split()[0]),
+            "amount": amount,
+            "rmse_speed": 0.5,
+            "rmse_gap": 2.0,
+            "improvement": gain + 0.01 * (-1) ** k,
+        }
+        for (base, amount), gain in gains.items()
+        for k, drive in enumerate(drives)
+    ]
+    return pd.DataFrame(rows)
+
+
+GAINS = {("own", "0 s"): -0.1, ("own", "10 s"): 0.1, ("own", "80 %"): 0.2, ("population", "80 %"): 0.05}
 
 
 def rows_of(k: int, drive: Drive, space: ParameterSpace) -> list[dict[str, object]]:

@@ -27,7 +27,7 @@ FLOORS = (
     ("protocols",),
     ("tracking", "figures"),
     ("config", "nodes", "ui", "testing", "report"),
-    ("job", "hydra_source", "mistakes", "sweep", "application", "plugins", "cli"),
+    ("job", "hydra_source", "mistakes", "sweep", "application", "plugins", "cli", "sumo"),
 )
 """From the ground up; a room may use rooms on its own floor and below."""
 

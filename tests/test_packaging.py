@@ -51,8 +51,11 @@ def test_the_wheel_holds_the_package_and_its_config_files(tmp_path: Path) -> Non
     conf = {f"cfx/conf/{path.relative_to(ROOT / 'conf').as_posix()}" for path in (ROOT / "conf").rglob("*.yaml")}
     assert conf <= names
     assert {"cfx/cli.py", "cfx/py.typed", "cfx/models/krauss.py"} <= names
-    assets = ROOT / "cfx" / "report" / "assets"
-    assert {f"cfx/report/assets/{path.relative_to(assets).as_posix()}" for path in assets.rglob("*") if path.is_file()} <= names
+    for room in ("report", "sumo"):
+        assets = ROOT / "cfx" / room / "assets"
+        found = {f"cfx/{room}/assets/{path.relative_to(assets).as_posix()}" for path in assets.rglob("*") if path.is_file()}
+        assert found, room
+        assert found <= names
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert not [name for name in names if name.startswith(("tests/", "conf/", "outputs/"))]
 

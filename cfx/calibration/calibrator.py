@@ -15,7 +15,6 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from cfx import simulation
 from cfx.calibration.cache import Arrays, Cache
 from cfx.calibration.objective import DriveObjective, JointObjective
 from cfx.calibration.windows import Windows
@@ -23,7 +22,7 @@ from cfx.component import content_key, folder_hash
 from cfx.optimizers.base import Optimizer, Progress
 from cfx.pairs import PairBatch, PairSet
 from cfx.progress import Task
-from cfx.simulation.rollout import Simulator
+from cfx.simulation.base import BaseSimulator
 
 _GROUP = 1024
 """Problems solved together: enough to fill the batch, few enough that an interruption loses little."""
@@ -90,7 +89,7 @@ class Calibrator:
 
     def __init__(
         self,
-        simulator: Simulator,
+        simulator: BaseSimulator,
         optimizer: Optimizer,
         *,
         seed: int,
@@ -262,7 +261,7 @@ class Calibrator:
                 "what": what,
                 "pair": pair,
                 "dt": self.simulator.dt,
-                "simulation": folder_hash(simulation.__file__),
+                "simulation": self.simulator.identity(),
                 "calibration": folder_hash(__file__),
                 "model": model.identity(),
                 "parameters": [(p.name, p.low, p.high, p.default, p.tuned) for p in self.space],

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from cfx.models.base import Leader
 from cfx.pairs import PairBatch
-from cfx.simulation.rollout import Simulator, Start
+from cfx.simulation.base import BaseSimulator
+from cfx.simulation.rollout import Start
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class DriveObjective:
         counted: frames that count, `(K, P)`, 1 or 0.
     """
 
-    simulator: Simulator
+    simulator: BaseSimulator
     leader_position: Tensor
     leader_speed: Tensor
     leader_acceleration: Tensor
@@ -39,7 +40,9 @@ class DriveObjective:
     counted: Tensor
 
     @classmethod
-    def of_segments(cls, simulator: Simulator, batch: PairBatch, pair: Tensor, first: Tensor, steps: Tensor) -> DriveObjective:
+    def of_segments(
+        cls, simulator: BaseSimulator, batch: PairBatch, pair: Tensor, first: Tensor, steps: Tensor
+    ) -> DriveObjective:
         """Cuts segments out of pairs.
 
         Args:

@@ -15,7 +15,8 @@ from cfx.models.base import Leader
 from cfx.pairs import PairBatch
 from cfx.policies.features import History
 from cfx.policies.trained import TrainedPolicy
-from cfx.simulation.rollout import Simulator, Start
+from cfx.simulation.base import BaseSimulator
+from cfx.simulation.rollout import Start
 from cfx.simulation.threads import one_thread
 
 
@@ -36,7 +37,16 @@ class ClosedLoop(NamedTuple):
 
 @torch.no_grad()
 @one_thread()
-def drive(simulator: Simulator, policy: TrainedPolicy, batch: PairBatch, first: Tensor, network: Tensor) -> ClosedLoop:
+def drive(
+    simulator: BaseSimulator,
+    policy: TrainedPolicy,
+    batch: PairBatch,
+    first: Tensor,
+    network: Tensor,
+    *,
+    base: Tensor | None = None,
+    history: float | None = None,
+) -> ClosedLoop:
     """Lets a policy drive the test part of P pairs.
 
     Args:
@@ -45,6 +55,8 @@ def drive(simulator: Simulator, policy: TrainedPolicy, batch: PairBatch, first: 
         batch: P pairs, whole.
         first: `(P,)`, the frame of the last measured state.
         network: `(P,)`, which of the policy's networks drives each pair.
+        base: `(P, n)` in SI units, what a policy's offsets are from; None: the policy's own base.
+        history: seconds of measured history before `first` that the policy reads; None: all there is.
     """
     length, stride = policy.windows.length, policy.windows.stride
     steps = int((batch.lengths - 1 - first).max())
@@ -60,7 +72,8 @@ def drive(simulator: Simulator, policy: TrainedPolicy, batch: PairBatch, first: 
     now = length - 1
     for buffer in (position, speed, acceleration):
         buffer[:, now + 1 :] = torch.nan  # nothing measured may be seen from here on
-    state = policy.read(batch, first, policy.begin(network))
+    since = None if history is None else (first - round(history / simulator.dt)).clamp(min=0)
+    state = policy.read(batch, first, policy.begin(network, base), since)
     follower = simulator.begin(Start(position[:, now], speed[:, now], acceleration[:, now]))
     parameters = speed.new_empty((len(batch), steps + 1, len(policy.space)))
     gap = leader_position - batch.leader_length[:, None] - position

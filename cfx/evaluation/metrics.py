@@ -13,7 +13,8 @@ from scipy import stats
 from torch import Tensor
 
 from cfx.evaluation.closed_loop import ClosedLoop
-from cfx.evaluation.result import METHODS, Array, Drive, Evaluation, Improvement
+from cfx.evaluation.result import METHODS, Array, Drive, Evaluation, Improvement, Platoon
+from cfx.evaluation.safety import Safety, rms_jerk
 from cfx.pairs import PairBatch, PairSet
 from cfx.parameters import ParameterSpace
 from cfx.style.result import CLUSTERS, StyleResult
@@ -62,6 +63,22 @@ def improvement_statistics(
     )
 
 
+def mean_interval(values: Sequence[float], drivers: Sequence[str], *, seed: int) -> tuple[float, float, float]:
+    """Returns the mean over pairs and its 95 % interval, drivers drawn with all their pairs; NaN where it is not defined.
+
+    Args:
+        values: one for each pair; those that are not finite do not count.
+        drivers: whose pair each is.
+        seed: of the bootstrap.
+    """
+    every = np.asarray(values, dtype=np.float64)
+    counts = np.isfinite(every)
+    if not counts.any():
+        return float("nan"), float("nan"), float("nan")
+    who = np.unique(np.asarray(drivers)[counts], return_inverse=True)[1]
+    return float(every[counts].mean()), *_interval(every[counts], who, seed)
+
+
 def _interval(gain: NDArray[np.float64], who: NDArray[np.intp], seed: int) -> tuple[float, float]:
     """Returns the 95 % interval of the mean gain, drawing drivers with all their pairs; NaN for a single driver."""
     number = np.bincount(who).astype(float)
@@ -82,17 +99,32 @@ def _interval(gain: NDArray[np.float64], who: NDArray[np.intp], seed: int) -> tu
     return float(interval.low), float(interval.high)
 
 
+def closed_loop_errors(batch: PairBatch, first: Tensor, loop: ClosedLoop) -> tuple[Array, Array]:
+    """Returns the RMSE of speed (m/s) and of gap (m) of P closed loops that begin at frames `first`, `(P,)` each."""
+    frames = first[:, None] + torch.arange(loop.counted.shape[1], device=first.device)
+    index = frames.clamp(max=batch.mask.shape[1] - 1)
+    return (
+        _rmse(loop.speed, batch.follower_speed.gather(1, index), loop.counted),
+        _rmse(loop.gap, batch.gap.gather(1, index), loop.counted),
+    )
+
+
 @dataclass(frozen=True)
 class _Errors:
-    """RMSEs of each method over the frames that its closed loops have, `(P,)` each; `counted` as in `ClosedLoop`."""
+    """What each method did over the frames that its closed loops have, `(P,)` each; `counted` as in `ClosedLoop`.
+
+    `speed` and `gap` are RMSEs; `real_jerk` is the recorded drivers', m/s3.
+    """
 
     speed: Mapping[str, Array]
     gap: Mapping[str, Array]
+    safety: Mapping[str, Safety]
+    real_jerk: Array
     counted: Tensor
     index: Tensor
 
     @classmethod
-    def of(cls, batch: PairBatch, first: Tensor, loops: Mapping[str, ClosedLoop]) -> _Errors:
+    def of(cls, batch: PairBatch, first: Tensor, loops: Mapping[str, ClosedLoop], space: ParameterSpace) -> _Errors:
         counted = next(iter(loops.values())).counted
         frames = first[:, None] + torch.arange(counted.shape[1], device=first.device)
         index = frames.clamp(max=batch.mask.shape[1] - 1)
@@ -100,9 +132,39 @@ class _Errors:
         return cls(
             {m: _rmse(loop.speed, real_speed, counted) for m, loop in loops.items()},
             {m: _rmse(loop.gap, real_gap, counted) for m, loop in loops.items()},
+            {m: Safety.of(loop, space, batch.dt) for m, loop in loops.items()},
+            rms_jerk(real_speed, counted, batch.dt),
             counted,
             index,
         )
+
+    def row(self, i: int, method: str) -> dict[str, float]:
+        """Returns what the table says of pair i and a method."""
+        before, after, safety = self.speed["fixed"][i], self.speed[method][i], self.safety[method]
+        row = {
+            "frames": int(self.counted[i].sum()),
+            "rmse_speed": float(after),
+            "rmse_gap": float(self.gap[method][i]),
+            "improvement": _gain(before, after),
+        }
+        for other in (name for name in self.speed if name not in {"fixed", "policy"}):
+            row[f"improvement_over_{other}"] = _gain(self.speed[other][i], after)
+        return row | {
+            "collisions": int(safety.collided[i]),
+            "hard_braking": int(safety.hard_braking[i]),
+            "rms_jerk": float(safety.rms_jerk[i]),
+            "real_rms_jerk": float(self.real_jerk[i]),
+            "at_bounds": float(safety.at_bounds[i]),
+        }
+
+    def whole_row(self, i: int, method: str) -> dict[str, float]:
+        """Returns what the table says of the whole drive of pair i; NaN for a method that did not drive it."""
+        names = ("rmse_speed", "rmse_gap", "collisions", "hard_braking")
+        if method not in self.speed:
+            return {f"whole_{name}": float("nan") for name in names}
+        safety = self.safety[method]
+        found = (self.speed[method], self.gap[method], safety.collided, safety.hard_braking)
+        return {f"whole_{name}": float(values[i]) for name, values in zip(names, found, strict=True)}
 
     def improvements(self, drivers: Sequence[str], seed: int) -> dict[str, Improvement]:
         """Returns the policy's improvement over every other method."""
@@ -124,6 +186,8 @@ def evaluate(
     seed: int,
     fold: Tensor | None = None,
     whole: Mapping[str, ClosedLoop] | None = None,
+    platoon: Platoon | None = None,
+    history: pd.DataFrame | None = None,
 ) -> Evaluation:
     """Measures closed loops against the recording.
 
@@ -137,41 +201,30 @@ def evaluate(
         seed: of the bootstrap.
         fold: `(P,)`, in which fold each pair was tested; None if there was one.
         whole: closed loops from frame 0 on, of methods that nothing of these drivers went into; None if there are none.
+        platoon, history: further results, handed on; see `Evaluation`.
     """
     loops = {method: loops[method] for method in METHODS if method in loops}
-    errors = _Errors.of(batch, first, loops)
-    errors_whole = _Errors.of(batch, torch.zeros_like(first), whole) if whole else None
-    drivers = [pair.driver for pair in pairs]
-    collided = {m: ((loop.gap < 0) & errors.counted).any(1).cpu().numpy() for m, loop in loops.items()}
+    errors = _Errors.of(batch, first, loops, space)
+    errors_whole = _Errors.of(batch, torch.zeros_like(first), whole, space) if whole else None
     means = {m: _mean(loop.parameters, errors.counted) for m, loop in loops.items()}
     by_driver = style.table.set_index("driver")
     rows = []
     for i, pair in enumerate(pairs):
+        about = {
+            "pair_id": pair.pair_id,
+            "recording": pair.recording,
+            "leader_id": pair.leader_id,
+            "follower_id": pair.follower_id,
+            "driver": pair.driver,
+            "cluster": CLUSTERS[by_driver["cluster"][pair.driver]],
+            "style_score": float(by_driver["score"][pair.driver]),
+            "fold": int(fold[i]) if fold is not None else 0,
+        }
         for method in loops:
-            row = {
-                "pair_id": pair.pair_id,
-                "recording": pair.recording,
-                "leader_id": pair.leader_id,
-                "follower_id": pair.follower_id,
-                "driver": pair.driver,
-                "cluster": CLUSTERS[by_driver["cluster"][pair.driver]],
-                "style_score": float(by_driver["score"][pair.driver]),
-                "fold": int(fold[i]) if fold is not None else 0,
-                "method": method,
-                "frames": int(errors.counted[i].sum()),
-                "rmse_speed": float(errors.speed[method][i]),
-                "rmse_gap": float(errors.gap[method][i]),
-                "improvement": _gain(errors.speed["fixed"][i], errors.speed[method][i]),
-            }
-            for other in (name for name in loops if name not in {"fixed", "policy"}):
-                row[f"improvement_over_{other}"] = _gain(errors.speed[other][i], errors.speed[method][i])
-            row["collisions"] = int(collided[method][i])
+            row = about | {"method": method} | errors.row(i, method)
             row |= {f"parameter_{name}": float(v) for name, v in zip(space.names, means[method][i], strict=True)}
-            if errors_whole is not None:
-                known = method in errors_whole.speed
-                row["whole_rmse_speed"] = float(errors_whole.speed[method][i]) if known else float("nan")
-                row["whole_rmse_gap"] = float(errors_whole.gap[method][i]) if known else float("nan")
-            rows.append(row)
+            rows.append(row | (errors_whole.whole_row(i, method) if errors_whole is not None else {}))
+    drivers = [pair.driver for pair in pairs]
     return Evaluation(
         table=pd.DataFrame(rows),
         improvements=errors.improvements(drivers, seed),
@@ -180,6 +233,8 @@ def evaluate(
         units=tuple(parameter.unit for parameter in space.tuned),
         bounds=space.bounds().numpy(),
         whole_improvements=errors_whole.improvements(drivers, seed) if errors_whole is not None else {},
+        platoon=platoon,
+        history=history,
     )
 
 

@@ -76,21 +76,91 @@ class Improvement:
         return {name: float(getattr(self, name)) for name in STATISTICS}
 
 
+_SAFETY_SUMMARIES = {
+    "collisions": ("collisions", "sum"),
+    "hard_braking": ("hard_braking", "sum"),
+    "jerk": ("rms_jerk", "mean"),
+    "at_bounds": ("at_bounds", "mean"),
+}
+"""Metrics of safety: the table's column, and how its pairs become one number."""
+
+_PLATOON_SUMMARIES = {
+    "amplification": "mean",
+    "head_to_tail": "mean",
+    "string_stable": "mean",
+    "settled": "mean",
+    "min_gap": "min",
+    "collisions": "sum",
+    "hard_braking": "sum",
+}
+"""How measures of several networks become one metric."""
+
+
+@dataclass(frozen=True)
+class Platoon:
+    """Platoons of one method's drivers each, behind a leader that brakes (`cfx.evaluation.platoon`).
+
+    Attributes:
+        table: a row per method, network, vehicle and frame: method, network (which network or parameter set drives), vehicle (0
+            is the leader), time_s, speed (m/s), gap (m; NaN for the leader).
+        measures: a row per method and network: method, network, drop_leader, drop_first, drop_last (m/s, by how much the
+            leader, the first and the last follower slow down), amplification (drop_last / drop_first), head_to_tail
+            (drop_last / drop_leader), collisions (followers whose gap became negative; with one the two ratios are NaN), settled
+            (1 if all followed steadily before the leader braked), string_stable (1 if nobody slows down more than the vehicle
+            ahead, of those that settled and did not collide), and from the moment on at which the leader brakes min_gap (m) and
+            hard_braking (frames with an acceleration below -8 m/s2).
+    """
+
+    table: pd.DataFrame
+    measures: pd.DataFrame
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """The methods that drove, in the order of `METHODS`."""
+        present = set(self.measures["method"])
+        return tuple(method for method in METHODS if method in present)
+
+    def metrics(self) -> dict[str, float]:
+        """Returns `platoon/MEASURE/METHOD`: over the method's networks the mean, the least gap, and sums of what is counted."""
+        values: dict[str, float] = {}
+        for column, summary in _PLATOON_SUMMARIES.items():
+            found = self.measures.groupby("method")[column].agg(summary)
+            values |= {f"platoon/{column}/{method}": float(found[method]) for method in self.methods}
+        return values
+
+
 @dataclass(frozen=True)
 class Evaluation:
     """The comparison of all methods.
 
+    Metrics (`metrics`), under their names in metrics.json and MLflow; METHOD is one of `methods`:
+        `rmse_speed/METHOD`, `rmse_gap/METHOD`: m/s and m, means over pairs.
+        `rmse_improvement/STATISTIC`, `rmse_improvement/BASELINE/STATISTIC`: see `Improvement`; against `fixed` unless told.
+        `collisions/METHOD`: number of pairs. `hard_braking/METHOD`: number of frames with an acceleration below -8 m/s2.
+        `jerk/METHOD`, `jerk/real`: m/s3, mean over pairs of the root mean square jerk; that of the recorded drivers.
+        `at_bounds/METHOD`: share of the tuned parameters' values within 1 % of their range of a bound, mean over pairs.
+        `whole/...`: the same over whole drives, where those were driven.
+        `platoon/MEASURE/METHOD`: see `Platoon`.
+        `history/BASE/AMOUNT/rmse_improvement`: see `history`; of "80 %" the name is `80pct`, of "10 s" `10s`.
+
     Attributes:
         table: a row per pair and method: pair_id, recording, leader_id, follower_id, driver, cluster, style_score, fold, method,
             frames, rmse_speed (m/s), rmse_gap (m), improvement (against fixed, a fraction), `improvement_over_BASELINE` for the
-            other baselines, collisions (1 if the gap became negative), and one column `parameter_NAME` with the mean of each
-            tuned parameter; where whole drives were driven too, `whole_rmse_speed` and `whole_rmse_gap`.
+            other baselines, collisions (1 if the gap became negative), hard_braking (frames with an acceleration below -8 m/s2),
+            rms_jerk and real_rms_jerk (m/s3; of the simulated and of the recorded follower), at_bounds (share of the tuned
+            parameters' values at a bound), and one column `parameter_NAME` with the mean of each tuned parameter; where whole
+            drives were driven too, `whole_rmse_speed`, `whole_rmse_gap`, `whole_collisions` and `whole_hard_braking`.
         improvements: statistics of the policy's improvement over each baseline.
         drives: the closed loops themselves, in the order of the pairs.
         names: the tuned parameters' names.
         units: their units.
         bounds: `(2, n)`.
         whole_improvements: as `improvements`, over whole drives of drivers that nothing was fitted to; empty if there were none.
+        platoon: ten drivers in a row behind a braking leader; None if no network is for any driver.
+        history: what the policy gains from what it has read before it drives; None if that was not tried. A row per pair, base
+            and amount: pair_id, driver, base (what the policy's answers are offsets from, `own` or `population`), history_s
+            (seconds of measured history read before the test part), amount (the same in words, "10 s" or "80 %"), rmse_speed,
+            rmse_gap, improvement (over the driver's own fixed parameters, a fraction).
     """
 
     table: pd.DataFrame
@@ -100,6 +170,8 @@ class Evaluation:
     units: tuple[str, ...]
     bounds: Array
     whole_improvements: Mapping[str, Improvement] = field(default_factory=dict)
+    platoon: Platoon | None = None
+    history: pd.DataFrame | None = None
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -122,14 +194,39 @@ class Evaluation:
         for baseline, improvement in self.improvements.items():
             prefix = "rmse_improvement" if baseline == "fixed" else f"rmse_improvement/{baseline}"
             values |= {f"{prefix}/{name}": value for name, value in improvement.metrics().items()}
-        collisions = by_method["collisions"].sum()
-        values |= {f"collisions/{method}": float(collisions[method]) for method in self.methods}
+        values |= self._safety_metrics()
         for baseline, improvement in self.whole_improvements.items():
             values |= {f"whole/rmse_improvement/{baseline}/{name}": value for name, value in improvement.metrics().items()}
         if self.whole_improvements:
             for column in ("rmse_speed", "rmse_gap"):
                 means = by_method[f"whole_{column}"].mean()
-                values |= {f"whole/{column}/{m}": float(means[m]) for m in (*self.whole_improvements, "policy")}
+                values |= {f"whole/{column}/{m}": float(means[m]) for m in self._whole_methods}
+        if self.platoon is not None:
+            values |= self.platoon.metrics()
+        if self.history is not None:
+            for (base, amount), gains in self.history.groupby(["base", "amount"])["improvement"]:
+                name = str(amount).replace(" ", "").replace("%", "pct")
+                values[f"history/{base}/{name}/rmse_improvement"] = float(gains.mean())
+        return values
+
+    @property
+    def _whole_methods(self) -> tuple[str, ...]:
+        return (*self.whole_improvements, "policy")
+
+    def _safety_metrics(self) -> dict[str, float]:
+        """Returns counts and means of what a protocol measured; one that makes its own table may leave all but collisions out."""
+        by_method = self.table.groupby("method")
+        values: dict[str, float] = {}
+        for name, (column, summary) in _SAFETY_SUMMARIES.items():
+            if column in self.table:
+                found = by_method[column].agg(summary)
+                values |= {f"{name}/{method}": float(found[method]) for method in self.methods}
+        if "real_rms_jerk" in self.table:
+            values["jerk/real"] = float(self.table.drop_duplicates("pair_id")["real_rms_jerk"].mean())
+        for column in ("collisions", "hard_braking"):
+            if self.whole_improvements and f"whole_{column}" in self.table:
+                found = by_method[f"whole_{column}"].sum()
+                values |= {f"whole/{column}/{method}": float(found[method]) for method in self._whole_methods}
         return values
 
     def drives_table(self) -> pd.DataFrame:

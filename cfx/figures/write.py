@@ -12,9 +12,11 @@ from matplotlib.figure import Figure
 from cfx.errors import OutputError
 from cfx.evaluation.result import Evaluation
 from cfx.figures.drives import chosen_parameters, drives, speeds
+from cfx.figures.history import history_gain
 from cfx.figures.improvement import improvement_per_driver
 from cfx.figures.learning import learning_curve
 from cfx.figures.look import DPI, look
+from cfx.figures.platoon import platoons
 from cfx.figures.style import style_distribution
 from cfx.files import whole
 from cfx.style.result import StyleResult
@@ -26,7 +28,7 @@ def write_figures(folder: Path, evaluation: Evaluation, style: StyleResult, curv
     Args:
         folder: made if it is not there.
         curves: columns `network`, `epoch`, `train_loss`, `validation_loss`; empty if nothing was learned, and then there is no
-            `learning_curve.png`.
+            `learning_curve.png`. Neither is there a `platoon.png` or `history.png` where the protocol delivered no such result.
 
     Raises:
         OutputError: a file cannot be written.
@@ -40,6 +42,11 @@ def write_figures(folder: Path, evaluation: Evaluation, style: StyleResult, curv
     }
     if len(curves):
         jobs["learning_curve"] = lambda: learning_curve(curves)
+    platoon, history = evaluation.platoon, evaluation.history
+    if platoon is not None:
+        jobs["platoon"] = lambda: platoons(platoon)
+    if history is not None:
+        jobs["history"] = lambda: history_gain(history)
     return [write_figure(draw(), folder / f"{name}.png") for name, draw in jobs.items()]
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar
 
 import pandas as pd
@@ -18,7 +19,7 @@ from cfx.component import Component
 from cfx.pairs import PairBatch
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.trained import Scaler
-from cfx.simulation.rollout import Simulator
+from cfx.simulation.base import BaseSimulator
 
 CURVE_COLUMNS = ["network", "epoch", "train_loss", "validation_loss"]
 
@@ -38,9 +39,13 @@ class Lesson:
         network: which network learns from each pair, `(P,)` int64.
         names: what each network is for, N of them.
         seed: for initial weights and everything random.
+        base: the parameters that each driver is driven by once his history was read, `(P, n)`, SI units, where these are others
+            than `fixed`: his own set, while `fixed` is the population's. Only learners of offsets read them.
+        drivers: whose pair each is; None if each is another's.
+        workspace: a folder for what training needs to go on after an interruption; None: nothing is kept.
     """
 
-    simulator: Simulator
+    simulator: BaseSimulator
     batch: PairBatch
     split: Split
     windows: WindowSettings
@@ -49,6 +54,9 @@ class Lesson:
     network: Tensor
     names: tuple[str, ...]
     seed: int
+    base: Tensor | None = None
+    drivers: tuple[str, ...] | None = None
+    workspace: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -59,11 +67,14 @@ class Learned:
         network: N trained networks, in evaluation mode.
         scaler: how their tokens are normalised.
         curves: columns network, epoch, train_loss, validation_loss (NaN where not measured).
+        base: `(N, n)`, SI units: the parameters that answers are offsets from (`cfx.policies.offsets`) for a driver who brings
+            none of his own; the networks then read tokens with the base appended. None: answers are the parameters themselves.
     """
 
     network: PolicyNetwork
     scaler: Scaler
     curves: pd.DataFrame
+    base: Tensor | None = None
 
 
 class Learner(Component):

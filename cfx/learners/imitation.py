@@ -6,9 +6,7 @@ networks are trained at once as one batched network; the sum of their losses tra
 
 from __future__ import annotations
 
-import logging
 import math
-import warnings
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -22,13 +20,11 @@ from torch.utils.data import DataLoader
 from cfx.component import Settings
 from cfx.errors import DataError
 from cfx.learners.base import CURVE_COLUMNS, Learned, Learner, Lesson
+from cfx.learners.batched import BatchedModule, Grid, fit
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import token_width, tokens
-from cfx.policies.trained import Scaler, driver_places, measured_history
+from cfx.policies.trained import Scaler, measured_history
 from cfx.progress import Task
-from cfx.simulation.threads import one_thread
-
-log = logging.getLogger(__name__)
 
 
 class ImitationSettings(Settings):
@@ -68,7 +64,6 @@ class ImitationLearner(Learner):
     def fit(self, policy: Policy, lesson: Lesson) -> Learned:
         if lesson.labels is None:
             raise TypeError("imitation needs window labels")
-        _quiet_lightning()
         material = _Material.of(policy, lesson, self.settings)
         generator = torch.Generator().manual_seed(lesson.seed)
         space = lesson.simulator.model.space
@@ -81,25 +76,8 @@ class ImitationLearner(Learner):
         module = ImitationModule(network, material, self.settings, lesson.names, on_epoch=task.advance)
         data = SegmentData(material.windows, self.settings.batch_size)
         device = material.tokens.device
-        with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
-            torch.manual_seed(lesson.seed)  # dropout draws from the global generator
-            trainer = pl.Trainer(
-                max_epochs=self.settings.epochs,
-                accelerator="gpu" if device.type == "cuda" else "cpu",
-                devices=1,
-                logger=False,
-                enable_checkpointing=False,
-                enable_model_summary=False,
-                enable_progress_bar=False,
-                num_sanity_val_steps=0,
-                # Nothing random happens between batches, and the segments must come in order.
-                use_distributed_sampler=False,
-            )
-            with warnings.catch_warnings(), one_thread(), task:
-                warnings.filterwarnings("ignore", module=r"lightning\.")
-                _fit(trainer, module, data)
-        module.restore_best()
-        return Learned(module.network.to(device).eval(), material.scaler.to(device), module.curves())
+        fit(module, data, epochs=self.settings.epochs, seed=lesson.seed, device=device, task=task)
+        return Learned(module.network, material.scaler.to(device), module.curves())
 
 
 class _Material(nn.Module):
@@ -150,7 +128,7 @@ class _Material(nn.Module):
         train = mask & (number < (counts - kept)[:, None])
         validation = mask & ~train
         weight = _spread_weight(spread_grid, train) if settings.weight_by_spread else torch.ones_like(spread_grid)
-        grid = _Grid(lesson.network.to(device), len(lesson.names))
+        grid = Grid(lesson.network.to(device), len(lesson.names))
         train_grid = grid.scatter(train)
         scaler = Scaler.of(grid.scatter(token_grid), train_grid)
         return cls(
@@ -160,21 +138,6 @@ class _Material(nn.Module):
             grid.scatter(weight * train),
             grid.scatter(weight * validation),
         )
-
-
-class _Grid:
-    """Places P pairs as N networks by B drivers."""
-
-    def __init__(self, network: Tensor, networks: int) -> None:
-        self.network = network
-        self.place = driver_places(network)
-        self.shape = (networks, int(self.place.max()) + 1)
-
-    def scatter(self, values: Tensor) -> Tensor:
-        """Arranges `(P, ...)` as `(N, B, ...)`, zero where a network has fewer drivers."""
-        grid = values.new_zeros((*self.shape, *values.shape[1:]))
-        grid[self.network, self.place] = values
-        return grid
 
 
 def _spread_weight(spread: Tensor, train: Tensor) -> Tensor:
@@ -210,8 +173,8 @@ class SegmentData(pl.LightningDataModule):
         return DataLoader([(0, self.windows)], batch_size=None)  # type: ignore[arg-type]  # a list is a dataset
 
 
-class ImitationModule(pl.LightningModule):
-    """Trains N networks on their segments, and keeps for each the weights of its best epoch."""
+class ImitationModule(BatchedModule):
+    """Trains N networks on their segments."""
 
     def __init__(
         self,
@@ -221,20 +184,11 @@ class ImitationModule(pl.LightningModule):
         names: tuple[str, ...],
         on_epoch: Callable[[], None] = lambda: None,
     ) -> None:
-        super().__init__()
-        self.on_epoch = on_epoch
-        self.network = network
+        super().__init__(network, names, settings, on_epoch)
         self.material = material
-        self.settings = settings
-        self.names = names
-        count = len(names)
         self.state: Tensor | None = None
-        self.best = {key: value.detach().clone() for key, value in network.named_parameters()}
-        self.best_loss = torch.full((count,), math.inf)
-        self.stale = torch.zeros(count, dtype=torch.int64)
-        self.train_sum = torch.zeros(count)
-        self.train_weight = torch.zeros(count)
-        self.rows: list[tuple[Tensor, Tensor]] = []
+        self.train_sum = torch.zeros(len(names))
+        self.train_weight = torch.zeros(len(names))
 
     def training_step(self, segment: tuple[int, int], index: int) -> Tensor:
         first, last = segment
@@ -250,83 +204,17 @@ class ImitationModule(pl.LightningModule):
         self.train_weight += total.detach().cpu()
         return (error / total.clamp(min=1e-9)).sum()
 
-    def configure_gradient_clipping(self, optimizer: Any, *args: Any, **kwargs: Any) -> None:
-        """Clips each network's gradient on its own: a norm over all would couple them."""
-        if self.settings.gradient_clip is None:
-            return
-        gradients = [parameter.grad for parameter in self.network.parameters() if parameter.grad is not None]
-        norm = torch.stack([gradient.square().flatten(1).sum(1) for gradient in gradients]).sum(0).sqrt()
-        scale = (self.settings.gradient_clip / norm.clamp(min=1e-12)).clamp(max=1.0)
-        for gradient in gradients:
-            gradient.mul_(scale.view(-1, *[1] * (gradient.dim() - 1)))
-
     def validation_step(self, segment: tuple[int, int], index: int) -> None:
         networks, drivers = self.material.tokens.shape[:2]
         out, _ = self.network(self.material.tokens, self.network.initial_state(networks, drivers))
         weight = self.material.validation_weight
         total = weight.sum((1, 2))
         loss = _weighted_error(out, self.material.labels, weight) / total.clamp(min=1e-9)
-        self.rows.append((self.train_sum / self.train_weight.clamp(min=1e-9), torch.where(total > 0, loss, math.nan).cpu()))
+        self.judge(self.train_sum / self.train_weight.clamp(min=1e-9), torch.where(total > 0, loss, math.nan).cpu())
         self.train_sum.zero_()
         self.train_weight.zero_()
-        self._keep_best()
-        self.on_epoch()
-
-    def _keep_best(self) -> None:
-        """Keeps the weights of each network's best epoch so far, and stops when no network has hope left.
-
-        A network without validation windows is judged by its training loss.
-        """
-        train, validation = self.rows[-1]
-        loss = torch.where(validation.isnan(), train, validation)
-        patience = self.settings.patience
-        active = torch.ones_like(self.stale, dtype=torch.bool) if patience is None else self.stale < patience
-        better = (loss < self.best_loss) & active
-        self.best_loss = torch.where(better, loss, self.best_loss)
-        self.stale = torch.where(better, 0, self.stale + active.long())
-        for key, value in self.network.named_parameters():
-            chosen = better.to(value.device).view(-1, *[1] * (value.dim() - 1))
-            self.best[key] = torch.where(chosen, value.detach(), self.best[key].to(value.device))
-        if patience is not None and not bool((self.stale < patience).any()):
-            self.trainer.should_stop = True
-
-    def restore_best(self) -> None:
-        """Puts each network's best weights back."""
-        with torch.no_grad():
-            for key, value in self.network.named_parameters():
-                value.copy_(self.best[key])
-
-    def curves(self) -> pd.DataFrame:
-        """Returns the learning curves in long form."""
-        frames = [
-            pd.DataFrame(
-                {"network": self.names, "epoch": epoch, "train_loss": train.numpy(), "validation_loss": validation.numpy()}
-            )
-            for epoch, (train, validation) in enumerate(self.rows)
-        ]
-        return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=CURVE_COLUMNS)
-
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        return torch.optim.AdamW(
-            self.network.parameters(), lr=self.settings.learning_rate, weight_decay=self.settings.weight_decay
-        )
 
 
 def _weighted_error(out: Tensor, labels: Tensor, weight: Tensor) -> Tensor:
     """Returns the weighted sum of squared errors of each network, `(N,)`; the mean over parameters."""
     return ((out - labels).square().mean(-1) * weight).sum((1, 2))
-
-
-def _fit(trainer: pl.Trainer, module: ImitationModule, data: SegmentData) -> None:
-    """Fits; Ctrl-C, which Lightning turns into an exit, stays what it is."""
-    try:
-        trainer.fit(module, datamodule=data)
-    except SystemExit as error:
-        if isinstance(error.__context__, KeyboardInterrupt):
-            raise KeyboardInterrupt from None
-        raise
-
-
-def _quiet_lightning() -> None:
-    for name in ("lightning.pytorch", "lightning.fabric"):
-        logging.getLogger(name).setLevel(logging.ERROR)

@@ -8,15 +8,17 @@ Letters: `*batch` are the leading dimensions; leader tensors and parameters may 
 
 from __future__ import annotations
 
+import copy
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 import torch
 from pydantic import Field
 from torch import Tensor
 
 from cfx.component import Component, Settings
+from cfx.models.regimes import Softness
 from cfx.parameters import ParameterOverride, ParameterSpace
 
 
@@ -74,7 +76,10 @@ class DrivingModel(Component):
         differentiable: `next_speed` has useful gradients with respect to states and parameters. Tested.
         collision_free: with its default parameters the model does not hit a leader that brakes as hard as the model
             expects of it. Tested.
+        follows: with constant parameters the model reacts to its leader. A model without that has parameters that are the control
+            itself: constant ones are no baseline, and reports do not compare with them. Tested.
         reference: where the equations come from.
+        softness: how gradually regimes switch; 0, the exact model, everywhere but in a learner's training (`smoothed`).
     """
 
     kind = "model"
@@ -85,11 +90,26 @@ class DrivingModel(Component):
     memory_size: ClassVar[int] = 0
     differentiable: ClassVar[bool] = True
     collision_free: ClassVar[bool] = False
+    follows: ClassVar[bool] = True
     reference: ClassVar[str] = ""
+    softness: Softness = 0.0
 
     def __init__(self, settings: Settings | None = None, **options: object) -> None:
         super().__init__(settings, **options)
         self.space = self.parameters.override(self.settings.parameters)
+
+    def smoothed(self, softness: Softness) -> Self:
+        """Returns the model with its regime switches smoothed, for training by gradients.
+
+        A model that chooses between cases reads `self.softness` in `next_speed` and, where it is not 0, mixes the cases near
+        their thresholds (`cfx.models.regimes`). In all others nothing changes.
+
+        Args:
+            softness: how gradual the switches are, in multiples of the model's own scales; 0 is the exact model.
+        """
+        model = copy.copy(self)
+        model.softness = softness
+        return model
 
     @abstractmethod
     def next_speed(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float) -> Tensor:

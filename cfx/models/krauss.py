@@ -14,9 +14,11 @@ from pydantic import Field
 from torch import Tensor
 
 from cfx.component import Settings
+from cfx.errors import ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader, ModelSettings, bumper_gap
 from cfx.models.guarded import root
 from cfx.models.sumo_step import sumo_speed
+from cfx.models.vtype import VType
 from cfx.parameters import Parameter, ParameterSpace
 
 _PAPER = "Yang et al. (2021); bounds: wide enough for drivers who stay far behind"
@@ -83,3 +85,14 @@ class Krauss(DrivingModel):
         creep = torch.where(g <= b * dt, torch.minimum(b * dt, g / dt), v_safe)
         v_safe = torch.where(v_l == 0, torch.where(g < 0.01, 0.0, creep), v_safe)
         return sumo_speed(v, v_safe, accel=p["a"], decel=b, emergency_decel=p["b_max"], v_max=p["v_max"], dt=dt)
+
+    def sumo_vtype(self, p: Mapping[str, Tensor]) -> VType:
+        lag = self.space["t_i"]
+        if self.settings.variant != "sumo" or self.settings.leader_deceleration is not None or lag.tuned or lag.default != 0:
+            raise ConfigError(
+                "simulator=sumo: SUMO has model=krauss (its KraussOrig1) only without a brake build-up time; add"
+                " model.variant=sumo model.leader_deceleration=null model.parameters.t_i.default=0"
+                " model.parameters.t_i.tuned=false, or choose model=krauss_sumo"
+            )
+        names = {"t_r": "tau", "a": "accel", "b": "decel", "v_max": "maxSpeed", "min_gap": "minGap", "b_max": "emergencyDecel"}
+        return VType("KraussOrig1", {theirs: p[ours] for ours, theirs in names.items()})

@@ -11,9 +11,9 @@ def sumo_speed(
 ) -> Tensor:
     """Returns the speed `(*batch,)` that SUMO realises when a car-following model wants `wanted`, both m/s.
 
-    With `top = min(v + accel dt, v_max)` and `comfortable = max(0, v - decel dt)` the plan is `min(top, wanted)`; below
-    `comfortable` it is bounded by `v - emergency_decel dt` and 0, so that `emergency_decel` is the brake cap, not `decel`. Speeds
-    below 1e-5 m/s become 0. The lane's limit is taken to be above `v_max`.
+    With `top = min(v + accel dt, v_max)` the plan is `min(top, wanted)`; it is bounded by 0 and by `v - emergency_decel dt`, so
+    that `emergency_decel` is the brake cap, not `decel`, unless that is the larger one. Speeds below 1e-5 m/s become 0. The
+    lane's limit is taken to be above `v_max`.
 
     Args:
         v: speed now, m/s.
@@ -25,6 +25,6 @@ def sumo_speed(
     top = torch.minimum(v + accel * dt, v_max)
     comfortable = (v - decel * dt).clamp(min=0.0)
     plan = torch.minimum(top, wanted)
-    hard = torch.maximum(plan, (v - emergency_decel * dt).clamp(min=0.0))
-    speed = torch.where(plan >= comfortable, plan, hard)
+    hardest = torch.minimum(comfortable, (v - emergency_decel * dt).clamp(min=0.0))
+    speed = torch.maximum(plan, hardest)
     return torch.where(speed.abs() < 1e-5, 0.0, speed)

@@ -10,6 +10,7 @@ The thresholds' form with five tuned parameters is that of Yang, Masuda and Tats
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.guarded import root
+from cfx.models.regimes import SPACING, SPEED, below, exact, up_to
 from cfx.parameters import Parameter, ParameterSpace
 
 _NEAREST_ROOM = 1e-3  # m: bounds quotients (and their gradients) beside a threshold; the brake cap acts long before
@@ -68,7 +70,7 @@ class W74(DrivingModel):
     acceleration.
 
     Not differentiable in the thresholds themselves: gradients are those of the case that holds; while following they are those of
-    b_null alone.
+    b_null alone. `smoothed` makes them differentiable for training.
     """
 
     reference = "Wiedemann (1974); Wiedemann and Reiter (1992); Janson Olstam and Tapani (2004), VTI meddelande 960A"
@@ -105,8 +107,13 @@ class W74(DrivingModel):
         emergency = a_l - 0.5 * closing.clamp(min=0.0).square() / (s - ax).clamp(min=_NEAREST_ROOM) + b_min * lack
         emergency = torch.where(s <= ax, b_min, emergency.clamp(max=0.0))
 
+        most = torch.maximum(free, b_null)
+        if not exact(self.softness):  # they are mixed, so each must be something that the vehicle can do
+            approaching, emergency = (a.maximum(b_min).minimum(most) for a in (approaching, emergency))
         # Nested, not joined by `&`, as in w99: masks of doubles are slow to join.
-        calm = torch.where(closing > opdv, torch.where(s < sdx, following, free), free)
-        acceleration = torch.where(s <= abx, emergency, torch.where(closing > sdv, approaching, calm))
-        acceleration = torch.maximum(torch.minimum(acceleration, torch.maximum(free, b_null)), b_min)
+        near_by, slower = (partial(below, scale=scale, softness=self.softness) for scale in (SPACING, SPEED))
+        calm = slower(opdv, closing, near_by(s, sdx, following, free), free)
+        calm = slower(sdv, closing, approaching, calm)
+        acceleration = up_to(s, abx, emergency, calm, scale=SPACING, softness=self.softness)
+        acceleration = torch.maximum(torch.minimum(acceleration, most), b_min)
         return (v + acceleration * dt).clamp(min=0.0)

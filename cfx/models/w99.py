@@ -7,6 +7,7 @@ decision rules are those of SUMO's implementation (M. Gao, *Wiedemann 99 in SUMO
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import ClassVar, Literal
 
 import torch
@@ -14,9 +15,12 @@ from pydantic import Field
 from torch import Tensor
 
 from cfx.component import Settings
+from cfx.errors import ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader, ModelSettings, bumper_gap
 from cfx.models.guarded import divisor, root
+from cfx.models.regimes import SPACING, SPEED, below, exact, up_to
 from cfx.models.sumo_step import sumo_speed
+from cfx.models.vtype import VType
 from cfx.parameters import Parameter, ParameterSpace
 
 _VISSIM = "default: Vissim and SUMO; bounds: the ranges used in the calibration literature"
@@ -62,7 +66,8 @@ class W99(DrivingModel):
 
     Differences from the paper: it lists the 1974 thresholds but ran SUMO's ten-parameter model, which this is.
 
-    Not differentiable in the thresholds themselves: gradients are those of the case that holds.
+    Not differentiable in the thresholds themselves: gradients are those of the case that holds. `smoothed` makes them
+    differentiable for training.
     """
 
     reference = "Wiedemann (1974, 1999); PTV Vissim manual, CC0 to CC9; SUMO's carFollowModel W99"
@@ -120,10 +125,19 @@ class W99(DrivingModel):
         free = torch.where(inside, torch.minimum(dv * dv / divisor(far - dx, inside), a_max), a_max)
         free = torch.where(dx > near, free, 0.0)
 
+        if not exact(self.softness):  # they are mixed, so each must be something that the vehicle can do
+            approaching, too_close, free = (a.clamp(min=-p["b_max"]).minimum(cap) for a in (approaching, too_close, free))
         # Nested, not joined by `&`: compiled in float64 that is three times as fast (masks of doubles are joined as integers).
-        calm = dv < opening_threshold
-        rest = torch.where(calm, torch.where(inside, following, free), free)
-        rest = torch.where(dv < closing_threshold, torch.where(dx < perceived, approaching, rest), rest)
-        acceleration = torch.where(calm, torch.where(dx <= near, too_close, rest), rest)
+        near_by, slower = (partial(below, scale=scale, softness=self.softness) for scale in (SPACING, SPEED))
+        rest = slower(dv, opening_threshold, near_by(dx, far, following, free), free)
+        rest = slower(dv, closing_threshold, near_by(dx, perceived, approaching, rest), rest)
+        too_near = up_to(dx, near, too_close, rest, scale=SPACING, softness=self.softness)
+        acceleration = slower(dv, opening_threshold, too_near, rest)
         wanted = v + acceleration * dt
         return sumo_speed(v, wanted, accel=cap, decel=p["b"], emergency_decel=p["b_max"], v_max=p["v_max"], dt=dt)
+
+    def sumo_vtype(self, p: Mapping[str, Tensor]) -> VType:
+        if self.settings.variant != "sumo":
+            raise ConfigError(f"simulator=sumo: SUMO has model=w99 as variant=sumo only, not {self.settings.variant}")
+        names = {"cc0": "minGap", "b": "decel", "b_max": "emergencyDecel", "v_max": "maxSpeed"}
+        return VType("W99", {names.get(ours, ours): value for ours, value in p.items()})

@@ -23,6 +23,7 @@ from cfx.pairs import PairBatch, PairSet
 from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import History, token_width, tokens
+from cfx.policies.offsets import coordinates, moved
 
 _FORMAT = 1
 
@@ -62,11 +63,13 @@ class PolicyState(NamedTuple):
         network: `(D,)` int64.
         place: `(D,)` int64.
         state: `(N, B, s)`.
+        base: parameters that answers are offsets from, `(D, n)` in unit space; None where answers are the parameters themselves.
     """
 
     network: Tensor
     place: Tensor
     state: Tensor
+    base: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,8 @@ class TrainedPolicy:
         windows: how often parameters change, and how many frames a token holds.
         dt: time step, s.
         names: what each network was trained for (a pair's id, a fold, or `ALL`), N of them.
+        base: parameters that answers are offsets from (`cfx.policies.offsets`) for a driver who brings none of his own, `(N, n)`
+            in SI units; None if answers are the parameters themselves.
     """
 
     policy: Policy
@@ -93,12 +98,21 @@ class TrainedPolicy:
     windows: WindowSettings
     dt: float
     names: tuple[str, ...]
+    base: Tensor | None = None
 
-    def begin(self, network: Tensor) -> PolicyState:
-        """Returns the state of D drivers before their first window; `network` `(D,)` says which network drives each."""
+    def begin(self, network: Tensor, base: Tensor | None = None) -> PolicyState:
+        """Returns the state of D drivers before their first window.
+
+        Args:
+            network: `(D,)`, which network drives each.
+            base: `(D, n)` in SI units, each driver's own base; None: the policy's. Ignored where answers are not offsets.
+        """
         place = driver_places(network)
         drivers = int(place.max()) + 1
-        return PolicyState(network, place, self.network.initial_state(len(self.names), drivers))
+        unit = None
+        if self.base is not None:
+            unit = self.space.to_unit((self.base[network] if base is None else base).double())
+        return PolicyState(network, place, self.network.initial_state(len(self.names), drivers), unit)
 
     @torch.no_grad()
     def act(self, history: History, state: PolicyState) -> tuple[Tensor, PolicyState]:
@@ -112,25 +126,31 @@ class TrainedPolicy:
             Parameters `(D, n)` in SI units, in the dtype of the history, and where they stand now.
         """
         seen = tokens(history, self.policy.inputs, self.policy.summary)
+        if state.base is not None:
+            seen = torch.cat([seen, coordinates(state.base).to(seen.dtype)], -1)
         networks, drivers, _ = state.state.shape
         grid = seen.new_zeros((networks, drivers, 1, seen.shape[-1]), dtype=self.scaler.mean.dtype)
         grid[state.network, state.place, 0] = seen.to(grid.dtype)
         unit, after = self.network(self.scaler(grid), state.state)
         chosen = unit[state.network, state.place, 0].to(seen.dtype)
+        if state.base is not None:
+            chosen = moved(state.base, chosen.double()).to(seen.dtype)
         return self.space.from_unit(chosen), state._replace(state=after)
 
-    def read(self, batch: PairBatch, until: Tensor, state: PolicyState) -> PolicyState:
+    def read(self, batch: PairBatch, until: Tensor, state: PolicyState, since: Tensor | None = None) -> PolicyState:
         """Lets D drivers read their measured history before they drive.
 
         Args:
             batch: their D pairs.
             until: `(D,)`, the frame at which each will start to drive; windows that start before it are read.
             state: where they stand.
+            since: `(D,)`, the frame from which on they read; None: from the first.
         """
         stride = self.windows.stride
-        for first in range(0, int(until.max()), stride):
+        begin = 0 if since is None else int(since.min()) // stride * stride
+        for first in range(begin, int(until.max()), stride):
             _, after = self.act(measured_history(batch, torch.full_like(until, first), self.windows.length), state)
-            reading = (first < until)[:, None]
+            reading = ((first < until) & (first >= (0 if since is None else since)))[:, None]
             merged = state.state.clone()
             kept, new = state.state[state.network, state.place], after.state[state.network, state.place]
             merged[state.network, state.place] = torch.where(reading, new, kept)
@@ -187,6 +207,8 @@ class TrainedPolicy:
         """Writes `policy.pt` and `policy.json`; each appears whole."""
         weights = {f"network.{key}": value.cpu() for key, value in self.network.state_dict().items()}
         weights |= {f"scaler.{key}": value.cpu() for key, value in self.scaler.state_dict().items()}
+        if self.base is not None:
+            weights["base"] = self.base.cpu()
         folder.mkdir(parents=True, exist_ok=True)
         with whole(folder / "policy.pt") as temporary:
             torch.save(weights, temporary)
@@ -226,7 +248,8 @@ class TrainedPolicy:
         space = model.space  # type: ignore[attr-defined]  # the registry has checked that it is a model
         windows = WindowSettings(**description["windows"])
         networks, features = weights["scaler.mean"].shape
-        width = token_width(policy.inputs, policy.summary, windows.length)
+        base = weights.get("base")
+        width = token_width(policy.inputs, policy.summary, windows.length) + (len(space) if base is not None else 0)
         if features != width:
             raise DataError(f"{folder}: the weights read {features} features, the policy's settings give {width}")
         blank = torch.zeros((networks, len(space)), dtype=weights["scaler.mean"].dtype)
@@ -243,6 +266,7 @@ class TrainedPolicy:
             windows=windows,
             dt=description["dt"],
             names=tuple(description["names"]),
+            base=base,
         )
 
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+import pandas as pd
 import torch
 from pydantic import Field
 from scipy.sparse import coo_array
@@ -19,9 +21,11 @@ from cfx.calibration.windows import Split
 from cfx.component import Settings
 from cfx.errors import DataError
 from cfx.evaluation.closed_loop import drive
-from cfx.evaluation.metrics import evaluate
+from cfx.evaluation.metrics import closed_loop_errors, evaluate
+from cfx.evaluation.platoon import measure_platoons
+from cfx.evaluation.result import Evaluation
 from cfx.learners.base import Learned, Lesson
-from cfx.pairs import Pair, PairSet
+from cfx.pairs import Pair, PairBatch, PairSet
 from cfx.policies.default import DefaultPolicy
 from cfx.policies.fixed import FixedPolicy
 from cfx.policies.trained import ALL, TrainedPolicy
@@ -37,6 +41,20 @@ class AcrossDriversSettings(Settings):
     together: Literal["driver", "platoon"] = Field(
         "driver",
         description="what a fold keeps together: driver: all pairs of one follower; platoon: also all who follow each other",
+    )
+    min_test_frames: int | None = Field(
+        None, ge=1, description="frames a pair must have to be tested; shorter ones are only learned from; null: all are tested"
+    )
+    base: Literal["own", "population", "default"] = Field(
+        "own",
+        description="what a policy of offsets starts from, for a driver whose history it has read: his own fixed parameters, the"
+        " population's, or the model's default ones; for strangers it is the population's, or the default ones",
+    )
+    history: float | None = Field(
+        None, ge=0, description="s of measured history before the test part that the policy reads; null: all there is"
+    )
+    histories: tuple[float, ...] = Field(
+        (0.0, 10.0, 30.0), description="s: other amounts of history to compare, for policies of offsets; empty: none"
     )
 
 
@@ -64,60 +82,86 @@ class AcrossDrivers(Protocol):
 
     def run(self, study: Study) -> Outcome:
         pairs, batch = study.pairs, study.batch
-        device = batch.lengths.device
         fold = self.folds(pairs, seed=study.seed)
         # Row k: the pairs that network k learns from; the last network learns from all.
-        members = torch.cat([torch.stack([fold != k for k in range(self.settings.folds)]), torch.ones(1, len(pairs)).bool()])
+        numbers = torch.arange(self.settings.folds + 1)[:, None]
+        members = ((fold != numbers) & (fold != -2 - numbers)) | (numbers == self.settings.folds)
         notes = _overlap(pairs, fold)
         split, whole = Split.of(pairs, study.windows, study.split), Split.none(pairs, study.windows)
         fixed = study.calibrator.fixed(pairs, batch, split.frame)
         population = study.calibrator.population(pairs, batch, whole.frame, members)
         labels = study.labels(whole.windows, fixed)
         names = (*(f"fold {k}" for k in range(self.settings.folds)), ALL)
-        policy, learned = self._learn(study, whole, members, population, labels, names)
+        default = study.space.defaults(dtype=population.dtype, device=population.device).expand_as(population)
+        strange = default if self.settings.base == "default" else population
+        own = fixed if self.settings.base == "own" else None
+        policy, learned = self._learn(study, whole, members, strange, own, labels, names)
 
-        network = fold.to(device)
-        own = torch.arange(len(pairs), device=device)
-        first, start = split.frame.to(device), torch.zeros_like(own)
-        strangers = {
-            "default": study.constant(DefaultPolicy(), population),
-            "population": study.constant(FixedPolicy(), population),
-            "policy": policy,
-        }
-        loops = {name: drive(study.simulator, one, batch, first, network) for name, one in strangers.items()}
-        loops["fixed"] = drive(study.simulator, study.constant(FixedPolicy(), fixed), batch, first, own)
-        whole_loops = {name: drive(study.simulator, one, batch, start, network) for name, one in strangers.items()}
-        evaluation = evaluate(
-            pairs, batch, first, loops, policy.space, study.style, seed=study.seed, fold=fold, whole=whole_loops
+        tested = (fold >= 0).nonzero()[:, 0]
+        test = _Test(
+            study=study,
+            pairs=replace(pairs, pairs=tuple(pairs[int(number)] for number in tested)),
+            batch=batch[tested.to(batch.lengths.device)],
+            fold=fold[tested],
+            first=split.frame[tested].to(batch.lengths.device),
+            fixed=fixed[tested.to(fixed.device)],
+            strange=strange[fold[tested].to(strange.device)],
+            population=population,
+            policy=policy,
         )
-        return Outcome(evaluation, policy, learned.curves, labels, notes)
+        return Outcome(test.evaluation(self.settings), policy, learned.curves, labels, notes)
 
     def folds(self, pairs: PairSet, *, seed: int) -> Tensor:
-        """Returns in which fold each pair is tested, `(P,)` int64.
+        """Returns in which fold each pair is tested, `(P,)` int64; -1 for a pair that is only learned from.
+
+        Pairs that are too short to be tested do not change the folds of the others. Where their driver (or platoon) is tested
+        with another pair, they belong to the same fold, as number `-2 - fold`, so that nobody of that fold learns from them.
 
         Raises:
             DataError: there are fewer drivers (or platoons) than folds.
         """
         groups = _platoons(pairs) if self.settings.together == "platoon" else [pair.driver for pair in pairs]
-        found = len(set(groups))
+        least = self.settings.min_test_frames or 0
+        tested = [number for number, pair in enumerate(pairs) if len(pair) >= least]
+        found = len({groups[number] for number in tested})
         if found < self.settings.folds:
             what = f"platoon{'s' * (found != 1)}" if self.settings.together == "platoon" else f"driver{'s' * (found != 1)}"
+            long = f" with {least} frames or more" if least else ""
             raise DataError(
-                f"protocol.folds={self.settings.folds}: {pairs.source} has only {found} {what} here; lower protocol.folds"
+                f"protocol.folds={self.settings.folds}: {pairs.source} has only {found} {what}{long} here; lower protocol.folds"
                 f" (2 at least) or use more pairs"
             )
-        fold = torch.full((len(pairs),), -1)
+        of_group: dict[Any, int] = {}
         splitter = GroupKFold(self.settings.folds, shuffle=True, random_state=seed)
-        for number, (_, tested) in enumerate(splitter.split(np.zeros(len(pairs)), groups=groups)):
-            fold[torch.as_tensor(tested)] = number
-        return fold
+        ours = [groups[number] for number in tested]
+        for number, (_, part) in enumerate(splitter.split(np.zeros(len(tested)), groups=ours)):
+            of_group |= {ours[index]: number for index in part}
+        long_enough = set(tested)
+        return torch.tensor(
+            [
+                of_group[group] if number in long_enough else -2 - of_group[group] if group in of_group else -1
+                for number, group in enumerate(groups)
+            ]
+        )
 
     def _learn(
-        self, study: Study, whole: Split, members: Tensor, population: Tensor, labels: Labels | None, names: tuple[str, ...]
+        self,
+        study: Study,
+        whole: Split,
+        members: Tensor,
+        start: Tensor,
+        base: Tensor | None,
+        labels: Labels | None,
+        names: tuple[str, ...],
     ) -> tuple[TrainedPolicy, Learned]:
-        """Trains a network for each row of `members` `(K, P)` on these pairs' whole drives."""
+        """Trains a network for each row of `members` `(K, P)` on these pairs' whole drives.
+
+        Args:
+            start: what each network starts from, `(K, n)`.
+            base: drivers' own bases, `(P, n)`, if they have any.
+        """
         if not study.policy.trainable:
-            learned = study.untrained(study.policy, population)
+            learned = study.untrained(study.policy, start)
             return study.ready(study.policy, learned, names), learned
         network, index = members.nonzero().unbind(1)
         device = study.batch.lengths.device
@@ -126,11 +170,14 @@ class AcrossDrivers(Protocol):
             batch=study.batch[index.to(device)],
             split=whole[index],
             windows=study.windows,
-            fixed=population[network.to(device)],
+            fixed=start[network.to(device)],
             labels=labels.select(index) if labels is not None else None,
             network=network.to(device),
             names=names,
             seed=study.seed,
+            base=base[index.to(device)] if base is not None else None,
+            drivers=tuple(study.pairs[number].driver for number in index.tolist()),
+            workspace=study.workspace,
         )
         learned = study.learner.fit(study.policy, lesson)
         return study.ready(study.policy, learned, names), learned
@@ -146,25 +193,125 @@ def _platoons(pairs: Sequence[Pair]) -> list[int]:
     return [int(platoon[number[follower]]) for _, follower in names]
 
 
+@dataclass(frozen=True)
+class _Test:
+    """The Q tested pairs, and what drives them.
+
+    Attributes:
+        pairs, batch: the drives.
+        fold: in which fold each is tested, `(Q,)`.
+        first: the last measured frame before the test part, `(Q,)`.
+        fixed: each driver's own set, `(Q, n)`.
+        strange: what offsets start from for a driver of whom nothing is known, `(Q, n)`.
+        population: of each network, `(K, n)`.
+        policy: what was learned.
+    """
+
+    study: Study
+    pairs: PairSet
+    batch: PairBatch
+    fold: Tensor
+    first: Tensor
+    fixed: Tensor
+    strange: Tensor
+    population: Tensor
+    policy: TrainedPolicy
+
+    def evaluation(self, settings: AcrossDriversSettings) -> Evaluation:
+        """Drives all methods and compares them."""
+        study, batch, first = self.study, self.batch, self.first
+        network = self.fold.to(first.device)
+        strangers = {
+            "default": study.constant(DefaultPolicy(), self.population),
+            "population": study.constant(FixedPolicy(), self.population),
+            "policy": self.policy,
+        }
+        base = self.fixed if settings.base == "own" else self.strange
+        loops = {
+            name: drive(study.simulator, one, batch, first, network, base=base, history=settings.history)
+            for name, one in strangers.items()
+        }
+        each = torch.arange(len(first), device=first.device)
+        loops["fixed"] = drive(study.simulator, study.constant(FixedPolicy(), self.fixed), batch, first, each)
+        whole = {name: drive(study.simulator, one, batch, torch.zeros_like(first), network) for name, one in strangers.items()}
+        default = study.constant(DefaultPolicy(), self.population[:1])
+        platoons = {
+            "default": (default, ("any",)),
+            "population": (strangers["population"], self.policy.names),
+            "policy": (self.policy, self.policy.names),
+        }
+        return evaluate(
+            self.pairs,
+            batch,
+            first,
+            loops,
+            self.policy.space,
+            study.style,
+            seed=study.seed,
+            fold=self.fold,
+            whole=whole,
+            platoon=measure_platoons(study.simulator.model, platoons),
+            history=self.history(settings) if self.policy.base is not None and settings.histories else None,
+        )
+
+    def history(self, settings: AcrossDriversSettings) -> pd.DataFrame:
+        """Drives the test part after reading different amounts of history; see `Evaluation.history`."""
+        study, batch, first, network = self.study, self.batch, self.first, self.fold.to(self.first.device)
+        each = torch.arange(len(first), device=first.device)
+        fixed = drive(study.simulator, study.constant(FixedPolicy(), self.fixed), batch, first, each)
+        own, _ = closed_loop_errors(batch, first, fixed)
+        bases = {"own": self.fixed} if settings.base == "own" else {}
+        rows = []
+        for base, values in {**bases, "population": self.strange}.items():
+            for amount in (*sorted(settings.histories), None):
+                loop = drive(study.simulator, self.policy, batch, first, network, base=values, history=amount)
+                speed, gap = closed_loop_errors(batch, first, loop)
+                read = first.cpu().numpy() * study.simulator.dt
+                rows.append(
+                    pd.DataFrame(
+                        {
+                            "pair_id": [pair.pair_id for pair in self.pairs],
+                            "driver": [pair.driver for pair in self.pairs],
+                            "base": base,
+                            "history_s": read if amount is None else np.minimum(read, amount),
+                            "amount": f"{study.split:.0%}".replace("%", " %") if amount is None else f"{amount:g} s",
+                            "rmse_speed": speed,
+                            "rmse_gap": gap,
+                            "improvement": np.divide(own - speed, own, out=np.full_like(own, np.nan), where=own > 0),
+                        }
+                    )
+                )
+        return pd.concat(rows, ignore_index=True)
+
+
 def _overlap(pairs: PairSet, fold: Tensor) -> dict[str, Any]:
     """Counts the vehicles that stand on both sides of a fold, though never as followers; says so in the log."""
-    led = [f"{pair.recording}/{pair.leader_id}" for pair in pairs]
-    of_driver = {pair.driver: int(k) for pair, k in zip(pairs, fold, strict=True)}
-    behind_trained = sum(leader in of_driver and of_driver[leader] != int(k) for leader, k in zip(led, fold, strict=True))
-    seen_as_leader = {leader for leader, k in zip(led, fold, strict=True) if leader in of_driver and of_driver[leader] != int(k)}
-    drivers = len(of_driver)
+    places = [int(number) for number in fold]
+    tested = {pair.driver: k for pair, k in zip(pairs, places, strict=True) if k >= 0}
+    # Of whom somebody learns: in which fold they do not.
+    learned = {pair.driver: k if k >= 0 else -2 - k for pair, k in zip(pairs, places, strict=True)}
+    behind_trained, leaders = 0, set()
+    for pair, k in zip(pairs, places, strict=True):
+        leader = f"{pair.recording}/{pair.leader_id}"
+        behind_trained += k >= 0 and leader in learned and learned[leader] != k
+        if leader in tested and tested[leader] not in {k, -2 - k}:
+            leaders.add(leader)
+    folds, count = max(places) + 1, sum(k >= 0 for k in places)
     log.info(
         "%d folds over %d drivers; %d of %d test pairs follow a driver of the training part, %d test drivers lead one there",
-        int(fold.max()) + 1,
-        drivers,
+        folds,
+        len(tested),
         behind_trained,
-        len(pairs),
-        len(seen_as_leader),
+        count,
+        len(leaders),
     )
+    if count < len(pairs):
+        log.info("%d shorter pairs are only learned from", len(pairs) - count)
     return {
-        "folds": int(fold.max()) + 1,
-        "drivers": drivers,
-        "drivers_per_fold": [len({d for d, k in of_driver.items() if k == number}) for number in range(int(fold.max()) + 1)],
+        "folds": folds,
+        "drivers": len(tested),
+        "drivers_per_fold": [sum(k == number for k in tested.values()) for number in range(folds)],
         "test_pairs_behind_a_training_driver": behind_trained,
-        "test_drivers_who_lead_a_training_pair": len(seen_as_leader),
+        "test_drivers_who_lead_a_training_pair": len(leaders),
+        "pairs_only_learned_from": len(pairs) - count,
     }

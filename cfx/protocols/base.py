@@ -6,6 +6,7 @@ import logging
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -24,7 +25,7 @@ from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy
 from cfx.policies.features import token_width
 from cfx.policies.trained import Scaler, TrainedPolicy
-from cfx.simulation.rollout import Simulator
+from cfx.simulation.base import BaseSimulator
 from cfx.style.result import StyleResult
 
 log = logging.getLogger(__name__)
@@ -43,12 +44,13 @@ class Study:
         windows: how drives are cut.
         split: share of each pair's windows for training.
         seed: for everything random.
+        workspace: a folder where interrupted training finds what it needs to go on; None: it begins again.
     """
 
     pairs: PairSet
     batch: PairBatch
     style: StyleResult
-    simulator: Simulator
+    simulator: BaseSimulator
     model_node: Mapping[str, Any]
     policy_node: Mapping[str, Any]
     calibrator: Calibrator
@@ -57,6 +59,7 @@ class Study:
     windows: WindowSettings
     split: float
     seed: int
+    workspace: Path | None = None
 
     @property
     def space(self) -> ParameterSpace:
@@ -118,6 +121,7 @@ class Study:
             windows=self.windows,
             dt=self.simulator.dt,
             names=names,
+            base=learned.base,
         )
 
 

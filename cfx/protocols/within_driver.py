@@ -58,6 +58,9 @@ class WithinDriver(Protocol):
                 network=network,
                 names=groups,
                 seed=study.seed,
+                base=fixed if self.settings.networks == "all" else None,
+                drivers=tuple(pair.driver for pair in pairs),
+                workspace=study.workspace,
             )
             learned = study.learner.fit(study.policy, lesson)
         else:
@@ -68,6 +71,6 @@ class WithinDriver(Protocol):
             name: drive(study.simulator, study.constant(constant, fixed), batch, first, own)
             for name, constant in {"default": DefaultPolicy(), "fixed": FixedPolicy()}.items()
         }
-        loops["policy"] = drive(study.simulator, policy, batch, first, network)
+        loops["policy"] = drive(study.simulator, policy, batch, first, network, base=fixed)
         evaluation = evaluate(pairs, batch, first, loops, policy.space, study.style, seed=study.seed)
         return Outcome(evaluation, policy, learned.curves, labels)

@@ -36,12 +36,14 @@ class Plot:
         height: pixels.
         label: what it shows, for readers who do not see it.
         orders: by what the reader chooses, the categories of the x axis; empty if their order is fixed.
+        chooser: what the views differ in, the label of the choice.
     """
 
     views: Mapping[str, Mapping[str, Any]]
     height: int
     label: str
     orders: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    chooser: str = "Policy"
 
 
 def safe(value: object) -> str:

@@ -20,12 +20,14 @@ import yaml
 from cfx.errors import OutputError
 from cfx.figures.look import CLUSTER_COLOURS, COLOURS, LABELS, percent
 from cfx.files import whole
-from cfx.report import paper, tables
+from cfx.report import comparison, paper, tables
 from cfx.report.drive_plots import chosen_drives, drive
 from cfx.report.figure import Plot
+from cfx.report.history_plot import histories, history
 from cfx.report.improvement_plots import overview, per_cluster, per_driver
 from cfx.report.learning_plot import learning
 from cfx.report.names import SEPARATOR, differences
+from cfx.report.platoon_plot import platoon
 from cfx.report.read import Job, Runs, improvement_of
 from cfx.report.style_plot import style
 from cfx.report.tables import BASELINES, NOTHING
@@ -125,8 +127,7 @@ def _content(runs: Runs, title: str | None) -> dict[str, Any]:
     jobs = runs.jobs
     scripts = _scripts()
     models = " and ".join(dict.fromkeys(job.component("model") for job in jobs))
-    baselines = list(dict.fromkeys(baseline for job in jobs for baseline in job.baselines()))
-    series = cluster_series(jobs)
+    compared = [job for job in jobs if job.follows]
     common, own = facts(jobs)
     return {
         "title": title or f"Parameters that adapt: {models}",
@@ -140,12 +141,16 @@ def _content(runs: Runs, title: str | None) -> dict[str, Any]:
         "own": own,
         "configs": [(job.name, job.place, _configuration(job)) for job in jobs],
         "unfinished": runs.unfinished,
-        "overview": overview(jobs),
+        "closeness": comparison.closeness(jobs),
+        "safety": comparison.safety(jobs),
+        "absolute": comparison.absolute(jobs),
+        "safety_of_methods": comparison.safety_of_methods(jobs),
+        "platoons": [(job.name, platoon(job)) for job in jobs if job.platoon is not None],
+        "histories": [(job.name, history(job)) for job in jobs if job.history is not None],
+        "history_sheet": histories(jobs),
+        "not_following": [job.name for job in jobs if not job.follows],
         "errors": tables.errors(jobs),
-        "improvements": tables.improvements(jobs),
-        "per_driver": per_driver(jobs),
-        "per_cluster": per_cluster(series, baselines),
-        "cluster_sheets": [(LABELS.get(one, one), tables.clusters(series, one)) for one in baselines],
+        "compared": _compared(compared) if compared else None,
         "styles": _styles(jobs),
         "drives": [_drives(job) for job in jobs if job.drives is not None],
         "curves": [(job.name, curves["network"].nunique(), learning(curves)) for job, curves in _learned(jobs)],
@@ -154,6 +159,19 @@ def _content(runs: Runs, title: str | None) -> dict[str, Any]:
             file: [job.name for job in jobs if file in job.missing] for file in ("style.csv", "drives.parquet", "curves.parquet")
         },
         "paper": paper.comparisons(jobs),
+    }
+
+
+def _compared(jobs: Sequence[Job]) -> dict[str, Any]:
+    """Returns what compares the policy with constant parameters."""
+    baselines = list(dict.fromkeys(baseline for job in jobs for baseline in job.baselines()))
+    series = cluster_series(jobs)
+    return {
+        "overview": overview(jobs),
+        "improvements": tables.improvements(jobs),
+        "per_driver": per_driver(jobs),
+        "per_cluster": per_cluster(series, baselines),
+        "cluster_sheets": [(LABELS.get(one, one), tables.clusters(series, one)) for one in baselines],
     }
 
 
@@ -175,16 +193,28 @@ def summary(jobs: Sequence[Job]) -> list[str]:
     first = (
         f"{_amount(jobs)}: does a policy that adapts the parameters drive closer to the real driver than {BASELINES['fixed']}?"
     )
-    if len(jobs) <= 3:
-        return [first, *(_verdict(job) for job in jobs)]
+    following = [job for job in jobs if job.follows]
+    marks = [_mark(job) for job in jobs if not job.follows]
+    if len(following) <= 3:
+        return [first, *(_verdict(job) for job in following), *marks]
     said = []
     for baseline, against in (("fixed", ""), ("population", "; against the population's parameters")):
-        sides = [_side(job, baseline) for job in jobs if baseline in job.baselines()]
+        sides = [_side(job, baseline) for job in following if baseline in job.baselines()]
         if sides:
             counts = f"yes in {sides.count('yes')}, no in {sides.count('no')}, undecided in {sides.count('undecided')}"
-            said.append(f"{against or f'Of {len(jobs)} jobs'}: {counts}")
-    best = max(jobs, key=lambda job: float(np.nan_to_num(job.metrics.get("rmse_improvement/mean", np.nan), nan=-np.inf)))
-    return [first, f"{''.join(said)} (by the 95 % interval of the mean improvement).", f"The best mean: {_verdict(best)}"]
+            said.append(f"{against or f'Of {len(following)} jobs'}: {counts}")
+    best = max(following, key=lambda job: float(np.nan_to_num(job.metrics.get("rmse_improvement/mean", np.nan), nan=-np.inf)))
+    counted = f"{''.join(said)} (by the 95 % interval of the mean improvement)."
+    return [first, counted, f"The best mean: {_verdict(best)}", *marks]
+
+
+def _mark(job: Job) -> str:
+    """Says what a policy reaches that sets the acceleration itself."""
+    speed, gap = (job.metrics.get(f"{name}/policy", np.nan) for name in ("rmse_speed", "rmse_gap"))
+    return (
+        f"{job.name}: the policy sets the acceleration itself. RMSE of speed {speed:.3f} m/s, of gap {gap:.2f} m, as a mark for"
+        " the models that follow."
+    )
 
 
 def _amount(jobs: Sequence[Job]) -> str:
@@ -353,8 +383,7 @@ def _drives(job: Job) -> Drives:
     for chosen in chosen_drives(job):
         row = job.by_pair.set_index("pair_id").loc[chosen.pair_id]
         errors = ", ".join(f"{method} {row[f'rmse_speed/{method}']:.3f}" for method in job.methods)
-        heading = (
-            f"{chosen.rank}: pair {chosen.pair_id}, {percent(chosen.improvement, 1)} over fixed; RMSE of speed (m/s): {errors}"
-        )
+        over = f", {percent(chosen.improvement, 1)} over fixed" if job.follows else ""
+        heading = f"{chosen.rank}: pair {chosen.pair_id}{over}; RMSE of speed (m/s): {errors}"
         shown.append((heading[:1].upper() + heading[1:], drive(job, chosen.pair_id)))
     return Drives(job.name, tuple(shown))

@@ -26,6 +26,8 @@ T = TypeVar("T")
 _PAIR_COLUMNS = ("pair_id", "driver", "cluster", "method", "rmse_speed", "rmse_gap", "improvement", "collisions", "frames")
 _STYLE_COLUMNS = ("driver", "score", "cluster")
 _DRIVE_COLUMNS = ("pair_id", "time_s", "leader_speed", "real_speed", "real_gap")
+_PLATOON_COLUMNS = ("method", "network", "vehicle", "time_s", "speed", "gap")
+_HISTORY_COLUMNS = ("pair_id", "driver", "base", "history_s", "amount", "rmse_speed", "rmse_gap", "improvement")
 _CURVE_COLUMNS = ("network", "epoch", "train_loss", "validation_loss")
 _PASSWORD = re.compile(r"(://[^/@\s:]*):[^/@\s]+@")
 
@@ -43,6 +45,8 @@ class Job:
         style: a row per driver; None if the job left none.
         drives: the closed loops of the test part, a row per frame; SI units; None if the job left none.
         curves: the losses by network and epoch; None if the job left none.
+        platoon: `Evaluation.platoon`'s table; None if no platoon was driven.
+        history: as `Evaluation.history`; None if that was not tried.
         overrides: what was typed; None if that is not known.
         experiment: the preset that was chosen, "" for none; None if that is not known.
         started: when it began; None if that is not known.
@@ -60,6 +64,8 @@ class Job:
     style: pd.DataFrame | None
     drives: pd.DataFrame | None
     curves: pd.DataFrame | None
+    platoon: pd.DataFrame | None = None
+    history: pd.DataFrame | None = None
     overrides: tuple[str, ...] | None = None
     experiment: str | None = None
     started: datetime | None = None
@@ -86,12 +92,19 @@ class Job:
         present = [str(method) for method in self.pairs["method"].unique()]
         return tuple(sorted(present, key=lambda method: METHODS.index(method) if method in METHODS else len(METHODS)))
 
+    @property
+    def follows(self) -> bool:
+        """Says whether the model follows its leader with constant parameters, so that those are baselines."""
+        return self.data.get("follows") is not False
+
     def baselines(self, where: str = "") -> tuple[str, ...]:
-        """Returns what the policy was compared with, the driver's own fixed parameters first.
+        """Returns what the policy was compared with, the driver's own fixed parameters first; nothing if `follows` is false.
 
         Args:
             where: "" for the test part, "whole/" for whole drives.
         """
+        if not self.follows:
+            return ()
         found = ("fixed", *(method for method in self.methods if method not in {"fixed", "policy"}))
         known = {baseline for baseline in found if f"{improvement_of(baseline, where)}/mean" in self.metrics}
         return tuple(baseline for baseline in found if baseline in known & set(self.methods))
@@ -191,6 +204,8 @@ def read_job(folder: Path, origin: Origin) -> Job:
         style=optional["style.csv"],
         drives=optional["drives.parquet"],
         curves=optional["curves.parquet"],
+        platoon=_optional(folder / "platoon.parquet", lambda path: _table(path, _PLATOON_COLUMNS)),
+        history=_optional(folder / "history.parquet", lambda path: _table(path, _HISTORY_COLUMNS)),
         overrides=None if overrides is None else tuple(without_password(str(one)) for one in overrides),
         experiment=_experiment(config, hydra),
         started=started,
@@ -241,7 +256,7 @@ def _pairs(path: Path) -> pd.DataFrame:
     return table
 
 
-_TEXT = {"pair_id": str, "recording": str, "leader_id": str, "follower_id": str, "driver": str, "method": str, "network": str}
+_TEXT = dict.fromkeys(("pair_id", "recording", "leader_id", "follower_id", "driver", "method", "network", "base", "amount"), str)
 
 
 def _table(path: Path, columns: Iterable[str]) -> pd.DataFrame:

@@ -28,12 +28,14 @@ SHORT = {"fixed": "own fixed"}
 
 @dataclass(frozen=True)
 class Cell:
-    """What a table shows, and by what it is sorted."""
+    """What a table shows, and by what it is sorted; `second` is a smaller line below, `best` marks the best of a column."""
 
     text: str
     sort: str = ""
     number: bool = False
     colour: str = ""
+    second: str = ""
+    best: bool = False
 
 
 @dataclass(frozen=True)
@@ -47,10 +49,11 @@ class Column:
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table; one cell per column in each row."""
+    """A table; one cell per column in each row. `groups` are headings above the columns, each with how many it spans."""
 
     columns: tuple[Column, ...]
     rows: tuple[tuple[Cell, ...], ...]
+    groups: tuple[tuple[str, int], ...] = ()
 
     def explained(self) -> tuple[Column, ...]:
         """Returns the columns that have something to explain."""
@@ -103,7 +106,7 @@ def errors(jobs: Sequence[Job]) -> Sheet:
             Column("Whole drive: RMSE of speed (m/s)", meaning + " The driver's own fixed parameters do not compete here."),
             Column("Whole drive: RMSE of gap (m)", "The same for the gap."),
         ]
-    rows = [_error_row(job, method, whole) for job in jobs for method in job.methods]
+    rows = [_error_row(job, method, whole) for job in jobs for method in (job.methods if job.follows else ("policy",))]
     return Sheet(tuple(columns), tuple(rows))
 
 

@@ -15,13 +15,15 @@ import math
 import shutil
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
+from cfx.component import folder_hash
 from cfx.errors import ParameterError
 from cfx.models.base import DrivingModel, Follower, Leader
+from cfx.simulation.base import BaseSimulator
 from cfx.simulation.threads import one_thread
 
 Compile = Literal["auto", "always", "never"]
@@ -67,7 +69,7 @@ class Trajectory(NamedTuple):
     collided: Tensor
 
 
-class Simulator:
+class Simulator(BaseSimulator):
     """Advances followers of one model at one time step.
 
     Compiles the model's step once that pays (`compile="auto"`), where a compiler is found; runs it eagerly otherwise and
@@ -75,26 +77,16 @@ class Simulator:
     is kept for the process, and simulators of equal models share it.
     """
 
+    differentiable: ClassVar[bool] = True
+
     def __init__(self, model: DrivingModel, dt: float, *, compile: Compile = "auto") -> None:
-        self.model = model
-        self.dt = dt
+        super().__init__(model, dt)
         self._mode: Compile = compile
 
-    def begin(self, start: Start) -> Follower:
-        """Returns the follower at the start of a rollout."""
-        return Follower(*start, self.model.initial_memory(start.speed))
+    def identity(self) -> str:
+        return folder_hash(__file__)
 
     def advance(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor]) -> tuple[Follower, Tensor, Tensor]:
-        """Takes K steps with constant parameters.
-
-        Args:
-            follower: state at the first frame, `(*batch,)`.
-            leader: frames 0 to K - 1, `(K, *batch)` each (the length without time), broadcasting to the follower's batch.
-            p: one tensor per parameter, broadcasting to `(*batch,)`.
-
-        Returns:
-            The follower at frame K, and positions and speeds `(K, *batch)` of frames 1 to K.
-        """
         steps, batch = len(leader.position), follower.speed.shape
         if steps == 0:
             nothing = follower.speed.new_empty((0, *batch))
@@ -160,12 +152,12 @@ def _stepper(model: DrivingModel, dt: float) -> _Step:
     return take
 
 
-_COMPILED: dict[tuple[type[DrivingModel], str, float, int], _Step] = {}
+_COMPILED: dict[tuple[type[DrivingModel], str, float, float, int], _Step] = {}
 
 
 def _compiled_stepper(model: DrivingModel, dt: float, steps: int) -> _Step:
     """Returns `_stepper`, compiled for a number of steps; equal models share it."""
-    key = (type(model), model.settings.model_dump_json(exclude={"parameters"}), dt, steps)
+    key = (type(model), model.settings.model_dump_json(exclude={"parameters"}), float(model.softness), dt, steps)
     if key not in _COMPILED:
         # Each model and block has a cache of its own: torch counts recompilations per function, and gives up after eight.
         with warnings.catch_warnings():

@@ -16,14 +16,16 @@ from matplotlib.image import imread
 from cfx.errors import ConfigError, OutputError
 from cfx.evaluation.result import Evaluation
 from cfx.figures.drives import chosen_parameters, drives, speeds
+from cfx.figures.history import amounts_of, history_gain
 from cfx.figures.improvement import improvement_per_driver
 from cfx.figures.learning import learning_curve
 from cfx.figures.look import COLOURS, percent, pretty_unit, short, unit_label
+from cfx.figures.platoon import braking_time, platoons, worst_platoon
 from cfx.figures.style import style_distribution
 from cfx.figures.write import write_figures
 from cfx.learners.curves import over_networks
 from cfx.parameters import Parameter, ParameterSpace
-from tests.made_up import MadeUp, make_results
+from tests.made_up import GAINS, MadeUp, make_history, make_platoon, make_results
 
 TEN = ParameterSpace.of(*(Parameter(f"p{k}", "m/s2", -2.0, 3.0 + k, 1.0, "made up") for k in range(10)))
 
@@ -213,3 +215,44 @@ def test_each_method_has_its_own_speed_plot() -> None:
     assert len(figure.axes) == 4
     row = evaluation.table[evaluation.table["method"] == "population"].sort_values("improvement")
     assert any(f"{value:.3f} m/s" in texts(figure) for value in row["rmse_speed"])
+
+
+def test_a_panel_per_method_shows_the_worst_platoon() -> None:
+    platoon = make_platoon({"default": 1, "policy": 3})
+    figure = platoons(platoon)
+    figure.canvas.draw()
+    default, policy = figure.axes
+    assert "string stable" in default.get_title(loc="left")
+    assert "2 of 3 platoons are string stable" in policy.get_title(loc="left")
+    assert "2.59 times" in policy.get_title(loc="left")
+    for axes in (default, policy):
+        assert len([line for line in axes.lines if len(line.get_xdata()) > 1]) == 11
+    # In fold 2 followers collide from its fifth follower on; fold 0, all that `default` has, never does.
+    assert len([line for line in policy.lines if line.get_marker() == "X"]) == 6
+    assert not [line for line in default.lines if line.get_marker() == "X"]
+    rows, network = worst_platoon(platoon.table[platoon.table["method"] == "policy"])
+    assert network == "fold 2"
+    assert braking_time(rows) == 12.0
+
+
+def test_history_is_drawn_from_least_to_most_with_its_intervals() -> None:
+    history = make_history(make_results(pairs=6, frames=20).evaluation.drives, GAINS)
+    assert amounts_of(history) == ["0 s", "10 s", "80 %"]
+    # A drive may be shorter than the longest amount in seconds.
+    short = history.assign(history_s=history["history_s"].where(~history["amount"].str.endswith("%"), 8.0))
+    assert amounts_of(short) == ["0 s", "10 s", "80 %"]
+    (axes,) = history_gain(history).axes
+    own, population = axes.containers
+    assert list(own.lines[0].get_ydata()) == pytest.approx([-0.1, 0.1, 0.2])
+    assert list(population.lines[0].get_ydata()) == pytest.approx([0.05])
+    (low, high) = own.lines[2][0].get_segments()[0][:, 1]
+    assert low < -0.1 < high
+
+
+def test_platoon_and_history_are_written_where_a_protocol_delivered_them(tmp_path: Path) -> None:
+    results = make_results(pairs=3, frames=20)
+    history = make_history(results.evaluation.drives, GAINS)
+    further = dataclasses.replace(results.evaluation, platoon=make_platoon({"policy": 2}), history=history)
+    names = {path.name for path in write_figures(tmp_path, further, results.style, results.curves)}
+    assert {"platoon.png", "history.png"} <= names
+    assert len(names) == 8

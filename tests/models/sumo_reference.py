@@ -3,10 +3,10 @@
 Runs as a process of its own, because libsumo and pyarrow do not get on in one. All followers of a job drive at once, each on
 its own road behind its own leader.
 
-Job: `{"dt": s, "runs": [run, ...]}`. Run: `model` (SUMO's name), `parameters` (SUMO's vType attributes), `leader_speed` (frames
-0 to T - 1), `leader_position`, `leader_acceleration` (frame 0), `leader_length`, and `position`, `speed`, `acceleration` of the
-follower at frame 0. SI units. Answer: `{"runs": [{"speed": [...], "position": [...], "leader_position": [...]}, ...]}`, T frames
-each.
+Job: `{"dt": s, "runs": [run, ...]}`. Run: `model` (SUMO's name), `parameters` and `leader` (SUMO's vType attributes of the
+follower and of the leader), `leader_speed` (frames 0 to T - 1), `leader_position`, `leader_acceleration` (frame 0),
+`leader_length`, and `position`, `speed`, `acceleration` of the follower at frame 0. SI units. Answer: `{"runs": [{"speed": [...],
+"position": [...], "leader_position": [...]}, ...]}`, T frames each.
 """
 
 from __future__ import annotations
@@ -87,9 +87,9 @@ def _routes(runs: list[Job]) -> str:
     lines = ["<routes>"]
     for i, run in enumerate(runs):
         given = " ".join(f'{name}="{value!r}"' for name, value in run["parameters"].items())
-        lines.append(
-            f'<vType id="lead{i}" length="{run["leader_length"]!r}" maxSpeed="{_FAST}" sigma="0" speedFactor="1" speedDev="0"/>'
-        )
+        ahead = " ".join(f'{name}="{value!r}"' for name, value in run["leader"].items())
+        lines.append(f'<vType id="lead{i}" maxSpeed="{_FAST}" sigma="0" speedFactor="1" speedDev="0" {ahead}')
+        lines.append(f' length="{run["leader_length"]!r}"/>')
         lines.append(f'<vType id="drive{i}" carFollowModel="{run["model"]}" sigma="0" speedFactor="1" speedDev="0" {given}/>')
         lines.append(f'<route id="route{i}" edges="road{i}"/>')
     for i, run in enumerate(runs):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -16,7 +17,7 @@ from cfx.evaluation.metrics import improvement_statistics
 from cfx.evaluation.result import Evaluation, Improvement
 from cfx.parameters import ParameterSpace
 from cfx.style.result import CLUSTERS
-from tests.made_up import TWO, make_results
+from tests.made_up import GAINS, TWO, make_history, make_platoon, make_results
 
 WITHIN = ("default", "fixed", "policy")
 ACROSS = ("default", "population", "fixed", "policy")
@@ -36,11 +37,19 @@ def write_job(
     space: ParameterSpace = TWO,
     source: str = "recording.parquet",
     settings: Mapping[str, Any] | None = None,
+    follows: bool = True,
+    further: bool = False,
 ) -> dict[str, float | None]:
-    """Writes a job's folder; returns what its metrics.json holds."""
+    """Writes a job's folder; returns what its metrics.json holds. `further`: with safety, platoons and history."""
     made = make_results(pairs=pairs, frames=frames, space=space, seed=seed, epochs=12, methods=tuple(methods))
     evaluation = _completed(made.evaluation, methods, cluster)
     folder.mkdir(parents=True)
+    if further:
+        evaluation = _with_further_results(evaluation)
+        assert evaluation.platoon is not None
+        assert evaluation.history is not None
+        evaluation.platoon.table.to_parquet(folder / "platoon.parquet", index=False)
+        evaluation.history.to_parquet(folder / "history.parquet", index=False)
     config = {
         "preset": experiment or None,
         "data": {"name": "tidy", "path": source},
@@ -68,6 +77,7 @@ def write_job(
         "pairs": pairs,
         "dropped": dropped,
         "parameters": units,
+        "follows": follows,
     }
     (folder / "data.json").write_text(json.dumps(data), encoding="utf-8")
     (folder / ".hydra").mkdir()
@@ -76,6 +86,15 @@ def write_job(
     metrics = {name: value if math.isfinite(value) else None for name, value in evaluation.metrics().items()}
     (folder / "metrics.json").write_text(json.dumps(metrics), encoding="utf-8")
     return metrics
+
+
+def _with_further_results(evaluation: Evaluation) -> Evaluation:
+    table = evaluation.table.assign(hard_braking=1, rms_jerk=2.5, real_rms_jerk=0.4, at_bounds=0.25)
+    if evaluation.whole_improvements:
+        table = table.assign(whole_collisions=0.0, whole_hard_braking=2.0)
+    methods = [method for method in evaluation.methods if method != "fixed"]
+    platoon = make_platoon(dict.fromkeys(methods, 2))
+    return dataclasses.replace(evaluation, table=table, platoon=platoon, history=make_history(evaluation.drives, GAINS))
 
 
 def _completed(evaluation: Evaluation, methods: Sequence[str], cluster: str) -> Evaluation:

@@ -21,7 +21,7 @@ from cfx.report.runs import read_runs
 from tests.report.folders import ACROSS, write_job
 
 HOSTILE = "</script><img src=x onerror=alert(1)>&\"'"
-SECTIONS = ("summary", "run", "results", "drivers", "clusters", "style", "drives", "learning", "configs")
+SECTIONS = ("summary", "comparison", "run", "results", "safety", "drivers", "clusters", "style", "drives", "learning", "configs")
 
 
 class Page(HTMLParser):

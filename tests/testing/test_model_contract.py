@@ -99,6 +99,7 @@ BROKEN = {
     "root": (model(root_of_gap), checks.gradients_are_finite_at_every_extreme, "not finite"),
     "explodes": (Exploding(), checks.no_rollout_leaves_what_is_finite, "infinity or NaN|absurd speeds"),
     "blind": (model(lambda v, f, *_: f.speed, collision_free=True), checks.collision_free_as_claimed, "hits a leader"),
+    "ignores": (model(lambda v, f, *_: f.speed), checks.follows_its_leader_as_claimed, "set `follows = False`"),
     "stubborn": (Stubborn(), checks.constants_can_be_tuned_and_tuned_parameters_fixed, "must turn a constant"),
     "no source": (Undocumented(), checks.every_parameter_says_what_it_is, "has no source"),
     "no unit": (Dimensionless(), checks.every_parameter_says_what_it_is, "has no unit"),

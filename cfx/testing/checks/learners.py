@@ -23,6 +23,7 @@ from cfx.models.krauss import Krauss
 from cfx.pairs import SIGNALS, PairBatch, PairSet
 from cfx.policies.features import token_width
 from cfx.policies.gru import GruPolicy
+from cfx.policies.offsets import NONE
 from cfx.policies.trained import TrainedPolicy, measured_history
 from cfx.simulation.rollout import Simulator
 from cfx.testing.contract import contract_of
@@ -72,14 +73,15 @@ def delivers_networks_that_are_ready_to_drive(learner: Learner) -> None:
         material = lesson(needs_labels=learner.needs_labels, together=together)
         learned = _fitted(learner, material)
         assert isinstance(learned, Learned), f"`fit` must return a cfx.Learned, not a {type(learned).__name__}"
-        networks, width = len(material.names), token_width(_POLICY.inputs, _POLICY.summary, WINDOWS.length)
+        networks, width = len(material.names), _width(learned, material)
         for name, value in [*learned.network.named_parameters(), *learned.network.named_buffers()]:
             assert value.shape[0] == networks, (
                 f"{name} is for {value.shape[0]} networks, but the lesson names {networks}: `network` and `names` of the lesson"
                 " say how many there are and who learns in which"
             )
         assert learned.scaler.mean.shape == learned.scaler.scale.shape == (networks, width), (
-            f"the scaler must hold {(networks, width)} means and scales: each network's tokens are normalised on their own"
+            f"the scaler must hold {(networks, width)} means and scales: each network's tokens are normalised on their own, with"
+            " the base beside them where answers are offsets"
         )
         assert not learned.network.training, (
             "the networks must be in evaluation mode (`network.eval()`): dropout would make a driver's parameters random"
@@ -92,13 +94,15 @@ def delivers_networks_that_are_ready_to_drive(learner: Learner) -> None:
 
 def learns_something(learner: Learner) -> None:
     material = lesson(needs_labels=learner.needs_labels)
+    learned = _fitted(learner, material)
+    space = material.simulator.model.space
+    unit = space.to_unit(material.fixed).float()
     untrained = _POLICY.build(
-        token_width(_POLICY.inputs, _POLICY.summary, WINDOWS.length),
-        material.simulator.model.space.to_unit(material.simulator.model.space.defaults()).float(),
-        material.simulator.model.space.to_unit(material.fixed).float(),
+        _width(learned, material),
+        space.to_unit(space.defaults()).float(),
+        unit if learned.base is None else torch.full_like(unit, NONE),
         torch.Generator().manual_seed(0),
     ).eval()
-    learned = _fitted(learner, material)
     before, after = _rmse(replace(learned, network=untrained), material), _rmse(learned, material)
     assert after < 0.7 * before, (
         "drivers with constant parameters are the easiest lesson there is: in closed loop over the frames that were learned from,"
@@ -233,7 +237,14 @@ def _ready(learned: Learned, material: Lesson) -> TrainedPolicy:
         windows=WINDOWS,
         dt=material.simulator.dt,
         names=material.names,
+        base=learned.base,
     )
+
+
+def _width(learned: Learned, material: Lesson) -> int:
+    """Returns f; where answers are offsets, the networks read the base too."""
+    width = token_width(_POLICY.inputs, _POLICY.summary, WINDOWS.length)
+    return width if learned.base is None else width + len(material.simulator.model.space)
 
 
 def _state(learned: Learned) -> dict[str, Tensor]:

@@ -208,6 +208,19 @@ def gradients_are_finite_at_every_extreme(model: DrivingModel) -> None:
         )
 
 
+def follows_its_leader_as_claimed(model: DrivingModel) -> None:
+    if not model.follows:
+        raise NotApplicable("the model does not claim to follow with constant parameters")
+    follower, leader, p = _ordinary(model)
+    near = model.next_speed(follower, leader, p, DT)
+    far = model.next_speed(follower, leader._replace(position=leader.position + 1e3, speed=leader.speed + 20.0), p, DT)
+    reacts = (near - far).abs().gt(1e-6).double().mean().item()
+    assert reacts >= 0.1, (
+        f"the model claims `follows`, but takes notice of its leader in {reacts:.0%} of ordinary states: fixed parameters would"
+        " be no baseline (set `follows = False` for a model whose parameters are the control itself)"
+    )
+
+
 def no_rollout_leaves_what_is_finite(model: DrivingModel) -> None:
     draw = torch.Generator().manual_seed(3)
     corner = torch.randint(0, 2, (256, len(model.space)), generator=draw).double()

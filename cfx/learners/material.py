@@ -1,0 +1,333 @@
+"""What is learned from when a policy learns by driving: drivers placed in networks, and drives drawn from their recordings.
+
+Letters: P pairs of the lesson, N networks, B drivers of the largest, D drives, H windows of a drive, W windows of the longest
+pair, L frames that a token holds, S steps of a window, f features, n tuned parameters, s width of a policy's state, m of a
+model's memory.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from cfx.learners.base import Lesson
+from cfx.learners.batched import Grid
+from cfx.learners.window_step import Ahead, Recent, WindowStep
+from cfx.models.base import Leader
+from cfx.pairs import PairBatch
+from cfx.policies.base import Policy
+from cfx.policies.features import tokens
+from cfx.policies.offsets import coordinates
+from cfx.policies.trained import Scaler, measured_history
+from cfx.simulation.rollout import Start
+
+_FEW_DRIVERS = 5
+"""A network with fewer drivers holds out the end of each drive for validation, not drivers."""
+
+_TABLE = 4_000_000
+"""Vehicle steps of one part of a table of errors, which bounds its memory to some hundred MB."""
+
+
+class Drives(NamedTuple):
+    """Drives to simulate, D for each network.
+
+    Attributes:
+        place: which of the network's drivers, `(N, D)`.
+        start: window at whose beginning the policy takes over, `(N, D)`.
+        stranger: whether it has read nothing and begins from the population's parameters, bool `(N, D)`.
+        last: the last frame that counts, `(N, D)`.
+        weight: `(N, D)`; 0 leaves a drive out.
+    """
+
+    place: Tensor
+    start: Tensor
+    stranger: Tensor
+    last: Tensor
+    weight: Tensor
+
+
+@dataclass
+class Material:
+    """The lesson, placed as N networks by B drivers, in single precision.
+
+    Attributes:
+        batch: the P pairs.
+        pair: which of them stands at each place, `(N, B)`.
+        real: whether one stands there, bool.
+        trains, validates: what a place is used for, bool `(N, B)`.
+        until: last frame that training may use, `(N, B)`.
+        last: last frame of the training part, `(N, B)`.
+        base: each driver's base in unit space, `(N, B, n)`.
+        start: the population's, `(N, n)`: of those who bring no base of their own.
+        tokens: what was measured, `(P, W, f)`.
+        scaler: normalises tokens and the base in the squashed space, f + n features.
+    """
+
+    batch: PairBatch
+    pair: Tensor
+    real: Tensor
+    trains: Tensor
+    validates: Tensor
+    until: Tensor
+    last: Tensor
+    base: Tensor
+    start: Tensor
+    tokens: Tensor
+    scaler: Scaler
+
+    @classmethod
+    def of(cls, lesson: Lesson, policy: Policy, share: float, generator: torch.Generator) -> Material:
+        batch = _single(lesson.batch)
+        device = batch.lengths.device
+        grid = Grid(lesson.network.to(device), len(lesson.names))
+        pairs = torch.arange(len(batch), device=device)
+        pair, real = grid.scatter(pairs), grid.scatter(torch.ones_like(pairs)).bool()
+        last = lesson.split.frame.to(device)[pair]
+        held, few = _held_out(lesson, pair.cpu(), real.cpu(), share, generator)
+        held, few = held.to(device), few.to(device)[:, None]
+        cut = (last * (1.0 - share)).long()
+        space, stride = lesson.simulator.model.space, lesson.windows.stride
+        unit = space.to_unit(lesson.fixed).float()
+        own = unit if lesson.base is None else space.to_unit(lesson.base).float()
+        weight = real.float()[..., None]
+        start = (unit[pair] * weight).sum(1) / weight.sum(1)
+        windows = torch.arange(0, int(lesson.split.frame.max()) + 1, stride, device=device)
+        measured = measured_history(
+            batch[pairs.repeat_interleave(len(windows))], windows.repeat(len(batch)), lesson.windows.length
+        )
+        seen = tokens(measured, policy.inputs, policy.summary).view(len(batch), len(windows), -1)
+        trains = real & (few | ~held)
+        features = torch.cat([seen, coordinates(own)[:, None].expand(-1, len(windows), -1)], -1)[pair]
+        scaler = Scaler.of(features, trains[..., None] & (windows <= torch.where(few, cut, last)[..., None]))
+        return cls(
+            batch=batch,
+            pair=pair,
+            real=real,
+            trains=trains,
+            validates=real & (few | held) & (share > 0),
+            until=torch.where(few, cut, last),
+            last=last,
+            base=own[pair],
+            start=start,
+            tokens=seen,
+            scaler=scaler,
+        )
+
+    def states(self, step: WindowStep, windows: int) -> Tensor:
+        """Lets the policy read all drives from their beginning; returns its state before each window.
+
+        Returns:
+            `(windows + 1, N, B, s)`.
+        """
+        networks, drivers = self.pair.shape
+        squashed = coordinates(self.base)
+        state = step.network.initial_state(networks, drivers)
+        states = [state]
+        if state.is_floating_point() and torch.is_grad_enabled():
+            state = state.detach().requires_grad_()  # as all later ones, so that one compiled function serves all
+        for window in range(windows):
+            _, state = step.read(self.tokens[:, window][self.pair], squashed, state)
+            states.append(state)
+        return torch.stack(states)
+
+    def begin(self, states: Tensor, drives: Drives) -> tuple[Tensor, Tensor, Tensor]:
+        """Returns which pair each drive is of `(N, D)`, its base `(N, D, n)` and the policy's state `(N, D, s)` as it begins.
+
+        Args:
+            states: as `states` returns them, at least up to the last start.
+        """
+        n = torch.arange(len(self.pair), device=self.pair.device)[:, None]
+        stranger = drives.stranger[..., None]
+        base = torch.where(stranger, self.start[:, None], self.base[n, drives.place])
+        state = torch.where(stranger, states[0][n, drives.place], states[drives.start, n, drives.place])
+        return self.pair[n, drives.place], base, state
+
+
+class Real(NamedTuple):
+    """What was measured at simulated frames; `(N, D, frames)` each.
+
+    Attributes:
+        speed: m/s.
+        gap: m.
+        counted: 1 for a frame within the training part, else 0.
+    """
+
+    speed: Tensor
+    gap: Tensor
+    counted: Tensor
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is measured around drives; H windows, time in frames from `1 - L` to `H S`.
+
+    Attributes:
+        leader: position, speed, acceleration, window by window, `(3, H, N, D, L + S)`.
+        leader_length: `(N, D)`.
+        follower: position, speed, acceleration of the last L frames before the policy takes over, `(3, N, D, L)`.
+        memory: of the model at that moment, `(N, D, m)`.
+        measured: at the `H S` frames that are simulated.
+    """
+
+    leader: Tensor
+    leader_length: Tensor
+    follower: Tensor
+    memory: Tensor
+    measured: Real
+
+    @classmethod
+    def of(cls, batch: PairBatch, pair: Tensor, drives: Drives, step: WindowStep, windows: int) -> Scene:
+        length, stride = step.length, step.stride
+        now, end = (drives.start * stride)[..., None], batch.mask.shape[1] - 1
+        device = pair.device
+
+        def at(signal: Tensor, frames: Tensor) -> Tensor:
+            return signal[pair[..., None], frames.clamp(min=0, max=end)]
+
+        origin = at(batch.follower_position, now)
+        past = now + torch.arange(1 - length, 1, device=device)
+        follower = torch.stack(
+            [at(batch.follower_position, past) - origin, at(batch.follower_speed, past), at(batch.follower_acceleration, past)]
+        )
+        offsets = torch.arange(windows, device=device)[:, None] * stride + torch.arange(1 - length, stride + 1, device=device)
+        around = now + offsets[:, None, None]
+        leader = torch.stack(
+            [at(batch.leader_position, around) - origin, at(batch.leader_speed, around), at(batch.leader_acceleration, around)]
+        )
+        simulated = now + torch.arange(1, windows * stride + 1, device=device)
+        return cls(
+            leader=leader,
+            leader_length=batch.leader_length[pair],
+            follower=follower,
+            memory=step.model.initial_memory(follower[1, ..., -1]),
+            measured=Real(
+                at(batch.follower_speed, simulated),
+                at(batch.gap, simulated),
+                (simulated <= drives.last[..., None]).to(follower.dtype),
+            ),
+        )
+
+    def recent(self, state: Tensor) -> Recent:
+        """Returns where the drives begin."""
+        position, speed, acceleration = self.follower.unbind(0)
+        begin = Recent(position, speed, acceleration, self.memory, state)
+        if not torch.is_grad_enabled():
+            return begin
+        # Gradients flow through all later states; if they did not through the first, it would be compiled for once more.
+        return Recent(*(value if value.requires_grad else value.clone().requires_grad_() for value in begin))
+
+    def real(self, frames: slice) -> Real:
+        """Returns what was measured at some of the simulated frames."""
+        return Real(*(signal[..., frames] for signal in self.measured))
+
+    def ahead(self, window: int) -> Ahead:
+        """Returns the leader around a window."""
+        return Ahead(*self.leader[:, window].unbind(0))
+
+
+@dataclass(frozen=True)
+class BaseErrors:
+    """RMSE of speed and of gap of constant parameters, which a drive's errors are divided by.
+
+    Attributes:
+        familiar, strange: of each driver's base and of the population's set over the horizon from each window on,
+            `(N, B, W, 2)`.
+        whole: of the population's set over the whole training part, `(N, B, 2)`.
+    """
+
+    familiar: Tensor
+    strange: Tensor
+    whole: Tensor
+
+    @classmethod
+    def of(cls, lesson: Lesson, material: Material, horizon: int) -> BaseErrors:
+        """Simulates them; `horizon` in windows."""
+        stride, (networks, drivers) = lesson.windows.stride, material.pair.shape
+        windows = torch.arange(material.tokens.shape[1], device=material.pair.device) * stride
+        near, far = (_Constant(lesson, material.batch, steps) for steps in (horizon * stride, int(material.last.max())))
+        pairs, start = material.pair.flatten(), material.start.repeat_interleave(drivers, 0)
+        familiar = near.errors(pairs, material.base.flatten(0, 1), windows).view(networks, drivers, -1, 2)
+        if lesson.base is None:
+            return cls(familiar, familiar, far.errors(pairs, start, windows[:1]).view(networks, drivers, 2))
+        strange = near.errors(pairs, start, windows).view(networks, drivers, -1, 2)
+        return cls(familiar, strange, far.errors(pairs, start, windows[:1]).view(networks, drivers, 2))
+
+    def over_horizon(self, drives: Drives) -> Tensor:
+        """Returns the errors over the horizon from where each drive begins, `(N, D, 2)`."""
+        places = (torch.arange(len(drives.place), device=drives.place.device)[:, None], drives.place, drives.start)
+        return torch.where(drives.stranger[..., None], self.strange[places], self.familiar[places])
+
+
+class _Constant:
+    """Drives with constant parameters from many frames on."""
+
+    def __init__(self, lesson: Lesson, batch: PairBatch, steps: int) -> None:
+        self.simulator = lesson.simulator
+        self.batch = batch
+        self.steps = steps
+        self.last = lesson.split.frame.to(batch.lengths.device)
+
+    @torch.no_grad()
+    def errors(self, pair: Tensor, unit: Tensor, windows: Tensor) -> Tensor:
+        """Returns RMSE of speed and gap over the horizon, `(B, W, 2)`.
+
+        Args:
+            pair: `(B,)`.
+            unit: parameters in unit space, `(B, n)`.
+            windows: frames at which drives begin, `(W,)`.
+        """
+        size = max(1, _TABLE // (len(windows) * self.steps))
+        parts = zip(torch.split(pair, size), torch.split(unit, size), strict=True)
+        return torch.cat([self._part(one, values, windows) for one, values in parts])
+
+    def _part(self, pair: Tensor, unit: Tensor, windows: Tensor) -> Tensor:
+        batch, end = self.batch, self.batch.mask.shape[1] - 1
+        shape = (len(pair), len(windows))
+        frames = (windows + torch.arange(self.steps + 1, device=pair.device)[:, None])[:, None]
+        index = frames.clamp(max=end).expand(-1, *shape)
+        rows = pair[:, None].expand(shape)
+        first = windows.clamp(max=end).expand(shape)
+        position, speed, acceleration = (
+            signal[rows, index] for signal in (batch.leader_position, batch.leader_speed, batch.leader_acceleration)
+        )
+        length = batch.leader_length[rows]
+        start = Start(*(s[rows, first] for s in (batch.follower_position, batch.follower_speed, batch.follower_acceleration)))
+        space = self.simulator.model.space
+        p = {k: v[:, None] if v.dim() else v for k, v in space.unpack(space.from_unit(unit)).items()}
+        leader = Leader(position[:-1], speed[:-1], acceleration[:-1], length)
+        _, simulated, driven = self.simulator.advance(self.simulator.begin(start), leader, p)
+        counted = (frames[1:] <= self.last[pair][:, None]).to(driven.dtype)
+        gap = position[1:] - length - simulated
+        errors = [driven - batch.follower_speed[rows, index[1:]], gap - batch.gap[rows, index[1:]]]
+        total = counted.sum(0).clamp(min=1.0)
+        return torch.stack([((e.square() * counted).sum(0) / total).sqrt() for e in errors], -1)
+
+
+def _single(batch: PairBatch) -> PairBatch:
+    """Returns the batch in single precision, which resolves positions on it to 0.1 mm."""
+    names = [f.name for f in fields(batch) if f.name not in {"lengths", "mask", "dt"}]
+    changed: dict[str, Any] = {name: getattr(batch, name).float() for name in names}
+    return replace(batch, **changed)
+
+
+def _held_out(lesson: Lesson, pair: Tensor, real: Tensor, share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Chooses validation drivers for each network.
+
+    Returns:
+        Whether a place's driver is held out, `(N, B)`; and which networks have too few drivers for that, `(N,)`.
+    """
+    drivers = lesson.drivers or tuple(str(number) for number in range(len(lesson.batch)))
+    held, few = torch.zeros_like(real), torch.zeros(len(pair), dtype=torch.bool)
+    for number, (places, there) in enumerate(zip(pair.tolist(), real.tolist(), strict=True)):
+        who = [drivers[place] if here else None for place, here in zip(places, there, strict=True)]
+        known = sorted({driver for driver in who if driver is not None})
+        few[number] = len(known) < _FEW_DRIVERS
+        if few[number] or share == 0:
+            continue
+        order = torch.randperm(len(known), generator=generator)[: max(1, round(share * len(known)))]
+        chosen = {known[index] for index in order.tolist()}
+        held[number] = torch.tensor([driver in chosen for driver in who])
+    return held, few

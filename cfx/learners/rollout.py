@@ -1,0 +1,356 @@
+"""Learning through the simulation: the policy is trained on what matters, the closed-loop error of the drives it simulates.
+
+Where window labels are not determined by the data, their average means little (see `imitation`). Here nothing is labelled: from
+random measured states on, the policy drives in closed loop behind the measured leader, and the error of its speeds and gaps is
+propagated back through the simulation into the network.
+
+Letters: P pairs of the lesson, N networks, B drivers of the largest, D drives of one step, H windows of a drive, W windows of the
+longest pair, n tuned parameters.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import lightning.pytorch as pl
+import pandas as pd
+import torch
+from lightning.pytorch.core.optimizer import LightningOptimizer
+from pydantic import Field
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+
+from cfx.component import Settings, content_key
+from cfx.errors import ConfigError
+from cfx.learners.base import CURVE_COLUMNS, Learned, Learner, Lesson
+from cfx.learners.batched import BatchedModule, clip_each, fit
+from cfx.learners.material import BaseErrors, Drives, Material, Real, Scene
+from cfx.learners.window_step import Recent, WindowStep, bounded
+from cfx.policies.base import Policy, PolicyNetwork
+from cfx.policies.offsets import NONE, coordinates
+from cfx.progress import Task
+from cfx.simulation.rollout import Compile, can_compile
+
+_WORTH_COMPILING = 5_000
+"""Windows driven in training, one after the other, from which compiling pays: some ten seconds of eager work."""
+
+_VALIDATED = (0.2, 0.4, 0.6, 0.8)
+"""Shares of a validation drive at which the policy takes over, having read the part before."""
+
+_LEAST_SPEED, _LEAST_GAP = 0.2, 1.0
+"""m/s, m: added to the errors of the base that a drive's error is divided by, so that drives that it fits well do not rule."""
+
+_LEAST_SOFTNESS = 0.02
+"""Below this a smoothed switch has no gradient that single precision resolves."""
+
+_SMALL = 1e-4
+"""(m/s)2, m2: keeps the root's slope finite where a drive has no error."""
+
+_WARM_UP = 20
+"""Gradient steps over which the learning rate rises."""
+
+
+class RolloutSettings(Settings):
+    """Settings of `rollout`."""
+
+    epochs: int = Field(16, ge=1, description="epochs at most; after each, every network is validated")
+    steps: int = Field(25, ge=1, description="gradient steps of an epoch; in each, every driver drives")
+    draws: int = Field(2, ge=1, description="drives of each driver and step, each from a random measured state")
+    horizon: int = Field(30, ge=1, description="windows that a drive lasts")
+    strangers: float = Field(
+        0.3,
+        ge=0,
+        le=1,
+        description="share of drives that begin without history, from the population's parameters, where drivers have their own",
+    )
+    gap_weight: float = Field(0.1, ge=0, description="weight of the gap's error beside the speed's")
+    error: Literal["rmse", "huber"] = Field(
+        "rmse", description="of a drive: rmse; huber: the root of twice the mean Huber loss, which outliers move less"
+    )
+    huber_delta: float = Field(1.0, gt=0, description="m/s (speed) and m (gap): where Huber's loss turns from square to linear")
+    normalise: bool = Field(
+        True, description="divide each drive's error by what the base parameters have there, as the improvement is counted"
+    )
+    learning_rate: float = Field(3e-3, gt=0, description="of Adam, at its highest; it falls to 0 along a cosine")
+    weight_decay: float = Field(1e-4, ge=0, description="of AdamW, decoupled")
+    gradient_clip: float | None = Field(1.0, gt=0, description="largest gradient norm of a network; null: none")
+    damping: float = Field(
+        0.9, gt=0, le=1, description="factor on gradients that come back through one window; 1 remembers the whole drive"
+    )
+    gradient_bound: float = Field(2.0, gt=0, description="largest gradient that one drive's error sends back through a window")
+    truncation: int | None = Field(
+        None, ge=1, description="windows after which gradients are cut and memory is freed; null: the whole drive"
+    )
+    smoothing: float = Field(
+        1.0, ge=0, description="how gradually regimes switch in training, at first; 0: exactly. Evaluation is always exact."
+    )
+    smoothing_end: float = Field(0.3, ge=0, description="the same in the last epoch")
+    validation: float = Field(
+        0.25, ge=0, lt=1, description="share of the drivers kept for validation; of each drive's end where drivers are few"
+    )
+    patience: int | None = Field(
+        6, ge=1, description="epochs without a better validation loss after which a network stops; null: never"
+    )
+    compile: Compile = Field("auto", description="the window that training repeats: auto: where it pays; always; never")
+
+
+class RolloutLearner(Learner):
+    """Back-propagates the error of closed-loop drives into the policy.
+
+    Networks answer offsets (`cfx.policies.offsets`): untrained, each driver is driven by his base parameters, so training starts
+    from the fixed model. Before a drive the policy reads the driver's measured history up to there; strangers' drives begin with
+    none. All drivers of all networks drive at once, from random measured states. Models with regimes are smoothed meanwhile, and
+    validated as they are.
+
+    Training goes on where it was interrupted, and gives the same then, if the lesson has a workspace.
+
+    Differences from the paper: it imitates window labels.
+    """
+
+    schema: ClassVar[type[Settings]] = RolloutSettings
+    settings: RolloutSettings
+    needs_labels = False
+
+    def fit(self, policy: Policy, lesson: Lesson) -> Learned:
+        """As `Learner.fit`.
+
+        Raises:
+            ConfigError: the simulator or the model has no gradients.
+        """
+        simulator, s = lesson.simulator, self.settings
+        if not (simulator.differentiable and simulator.model.differentiable):
+            who = "the driving model" if simulator.differentiable else "the simulator"
+            raise ConfigError(
+                f"learner=rollout needs gradients, and {who} has none; choose a differentiable model and simulator=memory, or"
+                " learner=imitation"
+            )
+        generator = torch.Generator().manual_seed(lesson.seed)
+        material = Material.of(lesson, policy, s.validation, generator)
+        space, device = simulator.model.space, lesson.batch.lengths.device
+        blank = torch.full((len(lesson.names), len(space)), NONE)
+        default = space.to_unit(space.defaults()).float()
+        network = policy.build(material.scaler.mean.shape[-1], default, blank, generator).to(device)
+        base = space.from_unit(material.start.to(lesson.fixed.dtype))
+        if not any(parameter.requires_grad for parameter in network.parameters()):
+            return Learned(network.eval(), material.scaler, pd.DataFrame(columns=CURVE_COLUMNS), base=base)
+        task = Task(f"Training ({len(lesson.names)} networks, at most {s.epochs} epochs)", s.epochs)
+        module = RolloutModule(network, material, policy, lesson, s, on_epoch=task.advance)
+        kept = self.checkpoint(policy, lesson)
+        fit(module, _Steps(s.steps), epochs=s.epochs, seed=lesson.seed, device=device, task=task, checkpoint=kept)
+        return Learned(module.network, material.scaler, module.curves(), base=base)
+
+    def checkpoint(self, policy: Policy, lesson: Lesson) -> Path | None:
+        """Returns the file from which this very training goes on, or None without a workspace."""
+        if lesson.workspace is None:
+            return None
+        batch, drives = lesson.batch, hashlib.sha256()
+        signals = (batch.leader_position, batch.leader_speed, batch.follower_position, batch.follower_speed)
+        chosen = (lesson.split.frame, lesson.fixed, lesson.network, *([lesson.base] if lesson.base is not None else []))
+        for tensor in (*signals, *chosen):
+            drives.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+        description = {
+            "learner": self.identity(),
+            "policy": policy.identity(),
+            "model": lesson.simulator.model.identity(),
+            "windows": lesson.windows.model_dump(),
+            "drives": drives.hexdigest(),
+            "names": lesson.names,
+            "drivers": lesson.drivers,
+            "seed": lesson.seed,
+        }
+        return lesson.workspace / f"{content_key(description)}.ckpt"
+
+
+class _Steps(pl.LightningDataModule):
+    """The numbers of an epoch's gradient steps; what is drawn in each follows from the seed and its number."""
+
+    def __init__(self, steps: int) -> None:
+        super().__init__()
+        self.steps = steps
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        return DataLoader(range(self.steps), batch_size=None, shuffle=False)  # type: ignore[arg-type]  # a range is a dataset
+
+    def val_dataloader(self) -> DataLoader[Any]:
+        return DataLoader([0], batch_size=None)  # type: ignore[arg-type]  # a list is a dataset
+
+
+class RolloutModule(BatchedModule):
+    """Trains N networks on random closed-loop drives."""
+
+    def __init__(
+        self,
+        network: PolicyNetwork,
+        material: Material,
+        policy: Policy,
+        lesson: Lesson,
+        settings: RolloutSettings,
+        on_epoch: Callable[[], None] = lambda: None,
+    ) -> None:
+        super().__init__(network, lesson.names, settings, on_epoch)
+        self.automatic_optimization = False
+        self.material = material
+        self.settings = settings
+        self.seed = lesson.seed
+        self.has_strangers = lesson.base is not None
+        self.softness = torch.tensor(settings.smoothing, device=material.base.device)
+        model, dt = lesson.simulator.model, lesson.simulator.dt
+        smooth = model.smoothed(self.softness) if settings.smoothing > 0 else model
+        self.exact = WindowStep(network, material.scaler, policy, model, lesson.windows, dt)
+        self.step = WindowStep(network, material.scaler, policy, smooth, lesson.windows, dt)
+        if self._compiles():
+            self.step.compile()
+        self.errors = BaseErrors.of(lesson, material, settings.horizon) if settings.normalise else None
+        self.losses: list[Tensor] = []
+
+    def _compiles(self) -> bool:
+        s = self.settings
+        worth_it = s.compile == "always" or (s.compile == "auto" and s.epochs * s.steps * s.horizon >= _WORTH_COMPILING)
+        return worth_it and can_compile(self.material.base.device)
+
+    def configure_optimizers(self) -> Any:
+        s = self.settings
+        optimizer = super().configure_optimizers()
+        total = s.epochs * s.steps
+
+        def rate(step: int) -> float:
+            return min(1.0, (step + 1) / _WARM_UP) * 0.5 * (1.0 + math.cos(math.pi * min(1.0, step / total)))
+
+        return [optimizer], [torch.optim.lr_scheduler.LambdaLR(optimizer, rate)]
+
+    def on_train_epoch_start(self) -> None:
+        s = self.settings
+        done = self.current_epoch / max(1, s.epochs - 1)
+        self.softness.fill_(max(s.smoothing + done * (s.smoothing_end - s.smoothing), _LEAST_SOFTNESS))
+
+    def simulate(self, step: WindowStep, states: Tensor, drives: Drives, windows: int) -> tuple[Tensor, Tensor]:
+        """Simulates drives in closed loop, without gradients; returns speeds and gaps, `(N, D, H S)`."""
+        speeds, gaps, _ = next(self._stretches(step, states, drives, windows))
+        return speeds, gaps
+
+    def drive(self, step: WindowStep, states: Tensor, drives: Drives, windows: int, scale: Tensor | None) -> Iterator[Tensor]:
+        """Simulates drives in closed loop.
+
+        Args:
+            step: takes one window.
+            states: as `Material.states` returns them, at least up to the last start.
+            windows: H.
+            scale: what the errors of speed and gap are divided by, `(N, D, 2)`; None: nothing.
+
+        Yields:
+            The loss of each drive, `(N, D)`, of each stretch between two truncations.
+        """
+        for speeds, gaps, real in self._stretches(step, states, drives, windows):
+            speed_error = _error(speeds - real.speed, real.counted, self.settings)
+            gap_error = _error(gaps - real.gap, real.counted, self.settings)
+            if scale is not None:
+                speed_error, gap_error = speed_error / (scale[..., 0] + _LEAST_SPEED), gap_error / (scale[..., 1] + _LEAST_GAP)
+            yield speed_error + self.settings.gap_weight * gap_error
+
+    def _stretches(self, step: WindowStep, states: Tensor, drives: Drives, windows: int) -> Iterator[tuple[Tensor, Tensor, Real]]:
+        """Yields simulated speeds and gaps of each stretch, and what was measured there."""
+        s, learning = self.settings, torch.is_grad_enabled()
+        pair, base, state = self.material.begin(states, drives)
+        scene = Scene.of(self.material.batch, pair, drives, step, windows)
+        squashed, recent = coordinates(base), scene.recent(state)
+        length = s.truncation if s.truncation and learning else windows
+        for first in range(0, windows, length):
+            speeds, gaps = [], []
+            for window in range(first, min(first + length, windows)):
+                recent, speed, gap = step.drive(recent, scene.ahead(window), scene.leader_length, base, squashed)
+                if learning:
+                    recent = bounded(recent, s.damping, s.gradient_bound / drives.place.shape[1])
+                speeds.append(speed)
+                gaps.append(gap)
+            frames = slice(first * step.stride, (first + len(speeds)) * step.stride)
+            yield torch.cat(speeds, -1), torch.cat(gaps, -1), scene.real(frames)
+            recent = Recent(*(value.detach().requires_grad_(learning) for value in recent))
+
+    def _scale(self, drives: Drives) -> Tensor | None:
+        return self.errors.over_horizon(drives) if self.errors is not None else None
+
+    def training_step(self, number: int, index: int) -> None:
+        s, material = self.settings, self.material
+        optimizer, schedule = self.optimizers(), self.lr_schedulers()
+        assert isinstance(optimizer, LightningOptimizer)
+        assert isinstance(schedule, torch.optim.lr_scheduler.LambdaLR)
+        step = self.current_epoch * s.steps + int(number)
+        torch.manual_seed(self._seed(step))  # for dropout, which draws from the global generator
+        drives = self._draw(step)
+        optimizer.zero_grad()
+        states = material.states(self.step, int(drives.start.max()))
+        count = drives.weight.sum(1).clamp(min=1.0)
+        total = torch.zeros_like(count)
+        for errors in self.drive(self.step, states, drives, s.horizon, self._scale(drives)):
+            loss = (errors * drives.weight).sum(1) / count
+            self.manual_backward(loss.sum())
+            total += loss.detach()
+        if s.gradient_clip is not None:
+            clip_each(self.network, s.gradient_clip)
+        optimizer.step()
+        schedule.step()
+        self.losses.append(total.cpu())
+
+    def _seed(self, step: int) -> int:
+        return (self.seed * 1_000_003 + step) % 2**63
+
+    def _draw(self, step: int) -> Drives:
+        """Draws the drives of one step; they follow from the seed and the step's number, whatever came before."""
+        s, material = self.settings, self.material
+        generator = torch.Generator().manual_seed(self._seed(step))
+        networks, drivers = material.pair.shape
+        shape, device = (networks, drivers * s.draws), material.pair.device
+        place = torch.arange(drivers, device=device).repeat(s.draws).expand(shape)
+        share = torch.rand(shape, generator=generator).to(device)
+        until = material.until.repeat(1, s.draws)
+        latest = (until // self.step.stride - s.horizon // 2).clamp(min=1)
+        stranger = torch.rand(shape, generator=generator).to(device) < (s.strangers if self.has_strangers else 0.0)
+        weight = material.trains.float().repeat(1, s.draws)
+        return Drives(place, (share * latest).long(), stranger, until, weight)
+
+    @torch.no_grad()
+    def validation_step(self, number: int, index: int) -> None:
+        train = torch.stack(self.losses).mean(0)
+        self.losses.clear()
+        self.judge(train, self._validation_loss().cpu())
+
+    def _validation_loss(self) -> Tensor:
+        """Returns what the exact model makes of the validation drives, `(N,)`; NaN for a network that has none."""
+        s, material = self.settings, self.material
+        networks, drivers = material.pair.shape
+        place = torch.arange(drivers, device=material.pair.device).expand(networks, drivers)
+        began = torch.where(material.until < material.last, material.until, 0)
+        starts = [((began + share * (material.last - began)) / self.exact.stride).long() for share in _VALIDATED]
+        repeated = (x.repeat(1, len(starts)) for x in (place, material.last, material.validates.float()))
+        places, last, weight = repeated
+        never = torch.zeros_like(places, dtype=torch.bool)
+        drives = Drives(places, torch.cat(starts, 1), never, last, weight)
+        states = material.states(self.exact, int(drives.start.max()))
+        loss = _mean(next(self.drive(self.exact, states, drives, s.horizon, self._scale(drives))), weight)
+        strangers = Drives(place, torch.zeros_like(place), never[:, :drivers] | True, material.last, weight[:, :drivers])
+        strangers = strangers._replace(weight=strangers.weight * (material.until == material.last))
+        if not (self.has_strangers and s.strangers > 0 and bool(strangers.weight.any())):
+            return loss
+        windows = -(-int(material.last.max()) // self.exact.stride)
+        scale = self.errors.whole if self.errors is not None else None
+        whole = _mean(next(self.drive(self.exact, states, strangers, windows, scale)), strangers.weight)
+        return torch.where(whole.isnan(), loss, (1.0 - s.strangers) * loss + s.strangers * whole)
+
+
+def _mean(values: Tensor, weight: Tensor) -> Tensor:
+    """Returns the weighted mean over drives, `(N,)`; NaN where nothing has weight."""
+    return torch.where(weight > 0, values, 0.0).mul(weight).sum(1) / weight.sum(1)
+
+
+def _error(difference: Tensor, counted: Tensor, settings: RolloutSettings) -> Tensor:
+    """Returns the error of each drive, `(N, D)`, over the frames that count."""
+    if settings.error == "huber":
+        nothing = torch.zeros_like(difference)
+        squares = 2.0 * nn.functional.huber_loss(difference, nothing, reduction="none", delta=settings.huber_delta)
+    else:
+        squares = difference.square()
+    return ((squares * counted).sum(-1) / counted.sum(-1).clamp(min=1.0) + _SMALL).sqrt()

@@ -1,0 +1,38 @@
+"""No driving model: whoever chooses the parameters sets the acceleration itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from cfx.models.base import DrivingModel, Follower, Leader
+from cfx.parameters import Parameter, ParameterSpace
+
+
+class Direct(DrivingModel):
+    """Drives with the acceleration that it is given: the ceiling that models with adaptive parameters are compared with.
+
+        v' = max(0, min(v_max, v + acceleration dt))
+
+    A policy that drives it sets the acceleration anew for each window. No equation of traffic stands between the policy and the
+    vehicle, so this shows how close a policy can come to a driver from what it sees, and what a driving model with few parameters
+    costs beside it. What it does not show is safety: nothing keeps it from running into its leader, or behind a leader other
+    than those it has learned from, from driving senselessly.
+
+    With constant parameters it holds a constant acceleration, whatever its leader does. So its `default`, `population` and
+    `fixed` are no baselines and improvements over them mean nothing (`follows = False`; reports leave them out). Compare its
+    absolute RMSE with other jobs' on the same data.
+    """
+
+    reference = "longitudinal kinematics, forward Euler"
+    follows = False
+
+    parameters = ParameterSpace.of(
+        Parameter("acceleration", "m/s2", -8.0, 4.0, 0.0, "acceleration until the next choice", "what tyres and engine give"),
+        Parameter("v_max", "m/s", 5.0, 70.0, 55.0, "maximum speed", "SUMO's default passenger car", tuned=False),
+    )
+
+    def next_speed(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float) -> Tensor:
+        return torch.minimum(follower.speed + p["acceleration"] * dt, p["v_max"]).clamp(min=0.0)

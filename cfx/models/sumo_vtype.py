@@ -1,0 +1,73 @@
+"""Any car-following model of SUMO's, by its name (`sumo_vtype`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar, NoReturn
+
+from pydantic import Field
+from torch import Tensor
+
+from cfx.component import Settings
+from cfx.errors import ConfigError
+from cfx.models.base import Follower, Leader, ModelSettings
+from cfx.models.vtype import SumoOnly, VType
+from cfx.parameters import ParameterOverride, ParameterSpace
+
+_UNITS = {
+    **dict.fromkeys(("tau", "actionStepLength", "startupDelay", "treaction", "tpreview", "tPersDrive", "tPersEstimate"), "s"),
+    **dict.fromkeys(("accel", "decel", "emergencyDecel", "apparentDecel", "taccmax"), "m/s2"),
+    **dict.fromkeys(("maxSpeed", "desiredMaxSpeed"), "m/s"),
+    **dict.fromkeys(("speedFactor", "sigma", "delta", "collisionMinGapFactor", "ccoolness"), "1"),
+    "minGap": "m",
+    "jerkmax": "m/s3",
+    "stepping": "s",
+}
+_DRAWN = ("sigmaleader", "sigmagap", "sigmaerror")  # of EIDM; `sigma` of others is 0 unless it is given, too
+
+
+class SumoVTypeSettings(ModelSettings):
+    """Settings of `sumo_vtype`."""
+
+    car_follow_model: str = Field("EIDM", description="SUMO's name of the model: Krauss, IDM, EIDM, W99, Wiedemann, ACC ...")
+    parameters: dict[str, ParameterOverride] = Field(description="vType attributes with low, high and default, by SUMO's names")
+    attributes: dict[str, float | str] | None = Field(
+        None, description="vType attributes that stay as they are; all others are SUMO's defaults"
+    )
+
+
+class SumoVType(SumoOnly):
+    """Whatever SUMO drives: its parameters are vType attributes, by SUMO's names, from the config.
+
+        model=sumo_vtype model.car_follow_model=EIDM 'model.parameters={tau: {low: 0.5, high: 3, default: 1}}'
+
+    It has no equations here, so it needs `simulator=sumo`. What is neither a parameter nor in `attributes` has SUMO's default,
+    but for what makes a drive random: sigma (0.5 in SUMO's Krauss) and EIDM's sigmaleader, sigmagap and sigmaerror are 0 unless
+    they are given. Some models draw random numbers all the same (W99, Wiedemann): the same request gives the same drives, but a
+    follower on another road draws others.
+
+    Differences from SUMO: none.
+    """
+
+    reference = "SUMO's own definition of vehicle types"
+    schema: ClassVar[type[Settings]] = SumoVTypeSettings
+    settings: SumoVTypeSettings
+    parameters = ParameterSpace((), open=True)
+
+    def __init__(self, settings: Settings | None = None, **options: object) -> None:
+        super().__init__(settings, **options)
+        named = (replace(one, unit=_UNITS.get(one.name, "SUMO's unit"), meaning=f"SUMO's {one.name}") for one in self.space)
+        self.space = ParameterSpace(tuple(named))
+        twice = sorted((self.settings.attributes or {}).keys() & {parameter.name for parameter in self.space})
+        if twice:
+            raise ConfigError(f"model.attributes.{twice[0]}: it is among model.parameters too; give it once")
+
+    def next_speed(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float) -> NoReturn:
+        raise ConfigError("model=sumo_vtype has no equations in Python, SUMO alone drives it; add simulator=sumo")
+
+    def sumo_vtype(self, p: Mapping[str, Tensor]) -> VType:
+        name = self.settings.car_follow_model
+        still = dict.fromkeys(_DRAWN, "0") if name == "EIDM" else {}
+        given = {key: value if isinstance(value, str) else repr(value) for key, value in (self.settings.attributes or {}).items()}
+        return VType(name, {**still, **given, **p}, remembers=True)

@@ -1,0 +1,35 @@
+"""Answers as offsets from base parameters.
+
+A network that answers offsets is asked, for each driver, to move away from parameters that are already good for him: his own
+fixed set, or the population's. Its answer in unit space, 1/2 meaning no offset, is added to the base in the squashed space (on
+logits), so that an untrained network *is* the fixed model and no answer leaves the bounds.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+NONE = 0.5
+"""The answer that leaves the base as it is."""
+
+_EDGE = 0.005
+"""How close to a bound, in unit space, a base counts as being when it is moved: at the bound itself no offset would move it."""
+
+_LARGEST = 1e-6
+
+
+def coordinates(base: Tensor) -> Tensor:
+    """Returns the base in the squashed space: logits `(*batch, n)` of unit-space values `(*batch, n)`; finite at the bounds."""
+    return torch.logit(base.clamp(_EDGE, 1.0 - _EDGE))
+
+
+def moved(base: Tensor, answer: Tensor) -> Tensor:
+    """Returns the base moved by an answer, both `(*batch, n)` in unit space; exactly the base where the answer is 1/2.
+
+    A base within 0.5 % of a bound is moved as if it were that far from it, and the difference kept.
+    """
+    inner = base.clamp(_EDGE, 1.0 - _EDGE)
+    logit = torch.logit(inner)
+    step = torch.sigmoid(logit + torch.logit(answer, eps=_LARGEST)) - torch.sigmoid(logit)
+    return (base + step).clamp(0.0, 1.0)

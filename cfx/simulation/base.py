@@ -1,0 +1,56 @@
+"""What calibration, learning and evaluation ask of whatever takes the steps."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, ClassVar
+
+from torch import Tensor
+
+from cfx.models.base import DrivingModel, Follower, Leader
+
+if TYPE_CHECKING:
+    from cfx.simulation.rollout import Start
+
+
+class BaseSimulator(ABC):
+    """Advances followers of one model at one time step.
+
+    Args:
+        model: what drives.
+        dt: time step, s.
+
+    Attributes:
+        differentiable: gradients flow through `advance`. A learner that needs them asks here.
+    """
+
+    differentiable: ClassVar[bool] = False
+
+    def __init__(self, model: DrivingModel, dt: float) -> None:
+        self.model = model
+        self.dt = dt
+
+    def begin(self, start: Start) -> Follower:
+        """Returns the follower at the start of a rollout."""
+        return Follower(*start, self.model.initial_memory(start.speed))
+
+    @abstractmethod
+    def advance(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor]) -> tuple[Follower, Tensor, Tensor]:
+        """Takes K steps with constant parameters.
+
+        Args:
+            follower: state at the first frame, `(*batch,)`.
+            leader: frames 0 to K - 1, `(K, *batch)` each (the length without time), broadcasting to the follower's batch.
+            p: one tensor per parameter, broadcasting to `(*batch,)`.
+
+        Returns:
+            The follower at frame K, and positions and speeds `(K, *batch)` of frames 1 to K.
+        """
+
+    def close(self) -> None:  # noqa: B027 - most simulators hold nothing
+        """Lets go of what takes the steps, such as processes; `advance` may start it again."""
+
+    @abstractmethod
+    def identity(self) -> str:
+        """Returns what results depend on besides the model and the time step; caches carry it."""

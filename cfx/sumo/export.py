@@ -1,0 +1,144 @@
+"""`cfx export --to sumo`: a job's fixed parameters as vTypes that SUMO loads as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import pandas as pd
+import torch
+import yaml
+from torch import Tensor
+
+from cfx import registry
+from cfx.errors import ConfigError, DataError, OutputError
+from cfx.files import whole
+from cfx.models.base import DrivingModel
+from cfx.models.vtype import InSumo, VType
+
+NAME = "drivers.add.xml"
+
+_WITHOUT_LAG = {"variant": "sumo", "leader_deceleration": None}
+"""Settings with which krauss is SUMO's KraussOrig1, once its t_i is 0."""
+
+
+def export(run: str | Path, output: str | Path | None = None) -> list[str]:
+    """Writes a vTypeDistribution for each cluster, with a vType for each pair's fixed parameters; returns what to tell the user.
+
+    Args:
+        run: a job's output folder, or the id of its MLflow run.
+        output: the file; None for `drivers.add.xml` in that folder, or here for an MLflow run.
+
+    Raises:
+        DataError: there is no finished job, or it has no fixed parameters.
+        ConfigError: SUMO has no model that drives as the job's.
+        OutputError: the file cannot be written.
+    """
+    folder, home = _folder(run)
+    node, table = _read(folder)
+    kind, notes = vtypes(node, table)
+    path = Path(output).expanduser() if output else home / NAME
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole(path) as partial:
+            partial.write_text(_xml(table, kind, notes), encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written ({error.strerror or error}); name another --output") from error
+    first = quoteattr(str(table["cluster"].iloc[0]))
+    counts = ", ".join(f"{name} {count}" for name, count in table.groupby("cluster", sort=False).size().items())
+    return [
+        f"vTypes of SUMO's {kind.car_follow_model}, in one vTypeDistribution for each cluster: {counts}",
+        *(f"Note: {note}" for note in notes),
+        f"Use it: sumo --additional-files {path.absolute()}; then in a flow or vehicle: type={first}",
+    ]
+
+
+def vtypes(node: Mapping[str, Any], table: pd.DataFrame) -> tuple[VType, list[str]]:
+    """Returns what SUMO calls the drivers of a table, and what a reader of the result must know.
+
+    Args:
+        node: the driving model's config node.
+        table: a row for each driver, with a column `parameter_NAME` for each tuned parameter.
+
+    Raises:
+        ConfigError: SUMO has no model that drives as this one.
+        DataError: the table has other parameters than the model.
+    """
+    model = cast(DrivingModel, registry.create("model", node))
+    columns = [f"parameter_{name}" for name in model.space.names]
+    missing = [column for column in columns if column not in table]
+    if missing:
+        raise DataError(f"pairs.csv has no column {missing[0]}, which model={node['name']} here needs; run the job again")
+    p: dict[str, Tensor] = model.space.unpack(torch.tensor(table[columns].to_numpy(dtype=float)))
+    notes: list[str] = []
+    if node["name"] == "krauss":
+        model, notes = _krauss(node, p)
+    if not isinstance(model, InSumo):
+        raise ConfigError(
+            f"SUMO has no car-following model that drives as model={node['name']}; export jobs with model=krauss, w99,"
+            " krauss_sumo, idm_sumo or sumo_vtype"
+        )
+    return model.sumo_vtype(p), notes
+
+
+def _krauss(node: Mapping[str, Any], p: Mapping[str, Tensor]) -> tuple[DrivingModel, list[str]]:
+    """Returns krauss as SUMO has it; what is lost stands in the notes."""
+    notes = []
+    if bool((p["t_i"] > 0).any()):
+        notes.append(
+            "SUMO's KraussOrig1 has no brake build-up time t_i; tau is t_r, with which the gap at constant speed is the same, and"
+            " braking begins a little later"
+        )
+    if node.get("leader_deceleration") is not None:
+        notes.append("SUMO's KraussOrig1 expects of the leader the follower's own decel, not leader_deceleration")
+    parameters = dict(node.get("parameters") or {})
+    parameters["t_i"] = {"default": 0.0, "tuned": False}
+    return cast(DrivingModel, registry.create("model", {**node, **_WITHOUT_LAG, "parameters": parameters})), notes
+
+
+def _folder(run: str | Path) -> tuple[Path, Path]:
+    """Returns the folder of a job, and where its export goes unless told otherwise."""
+    folder = Path(run).expanduser()
+    if folder.is_dir():
+        return folder, folder
+    from cfx.tracking.tracker import download_run
+
+    return download_run(str(run)), Path()
+
+
+def _read(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
+    """Reads the model's node, and the rows of `fixed` from the calmest cluster to the most aggressive."""
+    try:
+        node = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))["model"]
+        table = pd.read_csv(folder / "pairs.csv", dtype={"pair_id": str})
+        fixed = table[table["method"] == "fixed"]
+        fixed = fixed[np.isfinite(fixed.filter(like="parameter_").to_numpy(dtype=float)).all(axis=1)]
+        fixed = fixed.sort_values("style_score", kind="stable").reset_index(drop=True)
+    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError) as error:
+        raise DataError(f"{folder} holds no finished job ({error}); give the output folder that a job printed") from error
+    if fixed.empty:
+        raise DataError(f"{folder}/pairs.csv holds no driver with fixed parameters; give a job that calibrated some")
+    return node, fixed
+
+
+def _xml(table: pd.DataFrame, kind: VType, notes: list[str]) -> str:
+    columns = {name: _texts(value, len(table)) for name, value in {"sigma": "0", **kind.attributes}.items()}
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>', "<!-- Fixed parameters of recorded drivers, calibrated by cfx."]
+    lines += [*(f"     {note}." for note in notes), "-->", "<additional>"]
+    for cluster, rows in table.groupby("cluster", sort=False):
+        lines.append(f"    <vTypeDistribution id={quoteattr(str(cluster))}>")
+        for place, row in enumerate(rows.index):
+            attributes = " ".join(f"{name}={quoteattr(values[row])}" for name, values in columns.items())
+            name = quoteattr(f"{cluster}_{place}")
+            lines.append(f'        <vType id={name} carFollowModel="{kind.car_follow_model}" speedDev="0" {attributes}>')
+            lines.append(f'            <param key="pair" value={quoteattr(rows["pair_id"][row])}/>')
+            lines.append("        </vType>")
+        lines.append("    </vTypeDistribution>")
+    return "\n".join([*lines, "</additional>", ""])
+
+
+def _texts(value: Tensor | str, count: int) -> list[str]:
+    return [value] * count if isinstance(value, str) else [repr(float(one)) for one in value.expand(count)]

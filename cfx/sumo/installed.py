@@ -1,0 +1,34 @@
+"""Whether SUMO is there, told from metadata alone: libsumo is never imported into a job's process."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import re
+
+from cfx.errors import SumoError
+
+OLDEST, BELOW = (1, 28), (2, 0)
+"""Versions that cfx works with, as the extra `sumo` in pyproject.toml asks for them."""
+
+
+def require_sumo() -> str:
+    """Returns the version of the libsumo that is installed.
+
+    Raises:
+        SumoError: it is not installed, or its version is not one that cfx works with; says what to install.
+    """
+    wanted = f"SUMO {_text(OLDEST)} or newer, below {BELOW[0]}"
+    try:
+        version = importlib.metadata.version("libsumo")
+    except importlib.metadata.PackageNotFoundError:
+        raise SumoError(f'SUMO is not installed; {wanted}, comes with: pip install "cfx-driving[sumo]"') from None
+    number = re.match(r"(\d+)\.(\d+)", version)
+    if number is None or not OLDEST <= (int(number[1]), int(number[2])) < BELOW:
+        raise SumoError(
+            f'SUMO {version} is installed (the package libsumo), but cfx works with {wanted}: pip install "cfx-driving[sumo]"'
+        )
+    return version
+
+
+def _text(version: tuple[int, int]) -> str:
+    return f"{version[0]}.{version[1]}"

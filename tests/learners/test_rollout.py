@@ -1,0 +1,258 @@
+"""Learning through the simulation. Small drives, eager code: what is tested is what is learned from, not how fast."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+import torch
+
+from cfx.calibration.windows import Split, WindowSettings
+from cfx.errors import ConfigError
+from cfx.evaluation.closed_loop import ClosedLoop, drive
+from cfx.learners.base import Learned, Lesson
+from cfx.learners.material import BaseErrors, Drives, Material
+from cfx.learners.rollout import RolloutLearner, RolloutModule, RolloutSettings
+from cfx.models.krauss import Krauss
+from cfx.models.w99 import W99
+from cfx.pairs import PairBatch
+from cfx.policies.base import Policy
+from cfx.policies.gru import GruPolicy
+from cfx.policies.lstm import LstmPolicy
+from cfx.policies.trained import TrainedPolicy
+from cfx.simulation.rollout import Simulator
+from tests.drives import wavy_pairs
+
+WINDOWS = WindowSettings()
+INPUTS = ("leader_speed", "relative_speed", "gap")
+QUICK: dict[str, Any] = {"epochs": 6, "steps": 15, "horizon": 12, "compile": "never"}
+TRUE = torch.tensor([[1.0, 0.1], [1.4, 0.3], [1.8, 0.5], [2.2, 0.0], [2.6, 0.2], [3.0, 0.4]]).double()
+
+
+def gru(**options: Any) -> Policy:
+    return GruPolicy(inputs=INPUTS, hidden_size=12, **options)
+
+
+def lesson(*, model: Any = None, networks: int = 2, frames: int = 260, **changes: Any) -> Lesson:
+    """Six Krauss drivers; each network learns from all, starting from a set that fits none, with or without own bases."""
+    driven = Krauss()
+    model = model or driven
+    pairs = wavy_pairs(driven, TRUE, frames=frames)
+    batch = PairBatch.of(pairs)
+    split = Split.none(pairs, WINDOWS)
+    index = torch.arange(len(pairs)).repeat(networks)
+    start = model.space.defaults().expand(len(index), -1).clone()
+    if isinstance(model, Krauss):
+        start[:] = torch.tensor([4.0, 0.8])
+    return replace(
+        Lesson(
+            Simulator(model, 0.1),
+            batch[index],
+            split[index],
+            WINDOWS,
+            start,
+            None,
+            torch.arange(networks).repeat_interleave(len(pairs)),
+            tuple(f"n{number}" for number in range(networks)),
+            seed=0,
+            drivers=tuple(pairs[int(number)].driver for number in index),
+        ),
+        **changes,
+    )
+
+
+def ready(learned: Learned, material: Lesson, policy: Policy) -> TrainedPolicy:
+    model, names = material.simulator.model, material.names
+    return TrainedPolicy(policy, learned.network, learned.scaler, {}, {}, model.space, WINDOWS, 0.1, names, learned.base)
+
+
+def loop(learned: Learned, material: Lesson, policy: Policy, first: int = 0, **options: Any) -> ClosedLoop:
+    frames = torch.full_like(material.network, first)
+    return drive(material.simulator, ready(learned, material, policy), material.batch, frames, material.network, **options)
+
+
+def error(found: ClosedLoop, material: Lesson, first: int = 0) -> float:
+    real = material.batch.follower_speed[:, first:]
+    return float((found.speed - real)[found.counted].square().mean().sqrt())
+
+
+def untrained(material: Lesson, policy: Policy) -> Learned:
+    still = RolloutLearner(**(QUICK | {"epochs": 1, "steps": 1, "learning_rate": 1e-12, "weight_decay": 0.0}))
+    return still.fit(policy, material)
+
+
+def test_untrained_it_is_the_fixed_model() -> None:
+    """With the population's base and with drivers' own, to the last bits."""
+    policy, material = gru(), lesson(base=TRUE.repeat(2, 1))
+    learned = untrained(material, policy)
+    for base, expected in ((None, material.fixed), (TRUE.repeat(2, 1), TRUE.repeat(2, 1))):
+        found = loop(learned, material, policy, first=100, base=base)
+        torch.testing.assert_close(found.parameters, expected[:, None].expand_as(found.parameters), rtol=0, atol=1e-6)
+
+
+def test_it_learns_to_drive_like_the_drivers() -> None:
+    policy, material = gru(), lesson()
+    before = error(loop(untrained(material, policy), material, policy), material)
+    learned = RolloutLearner(**(QUICK | {"epochs": 10, "strangers": 0.0})).fit(policy, material)
+    assert error(loop(learned, material, policy, first=100), material, first=100) < 0.5 * before
+    curves = learned.curves.groupby("epoch")[["train_loss", "validation_loss"]].mean()
+    assert curves.train_loss.iloc[-1] < 0.7 * curves.train_loss.iloc[0]
+    assert curves.validation_loss.min() < 0.8 * curves.validation_loss.iloc[0]
+
+
+@pytest.mark.parametrize("model", [Krauss(), W99()], ids=["krauss", "w99"])
+def test_training_simulates_what_evaluation_simulates(model: Any) -> None:
+    """The training step's closed loop and `closed_loop.drive` give the same speeds, gaps and memory of what was read."""
+    policy, material = gru(), lesson(model=model, networks=1)
+    learned = RolloutLearner(**(QUICK | {"epochs": 1, "learning_rate": 0.05})).fit(policy, material)
+    settings = RolloutSettings(**QUICK)
+    held = Material.of(material, policy, settings.validation, torch.Generator().manual_seed(0))
+    held.scaler = learned.scaler
+    module = RolloutModule(learned.network, held, policy, material, settings)
+    place = torch.arange(6)[None]
+    start, windows = torch.full_like(place, 20), 12
+    drives = Drives(place, start, torch.zeros_like(place).bool(), held.last, torch.ones_like(place).float())
+    with torch.no_grad():
+        speeds, gaps = module.simulate(module.exact, held.states(module.exact, 20), drives, windows)
+    found = loop(learned, material, policy, first=100)
+    torch.testing.assert_close(speeds[0].double(), found.speed[:, 1:61], rtol=0, atol=2e-3)
+    torch.testing.assert_close(gaps[0].double(), found.gap[:, 1:61], rtol=0, atol=2e-3)
+
+
+def test_training_goes_on_where_it_was_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, whole = gru(dropout=0.1), lesson(workspace=tmp_path / "whole")
+    learner = RolloutLearner(**QUICK)
+    expected = learner.fit(policy, whole)
+    broken = replace(whole, workspace=tmp_path / "broken")
+    judge, epochs = RolloutModule.judge, []
+
+    def interrupt(self: RolloutModule, *losses: torch.Tensor) -> None:
+        judge(self, *losses)
+        epochs.append(len(self.rows))
+        if len(epochs) == 3:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(RolloutModule, "judge", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        learner.fit(policy, broken)
+    assert len(list((tmp_path / "broken").iterdir())) == 1
+    again = learner.fit(policy, broken)
+    assert epochs == [1, 2, 3, 3, 4, 5, 6]  # the broken epoch is done again, those before it are not
+    pd.testing.assert_frame_equal(again.curves, expected.curves)
+    assert all(torch.equal(a, b) for a, b in zip(again.network.parameters(), expected.network.parameters(), strict=True))
+    assert not list(tmp_path.glob("*/*"))  # nothing is kept of a training that ended
+
+
+def test_a_checkpoint_of_another_training_is_not_taken_up(tmp_path: Path) -> None:
+    policy, learner = gru(), RolloutLearner(**QUICK)
+    one, other = lesson(workspace=tmp_path), lesson(workspace=tmp_path, seed=1)
+    assert learner.checkpoint(policy, one) != learner.checkpoint(policy, other)
+    assert learner.checkpoint(policy, one) != RolloutLearner(**(QUICK | {"steps": 16})).checkpoint(policy, one)
+    assert learner.checkpoint(policy, one) == learner.checkpoint(policy, lesson(workspace=tmp_path))
+
+
+def test_validation_drivers_teach_nothing() -> None:
+    """What a held-out driver does changes the validation loss, and no weight."""
+    policy, settings = gru(), QUICK | {"epochs": 2, "patience": None}
+    material = lesson(networks=1)
+    placed = Material.of(material, policy, 0.25, torch.Generator().manual_seed(material.seed))
+    held = placed.validates[0]
+    assert 0 < int(held.sum()) < 6
+    assert not bool((placed.trains & placed.validates).any())
+    shifted = torch.where(held[:, None], material.batch.follower_speed + 1.0, material.batch.follower_speed)
+    other = replace(material, batch=replace(material.batch, follower_speed=shifted))
+    one, two = (RolloutLearner(**settings).fit(policy, which) for which in (material, other))
+    assert one.curves.train_loss.tolist() == two.curves.train_loss.tolist()
+    assert one.curves.validation_loss.tolist() != two.curves.validation_loss.tolist()
+
+
+def test_a_network_of_few_drivers_holds_out_the_end_of_their_drives() -> None:
+    material = lesson(networks=1)
+    few = replace(material, batch=material.batch[:2], split=material.split[torch.arange(2)], fixed=material.fixed[:2])
+    few = replace(few, network=material.network[:2], drivers=("a", "b"))
+    placed = Material.of(few, gru(), 0.25, torch.Generator().manual_seed(0))
+    assert bool((placed.trains & placed.validates).all())
+    assert placed.until.tolist() == [[int(0.75 * 259)] * 2]
+
+
+def test_one_driver_is_never_on_both_sides() -> None:
+    names = ("a", "a", "b", "c", "d", "e") * 2
+    placed = Material.of(lesson(drivers=names), gru(), 0.4, torch.Generator().manual_seed(3))
+    for row in placed.validates.tolist():
+        held = {name for name, chosen in zip(names[:6], row, strict=True) if chosen}
+        kept = {name for name, chosen in zip(names[:6], row, strict=True) if not chosen}
+        assert held
+        assert not held & kept
+
+
+def test_errors_of_the_base_are_those_of_plain_drives() -> None:
+    material = lesson(networks=1, base=TRUE)
+    placed = Material.of(material, gru(), 0.0, torch.Generator().manual_seed(0))
+    errors = BaseErrors.of(material, placed, 12)
+    assert float(errors.familiar[..., :30, 0].max()) < 1e-3  # the true parameters drive as the drivers did
+    fixed = untrained(replace(material, base=None), gru())
+    found = loop(fixed, material, gru())
+    real = (found.speed - material.batch.follower_speed).square()[:, 1:]
+    torch.testing.assert_close(errors.whole[0, :, 0].double(), real.mean(1).sqrt(), rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(errors.strange[0, :, 0, 0].double(), real[:, :60].mean(1).sqrt(), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"error": "huber"},
+        {"normalise": False},
+        {"truncation": 4},
+        {"gradient_clip": None, "patience": None},
+        {"validation": 0.0},
+        {"strangers": 1.0},
+        {"smoothing": 0.0},
+    ],
+    ids=lambda options: next(iter(options)),
+)
+def test_every_option_trains(options: dict[str, Any]) -> None:
+    policy, material = gru(), lesson(base=TRUE.repeat(2, 1) * 1.3)
+    learned = RolloutLearner(**(QUICK | options)).fit(policy, material)
+    curve = learned.curves.groupby("epoch").train_loss.mean()
+    assert curve.iloc[-1] < curve.iloc[0]
+    assert bool(learned.curves.validation_loss.isna().all()) == (options.get("validation") == 0.0)
+
+
+def test_w99_learns_through_its_smoothed_regimes_and_drives_exactly() -> None:
+    """Its exact thresholds have no gradient: smoothed they have one, and the exact model drives better for it."""
+    policy, material = LstmPolicy(inputs=INPUTS, hidden_size=12), lesson(model=W99(), networks=1)
+    before = error(loop(untrained(material, policy), material, policy, first=50), material, first=50)
+    learned = RolloutLearner(**(QUICK | {"epochs": 8, "patience": None})).fit(policy, material)
+    assert error(loop(learned, material, policy, first=50), material, first=50) < 0.9 * before
+    assert material.simulator.model.softness == 0
+
+
+def test_compiled_training_is_eager_training() -> None:
+    policy, material = gru(), lesson(networks=1)
+    curves = [
+        RolloutLearner(**(QUICK | {"epochs": 2, "steps": 3, "compile": how})).fit(policy, material).curves
+        for how in ("never", "always")
+    ]
+    pd.testing.assert_frame_equal(*curves, rtol=1e-3)
+
+
+def test_a_simulator_without_gradients_is_refused() -> None:
+    class Blind(Simulator):
+        differentiable = False
+
+    material = lesson(networks=1)
+    with pytest.raises(
+        ConfigError, match=r"learner=rollout needs gradients, and the simulator has none; choose .* learner=imitation"
+    ):
+        RolloutLearner(**QUICK).fit(gru(), replace(material, simulator=Blind(Krauss(), 0.1)))
+
+
+def test_a_model_without_gradients_is_refused() -> None:
+    class Stepwise(Krauss):
+        differentiable = False
+
+    with pytest.raises(ConfigError, match="the driving model has none"):
+        RolloutLearner(**QUICK).fit(gru(), lesson(networks=1, model=Stepwise()))

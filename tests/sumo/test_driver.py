@@ -1,0 +1,355 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import cfx.sumo
+from cfx.errors import DataError, ParameterError, SumoError
+from cfx.evaluation.closed_loop import drive
+from cfx.evaluation.metrics import evaluate
+from cfx.models.krauss import Krauss
+from cfx.models.w99 import W99
+from cfx.pairs import PairBatch
+from cfx.policies.base import ConstantNetwork
+from cfx.policies.default import DefaultPolicy
+from cfx.policies.fixed import FixedPolicy
+from cfx.policies.trained import Scaler, TrainedPolicy
+from cfx.simulation.rollout import Simulator
+from cfx.style.entropy import measure_style
+from cfx.style.result import StyleResult
+from cfx.style.settings import StyleSettings
+from cfx.sumo.demo import Known, drive_in_sumo
+from cfx.sumo.driver import Driver
+from cfx.sumo.fleet import Fleet
+from cfx.sumo.motorway import read_motorway
+from tests.drives import wavy_pairs
+from tests.sumo.policies import adaptive
+
+pytest.importorskip("traci", reason="needs the extra sumo")
+
+
+@dataclass
+class Car:
+    speed: float = 10.0
+    acceleration: float = 0.0
+    length: float = 5.0
+    leader: str | None = None
+    gap: float = 20.0
+    allowed: float = 60.0
+    kind: str = "calm"
+    told: list[float] = field(default_factory=list)
+    mode: int = 31
+
+
+class TraCIException(Exception):  # noqa: N818 - SUMO's name
+    """As SUMO's two libraries call it."""
+
+
+class Road:
+    """Stands in for a simulation: what tests put on it is there, and what it is told it writes down."""
+
+    def __init__(self, dt: float = 0.1, **cars: Car) -> None:
+        self.cars = dict(cars)
+        self.time, self.dt = 0.0, dt
+        self.vehicle = self.simulation = self
+
+    def advance(self) -> None:
+        self.time += self.dt
+
+    def getTime(self) -> float:  # noqa: N802 - SUMO's names
+        return self.time
+
+    def getDeltaT(self) -> float:  # noqa: N802
+        return self.dt
+
+    def getIDList(self) -> tuple[str, ...]:  # noqa: N802
+        return tuple(self.cars)
+
+    def getLeader(self, name: str, distance: float) -> tuple[str, float] | None:  # noqa: N802
+        if name not in self.cars:
+            raise TraCIException(f"Vehicle '{name}' is not known.")
+        car = self.cars[name]
+        return (car.leader, car.gap - 2.5) if car.leader else None
+
+    def getMinGap(self, name: str) -> float:  # noqa: N802
+        return 2.5
+
+    def getDecel(self, name: str) -> float:  # noqa: N802
+        return 4.5
+
+    def setSpeed(self, name: str, speed: float) -> None:  # noqa: N802
+        self.cars[name].told.append(speed)
+
+    def setSpeedMode(self, name: str, mode: int) -> None:  # noqa: N802
+        self.cars[name].mode = mode
+
+    def __getattr__(self, name: str) -> Any:
+        fields = {"Speed": "speed", "Acceleration": "acceleration", "Length": "length", "AllowedSpeed": "allowed"}
+        fields |= {"TypeID": "kind", "SpeedMode": "mode"}
+        return lambda vehicle: getattr(self.cars[vehicle], fields[name.removeprefix("get")])
+
+
+def platoon(count: int, **settings: Any) -> Road:
+    return Road(
+        lead=Car(), **{f"v{i}": Car(speed=8.0 + i % 9, gap=15.0 + 3 * (i % 50), leader="lead", **settings) for i in range(count)}
+    )
+
+
+def counted(policy: TrainedPolicy, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Returns a list that grows by the number of drivers at each call of the policy."""
+    calls: list[int] = []
+    original = TrainedPolicy.act
+
+    def act(self: TrainedPolicy, history: Any, state: Any) -> tuple[Tensor, Any]:
+        calls.append(len(history.gap))
+        return original(self, history, state)
+
+    monkeypatch.setattr(TrainedPolicy, "act", act)
+    return calls
+
+
+def test_all_vehicles_are_one_call_of_the_policy_and_windows_are_each_vehicles_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    road = platoon(300)
+    late = [f"v{i}" for i in range(200, 300)]
+    driver = Driver(adaptive({"name": "w99"}))
+    calls = counted(driver.policy, monkeypatch)
+    for k in range(11):
+        driver.step(road, [name for name in road.cars if name != "lead" and (k >= 2 or name not in late)])
+        road.advance()
+    assert calls == [200, 100, 200, 100, 200], "at steps 0, 2, 5, 7, 10"
+    assert all(len(road.cars[name].told) == (9 if name in late else 11) for name in road.cars if name != "lead")
+
+
+def test_many_at_once_drive_as_one_by_one() -> None:
+    together, alone = platoon(7), platoon(7)
+    for road, groups in ((together, [[f"v{i}" for i in range(7)]]), (alone, [f"v{i}" for i in range(7)])):
+        driver = Driver(adaptive({"name": "krauss"}))
+        for _ in range(12):
+            for group in groups:
+                driver.step(road, group)
+            road.advance()
+    for name in together.cars:
+        assert together.cars[name].told == pytest.approx(alone.cars[name].told, abs=1e-12)
+
+
+def test_a_vehicle_that_leaves_is_forgotten_and_its_place_is_used_again() -> None:
+    road = platoon(20)
+    driver = Driver(adaptive({"name": "krauss"}))
+    driver.step(road, [name for name in road.cars if name != "lead"])
+    for k in range(50):
+        road.advance()
+        del road.cars[f"v{k}"]
+        road.cars[f"v{k + 20}"] = Car(leader="lead")
+        driver.step(road, [name for name in road.cars if name != "lead"])
+        assert set(driver.vehicles) == set(road.cars) - {"lead"}
+    assert len(driver._store.time) <= 64
+    assert driver.parameters("v3") == {}
+
+
+def test_without_a_leader_sumo_drives_and_a_new_leader_begins_anew() -> None:
+    road = platoon(1)
+    car = road.cars["v0"]
+    driver = Driver(adaptive({"name": "krauss"}), look_ahead=100)
+    driver.step(road, "v0")
+    assert car.mode == 0
+    assert driver.drives("v0")
+    before = driver.parameters("v0")
+    road.advance()
+    car.gap = 101.0
+    driver.step(road, "v0")
+    assert car.told[-1] == -1
+    assert car.mode == 31
+    assert not driver.drives("v0")
+    assert driver.vehicles == ()
+    car.leader = None
+    road.advance()
+    driver.step(road, "v0")
+    assert car.told[1:] == [-1], "SUMO is told once"
+    car.leader, car.gap = "lead", 15.0
+    road.advance()
+    driver.step(road, "v0")
+    assert driver.parameters("v0") == pytest.approx(before), "as at the very first"
+    assert car.mode == 0
+
+
+def test_a_change_of_leader_begins_nothing_and_a_missed_step_begins_anew() -> None:
+    road = platoon(1)
+    road.cars["other"] = Car(speed=3.0)
+    driver = Driver(adaptive({"name": "krauss"}))
+    first = None
+    for k in range(6):
+        driver.step(road, ["v0"])
+        first = first or driver.parameters("v0")
+        road.advance()
+        road.cars["v0"].leader = "other" if k >= 2 else "lead"
+    assert driver.parameters("v0") != first, "the second window saw the slow leader"
+    road.cars["v0"].leader = "lead"
+    road.advance()
+    driver.step(road, ["v0"])
+    assert driver.parameters("v0") == pytest.approx(first)
+
+
+def test_stepping_twice_at_one_instant_is_stepping_once() -> None:
+    road = platoon(3)
+    driver = Driver(adaptive({"name": "w99"}))
+    for _ in range(6):
+        for vehicles in (["v0", "v1"], "v1", ["v0", "v1", "v2"]):
+            driver.step(road, vehicles)
+        road.advance()
+    once = platoon(3)
+    other = Driver(adaptive({"name": "w99"}))
+    for _ in range(6):
+        other.step(once, ["v0", "v1", "v2"])
+        once.advance()
+    assert [road.cars[v].told for v in ("v0", "v1", "v2")] == [once.cars[v].told for v in ("v0", "v1", "v2")]
+
+
+def test_the_speed_limit_holds_as_around_sumos_own_models() -> None:
+    road = Road(
+        lead=Car(speed=30), v0=Car(speed=20, gap=90, leader="lead", allowed=20.1), v1=Car(speed=20, gap=90, leader="lead")
+    )
+    road.cars["v2"] = Car(speed=20, gap=90, leader="lead", allowed=10)
+    Driver(adaptive({"name": "krauss"})).step(road, ["v0", "v1", "v2"])
+    told = [road.cars[name].told[0] for name in ("v0", "v1", "v2")]
+    assert told == pytest.approx([20.1, 20.26, 20 - 0.45]), "the limit; the model; not harder than decel for a limit"
+
+
+def test_a_constant_driver_takes_parameters_by_name() -> None:
+    road = platoon(1)
+    driver = Driver.constant(W99(), {"cc1": 2.0})
+    driver.step(road, "v0")
+    assert driver.parameters("v0")["cc1"] == pytest.approx(2.0)
+    assert driver.parameters("v0")["cc2"] == pytest.approx(8.0)
+    with pytest.raises(ParameterError, match="'cc11' is no tuned parameter"):
+        Driver.constant(W99(), {"cc11": 2.0})
+    with pytest.raises(ParameterError, match="base: give a value for each of t_r, t_i"):
+        Driver(adaptive({"name": "krauss"}, offsets=True)).assign("v0", base={"t_r": 1.0})
+
+
+def test_what_cannot_be_driven_is_one_sentence(tmp_path: Path) -> None:
+    policy = adaptive({"name": "krauss"})
+    driver = Driver(policy, source="outputs/job")
+    with pytest.raises(SumoError, match=r"steps by 1 s, the policy of outputs/job was trained at 0.1 s; start SUMO with"):
+        driver.step(Road(dt=1.0), [])
+    with pytest.raises(SumoError, match=r"vehicle 'gone' cannot be driven \(Vehicle 'gone' is not known"):
+        driver.step(platoon(1), ["gone"])
+    with pytest.raises(DataError, match=r"no network of this policy was assigned to vehicle 'v0'; call assign"):
+        Driver(policy, network=None).step(platoon(1), "v0")
+    node = {"name": "sumo_vtype", "car_follow_model": "EIDM", "parameters": {"tau": {"low": 0.5, "high": 3, "default": 1}}}
+    untold = adaptive(node)
+    with pytest.raises(DataError, match="SUMO alone drives"):
+        Driver(untold)
+    adaptive({"name": "krauss"}, ("p1", "p2")).save(tmp_path / "policy")
+    with pytest.raises(DataError, match=r"has 2 networks, each for one driver \(p1, \.\.\.\), and none for strangers"):
+        Driver.load(tmp_path)
+    with pytest.raises(DataError, match=r"has no network 'p3'; it has p1, p2"):
+        Driver.load(tmp_path, network="p3")
+    with pytest.raises(DataError, match=r"was trained for model=krauss, not for model=w99"):
+        Driver.load(tmp_path, network="p1", model="w99")
+    description = json.loads((tmp_path / "policy" / "policy.json").read_text())
+    (tmp_path / "policy" / "policy.json").write_text(json.dumps(description | {"parameters": ["t_r", "other"]}))
+    with pytest.raises(DataError, match=r"with the parameters t_r, other, but model=krauss here has t_r, t_i"):
+        Driver.load(tmp_path, network="p1")
+    (tmp_path / "policy" / "policy.pt").unlink()
+    with pytest.raises(DataError, match="holds no policy"):
+        Driver.load(tmp_path, network="p1")
+
+
+def test_a_fleet_drives_each_type_by_its_own_and_finds_who_comes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, model in (("calm", "krauss"), ("hasty", "w99")):
+        adaptive({"name": model}).save(tmp_path / name / "policy")
+    fleet = Fleet.load({"calm": tmp_path / "calm", "normal": tmp_path / "calm", "hasty": tmp_path / "hasty"})
+    assert fleet.drivers["calm"] is fleet.drivers["normal"], "types of one run are one batch"
+    road = platoon(9)
+    road.cars["lead"].kind = "other"
+    for i, kind in enumerate(["calm", "normal", "hasty", "calm@v3", "other", "hasty", "normal", "calm", "calm"]):
+        road.cars[f"v{i}"].kind = kind
+    calls = counted(fleet.drivers["calm"].policy, monkeypatch)
+    fleet.step(road)
+    assert sorted(calls) == [2, 6]
+    assert {name for name, kind in fleet.vehicles.items() if kind == "calm"} == {"v0", "v3", "v7", "v8"}
+    assert {name for name, kind in fleet.vehicles.items() if kind == "hasty"} == {"v2", "v5"}
+    assert len(fleet.vehicles) == 8
+    assert set(fleet.driver("v2").parameters("v2")) == set(W99().space.names)
+    road.advance()
+    del road.cars["v0"]
+    road.cars["new"] = Car(leader="lead", kind="hasty")
+    fleet.step(road)
+    assert "v0" not in fleet.vehicles
+    assert fleet.drivers["hasty"].drives("new")
+    assert road.cars["v4"].told == road.cars["lead"].told == []
+    with pytest.raises(DataError, match=r"different time steps \(a 0.1 s, b 0.2 s\)"):
+        Fleet({"a": Driver(adaptive({"name": "krauss"})), "b": Driver(adaptive({"name": "krauss"}, dt=0.2))})
+
+
+def test_the_package_gives_the_driver_and_imports_no_sumo() -> None:
+    assert cfx.sumo.Driver is Driver, "also after a plain `import cfx`"
+    assert cfx.sumo.Fleet is Fleet
+    with pytest.raises(AttributeError, match="no attribute 'Rider'"):
+        _ = cfx.sumo.Rider
+
+
+def _baseline(policy: TrainedPolicy, component: Any, pairs: int) -> TrainedPolicy:
+    unit = policy.space.to_unit(policy.space.defaults()).expand(pairs, -1)
+    blank = torch.zeros((pairs, 1)).double()
+    names = tuple(str(i) for i in range(pairs))
+    return TrainedPolicy(
+        policy=component,
+        network=ConstantNetwork(unit),
+        scaler=Scaler(blank, blank + 1),
+        model_node=policy.model_node,
+        policy_node={"name": "default"},
+        space=policy.space,
+        windows=policy.windows,
+        dt=policy.dt,
+        names=names,
+    )
+
+
+def style_of(pairs: Sequence[Any]) -> StyleResult:
+    return measure_style(pairs, StyleSettings())  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("node", "length", "frames", "history"),
+    [({"name": "krauss"}, 5, 250, 5.3), ({"name": "w99"}, 8, 1000, None)],
+    ids=["offsets from own parameters, after 5 s", "parameters, after all there is"],
+)
+def test_in_sumo_a_policy_drives_as_in_memory(
+    node: dict[str, Any], length: int, frames: int, history: float | None, tmp_path: Path
+) -> None:
+    """Behind replayed leaders in libsumo, across edges and junctions of a road, after it has watched the first part: to 1e-9."""
+    model = {"krauss": Krauss, "w99": W99}[node["name"]]()
+    low, high = model.space.bounds()
+    true = (model.space.defaults() + 0.1 * (high - low) * torch.linspace(-1, 1, 4).double()[:, None]).clamp(low, high)
+    pairs = wavy_pairs(model, true, frames=frames)
+    batch = PairBatch.of(pairs)
+    policy = adaptive(node, tuple(pair.pair_id for pair in pairs), length=length, offsets=history is not None)
+    policy.save(tmp_path / "policy")
+    first, own = torch.tensor([0, 215, 100, frames - 100]), torch.arange(4)
+    simulator, base = Simulator(model, 0.1), model.space.defaults().expand(4, -1)
+    loops = {
+        "policy": drive(simulator, policy, batch, first, own, base=base, history=history),
+        "default": drive(simulator, _baseline(policy, DefaultPolicy(), 4), batch, first, own),
+        "fixed": drive(simulator, _baseline(policy, FixedPolicy(), 4), batch, first, own),
+    }
+    evaluation = evaluate(pairs, batch, first, loops, model.space, style_of(pairs), seed=0)
+    known = Known("fixed", history)
+    shown = drive_in_sumo(tmp_path / "policy", pairs, policy, evaluation, read_motorway(None, tmp_path), 4, known=known)
+    assert {one.pair.pair_id: one.first for one in shown} == {f"p{i}": int(first[i]) for i in range(4)}
+    for one in shown:
+        assert one.table["difference_speed"].max() < 1e-9
+        assert one.table["difference_gap"].max() < 1e-9
+        memory = one.drive.parameters["policy"][1:]
+        chosen = one.parameters[one.first : one.first + len(memory)]
+        assert chosen == pytest.approx(memory, abs=1e-9)
+        assert memory.std(axis=0).max() > 1e-3, "the policy changes what it chooses"
+        assert one.gap["real"] == pytest.approx(one.pair.gap, abs=1e-9)
+        assert one.speed["real"] == pytest.approx(one.pair.follower_speed, abs=1e-12)

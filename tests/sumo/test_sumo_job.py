@@ -1,0 +1,101 @@
+"""The same job with either simulator."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+import yaml
+
+from cfx.config import JobConfig
+from cfx.errors import ConfigError, SumoError
+from cfx.hydra_source import composed, plain
+from cfx.job import run_job
+from cfx.nodes import conf_dir
+from cfx.simulation.settings import SIMULATORS
+from cfx.sumo import installed
+
+needs_sumo = pytest.mark.skipif(
+    importlib.util.find_spec("libsumo") is None, reason="SUMO is not here; pip install 'cfx-driving[sumo]'"
+)
+
+QUICK = [
+    "data=synthetic_short",
+    "data.max_pairs=3",
+    "optimizer=random",
+    "optimizer.samples=12",
+    "policy=fixed",
+    "figures.enabled=false",
+    "tracking.enabled=false",
+]
+
+
+def job(folder: Path, *overrides: str) -> Any:
+    values = plain(composed([*QUICK, f"cache.folder={folder.parent / 'cache'}", *overrides]))
+    return run_job(JobConfig.of(values), folder)
+
+
+@needs_sumo
+def test_the_table_is_the_same_with_sumo_in_the_loop(tmp_path: Path) -> None:
+    memory = job(tmp_path / "memory", "model=krauss_sumo")
+    sumo = job(tmp_path / "sumo", "model=krauss_sumo", "simulator=sumo", "simulator.followers=8")
+    pd.testing.assert_frame_equal(sumo.pairs, memory.pairs, rtol=0, atol=1e-9)
+    assert len(list((tmp_path / "cache").rglob("*.npz"))) == 2 * 3, "each simulator has its own results in the cache"
+
+
+@needs_sumo
+def test_any_model_of_sumo_is_calibrated_by_its_name(tmp_path: Path) -> None:
+    own = "model.parameters={tau: {low: 0.5, high: 3, default: 1}, accel: {low: 0.5, high: 4, default: 2}}"
+    result = job(tmp_path / "eidm", "model=sumo_vtype", own, "model.attributes={treaction: 0.6}", "simulator=sumo")
+    fixed = result.pairs[result.pairs["method"] == "fixed"]
+    assert fixed["rmse_speed"].between(0.0, 5.0).all()
+    assert fixed["parameter_tau"].between(0.5, 3.0).all()
+
+
+@needs_sumo
+def test_the_preset_of_eidm_is_what_sumo_knows(tmp_path: Path) -> None:
+    result = job(tmp_path / "eidm", "model=eidm", "simulator=sumo", "data.max_pairs=1", "optimizer.samples=2")
+    assert {"parameter_treaction", "parameter_jerkmax"} <= set(result.pairs.columns)
+
+
+@needs_sumo
+def test_a_policy_that_learned_drives_w99_in_sumo(tmp_path: Path) -> None:
+    same = ["model=w99", "policy=gru", "learner.epochs=1"]
+    memory = job(tmp_path / "memory", *same)
+    sumo = job(tmp_path / "sumo", *same, "simulator=sumo")
+    columns = ["pair_id", "method", "rmse_speed"]
+    both = sumo.pairs[columns].merge(memory.pairs[columns], on=["pair_id", "method"])
+    assert len(both) == 9
+    assert both["rmse_speed_x"].notna().all()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "sentence"),
+    [
+        (["model=sumo_vtype", "model.parameters={tau: {low: 0.5, high: 3, default: 1}}"], "add simulator=sumo"),
+        pytest.param(["model=w74", "simulator=sumo"], "SUMO has no car-following model W74", marks=needs_sumo),
+        (["simulator=sumo", "simulator.workers=0"], "simulator.workers=0: should be greater than or equal to 1"),
+        (["simulator.name=somu"], "there is no simulator 'somu'. Did you mean 'sumo'?"),
+    ],
+)
+def test_a_combination_that_cannot_be_leaves_nothing(overrides: list[str], sentence: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as error:
+        job(tmp_path / "job", *overrides)
+    assert sentence in str(error.value)
+    assert not (tmp_path / "job").exists()
+
+
+def test_without_sumo_nothing_is_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(installed, "BELOW", (1, 0))  # as if another version were needed
+    with pytest.raises(SumoError, match=r'pip install "cfx-driving\[sumo\]"$'):
+        job(tmp_path / "job", "model=krauss_sumo", "simulator=sumo")
+    assert not (tmp_path / "job").exists()
+
+
+@pytest.mark.parametrize("name", list(SIMULATORS))
+def test_the_option_in_conf_says_what_its_settings_do(name: str) -> None:
+    node = yaml.safe_load((conf_dir() / "simulator" / f"{name}.yaml").read_text(encoding="utf-8"))
+    assert node == SIMULATORS[name]().model_dump()

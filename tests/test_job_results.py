@@ -1,0 +1,74 @@
+"""What a job says and writes about results that only some jobs have."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+from pathlib import Path
+from typing import Any, cast
+
+import pandas as pd
+import pytest
+from rich.console import Console
+
+from cfx.evaluation.result import Evaluation
+from cfx.job import JobResult, _further, _Output, report
+from tests.made_up import GAINS, make_history, make_platoon, make_results
+
+
+class Untracked:
+    def how_to_open(self) -> tuple[str, ...]:
+        return ()
+
+
+def said(evaluation: Evaluation, *, follows: bool = True) -> str:
+    """Returns what a job prints."""
+    out = io.StringIO()
+    result = JobResult(evaluation.metrics(), evaluation.table, cast(Any, None), (), Path("folder"))
+    report(result, evaluation, Console(file=out, width=200), cast(Any, Untracked()), follows=follows)
+    return out.getvalue()
+
+
+def measured(hard_braking: dict[str, int], at_bounds: dict[str, float]) -> Evaluation:
+    evaluation = make_results(pairs=4, frames=20).evaluation
+    table = evaluation.table.assign(rms_jerk=1.0, real_rms_jerk=1.0)
+    table["hard_braking"] = table["method"].map(hard_braking)
+    table["at_bounds"] = table["method"].map(at_bounds)
+    return dataclasses.replace(evaluation, table=table)
+
+
+def test_a_safe_drive_is_not_talked_about() -> None:
+    nothing = dict.fromkeys(("default", "fixed", "policy"), 0)
+    text = said(measured(nothing, {"default": 0.0, "fixed": 0.3, "policy": 0.004}))
+    assert "-8 m/s2" not in text
+    assert "bounds" not in text
+
+
+def test_hard_braking_and_parameters_at_bounds_are_told() -> None:
+    text = said(measured({"default": 0, "fixed": 1, "policy": 2}, {"default": 0.0, "fixed": 0.25, "policy": 0.5}))
+    assert "Frames with an acceleration below -8 m/s2: fixed 4, policy 8." in text
+    assert "Parameters at their bounds: fixed 25%, policy 50%." in text
+
+
+def test_a_model_that_follows_nobody_is_not_compared_with_its_fixed_parameters() -> None:
+    evaluation = make_results(pairs=4, frames=20).evaluation
+    assert "Improvement of policy over fixed" in said(evaluation)
+    text = said(evaluation, follows=False)
+    assert "Improvement" not in text
+    assert "compare the policy's RMSE with other jobs'" in text
+
+
+@pytest.mark.parametrize("present", [True, False])
+def test_platoon_and_history_are_written_and_old_ones_go(tmp_path: Path, present: bool) -> None:
+    evaluation = make_results(pairs=3, frames=20).evaluation
+    names = ["platoon.parquet", "history.parquet"]
+    for name in names:
+        (tmp_path / name).write_bytes(b"of an earlier job")
+    if present:
+        history = make_history(evaluation.drives, GAINS)
+        evaluation = dataclasses.replace(evaluation, platoon=make_platoon({"policy": 1}), history=history)
+    written = _further(evaluation, _Output(tmp_path))
+    assert written == ([tmp_path / name for name in names] if present else [])
+    assert sorted(path.name for path in tmp_path.iterdir()) == (sorted(names) if present else [])
+    if present:
+        assert set(pd.read_parquet(tmp_path / "platoon.parquet")) == {"method", "network", "vehicle", "time_s", "speed", "gap"}
