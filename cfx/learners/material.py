@@ -40,6 +40,8 @@ class Drives(NamedTuple):
         stranger: whether it has read nothing and begins from the population's parameters, bool `(N, D)`.
         last: the last frame that counts, `(N, D)`.
         weight: `(N, D)`; 0 leaves a drive out.
+        scale: factor on all distances, speeds and accelerations of the drive, `(N, D)`; None: 1. A made-up recording of another
+            driver on another road.
     """
 
     place: Tensor
@@ -47,6 +49,7 @@ class Drives(NamedTuple):
     stranger: Tensor
     last: Tensor
     weight: Tensor
+    scale: Tensor | None = None
 
 
 @dataclass
@@ -198,14 +201,21 @@ class Scene:
             [at(batch.leader_position, around) - origin, at(batch.leader_speed, around), at(batch.leader_acceleration, around)]
         )
         simulated = now + torch.arange(1, windows * stride + 1, device=device)
+        length_of = batch.leader_length[pair]
+        real_speed, real_gap = at(batch.follower_speed, simulated), at(batch.gap, simulated)
+        if drives.scale is not None:
+            scale = drives.scale[..., None]
+            follower, real_speed, real_gap = follower * scale, real_speed * scale, real_gap * scale
+            rear = torch.stack([length_of[..., None], *[torch.zeros_like(scale)] * 2])[:, None]
+            leader = (leader - rear) * scale + rear  # the gap is scaled, the vehicle is not
         return cls(
             leader=leader,
-            leader_length=batch.leader_length[pair],
+            leader_length=length_of,
             follower=follower,
             memory=step.model.initial_memory(follower[1, ..., -1]),
             measured=Real(
-                at(batch.follower_speed, simulated),
-                at(batch.gap, simulated),
+                real_speed,
+                real_gap,
                 (simulated <= drives.last[..., None]).to(follower.dtype),
             ),
         )
@@ -258,7 +268,8 @@ class BaseErrors:
     def over_horizon(self, drives: Drives) -> Tensor:
         """Returns the errors over the horizon from where each drive begins, `(N, D, 2)`."""
         places = (torch.arange(len(drives.place), device=drives.place.device)[:, None], drives.place, drives.start)
-        return torch.where(drives.stranger[..., None], self.strange[places], self.familiar[places])
+        errors = torch.where(drives.stranger[..., None], self.strange[places], self.familiar[places])
+        return errors if drives.scale is None else errors * drives.scale[..., None]
 
 
 class _Constant:

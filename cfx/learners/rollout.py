@@ -67,6 +67,11 @@ class RolloutSettings(Settings):
         le=1,
         description="share of drives that begin without history, from the population's parameters, where drivers have their own",
     )
+    scaling: float = Field(
+        0.15,
+        ge=0,
+        description="augmentation: spread (of the logarithm) of a factor on a stranger's distances, speeds and accelerations",
+    )
     gap_weight: float = Field(0.1, ge=0, description="weight of the gap's error beside the speed's")
     error: Literal["rmse", "huber"] = Field(
         "rmse", description="of a drive: rmse; huber: the root of twice the mean Huber loss, which outliers move less"
@@ -309,8 +314,12 @@ class RolloutModule(BatchedModule):
         until = material.until.repeat(1, s.draws)
         latest = (until // self.step.stride - s.horizon // 2).clamp(min=1)
         stranger = torch.rand(shape, generator=generator).to(device) < (s.strangers if self.has_strangers else 0.0)
+        scale = None
+        if self.has_strangers and s.strangers > 0 and s.scaling > 0:
+            drawn = torch.exp(s.scaling * torch.randn(shape, generator=generator)).to(device)
+            scale = torch.where(stranger, drawn, 1.0)
         weight = material.trains.float().repeat(1, s.draws)
-        return Drives(place, (share * latest).long(), stranger, until, weight)
+        return Drives(place, (share * latest).long(), stranger, until, weight, scale)
 
     @torch.no_grad()
     def validation_step(self, number: int, index: int) -> None:

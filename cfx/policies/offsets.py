@@ -18,6 +18,10 @@ _EDGE = 0.005
 
 _LARGEST = 1e-6
 
+_GAIN = 3.0
+"""How many times an answer's logit counts. Networks begin with small outputs, and models with parameters far from the middle of
+their bounds (Wiedemann 99) need large offsets: without this they train three times as long to reach them."""
+
 
 def coordinates(base: Tensor) -> Tensor:
     """Returns the base in the squashed space: logits `(*batch, n)` of unit-space values `(*batch, n)`; finite at the bounds."""
@@ -31,5 +35,5 @@ def moved(base: Tensor, answer: Tensor) -> Tensor:
     """
     inner = base.clamp(_EDGE, 1.0 - _EDGE)
     logit = torch.logit(inner)
-    step = torch.sigmoid(logit + torch.logit(answer, eps=_LARGEST)) - torch.sigmoid(logit)
+    step = torch.sigmoid(logit + _GAIN * torch.logit(answer, eps=_LARGEST)) - torch.sigmoid(logit)
     return (base + step).clamp(0.0, 1.0)

@@ -9,9 +9,8 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import pandas as pd
 import torch
 from torch import Tensor, nn
 
@@ -24,6 +23,9 @@ from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import History, token_width, tokens
 from cfx.policies.offsets import coordinates, moved
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _FORMAT = 1
 
@@ -171,6 +173,8 @@ class TrainedPolicy:
         Raises:
             DataError: the table is not in the tidy layout, its time step is another, or it is not clear which network to use.
         """
+        import pandas as pd
+
         from cfx.datasets.tidy import pairs_from_frame
 
         pairs = pairs_from_frame(frame, source="the table given to the policy")

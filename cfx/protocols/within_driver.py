@@ -11,6 +11,7 @@ from cfx.calibration.windows import Split
 from cfx.component import Settings
 from cfx.evaluation.closed_loop import drive
 from cfx.evaluation.metrics import evaluate
+from cfx.evaluation.platoon import measure_platoons
 from cfx.learners.base import Lesson
 from cfx.policies.default import DefaultPolicy
 from cfx.policies.fixed import FixedPolicy
@@ -72,5 +73,9 @@ class WithinDriver(Protocol):
             for name, constant in {"default": DefaultPolicy(), "fixed": FixedPolicy()}.items()
         }
         loops["policy"] = drive(study.simulator, policy, batch, first, network, base=fixed)
-        evaluation = evaluate(pairs, batch, first, loops, policy.space, study.style, seed=study.seed)
+        platoon = None
+        if self.settings.networks == "all" and study.policy.trainable:
+            default = study.constant(DefaultPolicy(), fixed[:1])
+            platoon = measure_platoons(study.simulator.model, {"default": (default, ("any",)), "policy": (policy, policy.names)})
+        evaluation = evaluate(pairs, batch, first, loops, policy.space, study.style, seed=study.seed, platoon=platoon)
         return Outcome(evaluation, policy, learned.curves, labels)
