@@ -11,6 +11,7 @@ longest pair, n tuned parameters.
 from __future__ import annotations
 
 import hashlib
+import logging
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -34,6 +35,10 @@ from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.offsets import NONE, coordinates
 from cfx.progress import Task
 from cfx.simulation.rollout import Compile, can_compile
+
+log = logging.getLogger(__name__)
+
+_SEEING = "policy.inputs=[leader_speed,relative_speed,gap,follower_acceleration,leader_acceleration]"
 
 _WORTH_COMPILING = 5_000
 """Windows driven in training, one after the other, from which compiling pays: some ten seconds of eager work."""
@@ -84,7 +89,7 @@ class RolloutSettings(Settings):
     weight_decay: float = Field(1e-4, ge=0, description="of AdamW, decoupled")
     gradient_clip: float | None = Field(1.0, gt=0, description="largest gradient norm of a network; null: none")
     damping: float = Field(
-        0.9, gt=0, le=1, description="factor on gradients that come back through one window; 1 remembers the whole drive"
+        0.8, gt=0, le=1, description="factor on gradients that come back through one window; 1 remembers the whole drive"
     )
     gradient_bound: float = Field(2.0, gt=0, description="largest gradient that one drive's error sends back through a window")
     truncation: int | None = Field(
@@ -133,6 +138,8 @@ class RolloutLearner(Learner):
                 f"learner=rollout needs gradients, and {who} has none; choose a differentiable model and simulator=memory, or"
                 " learner=imitation"
             )
+        if not {"gap", "time_headway"} & set(policy.inputs):
+            log.info("The policy does not see the gap; it drives better with %s", _SEEING)
         generator = torch.Generator().manual_seed(lesson.seed)
         material = Material.of(lesson, policy, s.validation, generator)
         space, device = simulator.model.space, lesson.batch.lengths.device
@@ -285,13 +292,9 @@ class RolloutModule(BatchedModule):
         assert isinstance(schedule, torch.optim.lr_scheduler.LambdaLR)
         step = self.current_epoch * s.steps + int(number)
         torch.manual_seed(self._seed(step))  # for dropout, which draws from the global generator
-        drives = self._draw(step)
         optimizer.zero_grad()
-        states = material.states(self.step, int(drives.start.max()))
-        count = drives.weight.sum(1).clamp(min=1.0)
-        total = torch.zeros_like(count)
-        for errors in self.drive(self.step, states, drives, s.horizon, self._scale(drives)):
-            loss = (errors * drives.weight).sum(1) / count
+        total = torch.zeros(len(material.pair), device=material.pair.device)
+        for loss in self.losses_of(step):
             self.manual_backward(loss.sum())
             total += loss.detach()
         if s.gradient_clip is not None:
@@ -299,6 +302,14 @@ class RolloutModule(BatchedModule):
         optimizer.step()
         schedule.step()
         self.losses.append(total.cpu())
+
+    def losses_of(self, step: int) -> Iterator[Tensor]:
+        """Yields each network's loss in a gradient step, `(N,)`, of each stretch between two truncations."""
+        drives = self._draw(step)
+        states = self.material.states(self.step, int(drives.start.max()))
+        count = drives.weight.sum(1).clamp(min=1.0)
+        for errors in self.drive(self.step, states, drives, self.settings.horizon, self._scale(drives)):
+            yield (errors * drives.weight).sum(1) / count
 
     def _seed(self, step: int) -> int:
         return (self.seed * 1_000_003 + step) % 2**63

@@ -19,10 +19,11 @@ from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.objective import DriveObjective, JointObjective
 from cfx.calibration.windows import Split, WindowSettings
 from cfx.datasets.synthetic import SyntheticDataset
+from cfx.datasets.tidy import write_tidy
 from cfx.errors import DataError
 from cfx.models.krauss import Krauss
 from cfx.optimizers.random import RandomSearch
-from cfx.pairs import PairBatch, PairSet
+from cfx.pairs import SIGNALS, PairBatch, PairSet
 from cfx.progress import Task
 from cfx.protocols.across_drivers import AcrossDrivers
 from cfx.simulation.rollout import Simulator
@@ -213,3 +214,80 @@ def test_a_baseline_as_policy_equals_itself(policy: str, monkeypatch: pytest.Mon
     same = {"fixed": "population", "default": "default"}[policy]
     assert metrics["rmse_speed/policy"] == metrics[f"rmse_speed/{same}"]
     assert metrics[f"rmse_improvement/{same}/mean"] == 0
+
+
+def test_short_pairs_are_learned_from_but_not_tested() -> None:
+    """They change no fold of the others, and nobody learns from a short pair of a driver whom his fold tests."""
+    long = chained(*((str(k), str(k + 100)) for k in range(10)))
+    extra = straight_pairs([60, 60])
+    # One of a driver who is tested too, one of somebody else.
+    short = (
+        replace(extra[0], pair_id="s0", leader_id="77", follower_id="103"),
+        replace(extra[1], pair_id="s1", leader_id="78", follower_id="500"),
+    )
+    pairs = PairSet((*long.pairs, *short), "test")
+    protocol = AcrossDrivers(min_test_frames=100)
+    fold = protocol.folds(pairs, seed=0)
+    assert fold[:10].equal(AcrossDrivers().folds(long, seed=0))
+    assert int(fold[10]) == -2 - int(fold[3])
+    assert int(fold[11]) == -1
+
+
+def test_too_few_long_pairs_are_told() -> None:
+    with pytest.raises(DataError, match=r"has only 0 drivers with 5000 frames or more here"):
+        AcrossDrivers(min_test_frames=5000).folds(chained(("1", "2"), ("2", "3")), seed=0)
+
+
+def rollout(folder: Path, *changes: str) -> cfx.JobResult:
+    small = ["learner=rollout", "learner.epochs=2", "learner.steps=4", "learner.horizon=8", "protocol.folds=2"]
+    return cfx.run([*QUICK, "protocol=across_drivers", *small, f"hydra.run.dir={folder}", *changes])
+
+
+def test_a_job_learns_by_rollout_and_tells_how_much_history_matters(tmp_path: Path) -> None:
+    result = rollout(tmp_path / "one", "protocol.histories=[0,5]")
+    history = pd.read_parquet(tmp_path / "one" / "history.parquet")
+    assert set(history["base"]) == {"own", "population"}
+    assert list(dict.fromkeys(history["amount"])) == ["0 s", "5 s", "80 %"]
+    whole = history[(history["base"] == "own") & (history["amount"] == "80 %")].set_index("pair_id")["rmse_speed"]
+    policy = result.pairs[result.pairs["method"] == "policy"].set_index("pair_id")["rmse_speed"]
+    pd.testing.assert_series_equal(whole, policy, check_names=False, rtol=1e-9)
+    again = cfx.load(tmp_path / "one").policy
+    assert again.base is not None
+    assert torch.equal(again.base, result.policy.base)  # type: ignore[arg-type]  # it has one
+    assert {"hard_braking/policy", "jerk/policy", "at_bounds/policy", "platoon/collisions/policy"} <= result.metrics.keys()
+
+
+def test_less_history_is_what_the_plot_says(tmp_path: Path) -> None:
+    one, other = rollout(tmp_path / "one"), rollout(tmp_path / "other", "protocol.history=0")
+    history = pd.read_parquet(tmp_path / "one" / "history.parquet")
+    none = history[(history["base"] == "own") & (history["amount"] == "0 s")]["rmse_speed"].to_numpy()
+    policy = other.pairs[other.pairs["method"] == "policy"]["rmse_speed"].to_numpy()
+    np.testing.assert_allclose(none, policy, rtol=1e-9)
+    assert not np.allclose(one.pairs[one.pairs["method"] == "policy"]["rmse_speed"], policy)
+
+
+@pytest.mark.parametrize(("base", "method"), [("own", "fixed"), ("population", "population"), ("default", "default")])
+def test_without_learning_the_policy_is_its_base(tmp_path: Path, base: str, method: str) -> None:
+    still = ["learner.epochs=1", "learner.steps=1", "learner.learning_rate=1e-12", "learner.weight_decay=0"]
+    result = rollout(tmp_path, f"protocol.base={base}", "protocol.histories=[]", *still)
+    rmse = result.pairs.set_index(["method", "pair_id"])["rmse_speed"]
+    np.testing.assert_allclose(rmse["policy"], rmse[method], rtol=1e-5)
+    assert not (tmp_path / "history.parquet").exists()
+
+
+def test_drives_that_are_too_short_to_test_change_what_is_learned(tmp_path: Path) -> None:
+    """All pairs are calibrated and learned from, the long ones alone stand in the results."""
+    frames = [160, 200, 200, 200, 200]
+    pairs = wavy_pairs(Krauss(), torch.tensor([[1.0, 0.1], [1.5, 0.1], [2.0, 0.1], [2.5, 0.1], [3.0, 0.1]]).double(), frames=200)
+    cut = []
+    for pair, count in zip(pairs, frames, strict=True):
+        signals: dict[str, Any] = {name: getattr(pair, name)[:count] for name in SIGNALS}
+        cut.append(replace(pair, **signals))
+    write_tidy(PairSet(tuple(cut), "test"), tmp_path / "pairs.csv")
+    options = ["data=tidy", f"data.path={tmp_path / 'pairs.csv'}", "protocol.min_test_frames=180", "data.min_frames=100"]
+    data = [option for option in QUICK if not option.startswith("data.")]
+    small = ["learner=rollout", "learner.epochs=1", "learner.steps=2", "learner.horizon=8", "protocol.folds=2"]
+    result = cfx.run([*data, "protocol=across_drivers", *small, *options, f"hydra.run.dir={tmp_path / 'job'}"])
+    assert set(result.pairs["pair_id"]) == {"p1", "p2", "p3", "p4"}
+    notes = json.loads((tmp_path / "job" / "data.json").read_text())["protocol"]
+    assert notes["pairs_only_learned_from"] == 1

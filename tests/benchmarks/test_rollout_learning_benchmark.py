@@ -1,0 +1,84 @@
+"""A gradient step of learning by rollout, beside the same step in plain eager PyTorch in the same run.
+
+The case has I-80's size: six networks (five folds and one for everybody) of 57 drivers, two drives of 15 s for each, the policy
+having read up to a minute of history. Both ways run the same code, one of them through `torch.compile`. `extra_info` holds the
+ratio of their times; nothing passes or fails by the clock.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from cfx.calibration.windows import Split, WindowSettings
+from cfx.learners.base import Lesson
+from cfx.learners.material import Material
+from cfx.learners.rollout import RolloutModule, RolloutSettings
+from cfx.models.base import DrivingModel
+from cfx.models.krauss import Krauss
+from cfx.models.w99 import W99
+from cfx.pairs import PairBatch
+from cfx.policies.gru import GruPolicy
+from cfx.policies.offsets import NONE
+from cfx.simulation.rollout import Simulator
+from cfx.simulation.threads import one_thread
+from tests.drives import wavy_pairs
+
+NETWORKS, DRIVERS, FRAMES = 6, 57, 700
+POLICY = GruPolicy(inputs=("leader_speed", "relative_speed", "gap", "follower_acceleration", "leader_acceleration"))
+
+
+def _lesson(model: DrivingModel) -> Lesson:
+    driven = Krauss()
+    unit = torch.rand((DRIVERS, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    pairs = wavy_pairs(driven, driven.space.from_unit(0.1 + 0.2 * unit), frames=FRAMES)
+    index = torch.arange(DRIVERS).repeat(NETWORKS)
+    network = torch.arange(NETWORKS).repeat_interleave(DRIVERS)
+    fixed = model.space.defaults().expand(len(index), -1)
+    names, windows = tuple(f"fold {k}" for k in range(NETWORKS)), WindowSettings()
+    batch, split = PairBatch.of(pairs)[index], Split.none(pairs, windows)[index]
+    return Lesson(Simulator(model, 0.1), batch, split, windows, fixed, None, network, names, seed=0, base=fixed)
+
+
+class Step:
+    """What `RolloutModule.training_step` computes, with the optimizer that it uses and without Lightning around it."""
+
+    def __init__(self, model: DrivingModel, settings: RolloutSettings) -> None:
+        lesson = _lesson(model)
+        material = Material.of(lesson, POLICY, settings.validation, torch.Generator().manual_seed(0))
+        blank = torch.full((NETWORKS, len(model.space)), NONE)
+        width = material.scaler.mean.shape[-1]
+        network = POLICY.build(width, blank[0], blank, torch.Generator().manual_seed(0))
+        self.module = RolloutModule(network, material, POLICY, replace(lesson, workspace=None), settings)
+        self.optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3)
+        self.number = 0
+
+    @one_thread()
+    def __call__(self) -> None:
+        self.optimizer.zero_grad()
+        for loss in self.module.losses_of(self.number):
+            loss.sum().backward()
+        self.optimizer.step()
+        self.number += 1
+
+
+@pytest.mark.benchmark(group="training")
+@pytest.mark.parametrize("model", [Krauss(), W99()], ids=["krauss", "w99"])
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf:UserWarning")
+def test_a_gradient_step_of_six_networks(benchmark: Any, model: DrivingModel) -> None:
+    compiled, eager = (Step(model, RolloutSettings(compile=how)) for how in ("always", "never"))
+    began = time.perf_counter()
+    compiled()
+    benchmark.extra_info["seconds to compile"] = time.perf_counter() - began
+    eager()
+    for step in (compiled, eager):
+        step.number = 100
+    benchmark.pedantic(compiled, rounds=5)
+    began = time.perf_counter()
+    for _ in range(3):
+        eager()
+    benchmark.extra_info["times faster than eager"] = (time.perf_counter() - began) / 3 / benchmark.stats.stats.median
