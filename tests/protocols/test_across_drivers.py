@@ -285,6 +285,7 @@ def test_drives_that_are_too_short_to_test_change_what_is_learned(tmp_path: Path
         cut.append(replace(pair, **signals))
     write_tidy(PairSet(tuple(cut), "test"), tmp_path / "pairs.csv")
     options = ["data=tidy", f"data.path={tmp_path / 'pairs.csv'}", "protocol.min_test_frames=180", "data.min_frames=100"]
+    options.append("data.max_pairs=null")
     data = [option for option in QUICK if not option.startswith("data.")]
     small = ["learner=rollout", "learner.epochs=1", "learner.steps=2", "learner.horizon=8", "protocol.folds=2"]
     result = cfx.run([*data, "protocol=across_drivers", *small, *options, f"hydra.run.dir={tmp_path / 'job'}"])
