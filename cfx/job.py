@@ -135,12 +135,14 @@ class _Parts:
     def of(cls, config: JobConfig) -> _Parts:
         model = cast(DrivingModel, registry.create("model", config.model))
         check_simulator(config, model)
+        learner = cast(Learner, registry.create("learner", config.learner))
+        learner.require_gradients(model, not isinstance(config.simulator, SumoSettings))
         return cls(
             dataset=cast(Dataset, registry.create("dataset", config.data)),
             model=model,
             optimizer=cast(Optimizer, registry.create("optimizer", config.optimizer)),
             policy=cast(Policy, registry.create("policy", config.policy)),
-            learner=cast(Learner, registry.create("learner", config.learner)),
+            learner=learner,
             protocol=cast(Protocol, registry.create("protocol", config.protocol)),
         )
 

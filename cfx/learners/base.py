@@ -16,6 +16,8 @@ from torch import Tensor
 from cfx.calibration.calibrator import Labels
 from cfx.calibration.windows import Split, WindowSettings
 from cfx.component import Component
+from cfx.errors import ConfigError
+from cfx.models.base import DrivingModel
 from cfx.pairs import PairBatch
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.trained import Scaler
@@ -85,10 +87,29 @@ class Learner(Component):
 
     Attributes:
         needs_labels: whether the protocol must find window labels first.
+        needs_gradients: whether it differentiates through the simulation.
     """
 
     kind = "learner"
     needs_labels: ClassVar[bool] = False
+    needs_gradients: ClassVar[bool] = False
+
+    def require_gradients(self, model: DrivingModel, differentiable: bool) -> None:
+        """Checks that there are gradients where they are needed; a job asks before any work begins.
+
+        Args:
+            model: the driving model.
+            differentiable: whether gradients flow through the simulator.
+
+        Raises:
+            ConfigError: there are none.
+        """
+        if self.needs_gradients and not (differentiable and model.differentiable):
+            who = "the driving model" if differentiable else "the simulator"
+            raise ConfigError(
+                f"this learner needs gradients, and {who} has none; choose a differentiable model and simulator=memory, or"
+                " learner=imitation"
+            )
 
     @abstractmethod
     def fit(self, policy: Policy, lesson: Lesson) -> Learned:

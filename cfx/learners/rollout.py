@@ -26,7 +26,6 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from cfx.component import Settings, content_key
-from cfx.errors import ConfigError
 from cfx.learners.base import CURVE_COLUMNS, Learned, Learner, Lesson
 from cfx.learners.batched import BatchedModule, clip_each, fit
 from cfx.learners.material import BaseErrors, Drives, Material, Real, Scene
@@ -78,6 +77,9 @@ class RolloutSettings(Settings):
         description="augmentation: spread (of the logarithm) of a factor on a stranger's distances, speeds and accelerations",
     )
     gap_weight: float = Field(0.1, ge=0, description="weight of the gap's error beside the speed's")
+    jerk_weight: float = Field(
+        0.01, ge=0, description="weight of the RMS jerk (m/s3) beside the errors: parameters that jump make drivers who jerk"
+    )
     error: Literal["rmse", "huber"] = Field(
         "rmse", description="of a drive: rmse; huber: the root of twice the mean Huber loss, which outliers move less"
     )
@@ -123,7 +125,7 @@ class RolloutLearner(Learner):
 
     schema: ClassVar[type[Settings]] = RolloutSettings
     settings: RolloutSettings
-    needs_labels = False
+    needs_gradients = True
 
     def fit(self, policy: Policy, lesson: Lesson) -> Learned:
         """As `Learner.fit`.
@@ -132,12 +134,7 @@ class RolloutLearner(Learner):
             ConfigError: the simulator or the model has no gradients.
         """
         simulator, s = lesson.simulator, self.settings
-        if not (simulator.differentiable and simulator.model.differentiable):
-            who = "the driving model" if simulator.differentiable else "the simulator"
-            raise ConfigError(
-                f"learner=rollout needs gradients, and {who} has none; choose a differentiable model and simulator=memory, or"
-                " learner=imitation"
-            )
+        self.require_gradients(simulator.model, simulator.differentiable)
         if not {"gap", "time_headway"} & set(policy.inputs):
             log.info("The policy does not see the gap; it drives better with %s", _SEEING)
         generator = torch.Generator().manual_seed(lesson.seed)
@@ -261,7 +258,8 @@ class RolloutModule(BatchedModule):
             gap_error = _error(gaps - real.gap, real.counted, self.settings)
             if scale is not None:
                 speed_error, gap_error = speed_error / (scale[..., 0] + _LEAST_SPEED), gap_error / (scale[..., 1] + _LEAST_GAP)
-            yield speed_error + self.settings.gap_weight * gap_error
+            loss = speed_error + self.settings.gap_weight * gap_error
+            yield loss + self.settings.jerk_weight * _rms_jerk(speeds, real.counted, step.dt)
 
     def _stretches(self, step: WindowStep, states: Tensor, drives: Drives, windows: int) -> Iterator[tuple[Tensor, Tensor, Real]]:
         """Yields simulated speeds and gaps of each stretch, and what was measured there."""
@@ -374,3 +372,10 @@ def _error(difference: Tensor, counted: Tensor, settings: RolloutSettings) -> Te
     else:
         squares = difference.square()
     return ((squares * counted).sum(-1) / counted.sum(-1).clamp(min=1.0) + _SMALL).sqrt()
+
+
+def _rms_jerk(speeds: Tensor, counted: Tensor, dt: float) -> Tensor:
+    """Returns the RMS jerk of each drive, m/s3, `(N, D)`, over the frames that count."""
+    jerk = speeds.diff(n=2, dim=-1) / (dt * dt)
+    weight = counted[..., 2:]
+    return ((jerk.square() * weight).sum(-1) / weight.sum(-1).clamp(min=1.0) + _SMALL).sqrt()

@@ -245,7 +245,7 @@ def test_a_simulator_without_gradients_is_refused() -> None:
 
     material = lesson(networks=1)
     with pytest.raises(
-        ConfigError, match=r"learner=rollout needs gradients, and the simulator has none; choose .* learner=imitation"
+        ConfigError, match=r"this learner needs gradients, and the simulator has none; choose .* learner=imitation"
     ):
         RolloutLearner(**QUICK).fit(gru(), replace(material, simulator=Blind(Krauss(), 0.1)))
 

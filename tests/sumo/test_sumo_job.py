@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 import yaml
 
+import cfx
 from cfx.config import JobConfig
 from cfx.errors import ConfigError, SumoError
 from cfx.hydra_source import composed, plain
@@ -99,3 +100,9 @@ def test_without_sumo_nothing_is_begun(tmp_path: Path, monkeypatch: pytest.Monke
 def test_the_option_in_conf_says_what_its_settings_do(name: str) -> None:
     node = yaml.safe_load((conf_dir() / "simulator" / f"{name}.yaml").read_text(encoding="utf-8"))
     assert node == SIMULATORS[name]().model_dump()
+
+
+def test_a_learner_that_needs_gradients_is_refused_before_any_work(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="needs gradients, and the simulator has none"):
+        cfx.run(["simulator=sumo", "model=krauss_sumo", "learner=rollout", "tracking.enabled=false", f"hydra.run.dir={tmp_path}"])
+    assert not (tmp_path / "config.yaml").exists()
