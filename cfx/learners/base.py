@@ -41,8 +41,8 @@ class Lesson:
         network: which network learns from each pair, `(P,)` int64.
         names: what each network is for, N of them.
         seed: for initial weights and everything random.
-        base: the parameters that each driver is driven by once his history was read, `(P, n)`, SI units, where these are others
-            than `fixed`: his own set, while `fixed` is the population's. Only learners of offsets read them.
+        base: the parameters that each driver is driven by once his history was read, `(P, n)`, SI units: his own set, while
+            `fixed` is the population's; None where nobody drives without. Only learners of offsets read them.
         drivers: whose pair each is; None if each is another's.
         workspace: a folder for what training needs to go on after an interruption; None: nothing is kept.
     """

@@ -78,7 +78,7 @@ class RolloutSettings(Settings):
     )
     gap_weight: float = Field(0.1, ge=0, description="weight of the gap's error beside the speed's")
     jerk_weight: float = Field(
-        0.01, ge=0, description="weight of the RMS jerk (m/s3) beside the errors: parameters that jump make drivers who jerk"
+        0.0, ge=0, description="weight of the RMS jerk (m/s3) beside the errors; 0.01 costs little and calms drivers much"
     )
     error: Literal["rmse", "huber"] = Field(
         "rmse", description="of a drive: rmse; huber: the root of twice the mean Huber loss, which outliers move less"

@@ -175,7 +175,8 @@ class AcrossDrivers(Protocol):
             network=network.to(device),
             names=names,
             seed=study.seed,
-            base=base[index.to(device)] if base is not None else None,
+            # Also where both are the same: strangers differ in that nothing of their history was read.
+            base=base[index.to(device)] if base is not None else start[network.to(device)],
             drivers=tuple(study.pairs[number].driver for number in index.tolist()),
             workspace=study.workspace,
         )
