@@ -10,7 +10,7 @@ from cfx.report.read import Job
 from cfx.tracking.provenance import flatten
 
 GROUPS = ("model", "policy", "learner", "protocol", "optimizer", "data")
-_NO_DIFFERENCE = ("tracking.", "cache.", "figures.", "simulation.", "threads", "device")
+_NO_DIFFERENCE = ("tracking.", "cache.", "figures.", "simulation.", "threads", "device", "preset")
 """Settings that change where or how fast a job runs, not what comes out."""
 
 _MOST = 4
@@ -53,7 +53,7 @@ def differences(jobs: Sequence[Job], ignored: Sequence[str] = ()) -> list[list[s
 
 
 def _said(key: str, values: Mapping[str, Any]) -> str:
-    short = {"style.cluster": "{}", "seed": "seed {}"}.get(key, key.partition(".")[2].replace("{", "").replace("}", "") + "={}")
+    short = {"style.cluster": "{}", "seed": "seed {}"}.get(key, (key.partition(".")[2] or key).replace("{", "").replace("}", "") + "={}")
     return short.format(values[key]) if key in values else ""
 
 
