@@ -53,7 +53,8 @@ def differences(jobs: Sequence[Job], ignored: Sequence[str] = ()) -> list[list[s
 
 
 def _said(key: str, values: Mapping[str, Any]) -> str:
-    short = {"style.cluster": "{}", "seed": "seed {}"}.get(key, (key.partition(".")[2] or key).replace("{", "").replace("}", "") + "={}")
+    setting = (key.partition(".")[2] or key).replace("{", "").replace("}", "")
+    short = {"style.cluster": "{}", "seed": "seed {}"}.get(key, setting + "={}")
     return short.format(values[key]) if key in values else ""
 
 

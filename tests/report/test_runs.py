@@ -37,6 +37,14 @@ def test_a_job_is_read_once_however_often_it_is_named(tmp_path: Path) -> None:
     assert [job.name for job in found.jobs] == ["w99", "krauss"]
 
 
+def test_settings_outside_of_groups_keep_their_names(tmp_path: Path) -> None:
+    """And which experiment chose the settings tells no jobs apart."""
+    write_job(tmp_path / "0", settings={"split": 0.8, "preset": "adaptive"})
+    write_job(tmp_path / "1", settings={"split": 0.7, "preset": None})
+    names = [job.name for job in read_runs([str(tmp_path / "0"), str(tmp_path / "1")]).jobs]
+    assert names == ["krauss · split=0.8", "krauss · split=0.7"]
+
+
 def test_jobs_are_named_by_what_differs(tmp_path: Path) -> None:
     write_job(tmp_path / "a", model="krauss", settings={"learner": {"name": "imitation", "epochs": 20}})
     write_job(tmp_path / "b", model="krauss", settings={"learner": {"name": "imitation", "epochs": 500}})
