@@ -112,7 +112,7 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
         study = _study(config, parts, pairs, style, device)
         with closing(study.simulator):
             outcome = _outcome(parts.protocol, study)
-        result = _keep(config, folder, pairs, style, outcome, tracker)
+        result = _keep(config, folder, pairs, style, outcome, tracker, follows=parts.model.follows)
     report(result, outcome.evaluation, console, tracker, follows=parts.model.follows)
     return result
 
@@ -227,7 +227,16 @@ def _outcome(protocol: Protocol, study: Study) -> Outcome:
     return outcome
 
 
-def _keep(config: JobConfig, folder: Path, pairs: PairSet, style: StyleResult, outcome: Outcome, tracker: Tracker) -> JobResult:
+def _keep(
+    config: JobConfig,
+    folder: Path,
+    pairs: PairSet,
+    style: StyleResult,
+    outcome: Outcome,
+    tracker: Tracker,
+    *,
+    follows: bool,
+) -> JobResult:
     """Writes everything into the folder, then into MLflow."""
     evaluation = outcome.evaluation
     of_training = (outcome.labels.metrics() if outcome.labels is not None else {}) | best_losses(outcome.curves)
@@ -265,7 +274,7 @@ def _keep(config: JobConfig, folder: Path, pairs: PairSet, style: StyleResult, o
             {"name": name, "unit": unit, "low": float(low), "high": float(high)}
             for name, unit, low, high in zip(evaluation.names, evaluation.units, *evaluation.bounds, strict=True)
         ],
-        "follows": cast(DrivingModel, registry.create("model", config.model)).follows,
+        "follows": follows,
         "cfx": version(),
     }
     written.file("data.json", lambda path: _dump(provenance, path))

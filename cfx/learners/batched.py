@@ -44,6 +44,11 @@ class Grid:
         grid[self.network, self.place] = values
         return grid
 
+    def mean(self, values: Tensor) -> Tensor:
+        """Returns the mean of `(P, n)` over each network's pairs, `(N, n)`."""
+        total = values.new_zeros((self.shape[0], values.shape[1])).index_add_(0, self.network, values)
+        return total / torch.bincount(self.network, minlength=self.shape[0])[:, None]
+
 
 class Training(Protocol):
     """Settings that every such learner has."""

@@ -68,7 +68,8 @@ class ImitationLearner(Learner):
         generator = torch.Generator().manual_seed(lesson.seed)
         space = lesson.simulator.model.space
         unit_default = space.to_unit(space.defaults()).float()
-        unit_fixed = _mean_by_network(space.to_unit(lesson.fixed), lesson).float()
+        grid = Grid(lesson.network.to(lesson.fixed.device), len(lesson.names))
+        unit_fixed = grid.mean(space.to_unit(lesson.fixed)).float()
         network = policy.build(material.tokens.shape[-1], unit_default, unit_fixed.cpu(), generator)
         if not any(parameter.requires_grad for parameter in network.parameters()):
             return Learned(network.eval(), material.scaler, pd.DataFrame(columns=CURVE_COLUMNS))
@@ -148,13 +149,6 @@ def _spread_weight(spread: Tensor, train: Tensor) -> Tensor:
     count = train.sum(1, keepdim=True)
     mean = (spread * train).sum(1, keepdim=True) / count
     return torch.where(mean > 0, spread / mean.clamp(min=torch.finfo(spread.dtype).tiny), 1.0)
-
-
-def _mean_by_network(values: Tensor, lesson: Lesson) -> Tensor:
-    """Returns the mean of `(P, n)` over each network's pairs, `(N, n)`."""
-    network = lesson.network.to(values.device)
-    total = values.new_zeros((len(lesson.names), values.shape[1])).index_add_(0, network, values)
-    return total / torch.bincount(network, minlength=len(lesson.names))[:, None]
 
 
 class SegmentData(pl.LightningDataModule):

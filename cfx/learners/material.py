@@ -59,7 +59,6 @@ class Material:
     Attributes:
         batch: the P pairs.
         pair: which of them stands at each place, `(N, B)`.
-        real: whether one stands there, bool.
         trains, validates: what a place is used for, bool `(N, B)`.
         until: last frame that training may use, `(N, B)`.
         last: last frame of the training part, `(N, B)`.
@@ -71,7 +70,6 @@ class Material:
 
     batch: PairBatch
     pair: Tensor
-    real: Tensor
     trains: Tensor
     validates: Tensor
     until: Tensor
@@ -93,10 +91,8 @@ class Material:
         held, few = held.to(device), few.to(device)[:, None]
         cut = (last * (1.0 - share)).long()
         space, stride = lesson.simulator.model.space, lesson.windows.stride
-        unit = space.to_unit(lesson.fixed).float()
-        own = unit if lesson.base is None else space.to_unit(lesson.base).float()
-        weight = real.float()[..., None]
-        start = (unit[pair] * weight).sum(1) / weight.sum(1)
+        fixed = space.to_unit(lesson.fixed)
+        own = (fixed if lesson.base is None else space.to_unit(lesson.base)).float()
         windows = torch.arange(0, int(lesson.split.frame.max()) + 1, stride, device=device)
         measured = measured_history(
             batch[pairs.repeat_interleave(len(windows))], windows.repeat(len(batch)), lesson.windows.length
@@ -108,13 +104,12 @@ class Material:
         return cls(
             batch=batch,
             pair=pair,
-            real=real,
             trains=trains,
             validates=real & (few | held) & (share > 0),
             until=torch.where(few, cut, last),
             last=last,
             base=own[pair],
-            start=start,
+            start=grid.mean(fixed).float(),
             tokens=seen,
             scaler=scaler,
         )

@@ -27,7 +27,7 @@ from torch.utils.data import DataLoader
 
 from cfx.component import Settings, content_key
 from cfx.learners.base import CURVE_COLUMNS, Learned, Learner, Lesson
-from cfx.learners.batched import BatchedModule, clip_each, fit
+from cfx.learners.batched import BatchedModule, fit
 from cfx.learners.material import BaseErrors, Drives, Material, Real, Scene
 from cfx.learners.window_step import Recent, WindowStep, bounded
 from cfx.policies.base import Policy, PolicyNetwork
@@ -295,8 +295,7 @@ class RolloutModule(BatchedModule):
         for loss in self.losses_of(step):
             self.manual_backward(loss.sum())
             total += loss.detach()
-        if s.gradient_clip is not None:
-            clip_each(self.network, s.gradient_clip)
+        self.configure_gradient_clipping(optimizer)
         optimizer.step()
         schedule.step()
         self.losses.append(total.cpu())

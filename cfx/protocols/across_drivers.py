@@ -20,7 +20,7 @@ from cfx.calibration.calibrator import Labels
 from cfx.calibration.windows import Split
 from cfx.component import Settings
 from cfx.errors import DataError
-from cfx.evaluation.closed_loop import drive
+from cfx.evaluation.closed_loop import ClosedLoop, drive
 from cfx.evaluation.metrics import closed_loop_errors, evaluate
 from cfx.evaluation.platoon import measure_platoons
 from cfx.evaluation.result import Evaluation
@@ -252,14 +252,16 @@ class _Test:
             fold=self.fold,
             whole=whole,
             platoon=measure_platoons(study.simulator.model, platoons),
-            history=self.history(settings) if self.policy.base is not None and settings.histories else None,
+            history=self.history(settings, loops["fixed"]) if self.policy.base is not None and settings.histories else None,
         )
 
-    def history(self, settings: AcrossDriversSettings) -> pd.DataFrame:
-        """Drives the test part after reading different amounts of history; see `Evaluation.history`."""
+    def history(self, settings: AcrossDriversSettings, fixed: ClosedLoop) -> pd.DataFrame:
+        """Drives the test part after reading different amounts of history; see `Evaluation.history`.
+
+        Args:
+            fixed: what the drivers' own sets drove there.
+        """
         study, batch, first, network = self.study, self.batch, self.first, self.fold.to(self.first.device)
-        each = torch.arange(len(first), device=first.device)
-        fixed = drive(study.simulator, study.constant(FixedPolicy(), self.fixed), batch, first, each)
         own, _ = closed_loop_errors(batch, first, fixed)
         bases = {"own": self.fixed} if settings.base == "own" else {}
         rows = []
