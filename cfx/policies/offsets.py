@@ -28,6 +28,23 @@ def coordinates(base: Tensor) -> Tensor:
     return torch.logit(base.clamp(_EDGE, 1.0 - _EDGE))
 
 
+def drawn(base: Tensor, towards: Tensor, shrinkage: float) -> Tensor:
+    """Returns a base drawn towards other parameters in the squashed space, `(*batch, n)`, all in unit space.
+
+    A set of ten parameters fitted to one minute of driving holds much that is chance. As the starting point for offsets it does
+    better when it is drawn towards what is known beforehand, as estimates of many small groups do (shrinkage: W. James and
+    C. Stein, 1961, *Estimation with quadratic loss*, Proc. 4th Berkeley Symposium).
+
+    Args:
+        base: `(*batch, n)`.
+        towards: broadcasts to it.
+        shrinkage: 0: exactly the base; 1: what it is drawn towards.
+    """
+    if shrinkage == 0:
+        return base
+    return torch.sigmoid(torch.lerp(coordinates(base), coordinates(towards).expand_as(base), shrinkage))
+
+
 def moved(base: Tensor, answer: Tensor) -> Tensor:
     """Returns the base moved by an answer, both `(*batch, n)` in unit space; exactly the base where the answer is 1/2.
 

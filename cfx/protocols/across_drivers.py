@@ -28,6 +28,7 @@ from cfx.learners.base import Learned, Lesson
 from cfx.pairs import Pair, PairBatch, PairSet
 from cfx.policies.default import DefaultPolicy
 from cfx.policies.fixed import FixedPolicy
+from cfx.policies.offsets import drawn
 from cfx.policies.trained import ALL, TrainedPolicy
 from cfx.protocols.base import Outcome, Protocol, Study
 
@@ -49,6 +50,13 @@ class AcrossDriversSettings(Settings):
         "own",
         description="what a policy of offsets starts from, for a driver whose history it has read: his own fixed parameters, the"
         " population's, or the model's default ones; for strangers it is the population's, or the default ones",
+    )
+    shrinkage: float = Field(
+        0.7,
+        ge=0,
+        le=1,
+        description="how far a driver's own set, as such a base, is drawn towards the model's default parameters (in the squashed"
+        " space); 0: not at all. The baseline `fixed` is never drawn.",
     )
     history: float | None = Field(
         None, ge=0, description="s of measured history before the test part that the policy reads; null: all there is"
@@ -94,7 +102,7 @@ class AcrossDrivers(Protocol):
         names = (*(f"fold {k}" for k in range(self.settings.folds)), ALL)
         default = study.space.defaults(dtype=population.dtype, device=population.device).expand_as(population)
         strange = default if self.settings.base == "default" else population
-        own = fixed if self.settings.base == "own" else None
+        own = self._own(study, fixed) if self.settings.base == "own" else None
         policy, learned = self._learn(study, whole, members, strange, own, labels, names)
 
         tested = (fold >= 0).nonzero()[:, 0]
@@ -105,6 +113,7 @@ class AcrossDrivers(Protocol):
             fold=fold[tested],
             first=split.frame[tested].to(batch.lengths.device),
             fixed=fixed[tested.to(fixed.device)],
+            base=own[tested.to(fixed.device)] if own is not None else None,
             strange=strange[fold[tested].to(strange.device)],
             population=population,
             policy=policy,
@@ -143,6 +152,13 @@ class AcrossDrivers(Protocol):
                 for number, group in enumerate(groups)
             ]
         )
+
+    def _own(self, study: Study, fixed: Tensor) -> Tensor:
+        """Returns what offsets start from for drivers whose history was read, `(P, n)`."""
+        if self.settings.shrinkage == 0:
+            return fixed
+        space, default = study.space, study.space.defaults(dtype=fixed.dtype, device=fixed.device)
+        return space.from_unit(drawn(space.to_unit(fixed), space.to_unit(default), self.settings.shrinkage))
 
     def _learn(
         self,
@@ -203,6 +219,7 @@ class _Test:
         fold: in which fold each is tested, `(Q,)`.
         first: the last measured frame before the test part, `(Q,)`.
         fixed: each driver's own set, `(Q, n)`.
+        base: what offsets start from for him, if not from what they do for a stranger, `(Q, n)`.
         strange: what offsets start from for a driver of whom nothing is known, `(Q, n)`.
         population: of each network, `(K, n)`.
         policy: what was learned.
@@ -214,6 +231,7 @@ class _Test:
     fold: Tensor
     first: Tensor
     fixed: Tensor
+    base: Tensor | None
     strange: Tensor
     population: Tensor
     policy: TrainedPolicy
@@ -227,7 +245,7 @@ class _Test:
             "population": study.constant(FixedPolicy(), self.population),
             "policy": self.policy,
         }
-        base = self.fixed if settings.base == "own" else self.strange
+        base = self.strange if self.base is None else self.base
         loops = {
             name: drive(study.simulator, one, batch, first, network, base=base, history=settings.history)
             for name, one in strangers.items()
@@ -263,7 +281,7 @@ class _Test:
         """
         study, batch, first, network = self.study, self.batch, self.first, self.fold.to(self.first.device)
         own, _ = closed_loop_errors(batch, first, fixed)
-        bases = {"own": self.fixed} if settings.base == "own" else {}
+        bases = {"own": self.base} if self.base is not None else {}
         rows = []
         for base, values in {**bases, "population": self.strange}.items():
             for amount in (*sorted(settings.histories), None):

@@ -4,7 +4,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cfx.policies.offsets import NONE, coordinates, moved
+from cfx.policies.offsets import NONE, coordinates, drawn, moved
 
 unit = st.floats(0.0, 1.0)
 
@@ -33,6 +33,21 @@ def test_offsets_add_up_on_logits(base: float, answer: float) -> None:
     """Inside the bounds the squashed space is the logit: the closed form."""
     b, a = torch.tensor(base).double(), torch.tensor(answer).double()
     torch.testing.assert_close(moved(b, a), torch.sigmoid(torch.logit(b) + 3.0 * torch.logit(a)), rtol=0, atol=1e-12)
+
+
+@given(unit, unit)
+def test_a_base_that_is_not_drawn_stays_exactly_and_one_drawn_fully_arrives(base: float, towards: float) -> None:
+    b, t = torch.tensor([base]).double(), torch.tensor([towards]).double()
+    assert torch.equal(drawn(b, t, 0.0), b)
+    torch.testing.assert_close(drawn(b, t, 1.0), t.clamp(0.005, 0.995), rtol=0, atol=1e-12)
+
+
+@given(unit, unit, st.floats(0.0, 1.0), st.floats(0.0, 1.0))
+def test_the_more_a_base_is_drawn_the_nearer_it_comes(base: float, towards: float, one: float, other: float) -> None:
+    less, more = sorted((one, other))
+    b, t = torch.tensor(base).double(), torch.tensor(towards).double()
+    near, far = (float((coordinates(drawn(b, t, s)) - coordinates(t)).abs()) for s in (more, less))
+    assert near <= far + 1e-9
 
 
 def test_a_base_at_its_bound_can_be_moved_and_has_finite_coordinates() -> None:

@@ -266,10 +266,14 @@ def test_less_history_is_what_the_plot_says(tmp_path: Path) -> None:
     assert not np.allclose(one.pairs[one.pairs["method"] == "policy"]["rmse_speed"], policy)
 
 
-@pytest.mark.parametrize(("base", "method"), [("own", "fixed"), ("population", "population"), ("default", "default")])
-def test_without_learning_the_policy_is_its_base(tmp_path: Path, base: str, method: str) -> None:
+@pytest.mark.parametrize(
+    ("base", "shrinkage", "method"),
+    [("own", 0, "fixed"), ("own", 1, "default"), ("population", 0.7, "population"), ("default", 0.7, "default")],
+)
+def test_without_learning_the_policy_is_its_base(tmp_path: Path, base: str, shrinkage: float, method: str) -> None:
     still = ["learner.epochs=1", "learner.steps=1", "learner.learning_rate=1e-12", "learner.weight_decay=0"]
-    result = rollout(tmp_path, f"protocol.base={base}", "protocol.histories=[]", *still)
+    start = [f"protocol.base={base}", f"protocol.shrinkage={shrinkage}"]
+    result = rollout(tmp_path, *start, "protocol.histories=[]", *still)
     rmse = result.pairs.set_index(["method", "pair_id"])["rmse_speed"]
     np.testing.assert_allclose(rmse["policy"], rmse[method], rtol=1e-5)
     assert not (tmp_path / "history.parquet").exists()
