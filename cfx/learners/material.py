@@ -114,34 +114,34 @@ class Material:
             scaler=scaler,
         )
 
-    def states(self, step: WindowStep, windows: int) -> Tensor:
-        """Lets the policy read all drives from their beginning; returns its state before each window.
+    def of_drives(self, drives: Drives) -> tuple[Tensor, Tensor]:
+        """Returns which pair each drive is of `(N, D)`, and the base that its driver is driven from `(N, D, n)`."""
+        n = torch.arange(len(self.pair), device=self.pair.device)[:, None]
+        base = torch.where(drives.stranger[..., None], self.start[:, None], self.base[n, drives.place])
+        return self.pair[n, drives.place], base
 
-        Returns:
-            `(windows + 1, N, B, s)`.
-        """
-        networks, drivers = self.pair.shape
-        squashed = coordinates(self.base)
-        state = step.network.initial_state(networks, drivers)
-        states = [state]
-        if state.is_floating_point() and torch.is_grad_enabled():
-            state = state.detach().requires_grad_()  # as all later ones, so that one compiled function serves all
-        for window in range(windows):
-            _, state = step.read(self.tokens[:, window][self.pair], squashed, state)
-            states.append(state)
-        return torch.stack(states)
-
-    def begin(self, states: Tensor, drives: Drives) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns which pair each drive is of `(N, D)`, its base `(N, D, n)` and the policy's state `(N, D, s)` as it begins.
+    def read(self, step: WindowStep, drives: Drives, most: int | None = None) -> Tensor:
+        """Lets the policy read what was measured before each drive; nothing, for a stranger.
 
         Args:
-            states: as `states` returns them, at least up to the last start.
+            step: reads one window.
+            drives: where they begin.
+            most: windows that are read at most, the last ones before the drive; None: all there are.
+
+        Returns:
+            The policy's state as each drive begins, `(N, D, s)`.
         """
-        n = torch.arange(len(self.pair), device=self.pair.device)[:, None]
-        stranger = drives.stranger[..., None]
-        base = torch.where(stranger, self.start[:, None], self.base[n, drives.place])
-        state = torch.where(stranger, states[0][n, drives.place], states[drives.start, n, drives.place])
-        return self.pair[n, drives.place], base, state
+        pair, base = self.of_drives(drives)
+        start = torch.where(drives.stranger, 0, drives.start)
+        count = int(start.max()) if most is None else min(int(start.max()), most)
+        windows = start - count + torch.arange(count, device=start.device)[:, None, None]
+        seen, squashed = self.tokens[pair, windows.clamp(min=0)], coordinates(base)
+        state = step.network.initial_state(*pair.shape)
+        if state.is_floating_point() and torch.is_grad_enabled():
+            state = state.detach().requires_grad_()  # as all later ones, so that one compiled function serves all
+        for k in range(count):
+            state = step.read(seen[k], squashed, state, windows[k] >= 0)
+        return state
 
 
 class Real(NamedTuple):

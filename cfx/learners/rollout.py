@@ -65,6 +65,9 @@ class RolloutSettings(Settings):
     steps: int = Field(25, ge=1, description="gradient steps of an epoch; in each, every driver drives")
     draws: int = Field(2, ge=1, description="drives of each driver and step, each from a random measured state")
     horizon: int = Field(30, ge=1, description="windows that a drive lasts")
+    reading: float | None = Field(
+        20.0, gt=0, description="s of measured history that the policy reads before a drive in training, at most; null: all"
+    )
     strangers: float = Field(
         0.3,
         ge=0,
@@ -236,24 +239,24 @@ class RolloutModule(BatchedModule):
         done = self.current_epoch / max(1, s.epochs - 1)
         self.softness.fill_(max(s.smoothing + done * (s.smoothing_end - s.smoothing), _LEAST_SOFTNESS))
 
-    def simulate(self, step: WindowStep, states: Tensor, drives: Drives, windows: int) -> tuple[Tensor, Tensor]:
+    def simulate(self, step: WindowStep, state: Tensor, drives: Drives, windows: int) -> tuple[Tensor, Tensor]:
         """Simulates drives in closed loop, without gradients; returns speeds and gaps, `(N, D, H S)`."""
-        speeds, gaps, _ = next(self._stretches(step, states, drives, windows))
+        speeds, gaps, _ = next(self._stretches(step, state, drives, windows))
         return speeds, gaps
 
-    def drive(self, step: WindowStep, states: Tensor, drives: Drives, windows: int, scale: Tensor | None) -> Iterator[Tensor]:
+    def drive(self, step: WindowStep, state: Tensor, drives: Drives, windows: int, scale: Tensor | None) -> Iterator[Tensor]:
         """Simulates drives in closed loop.
 
         Args:
             step: takes one window.
-            states: as `Material.states` returns them, at least up to the last start.
+            state: of the policy as each drive begins, as `Material.read` returns it.
             windows: H.
             scale: what the errors of speed and gap are divided by, `(N, D, 2)`; None: nothing.
 
         Yields:
             The loss of each drive, `(N, D)`, of each stretch between two truncations.
         """
-        for speeds, gaps, real in self._stretches(step, states, drives, windows):
+        for speeds, gaps, real in self._stretches(step, state, drives, windows):
             speed_error = _error(speeds - real.speed, real.counted, self.settings)
             gap_error = _error(gaps - real.gap, real.counted, self.settings)
             if scale is not None:
@@ -261,10 +264,10 @@ class RolloutModule(BatchedModule):
             loss = speed_error + self.settings.gap_weight * gap_error
             yield loss + self.settings.jerk_weight * _rms_jerk(speeds, real.counted, step.dt)
 
-    def _stretches(self, step: WindowStep, states: Tensor, drives: Drives, windows: int) -> Iterator[tuple[Tensor, Tensor, Real]]:
+    def _stretches(self, step: WindowStep, state: Tensor, drives: Drives, windows: int) -> Iterator[tuple[Tensor, Tensor, Real]]:
         """Yields simulated speeds and gaps of each stretch, and what was measured there."""
         s, learning = self.settings, torch.is_grad_enabled()
-        pair, base, state = self.material.begin(states, drives)
+        pair, base = self.material.of_drives(drives)
         scene = Scene.of(self.material.batch, pair, drives, step, windows)
         squashed, recent = coordinates(base), scene.recent(state)
         length = s.truncation if s.truncation and learning else windows
@@ -303,10 +306,16 @@ class RolloutModule(BatchedModule):
     def losses_of(self, step: int) -> Iterator[Tensor]:
         """Yields each network's loss in a gradient step, `(N,)`, of each stretch between two truncations."""
         drives = self._draw(step)
-        states = self.material.states(self.step, int(drives.start.max()))
+        state = self.material.read(self.step, drives, self._most())
         count = drives.weight.sum(1).clamp(min=1.0)
-        for errors in self.drive(self.step, states, drives, self.settings.horizon, self._scale(drives)):
+        for errors in self.drive(self.step, state, drives, self.settings.horizon, self._scale(drives)):
             yield (errors * drives.weight).sum(1) / count
+
+    def _most(self) -> int | None:
+        """Returns how many windows of measured history a drive's policy reads at most in training."""
+        if self.settings.reading is None:
+            return None
+        return max(1, round(self.settings.reading / (self.step.stride * self.step.dt)))
 
     def _seed(self, step: int) -> int:
         return (self.seed * 1_000_003 + step) % 2**63
@@ -346,15 +355,16 @@ class RolloutModule(BatchedModule):
         places, last, weight = repeated
         never = torch.zeros_like(places, dtype=torch.bool)
         drives = Drives(places, torch.cat(starts, 1), never, last, weight)
-        states = material.states(self.exact, int(drives.start.max()))
-        loss = _mean(next(self.drive(self.exact, states, drives, s.horizon, self._scale(drives))), weight)
+        state = material.read(self.exact, drives)
+        loss = _mean(next(self.drive(self.exact, state, drives, s.horizon, self._scale(drives))), weight)
         strangers = Drives(place, torch.zeros_like(place), never[:, :drivers] | True, material.last, weight[:, :drivers])
         strangers = strangers._replace(weight=strangers.weight * (material.until == material.last))
         if not (self.has_strangers and s.strangers > 0 and bool(strangers.weight.any())):
             return loss
         windows = -(-int(material.last.max()) // self.exact.stride)
         scale = self.errors.whole if self.errors is not None else None
-        whole = _mean(next(self.drive(self.exact, states, strangers, windows, scale)), strangers.weight)
+        state = material.read(self.exact, strangers)
+        whole = _mean(next(self.drive(self.exact, state, strangers, windows, scale)), strangers.weight)
         return torch.where(whole.isnan(), loss, (1.0 - s.strangers) * loss + s.strangers * whole)
 
 

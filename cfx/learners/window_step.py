@@ -70,18 +70,19 @@ class WindowStep:
         self.read = torch.compile(self.read, dynamic=False)  # type: ignore[method-assign]  # the compiled one takes its place
         self.drive = torch.compile(self.drive, dynamic=False)  # type: ignore[method-assign]  # likewise
 
-    def read(self, seen: Tensor, base: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+    def read(self, seen: Tensor, base: Tensor, state: Tensor, there: Tensor) -> Tensor:
         """Reads one token of each drive.
 
         Args:
             seen: `(N, D, f)`, not normalised.
             base: the base in the squashed space, `(N, D, n)`.
             state: `(N, D, s)`.
+            there: whether the drive has this token; where not, its state stays, bool `(N, D)`.
 
         Returns:
-            The network's answer `(N, D, n)` and its state afterwards.
+            The network's state afterwards.
         """
-        return self._answer(seen, base, state)
+        return torch.where(there[..., None], self._answer(seen, base, state)[1], state)
 
     def _answer(self, seen: Tensor, base: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         answer, after = self.network(self.scaler(torch.cat([seen, base], -1)[:, :, None]), state)

@@ -22,6 +22,7 @@ from cfx.pairs import PairBatch
 from cfx.policies.base import Policy
 from cfx.policies.gru import GruPolicy
 from cfx.policies.lstm import LstmPolicy
+from cfx.policies.offsets import coordinates
 from cfx.policies.trained import TrainedPolicy
 from cfx.simulation.rollout import Simulator
 from tests.drives import wavy_pairs
@@ -116,10 +117,32 @@ def test_training_simulates_what_evaluation_simulates(model: Any) -> None:
     start, windows = torch.full_like(place, 20), 12
     drives = Drives(place, start, torch.zeros_like(place).bool(), held.last, torch.ones_like(place).float())
     with torch.no_grad():
-        speeds, gaps = module.simulate(module.exact, held.states(module.exact, 20), drives, windows)
+        speeds, gaps = module.simulate(module.exact, held.read(module.exact, drives), drives, windows)
     found = loop(learned, material, policy, first=100)
     torch.testing.assert_close(speeds[0].double(), found.speed[:, 1:61], rtol=0, atol=2e-3)
     torch.testing.assert_close(gaps[0].double(), found.gap[:, 1:61], rtol=0, atol=2e-3)
+
+
+def test_reading_at_most_some_windows_forgets_what_was_before() -> None:
+    """The state of one who began to read that many windows ago, in the same network; strangers have read nothing."""
+    policy, material = gru(), lesson(networks=1)
+    generator = torch.Generator().manual_seed(0)
+    held = Material.of(material, policy, 0.25, generator)
+    network = policy.build(held.scaler.mean.shape[-1], torch.full((2,), 0.5), torch.full((1, 2), 0.5), generator)
+    step = RolloutModule(network, held, policy, material, RolloutSettings(**QUICK)).exact
+    place, start = torch.arange(6)[None], torch.tensor([[2, 4, 5, 9, 12, 12]])
+    stranger = torch.tensor([[False, False, False, False, False, True]])
+    drives = Drives(place, start, stranger, held.last, torch.ones_like(place).float())
+    with torch.no_grad():
+        torch.testing.assert_close(held.read(step, drives, 100), held.read(step, drives), rtol=0, atol=0)
+        short = held.read(step, drives, 5)
+        for number, first in enumerate(start[0, :5].tolist()):
+            state = network.initial_state(1, 6)
+            for window in range(max(0, first - 5), first):
+                state = step.read(held.tokens[:, window][held.pair], coordinates(held.base), state, ~stranger | True)
+            torch.testing.assert_close(short[0, number], state[0, number])
+        assert not bool(short[0, 5].any())
+        assert not torch.allclose(short[0, 4], held.read(step, drives)[0, 4], atol=1e-6)
 
 
 def test_training_goes_on_where_it_was_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
