@@ -117,7 +117,7 @@ class RolloutLearner(Learner):
     """Back-propagates the error of closed-loop drives into the policy.
 
     Networks answer offsets (`cfx.policies.offsets`): untrained, each driver is driven by his base parameters, so training starts
-    from the fixed model. Before a drive the policy reads the driver's measured history up to there; strangers' drives begin with
+    from a fixed model. Before a drive the policy reads the driver's measured history up to there; strangers' drives begin with
     none. All drivers of all networks drive at once, from random measured states. Models with regimes are smoothed meanwhile, and
     validated as they are.
 

@@ -2,13 +2,15 @@
 
 A network that answers offsets is asked, for each driver, to move away from parameters that are already good for him: his own
 fixed set, or the population's. Its answer in unit space, 1/2 meaning no offset, is added to the base in the squashed space (on
-logits), so that an untrained network *is* the fixed model and no answer leaves the bounds.
+logits), so that an untrained network *is* the base and no answer leaves the bounds.
 """
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
+
+from cfx.parameters import ParameterSpace
 
 NONE = 0.5
 """The answer that leaves the base as it is."""
@@ -28,21 +30,23 @@ def coordinates(base: Tensor) -> Tensor:
     return torch.logit(base.clamp(_EDGE, 1.0 - _EDGE))
 
 
-def drawn(base: Tensor, towards: Tensor, shrinkage: float) -> Tensor:
-    """Returns a base drawn towards other parameters in the squashed space, `(*batch, n)`, all in unit space.
+def drawn(space: ParameterSpace, own: Tensor, shrinkage: float) -> Tensor:
+    """Returns drivers' own parameters drawn towards the model's default in the squashed space; both `(*batch, n)` in SI units.
 
     A set of ten parameters fitted to one minute of driving holds much that is chance. As the starting point for offsets it does
     better when it is drawn towards what is known beforehand, as estimates of many small groups do (shrinkage: W. James and
     C. Stein, 1961, *Estimation with quadratic loss*, Proc. 4th Berkeley Symposium).
 
     Args:
-        base: `(*batch, n)`.
-        towards: broadcasts to it.
-        shrinkage: 0: exactly the base; 1: what it is drawn towards.
+        space: the model's parameters.
+        own: the sets.
+        shrinkage: 0: exactly the sets; 1: the default.
     """
     if shrinkage == 0:
-        return base
-    return torch.sigmoid(torch.lerp(coordinates(base), coordinates(towards).expand_as(base), shrinkage))
+        return own
+    default = space.defaults(dtype=own.dtype, device=own.device)
+    one, other = (coordinates(space.to_unit(values)) for values in (own, default.expand_as(own)))
+    return space.from_unit(torch.sigmoid(torch.lerp(one, other, shrinkage)))
 
 
 def moved(base: Tensor, answer: Tensor) -> Tensor:

@@ -22,7 +22,7 @@ from cfx.pairs import PairBatch, PairSet
 from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import History, token_width, tokens
-from cfx.policies.offsets import coordinates, moved
+from cfx.policies.offsets import coordinates, drawn, moved
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -89,6 +89,8 @@ class TrainedPolicy:
         names: what each network was trained for (a pair's id, a fold, or `ALL`), N of them.
         base: parameters that answers are offsets from (`cfx.policies.offsets`) for a driver who brings none of his own, `(N, n)`
             in SI units; None if answers are the parameters themselves.
+        shrinkage: how far a driver's own parameters are drawn towards the model's default before offsets start from them, as they
+            were in training.
     """
 
     policy: Policy
@@ -101,13 +103,19 @@ class TrainedPolicy:
     dt: float
     names: tuple[str, ...]
     base: Tensor | None = None
+    shrinkage: float = 0.0
+
+    def base_of(self, own: Tensor) -> Tensor:
+        """Returns what offsets start from for drivers whose own parameters are these; both `(D, n)` in SI units."""
+        return drawn(self.space, own, self.shrinkage)
 
     def begin(self, network: Tensor, base: Tensor | None = None) -> PolicyState:
         """Returns the state of D drivers before their first window.
 
         Args:
             network: `(D,)`, which network drives each.
-            base: `(D, n)` in SI units, each driver's own base; None: the policy's. Ignored where answers are not offsets.
+            base: `(D, n)` in SI units, what each driver's offsets start from (`base_of`); None: the policy's, for drivers of whom
+                nothing is known. Ignored where answers are not offsets.
         """
         place = driver_places(network)
         drivers = int(place.max()) + 1
@@ -224,6 +232,7 @@ class TrainedPolicy:
             "windows": self.windows.model_dump(),
             "dt": self.dt,
             "names": list(self.names),
+            "shrinkage": self.shrinkage,
         }
         with whole(folder / "policy.json") as temporary:
             temporary.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
@@ -271,6 +280,7 @@ class TrainedPolicy:
             dt=description["dt"],
             names=tuple(description["names"]),
             base=base,
+            shrinkage=description.get("shrinkage", 0.0),
         )
 
 

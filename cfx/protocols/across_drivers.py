@@ -102,7 +102,7 @@ class AcrossDrivers(Protocol):
         names = (*(f"fold {k}" for k in range(self.settings.folds)), ALL)
         default = study.space.defaults(dtype=population.dtype, device=population.device).expand_as(population)
         strange = default if self.settings.base == "default" else population
-        own = self._own(study, fixed) if self.settings.base == "own" else None
+        own = drawn(study.space, fixed, self.settings.shrinkage) if self.settings.base == "own" else None
         policy, learned = self._learn(study, whole, members, strange, own, labels, names)
 
         tested = (fold >= 0).nonzero()[:, 0]
@@ -153,13 +153,6 @@ class AcrossDrivers(Protocol):
             ]
         )
 
-    def _own(self, study: Study, fixed: Tensor) -> Tensor:
-        """Returns what offsets start from for drivers whose history was read, `(P, n)`."""
-        if self.settings.shrinkage == 0:
-            return fixed
-        space, default = study.space, study.space.defaults(dtype=fixed.dtype, device=fixed.device)
-        return space.from_unit(drawn(space.to_unit(fixed), space.to_unit(default), self.settings.shrinkage))
-
     def _learn(
         self,
         study: Study,
@@ -197,7 +190,8 @@ class AcrossDrivers(Protocol):
             workspace=study.workspace,
         )
         learned = study.learner.fit(study.policy, lesson)
-        return study.ready(study.policy, learned, names), learned
+        policy = study.ready(study.policy, learned, names)
+        return replace(policy, shrinkage=0.0 if self.settings.base != "own" else self.settings.shrinkage), learned
 
 
 def _platoons(pairs: Sequence[Pair]) -> list[int]:

@@ -198,8 +198,9 @@ class Driver:
         Args:
             vehicle: its id.
             network: which of the policy's networks drives it; None for this driver's.
-            base: a driver's own parameters, name -> SI value, that a policy of offsets (`learner=rollout`) starts from; None:
-                what it has for strangers. Policies that answer parameters themselves have no use for it.
+            base: a driver's own parameters, name -> SI value, that a policy of offsets (`learner=rollout`) starts from, drawn
+                towards the default as in training; None: what it has for strangers. Policies that answer parameters themselves
+                have no use for it.
 
         Raises:
             DataError: the policy has no such network.
@@ -210,7 +211,8 @@ class Driver:
         if base is not None:
             if set(base) != set(self.policy.space.names):
                 raise ParameterError(f"base: give a value for each of {', '.join(self.policy.space.names)}, and nothing else")
-            self._bases[vehicle] = [base[name] for name in self.policy.space.names]
+            own = torch.tensor([[base[name] for name in self.policy.space.names]], dtype=torch.float64)
+            self._bases[vehicle] = self.policy.base_of(own)[0].tolist()
 
     def renew(self, vehicle: str) -> None:
         """Lets the policy's memory of a vehicle begin anew; the frames of its last window stay."""

@@ -4,6 +4,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cfx.models.krauss import Krauss
 from cfx.policies.offsets import NONE, coordinates, drawn, moved
 
 unit = st.floats(0.0, 1.0)
@@ -35,19 +36,25 @@ def test_offsets_add_up_on_logits(base: float, answer: float) -> None:
     torch.testing.assert_close(moved(b, a), torch.sigmoid(torch.logit(b) + 3.0 * torch.logit(a)), rtol=0, atol=1e-12)
 
 
-@given(unit, unit)
-def test_a_base_that_is_not_drawn_stays_exactly_and_one_drawn_fully_arrives(base: float, towards: float) -> None:
-    b, t = torch.tensor([base]).double(), torch.tensor([towards]).double()
-    assert torch.equal(drawn(b, t, 0.0), b)
-    torch.testing.assert_close(drawn(b, t, 1.0), t.clamp(0.005, 0.995), rtol=0, atol=1e-12)
+SPACE = Krauss().space
 
 
-@given(unit, unit, st.floats(0.0, 1.0), st.floats(0.0, 1.0))
-def test_the_more_a_base_is_drawn_the_nearer_it_comes(base: float, towards: float, one: float, other: float) -> None:
+def krauss(unit: float) -> torch.Tensor:
+    return SPACE.from_unit(torch.full((1, len(SPACE)), unit, dtype=torch.float64))
+
+
+@given(unit)
+def test_a_set_that_is_not_drawn_stays_exactly_and_one_drawn_fully_is_the_default(own: float) -> None:
+    values = krauss(own)
+    assert torch.equal(drawn(SPACE, values, 0.0), values)
+    torch.testing.assert_close(drawn(SPACE, values, 1.0)[0], SPACE.defaults(), rtol=0, atol=1e-9)
+
+
+@given(unit, st.floats(0.001, 1.0), st.floats(0.001, 1.0))
+def test_the_more_a_set_is_drawn_the_nearer_it_comes(own: float, one: float, other: float) -> None:
     less, more = sorted((one, other))
-    b, t = torch.tensor(base).double(), torch.tensor(towards).double()
-    near, far = (float((coordinates(drawn(b, t, s)) - coordinates(t)).abs()) for s in (more, less))
-    assert near <= far + 1e-9
+    far, near = ((drawn(SPACE, krauss(own), s) - SPACE.defaults()).abs() for s in (less, more))
+    assert bool((near <= far + 1e-9).all())
 
 
 def test_a_base_at_its_bound_can_be_moved_and_has_finite_coordinates() -> None:

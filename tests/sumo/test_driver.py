@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from cfx.pairs import PairBatch
 from cfx.policies.base import ConstantNetwork
 from cfx.policies.default import DefaultPolicy
 from cfx.policies.fixed import FixedPolicy
+from cfx.policies.offsets import drawn
 from cfx.policies.trained import Scaler, TrainedPolicy
 from cfx.simulation.rollout import Simulator
 from cfx.style.entropy import measure_style
@@ -231,6 +232,19 @@ def test_a_constant_driver_takes_parameters_by_name() -> None:
         Driver.constant(W99(), {"cc11": 2.0})
     with pytest.raises(ParameterError, match="base: give a value for each of t_r, t_i"):
         Driver(adaptive({"name": "krauss"}, offsets=True)).assign("v0", base={"t_r": 1.0})
+
+
+def test_a_drivers_own_parameters_are_drawn_towards_the_default_as_in_training() -> None:
+    plain = adaptive({"name": "krauss"}, offsets=True)
+    own, found = torch.tensor([[4.0, 1.0]], dtype=torch.float64), []
+    middle = drawn(plain.space, own, 0.5)[0].tolist()
+    for policy, values in ((replace(plain, shrinkage=0.5), own[0].tolist()), (plain, middle), (plain, own[0].tolist())):
+        driver = Driver(policy)
+        driver.assign("v0", base=dict(zip(plain.space.names, values, strict=True)))
+        driver.step(platoon(1), "v0")
+        found.append(driver.parameters("v0")["t_r"])
+    assert found[0] == pytest.approx(found[1], rel=1e-9)
+    assert found[0] != pytest.approx(found[2], rel=1e-3)
 
 
 def test_what_cannot_be_driven_is_one_sentence(tmp_path: Path) -> None:
