@@ -326,6 +326,8 @@ def report(result: JobResult, evaluation: Evaluation, console: Console, tracker:
         console.print(text, soft_wrap=True)
     else:
         _tell(evaluation.improvement, "fixed", console)
+        if "base" in evaluation.improvements:
+            _tell(evaluation.improvements["base"], "base (own, drawn towards the default)", console)
         if "population" in evaluation.improvements:
             _tell(evaluation.improvements["population"], "population", console)
         if "population" in evaluation.whole_improvements:

@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-METHODS = ("default", "population", "fixed", "policy")
+METHODS = ("default", "population", "fixed", "base", "policy")
 """What an evaluation may compare, in the order in which it is shown; always on the same frames from the same measured state.
 
 `default`: the model's default parameters. `population`: one set calibrated jointly on the training drivers, none of whom is
-tested. `fixed`: the driver's own set, from the first part of the drive. `policy`: parameters that a policy chooses as it drives.
+tested. `fixed`: the driver's own set, from the first part of the drive. `base`: that set drawn towards the default, held: what a
+policy of offsets starts from where that is not `fixed` itself, so that what adapting adds can be told from what drawing does.
+`policy`: parameters that a policy chooses as it drives.
 """
 
 STATISTICS = ("mean", "trimmed_mean", "median", "ci95_low", "ci95_high", "win_rate", "p_value")

@@ -246,6 +246,8 @@ class _Test:
         }
         each = torch.arange(len(first), device=first.device)
         loops["fixed"] = drive(study.simulator, study.constant(FixedPolicy(), self.fixed), batch, first, each)
+        if self.base is not None and self.policy.base is not None and self.policy.shrinkage > 0:
+            loops["base"] = drive(study.simulator, study.constant(FixedPolicy(), self.base), batch, first, each)
         whole = {name: drive(study.simulator, one, batch, torch.zeros_like(first), network) for name, one in strangers.items()}
         default = study.constant(DefaultPolicy(), self.population[:1])
         platoons = {

@@ -9,23 +9,23 @@ from typing import Any
 
 import numpy as np
 
+from cfx.evaluation.result import METHODS
 from cfx.figures.look import COLOURS, INK, LABELS, percent
 from cfx.report.figure import Plot, Trace, axis, safe, view
 from cfx.report.read import Job, finite, improvement_of
 from cfx.report.tables import BASELINES, NOTHING, SHORT, Cell, Column, Sheet, number, tested, text
 
-_METHODS = ("default", "population", "fixed", "policy")
 _WIDE = 1.6
 """An axis of errors reaches so many times as far as the largest error of the methods but `default`, which may lie far off."""
 
 
 def closeness(jobs: Sequence[Job]) -> Sheet:
     """Returns a row per job: the errors of each method, and the policy's improvement. The numbers are those of `metrics.json`."""
-    shown = {
-        where: [m for m in _METHODS if any(_known(job, f"{where}rmse_speed", m) for job in jobs)] for where in ("", "whole/")
-    }
+    shown = {where: [m for m in METHODS if any(_known(job, f"{where}rmse_speed", m) for job in jobs)] for where in ("", "whole/")}
     gains = [
-        (b, where) for b, where in (("fixed", ""), ("population", ""), ("population", "whole/")) if _compared(jobs, b, where)
+        (b, where)
+        for b, where in (("fixed", ""), ("base", ""), ("population", ""), ("population", "whole/"))
+        if _compared(jobs, b, where)
     ]
     frames = {"": tested(jobs), "whole/": "the whole drive of drivers whom nothing was fitted to, from its first frame on"}
     columns = [Column("Job", "", number=False)]
@@ -142,8 +142,8 @@ def absolute(jobs: Sequence[Job]) -> Plot:
 def _absolute_view(jobs: Sequence[Job], metric: str, unit: str) -> dict[str, Any]:
     places = np.arange(len(jobs))[::-1]
     data: list[Trace] = []
-    values = {m: np.array([_metric(job, f"{metric}/{m}") if m in _methods(job) else math.nan for job in jobs]) for m in _METHODS}
-    for method in (m for m in _METHODS if np.isfinite(values[m]).any()):
+    values = {m: np.array([_metric(job, f"{metric}/{m}") if m in _methods(job) else math.nan for job in jobs]) for m in METHODS}
+    for method in (m for m in METHODS if np.isfinite(values[m]).any()):
         hover = [
             f"<b>{safe(job.name)}</b><br>{LABELS[method]}: {v:.3f} {unit}" for job, v in zip(jobs, values[method], strict=True)
         ]
@@ -163,7 +163,7 @@ def _absolute_view(jobs: Sequence[Job], metric: str, unit: str) -> dict[str, Any
                 },
             }
         )
-    near = finite(np.concatenate([values[m] for m in _METHODS if m != "default"]))
+    near = finite(np.concatenate([values[m] for m in METHODS if m != "default"]))
     end = _WIDE * float(near.max(initial=1e-9))
     off = finite(values["default"])
     off = off[off > end]

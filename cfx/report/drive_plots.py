@@ -13,7 +13,15 @@ from cfx.figures.look import COLOURS, LABELS, unit_label
 from cfx.report.figure import Plot, Trace, axis, safe, view
 from cfx.report.read import Job, finite
 
-_DASHES = {"real": "solid", "leader": "solid", "default": "dot", "population": "dashdot", "fixed": "dash", "policy": "solid"}
+_DASHES = {
+    "real": "solid",
+    "leader": "solid",
+    "default": "dot",
+    "population": "dashdot",
+    "fixed": "dash",
+    "base": "longdashdot",
+    "policy": "solid",
+}
 _WIDTHS = {"real": 2.2, "leader": 1.2, "policy": 2.2}
 
 

@@ -19,10 +19,11 @@ BASELINES = {
     "default": "the model's default parameters",
     "population": "one set of parameters for all, calibrated jointly on the training drivers",
     "fixed": "the driver's own fixed parameters, calibrated on the first part of his own drive",
+    "base": "the driver's own fixed parameters drawn towards the default, which the policy starts from",
 }
 """What the policy is compared with, in words that end a sentence."""
 
-SHORT = {"fixed": "own fixed"}
+SHORT = {"fixed": "own fixed", "base": "own, drawn"}
 """Methods in a table, where their own name says too little."""
 
 

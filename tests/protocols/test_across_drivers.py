@@ -269,7 +269,7 @@ def test_less_history_is_what_the_plot_says(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("base", "shrinkage", "method"),
-    [("own", 0, "fixed"), ("own", 1, "default"), ("population", 0.7, "population"), ("default", 0.7, "default")],
+    [("own", 0, "fixed"), ("own", 0.7, "base"), ("own", 1, "default"), ("population", 0.7, "population"), ("default", 0.7, "default")],
 )
 def test_without_learning_the_policy_is_its_base(tmp_path: Path, base: str, shrinkage: float, method: str) -> None:
     still = ["learner.epochs=1", "learner.steps=1", "learner.learning_rate=1e-12", "learner.weight_decay=0"]
@@ -277,6 +277,9 @@ def test_without_learning_the_policy_is_its_base(tmp_path: Path, base: str, shri
     result = rollout(tmp_path, *start, "protocol.histories=[]", *still)
     rmse = result.pairs.set_index(["method", "pair_id"])["rmse_speed"]
     np.testing.assert_allclose(rmse["policy"], rmse[method], rtol=1e-5)
+    # What drawing does on its own is shown where it was done.
+    assert ("base" in rmse.index.get_level_values(0)) == (base == "own" and shrinkage > 0)
+    assert ("rmse_improvement_over_base/mean" in result.metrics) == (base == "own" and shrinkage > 0)
     assert not (tmp_path / "history.parquet").exists()
 
 
