@@ -279,7 +279,7 @@ def test_without_learning_the_policy_is_its_base(tmp_path: Path, base: str, shri
     np.testing.assert_allclose(rmse["policy"], rmse[method], rtol=1e-5)
     # What drawing does on its own is shown where it was done.
     assert ("base" in rmse.index.get_level_values(0)) == (base == "own" and shrinkage > 0)
-    assert ("rmse_improvement_over_base/mean" in result.metrics) == (base == "own" and shrinkage > 0)
+    assert ("rmse_improvement/base/mean" in result.metrics) == (base == "own" and shrinkage > 0)
     assert not (tmp_path / "history.parquet").exists()
 
 
