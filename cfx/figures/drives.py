@@ -108,7 +108,7 @@ def speeds(evaluation: Evaluation, pair_id: str | None = None) -> Figure:
     figure.legend(
         handles=method_handles(("real", *evaluation.methods)),
         loc="outside upper center",
-        ncols=len(evaluation.methods) + 1,
+        ncols=min(len(evaluation.methods) + 1, 5),
         columnspacing=1.6,
         handlelength=2.4,
         title=f"pair {short(drive.pair_id, 60)}, test part",
@@ -229,7 +229,7 @@ def _rmse(rows: dict[str, dict[str, float]], column: str, unit: str) -> str:
 
 
 def _two_line_title(axes: Axes, strong: str, fine: str) -> None:
-    axes.set_title(fine, fontsize=9.5, color=INK)
+    axes.set_title(fine, fontsize=8.5, color=INK)  # four methods' errors beside each other
     if strong:
         axes.annotate(
             strong,
