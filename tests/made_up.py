@@ -77,6 +77,7 @@ def make_drive(
         "fixed": np.tile(best, (frames + 1, 1)),
         "policy": np.clip(best + wander * (high - low), low, high),
         "population": np.tile(low + 0.3 * (high - low), (frames + 1, 1)),
+        "base": np.tile(low + 0.4 * (high - low), (frames + 1, 1)),
     }
     parameters = {method: parameters[method] for method in methods}
     number = 1000 + 7 * k

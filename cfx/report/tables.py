@@ -230,6 +230,8 @@ def clusters(series: Mapping[str, Mapping[str, pd.DataFrame]], baseline: str) ->
     rows = []
     for name, by_cluster in series.items():
         for cluster, table in by_cluster.items():
+            if f"rmse_speed/{baseline}" not in table:  # these jobs have no such baseline; others beside them have
+                continue
             found = statistics(table, baseline)
             rows.append(
                 (

@@ -269,7 +269,13 @@ def test_less_history_is_what_the_plot_says(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("base", "shrinkage", "method"),
-    [("own", 0, "fixed"), ("own", 0.7, "base"), ("own", 1, "default"), ("population", 0.7, "population"), ("default", 0.7, "default")],
+    [
+        ("own", 0, "fixed"),
+        ("own", 0.7, "base"),
+        ("own", 1, "default"),
+        ("population", 0.7, "population"),
+        ("default", 0.7, "default"),
+    ],
 )
 def test_without_learning_the_policy_is_its_base(tmp_path: Path, base: str, shrinkage: float, method: str) -> None:
     still = ["learner.epochs=1", "learner.steps=1", "learner.learning_rate=1e-12", "learner.weight_decay=0"]

@@ -56,6 +56,18 @@ def test_errors_of_all_jobs_stand_in_one_table_in_metres(sweep: Path) -> None:
     assert sum(span for _, span in sheet.groups) == len(sheet.columns)
 
 
+def test_jobs_with_and_without_a_baseline_stand_in_one_report(tmp_path: Path) -> None:
+    """A drawn base is a baseline of jobs that learn by rollout; those that imitate beside them have none."""
+    write_job(tmp_path / "rollout", model="krauss", methods=(*ACROSS, "base"), seed=0)
+    write_job(tmp_path / "imitation", model="w99", methods=ACROSS, seed=1)
+    runs = read_runs([str(tmp_path)])
+    sheet, page = closeness(runs.jobs), render(runs)
+    with_base, without = (next(job for job in runs.jobs if ("base" in job.methods) is there) for there in (True, False))
+    assert cells(sheet, with_base.name)["own, drawn"][0].startswith(f"{with_base.metrics['rmse_speed/base']:.3f}")
+    assert set(cells(sheet, without.name)["own, drawn"]) == {"\N{EN DASH}"}
+    assert "drawn towards the default" in page
+
+
 def test_the_best_is_marked_where_the_pairs_are_the_same(sweep: Path, tmp_path: Path) -> None:
     jobs = read_runs([str(sweep)]).jobs
     best = min(jobs, key=lambda job: job.metrics["rmse_speed/policy"])
