@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 import pandas as pd
@@ -29,8 +29,8 @@ from cfx.figures.look import (
 )
 
 Array = NDArray[np.float64]
-_DRAWN = tuple(method for method in METHODS if method != "base")
-"""The methods that figures show: one more line than these and nobody tells them apart. Tables and pages have them all."""
+_SHOWN = tuple(method for method in METHODS if method != "base")
+"""The methods whose lines share axes: one more than these and nobody tells them apart. Tables and pages have them all."""
 
 _ROOM = 1.5
 """The default driver may stretch a vertical axis by so many times the range of the other lines, on either side."""
@@ -53,7 +53,7 @@ def drives(evaluation: Evaluation, pair_id: str | Sequence[str] | None = None, n
     grid = figure.subplots(len(chosen), 2, squeeze=False, sharex="row", width_ratios=(1.12, 1.0))
     for (speed_axes, gap_axes), (label, drive) in zip(grid, chosen, strict=True):
         rows = _rows(evaluation, drive.pair_id)
-        methods = [method for method in _DRAWN if method in drive.speed]
+        methods = _shown(drive.speed)
         method_line(speed_axes, "leader", drive.time, drive.leader_speed)
         for axes, real, simulated in ((speed_axes, drive.real_speed, drive.speed), (gap_axes, drive.real_gap, drive.gap)):
             method_line(axes, "real", drive.time, real)
@@ -74,9 +74,9 @@ def drives(evaluation: Evaluation, pair_id: str | Sequence[str] | None = None, n
     for axes in grid[-1]:
         axes.set_xlabel("time from the start of the pair (s)")
     figure.legend(
-        handles=method_handles(("real", "leader", *(m for m in evaluation.methods if m in _DRAWN))),
+        handles=method_handles(("real", "leader", *_shown(evaluation.methods))),
         loc="outside upper center",
-        ncols=len(_DRAWN) + 2,
+        ncols=len(_SHOWN) + 2,
         columnspacing=1.6,
         handlelength=2.4,
     )
@@ -154,9 +154,9 @@ def chosen_parameters(evaluation: Evaluation, pair_id: str | None = None) -> Fig
         axes.tick_params(labelbottom=axes in panels[-columns:])
     figure.supxlabel("time from the start of the pair (s)", fontsize=10.5, color=INK)
     figure.legend(
-        handles=method_handles(("real", "leader", *(m for m in evaluation.methods if m in _DRAWN))),
+        handles=method_handles(("real", "leader", *_shown(evaluation.methods))),
         loc="outside upper center",
-        ncols=len(_DRAWN) + 2,
+        ncols=len(_SHOWN) + 2,
         columnspacing=1.6,
         title=f"pair {short(drive.pair_id, 60)}",
         title_fontsize=11,
@@ -167,11 +167,10 @@ def chosen_parameters(evaluation: Evaluation, pair_id: str | None = None) -> Fig
 def _parameter(axes: Axes, drive: Drive, k: int, name: str, unit: str, bounds: Array) -> None:
     low, high = float(bounds[0]), float(bounds[1])
     seen = []
-    for method in _DRAWN:
-        if method in drive.parameters:
-            values = _finite(drive.parameters[method][:, k])
-            method_line(axes, method, drive.time, values, steps=True)
-            seen.append(values)
+    for method in _shown(drive.parameters):
+        values = _finite(drive.parameters[method][:, k])
+        method_line(axes, method, drive.time, values, steps=True)
+        seen.append(values)
     values = np.concatenate(seen) if seen else np.array([low, high])
     values = values[np.isfinite(values)] if np.isfinite(values).any() else np.array([low, high])
     width = max(1.3 * float(values.max() - values.min()), 0.2 * (high - low))
@@ -214,6 +213,11 @@ def _rank(place: int, count: int, n: int) -> str:
     return "median pair, " if n == 3 and count > 2 else f"{place + 1} of {count}, "
 
 
+def _shown(present: Collection[str]) -> list[str]:
+    """Returns those of `_SHOWN` that are present, in their order."""
+    return [method for method in _SHOWN if method in present]
+
+
 def _rows(evaluation: Evaluation, pair_id: str) -> dict[str, dict[str, float]]:
     """Returns method -> column -> value of one pair."""
     rows = evaluation.table[evaluation.table["pair_id"] == pair_id].drop_duplicates("method").set_index("method")
@@ -222,7 +226,7 @@ def _rows(evaluation: Evaluation, pair_id: str) -> dict[str, dict[str, float]]:
 
 
 def _rmse(rows: dict[str, dict[str, float]], column: str, unit: str) -> str:
-    values = [(method, rows[method][column]) for method in _DRAWN if method in rows]
+    values = [(method, rows[method][column]) for method in _shown(rows)]
     what = "speed" if column == "rmse_speed" else "gap"
     listed = ", ".join(f"{method} {value:.2f}" if np.isfinite(value) else f"{method} none" for method, value in values)
     return f"RMSE of {what}: {listed} {unit}"
