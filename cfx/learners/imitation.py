@@ -108,7 +108,7 @@ class _Material(nn.Module):
         device = batch.lengths.device
         pairs = len(batch)
         where = labels.windows
-        history = measured_history(batch[where.pair.to(device)], where.first.to(device), lesson.windows.length)
+        history = measured_history(batch, where.pair.to(device), where.first.to(device), lesson.windows.length)
         seen = tokens(history, policy.inputs, policy.summary).float()
         assert seen.shape[-1] == token_width(policy.inputs, policy.summary, lesson.windows.length)
         unit = lesson.simulator.model.space.to_unit(labels.parameters).float()

@@ -94,10 +94,7 @@ class Material:
         fixed = space.to_unit(lesson.fixed)
         own = (fixed if lesson.base is None else space.to_unit(lesson.base)).float()
         windows = torch.arange(0, int(lesson.split.frame.max()) + 1, stride, device=device)
-        measured = measured_history(
-            batch[pairs.repeat_interleave(len(windows))], windows.repeat(len(batch)), lesson.windows.length
-        )
-        seen = tokens(measured, policy.inputs, policy.summary).view(len(batch), len(windows), -1)
+        seen = tokens(measured_history(batch, pairs[:, None], windows, lesson.windows.length), policy.inputs, policy.summary)
         trains = real & (few | ~held)
         features = torch.cat([seen, coordinates(own)[:, None].expand(-1, len(windows), -1)], -1)[pair]
         scaler = Scaler.of(features, trains[..., None] & (windows <= torch.where(few, cut, last)[..., None]))

@@ -158,8 +158,9 @@ class TrainedPolicy:
         """
         stride = self.windows.stride
         begin = 0 if since is None else int(since.min()) // stride * stride
+        each = torch.arange(len(batch), device=until.device)
         for first in range(begin, int(until.max()), stride):
-            _, after = self.act(measured_history(batch, torch.full_like(until, first), self.windows.length), state)
+            _, after = self.act(measured_history(batch, each, torch.full_like(until, first), self.windows.length), state)
             reading = ((first < until) & (first >= (0 if since is None else since)))[:, None]
             merged = state.state.clone()
             kept, new = state.state[state.network, state.place], after.state[state.network, state.place]
@@ -193,7 +194,7 @@ class TrainedPolicy:
         batch = PairBatch.of(pairs)
         until = batch.lengths - 1
         state = self.read(batch, until, self.begin(self.networks_for(pairs)))
-        chosen, _ = self.act(measured_history(batch, until, self.windows.length), state)
+        chosen, _ = self.act(measured_history(batch, torch.arange(len(batch)), until, self.windows.length), state)
         return pd.DataFrame(
             {"pair_id": [pair.pair_id for pair in pairs], **dict(zip(self.space.names, chosen.T.tolist(), strict=True))}
         )
@@ -284,11 +285,21 @@ class TrainedPolicy:
         )
 
 
-def measured_history(batch: PairBatch, frame: Tensor, length: int) -> History:
-    """Returns the last `length` measured frames up to `frame` `(D,)` of D pairs; the first frame stands for those before it."""
-    index = (frame[:, None] + torch.arange(1 - length, 1, device=frame.device)).clamp(min=0)
+def measured_history(batch: PairBatch, pair: Tensor, frame: Tensor, length: int) -> History:
+    """Returns the last `length` measured frames up to a frame; the first frame stands for those before it.
+
+    Args:
+        batch: P pairs.
+        pair: which of them, `(*shape)`.
+        frame: `(*shape)`, or what broadcasts with it.
+        length: frames.
+
+    Returns:
+        Signals of `(*shape, length)`.
+    """
+    index = (frame[..., None] + torch.arange(1 - length, 1, device=frame.device)).clamp(min=0)
     signals = (batch.leader_speed, batch.leader_acceleration, batch.follower_speed, batch.follower_acceleration, batch.gap)
-    return History(*(signal.gather(1, index) for signal in signals))
+    return History(*(signal[pair[..., None], index] for signal in signals))
 
 
 def driver_places(network: Tensor) -> Tensor:

@@ -27,7 +27,7 @@ class Plain(Learner):
     def fit(self, policy: Policy, lesson: Lesson) -> Learned:
         torch_seed = torch.Generator().manual_seed(self.seed(lesson))
         windows = lesson.labels.windows
-        history = measured_history(lesson.batch[windows.pair], windows.first + self.ahead, lesson.windows.length)
+        history = measured_history(lesson.batch, windows.pair, windows.first + self.ahead, lesson.windows.length)
         seen, mask = windows.to_grid(tokens(history, policy.inputs, policy.summary).float(), len(lesson.batch))
         space = lesson.simulator.model.space
         wanted, _ = windows.to_grid(space.to_unit(lesson.labels.parameters).float(), len(lesson.batch))
