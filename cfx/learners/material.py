@@ -1,8 +1,8 @@
 """What is learned from when a policy learns by driving: drivers placed in networks, and drives drawn from their recordings.
 
-Letters: P pairs of the lesson, N networks, B drivers of the largest, D drives, H windows of a drive, W windows of the longest
-pair, L frames that a token holds, S steps of a window, f features, n tuned parameters, s width of a policy's state, m of a
-model's memory.
+Letters: P pairs of the lesson, N networks (each member of a committee counts), B drivers of the largest, D drives, H windows of a
+drive, W windows of the longest pair, L frames that a token holds, S steps of a window, f features, n tuned parameters, s width of
+a policy's state, m of a model's memory.
 """
 
 from __future__ import annotations
@@ -65,7 +65,8 @@ class Material:
         base: each driver's base in unit space, `(N, B, n)`.
         start: the population's, `(N, n)`: of those who bring no base of their own.
         tokens: what was measured, `(P, W, f)`.
-        scaler: normalises tokens and the base in the squashed space, f + n features.
+        scaler: normalises tokens and the base in the squashed space, f + n features; alike for all members of a committee.
+        members: networks of a committee, which stand behind one another.
     """
 
     batch: PairBatch
@@ -78,26 +79,38 @@ class Material:
     start: Tensor
     tokens: Tensor
     scaler: Scaler
+    members: int = 1
 
     @classmethod
-    def of(cls, lesson: Lesson, policy: Policy, share: float, generator: torch.Generator) -> Material:
+    def of(cls, lesson: Lesson, policy: Policy, share: float, generator: torch.Generator, members: int = 1) -> Material:
+        """Places a lesson.
+
+        Args:
+            lesson: what may be learned from.
+            policy: what is read.
+            share: of the drivers (of each drive's end, where drivers are few), kept for validation.
+            generator: chooses them, for each member of a committee anew.
+            members: networks of a committee.
+        """
         batch = _single(lesson.batch)
         device = batch.lengths.device
+        space, stride = lesson.simulator.model.space, lesson.windows.stride
         grid = Grid(lesson.network.to(device), len(lesson.names))
         pairs = torch.arange(len(batch), device=device)
-        pair, real = grid.scatter(pairs), grid.scatter(torch.ones_like(pairs)).bool()
+        population = grid.mean(space.to_unit(lesson.fixed)).float()
+        placed = (grid.scatter(pairs), grid.scatter(torch.ones_like(pairs)).bool(), population)
+        pair, real, start = (values.repeat_interleave(members, 0) for values in placed)
         last = lesson.split.frame.to(device)[pair]
         held, few = _held_out(lesson, pair.cpu(), real.cpu(), share, generator)
         held, few = held.to(device), few.to(device)[:, None]
         cut = (last * (1.0 - share)).long()
-        space, stride = lesson.simulator.model.space, lesson.windows.stride
-        fixed = space.to_unit(lesson.fixed)
-        own = (fixed if lesson.base is None else space.to_unit(lesson.base)).float()
+        own = space.to_unit(lesson.fixed if lesson.base is None else lesson.base).float()
         windows = torch.arange(0, int(lesson.split.frame.max()) + 1, stride, device=device)
         seen = tokens(measured_history(batch, pairs[:, None], windows, lesson.windows.length), policy.inputs, policy.summary)
         trains = real & (few | ~held)
         features = torch.cat([seen, coordinates(own)[:, None].expand(-1, len(windows), -1)], -1)[pair]
-        scaler = Scaler.of(features, trains[..., None] & (windows <= torch.where(few, cut, last)[..., None]))
+        seen_by_any = trains.view(-1, members, trains.shape[1]).any(1).repeat_interleave(members, 0)
+        scaler = Scaler.of(features, seen_by_any[..., None] & (windows <= torch.where(few, cut, last)[..., None]))
         return cls(
             batch=batch,
             pair=pair,
@@ -106,9 +119,10 @@ class Material:
             until=torch.where(few, cut, last),
             last=last,
             base=own[pair],
-            start=grid.mean(fixed).float(),
+            start=start,
             tokens=seen,
             scaler=scaler,
+            members=members,
         )
 
     def of_drives(self, drives: Drives) -> tuple[Tensor, Tensor]:
@@ -250,12 +264,16 @@ class BaseErrors:
         stride, (networks, drivers) = lesson.windows.stride, material.pair.shape
         windows = torch.arange(material.tokens.shape[1], device=material.pair.device) * stride
         near, far = (_Constant(lesson, material.batch, steps) for steps in (horizon * stride, int(material.last.max())))
-        pairs, start = material.pair.flatten(), material.start.repeat_interleave(drivers, 0)
-        familiar = near.errors(pairs, material.base.flatten(0, 1), windows).view(networks, drivers, -1, 2)
-        if lesson.base is None:
-            return cls(familiar, familiar, far.errors(pairs, start, windows[:1]).view(networks, drivers, 2))
-        strange = near.errors(pairs, start, windows).view(networks, drivers, -1, 2)
-        return cls(familiar, strange, far.errors(pairs, start, windows[:1]).view(networks, drivers, 2))
+        first = slice(None, None, material.members)  # what drives is the same for all members
+        pairs, own = material.pair[first].flatten(), material.base[first].flatten(0, 1)
+        start = material.start[first].repeat_interleave(drivers, 0)
+
+        def placed(errors: Tensor) -> Tensor:
+            return errors.view(networks // material.members, drivers, -1, 2).repeat_interleave(material.members, 0)
+
+        familiar = placed(near.errors(pairs, own, windows))
+        strange = familiar if lesson.base is None else placed(near.errors(pairs, start, windows))
+        return cls(familiar, strange, placed(far.errors(pairs, start, windows[:1]))[:, :, 0])
 
     def over_horizon(self, drives: Drives) -> Tensor:
         """Returns the errors over the horizon from where each drive begins, `(N, D, 2)`."""

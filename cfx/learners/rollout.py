@@ -4,8 +4,8 @@ Where window labels are not determined by the data, their average means little (
 random measured states on, the policy drives in closed loop behind the measured leader, and the error of its speeds and gaps is
 propagated back through the simulation into the network.
 
-Letters: P pairs of the lesson, N networks, B drivers of the largest, D drives of one step, H windows of a drive, W windows of the
-longest pair, n tuned parameters.
+Letters: P pairs of the lesson, N networks (each member of a committee counts), B drivers of the largest, D drives of one step,
+H windows of a drive, W windows of the longest pair, n tuned parameters.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ from cfx.learners.batched import BatchedModule, fit
 from cfx.learners.material import BaseErrors, Drives, Material, Real, Scene
 from cfx.learners.window_step import Recent, WindowStep, bounded
 from cfx.policies.base import Policy, PolicyNetwork
+from cfx.policies.committee import Committee
 from cfx.policies.offsets import NONE, coordinates
+from cfx.policies.trained import Scaler
 from cfx.progress import Task
 from cfx.simulation.rollout import Compile, can_compile
 
@@ -61,6 +63,9 @@ _WARM_UP = 20
 class RolloutSettings(Settings):
     """Settings of `rollout`."""
 
+    members: int = Field(
+        4, ge=1, description="networks of a committee, which answer together; each keeps other drivers for validation"
+    )
     epochs: int = Field(16, ge=1, description="epochs at most; after each, every network is validated")
     steps: int = Field(25, ge=1, description="gradient steps of an epoch; in each, every driver drives")
     draws: int = Field(2, ge=1, description="drives of each driver and step, each from a random measured state")
@@ -141,19 +146,18 @@ class RolloutLearner(Learner):
         if not {"gap", "time_headway"} & set(policy.inputs):
             log.info("The policy does not see the gap; it drives better with %s", _SEEING)
         generator = torch.Generator().manual_seed(lesson.seed)
-        material = Material.of(lesson, policy, s.validation, generator)
+        material = Material.of(lesson, policy, s.validation, generator, s.members)
         space, device = simulator.model.space, lesson.batch.lengths.device
-        blank = torch.full((len(lesson.names), len(space)), NONE)
+        blank = torch.full((len(material.pair), len(space)), NONE)
         default = space.to_unit(space.defaults()).float()
         network = policy.build(material.scaler.mean.shape[-1], default, blank, generator).to(device)
-        base = space.from_unit(material.start.to(lesson.fixed.dtype))
         if not any(parameter.requires_grad for parameter in network.parameters()):
-            return Learned(network.eval(), material.scaler, pd.DataFrame(columns=CURVE_COLUMNS), base=base)
-        task = Task(f"Training ({len(lesson.names)} networks, at most {s.epochs} epochs)", s.epochs)
+            return _learned(network.eval(), material, lesson, pd.DataFrame(columns=CURVE_COLUMNS))
+        task = Task(f"Training ({len(material.pair)} networks, at most {s.epochs} epochs)", s.epochs)
         module = RolloutModule(network, material, policy, lesson, s, on_epoch=task.advance)
         kept = self.checkpoint(policy, lesson)
         fit(module, _Steps(s.steps), epochs=s.epochs, seed=lesson.seed, device=device, task=task, checkpoint=kept)
-        return Learned(module.network, material.scaler, module.curves(), base=base)
+        return _learned(module.network, material, lesson, module.curves())
 
     def checkpoint(self, policy: Policy, lesson: Lesson) -> Path | None:
         """Returns the file from which this very training goes on, or None without a workspace."""
@@ -175,6 +179,21 @@ class RolloutLearner(Learner):
             "seed": lesson.seed,
         }
         return lesson.workspace / f"{content_key(description)}.ckpt"
+
+
+def _learned(network: PolicyNetwork, material: Material, lesson: Lesson, curves: pd.DataFrame) -> Learned:
+    """Returns the networks, those of a committee as one."""
+    space, members = lesson.simulator.model.space, material.members
+    base = space.from_unit(material.start[::members].to(lesson.fixed.dtype))
+    scaler = Scaler(material.scaler.mean[::members], material.scaler.scale[::members])
+    return Learned(Committee(network, members).eval() if members > 1 else network, scaler, curves, base=base)
+
+
+def _names(lesson: Lesson, members: int) -> tuple[str, ...]:
+    """Returns what each network is called in the learning curves."""
+    if members == 1:
+        return lesson.names
+    return tuple(f"{name}, {number} of {members}" for name in lesson.names for number in range(1, members + 1))
 
 
 class _Steps(pl.LightningDataModule):
@@ -203,7 +222,7 @@ class RolloutModule(BatchedModule):
         settings: RolloutSettings,
         on_epoch: Callable[[], None] = lambda: None,
     ) -> None:
-        super().__init__(network, lesson.names, settings, on_epoch)
+        super().__init__(network, _names(lesson, material.members), settings, on_epoch)
         self.automatic_optimization = False
         self.material = material
         self.settings = settings

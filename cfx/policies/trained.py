@@ -21,6 +21,7 @@ from cfx.files import whole
 from cfx.pairs import PairBatch, PairSet
 from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy, PolicyNetwork
+from cfx.policies.committee import Committee
 from cfx.policies.features import History, token_width, tokens
 from cfx.policies.offsets import coordinates, drawn, moved
 
@@ -233,6 +234,7 @@ class TrainedPolicy:
             "windows": self.windows.model_dump(),
             "dt": self.dt,
             "names": list(self.names),
+            "members": self.network.size if isinstance(self.network, Committee) else 1,
             "shrinkage": self.shrinkage,
         }
         with whole(folder / "policy.json") as temporary:
@@ -266,8 +268,10 @@ class TrainedPolicy:
         width = token_width(policy.inputs, policy.summary, windows.length) + (len(space) if base is not None else 0)
         if features != width:
             raise DataError(f"{folder}: the weights read {features} features, the policy's settings give {width}")
-        blank = torch.zeros((networks, len(space)), dtype=weights["scaler.mean"].dtype)
+        members = description.get("members", 1)
+        blank = torch.zeros((networks * members, len(space)), dtype=weights["scaler.mean"].dtype)
         network = policy.build(features, blank[0], blank, torch.Generator().manual_seed(0)).to(blank.dtype)
+        network = Committee(network, members) if members > 1 else network
         network.load_state_dict({k.removeprefix("network."): v for k, v in weights.items() if k.startswith("network.")})
         scaler = Scaler(weights["scaler.mean"], weights["scaler.scale"])
         return cls(

@@ -20,6 +20,7 @@ from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.pairs import PairBatch
 from cfx.policies.base import Policy
+from cfx.policies.committee import Committee
 from cfx.policies.gru import GruPolicy
 from cfx.policies.lstm import LstmPolicy
 from cfx.policies.offsets import coordinates
@@ -29,7 +30,7 @@ from tests.drives import wavy_pairs
 
 WINDOWS = WindowSettings()
 INPUTS = ("leader_speed", "relative_speed", "gap")
-QUICK: dict[str, Any] = {"epochs": 6, "steps": 15, "horizon": 12, "compile": "never"}
+QUICK: dict[str, Any] = {"members": 1, "epochs": 6, "steps": 15, "horizon": 12, "compile": "never"}
 TRUE = torch.tensor([[1.0, 0.1], [1.4, 0.3], [1.8, 0.5], [2.2, 0.0], [2.6, 0.2], [3.0, 0.4]]).double()
 
 
@@ -147,7 +148,7 @@ def test_reading_at_most_some_windows_forgets_what_was_before() -> None:
 
 def test_training_goes_on_where_it_was_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     policy, whole = gru(dropout=0.1), lesson(workspace=tmp_path / "whole")
-    learner = RolloutLearner(**QUICK)
+    learner = RolloutLearner(**(QUICK | {"members": 2}))
     expected = learner.fit(policy, whole)
     broken = replace(whole, workspace=tmp_path / "broken")
     judge, epochs = RolloutModule.judge, []
@@ -190,6 +191,38 @@ def test_validation_drivers_teach_nothing() -> None:
     one, two = (RolloutLearner(**settings).fit(policy, which) for which in (material, other))
     assert one.curves.train_loss.tolist() == two.curves.train_loss.tolist()
     assert one.curves.validation_loss.tolist() != two.curves.validation_loss.tolist()
+
+
+def test_members_of_a_committee_keep_other_drivers_for_validation_and_read_alike() -> None:
+    material = lesson()
+    placed = Material.of(material, gru(), 0.34, torch.Generator().manual_seed(0), members=5)
+    assert len({tuple(row) for row in placed.validates[:5].tolist()}) > 1
+    assert placed.pair[:5].tolist() == [list(range(6))] * 5
+    assert placed.pair[5:].tolist() == [list(range(6, 12))] * 5
+    for number in (0, 5):
+        torch.testing.assert_close(
+            placed.scaler.mean[number : number + 5], placed.scaler.mean[number].expand(5, -1), rtol=0, atol=0
+        )
+    errors = BaseErrors.of(material, placed, 12)
+    assert errors.familiar.shape[0] == errors.whole.shape[0] == 10
+
+
+def test_a_committee_learns_and_answers_as_one() -> None:
+    """Its error is below what its members reach on average, each driving alone; each has a learning curve."""
+    policy, material = gru(), lesson()
+    learned = RolloutLearner(**(QUICK | {"members": 3})).fit(policy, material)
+    assert isinstance(learned.network, Committee)
+    assert learned.curves.network.unique().tolist() == [f"n{n}, {m} of 3" for n in range(2) for m in (1, 2, 3)]
+    first = {"first": 100}
+    together, alone = error(loop(learned, material, policy, **first), material, **first), []
+    weights = learned.network.members.state_dict()
+    for number in range(3):
+        blank = torch.full((2, 2), 0.5)
+        network = policy.build(learned.scaler.mean.shape[-1], blank[0], blank, torch.Generator())
+        network.load_state_dict({key: value[number::3] for key, value in weights.items()})
+        alone.append(error(loop(replace(learned, network=network), material, policy, **first), material, **first))
+    assert together < sum(alone) / 3
+    assert together < error(loop(untrained(material, policy), material, policy, **first), material, **first)
 
 
 def test_a_network_of_few_drivers_holds_out_the_end_of_their_drives() -> None:

@@ -210,7 +210,8 @@ def _answers(learned: Learned, material: Lesson) -> Tensor:
     state = policy.begin(material.network)
     space, answers = material.simulator.model.space, []
     for first in range(0, int(material.split.frame.min()), WINDOWS.stride):
-        chosen, state = policy.act(measured_history(material.batch, torch.arange(PAIRS), torch.full((PAIRS,), first), WINDOWS.length), state)
+        seen = measured_history(material.batch, torch.arange(PAIRS), torch.full((PAIRS,), first), WINDOWS.length)
+        chosen, state = policy.act(seen, state)
         answers.append(space.to_unit(chosen))
     return torch.stack(answers, dim=1)
 

@@ -1,0 +1,42 @@
+"""Networks that answer together.
+
+Networks that start from different weights and keep different drivers for validation make different mistakes, and the mean of
+their answers makes fewer (L. K. Hansen and P. Salamon, 1990, *Neural network ensembles*, IEEE PAMI 12).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from cfx.policies.base import PolicyNetwork
+
+_EDGE = 1e-6
+
+
+class Committee(PolicyNetwork):
+    """N committees of M networks. All members of a committee read the same; it answers their mean in the squashed space (logits).
+
+    So the mean of offsets is an offset (`cfx.policies.offsets`), and no answer leaves the bounds. It is put together of trained
+    networks, not trained itself: its parameters' first dimension is N M.
+    """
+
+    def __init__(self, members: PolicyNetwork, size: int) -> None:
+        """Takes N times M networks, those of one committee behind one another, and M."""
+        super().__init__()
+        self.members = members
+        self.size = size
+
+    def initial_state(self, networks: int, drivers: int) -> Tensor:
+        return self._together(self.members.initial_state(networks * self.size, drivers))
+
+    def forward(self, tokens: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        networks, drivers, _ = state.shape
+        apart = state.view(networks, drivers, self.size, -1).transpose(1, 2).flatten(0, 1)
+        answers, after = self.members(tokens.repeat_interleave(self.size, 0), apart)
+        logits = torch.logit(answers, eps=_EDGE).view(networks, self.size, *answers.shape[1:])
+        return logits.mean(1).sigmoid(), self._together(after)
+
+    def _together(self, states: Tensor) -> Tensor:
+        """Arranges the members' states `(N M, B, s)` as `(N, B, M s)`."""
+        return states.view(-1, self.size, *states.shape[1:]).transpose(1, 2).flatten(2)

@@ -1,0 +1,55 @@
+"""A committee is a policy's network like any other, and answers what its members answer on average."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from cfx.policies.base import Policy, PolicyNetwork
+from cfx.policies.committee import Committee
+from cfx.policies.gru import GruPolicy
+from cfx.policies.offsets import NONE
+from cfx.testing.checks import policies as checks
+
+
+class Three(GruPolicy):
+    """Builds committees of three."""
+
+    def build(self, features: int, default: Tensor, fixed: Tensor, generator: torch.Generator) -> PolicyNetwork:
+        return Committee(super().build(features, default, fixed.repeat_interleave(3, 0), generator), 3)
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        checks.outputs_lie_within_the_bounds,
+        checks.streaming_equals_the_whole_sequence,
+        checks.a_policy_does_not_look_ahead,
+        checks.state_is_passed_not_kept,
+        checks.saved_equals_loaded,
+    ],
+)
+def test_it_keeps_what_the_contract_says_of_driving(statement: Callable[[Policy], None]) -> None:
+    """Not what it says of training: members are trained, and put together then."""
+    statement(Three(hidden_size=8))
+
+
+def test_it_answers_the_mean_of_its_members_logits() -> None:
+    policy, generator = GruPolicy(hidden_size=6, start="middle"), torch.Generator().manual_seed(0)
+    network = policy.build(5, torch.zeros(3), torch.zeros((4, 3)), generator).double()
+    tokens = torch.randn((2, 3, 7, 5), generator=generator, dtype=torch.float64)
+    committee = Committee(network, 2)
+    together, state = committee(tokens, committee.initial_state(2, 3))
+    alone, states = network(tokens[[0, 0, 1, 1]], network.initial_state(4, 3))
+    torch.testing.assert_close(torch.logit(together), torch.logit(alone).view(2, 2, 3, 7, 3).mean(1))
+    torch.testing.assert_close(state[1, 2], torch.cat([states[2, 2], states[3, 2]]))
+
+
+def test_members_who_all_leave_the_base_leave_it_exactly() -> None:
+    blank = torch.full((4, 3), NONE)
+    committee = Committee(GruPolicy().build(5, blank[0], blank, torch.Generator().manual_seed(0)), 2)
+    answer, _ = committee(torch.randn((2, 3, 1, 5)), committee.initial_state(2, 3))
+    assert bool((answer == NONE).all())
