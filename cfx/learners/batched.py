@@ -64,19 +64,26 @@ class Training(Protocol):
 
 
 class BatchedModule(pl.LightningModule):
-    """Trains N networks and keeps the weights of each one's best epoch."""
+    """Trains N networks and keeps the weights of each one's best epoch; `members` of them, behind one another, share a name."""
 
     def __init__(
-        self, network: PolicyNetwork, names: tuple[str, ...], settings: Training, on_epoch: Callable[[], None] = lambda: None
+        self,
+        network: PolicyNetwork,
+        names: tuple[str, ...],
+        settings: Training,
+        on_epoch: Callable[[], None] = lambda: None,
+        *,
+        members: int = 1,
     ) -> None:
         super().__init__()
         self.network = network
         self.names = names
+        self.members = members
         self.training_settings = settings
         self.on_epoch = on_epoch
         self.best = {key: value.detach().clone() for key, value in network.named_parameters()}
-        self.best_loss = torch.full((len(names),), math.inf)
-        self.stale = torch.zeros(len(names), dtype=torch.int64)
+        self.best_loss = torch.full((len(names) * members,), math.inf)
+        self.stale = torch.zeros(len(names) * members, dtype=torch.int64)
         self.rows: list[tuple[Tensor, Tensor]] = []
 
     def configure_optimizers(self) -> Any:
@@ -126,14 +133,17 @@ class BatchedModule(pl.LightningModule):
             self.on_epoch()
 
     def curves(self) -> pd.DataFrame:
-        """Returns the learning curves in long form."""
+        """Returns the learning curves in long form; those who share a name, on average."""
         frames = [
-            pd.DataFrame(
-                {"network": self.names, "epoch": epoch, "train_loss": train.numpy(), "validation_loss": validation.numpy()}
+            pd.DataFrame({"network": self.names, "epoch": epoch, **{name: self._mean(loss) for name, loss in losses.items()}})
+            for epoch, losses in enumerate(
+                {"train_loss": train, "validation_loss": validation} for train, validation in self.rows
             )
-            for epoch, (train, validation) in enumerate(self.rows)
         ]
         return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=CURVE_COLUMNS)
+
+    def _mean(self, losses: Tensor) -> list[float]:
+        return losses.view(-1, self.members).mean(1).tolist()
 
 
 def clip_each(network: PolicyNetwork, largest: float) -> None:

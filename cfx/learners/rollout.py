@@ -189,13 +189,6 @@ def _learned(network: PolicyNetwork, material: Material, lesson: Lesson, curves:
     return Learned(Committee(network, members).eval() if members > 1 else network, scaler, curves, base=base)
 
 
-def _names(lesson: Lesson, members: int) -> tuple[str, ...]:
-    """Returns what each network is called in the learning curves."""
-    if members == 1:
-        return lesson.names
-    return tuple(f"{name}, {number} of {members}" for name in lesson.names for number in range(1, members + 1))
-
-
 class _Steps(pl.LightningDataModule):
     """The numbers of an epoch's gradient steps; what is drawn in each follows from the seed and its number."""
 
@@ -222,7 +215,7 @@ class RolloutModule(BatchedModule):
         settings: RolloutSettings,
         on_epoch: Callable[[], None] = lambda: None,
     ) -> None:
-        super().__init__(network, _names(lesson, material.members), settings, on_epoch)
+        super().__init__(network, lesson.names, settings, on_epoch, members=material.members)
         self.automatic_optimization = False
         self.material = material
         self.settings = settings

@@ -24,6 +24,7 @@ from cfx.errors import DataError
 from cfx.models.krauss import Krauss
 from cfx.optimizers.random import RandomSearch
 from cfx.pairs import SIGNALS, PairBatch, PairSet
+from cfx.policies.committee import Committee
 from cfx.progress import Task
 from cfx.protocols.across_drivers import AcrossDrivers
 from cfx.simulation.rollout import Simulator
@@ -239,7 +240,14 @@ def test_too_few_long_pairs_are_told() -> None:
 
 
 def rollout(folder: Path, *changes: str) -> cfx.JobResult:
-    small = ["learner=rollout", "learner.epochs=2", "learner.steps=4", "learner.horizon=8", "protocol.folds=2"]
+    small = [
+        "learner=rollout",
+        "learner.members=2",
+        "learner.epochs=2",
+        "learner.steps=4",
+        "learner.horizon=8",
+        "protocol.folds=2",
+    ]
     return cfx.run([*QUICK, "protocol=across_drivers", *small, f"hydra.run.dir={folder}", *changes])
 
 
@@ -255,6 +263,10 @@ def test_a_job_learns_by_rollout_and_tells_how_much_history_matters(tmp_path: Pa
     assert again.base is not None
     assert torch.equal(again.base, result.policy.base)  # type: ignore[arg-type]  # it has one
     assert again.shrinkage == result.policy.shrinkage == 0.7
+    assert isinstance(again.network, Committee)
+    assert again.network.size == 2
+    kept = result.policy.network.state_dict()
+    assert all(torch.equal(value, kept[key]) for key, value in again.network.state_dict().items())
     assert {"hard_braking/policy", "jerk/policy", "at_bounds/policy", "platoon/collisions/policy"} <= result.metrics.keys()
 
 
@@ -301,7 +313,14 @@ def test_drives_that_are_too_short_to_test_change_what_is_learned(tmp_path: Path
     options = ["data=tidy", f"data.path={tmp_path / 'pairs.csv'}", "protocol.min_test_frames=180", "data.min_frames=100"]
     options.append("data.max_pairs=null")
     data = [option for option in QUICK if not option.startswith("data.")]
-    small = ["learner=rollout", "learner.epochs=1", "learner.steps=2", "learner.horizon=8", "protocol.folds=2"]
+    small = [
+        "learner=rollout",
+        "learner.members=1",
+        "learner.epochs=1",
+        "learner.steps=2",
+        "learner.horizon=8",
+        "protocol.folds=2",
+    ]
     result = cfx.run([*data, "protocol=across_drivers", *small, *options, f"hydra.run.dir={tmp_path / 'job'}"])
     assert set(result.pairs["pair_id"]) == {"p1", "p2", "p3", "p4"}
     notes = json.loads((tmp_path / "job" / "data.json").read_text())["protocol"]
