@@ -1,8 +1,8 @@
 """A gradient step of learning by rollout, beside the same step in plain eager PyTorch in the same run.
 
-The case has I-80's size: six networks (five folds and one for everybody) of 57 drivers, two drives of 15 s for each, the policy
-having read up to a minute of history. Both ways run the same code, one of them through `torch.compile`. `extra_info` holds the
-ratio of their times; nothing passes or fails by the clock.
+The case has I-80's size: six committees of four networks (five folds and one for everybody) of 57 drivers, two drives of 15 s for
+each, the policy having read up to a minute of history. Both ways run the same code, one of them through `torch.compile`.
+`extra_info` holds the ratio of their times; nothing passes or fails by the clock.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ class Step:
 
     def __init__(self, model: DrivingModel, settings: RolloutSettings) -> None:
         lesson = _lesson(model)
-        material = Material.of(lesson, POLICY, settings.validation, torch.Generator().manual_seed(0))
-        blank = torch.full((NETWORKS, len(model.space)), NONE)
+        material = Material.of(lesson, POLICY, settings.validation, torch.Generator().manual_seed(0), settings.members)
+        blank = torch.full((len(material.pair), len(model.space)), NONE)
         width = material.scaler.mean.shape[-1]
         network = POLICY.build(width, blank[0], blank, torch.Generator().manual_seed(0))
         self.module = RolloutModule(network, material, POLICY, replace(lesson, workspace=None), settings)
@@ -69,7 +69,7 @@ class Step:
 @pytest.mark.benchmark(group="training")
 @pytest.mark.parametrize("model", [Krauss(), W99()], ids=["krauss", "w99"])
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf:UserWarning")
-def test_a_gradient_step_of_six_networks(benchmark: Any, model: DrivingModel) -> None:
+def test_a_gradient_step_of_six_committees(benchmark: Any, model: DrivingModel) -> None:
     compiled, eager = (Step(model, RolloutSettings(compile=how)) for how in ("always", "never"))
     began = time.perf_counter()
     compiled()
