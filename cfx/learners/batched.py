@@ -135,10 +135,15 @@ class BatchedModule(pl.LightningModule):
     def curves(self) -> pd.DataFrame:
         """Returns the learning curves in long form; those who share a name, on average."""
         frames = [
-            pd.DataFrame({"network": self.names, "epoch": epoch, **{name: self._mean(loss) for name, loss in losses.items()}})
-            for epoch, losses in enumerate(
-                {"train_loss": train, "validation_loss": validation} for train, validation in self.rows
+            pd.DataFrame(
+                {
+                    "network": self.names,
+                    "epoch": epoch,
+                    "train_loss": self._mean(train),
+                    "validation_loss": self._mean(validation),
+                }
             )
+            for epoch, (train, validation) in enumerate(self.rows)
         ]
         return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=CURVE_COLUMNS)
 

@@ -185,7 +185,7 @@ def _learned(network: PolicyNetwork, material: Material, lesson: Lesson, curves:
     """Returns the networks, those of a committee as one."""
     space, members = lesson.simulator.model.space, material.members
     base = space.from_unit(material.start[::members].to(lesson.fixed.dtype))
-    scaler = Scaler(material.scaler.mean[::members], material.scaler.scale[::members])
+    scaler = Scaler(material.scaler.mean[::members].clone(), material.scaler.scale[::members].clone())
     return Learned(Committee(network, members).eval() if members > 1 else network, scaler, curves, base=base)
 
 

@@ -31,12 +31,12 @@ class Committee(PolicyNetwork):
         return self._together(self.members.initial_state(networks * self.size, drivers))
 
     def forward(self, tokens: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        networks, drivers, _ = state.shape
-        apart = state.view(networks, drivers, self.size, -1).transpose(1, 2).flatten(0, 1)
+        networks, drivers, width = state.shape
+        apart = state.view(networks, drivers, self.size, width // self.size).transpose(1, 2).flatten(0, 1)
         answers, after = self.members(tokens.repeat_interleave(self.size, 0), apart)
         logits = torch.logit(answers, eps=_EDGE).view(networks, self.size, *answers.shape[1:])
         return logits.mean(1).sigmoid(), self._together(after)
 
     def _together(self, states: Tensor) -> Tensor:
         """Arranges the members' states `(N M, B, s)` as `(N, B, M s)`."""
-        return states.view(-1, self.size, *states.shape[1:]).transpose(1, 2).flatten(2)
+        return states.view(len(states) // self.size, self.size, *states.shape[1:]).transpose(1, 2).flatten(2)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.policies.base import Policy, PolicyNetwork
+from cfx.policies.base import ConstantNetwork, Policy, PolicyNetwork
 from cfx.policies.committee import Committee
 from cfx.policies.gru import GruPolicy
 from cfx.policies.offsets import NONE
@@ -53,3 +53,11 @@ def test_members_who_all_leave_the_base_leave_it_exactly() -> None:
     committee = Committee(GruPolicy().build(5, blank[0], blank, torch.Generator().manual_seed(0)), 2)
     answer, _ = committee(torch.randn((2, 3, 1, 5)), committee.initial_state(2, 3))
     assert bool((answer == NONE).all())
+
+
+def test_members_without_a_memory_answer_together_too() -> None:
+    unit = torch.tensor([[0.2, 0.5], [0.8, 0.5], [0.1, 0.9], [0.1, 0.9]])
+    committee = Committee(ConstantNetwork(unit), 2)
+    answer, state = committee(torch.zeros((2, 3, 4, 5)), committee.initial_state(2, 3))
+    assert state.shape == (2, 3, 0)
+    torch.testing.assert_close(answer[:, 0, 0], torch.tensor([[0.5, 0.5], [0.1, 0.9]]))
