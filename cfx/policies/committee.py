@@ -1,7 +1,7 @@
 """Networks that answer together.
 
-Networks that start from different weights and keep different drivers for validation make different mistakes, and the mean of
-their answers makes fewer (L. K. Hansen and P. Salamon, 1990, *Neural network ensembles*, IEEE PAMI 12).
+Networks that start from different weights and keep different drivers for validation make different mistakes, and together they
+make fewer (L. K. Hansen and P. Salamon, 1990, *Neural network ensembles*, IEEE PAMI 12).
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ _EDGE = 1e-6
 
 
 class Committee(PolicyNetwork):
-    """N committees of M networks. All members of a committee read the same; it answers their mean in the squashed space (logits).
+    """N committees of M networks. All members of a committee read the same; it answers, for each parameter, their median.
 
-    So the mean of offsets is an offset (`cfx.policies.offsets`), and no answer leaves the bounds. It is put together of trained
-    networks, not trained itself: its parameters' first dimension is N M.
+    Not their mean: a member who answers far out drags it to where no member is, and a model with regimes (Wiedemann 74) then
+    drives worse than each of them. Of an even number the median is the mean of the middle two in the squashed space (logits). It
+    is put together of trained networks, not trained itself: its parameters' first dimension is N M.
     """
 
     def __init__(self, members: PolicyNetwork, size: int) -> None:
@@ -35,7 +36,7 @@ class Committee(PolicyNetwork):
         apart = state.view(networks, drivers, self.size, width // self.size).transpose(1, 2).flatten(0, 1)
         answers, after = self.members(tokens.repeat_interleave(self.size, 0), apart)
         logits = torch.logit(answers, eps=_EDGE).view(networks, self.size, *answers.shape[1:])
-        return logits.mean(1).sigmoid(), self._together(after)
+        return logits.quantile(0.5, dim=1).sigmoid(), self._together(after)
 
     def _together(self, states: Tensor) -> Tensor:
         """Arranges the members' states `(N M, B, s)` as `(N, B, M s)`."""

@@ -1,4 +1,4 @@
-"""A committee is a policy's network like any other, and answers what its members answer on average."""
+"""A committee is a policy's network like any other, and answers the median of what its members answer."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_it_keeps_what_the_contract_says_of_driving(statement: Callable[[Policy]
     statement(Three(hidden_size=8))
 
 
-def test_it_answers_the_mean_of_its_members_logits() -> None:
+def test_two_members_answer_the_mean_of_their_logits() -> None:
     policy, generator = GruPolicy(hidden_size=6, start="middle"), torch.Generator().manual_seed(0)
     network = policy.build(5, torch.zeros(3), torch.zeros((4, 3)), generator).double()
     tokens = torch.randn((2, 3, 7, 5), generator=generator, dtype=torch.float64)
@@ -61,3 +61,9 @@ def test_members_without_a_memory_answer_together_too() -> None:
     answer, state = committee(torch.zeros((2, 3, 4, 5)), committee.initial_state(2, 3))
     assert state.shape == (2, 3, 0)
     torch.testing.assert_close(answer[:, 0, 0], torch.tensor([[0.5, 0.5], [0.1, 0.9]]))
+
+
+def test_a_member_who_is_far_out_is_not_followed() -> None:
+    unit = torch.tensor([[0.4], [0.45], [0.55], [1e-5]])
+    answer, _ = (committee := Committee(ConstantNetwork(unit), 4))(torch.zeros((1, 1, 1, 5)), committee.initial_state(1, 1))
+    assert 0.4 < float(answer) < 0.45
