@@ -1,7 +1,7 @@
 """A gradient step of learning by rollout, beside the same step in plain eager PyTorch in the same run.
 
-The case has I-80's size: six committees of four networks (five folds and one for everybody) of 57 drivers, two drives of 15 s for
-each, the policy having read up to a minute of history. Both ways run the same code, one of them through `torch.compile`.
+The case has I-80's size: six networks (five folds and one for everybody), or committees of four, of 57 drivers, two drives of
+15 s for each, the policy having read up to a minute of history. Both ways run the same code, one of them through `torch.compile`.
 `extra_info` holds the ratio of their times; nothing passes or fails by the clock.
 """
 
@@ -68,9 +68,10 @@ class Step:
 
 @pytest.mark.benchmark(group="training")
 @pytest.mark.parametrize("model", [Krauss(), W99()], ids=["krauss", "w99"])
+@pytest.mark.parametrize("members", [1, 4])
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf:UserWarning")
-def test_a_gradient_step_of_six_committees(benchmark: Any, model: DrivingModel) -> None:
-    compiled, eager = (Step(model, RolloutSettings(compile=how)) for how in ("always", "never"))
+def test_a_gradient_step(benchmark: Any, model: DrivingModel, members: int) -> None:
+    compiled, eager = (Step(model, RolloutSettings(compile=how, members=members)) for how in ("always", "never"))
     began = time.perf_counter()
     compiled()
     benchmark.extra_info["seconds to compile"] = time.perf_counter() - began
