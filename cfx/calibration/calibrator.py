@@ -155,9 +155,10 @@ class Calibrator:
         guess = self.space.to_unit(self.space.defaults(device=device))[None, None, :]
 
         def solve(chosen: Tensor, report: Progress) -> list[Arrays]:
-            drives = torch.cat([members[k].nonzero()[:, 0] for k in chosen.cpu()]).to(device)
+            groups = members[chosen.cpu()].to(device)
+            drives = groups.any(0).nonzero()[:, 0]
             segments = DriveObjective.of_segments(self.simulator, batch, drives, torch.zeros_like(drives), last[drives])
-            objective = JointObjective(segments, members[chosen.cpu()].sum(1), self.memory)
+            objective = JointObjective(segments, groups[:, drives], self.memory)
             found = self._minimize(objective, guess.expand(len(chosen), 1, -1), report)
             return [{name: values[i] for name, values in found.items()} for i in range(len(chosen))]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -78,7 +78,14 @@ class DriveObjective:
 
     def select(self, first: int, last: int) -> DriveObjective:
         """Returns problems `first` to `last - 1`."""
-        cut = {f.name: getattr(self, f.name)[..., first:last] for f in fields(self) if f.name != "simulator"}
+        return self._cut(slice(first, last))
+
+    def take(self, problems: Tensor) -> DriveObjective:
+        """Returns the problems of these numbers, `(S,)` int64; one may stand there more than once."""
+        return self._cut(problems)
+
+    def _cut(self, which: slice | Tensor) -> DriveObjective:
+        cut = {f.name: getattr(self, f.name)[..., which] for f in fields(self) if f.name != "simulator"}
         return DriveObjective(self.simulator, **cut)
 
     @torch.no_grad()
@@ -106,40 +113,51 @@ _TURN = 1 << 27
 class JointObjective:
     """One parameter set for many drives: the mean over the drives of each one's RMSE of speed.
 
-    The mean of RMSEs, not the RMSE over all frames: every driver counts alike, and it is what an evaluation reports.
+    The mean of RMSEs, not the RMSE over all frames: every driver counts alike, and it is what an evaluation reports. Where all
+    problems ask for the same candidates, as space-filling ones are, a drive that is in several of them is simulated once.
 
     Attributes:
-        drives: D drives, those of problem 0 first, then those of problem 1 ...
-        sizes: drives of each problem, `(K,)` int64, on the CPU; they sum to D.
+        drives: D drives.
+        members: the drives of each of K problems, bool `(K, D)`.
         memory: bound in bytes for what is simulated at once; candidates are taken in turns where all drives of all of them need
             more.
     """
 
     drives: DriveObjective
-    sizes: Tensor
+    members: Tensor
     memory: int
 
     @property
     def problems(self) -> int:
         """K."""
-        return len(self.sizes)
+        return len(self.members)
 
     @property
     def bytes_per_candidate(self) -> int:
-        """Memory that one candidate of the largest problem needs."""
-        return self.drives.bytes_per_candidate * int(self.sizes.max())
+        """Memory that one candidate of one problem needs besides the turns, which are bounded: the drives' losses."""
+        return 2 * self.members.shape[1] * self.drives.observed.element_size()
 
     def select(self, first: int, last: int) -> JointObjective:
         """Returns problems `first` to `last - 1`."""
-        ends = [0, *self.sizes.cumsum(0).tolist()]
-        return JointObjective(self.drives.select(ends[first], ends[last]), self.sizes[first:last], self.memory)
+        return replace(self, members=self.members[first:last])
 
     @torch.no_grad()
     def __call__(self, candidates: Tensor) -> Tensor:
         """Returns losses `(K, q)`, m/s, of candidates `(K, q, n)` in unit space."""
-        sizes = self.sizes.to(candidates.device)
-        owner = torch.repeat_interleave(torch.arange(len(sizes), device=candidates.device), sizes)
-        turn = max(1, min(self.memory, _TURN) // (self.drives.bytes_per_candidate * len(owner)))
-        losses = torch.cat([self.drives(block[owner]) for block in torch.split(candidates, turn, dim=1)], dim=1)
-        total = losses.new_zeros((len(sizes), losses.shape[1])).index_add_(0, owner, losses)
-        return total / sizes[:, None]
+        problem, drive = self.members.nonzero().unbind(1)
+        if bool((candidates == candidates[:1]).all()):
+            used = self.members.any(0)
+            simulated, place = used.nonzero()[:, 0], used.cumsum(0) - 1
+            losses = self._simulated(simulated, torch.zeros_like(simulated), candidates)[place[drive]]
+        else:
+            losses = self._simulated(drive, problem, candidates)
+        total = losses.new_zeros(candidates.shape[:2]).index_add_(0, problem, losses)
+        return total / self.members.sum(1, keepdim=True)
+
+    def _simulated(self, drive: Tensor, problem: Tensor, candidates: Tensor) -> Tensor:
+        """Returns the losses `(S, q)` of S simulations, each of a drive `(S,)` with a problem's candidates `(S,)`."""
+        drives, count = self.drives.take(drive), candidates.shape[1]
+        # The turns are small, but there are many: together they may be worth compiling for, which none of them is alone.
+        drives = replace(drives, simulator=drives.simulator.for_work(len(drives.observed) * len(drive) * count))
+        turn = max(1, min(self.memory, _TURN) // (drives.bytes_per_candidate * len(drive)))
+        return torch.cat([drives(block[problem]) for block in torch.split(candidates, turn, dim=1)], dim=1)

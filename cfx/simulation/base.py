@@ -48,6 +48,10 @@ class BaseSimulator(ABC):
             The follower at frame K, and positions and speeds `(K, *batch)` of frames 1 to K.
         """
 
+    def for_work(self, steps: int) -> BaseSimulator:
+        """Returns what takes so many vehicle steps that belong together, however many calls of `advance` they are cut into."""
+        return self
+
     def close(self) -> None:  # noqa: B027 - most simulators hold nothing
         """Lets go of what takes the steps, such as processes; `advance` may start it again."""
 

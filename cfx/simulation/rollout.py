@@ -35,8 +35,8 @@ _BLOCK = 5
 were not faster and take long to compile."""
 
 _WORTH_COMPILING = 20_000_000
-"""Vehicle steps in one call from which compiling pays: about a second of eager work. The rule looks at the call alone, so that
-the same call gives the same bits whatever came before it."""
+"""Vehicle steps in one call, or in calls that belong together (`for_work`), from which compiling pays: about a second of eager
+work. The rule looks at these alone, so that the same call gives the same bits whatever came before it."""
 
 _TILE_BYTES = 1 << 17
 """What one tile of followers takes for each value. A tile does all its steps before the next begins, so that the twenty or so
@@ -86,6 +86,9 @@ class Simulator(BaseSimulator):
     def identity(self) -> str:
         return folder_hash(__file__)
 
+    def for_work(self, steps: int) -> Simulator:
+        return Simulator(self.model, self.dt, compile="always") if self._pays(steps) else self
+
     def advance(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor]) -> tuple[Follower, Tensor, Tensor]:
         steps, batch = len(leader.position), follower.speed.shape
         if steps == 0:
@@ -108,8 +111,10 @@ class Simulator(BaseSimulator):
         return end, position, speed
 
     def _compiles(self, steps: int, like: Tensor) -> bool:
-        worth_it = self._mode == "always" or (self._mode == "auto" and steps * like.numel() >= _WORTH_COMPILING)
-        return worth_it and can_compile(like.device)
+        return self._pays(steps * like.numel()) and can_compile(like.device)
+
+    def _pays(self, steps: int) -> bool:
+        return self._mode == "always" or (self._mode == "auto" and steps >= _WORTH_COMPILING)
 
     def _eager_drive(
         self, tile: _Tile, follower: Follower, leader: Leader, p: _Parameters, position: Tensor, speed: Tensor
