@@ -59,7 +59,12 @@ def drives(evaluation: Evaluation, pair_id: str | Sequence[str] | None = None, n
             method_line(axes, "real", drive.time, real)
             for method in methods:
                 method_line(axes, method, drive.time, _finite(simulated[method]))
-        _frame(speed_axes, [drive.leader_speed, drive.real_speed, *drive.speed.values()], drive.speed.get("default"), "m/s")
+        _frame(
+            speed_axes,
+            [drive.leader_speed, drive.real_speed, *(drive.speed[m] for m in methods)],
+            drive.speed.get("default"),
+            "m/s",
+        )
         near = [drive.real_gap, *(drive.gap[m] for m in methods if m != "default")]
         _frame(gap_axes, near, drive.gap.get("default"), "m")
         _mark_collisions(gap_axes, drive)

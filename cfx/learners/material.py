@@ -108,15 +108,17 @@ class Material:
         windows = torch.arange(0, int(lesson.split.frame.max()) + 1, stride, device=device)
         seen = tokens(measured_history(batch, pairs[:, None], windows, lesson.windows.length), policy.inputs, policy.summary)
         trains = real & (few | ~held)
-        features = torch.cat([seen, coordinates(own)[:, None].expand(-1, len(windows), -1)], -1)[pair]
-        seen_by_any = trains.view(-1, members, trains.shape[1]).any(1).repeat_interleave(members, 0)
-        scaler = Scaler.of(features, seen_by_any[..., None] & (windows <= torch.where(few, cut, last)[..., None]))
+        until = torch.where(few, cut, last)
+        features = torch.cat([seen, coordinates(own)[:, None].expand(-1, len(windows), -1)], -1)[pair[::members]]
+        seen_by_any = trains.view(-1, members, trains.shape[1]).any(1)
+        shared = Scaler.of(features, seen_by_any[..., None] & (windows <= until[::members, :, None]))
+        scaler = Scaler(*(values.repeat_interleave(members, 0) for values in (shared.mean, shared.scale)))
         return cls(
             batch=batch,
             pair=pair,
             trains=trains,
             validates=real & (few | held) & (share > 0),
-            until=torch.where(few, cut, last),
+            until=until,
             last=last,
             base=own[pair],
             start=start,
