@@ -132,10 +132,12 @@ def test_conf_holds_no_file_of_a_component_that_is_gone() -> None:
 def test_every_bound_of_a_models_parameters_is_overridden_without_a_plus() -> None:
     for model in registry.names("model"):
         space = registry.get("model", model).parameters  # type: ignore[attr-defined]  # a DrivingModel
+        keys = {parameter.name: f"model.parameters.{parameter.name}" for parameter in space}
+        highs = [f"{keys[parameter.name]}.high={parameter.high + 1}" for parameter in space]
+        node = values_of(f"model={model}", *highs, *(f"{key}.tuned=false" for key in keys.values()))["model"]
         for parameter in space:
-            key = f"model.parameters.{parameter.name}"
-            node = values_of(f"model={model}", f"{key}.high={parameter.high + 1}", f"{key}.tuned=false")["model"]
             assert node["parameters"][parameter.name]["high"] == parameter.high + 1
+            assert node["parameters"][parameter.name]["tuned"] is False
 
 
 class _Inner(Settings):

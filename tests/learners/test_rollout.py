@@ -98,7 +98,7 @@ def test_untrained_it_is_the_fixed_model() -> None:
 def test_it_learns_to_drive_like_the_drivers() -> None:
     policy, material = gru(), lesson()
     before = error(loop(untrained(material, policy), material, policy), material)
-    learned = RolloutLearner(**(QUICK | {"epochs": 10, "strangers": 0.0})).fit(policy, material)
+    learned = RolloutLearner(**(QUICK | {"epochs": 6, "steps": 10, "learning_rate": 0.01, "strangers": 0.0})).fit(policy, material)
     assert error(loop(learned, material, policy, first=100), material, first=100) < 0.5 * before
     curves = learned.curves.groupby("epoch")[["train_loss", "validation_loss"]].mean()
     assert curves.train_loss.iloc[-1] < 0.7 * curves.train_loss.iloc[0]
@@ -148,7 +148,7 @@ def test_reading_at_most_some_windows_forgets_what_was_before() -> None:
 
 def test_training_goes_on_where_it_was_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     policy, whole = gru(dropout=0.1), lesson(workspace=tmp_path / "whole")
-    learner = RolloutLearner(**(QUICK | {"members": 2}))
+    learner = RolloutLearner(**(QUICK | {"members": 2, "steps": 4}))
     expected = learner.fit(policy, whole)
     broken = replace(whole, workspace=tmp_path / "broken")
     judge, epochs = RolloutModule.judge, []
@@ -180,7 +180,7 @@ def test_a_checkpoint_of_another_training_is_not_taken_up(tmp_path: Path) -> Non
 
 def test_validation_drivers_teach_nothing() -> None:
     """What a held-out driver does changes the validation loss, and no weight."""
-    policy, settings = gru(), QUICK | {"epochs": 2, "patience": None}
+    policy, settings = gru(), QUICK | {"epochs": 2, "steps": 5, "patience": None}
     material = lesson(networks=1)
     placed = Material.of(material, policy, 0.25, torch.Generator().manual_seed(material.seed))
     held = placed.validates[0]
@@ -210,7 +210,7 @@ def test_members_of_a_committee_keep_other_drivers_for_validation_and_read_alike
 def test_a_committee_learns_and_drives_as_one() -> None:
     """Members learn different things; to whoever drives it is one network, with one learning curve."""
     policy, material = gru(), lesson()
-    learned = RolloutLearner(**(QUICK | {"members": 3})).fit(policy, material)
+    learned = RolloutLearner(**(QUICK | {"members": 3, "steps": 10, "learning_rate": 0.01})).fit(policy, material)
     assert isinstance(learned.network, Committee)
     assert learned.curves.network.tolist() == ["n0", "n1"] * 6
     assert learned.scaler.mean.shape[0] == len(material.names)
@@ -266,7 +266,7 @@ def test_errors_of_the_base_are_those_of_plain_drives() -> None:
 )
 def test_every_option_trains(options: dict[str, Any]) -> None:
     policy, material = gru(), lesson(base=TRUE.repeat(2, 1) * 1.3)
-    learned = RolloutLearner(**(QUICK | options)).fit(policy, material)
+    learned = RolloutLearner(**(QUICK | {"epochs": 3, "steps": 8, "learning_rate": 0.01} | options)).fit(policy, material)
     curve = learned.curves.groupby("epoch").train_loss.mean()
     assert curve.iloc[-1] < curve.iloc[0]
     assert bool(learned.curves.validation_loss.isna().all()) == (options.get("validation") == 0.0)
@@ -276,7 +276,7 @@ def test_w99_learns_through_its_smoothed_regimes_and_drives_exactly() -> None:
     """Its exact thresholds have no gradient: smoothed they have one, and the exact model drives better for it."""
     policy, material = LstmPolicy(inputs=INPUTS, hidden_size=12), lesson(model=W99(), networks=1)
     before = error(loop(untrained(material, policy), material, policy, first=50), material, first=50)
-    learned = RolloutLearner(**(QUICK | {"epochs": 8, "patience": None})).fit(policy, material)
+    learned = RolloutLearner(**(QUICK | {"epochs": 4, "steps": 8, "learning_rate": 0.01, "patience": None})).fit(policy, material)
     assert error(loop(learned, material, policy, first=50), material, first=50) < 0.9 * before
     assert material.simulator.model.softness == 0
 
