@@ -98,7 +98,9 @@ def test_untrained_it_is_the_fixed_model() -> None:
 def test_it_learns_to_drive_like_the_drivers() -> None:
     policy, material = gru(), lesson()
     before = error(loop(untrained(material, policy), material, policy), material)
-    learned = RolloutLearner(**(QUICK | {"epochs": 6, "steps": 10, "learning_rate": 0.01, "strangers": 0.0})).fit(policy, material)
+    learned = RolloutLearner(**(QUICK | {"epochs": 6, "steps": 10, "learning_rate": 0.01, "strangers": 0.0})).fit(
+        policy, material
+    )
     assert error(loop(learned, material, policy, first=100), material, first=100) < 0.5 * before
     curves = learned.curves.groupby("epoch")[["train_loss", "validation_loss"]].mean()
     assert curves.train_loss.iloc[-1] < 0.7 * curves.train_loss.iloc[0]

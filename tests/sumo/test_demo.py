@@ -48,6 +48,20 @@ def test_the_demonstration_has_the_errors_of_the_evaluation(demo: Path) -> None:
     assert default["difference_gap"].max() < 1e-9
 
 
+def test_offsets_start_in_sumo_from_what_they_start_from_in_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the driver's own set, drawn as in training; that is not his fixed set."""
+    monkeypatch.chdir(tmp_path)
+    learner = ["learner=rollout", "learner.members=2", "learner.epochs=1", "learner.steps=2", "learner.horizon=6"]
+    learner += ["optimizer=random", "optimizer.samples=32", "figures.enabled=false", "tracking.enabled=false"]
+    protocol = ["protocol=across_drivers", "protocol.folds=2", "protocol.histories=[]"]
+    folder = cfx.run(["experiment=sumo_demo", "data.pairs=4", "data.frames=150", "demo.pairs=1", *learner, *protocol]).folder
+    table = pd.read_csv(folder / "sumo" / "demo_rmse.csv").set_index("method").loc["policy"]
+    assert float(table["rmse_speed_sumo"]) == pytest.approx(float(table["rmse_speed_memory"]), abs=1e-4)
+    rows = pd.read_csv(folder / "pairs.csv").set_index(["pair_id", "method"])
+    base, fixed = (float(rows.loc[(table["pair_id"], method), "rmse_speed"]) for method in ("base", "fixed"))
+    assert base != pytest.approx(fixed, abs=1e-2)
+
+
 def test_its_pictures_and_its_road_are_there(demo: Path) -> None:
     assert {path.name for path in (demo / "sumo").iterdir()} == {
         "demo.html",
