@@ -30,7 +30,7 @@ from tests.drives import wavy_pairs
 
 WINDOWS = WindowSettings()
 INPUTS = ("leader_speed", "relative_speed", "gap")
-QUICK: dict[str, Any] = {"members": 1, "epochs": 6, "steps": 15, "horizon": 12, "compile": "never"}
+QUICK: dict[str, Any] = {"members": 1, "epochs": 6, "steps": 10, "learning_rate": 0.01, "horizon": 12, "compile": "never"}
 TRUE = torch.tensor([[1.0, 0.1], [1.4, 0.3], [1.8, 0.5], [2.2, 0.0], [2.6, 0.2], [3.0, 0.4]]).double()
 
 
@@ -98,9 +98,7 @@ def test_untrained_it_is_the_fixed_model() -> None:
 def test_it_learns_to_drive_like_the_drivers() -> None:
     policy, material = gru(), lesson()
     before = error(loop(untrained(material, policy), material, policy), material)
-    learned = RolloutLearner(**(QUICK | {"epochs": 6, "steps": 10, "learning_rate": 0.01, "strangers": 0.0})).fit(
-        policy, material
-    )
+    learned = RolloutLearner(**(QUICK | {"strangers": 0.0})).fit(policy, material)
     assert error(loop(learned, material, policy, first=100), material, first=100) < 0.5 * before
     curves = learned.curves.groupby("epoch")[["train_loss", "validation_loss"]].mean()
     assert curves.train_loss.iloc[-1] < 0.7 * curves.train_loss.iloc[0]
@@ -212,7 +210,7 @@ def test_members_of_a_committee_keep_other_drivers_for_validation_and_read_alike
 def test_a_committee_learns_and_drives_as_one() -> None:
     """Members learn different things; to whoever drives it is one network, with one learning curve."""
     policy, material = gru(), lesson()
-    learned = RolloutLearner(**(QUICK | {"members": 3, "steps": 10, "learning_rate": 0.01})).fit(policy, material)
+    learned = RolloutLearner(**(QUICK | {"members": 3})).fit(policy, material)
     assert isinstance(learned.network, Committee)
     assert learned.curves.network.tolist() == ["n0", "n1"] * 6
     assert learned.scaler.mean.shape[0] == len(material.names)
@@ -268,7 +266,7 @@ def test_errors_of_the_base_are_those_of_plain_drives() -> None:
 )
 def test_every_option_trains(options: dict[str, Any]) -> None:
     policy, material = gru(), lesson(base=TRUE.repeat(2, 1) * 1.3)
-    learned = RolloutLearner(**(QUICK | {"epochs": 3, "steps": 8, "learning_rate": 0.01} | options)).fit(policy, material)
+    learned = RolloutLearner(**(QUICK | {"epochs": 3, "steps": 8} | options)).fit(policy, material)
     curve = learned.curves.groupby("epoch").train_loss.mean()
     assert curve.iloc[-1] < curve.iloc[0]
     assert bool(learned.curves.validation_loss.isna().all()) == (options.get("validation") == 0.0)
@@ -278,7 +276,7 @@ def test_w99_learns_through_its_smoothed_regimes_and_drives_exactly() -> None:
     """Its exact thresholds have no gradient: smoothed they have one, and the exact model drives better for it."""
     policy, material = LstmPolicy(inputs=INPUTS, hidden_size=12), lesson(model=W99(), networks=1)
     before = error(loop(untrained(material, policy), material, policy, first=50), material, first=50)
-    learned = RolloutLearner(**(QUICK | {"epochs": 4, "steps": 8, "learning_rate": 0.01, "patience": None})).fit(policy, material)
+    learned = RolloutLearner(**(QUICK | {"epochs": 4, "steps": 8, "patience": None})).fit(policy, material)
     assert error(loop(learned, material, policy, first=50), material, first=50) < 0.9 * before
     assert material.simulator.model.softness == 0
 

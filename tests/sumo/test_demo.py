@@ -51,10 +51,10 @@ def test_the_demonstration_has_the_errors_of_the_evaluation(demo: Path) -> None:
 def test_offsets_start_in_sumo_from_what_they_start_from_in_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From the driver's own set, drawn as in training; that is not his fixed set."""
     monkeypatch.chdir(tmp_path)
-    learner = ["learner=rollout", "learner.members=2", "learner.epochs=1", "learner.steps=2", "learner.horizon=6"]
-    learner += ["optimizer=random", "optimizer.samples=32", "figures.enabled=false", "tracking.enabled=false"]
+    learner = ["learner=rollout", "learner.members=2", "learner.steps=2", "learner.horizon=6"]
     protocol = ["protocol=across_drivers", "protocol.folds=2", "protocol.histories=[]"]
-    folder = cfx.run(["experiment=sumo_demo", "data.pairs=4", "data.frames=150", "demo.pairs=1", *learner, *protocol]).folder
+    few = ["data.pairs=4", "data.frames=150", "demo.pairs=1"]
+    folder = cfx.run(["experiment=sumo_demo", *few, *SMALL, *learner, *protocol]).folder
     table = pd.read_csv(folder / "sumo" / "demo_rmse.csv").set_index("method").loc["policy"]
     assert float(table["rmse_speed_sumo"]) == pytest.approx(float(table["rmse_speed_memory"]), abs=1e-4)
     rows = pd.read_csv(folder / "pairs.csv").set_index(["pair_id", "method"])
