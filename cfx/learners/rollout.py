@@ -39,8 +39,6 @@ from cfx.simulation.rollout import Compile, can_compile
 
 log = logging.getLogger(__name__)
 
-_SEEING = "policy.inputs=[leader_speed,relative_speed,gap,follower_acceleration,leader_acceleration]"
-
 _WORTH_COMPILING = 5_000
 """Windows driven in training, one after the other, from which compiling pays: some ten seconds of eager work."""
 
@@ -144,7 +142,7 @@ class RolloutLearner(Learner):
         simulator, s = lesson.simulator, self.settings
         self.require_gradients(simulator.model, simulator.differentiable)
         if not {"gap", "time_headway"} & set(policy.inputs):
-            log.info("The policy does not see the gap; it drives better with %s", _SEEING)
+            log.info("The policy does not see the gap; it drives better with policy.inputs=situation")
         generator = torch.Generator().manual_seed(lesson.seed)
         material = Material.of(lesson, policy, s.validation, generator, s.members)
         space, device = simulator.model.space, lesson.batch.lengths.device

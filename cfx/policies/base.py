@@ -7,14 +7,14 @@ networks are trained and driven as one batched network: 94 pairs with a network 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 from torch import Tensor, nn
 
 from cfx.component import Component, Settings
-from cfx.policies.features import Summary, check_inputs
+from cfx.policies.features import Summary, check_inputs, named_inputs
 
 
 class PolicyNetwork(nn.Module, ABC):
@@ -45,10 +45,10 @@ class PolicyNetwork(nn.Module, ABC):
 class PolicySettings(Settings):
     """Settings of policies that read states."""
 
-    inputs: tuple[str, ...] = Field(
+    inputs: Annotated[tuple[str, ...], BeforeValidator(named_inputs)] = Field(
         ("leader_speed", "follower_speed"),
         description="signals that the policy sees; also: gap, relative_speed, time_headway, leader_acceleration,"
-        " follower_acceleration, inverse_time_to_collision",
+        " follower_acceleration, inverse_time_to_collision; or situation: what learner=rollout drives best with",
     )
     summary: Summary = Field("frames", description="how a window's frames become features: frames (all), last, mean, mean_std")
 

@@ -42,12 +42,31 @@ INPUTS: dict[str, Callable[[History], Tensor]] = {
 }
 """Signals that a policy may see, each `(*batch, length)`."""
 
+INPUT_SETS: dict[str, tuple[str, ...]] = {
+    "situation": ("leader_speed", "relative_speed", "gap", "time_headway", "follower_acceleration", "leader_acceleration"),
+}
+"""Inputs that go by one name: `policy.inputs=situation`."""
+
 _SUMMARIES: dict[Summary, Callable[[Tensor], list[Tensor]]] = {
     "frames": lambda x: list(x.unbind(-1)),
     "last": lambda x: [x[..., -1]],
     "mean": lambda x: [x.mean(-1)],
     "mean_std": lambda x: [x.mean(-1), x.std(-1, correction=0)],
 }
+
+
+def named_inputs(value: object) -> object:
+    """Returns the inputs that a set's name stands for, and whatever else was given as it is.
+
+    Raises:
+        ValueError: it is a name, but not of a set.
+    """
+    if not isinstance(value, str):
+        return value
+    if value not in INPUT_SETS:
+        hint = f" Write [{value}]." if value in INPUTS else nearest(value, [*INPUT_SETS, *INPUTS])
+        raise ValueError(f"not a set of inputs.{hint} Give {', '.join(INPUT_SETS)}, or a list of {', '.join(INPUTS)}")
+    return INPUT_SETS[value]
 
 
 def check_inputs(names: tuple[str, ...]) -> None:

@@ -8,7 +8,7 @@ import torch
 from cfx.errors import ConfigError
 from cfx.policies.base import Policy
 from cfx.policies.default import DefaultPolicy
-from cfx.policies.features import INPUTS, History, token_width, tokens
+from cfx.policies.features import INPUT_SETS, INPUTS, History, token_width, tokens
 from cfx.policies.fixed import FixedPolicy
 from cfx.policies.gru import GruPolicy
 from cfx.policies.lstm import LstmPolicy
@@ -75,6 +75,14 @@ def test_tokens_have_the_declared_width_and_are_finite_at_standstill() -> None:
 def test_wrong_inputs_are_named(inputs: tuple[str, ...], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         GruPolicy(inputs=inputs)
+
+
+@pytest.mark.parametrize(("name", "message"), [("situatoin", "Did you mean 'situation'"), ("gap", r"Write \[gap\]")])
+def test_a_set_of_inputs_goes_by_its_name(name: str, message: str) -> None:
+    listed = GruPolicy(inputs=INPUT_SETS["situation"])
+    assert GruPolicy(inputs="situation").identity() == listed.identity()
+    with pytest.raises(ConfigError, match=message):
+        GruPolicy(inputs=name)
 
 
 @pytest.mark.parametrize("component", [GruPolicy, LstmPolicy])
