@@ -141,6 +141,24 @@ class ParameterSpace:
             raise ParameterError("no parameter is tuned; set model.parameters.NAME.tuned=true for at least one")
         return space
 
+    def reaching(self, reach: Mapping[str, tuple[float, float]]) -> ParameterSpace:
+        """Returns the space with bounds moved outwards, as far as they are not there already; see `ModelSettings.reach`.
+
+        Raises:
+            ParameterError: an unknown name, or a lower bound that is not below the upper one.
+        """
+        for name, (low, high) in reach.items():
+            self[name]
+            if not (math.isfinite(low) and math.isfinite(high) and low < high):
+                raise ParameterError(f"model.reach.{name}=[{low}, {high}]: the first must be below the second, and both finite")
+        return replace(
+            self,
+            parameters=tuple(
+                replace(p, low=min(p.low, reach[p.name][0]), high=max(p.high, reach[p.name][1])) if p.name in reach else p
+                for p in self.parameters
+            ),
+        )
+
     def bounds(self, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Tensor:
         """Returns `(2, n)`: lower bounds, upper bounds."""
         import torch

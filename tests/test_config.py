@@ -189,7 +189,8 @@ def test_a_node_reads_back_as_the_defaults_of_its_class() -> None:
 def test_a_third_partys_model_is_an_option_and_its_node_is_written_from_its_class(install) -> None:
     install("mine-models", {"cfx.models": {"mine": "mine_models:Mine"}}, {"mine_models.py": PLUGIN})
     node = values_of("model=mine", "model.parameters.tau.high=9", "model.mood=wild")["model"]
-    assert node == {"name": "mine", "mood": "wild", "parameters": {"tau": {"low": 0.5, "high": 9, "default": 1.0, "tuned": True}}}
+    tau = {"low": 0.5, "high": 9, "default": 1.0, "tuned": True}
+    assert node == {"name": "mine", "reach": None, "mood": "wild", "parameters": {"tau": tau}}
 
 
 def test_a_plugins_own_yaml_wins_and_may_extend_the_generated_node(install) -> None:
@@ -203,6 +204,7 @@ def test_a_plugins_own_yaml_wins_and_may_extend_the_generated_node(install) -> N
     far = values_of("model=mine_far", "model.parameters.tau.low=0.7")["model"]
     assert far == {
         "name": "mine",
+        "reach": None,
         "mood": "wild",
         "parameters": {"tau": {"low": 0.7, "high": 8.0, "default": 1.0, "tuned": True}},
     }

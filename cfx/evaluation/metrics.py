@@ -124,7 +124,9 @@ class _Errors:
     index: Tensor
 
     @classmethod
-    def of(cls, batch: PairBatch, first: Tensor, loops: Mapping[str, ClosedLoop], space: ParameterSpace) -> _Errors:
+    def of(
+        cls, batch: PairBatch, first: Tensor, loops: Mapping[str, ClosedLoop], space: ParameterSpace, reach: ParameterSpace
+    ) -> _Errors:
         counted = next(iter(loops.values())).counted
         frames = first[:, None] + torch.arange(counted.shape[1], device=first.device)
         index = frames.clamp(max=batch.mask.shape[1] - 1)
@@ -132,7 +134,7 @@ class _Errors:
         return cls(
             {m: _rmse(loop.speed, real_speed, counted) for m, loop in loops.items()},
             {m: _rmse(loop.gap, real_gap, counted) for m, loop in loops.items()},
-            {m: Safety.of(loop, space, batch.dt) for m, loop in loops.items()},
+            {m: Safety.of(loop, reach if m == "policy" else space, batch.dt) for m, loop in loops.items()},
             rms_jerk(real_speed, counted, batch.dt),
             counted,
             index,
@@ -184,6 +186,7 @@ def evaluate(
     style: StyleResult,
     *,
     seed: int,
+    reach: ParameterSpace | None = None,
     fold: Tensor | None = None,
     whole: Mapping[str, ClosedLoop] | None = None,
     platoon: Platoon | None = None,
@@ -196,7 +199,8 @@ def evaluate(
         batch: the same as tensors.
         first: `(P,)`, the frame of the last measured state.
         loops: the closed loops of each method of `METHODS`, on the same frames; `fixed` and `policy` are among them.
-        space: the model's parameters.
+        space: the model's parameters, in the bounds of constant ones.
+        reach: the same in the bounds of `policy`; None: alike.
         style: score and cluster of each driver.
         seed: of the bootstrap.
         fold: `(P,)`, in which fold each pair was tested; None if there was one.
@@ -204,8 +208,9 @@ def evaluate(
         platoon, history: further results, handed on; see `Evaluation`.
     """
     loops = {method: loops[method] for method in METHODS if method in loops}
-    errors = _Errors.of(batch, first, loops, space)
-    errors_whole = _Errors.of(batch, torch.zeros_like(first), whole, space) if whole else None
+    reach = space if reach is None else reach
+    errors = _Errors.of(batch, first, loops, space, reach)
+    errors_whole = _Errors.of(batch, torch.zeros_like(first), whole, space, reach) if whole else None
     means = {m: _mean(loop.parameters, errors.counted) for m, loop in loops.items()}
     by_driver = style.table.set_index("driver")
     rows = []
@@ -231,7 +236,7 @@ def evaluate(
         drives=_drives(pairs, batch, first, errors.index, loops),
         names=space.names,
         units=tuple(parameter.unit for parameter in space.tuned),
-        bounds=space.bounds().numpy(),
+        bounds=reach.bounds().numpy(),
         whole_improvements=errors_whole.improvements(drivers, seed) if errors_whole is not None else {},
         platoon=platoon,
         history=history,

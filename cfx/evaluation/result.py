@@ -156,7 +156,7 @@ class Evaluation:
         drives: the closed loops themselves, in the order of the pairs.
         names: the tuned parameters' names.
         units: their units.
-        bounds: `(2, n)`.
+        bounds: `(2, n)`, those within which the policy chooses.
         whole_improvements: as `improvements`, over whole drives of drivers that nothing was fitted to; empty if there were none.
         platoon: ten drivers in a row behind a braking leader; None if no network is for any driver.
         history: what the policy gains from what it has read before it drives; None if that was not tried. A row per pair, base

@@ -94,7 +94,7 @@ class Material:
         """
         batch = _single(lesson.batch)
         device = batch.lengths.device
-        space, stride = lesson.simulator.model.space, lesson.windows.stride
+        space, stride = lesson.simulator.model.reach, lesson.windows.stride
         grid = Grid(lesson.network.to(device), len(lesson.names))
         pairs = torch.arange(len(batch), device=device)
         population = grid.mean(space.to_unit(lesson.fixed)).float()
@@ -318,7 +318,7 @@ class _Constant:
         )
         length = batch.leader_length[rows]
         start = Start(*(s[rows, first] for s in (batch.follower_position, batch.follower_speed, batch.follower_acceleration)))
-        space = self.simulator.model.space
+        space = self.simulator.model.reach
         p = {k: v[:, None] if v.dim() else v for k, v in space.unpack(space.from_unit(unit)).items()}
         leader = Leader(position[:-1], speed[:-1], acceleration[:-1], length)
         _, simulated, driven = self.simulator.advance(self.simulator.begin(start), leader, p)

@@ -145,7 +145,7 @@ class RolloutLearner(Learner):
             log.info("The policy does not see the gap; it drives better with policy.inputs=situation")
         generator = torch.Generator().manual_seed(lesson.seed)
         material = Material.of(lesson, policy, s.validation, generator, s.members)
-        space, device = simulator.model.space, lesson.batch.lengths.device
+        space, device = simulator.model.reach, lesson.batch.lengths.device
         blank = torch.full((len(material.pair), len(space)), NONE)
         default = space.to_unit(space.defaults()).float()
         network = policy.build(material.scaler.mean.shape[-1], default, blank, generator).to(device)
@@ -181,7 +181,7 @@ class RolloutLearner(Learner):
 
 def _learned(network: PolicyNetwork, material: Material, lesson: Lesson, curves: pd.DataFrame) -> Learned:
     """Returns the networks, those of a committee as one."""
-    space, members = lesson.simulator.model.space, material.members
+    space, members = lesson.simulator.model.reach, material.members
     base = space.from_unit(material.start[::members].to(lesson.fixed.dtype))
     scaler = Scaler(material.scaler.mean[::members].clone(), material.scaler.scale[::members].clone())
     return Learned(Committee(network, members).eval() if members > 1 else network, scaler, curves, base=base)

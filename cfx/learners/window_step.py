@@ -59,7 +59,8 @@ class WindowStep:
         self.inputs, self.summary = policy.inputs, policy.summary
         self.length, self.stride = windows.length, windows.stride
         self.dt = dt
-        low, high = model.space.bounds(dtype=scaler.mean.dtype, device=scaler.mean.device)
+        self.space = model.reach
+        low, high = self.space.bounds(dtype=scaler.mean.dtype, device=scaler.mean.device)
         self.low, self.range = low, high - low
 
     def compile(self) -> None:
@@ -107,7 +108,7 @@ class WindowStep:
         gap = ahead.position[..., :length] - leader_length[..., None] - recent.position
         history = History(ahead.speed[..., :length], ahead.acceleration[..., :length], recent.speed, recent.acceleration, gap)
         answer, state = self._answer(tokens(history, self.inputs, self.summary), squashed, recent.state)
-        p = self.model.space.unpack(self.low + moved(base, answer) * self.range)
+        p = self.space.unpack(self.low + moved(base, answer) * self.range)
         follower = Follower(recent.position[..., now], recent.speed[..., now], recent.acceleration[..., now], recent.memory)
         positions, speeds, accelerations = [], [], []
         for k in range(now, now + stride):

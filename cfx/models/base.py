@@ -60,6 +60,11 @@ class ModelSettings(Settings):
     parameters: dict[str, ParameterOverride] = Field(
         default_factory=dict, description="changes to the model's parameters: bounds, default, tuned or constant"
     )
+    reach: dict[str, tuple[float, float]] | None = Field(
+        None,
+        description="{NAME: [low, high]}: how far a policy of offsets (learner=rollout) may move a parameter, where that is"
+        " beyond the bounds of constant ones; null: no farther",
+    )
 
 
 class DrivingModel(Component):
@@ -97,6 +102,12 @@ class DrivingModel(Component):
     def __init__(self, settings: Settings | None = None, **options: object) -> None:
         super().__init__(settings, **options)
         self.space = self.parameters.override(self.settings.parameters)
+        self.space.reaching(self.settings.reach or {})  # says now what is wrong with it
+
+    @property
+    def reach(self) -> ParameterSpace:
+        """The parameters in the bounds within which a policy of offsets moves them; those of `space` and beyond."""
+        return self.space.reaching(self.settings.reach or {})
 
     def smoothed(self, softness: Softness) -> Self:
         """Returns the model with its regime switches smoothed, for training by gradients.

@@ -18,6 +18,7 @@ from cfx import registry
 from cfx.calibration.windows import WindowSettings
 from cfx.errors import DataError
 from cfx.files import whole
+from cfx.models.base import DrivingModel
 from cfx.pairs import PairBatch, PairSet
 from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy, PolicyNetwork
@@ -84,7 +85,7 @@ class TrainedPolicy:
         network: the networks themselves.
         scaler: normalises tokens.
         model_node: config node of the driving model.
-        space: the model's parameters.
+        space: the model's parameters; where answers are offsets, as far as they reach.
         windows: how often parameters change, and how many frames a token holds.
         dt: time step, s.
         names: what each network was trained for (a pair's id, a fold, or `ALL`), N of them.
@@ -261,10 +262,11 @@ class TrainedPolicy:
         policy = registry.create("policy", description["policy"])
         model = registry.create("model", description["model"])
         assert isinstance(policy, Policy)
-        space = model.space  # type: ignore[attr-defined]  # the registry has checked that it is a model
+        assert isinstance(model, DrivingModel)
         windows = WindowSettings(**description["windows"])
         networks, features = weights["scaler.mean"].shape
         base = weights.get("base")
+        space = model.space if base is None else model.reach
         width = token_width(policy.inputs, policy.summary, windows.length) + (len(space) if base is not None else 0)
         if features != width:
             raise DataError(f"{folder}: the weights read {features} features, the policy's settings give {width}")

@@ -102,7 +102,7 @@ class AcrossDrivers(Protocol):
         names = (*(f"fold {k}" for k in range(self.settings.folds)), ALL)
         default = study.space.defaults(dtype=population.dtype, device=population.device).expand_as(population)
         strange = default if self.settings.base == "default" else population
-        own = drawn(study.space, fixed, self.settings.shrinkage) if self.settings.base == "own" else None
+        own = drawn(study.simulator.model.reach, fixed, self.settings.shrinkage) if self.settings.base == "own" else None
         policy, learned = self._learn(study, whole, members, strange, own, labels, names)
 
         tested = (fold >= 0).nonzero()[:, 0]
@@ -260,8 +260,9 @@ class _Test:
             batch,
             first,
             loops,
-            self.policy.space,
+            study.space,
             study.style,
+            reach=self.policy.space,
             seed=study.seed,
             fold=self.fold,
             whole=whole,

@@ -117,7 +117,7 @@ class Study:
             scaler=learned.scaler,
             model_node=self.model_node,
             policy_node=self.policy_node,
-            space=self.space,
+            space=self.space if learned.base is None else self.simulator.model.reach,
             windows=self.windows,
             dt=self.simulator.dt,
             names=names,

@@ -77,5 +77,7 @@ class WithinDriver(Protocol):
         if self.settings.networks == "all" and study.policy.trainable:
             default = study.constant(DefaultPolicy(), fixed[:1])
             platoon = measure_platoons(study.simulator.model, {"default": (default, ("any",)), "policy": (policy, policy.names)})
-        evaluation = evaluate(pairs, batch, first, loops, policy.space, study.style, seed=study.seed, platoon=platoon)
+        evaluation = evaluate(
+            pairs, batch, first, loops, study.space, study.style, reach=policy.space, seed=study.seed, platoon=platoon
+        )
         return Outcome(evaluation, policy, learned.curves, labels)

@@ -25,6 +25,7 @@ from cfx.models.krauss import Krauss
 from cfx.optimizers.random import RandomSearch
 from cfx.pairs import SIGNALS, PairBatch, PairSet
 from cfx.policies.committee import Committee
+from cfx.policies.features import History
 from cfx.progress import Task
 from cfx.protocols.across_drivers import AcrossDrivers
 from cfx.simulation.rollout import Simulator
@@ -327,6 +328,29 @@ def test_without_learning_the_policy_is_its_base(tmp_path: Path, base: str, shri
     assert ("base" in rmse.index.get_level_values(0)) == (base == "own" and shrinkage > 0)
     assert ("rmse_improvement/base/mean" in result.metrics) == (base == "own" and shrinkage > 0)
     assert not (tmp_path / "history.parquet").exists()
+
+
+def test_a_policy_reaches_farther_than_constant_parameters(tmp_path: Path) -> None:
+    """Its base is as without reach, its answers may leave the bounds of constant ones, and what is saved answers the same."""
+    still = [
+        "learner.epochs=1",
+        "learner.steps=1",
+        "learner.learning_rate=1e-12",
+        "learner.weight_decay=0",
+        "protocol.histories=[]",
+    ]
+    result = rollout(tmp_path / "one", "model.reach={t_r: [0.05, 60]}", "protocol.base=population", *still)
+    rmse = result.pairs.set_index(["method", "pair_id"])["rmse_speed"]
+    np.testing.assert_allclose(rmse["policy"], rmse["population"], rtol=1e-5)
+    for policy in (result.policy, cfx.load(tmp_path / "one").policy):
+        largest = float(Krauss().space["t_r"].high)
+        assert policy.space["t_r"].high == 60 > largest
+        for weights in policy.network.parameters():
+            weights.data.fill_(0.0)
+        policy.network.get_parameter("members.b_out").data.fill_(20.0)  # as large an answer as there is
+        silence = History(*(torch.zeros((1, policy.windows.length), dtype=torch.float64) for _ in range(5)))
+        answer, _ = policy.act(silence, policy.begin(torch.zeros(1, dtype=torch.long)))
+        assert float(policy.space.unpack(answer)["t_r"]) == pytest.approx(60, rel=1e-3)
 
 
 def test_drives_that_are_too_short_to_test_change_what_is_learned(tmp_path: Path) -> None:

@@ -1,0 +1,39 @@
+"""How far a policy of offsets may move a parameter: the bounds of constant ones, or beyond."""
+
+from __future__ import annotations
+
+import pytest
+
+from cfx.errors import ConfigError, ParameterError
+from cfx.models.krauss import Krauss
+from cfx.models.w99 import W99
+
+
+def test_reach_moves_bounds_outwards_for_policies_alone() -> None:
+    model = Krauss(reach={"t_r": (0.001, 50.0)})
+    assert (model.reach["t_r"].low, model.reach["t_r"].high) == (0.001, 50.0)
+    assert model.space == Krauss().space
+    assert model.reach["b"] == model.space["b"]
+
+
+def test_reach_never_moves_bounds_inwards() -> None:
+    model = W99(parameters={"cc8": {"high": 9.0}})
+    assert (model.reach["cc8"].low, model.reach["cc8"].high) == (0.05, 9.0)
+    assert W99(reach=None).reach == W99().space
+
+
+@pytest.mark.parametrize(
+    ("reach", "message"),
+    [
+        ({"tr": (0.0, 1.0)}, "Did you mean 't_r'"),
+        ({"t_r": (2.0, 1.0)}, r"model\.reach\.t_r=\[2\.0, 1\.0\]: the first must be below"),
+    ],
+)
+def test_a_wrong_reach_is_named(reach: dict[str, tuple[float, float]], message: str) -> None:
+    with pytest.raises(ParameterError, match=message):
+        Krauss(reach=reach)
+
+
+def test_a_reach_needs_both_ends() -> None:
+    with pytest.raises(ConfigError, match=r"model\.reach\.t_r"):
+        Krauss(reach={"t_r": (1.0,)})  # type: ignore[dict-item]  # what a user may write
