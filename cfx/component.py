@@ -39,10 +39,12 @@ class Component:
 
     Attributes:
         deprecated: what to use instead, where a component is on its way out; jobs that name it log a warning.
+        trial: settings with which `plugins check` tries the component, where trying it with the default ones takes long.
     """
 
     kind: ClassVar[str]
     deprecated: ClassVar[str] = ""
+    trial: ClassVar[Mapping[str, Any]] = {}
     schema: ClassVar[type[Settings]] = Settings
     settings: Settings
 

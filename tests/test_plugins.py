@@ -129,6 +129,7 @@ def test_check_finds_every_broken_plugin_and_says_one_sentence_each(
 def test_check_exits_with_1_only_if_something_is_broken(install: Installer, twins: None, capsys) -> None:
     assert cli.main(["plugins", "check", "model", "w99"]) == 0
     assert cli.main(["plugins", "check", "policy"]) == 0
+    assert cli.main(["plugins", "check", "learner"]) == 0
     assert capsys.readouterr().err == ""
     assert cli.main(["plugins", "check", "model", "twin"]) == 1
     complaints = capsys.readouterr().err.splitlines()

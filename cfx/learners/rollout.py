@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -132,6 +132,7 @@ class RolloutLearner(Learner):
     schema: ClassVar[type[Settings]] = RolloutSettings
     settings: RolloutSettings
     needs_gradients = True
+    trial: ClassVar[Mapping[str, Any]] = {"members": 2, "epochs": 4, "steps": 12, "horizon": 10, "learning_rate": 0.02}
 
     def fit(self, policy: Policy, lesson: Lesson) -> Learned:
         """As `Learner.fit`.

@@ -70,7 +70,7 @@ def _chosen(kind: str | None, name: str | None) -> list[registry.Entry]:
 
 
 def examine(entry: registry.Entry) -> Verdict:
-    """Tries one component with its default settings; whatever it does, this returns."""
+    """Tries one component with its default settings, or those of its `trial`; whatever it does, this returns."""
     shadow = _shadow(entry)
     if shadow:
         return Verdict(entry, "shadowed", shadow)
@@ -80,7 +80,7 @@ def examine(entry: registry.Entry) -> Verdict:
         required = [name for name, field in cls.schema.model_fields.items() if registry.is_blank(field)]
         if required:
             return Verdict(entry, "fine", hint=_not_tried(entry, required))
-        component = registry.create(entry.kind, {"name": entry.name})
+        component = registry.create(entry.kind, {"name": entry.name, **cls.trial})
         complaint = _broken_contract(entry, component)
     except CfxError as error:
         complaint = " ".join(str(error).split())

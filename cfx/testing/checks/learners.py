@@ -21,6 +21,7 @@ from cfx.evaluation.closed_loop import drive
 from cfx.learners.base import CURVE_COLUMNS, Learned, Learner, Lesson
 from cfx.models.krauss import Krauss
 from cfx.pairs import SIGNALS, PairBatch, PairSet
+from cfx.policies.committee import Committee
 from cfx.policies.features import token_width
 from cfx.policies.gru import GruPolicy
 from cfx.policies.offsets import NONE
@@ -74,10 +75,12 @@ def delivers_networks_that_are_ready_to_drive(learner: Learner) -> None:
         learned = _fitted(learner, material)
         assert isinstance(learned, Learned), f"`fit` must return a cfx.Learned, not a {type(learned).__name__}"
         networks, width = len(material.names), _width(learned, material)
+        members = learned.network.size if isinstance(learned.network, Committee) else 1
+        wanted = f"{networks} of {members} members" if members > 1 else str(networks)
         for name, value in [*learned.network.named_parameters(), *learned.network.named_buffers()]:
-            assert value.shape[0] == networks, (
-                f"{name} is for {value.shape[0]} networks, but the lesson names {networks}: `network` and `names` of the lesson"
-                " say how many there are and who learns in which"
+            assert value.shape[0] == networks * members, (
+                f"{name} is for {value.shape[0]} networks, but the lesson names {wanted}: `network` and `names` of the"
+                " lesson say how many there are and who learns in which"
             )
         assert learned.scaler.mean.shape == learned.scaler.scale.shape == (networks, width), (
             f"the scaler must hold {(networks, width)} means and scales: each network's tokens are normalised on their own, with"
@@ -163,7 +166,8 @@ def networks_are_independent(learner: Learner) -> None:
     one, two = _state(_fitted(learner, material)), _state(learner.fit(_POLICY, other))
     message = "what a network learns must not depend on the drivers of another network: change one driver, and only his changes"
     for key in one:
-        torch.testing.assert_close(one[key][1:], two[key][1:], rtol=1e-4, atol=1e-5, msg=f"{message} ({key})")
+        his = len(one[key]) // PAIRS  # rows of one network, more than one in a committee
+        torch.testing.assert_close(one[key][his:], two[key][his:], rtol=1e-4, atol=1e-5, msg=f"{message} ({key})")
 
 
 def the_lesson_stays_as_it_is(learner: Learner) -> None:
