@@ -71,16 +71,8 @@ def test_the_table_and_the_metrics_tell_what_was_driven() -> None:
     style = StyleResult(
         pd.DataFrame({"driver": [p.driver for p in pairs], "score": [0.2, 0.8], "cluster": [0, 2]}), {}, (0.3, 0.7)
     )
-    found = evaluate(
-        pairs,
-        batch,
-        first,
-        {"default": calm, "fixed": calm, "policy": hard},
-        model.space,
-        style,
-        seed=0,
-        whole={"default": calm, "policy": hard},
-    )
+    loops = {"default": calm, "fixed": calm, "policy": hard}
+    found = evaluate(pairs, batch, first, loops, model.space, style, seed=0, whole={"default": calm, "policy": hard})
     table = found.table.set_index(["pair_id", "method"])
     assert table["hard_braking"].to_dict() == {("p0", "policy"): 1} | dict.fromkeys(table.index.drop(("p0", "policy")), 0)
     assert table.loc[("p0", "policy"), "rms_jerk"] == pytest.approx(math.sqrt(2 * 100**2 / 9))
@@ -92,6 +84,9 @@ def test_the_table_and_the_metrics_tell_what_was_driven() -> None:
     assert (metrics["at_bounds/policy"], metrics["at_bounds/fixed"]) == (0.5, 0)
     assert (metrics["whole/hard_braking/policy"], metrics["whole/collisions/policy"]) == (1, 0)
     assert "whole/collisions/fixed" not in metrics
+    reach = model.space.reaching({model.space.names[0]: (-5.0, 5.0)})  # then the policy's value is none of its bounds
+    within = evaluate(pairs, batch, first, {**loops, "fixed": hard}, model.space, style, seed=0, reach=reach).metrics()
+    assert (within["at_bounds/policy"], within["at_bounds/fixed"]) == (0, 0.5)
 
 
 def test_a_table_without_these_columns_still_has_its_other_metrics() -> None:
