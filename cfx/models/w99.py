@@ -35,12 +35,6 @@ class W99Settings(ModelSettings):
     variant: Literal["sumo", "vissim"] = Field(
         "sumo", description="sumo: CC8 caps every acceleration, so CC9 has no effect; vissim: CC8 at standstill to CC9 at 80 km/h"
     )
-    reach: dict[str, tuple[float, float]] | None = Field(
-        {"cc7": (0.01, 3.0), "cc8": (0.05, 5.0)},
-        description="how far a policy of offsets (learner=rollout) may move a parameter, where that is beyond the bounds of"
-        " constant ones: whoever changes CC7 and CC8 while driving sets the deceleration and the acceleration with them; null: no"
-        " farther",
-    )
 
 
 class W99(DrivingModel):

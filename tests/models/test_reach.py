@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from cfx import hydra_source, registry
 from cfx.errors import ConfigError, ParameterError
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
@@ -17,9 +18,9 @@ def test_reach_moves_bounds_outwards_for_policies_alone() -> None:
 
 
 def test_reach_never_moves_bounds_inwards() -> None:
-    model = W99(parameters={"cc8": {"high": 9.0}})
+    model = W99(parameters={"cc8": {"high": 9.0}}, reach={"cc8": (0.05, 5.0)})
     assert (model.reach["cc8"].low, model.reach["cc8"].high) == (0.05, 9.0)
-    assert W99(reach=None).reach == W99().space
+    assert W99().reach == W99().space
 
 
 @pytest.mark.parametrize(
@@ -37,3 +38,10 @@ def test_a_wrong_reach_is_named(reach: dict[str, tuple[float, float]], message: 
 def test_a_reach_needs_both_ends() -> None:
     with pytest.raises(ConfigError, match=r"model\.reach\.t_r"):
         Krauss(reach={"t_r": (1.0,)})  # type: ignore[dict-item]  # what a user may write
+
+
+def test_w99_reaching_calibrates_the_constants_of_w99() -> None:
+    model = registry.create("model", hydra_source.plain(hydra_source.composed(["model=w99_reaching"]))["model"])
+    assert isinstance(model, W99)
+    assert model.space == W99().space
+    assert (model.reach["cc7"].high, model.reach["cc8"].low) == (3.0, 0.05)
