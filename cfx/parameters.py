@@ -37,6 +37,7 @@ class Parameter:
         meaning: one line.
         source: where default and bounds come from.
         tuned: whether calibration and policies choose it; a constant otherwise.
+        held: whether policies of offsets leave it at their base (`ModelSettings.reach`).
     """
 
     name: str
@@ -47,6 +48,7 @@ class Parameter:
     meaning: str
     source: str = ""
     tuned: bool = True
+    held: bool = False
 
     def __post_init__(self) -> None:
         if not all(math.isfinite(value) for value in (self.low, self.high, self.default)):
@@ -141,23 +143,34 @@ class ParameterSpace:
             raise ParameterError("no parameter is tuned; set model.parameters.NAME.tuned=true for at least one")
         return space
 
-    def reaching(self, reach: Mapping[str, tuple[float, float]]) -> ParameterSpace:
-        """Returns the space with bounds moved outwards, as far as they are not there already; see `ModelSettings.reach`.
+    def reaching(self, reach: Mapping[str, tuple[float, float] | None]) -> ParameterSpace:
+        """Returns the space in which policies of offsets move; see `ModelSettings.reach`.
+
+        Args:
+            reach: bounds, name -> (low, high), which move outwards as far as they are not there already; None: held.
 
         Raises:
-            ParameterError: an unknown name, or a lower bound that is not below the upper one.
+            ParameterError: an unknown name, a lower bound that is not below the upper one, or nothing is left to move.
         """
-        for name, (low, high) in reach.items():
+        for name, bounds in reach.items():
             self[name]
-            if not (math.isfinite(low) and math.isfinite(high) and low < high):
-                raise ParameterError(f"model.reach.{name}=[{low}, {high}]: the first must be below the second, and both finite")
-        return replace(
-            self,
-            parameters=tuple(
-                replace(p, low=min(p.low, reach[p.name][0]), high=max(p.high, reach[p.name][1])) if p.name in reach else p
-                for p in self.parameters
-            ),
-        )
+            if bounds is not None and not (math.isfinite(bounds[0]) and math.isfinite(bounds[1]) and bounds[0] < bounds[1]):
+                raise ParameterError(
+                    f"model.reach.{name}=[{bounds[0]}, {bounds[1]}]: the first must be below the second, and both finite"
+                )
+        space = replace(self, parameters=tuple(_reaching(p, reach[p.name]) if p.name in reach else p for p in self.parameters))
+        if all(parameter.held for parameter in space.tuned):
+            raise ParameterError(
+                "model.reach: every tuned parameter is null, so a policy of offsets could move none; leave one out"
+            )
+        return space
+
+    def free(self, *, device: torch.device | str | None = None) -> Tensor | None:
+        """Returns which tuned parameters a policy of offsets moves, bool `(n,)`; None: all."""
+        import torch
+
+        held = [parameter.held for parameter in self.tuned]
+        return ~torch.tensor(held, device=device) if any(held) else None
 
     def bounds(self, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Tensor:
         """Returns `(2, n)`: lower bounds, upper bounds."""
@@ -197,6 +210,12 @@ class ParameterSpace:
                 raise ParameterError(
                     f"parameter {name}={value} lies outside its bounds [{parameter.low}, {parameter.high}] {parameter.unit}"
                 )
+
+
+def _reaching(parameter: Parameter, bounds: tuple[float, float] | None) -> Parameter:
+    if bounds is None:
+        return replace(parameter, held=True)
+    return replace(parameter, low=min(parameter.low, bounds[0]), high=max(parameter.high, bounds[1]))
 
 
 def _added(name: str, given: ParameterOverride) -> Parameter:

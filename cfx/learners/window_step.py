@@ -62,6 +62,7 @@ class WindowStep:
         self.space = model.reach
         low, high = self.space.bounds(dtype=scaler.mean.dtype, device=scaler.mean.device)
         self.low, self.range = low, high - low
+        self.free = self.space.free(device=low.device)
 
     def compile(self) -> None:
         """Lets `torch.compile` make one function of each of the two."""
@@ -108,7 +109,7 @@ class WindowStep:
         gap = ahead.position[..., :length] - leader_length[..., None] - recent.position
         history = History(ahead.speed[..., :length], ahead.acceleration[..., :length], recent.speed, recent.acceleration, gap)
         answer, state = self._answer(tokens(history, self.inputs, self.summary), squashed, recent.state)
-        p = self.space.unpack(self.low + moved(base, answer) * self.range)
+        p = self.space.unpack(self.low + moved(base, answer, self.free) * self.range)
         follower = Follower(recent.position[..., now], recent.speed[..., now], recent.acceleration[..., now], recent.memory)
         positions, speeds, accelerations = [], [], []
         for k in range(now, now + stride):

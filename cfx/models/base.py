@@ -60,10 +60,10 @@ class ModelSettings(Settings):
     parameters: dict[str, ParameterOverride] = Field(
         default_factory=dict, description="changes to the model's parameters: bounds, default, tuned or constant"
     )
-    reach: dict[str, tuple[float, float]] | None = Field(
+    reach: dict[str, tuple[float, float] | None] | None = Field(
         None,
-        description="{NAME: [low, high]}: how far a policy of offsets (learner=rollout) may move a parameter, where that is"
-        " beyond the bounds of constant ones; null: no farther",
+        description="what a policy of offsets (learner=rollout) may move, where that is not what calibration may:"
+        " {NAME: [low, high]}, farther; {NAME: null}, not at all",
     )
 
 
@@ -106,7 +106,7 @@ class DrivingModel(Component):
 
     @property
     def reach(self) -> ParameterSpace:
-        """The parameters in the bounds within which a policy of offsets moves them; those of `space` and beyond."""
+        """The parameters in the bounds within which a policy of offsets moves them: those of `space` and beyond."""
         return self.space.reaching(self.settings.reach or {})
 
     def smoothed(self, softness: Softness) -> Self:

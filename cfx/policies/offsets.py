@@ -49,11 +49,18 @@ def drawn(space: ParameterSpace, own: Tensor, shrinkage: float) -> Tensor:
     return space.from_unit(torch.sigmoid(torch.lerp(one, other, shrinkage)))
 
 
-def moved(base: Tensor, answer: Tensor) -> Tensor:
+def moved(base: Tensor, answer: Tensor, free: Tensor | None = None) -> Tensor:
     """Returns the base moved by an answer, both `(*batch, n)` in unit space; exactly the base where the answer is 1/2.
 
     A base within 0.5 % of a bound is moved as if it were that far from it, and the difference kept.
+
+    Args:
+        base: where offsets start.
+        answer: of a network.
+        free: which parameters may be moved, bool `(n,)`; None: all.
     """
+    if free is not None:
+        answer = torch.where(free, answer, NONE)
     inner = base.clamp(_EDGE, 1.0 - _EDGE)
     logit = torch.logit(inner)
     step = torch.sigmoid(logit + _GAIN * torch.logit(answer, eps=_LARGEST)) - torch.sigmoid(logit)

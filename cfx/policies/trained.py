@@ -146,7 +146,7 @@ class TrainedPolicy:
         unit, after = self.network(self.scaler(grid), state.state)
         chosen = unit[state.network, state.place, 0].to(seen.dtype)
         if state.base is not None:
-            chosen = moved(state.base, chosen.double()).to(seen.dtype)
+            chosen = moved(state.base, chosen.double(), self.space.free(device=chosen.device)).to(seen.dtype)
         return self.space.from_unit(chosen), state._replace(state=after)
 
     def read(self, batch: PairBatch, until: Tensor, state: PolicyState, since: Tensor | None = None) -> PolicyState:
