@@ -70,7 +70,8 @@ class Learned:
         scaler: how their tokens are normalised.
         curves: columns network, epoch, train_loss, validation_loss (NaN where not measured).
         base: `(N, n)`, SI units: the parameters that answers are offsets from (`cfx.policies.offsets`) for a driver who brings
-            none of his own; the networks then read tokens with the base appended. None: answers are the parameters themselves.
+            none of his own; the networks then read tokens with the base appended, and answer in the model's `reach`. None:
+            answers are the parameters themselves, in its `space`.
     """
 
     network: PolicyNetwork

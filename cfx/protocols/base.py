@@ -111,13 +111,16 @@ class Study:
             PluginError: the learner or the policy did not deliver such networks.
         """
         _check_learned(registry.origin(self.learner if policy.trainable else policy), learned, len(names), len(self.space))
+        reach = self.simulator.model.reach
+        if policy.trainable and learned.base is None and reach != self.space:
+            log.info("model.reach changes nothing here: this policy answers parameters, not offsets (learner=rollout)")
         return TrainedPolicy(
             policy=policy,
             network=learned.network,
             scaler=learned.scaler,
             model_node=self.model_node,
             policy_node=self.policy_node,
-            space=self.space if learned.base is None else self.simulator.model.reach,
+            space=self.space if learned.base is None else reach,
             windows=self.windows,
             dt=self.simulator.dt,
             names=names,

@@ -353,6 +353,13 @@ def test_a_policy_reaches_farther_than_constant_parameters(tmp_path: Path) -> No
         assert float(policy.space.unpack(answer)["t_r"]) == pytest.approx(60, rel=1e-3)
 
 
+def test_a_reach_without_offsets_is_said_to_change_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    short = ["protocol=across_drivers", "protocol.folds=2", "learner.epochs=1", f"hydra.run.dir={tmp_path / 'one'}"]
+    result = cfx.run([*QUICK, *short, "model.reach={t_r: [0.05, 60]}"])
+    assert "model.reach changes nothing here" in caplog.text
+    assert result.policy.space == Krauss().space
+
+
 def test_drives_that_are_too_short_to_test_change_what_is_learned(tmp_path: Path) -> None:
     """All pairs are calibrated and learned from, the long ones alone stand in the results."""
     frames = [160, 200, 200, 200, 200]
