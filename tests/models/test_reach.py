@@ -1,4 +1,4 @@
-"""How far a policy of offsets may move a parameter: the bounds of constant ones, or beyond."""
+"""How far a policy of offsets may move a parameter: within the bounds of constant ones, beyond, or not at all."""
 
 from __future__ import annotations
 
