@@ -88,7 +88,15 @@ class Pair:
     @cached_property
     def fingerprint(self) -> str:
         """SHA-256 of everything that calibration and learning read."""
-        digest = hashlib.sha256(f"{self.pair_id}|{self.recording}|{self.dt!r}|{self.leader_length!r}".encode())
+        return self._digest(f"{self.pair_id}|{self.recording}|{self.dt!r}|{self.leader_length!r}")
+
+    @cached_property
+    def content(self) -> str:
+        """SHA-256 of the drive itself, whatever it and its recording are called."""
+        return self._digest(f"{self.dt!r}|{self.leader_length!r}")
+
+    def _digest(self, header: str) -> str:
+        digest = hashlib.sha256(header.encode())
         for name in SIGNALS:
             digest.update(np.ascontiguousarray(getattr(self, name), dtype=np.float64).tobytes())
         return digest.hexdigest()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from glob import has_magic
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -18,15 +19,25 @@ from cfx.errors import DataError, PluginError, nearest
 from cfx.pairs import SIGNALS, Dropped, Pair, PairSet
 
 
-def _absolute(value: Any) -> Any:
+def _file(value: Any) -> Path:
     """Returns an absolute path, so that a later change of the working directory changes nothing."""
     if value is None or str(value).strip() in {"", "???"}:  # "???" is how a config file says that a value is missing
         raise PydanticCustomError("missing", "a value is required")
-    return Path(value).expanduser().absolute() if isinstance(value, str | Path) else value
+    if not isinstance(value, str | Path):
+        raise PydanticCustomError("path", "write a file, a list of files, or a pattern such as 'i-80/*.txt'")
+    return Path(value).expanduser().absolute()
 
 
-FilePath = Annotated[Path, BeforeValidator(_absolute)]
-"""A path that a user writes: `~` is their home, a relative one starts at the working directory."""
+def _files(value: Any) -> Path | tuple[Path, ...]:
+    if not isinstance(value, list | tuple):
+        return _file(value)
+    if not value:
+        raise PydanticCustomError("path", "the list is empty; write at least one file")
+    return tuple(_file(one) for one in value)
+
+
+FilePaths = Annotated[Path | tuple[Path, ...], BeforeValidator(_files)]
+"""One or several paths that a user writes: `~` is their home, a relative one starts at the working directory."""
 
 
 class DatasetSettings(Settings):
@@ -42,7 +53,31 @@ class DatasetSettings(Settings):
 class FileDatasetSettings(DatasetSettings):
     """What every dataset that reads a file has."""
 
-    path: FilePath = Field(description="the file to read; ~ and relative paths work")
+    path: FilePaths = Field(
+        description="the file to read, a list of files, or a pattern such as 'i-80/*.txt'; ~ and relative paths work"
+    )
+
+    def files(self) -> list[Path]:
+        """Returns the files in the order in which they are written, those of a pattern sorted by name.
+
+        Raises:
+            DataError: no file matches a pattern, or a file is named twice.
+        """
+        written = self.path if isinstance(self.path, tuple) else (self.path,)
+        files = [file for path in written for file in _matching(path)]
+        twice = [file for number, file in enumerate(files) if file in files[:number]]
+        if twice:
+            raise DataError(f"data.path: {twice[0]} is named more than once; name each file once")
+        return files
+
+
+def _matching(path: Path) -> list[Path]:
+    if path.exists() or not has_magic(str(path)):
+        return [path]
+    found = sorted(file for file in Path(path.anchor).glob(str(path.relative_to(path.anchor))) if file.is_file())
+    if not found:
+        raise DataError(f"data.path={path}: no file matches this pattern")
+    return found
 
 
 class Dataset(Component):
@@ -94,6 +129,36 @@ class Dataset(Component):
                         f"{registry.origin(self)}: pair {pair.pair_id} has a {name} that is not finite; a dataset splits or"
                         " leaves out what has gaps"
                     )
+
+
+def joined(parts: Sequence[PairSet]) -> PairSet:
+    """Returns the pairs of several files as one set, in their order, and counts together what was left out for the same reason.
+
+    Raises:
+        DataError: a pair stands in two of the files, by its id or by its content, however it is called: a driver who counts
+            twice would be learned from and tested.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    seen: dict[str, tuple[str, str]] = {}
+    for part in parts:
+        here: dict[str, tuple[str, str]] = {}
+        for pair in part:
+            for key in (pair.pair_id, pair.content):
+                if key in seen:
+                    source, name = seen[key]
+                    which = f"pair '{name}'" if name == pair.pair_id else f"pair '{name}', there '{pair.pair_id}',"
+                    raise DataError(f"{source} and {part.source}: {which} stands in both files; leave it out of one of them")
+                here[key] = (part.source, pair.pair_id)
+        seen |= here
+    counts: dict[tuple[str, str], int] = {}
+    for drop in (drop for part in parts for drop in part.dropped):
+        counts[drop.reason, drop.unit] = counts.get((drop.reason, drop.unit), 0) + drop.count
+    return PairSet(
+        tuple(pair for part in parts for pair in part),
+        f"{len(parts)} files ({listed((part.source for part in parts), 3)})",
+        tuple(Dropped(reason, count, unit) for (reason, unit), count in counts.items()),
+    )
 
 
 def _why(dropped: Sequence[Dropped]) -> str:

@@ -7,6 +7,7 @@ and Supporting Data*, data.transportation.gov, dataset 8ect-6jqj. In the public 
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from cfx.component import Settings
-from cfx.datasets.base import Dataset, FileDatasetSettings, listed
+from cfx.datasets.base import Dataset, FileDatasetSettings, joined, listed
 from cfx.datasets.files import PARQUET, Floats, Ints, Labels, TextTable, bad_cells, magic, read_columns, sniff
 from cfx.errors import DataError, nearest
 from cfx.pairs import Dropped, Pair, PairSet
@@ -92,6 +93,9 @@ class NgsimDataset(Dataset):
     of time (`LOCATION` if there is one alone; the file's name stands in where there is no `Location` column). Without a usable
     clock (no `Global_Time`, or one that a spreadsheet has rounded) each location counts as one recording.
 
+    **Several files** hold several recordings, as NGSIM's own downloads do. Where two of them call theirs alike, as all three
+    of I-80 are `i-80`, the file's name is put before the recording's.
+
     **Duplicates.** Rows that agree in every column read here are counted and dropped, as real exports hold some; rows that
     contradict each other are an error.
 
@@ -102,7 +106,8 @@ class NgsimDataset(Dataset):
     settings: NgsimSettings
 
     def read(self) -> PairSet:
-        return read_ngsim(self.settings.path, self.settings.location).pairs()
+        files = self.settings.files()
+        return joined([rows.pairs() for rows in _apart([read_ngsim(path, self.settings.location) for path in files])])
 
 
 @dataclass(frozen=True)
@@ -236,6 +241,28 @@ def read_ngsim(path: Path, location: str | None = None) -> Rows:
     )
     _check_units(rows)
     return rows
+
+
+def _apart(parts: Sequence[Rows]) -> list[Rows]:
+    """Returns the rows of several files, the recordings of which are named apart, as vehicles' ids start anew in each.
+
+    Raises:
+        DataError: two of the files are named alike, too.
+    """
+    names = Counter(name for rows in parts for name in rows.recordings)
+    named: dict[str, str] = {}
+    result = []
+    for rows in parts:
+        stem = _stem(Path(rows.source))
+        own = tuple(name if names[name] == 1 else stem if name == stem else f"{stem}-{name}" for name in rows.recordings)
+        clash = next((name for name in own if name in named), None)
+        if clash is not None:
+            raise DataError(
+                f"{named[clash]} and {rows.source}: both recordings would be called '{clash}'; rename one of the files"
+            )
+        named |= dict.fromkeys(own, rows.source)
+        result.append(replace(rows, recordings=own))
+    return result
 
 
 def _stem(path: Path) -> str:

@@ -32,7 +32,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cfx.component import Settings
-from cfx.datasets.base import Dataset, FileDatasetSettings, listed
+from cfx.datasets.base import Dataset, FileDatasetSettings, joined, listed
 from cfx.datasets.files import PARQUET, Floats, Ints, Labels, as_labels, bad_cells, magic, parsed, read_columns, sniff
 from cfx.errors import DataError, OutputError, nearest
 from cfx.files import whole
@@ -59,6 +59,8 @@ _FACTORS = {
 class TidyDataset(Dataset):
     """Pairs in the tidy layout (see the module), from parquet or CSV; gzipped CSV is fine. Rows may be in any order.
 
+    Several files are read as one: a recording may go on in another file, a pair may not.
+
     Columns beyond the layout are ignored and counted. Everything else that does not fit is an error that names row and column.
     """
 
@@ -66,7 +68,7 @@ class TidyDataset(Dataset):
     settings: FileDatasetSettings
 
     def read(self) -> PairSet:
-        return read_tidy(self.settings.path)
+        return joined([read_tidy(path) for path in self.settings.files()])
 
 
 @dataclass(frozen=True)

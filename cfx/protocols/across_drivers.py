@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
@@ -39,9 +39,10 @@ class AcrossDriversSettings(Settings):
     """Settings of `across_drivers`."""
 
     folds: int = Field(5, ge=2, description="parts that the drivers are divided into; each is tested once")
-    together: Literal["driver", "platoon"] = Field(
+    together: Literal["driver", "platoon", "recording"] = Field(
         "driver",
-        description="what a fold keeps together: driver: all pairs of one follower; platoon: also all who follow each other",
+        description="what a fold keeps together: driver: all pairs of one follower; platoon: also all who follow each other;"
+        " recording: all drivers of a recording, so that whole recordings are tested which nobody learned from",
     )
     min_test_frames: int | None = Field(
         None, ge=1, description="frames a pair must have to be tested; shorter ones are only learned from; null: all are tested"
@@ -80,6 +81,7 @@ class AcrossDrivers(Protocol):
     No driver is, as follower, in both training and test. A vehicle may be follower in one pair and leader in another: its
     recorded drive as leader is only what others react to, so such pairs are kept, and counted (`data.json`, and a line in the
     log). `together=platoon` puts all who follow one another into one fold, where even that cannot happen.
+    `together=recording` asks the harder question: whether what was learned holds on another day, road or data set.
 
     Differences from the paper: the paper's baseline is `population`; the driver's own set is the stronger one. It says nothing of
     how folds are drawn; here by a shuffle that `seed` determines.
@@ -94,7 +96,7 @@ class AcrossDrivers(Protocol):
         # Row k: the pairs that network k learns from; the last network learns from all.
         numbers = torch.arange(self.settings.folds + 1)[:, None]
         members = ((fold != numbers) & (fold != -2 - numbers)) | (numbers == self.settings.folds)
-        notes = _overlap(pairs, fold)
+        notes = _overlap(pairs, fold, apart=self.settings.together == "recording")
         split, whole = Split.of(pairs, study.windows, study.split), Split.none(pairs, study.windows)
         fixed = study.calibrator.fixed(pairs, batch, split.frame)
         population = study.calibrator.population(pairs, batch, whole.frame, members)
@@ -127,18 +129,18 @@ class AcrossDrivers(Protocol):
         with another pair, they belong to the same fold, as number `-2 - fold`, so that nobody of that fold learns from them.
 
         Raises:
-            DataError: there are fewer drivers (or platoons) than folds.
+            DataError: there are fewer drivers (platoons, recordings) than folds.
         """
-        groups = _platoons(pairs) if self.settings.together == "platoon" else [pair.driver for pair in pairs]
+        together = self.settings.together
+        groups = _GROUPS[together](pairs)
         least = self.settings.min_test_frames or 0
         tested = [number for number, pair in enumerate(pairs) if len(pair) >= least]
         found = len({groups[number] for number in tested})
         if found < self.settings.folds:
-            what = f"platoon{'s' * (found != 1)}" if self.settings.together == "platoon" else f"driver{'s' * (found != 1)}"
-            long = f" with {least} frames or more" if least else ""
+            what = f"{together}{'s' * (found != 1)}{f' with {least} frames or more' if least else ''}"
             raise DataError(
-                f"protocol.folds={self.settings.folds}: {pairs.source} has only {found} {what}{long} here; lower protocol.folds"
-                f" (2 at least) or use more pairs"
+                f"protocol.folds={self.settings.folds}: {pairs.source} has only {found} {what} here; lower protocol.folds"
+                f" (2 at least) or use more {'recordings' if together == 'recording' else 'pairs'}"
             )
         of_group: dict[Any, int] = {}
         splitter = GroupKFold(self.settings.folds, shuffle=True, random_state=seed)
@@ -202,6 +204,14 @@ def _platoons(pairs: Sequence[Pair]) -> list[int]:
     graph = coo_array((np.ones(len(names)), (edges[0], edges[1])), shape=(len(number), len(number)))
     _, platoon = connected_components(graph, directed=False)
     return [int(platoon[number[follower]]) for _, follower in names]
+
+
+_GROUPS: Mapping[str, Callable[[PairSet], Sequence[Any]]] = {
+    "driver": lambda pairs: [pair.driver for pair in pairs],
+    "platoon": _platoons,
+    "recording": lambda pairs: [pair.recording for pair in pairs],
+}
+"""What each pair's fold is chosen for: `protocol.together`."""
 
 
 @dataclass(frozen=True)
@@ -302,8 +312,12 @@ class _Test:
         return pd.concat(rows, ignore_index=True)
 
 
-def _overlap(pairs: PairSet, fold: Tensor) -> dict[str, Any]:
-    """Counts the vehicles that stand on both sides of a fold, though never as followers; says so in the log."""
+def _overlap(pairs: PairSet, fold: Tensor, *, apart: bool) -> dict[str, Any]:
+    """Counts the vehicles that stand on both sides of a fold, though never as followers; says so in the log.
+
+    Args:
+        apart: no recording is on both sides.
+    """
     places = [int(number) for number in fold]
     tested = {pair.driver: k for pair, k in zip(pairs, places, strict=True) if k >= 0}
     # Of whom somebody learns: in which fold they do not.
@@ -325,8 +339,13 @@ def _overlap(pairs: PairSet, fold: Tensor) -> dict[str, Any]:
     )
     if count < len(pairs):
         log.info("%d shorter pairs are only learned from", len(pairs) - count)
+    recordings = [sorted({p.recording for p, k in zip(pairs, places, strict=True) if k == number}) for number in range(folds)]
+    if apart:
+        for number, names in enumerate(recordings):
+            log.info("Fold %d is tested on %s, of which it learns nothing", number, ", ".join(names))
     return {
         "folds": folds,
+        "recordings_per_fold": recordings,
         "drivers": len(tested),
         "drivers_per_fold": [sum(k == number for k in tested.values()) for number in range(folds)],
         "test_pairs_behind_a_training_driver": behind_trained,

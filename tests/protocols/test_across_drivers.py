@@ -67,6 +67,39 @@ def test_a_platoon_stays_together_if_wanted() -> None:
     assert len(set(apart[:3])) > 1
 
 
+def in_recordings(*names: str, frames: int = 100) -> PairSet:
+    """A pair in each of these recordings, each of another driver, all of whom have the same number in their recording."""
+    pairs = straight_pairs([frames] * len(names))
+    return PairSet(
+        tuple(
+            replace(pair, recording=name, follower_id=str(names[:k].count(name)))
+            for k, (pair, name) in enumerate(zip(pairs, names, strict=True))
+        ),
+        "test",
+    )
+
+
+def test_recordings_stay_whole_if_wanted() -> None:
+    pairs = in_recordings("morning", "noon", "morning", "evening", "noon", "morning", "evening")
+    fold = AcrossDrivers(folds=3, together="recording").folds(pairs, seed=0).tolist()
+    of = {pair.recording: k for pair, k in zip(pairs, fold, strict=True)}
+    assert sorted(of.values()) == [0, 1, 2]
+    assert [of[pair.recording] for pair in pairs] == fold
+
+
+def test_short_pairs_of_a_tested_recording_teach_nobody_there_and_others_everybody() -> None:
+    long, short = in_recordings("a", "b", "a", "b"), in_recordings("a", "c", frames=50)
+    shorter = [replace(pair, pair_id=f"short {k}", follower_id=f"short {k}") for k, pair in enumerate(short)]
+    fold = (
+        AcrossDrivers(folds=2, together="recording", min_test_frames=100)
+        .folds(PairSet((*long, *shorter), "test"), seed=0)
+        .tolist()
+    )
+    assert fold[0] == fold[2] != fold[1] == fold[3]
+    assert fold[4] == -2 - fold[0]
+    assert fold[5] == -1
+
+
 def test_folds_follow_the_seed() -> None:
     pairs = chained(*((str(k), str(k + 1)) for k in range(20)))
     protocol = AcrossDrivers()
@@ -80,6 +113,8 @@ def test_too_few_drivers_are_told() -> None:
         AcrossDrivers().folds(chained(("1", "2"), ("2", "3"), ("3", "4"), ("9", "4")), seed=0)
     with pytest.raises(DataError, match="only 1 platoon here"):
         AcrossDrivers(folds=2, together="platoon").folds(chained(("1", "2"), ("2", "3")), seed=0)
+    with pytest.raises(DataError, match=r"only 2 recordings here; lower protocol.folds \(2 at least\) or use more recordings"):
+        AcrossDrivers(folds=5, together="recording").folds(in_recordings("a", "b", "a"), seed=0)
 
 
 def calibrator(memory: int = 1 << 28, samples: int = 256) -> Calibrator:
