@@ -25,6 +25,7 @@ from rich.table import Table
 from cfx import registry
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
+from cfx.calibration.settings import WindowSettings
 from cfx.config import JobConfig
 from cfx.datasets.base import Dataset
 from cfx.datasets.tidy import write_tidy
@@ -55,6 +56,9 @@ log = logging.getLogger(__name__)
 
 _TRACKED = ("config.yaml", "metrics.json", "pairs.csv", "style.csv", "data.json", "drives.parquet", "curves.parquet")
 """Files of a job's folder that MLflow keeps too, besides its figures and its policy."""
+
+_WINDOW_S = 0.5
+"""How long a window is in the paper and lasts with default settings at NGSIM's 0.1 s."""
 
 
 @dataclass(frozen=True)
@@ -164,6 +168,16 @@ def _pairs(dataset: Dataset, config: JobConfig) -> tuple[PairSet, StyleResult]:
     pairs = select_cluster(pairs, style, config.style.cluster)
     for drop in pairs.dropped:
         log.info("Left out: %d %s (%s)", drop.count, drop.unit, drop.reason)
+    length, lasts = config.windows.length, config.windows.length * pairs.dt
+    if length == WindowSettings().length and not 0.5 * _WINDOW_S < lasts < 2 * _WINDOW_S:
+        log.info(
+            "A window of %d steps lasts %.3g s in these recordings; settings are made for %g s: say data.time_step=%g, or change"
+            " windows.length and windows.stride",
+            length,
+            lasts,
+            _WINDOW_S,
+            _WINDOW_S / length,
+        )
     return pairs, style
 
 

@@ -152,7 +152,7 @@ class PairSet(Sequence[Pair]):
         if len(steps) != 1:
             raise DataError(
                 f"{self.source}: the pairs have different time steps ({', '.join(f'{step:g} s' for step in steps)});"
-                " a job needs one: split the file, or resample it"
+                " a job needs one: bring them to one with data.time_step, or split the file"
             )
         return steps[0]
 

@@ -175,6 +175,18 @@ def test_two_policies_calibrate_once(caplog: pytest.LogCaptureFixture) -> None:
     assert not [message for message in caplog.messages if "problems): done" in message and "0 problems" not in message]
 
 
+def test_other_time_steps_are_said_and_can_be_brought_to_the_usual_one(caplog: pytest.LogCaptureFixture) -> None:
+    fine = ["data.dt=0.04", "data.frames=500", "data.min_frames=200", "policy=fixed"]
+    with caplog.at_level("INFO"):
+        run(*fine)
+        assert any("5 steps lasts 0.2 s" in message and "data.time_step=0.1" in message for message in caplog.messages)
+        caplog.clear()
+        result = run(*fine, "data.time_step=0.1")
+    assert not any("data.time_step" in message for message in caplog.messages)
+    times = pd.read_parquet(result.folder / "drives.parquet").groupby("pair_id")["time_s"]
+    assert times.diff().dropna().round(6).unique().tolist() == [0.1]
+
+
 def test_a_style_cluster_is_selected() -> None:
     result = run("style.cluster=normal", "data.pairs=8")
     assert set(result.pairs.cluster) == {"normal"}

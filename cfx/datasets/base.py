@@ -15,6 +15,7 @@ from pydantic_core import PydanticCustomError
 
 from cfx import registry
 from cfx.component import Component, Settings
+from cfx.datasets.resample import resampled
 from cfx.errors import DataError, PluginError, nearest
 from cfx.pairs import SIGNALS, Dropped, Pair, PairSet
 
@@ -44,6 +45,9 @@ class DatasetSettings(Settings):
     """What every dataset lets its user select."""
 
     min_frames: int = Field(700, ge=2, description="shortest pair that is kept, frames; the paper keeps 700")
+    time_step: float | None = Field(
+        None, gt=0, description="s: bring all pairs to this step, in which windows and policies count too; null: as recorded"
+    )
     recording: str | None = Field(None, description="keep this recording alone; null: all")
     lanes: list[int] | None = Field(None, description="keep pairs in these lanes alone; null: all")
     pair_ids: list[str] | None = Field(None, description="keep these pairs alone, by their ids; null: all")
@@ -103,6 +107,8 @@ class Dataset(Component):
     def load(self) -> PairSet:
         """Returns the pairs that the settings select: by recording, lane, id and length, then the first `max_pairs` of them.
 
+        Lengths count in steps of `time_step`.
+
         Raises:
             DataError: as `read`; or the recording or a pair id is unknown, the source has no lanes, or too few pairs remain.
             PluginError: `read` gives anything but pairs of finite numbers.
@@ -117,6 +123,8 @@ class Dataset(Component):
             pairs = _select_lanes(pairs, self.settings.lanes)
         if self.settings.pair_ids is not None:
             pairs = _select_ids(pairs, self.settings.pair_ids)
+        if self.settings.time_step is not None:
+            pairs = resampled(pairs, self.settings.time_step)
         return _select_first(_select_long(pairs, self.settings.min_frames), self.settings)
 
     def _check(self, pairs: Any) -> None:
