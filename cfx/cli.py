@@ -43,8 +43,8 @@ def _plugins(arguments: Sequence[str]) -> int:
 def _data(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser("cfx data", description="Looks at recordings.")
     actions = parser.add_subparsers(dest="action", required=True)
-    describe = actions.add_parser("describe", help="what a recording holds")
-    describe.add_argument("file")
+    describe = actions.add_parser("describe", help="what recordings hold")
+    describe.add_argument("files", nargs="+", metavar="FILE")
     fetch = actions.add_parser("fetch", help="download a public recording; nothing else in cfx uses the network unasked")
     fetch.add_argument("recording", choices=["ngsim-i80"], metavar="ngsim-i80")
     fetch.add_argument("--recording", dest="part", default="0400", help="0400 (default), 0500, 0515 (pm, 15 minutes each) or all")
@@ -58,7 +58,8 @@ def _data(arguments: Sequence[str]) -> int:
 
     from cfx.datasets.describe import describe as describe_file
 
-    print(describe_file(Path(options.file)))
+    for number, file in enumerate(options.files):
+        print(f"{chr(10) if number else ''}{describe_file(Path(file))}")
     return 0
 
 

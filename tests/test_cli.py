@@ -14,8 +14,10 @@ from hydra.core.hydra_config import HydraConfig
 
 import cfx
 from cfx import application, cli, ui
+from cfx.datasets.tidy import write_tidy
 from cfx.errors import CfxError, ConfigError, DataError
 from cfx.tracking.store import open_store
+from tests.drives import straight_pairs
 
 JOB = """
     import logging, os, signal, sys, time
@@ -317,6 +319,15 @@ def test_a_sub_commands_mistake_is_one_sentence_and_exit_code_2(arguments: list[
     printed = capsys.readouterr().err
     assert message in printed
     assert len(printed.splitlines()) == 1
+
+
+def test_data_describe_takes_several_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = [str(tmp_path / f"{name}.csv") for name in "ab"]
+    for file, frames in zip(files, (50, 60), strict=True):
+        write_tidy(straight_pairs([frames]), file)
+    assert cli.main(["data", "describe", *files]) == 0
+    said = capsys.readouterr().out
+    assert said.index("data.path=" + files[0]) < said.index("data.path=" + files[1])
 
 
 def test_data_describe_prints_what_a_recording_holds(shared_data: Path, capsys) -> None:
