@@ -33,6 +33,7 @@ class _Contents(NamedTuple):
     pairs: PairSet
     rows: int
     vehicles: int
+    problem: str = ""
 
 
 def describe(path: Path) -> str:
@@ -52,7 +53,7 @@ def describe(path: Path) -> str:
         "",
         *_left_out(contents.pairs),
         "",
-        *_problems(contents.pairs),
+        *_problems(contents),
         "",
         f"Use it: data={contents.layout} data.path={path}",
     ]
@@ -69,7 +70,7 @@ def _read(path: Path) -> _Contents:
         vehicles = {(p.recording, vehicle) for p in pairs for vehicle in (p.leader_id, p.follower_id)}
         return _Contents("tidy", pairs, sum(map(len, pairs)), len(vehicles))
     rows = read_ngsim(path)
-    return _Contents("ngsim", rows.pairs(), rows.rows_read, rows.vehicles)
+    return _Contents("ngsim", rows.pairs(), rows.rows_read, rows.vehicles, rows.bent())
 
 
 def _looks_tidy(header: Sequence[str] | None) -> bool:
@@ -136,9 +137,9 @@ def _left_out(pairs: PairSet) -> list[str]:
     return ["Left out:", *(f"  {drop.count:,} {drop.unit}: {drop.reason}" for drop in pairs.dropped)]
 
 
-def _problems(pairs: PairSet) -> list[str]:
+def _problems(contents: _Contents) -> list[str]:
     """Returns what a recording may hold but rarely should."""
-    found = list(_suspicions(pairs))
+    found = [*_suspicions(contents.pairs), *([contents.problem] if contents.problem else [])]
     return ["Problems:", *(f"  {sentence}" for sentence in found)] if found else ["Problems: none found"]
 
 
@@ -147,7 +148,7 @@ def _suspicions(pairs: PairSet) -> Iterator[str]:
         yield "there is no leader-follower pair in it"
         return
     if len({round(pair.dt, 9) for pair in pairs}) > 1:
-        yield "the pairs have different time steps; a job needs one: split the file"
+        yield "the pairs have different time steps; a job needs one: set data.time_step, or split the file"
     lengths = float(np.median([pair.leader_length for pair in pairs]))
     if lengths > 11:
         yield f"leaders are typically {lengths:.1f} m long: feet, or lorries only?"

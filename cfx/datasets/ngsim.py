@@ -6,6 +6,7 @@ and Supporting Data*, data.transportation.gov, dataset 8ect-6jqj. In the public 
 
 from __future__ import annotations
 
+import logging
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -23,6 +24,8 @@ from cfx.datasets.base import Dataset, FileDatasetSettings, joined, listed
 from cfx.datasets.files import PARQUET, Floats, Ints, Labels, TextTable, bad_cells, magic, read_columns, sniff
 from cfx.errors import DataError, nearest
 from cfx.pairs import Dropped, Pair, PairSet
+
+log = logging.getLogger(__name__)
 
 FOOT = 0.3048
 """Metres; exact by definition."""
@@ -68,6 +71,12 @@ _NEW_RECORDING_MS = 60_000.0
 
 _FRAME_MS = 1000 * DT
 
+_EDGE_S = 3.0
+"""How far from both ends of a vehicle's rows the published speeds of I-80 are bent."""
+
+_BENT_MPS2 = 0.5
+"""Mean acceleration over all vehicles, beyond that of their rows between, from which the ends count as bent."""
+
 _DRIVING_MPS = 1.0  # below it, noise of position hides how far a vehicle moves in a frame
 
 
@@ -76,6 +85,9 @@ class NgsimSettings(FileDatasetSettings):
 
     location: str | None = Field(
         None, description="keep this location of a multi-location export alone (i-80, us-101); null: all"
+    )
+    trim: float = Field(
+        0.0, ge=0, description="s: leave so much out at both ends of each vehicle's rows, where smoothing has bent its speeds"
     )
 
 
@@ -96,6 +108,11 @@ class NgsimDataset(Dataset):
     **Several files** hold several recordings, as NGSIM's own downloads do. Where two of them call theirs alike, as all three
     of I-80 are `i-80`, the file's name is put before the recording's.
 
+    **Bent ends.** In NGSIM's I-80 as published, vehicles seem to speed up by some 1 m/s2 during the first three seconds of their
+    rows, and to slow down as much during the last three: all of them, wherever they are, as smoothing over too few rows does. A
+    driver who follows such a leader seems to foresee it, and a policy learns that. Where a file is like that, the log says so;
+    `trim=3` leaves these rows out, and counts them.
+
     **Duplicates.** Rows that agree in every column read here are counted and dropped, as real exports hold some; rows that
     contradict each other are an error.
 
@@ -106,8 +123,11 @@ class NgsimDataset(Dataset):
     settings: NgsimSettings
 
     def read(self) -> PairSet:
-        files = self.settings.files()
-        return joined([rows.pairs() for rows in _apart([read_ngsim(path, self.settings.location) for path in files])])
+        parts = _apart([read_ngsim(path, self.settings.location) for path in self.settings.files()])
+        for rows in parts if not self.settings.trim else ():
+            if bent := rows.bent():
+                log.info("%s: %s", rows.source, bent)
+        return joined([rows.trimmed(self.settings.trim).pairs() for rows in parts])
 
 
 @dataclass(frozen=True)
@@ -149,6 +169,36 @@ class Rows:
     def take(self, index: NDArray[Any]) -> Rows:
         cut = {f.name: getattr(self, f.name)[index] for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)}
         return replace(self, **cut)
+
+    def trimmed(self, seconds: float) -> Rows:
+        """Leaves out the rows within so many seconds of their vehicle's first or last one."""
+        begun, left = self._since_and_until()
+        near = np.minimum(begun, left) < round(seconds / DT)
+        if not near.any():
+            return self
+        lost = Dropped(f"within {seconds:g} s of their vehicle's first or last row", int(near.sum()), "rows")
+        return replace(self.take(np.flatnonzero(~near)), dropped=(*self.dropped, lost))
+
+    def bent(self) -> str:
+        """Says that speeds are bent at the ends of vehicles' rows, "" where they are not: see `NgsimDataset`."""
+        begun, left = self._since_and_until()
+        reach = round(_EDGE_S / DT)
+        ends = (begun < reach, left < reach, (begun >= reach) & (left >= reach))
+        if not all(end.any() for end in ends):
+            return ""
+        first, last, between = (float(self.acceleration[end].mean()) for end in ends)
+        if max(abs(first - between), abs(last - between)) < _BENT_MPS2:
+            return ""
+        return (
+            f"in the first and last {_EDGE_S:g} s of their rows vehicles accelerate by {first:+.1f} and {last:+.1f} m/s2 on"
+            f" average ({between:+.1f} between): smoothing has bent the ends; leave them out with data.trim={_EDGE_S:g}"
+        )
+
+    def _since_and_until(self) -> tuple[Ints, Ints]:
+        """Returns frames since the first and until the last row of each row's vehicle, `(N,)`."""
+        starts = np.flatnonzero(_changes(self.recording, self.vehicle))
+        sizes = np.diff(np.append(starts, len(self)))
+        return self.frame - np.repeat(self.frame[starts], sizes), np.repeat(self.frame[starts + sizes - 1], sizes) - self.frame
 
     def pairs(self) -> PairSet:
         """Cuts the rows into pairs: see `NgsimDataset`."""

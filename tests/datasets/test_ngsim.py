@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cfx.datasets.describe import describe
 from cfx.datasets.ngsim import FOOT, NgsimDataset, read_ngsim
 from cfx.datasets.tidy import TidyDataset
 from cfx.errors import DataError
@@ -243,6 +244,32 @@ def test_everything_left_out_is_counted_with_its_reason(tmp_path: Path) -> None:
     ]
 
 
+def test_both_ends_of_every_vehicle_are_left_out_if_wanted(tmp_path: Path) -> None:
+    rows = pd.concat([traffic(), vehicle(4, 3, 0.0, range(10, 25))], ignore_index=True)  # the last one is too short to be left
+    path = save(rows, tmp_path / "f.csv")
+    whole, pairs = (NgsimDataset(path=path, min_frames=2, trim=trim).load() for trim in (0.0, 1.0))
+    assert [(pair.pair_id, pair.first_frame, len(pair)) for pair in pairs] == [("f-2-1", 20, 30), ("f-3-2", 20, 30)]
+    np.testing.assert_array_equal(pairs[0].follower_position, whole[0].follower_position[10:40])
+    assert counts(pairs)["within 1 s of their vehicle's first or last row"] == 3 * 20 + 15
+    assert sum(map(len, pairs)) + sum(d.count for d in pairs.dropped if d.unit == "rows") == len(rows)
+
+
+def test_bent_ends_are_said_until_they_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    rows = pd.concat([vehicle(1, 0, 200.0, range(10, 200)), vehicle(2, 1, 120.0, range(10, 200))], ignore_index=True)
+    straight = save(rows, tmp_path / "straight.csv")
+    rows.loc[rows.Frame_ID < 40, "v_Acc"] = 4.5
+    bent = save(rows, tmp_path / "bent.csv")
+    with caplog.at_level("INFO"):
+        NgsimDataset(path=straight, min_frames=2).load()
+        NgsimDataset(path=bent, min_frames=2, trim=3).load()
+        assert not caplog.messages
+        NgsimDataset(path=bent, min_frames=2).load()
+    assert len(caplog.messages) == 1
+    assert "accelerate by +1.4 and +0.2 m/s2 on average (+0.2 between)" in caplog.messages[0]
+    assert "data.trim=3" in describe(bent)
+    assert "data.trim" not in describe(straight)
+
+
 # --- real recordings -------------------------------------------------------------------------------------------------
 
 
@@ -257,6 +284,12 @@ def test_raw_sample_has_142_pairs(raw: PairSet) -> None:
     assert counts(raw)["no vehicle ahead"] == 42_566
     assert counts(raw)["the leader is behind its follower (gap of 0 or less)"] == 24
     assert {pair.recording for pair in raw} == {"i80_0400_raw_sample"}
+
+
+def test_raw_speeds_are_bent_for_three_seconds(shared_data: Path) -> None:
+    rows = read_ngsim(shared_data / "i80_0400_raw_sample.csv.gz")
+    assert "by +0.8 and -1.1 m/s2" in rows.bent()
+    assert rows.trimmed(3.0).bent() == ""
 
 
 def test_raw_pairs_agree_with_their_reconstruction(raw: PairSet, shared_data: Path) -> None:
