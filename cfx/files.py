@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Paths that users write, and files that appear whole or not at all."""
 
 from __future__ import annotations
 
@@ -6,6 +6,27 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator
+from pydantic_core import PydanticCustomError
+
+
+def absolute(value: Any) -> Path:
+    """Returns an absolute path, so that a later change of the working directory changes nothing; `~` is the user's home.
+
+    Raises:
+        PydanticCustomError: it is no path.
+    """
+    if value is None or str(value).strip() in {"", "???"}:  # "???" is how a config file says that a value is missing
+        raise PydanticCustomError("missing", "a value is required")
+    if not isinstance(value, str | Path):
+        raise PydanticCustomError("path", "write a path")
+    return Path(value).expanduser().absolute()
+
+
+FilePath = Annotated[Path, BeforeValidator(absolute)]
+"""A path that a user writes."""
 
 
 @contextmanager

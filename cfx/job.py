@@ -101,6 +101,7 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
     device = _device(config.device)
     if config.threads is not None:
         torch.set_num_threads(config.threads)
+    config = _settled(config)
     parts = _Parts.of(config)
     _writable(folder)
     _write(folder / "config.yaml", yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
@@ -149,6 +150,16 @@ class _Parts:
             learner=learner,
             protocol=cast(Protocol, registry.create("protocol", config.protocol)),
         )
+
+
+def _settled(config: JobConfig) -> JobConfig:
+    """Returns the configuration with what the protocol determines of it."""
+    determined = cast(Protocol, registry.create("protocol", config.protocol)).determines()
+    if not determined:
+        return config
+    named = ", ".join(f"{key}={value['name']}" if "name" in value else key for key, value in determined.items())
+    log.info("The protocol determines %s", named)
+    return JobConfig.of({**config.model_dump(), **determined})
 
 
 def _device(name: str) -> torch.device:

@@ -17,24 +17,17 @@ from cfx import registry
 from cfx.component import Component, Settings
 from cfx.datasets.resample import resampled
 from cfx.errors import DataError, PluginError, nearest
+from cfx.files import absolute
 from cfx.pairs import SIGNALS, Dropped, Pair, PairSet
 
 
-def _file(value: Any) -> Path:
-    """Returns an absolute path, so that a later change of the working directory changes nothing."""
-    if value is None or str(value).strip() in {"", "???"}:  # "???" is how a config file says that a value is missing
-        raise PydanticCustomError("missing", "a value is required")
-    if not isinstance(value, str | Path):
-        raise PydanticCustomError("path", "write a file, a list of files, or a pattern such as 'i-80/*.txt'")
-    return Path(value).expanduser().absolute()
-
-
 def _files(value: Any) -> Path | tuple[Path, ...]:
-    if not isinstance(value, list | tuple):
-        return _file(value)
-    if not value:
+    several = isinstance(value, list | tuple)
+    if several and not value:
         raise PydanticCustomError("path", "the list is empty; write at least one file")
-    return tuple(_file(one) for one in value)
+    if not all(isinstance(one, str | Path | None) for one in (value if several else [value])):
+        raise PydanticCustomError("path", "write a file, a list of files, or a pattern such as 'i-80/*.txt'")
+    return tuple(absolute(one) for one in value) if several else absolute(value)
 
 
 FilePaths = Annotated[Path | tuple[Path, ...], BeforeValidator(_files)]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -93,6 +93,11 @@ class TrainedPolicy:
             in SI units; None if answers are the parameters themselves.
         shrinkage: how far a driver's own parameters are drawn towards the model's default before offsets start from them, as they
             were in training.
+        own: whether offsets start from a driver's own parameters where these are known, or from `base` for everybody.
+        history: seconds of a driver's measured history that it read before its test; None: all there was.
+        population: constant parameters calibrated on those whom each network learned from, `(N, n)` in SI units; None if there
+            are none.
+        learned_from: the pairs that the networks learned from: `Pair.content` and the driver's name.
     """
 
     policy: Policy
@@ -106,6 +111,10 @@ class TrainedPolicy:
     names: tuple[str, ...]
     base: Tensor | None = None
     shrinkage: float = 0.0
+    own: bool = True
+    history: float | None = None
+    population: Tensor | None = None
+    learned_from: Mapping[str, str] = field(default_factory=dict)
 
     def base_of(self, own: Tensor) -> Tensor:
         """Returns what offsets start from for drivers whose own parameters are these; both `(D, n)` in SI units."""
@@ -218,12 +227,49 @@ class TrainedPolicy:
             )
         return torch.tensor([number.get(pair.pair_id, number.get(ALL, 0)) for pair in pairs])
 
+    def for_strangers(self) -> TrainedPolicy:
+        """Returns the one network that drives anybody: the only one there is, or the one named `all`.
+
+        Raises:
+            DataError: each network is for a pair of its own.
+        """
+        if len(self.names) == 1:
+            return self
+        if ALL not in self.names:
+            raise DataError(
+                f"the policy has {len(self.names)} networks, one for each of its own pairs, and none for others; train one with"
+                " protocol.networks=all or protocol=across_drivers"
+            )
+        at = torch.tensor([self.names.index(ALL)], device=self.scaler.mean.device)
+        size = self.network.size if isinstance(self.network, Committee) else 1
+        members = (at[:, None] * size + torch.arange(size, device=at.device)).flatten()
+        weights = {name: value[members] for name, value in self.network.state_dict().items()}
+        return replace(
+            self,
+            network=_network(self.policy, weights, size, self.scaler.mean[at], self.space).to(at.device),
+            scaler=Scaler(self.scaler.mean[at], self.scaler.scale[at]),
+            names=(ALL,),
+            base=self.base[at] if self.base is not None else None,
+            population=self.population[at] if self.population is not None else None,
+        )
+
+    def to(self, device: torch.device) -> TrainedPolicy:
+        """Moves everything to a device."""
+        return replace(
+            self,
+            network=self.network.to(device),
+            scaler=self.scaler.to(device),
+            base=self.base.to(device) if self.base is not None else None,
+            population=self.population.to(device) if self.population is not None else None,
+        )
+
     def save(self, folder: Path) -> None:
         """Writes `policy.pt` and `policy.json`; each appears whole."""
         weights = {f"network.{key}": value.cpu() for key, value in self.network.state_dict().items()}
         weights |= {f"scaler.{key}": value.cpu() for key, value in self.scaler.state_dict().items()}
-        if self.base is not None:
-            weights["base"] = self.base.cpu()
+        weights |= {
+            name: value.cpu() for name, value in {"base": self.base, "population": self.population}.items() if value is not None
+        }
         folder.mkdir(parents=True, exist_ok=True)
         with whole(folder / "policy.pt") as temporary:
             torch.save(weights, temporary)
@@ -237,6 +283,9 @@ class TrainedPolicy:
             "names": list(self.names),
             "members": self.network.size if isinstance(self.network, Committee) else 1,
             "shrinkage": self.shrinkage,
+            "own": self.own,
+            "history": self.history,
+            "learned_from": dict(self.learned_from),
         }
         with whole(folder / "policy.json") as temporary:
             temporary.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
@@ -264,22 +313,18 @@ class TrainedPolicy:
         assert isinstance(policy, Policy)
         assert isinstance(model, DrivingModel)
         windows = WindowSettings(**description["windows"])
-        networks, features = weights["scaler.mean"].shape
+        mean = weights["scaler.mean"]
+        features = mean.shape[1]
         base = weights.get("base")
         space = model.space if base is None else model.reach
         width = token_width(policy.inputs, policy.summary, windows.length) + (len(space) if base is not None else 0)
         if features != width:
             raise DataError(f"{folder}: the weights read {features} features, the policy's settings give {width}")
-        members = description.get("members", 1)
-        blank = torch.zeros((networks * members, len(space)), dtype=weights["scaler.mean"].dtype)
-        network = policy.build(features, blank[0], blank, torch.Generator().manual_seed(0)).to(blank.dtype)
-        network = Committee(network, members) if members > 1 else network
-        network.load_state_dict({k.removeprefix("network."): v for k, v in weights.items() if k.startswith("network.")})
-        scaler = Scaler(weights["scaler.mean"], weights["scaler.scale"])
+        trained = {k.removeprefix("network."): v for k, v in weights.items() if k.startswith("network.")}
         return cls(
             policy=policy,
-            network=network.eval(),
-            scaler=scaler,
+            network=_network(policy, trained, description.get("members", 1), mean, space),
+            scaler=Scaler(mean, weights["scaler.scale"]),
             model_node=description["model"],
             policy_node=description["policy"],
             space=space,
@@ -288,7 +333,21 @@ class TrainedPolicy:
             names=tuple(description["names"]),
             base=base,
             shrinkage=description.get("shrinkage", 0.0),
+            own=description.get("own", True),
+            history=description.get("history"),
+            population=weights.get("population"),
+            learned_from=description.get("learned_from", {}),
         )
+
+
+def _network(policy: Policy, weights: Mapping[str, Tensor], size: int, mean: Tensor, space: ParameterSpace) -> PolicyNetwork:
+    """Returns networks with these weights, committees of `size` each; `mean` `(N, f)` says how many, and what they read."""
+    networks, features = mean.shape
+    blank = torch.zeros((networks * size, len(space)), dtype=mean.dtype)
+    network = policy.build(features, blank[0], blank, torch.Generator().manual_seed(0)).to(blank.dtype)
+    network = Committee(network, size) if size > 1 else network
+    network.load_state_dict(dict(weights))
+    return network.eval()
 
 
 def measured_history(batch: PairBatch, pair: Tensor, frame: Tensor, length: int) -> History:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-import pandas as pd
 import torch
 from pydantic import Field
 from scipy.sparse import coo_array
@@ -20,17 +19,12 @@ from cfx.calibration.calibrator import Labels
 from cfx.calibration.windows import Split
 from cfx.component import Settings
 from cfx.errors import DataError
-from cfx.evaluation.closed_loop import ClosedLoop, drive
-from cfx.evaluation.metrics import closed_loop_errors, evaluate
-from cfx.evaluation.platoon import measure_platoons
-from cfx.evaluation.result import Evaluation
 from cfx.learners.base import Learned, Lesson
-from cfx.pairs import Pair, PairBatch, PairSet
-from cfx.policies.default import DefaultPolicy
-from cfx.policies.fixed import FixedPolicy
+from cfx.pairs import Pair, PairSet
 from cfx.policies.offsets import drawn
 from cfx.policies.trained import ALL, TrainedPolicy
 from cfx.protocols.base import Outcome, Protocol, Study
+from cfx.protocols.held_out import HeldOut
 
 log = logging.getLogger(__name__)
 
@@ -106,13 +100,14 @@ class AcrossDrivers(Protocol):
         strange = default if self.settings.base == "default" else population
         own = drawn(study.simulator.model.reach, fixed, self.settings.shrinkage) if self.settings.base == "own" else None
         policy, learned = self._learn(study, whole, members, strange, own, labels, names)
+        policy = replace(policy, population=population)
 
         tested = (fold >= 0).nonzero()[:, 0]
-        test = _Test(
+        test = HeldOut(
             study=study,
             pairs=replace(pairs, pairs=tuple(pairs[int(number)] for number in tested)),
             batch=batch[tested.to(batch.lengths.device)],
-            fold=fold[tested],
+            network=fold[tested].to(batch.lengths.device),
             first=split.frame[tested].to(batch.lengths.device),
             fixed=fixed[tested.to(fixed.device)],
             base=own[tested.to(fixed.device)] if own is not None else None,
@@ -120,7 +115,8 @@ class AcrossDrivers(Protocol):
             population=population,
             policy=policy,
         )
-        return Outcome(test.evaluation(self.settings), policy, learned.curves, labels, notes)
+        evaluation = test.evaluation(self.settings.histories, fold=fold[tested])
+        return Outcome(evaluation, policy, learned.curves, labels, notes)
 
     def folds(self, pairs: PairSet, *, seed: int) -> Tensor:
         """Returns in which fold each pair is tested, `(P,)` int64; -1 for a pair that is only learned from.
@@ -193,7 +189,8 @@ class AcrossDrivers(Protocol):
         )
         learned = study.learner.fit(study.policy, lesson)
         policy = study.ready(study.policy, learned, names)
-        return replace(policy, shrinkage=0.0 if self.settings.base != "own" else self.settings.shrinkage), learned
+        own = self.settings.base == "own"
+        return replace(policy, shrinkage=self.settings.shrinkage if own else 0.0, own=own, history=self.settings.history), learned
 
 
 def _platoons(pairs: Sequence[Pair]) -> list[int]:
@@ -212,104 +209,6 @@ _GROUPS: Mapping[str, Callable[[PairSet], Sequence[Any]]] = {
     "recording": lambda pairs: [pair.recording for pair in pairs],
 }
 """What each pair's fold is chosen for: `protocol.together`."""
-
-
-@dataclass(frozen=True)
-class _Test:
-    """The Q tested pairs, and what drives them.
-
-    Attributes:
-        pairs, batch: the drives.
-        fold: in which fold each is tested, `(Q,)`.
-        first: the last measured frame before the test part, `(Q,)`.
-        fixed: each driver's own set, `(Q, n)`.
-        base: what offsets start from for him, if not from what they do for a stranger, `(Q, n)`.
-        strange: what offsets start from for a driver of whom nothing is known, `(Q, n)`.
-        population: of each network, `(K, n)`.
-        policy: what was learned.
-    """
-
-    study: Study
-    pairs: PairSet
-    batch: PairBatch
-    fold: Tensor
-    first: Tensor
-    fixed: Tensor
-    base: Tensor | None
-    strange: Tensor
-    population: Tensor
-    policy: TrainedPolicy
-
-    def evaluation(self, settings: AcrossDriversSettings) -> Evaluation:
-        """Drives all methods and compares them."""
-        study, batch, first = self.study, self.batch, self.first
-        network = self.fold.to(first.device)
-        strangers = {
-            "default": study.constant(DefaultPolicy(), self.population),
-            "population": study.constant(FixedPolicy(), self.population),
-            "policy": self.policy,
-        }
-        base = self.strange if self.base is None else self.base
-        loops = {
-            name: drive(study.simulator, one, batch, first, network, base=base, history=settings.history)
-            for name, one in strangers.items()
-        }
-        each = torch.arange(len(first), device=first.device)
-        loops["fixed"] = drive(study.simulator, study.constant(FixedPolicy(), self.fixed), batch, first, each)
-        if self.base is not None and self.policy.base is not None and self.policy.shrinkage > 0:
-            loops["base"] = drive(study.simulator, study.constant(FixedPolicy(), self.base), batch, first, each)
-        whole = {name: drive(study.simulator, one, batch, torch.zeros_like(first), network) for name, one in strangers.items()}
-        default = study.constant(DefaultPolicy(), self.population[:1])
-        platoons = {
-            "default": (default, ("any",)),
-            "population": (strangers["population"], self.policy.names),
-            "policy": (self.policy, self.policy.names),
-        }
-        return evaluate(
-            self.pairs,
-            batch,
-            first,
-            loops,
-            study.space,
-            study.style,
-            reach=self.policy.space,
-            seed=study.seed,
-            fold=self.fold,
-            whole=whole,
-            platoon=measure_platoons(study.simulator.model, platoons),
-            history=self.history(settings, loops["fixed"]) if self.policy.base is not None and settings.histories else None,
-        )
-
-    def history(self, settings: AcrossDriversSettings, fixed: ClosedLoop) -> pd.DataFrame:
-        """Drives the test part after reading different amounts of history; see `Evaluation.history`.
-
-        Args:
-            fixed: what the drivers' own sets drove there.
-        """
-        study, batch, first, network = self.study, self.batch, self.first, self.fold.to(self.first.device)
-        own, _ = closed_loop_errors(batch, first, fixed)
-        bases = {"own": self.base} if self.base is not None else {}
-        rows = []
-        for base, values in {**bases, "population": self.strange}.items():
-            for amount in (*sorted(settings.histories), None):
-                loop = drive(study.simulator, self.policy, batch, first, network, base=values, history=amount)
-                speed, gap = closed_loop_errors(batch, first, loop)
-                read = first.cpu().numpy() * study.simulator.dt
-                rows.append(
-                    pd.DataFrame(
-                        {
-                            "pair_id": [pair.pair_id for pair in self.pairs],
-                            "driver": [pair.driver for pair in self.pairs],
-                            "base": base,
-                            "history_s": read if amount is None else np.minimum(read, amount),
-                            "amount": f"{study.split:.0%}".replace("%", " %") if amount is None else f"{amount:g} s",
-                            "rmse_speed": speed,
-                            "rmse_gap": gap,
-                            "improvement": np.divide(own - speed, own, out=np.full_like(own, np.nan), where=own > 0),
-                        }
-                    )
-                )
-        return pd.concat(rows, ignore_index=True)
 
 
 def _overlap(pairs: PairSet, fold: Tensor, *, apart: bool) -> dict[str, Any]:

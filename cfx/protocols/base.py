@@ -7,7 +7,7 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pandas as pd
 import torch
@@ -125,6 +125,7 @@ class Study:
             dt=self.simulator.dt,
             names=names,
             base=learned.base,
+            learned_from={pair.content: pair.driver for pair in self.pairs} if policy.trainable else {},
         )
 
 
@@ -167,10 +168,23 @@ def _check_learned(who: str, learned: object, networks: int, parameters: int) ->
 class Protocol(Component):
     """Base of every protocol.
 
-    Life cycle: a job calls `run` once. All methods are tested on the same frames from the same measured state.
+    Life cycle: a job calls `determines` and then `run`, once each. All methods are tested on the same frames from the same
+    measured state.
+
+    Attributes:
+        trains: whether it has a `trainable` policy trained; not if it brings one.
     """
 
     kind = "protocol"
+    trains: ClassVar[bool] = True
+
+    def determines(self) -> Mapping[str, Any]:
+        """Returns what this protocol determines of a job's configuration, whatever is chosen there: key -> value.
+
+        Raises:
+            DataError: it depends on something that cannot be read.
+        """
+        return {}
 
     @abstractmethod
     def run(self, study: Study) -> Outcome:

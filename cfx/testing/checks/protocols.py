@@ -32,7 +32,7 @@ from cfx.protocols.base import Outcome, Protocol, Study
 from cfx.simulation.rollout import Simulator
 from cfx.style.entropy import measure_style
 from cfx.style.settings import StyleSettings
-from cfx.testing.contract import contract_of
+from cfx.testing.contract import NotApplicable, contract_of
 
 PAIRS, FRAMES = 6, 111
 
@@ -149,6 +149,8 @@ def the_same_seed_gives_the_same_outcome(protocol: Protocol) -> None:
 
 
 def learners_get_only_what_they_may_use(protocol: Protocol) -> None:
+    if not protocol.trains:
+        raise NotApplicable("this protocol trains nothing")
     watched = _Watched(ImitationLearner(epochs=1))
     protocol.run(study(recording(), learner=watched))
     assert watched.lessons, "a trainable policy must be trained by the study's learner"

@@ -1,0 +1,123 @@
+"""A policy that was trained elsewhere: does it hold on these recordings, from which nothing of it was learned?"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any, ClassVar
+
+import pandas as pd
+import torch
+from pydantic import Field
+
+from cfx.calibration.windows import Split
+from cfx.component import Settings
+from cfx.errors import DataError
+from cfx.files import FilePath
+from cfx.learners.base import CURVE_COLUMNS
+from cfx.pairs import PairSet
+from cfx.policies.trained import TrainedPolicy
+from cfx.protocols.base import Outcome, Protocol, Study
+from cfx.protocols.held_out import HeldOut
+
+log = logging.getLogger(__name__)
+
+
+class TransferSettings(Settings):
+    """Settings of `transfer`."""
+
+    run: FilePath = Field(description="output folder of the job whose policy drives; ~ and relative paths work")
+
+
+class Transfer(Protocol):
+    """A finished job's policy drives recordings that it has never seen; nothing is trained.
+
+    Model, policy and windows are that job's, whatever else is chosen. Its network for strangers (`all`, or the only one) drives
+    as its protocol let it: from each driver's own parameters or from the population's, after as much history. The baselines are
+    the model's default parameters, `population`, the constant ones that were calibrated on those whom the policy learned from
+    (where there are any), and the driver's own fixed parameters, from the first 80 % of his drive here. All drive the last
+    20 %; default, population and policy also drive each pair whole.
+
+    So all that `default`, `population` and `policy` know comes from elsewhere: what remains of their gains is what transfers to
+    another day, road or country. (To calibrate and train on some recordings and test on others of the same data, see
+    `across_drivers` with `together=recording`.)
+
+    Differences from the paper: it has no such experiment.
+    """
+
+    schema: ClassVar[type[Settings]] = TransferSettings
+    settings: TransferSettings
+    trains = False
+
+    @cached_property
+    def policy(self) -> TrainedPolicy:
+        """The policy that is tested, on the CPU.
+
+        Raises:
+            DataError: the folder holds none, or none for other drivers than those it was trained for.
+        """
+        try:
+            return TrainedPolicy.load(self.settings.run / "policy").for_strangers()
+        except DataError as error:
+            raise DataError(f"protocol.run={self.settings.run}: {error}") from None
+
+    def determines(self) -> Mapping[str, Any]:
+        policy = self.policy
+        return {"model": dict(policy.model_node), "policy": dict(policy.policy_node), "windows": policy.windows.model_dump()}
+
+    def run(self, study: Study) -> Outcome:
+        policy, pairs, batch = self.policy, study.pairs, study.batch
+        self._check(policy, pairs)
+        device = batch.lengths.device
+        policy = policy.to(device)
+        split = Split.of(pairs, study.windows, study.split)
+        fixed = study.calibrator.fixed(pairs, batch, split.frame)
+        default = study.space.defaults(dtype=fixed.dtype, device=fixed.device)
+        start = default[None] if policy.base is None else policy.base.to(fixed.dtype)
+        test = HeldOut(
+            study=study,
+            pairs=pairs,
+            batch=batch,
+            network=torch.zeros(len(pairs), dtype=torch.int64, device=device),
+            first=split.frame.to(device),
+            fixed=fixed,
+            base=policy.base_of(fixed) if policy.base is not None and policy.own else None,
+            strange=start.expand(len(pairs), -1),
+            population=policy.population.to(fixed.dtype) if policy.population is not None else None,
+            policy=policy,
+        )
+        notes = {
+            "run": str(self.settings.run),
+            "pairs_learned_from": len(policy.learned_from),
+            "drivers_named_as_some_learned_from": _named_alike(policy, pairs),
+        }
+        return Outcome(test.evaluation(), policy, pd.DataFrame(columns=CURVE_COLUMNS), None, notes)
+
+    def _check(self, policy: TrainedPolicy, pairs: PairSet) -> None:
+        """Raises DataError if the policy cannot drive these pairs, or has learned from some of them."""
+        where = f"protocol.run={self.settings.run}"
+        if abs(pairs.dt - policy.dt) > 1e-6:
+            raise DataError(
+                f"{where}: this policy drives in steps of {policy.dt:g} s, {pairs.source} has {pairs.dt:g} s; set"
+                f" data.time_step={policy.dt:g}"
+            )
+        known = [pair.pair_id for pair in pairs if pair.content in policy.learned_from]
+        if known:
+            raise DataError(
+                f"{where}: this policy has learned from {len(known)} of the {len(pairs)} pairs in {pairs.source}, the first of"
+                f" them '{known[0]}'; test it on others (data.recording, data.pair_ids)"
+            )
+        if not policy.learned_from:
+            log.info("%s does not say which pairs its policy has learned from; see to it yourself that these are others", where)
+        if alike := _named_alike(policy, pairs):
+            log.warning(
+                "%d drivers are called, recording and all, as some that the policy has learned from; if they are the same, as"
+                " another cut of their recording is, leave them out (data.recording, data.pair_ids)",
+                alike,
+            )
+
+
+def _named_alike(policy: TrainedPolicy, pairs: PairSet) -> int:
+    """Counts drivers here who have the name of one whom the policy learned from."""
+    return len({pair.driver for pair in pairs} & set(policy.learned_from.values()))
