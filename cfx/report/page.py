@@ -282,7 +282,7 @@ def _facts(job: Job, jobs: Sequence[Job]) -> dict[str, str]:
         "Drivers by style": str(job.setting("style.cluster") or NOTHING),
         "Protocol": _protocol(job),
         "Driving model": job.component("model") or NOTHING,
-        "Policy": f"{job.component('policy')}, learned by {job.component('learner')}",
+        "Policy": f"{job.component('policy')}, {_taught(job)}",
         "Calibrated by": job.component("optimizer") or NOTHING,
         "Seed": str(job.config.get("seed", NOTHING)),
         "cfx": job.version or "version not recorded",
@@ -315,14 +315,23 @@ def _range(values: pd.Series[Any]) -> str:
     return str(low) if low == high else f"{low} to {high}"
 
 
+def _taught(job: Job) -> str:
+    """Says how the policy was learned."""
+    elsewhere = job.setting("protocol.run") if job.component("protocol") == "transfer" else None
+    return f"as it was learned in {elsewhere}" if elsewhere else f"learned by {job.component('learner')}"
+
+
 def _protocol(job: Job) -> str:
     name = job.component("protocol")
     train, test = (f"{100 * share:.3g} %" for share in (job.split, 1 - job.split))
+    apart = {"platoon": " of whole platoons", "recording": " of whole recordings"}.get(str(job.setting("protocol.together")), "")
+    parts = f"the driver's own fixed parameters come from the first {train} of his drive, the test part is the last {test}"
     said = {
         "within_driver": f"calibrated and learned on the first {train} of each pair, tested on the last {test}",
-        "across_drivers": f"trained on some drivers and tested on others, none of whom is, as follower, in both;"
-        f" {job.setting('protocol.folds')} folds; the driver's own fixed parameters come from the first {train} of his drive,"
-        f" the test part is the last {test}",
+        "across_drivers": "trained on some drivers and tested on others, none of whom is, as follower, in both;"
+        f" {job.setting('protocol.folds')} folds{apart}; {parts}",
+        "transfer": "nothing is trained: another job's policy drives, and the population's parameters are those of the drivers it"
+        f" learned from; {parts}",
     }
     return f"{name}: {said[name]}" if name in said else name
 

@@ -240,6 +240,17 @@ def test_a_job_of_an_older_version_has_a_page_that_says_what_is_missing(tmp_path
         assert f"this job has no {name}" in words
 
 
+def test_the_page_says_who_was_trained_on_whom(tmp_path: Path) -> None:
+    write_job(
+        tmp_path / "a", methods=ACROSS, settings={"protocol": {"name": "across_drivers", "folds": 2, "together": "recording"}}
+    )
+    assert "2 folds of whole recordings; the driver's own" in page_of(tmp_path / "a").words
+    write_job(tmp_path / "b", methods=ACROSS, settings={"protocol": {"name": "transfer", "run": "/runs/motorway"}})
+    words = page_of(tmp_path / "b").words
+    assert "gru, as it was learned in /runs/motorway" in words
+    assert "nothing is trained" in words
+
+
 def test_unfinished_jobs_are_named_in_the_page(tmp_path: Path) -> None:
     write_job(tmp_path / "0", pairs=3)
     (tmp_path / "1" / ".hydra").mkdir(parents=True)
