@@ -351,6 +351,8 @@ def report(result: JobResult, evaluation: Evaluation, console: Console, tracker:
         console.print(text, soft_wrap=True)
     else:
         _tell(evaluation.improvement, "fixed", console)
+        if "fixed" in evaluation.later_improvements:
+            _tell(evaluation.later_improvements["fixed"], "fixed beyond the first 5 s", console)
         if "base" in evaluation.improvements:
             _tell(evaluation.improvements["base"], "base (own, drawn towards the default)", console)
         if "population" in evaluation.improvements:

@@ -24,6 +24,9 @@ _TRIMMED = 0.1
 
 _RESAMPLES = 9_999
 
+START_S = 5.0
+"""How long the start of a test part is: constant parameters leave the measured state for their own within some such time."""
+
 
 def improvement_statistics(
     baseline: NDArray[np.float64], policy: NDArray[np.float64], drivers: Sequence[str] | None = None, *, seed: int
@@ -113,11 +116,13 @@ def closed_loop_errors(batch: PairBatch, first: Tensor, loop: ClosedLoop) -> tup
 class _Errors:
     """What each method did over the frames that its closed loops have, `(P,)` each; `counted` as in `ClosedLoop`.
 
-    `speed` and `gap` are RMSEs; `real_jerk` is the recorded drivers', m/s3.
+    `speed` and `gap` are RMSEs; `later` is that of speed beyond the start (`START_S`), NaN for a drive that is no longer;
+    `real_jerk` is the recorded drivers', m/s3.
     """
 
     speed: Mapping[str, Array]
     gap: Mapping[str, Array]
+    later: Mapping[str, Array]
     safety: Mapping[str, Safety]
     real_jerk: Array
     counted: Tensor
@@ -131,9 +136,11 @@ class _Errors:
         frames = first[:, None] + torch.arange(counted.shape[1], device=first.device)
         index = frames.clamp(max=batch.mask.shape[1] - 1)
         real_speed, real_gap = batch.follower_speed.gather(1, index), batch.gap.gather(1, index)
+        later = counted & (torch.arange(counted.shape[1], device=first.device) * batch.dt > START_S + 1e-6)
         return cls(
             {m: _rmse(loop.speed, real_speed, counted) for m, loop in loops.items()},
             {m: _rmse(loop.gap, real_gap, counted) for m, loop in loops.items()},
+            {m: _rmse(loop.speed, real_speed, later) for m, loop in loops.items()},
             {m: Safety.of(loop, reach if m == "policy" else space, batch.dt) for m, loop in loops.items()},
             rms_jerk(real_speed, counted, batch.dt),
             counted,
@@ -147,6 +154,7 @@ class _Errors:
             "frames": int(self.counted[i].sum()),
             "rmse_speed": float(after),
             "rmse_gap": float(self.gap[method][i]),
+            "later_rmse_speed": float(self.later[method][i]),
             "improvement": _gain(before, after),
         }
         for other in (name for name in self.speed if name not in {"fixed", "policy"}):
@@ -168,11 +176,14 @@ class _Errors:
         found = (self.speed[method], self.gap[method], safety.collided, safety.hard_braking)
         return {f"whole_{name}": float(values[i]) for name, values in zip(names, found, strict=True)}
 
-    def improvements(self, drivers: Sequence[str], seed: int) -> dict[str, Improvement]:
-        """Returns the policy's improvement over every other method."""
+    def improvements(self, drivers: Sequence[str], seed: int, *, later: bool = False) -> dict[str, Improvement]:
+        """Returns the policy's improvement over every other method; `later`: beyond the start, empty if no drive is longer."""
+        errors = self.later if later else self.speed
+        if later and not np.isfinite(errors["policy"]).any():
+            return {}
         return {
-            method: improvement_statistics(before, self.speed["policy"], drivers, seed=seed)
-            for method, before in self.speed.items()
+            method: improvement_statistics(before, errors["policy"], drivers, seed=seed)
+            for method, before in errors.items()
             if method != "policy"
         }
 
@@ -233,6 +244,7 @@ def evaluate(
     return Evaluation(
         table=pd.DataFrame(rows),
         improvements=errors.improvements(drivers, seed),
+        later_improvements=errors.improvements(drivers, seed, later=True),
         drives=_drives(pairs, batch, first, errors.index, loops),
         names=space.names,
         units=tuple(parameter.unit for parameter in space.tuned),

@@ -141,22 +141,26 @@ class Evaluation:
         `collisions/METHOD`: number of pairs. `hard_braking/METHOD`: number of frames with an acceleration below -8 m/s2.
         `jerk/METHOD`, `jerk/real`: m/s3, mean over pairs of the root mean square jerk; that of the recorded drivers.
         `at_bounds/METHOD`: share of the tuned parameters' values within 1 % of their range of a bound, mean over pairs.
+        `later/rmse_speed/METHOD`, `later/rmse_improvement/BASELINE/STATISTIC`: the same beyond the first five seconds of the test
+            part, where that is longer. At first a driver still comes from where he was measured.
         `whole/...`: the same over whole drives, where those were driven.
         `platoon/MEASURE/METHOD`: see `Platoon`.
         `history/BASE/AMOUNT/rmse_improvement`: see `history`; of "80 %" the name is `80pct`, of "10 s" `10s`.
 
     Attributes:
         table: a row per pair and method: pair_id, recording, leader_id, follower_id, driver, cluster, style_score, fold, method,
-            frames, rmse_speed (m/s), rmse_gap (m), improvement (against fixed, a fraction), `improvement_over_BASELINE` for the
-            other baselines, collisions (1 if the gap became negative), hard_braking (frames with an acceleration below -8 m/s2),
-            rms_jerk and real_rms_jerk (m/s3; of the simulated and of the recorded follower), at_bounds (share of the tuned
-            parameters' values at a bound), and one column `parameter_NAME` with the mean of each tuned parameter; where whole
-            drives were driven too, `whole_rmse_speed`, `whole_rmse_gap`, `whole_collisions` and `whole_hard_braking`.
+            frames, rmse_speed (m/s), rmse_gap (m), later_rmse_speed (beyond the first five seconds; NaN if there is no more),
+            improvement (against fixed, a fraction), `improvement_over_BASELINE` for the other baselines, collisions (1 if the gap
+            became negative), hard_braking (frames with an acceleration below -8 m/s2), rms_jerk and real_rms_jerk (m/s3; of the
+            simulated and of the recorded follower), at_bounds (share of the tuned parameters' values at a bound), and one column
+            `parameter_NAME` with the mean of each tuned parameter; where whole drives were driven too, `whole_rmse_speed`,
+            `whole_rmse_gap`, `whole_collisions` and `whole_hard_braking`.
         improvements: statistics of the policy's improvement over each baseline.
         drives: the closed loops themselves, in the order of the pairs.
         names: the tuned parameters' names.
         units: their units.
         bounds: `(2, n)`, those within which the policy chooses.
+        later_improvements: as `improvements`, beyond the first five seconds of the test part; empty if none is longer.
         whole_improvements: as `improvements`, over whole drives of drivers that nothing was fitted to; empty if there were none.
         platoon: ten drivers in a row behind a braking leader; None if no network is for any driver.
         history: what the policy gains from what it has read before it drives; None if that was not tried. A row per pair, base
@@ -171,6 +175,7 @@ class Evaluation:
     names: tuple[str, ...]
     units: tuple[str, ...]
     bounds: Array
+    later_improvements: Mapping[str, Improvement] = field(default_factory=dict)
     whole_improvements: Mapping[str, Improvement] = field(default_factory=dict)
     platoon: Platoon | None = None
     history: pd.DataFrame | None = None
@@ -196,9 +201,13 @@ class Evaluation:
         for baseline, improvement in self.improvements.items():
             prefix = "rmse_improvement" if baseline == "fixed" else f"rmse_improvement/{baseline}"
             values |= {f"{prefix}/{name}": value for name, value in improvement.metrics().items()}
+        if self.later_improvements:
+            means = by_method["later_rmse_speed"].mean()
+            values |= {f"later/rmse_speed/{method}": float(means[method]) for method in self.methods}
+        for part, improvements in (("later", self.later_improvements), ("whole", self.whole_improvements)):
+            for baseline, improvement in improvements.items():
+                values |= {f"{part}/rmse_improvement/{baseline}/{name}": v for name, v in improvement.metrics().items()}
         values |= self._safety_metrics()
-        for baseline, improvement in self.whole_improvements.items():
-            values |= {f"whole/rmse_improvement/{baseline}/{name}": value for name, value in improvement.metrics().items()}
         if self.whole_improvements:
             for column in ("rmse_speed", "rmse_gap"):
                 means = by_method[f"whole_{column}"].mean()

@@ -17,6 +17,7 @@ from cfx.figures.improvement import improvement_per_driver
 from cfx.figures.learning import learning_curve
 from cfx.figures.look import DPI, look
 from cfx.figures.platoon import platoons
+from cfx.figures.start import error_over_time
 from cfx.figures.style import style_distribution
 from cfx.files import whole
 from cfx.style.result import StyleResult
@@ -37,6 +38,7 @@ def write_figures(folder: Path, evaluation: Evaluation, style: StyleResult, curv
         "improvement_per_driver": lambda: improvement_per_driver(evaluation),
         "drives": lambda: drives(evaluation),
         "speeds": lambda: speeds(evaluation),
+        "error_over_time": lambda: error_over_time(evaluation),
         "chosen_parameters": lambda: chosen_parameters(evaluation),
         "style_distribution": lambda: style_distribution(style),
     }

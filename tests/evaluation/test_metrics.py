@@ -3,12 +3,19 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pandas as pd
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from cfx.evaluation.metrics import improvement_statistics
+from cfx.evaluation.closed_loop import ClosedLoop
+from cfx.evaluation.metrics import evaluate, improvement_statistics
+from cfx.models.krauss import Krauss
+from cfx.pairs import PairBatch
+from cfx.style.result import StyleResult
+from tests.drives import straight_pairs
 
 
 def test_the_papers_pair() -> None:
@@ -71,3 +78,32 @@ def test_nothing_is_invented(values: list[tuple[float, float]]) -> None:
     assert gain.min() - 1e-9 <= result.ci95_low <= result.ci95_high <= gain.max() + 1e-9
     assert 0 <= result.p_value <= 1
     assert result.win_rate == (gain > 0).mean()
+
+
+def test_what_comes_after_the_start_is_measured_on_its_own() -> None:
+    """Errors of 1 m/s in the first five seconds, and of 0.5 (fixed) and 0.2 m/s (policy) from there on; one pair ends before."""
+    pairs = straight_pairs([100, 45])
+    batch, first = PairBatch.of(pairs), torch.tensor([9, 4])
+    frames = torch.arange(91)
+    counted = (first[:, None] + frames < batch.lengths[:, None]) & (frames > 0)
+    parameters = Krauss().space.from_unit(torch.full((2, 91, 2), 0.5).double())
+
+    def loop(later: float) -> ClosedLoop:
+        speed = 10 + torch.where(frames <= 50, 1.0, later).double().expand(2, -1)
+        return ClosedLoop(speed, speed + 10, parameters, counted)
+
+    style = StyleResult(
+        pd.DataFrame({"driver": [p.driver for p in pairs], "score": [0.2, 0.8], "cluster": [0, 2]}), {}, (0.3, 0.7)
+    )
+    loops = {"fixed": loop(0.5), "policy": loop(0.2)}
+    found = evaluate(pairs, batch, first, loops, Krauss().space, style, seed=0)
+    table = found.table.set_index(["pair_id", "method"])["later_rmse_speed"]
+    assert table["p0"].to_dict() == pytest.approx({"fixed": 0.5, "policy": 0.2})
+    assert table["p1"].isna().all()
+    metrics = found.metrics()
+    assert metrics["later/rmse_speed/policy"] == pytest.approx(0.2)
+    assert metrics["later/rmse_improvement/fixed/mean"] == pytest.approx(0.6)
+    assert found.later_improvements["fixed"].undefined == 1
+    alone = {method: ClosedLoop(*(values[1:] for values in one)) for method, one in loops.items()}
+    short = evaluate(pairs.select([False, True], "long"), batch[1:], first[1:], alone, Krauss().space, style, seed=0)
+    assert not [name for name in short.metrics() if name.startswith("later")]

@@ -21,6 +21,7 @@ from cfx.figures.improvement import improvement_per_driver
 from cfx.figures.learning import learning_curve
 from cfx.figures.look import COLOURS, percent, pretty_unit, short, unit_label
 from cfx.figures.platoon import braking_time, platoons, worst_platoon
+from cfx.figures.start import error_over_time, errors_over_time
 from cfx.figures.style import style_distribution
 from cfx.figures.write import write_figures
 from cfx.learners.curves import over_networks
@@ -47,13 +48,13 @@ def with_improvement(results: MadeUp, values: dict[int, float]) -> Evaluation:
 @pytest.mark.parametrize(
     ("options", "files"),
     [
-        ({}, 6),
-        ({"space": TEN}, 6),
-        ({"pairs": 1, "epochs": 1}, 6),
-        ({"pairs": 94, "frames": 40, "space": TEN}, 6),
-        ({"pairs": 2, "frames": 1}, 6),
-        ({"pairs": 3, "networks": 0}, 5),
-        ({"pairs": 3, "methods": ("default", "population", "fixed", "policy")}, 6),
+        ({}, 7),
+        ({"space": TEN}, 7),
+        ({"pairs": 1, "epochs": 1}, 7),
+        ({"pairs": 94, "frames": 40, "space": TEN}, 7),
+        ({"pairs": 2, "frames": 1}, 7),
+        ({"pairs": 3, "networks": 0}, 6),
+        ({"pairs": 3, "methods": ("default", "population", "fixed", "policy")}, 7),
     ],
     ids=["krauss", "ten parameters", "one pair", "94 pairs", "one frame", "nothing learned", "four methods"],
 )
@@ -65,6 +66,22 @@ def test_every_size_of_job_is_drawn(tmp_path: Path, options: dict[str, Any], fil
         height, width = imread(path).shape[:2]
         assert width == 1575
         assert 300 < height < 1400
+
+
+def test_errors_over_time_are_those_of_the_pairs_that_still_drive() -> None:
+    drives = make_results(pairs=4, frames=30).evaluation.drives
+    short = [
+        dataclasses.replace(d, time=d.time[:11], real_speed=d.real_speed[:11], speed={"policy": d.speed["policy"][:11]})
+        for d in drives[:3]
+    ]
+    seconds, error = errors_over_time(drives, "policy", "speed")
+    expected = np.sqrt(np.mean([(d.speed["policy"] - d.real_speed) ** 2 for d in drives], axis=0))
+    np.testing.assert_allclose(error, expected)
+    assert seconds[0] == 0
+    assert error[0] == 0
+    seconds, _ = errors_over_time([*short, drives[3]], "policy", "speed")  # one pair of four is not half of them
+    assert len(seconds) == 11
+    assert "time since the test part began" in texts(error_over_time(make_results(pairs=3).evaluation))
 
 
 @pytest.mark.parametrize("count", range(1, 11))
@@ -151,7 +168,7 @@ def test_names_are_text_and_never_formulas(tmp_path: Path) -> None:
     evaluation = dataclasses.replace(
         results.evaluation, table=table, drives=(dataclasses.replace(results.evaluation.drives[0], pair_id=name),)
     )
-    assert len(write_figures(tmp_path, evaluation, results.style, results.curves)) == 6
+    assert len(write_figures(tmp_path, evaluation, results.style, results.curves)) == 7
 
 
 def test_cuts_and_cluster_sizes_stand_in_the_style_figure() -> None:
@@ -255,4 +272,4 @@ def test_platoon_and_history_are_written_where_a_protocol_delivered_them(tmp_pat
     further = dataclasses.replace(results.evaluation, platoon=make_platoon({"policy": 2}), history=history)
     names = {path.name for path in write_figures(tmp_path, further, results.style, results.curves)}
     assert {"platoon.png", "history.png"} <= names
-    assert len(names) == 8
+    assert len(names) == 9
