@@ -160,13 +160,13 @@ class Evaluation:
         names: the tuned parameters' names.
         units: their units.
         bounds: `(2, n)`, those within which the policy chooses.
-        later_improvements: as `improvements`, beyond the first five seconds of the test part; empty if none is longer.
         whole_improvements: as `improvements`, over whole drives of drivers that nothing was fitted to; empty if there were none.
         platoon: ten drivers in a row behind a braking leader; None if no network is for any driver.
         history: what the policy gains from what it has read before it drives; None if that was not tried. A row per pair, base
             and amount: pair_id, driver, base (what the policy's answers are offsets from, `own` or `population`), history_s
             (seconds of measured history read before the test part), amount (the same in words, "10 s" or "80 %"), rmse_speed,
             rmse_gap, improvement (over the driver's own fixed parameters, a fraction).
+        later_improvements: as `improvements`, beyond the first five seconds of the test part; empty if none is longer.
     """
 
     table: pd.DataFrame
@@ -175,10 +175,10 @@ class Evaluation:
     names: tuple[str, ...]
     units: tuple[str, ...]
     bounds: Array
-    later_improvements: Mapping[str, Improvement] = field(default_factory=dict)
     whole_improvements: Mapping[str, Improvement] = field(default_factory=dict)
     platoon: Platoon | None = None
     history: pd.DataFrame | None = None
+    later_improvements: Mapping[str, Improvement] = field(default_factory=dict)
 
     @property
     def methods(self) -> tuple[str, ...]:
