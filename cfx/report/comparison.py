@@ -127,10 +127,11 @@ _OF_METHODS = (
 
 
 def absolute(jobs: Sequence[Job]) -> Plot:
-    """Errors of each method in m/s and m: a line per job; a view for speed and gap, test part and whole drives."""
+    """Errors of each method in m/s and m: a line per job; a view for each kind of error and part of drives."""
     kinds = {
         "speed, test part": ("rmse_speed", "m/s"),
         "gap, test part": ("rmse_gap", "m"),
+        "speed, test part beyond the first 5 s": ("later/rmse_speed", "m/s"),
         "speed, whole drives": ("whole/rmse_speed", "m/s"),
         "gap, whole drives": ("whole/rmse_gap", "m"),
     }

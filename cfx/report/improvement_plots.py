@@ -18,6 +18,8 @@ from cfx.style.result import CLUSTERS
 _NAMED = 90
 """Up to so many pairs carry their names under the axis."""
 
+_WHERE = {"": "", "later/": ", beyond the first 5 s", "whole/": ", whole drives"}
+"""The frames that improvements are of, as their metrics begin, and in words."""
 
 _BARS = 3
 """Up to so many jobs are drawn as bars beside each other, more as dots."""
@@ -25,11 +27,8 @@ _BARS = 3
 
 def overview(jobs: Sequence[Job]) -> Plot:
     """Mean improvement with its 95 % interval, trimmed mean and median: a line per job; a view per baseline and frames."""
-    kinds = [(b, where) for where in ("", "whole/") for b in dict.fromkeys(b for job in jobs for b in job.baselines(where))]
-    views = {
-        _against(baseline) + (", whole drives" if where else ""): _overview_view(jobs, baseline, where)
-        for baseline, where in kinds
-    }
+    kinds = [(b, where) for where in _WHERE for b in dict.fromkeys(b for job in jobs for b in job.baselines(where))]
+    views = {_against(baseline) + _WHERE[where]: _overview_view(jobs, baseline, where) for baseline, where in kinds}
     return Plot(views, 120 + 34 * len(jobs), "Mean improvement of each job with its 95 % interval")
 
 

@@ -101,7 +101,7 @@ class Job:
         """Returns what the policy was compared with, the driver's own fixed parameters first; nothing if `follows` is false.
 
         Args:
-            where: "" for the test part, "whole/" for whole drives.
+            where: "" for the test part, "later/" for what of it is beyond the first 5 s, "whole/" for whole drives.
         """
         if not self.follows:
             return ()

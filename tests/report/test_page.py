@@ -14,8 +14,9 @@ import pandas as pd
 import pytest
 
 from cfx.report import paper
+from cfx.report.comparison import absolute
 from cfx.report.drive_plots import chosen_drives, drive
-from cfx.report.improvement_plots import per_driver
+from cfx.report.improvement_plots import overview, per_driver
 from cfx.report.page import cluster_series, duration, render, summary
 from cfx.report.runs import read_runs
 from tests.report.folders import ACROSS, write_job
@@ -238,6 +239,19 @@ def test_a_job_of_an_older_version_has_a_page_that_says_what_is_missing(tmp_path
     words = page_of(tmp_path).words
     for name in ("drives.parquet", "curves.parquet", "style.csv"):
         assert f"this job has no {name}" in words
+
+
+def test_what_is_gained_after_the_start_has_a_view_of_its_own(tmp_path: Path) -> None:
+    write_job(tmp_path / "a")
+    metrics = json.loads((tmp_path / "a" / "metrics.json").read_text())
+    views = [overview(read_runs([tmp_path / "a"]).jobs).views, absolute(read_runs([tmp_path / "a"]).jobs).views]
+    assert not any("5 s" in name for view in views for name in view)  # test parts may be no longer
+    later = {f"later/rmse_improvement/fixed/{name}": 0.1 for name in ("mean", "ci95_low", "ci95_high", "trimmed_mean", "median")}
+    errors = {f"later/rmse_speed/{method}": 0.5 for method in ("default", "fixed", "policy")}
+    (tmp_path / "a" / "metrics.json").write_text(json.dumps(metrics | later | errors))
+    jobs = read_runs([tmp_path / "a"]).jobs
+    assert "against own fixed parameters, beyond the first 5 s" in overview(jobs).views
+    assert "speed, test part beyond the first 5 s" in absolute(jobs).views
 
 
 def test_the_page_says_who_was_trained_on_whom(tmp_path: Path) -> None:
