@@ -97,7 +97,7 @@ class TrainedPolicy:
         history: seconds of a driver's measured history that it read before its test; None: all there was.
         population: constant parameters calibrated on those whom each network learned from, `(N, n)` in SI units; None if there
             are none.
-        learned_from: the pairs that the networks learned from: `Pair.content` and the driver's name.
+        learned_from: the pairs that something of it was learned from or calibrated on: `Pair.content` and the driver's name.
     """
 
     policy: Policy

@@ -125,7 +125,7 @@ class Study:
             dt=self.simulator.dt,
             names=names,
             base=learned.base,
-            learned_from={pair.content: pair.driver for pair in self.pairs} if policy.trainable else {},
+            learned_from={pair.content: pair.driver for pair in self.pairs},  # constants are calibrated on them, too
         )
 
 

@@ -117,6 +117,15 @@ def test_what_it_has_learned_from_is_refused_whatever_it_is_called(strangers: Pa
         cfx.run([*tidy, f"data.path={tmp_path / 'renamed.csv'}", f"hydra.run.dir={tmp_path / 'again'}"])
 
 
+def test_constant_parameters_are_not_tested_on_whom_they_were_calibrated_on(tmp_path: Path) -> None:
+    constant = trained(tmp_path / "constant", "policy=fixed", "protocol=across_drivers", "protocol.folds=2")
+    with pytest.raises(DataError, match="has learned from 3 of the 3 pairs"):
+        transferred(constant, tmp_path, "data.seed=5", "data.pairs=6", "data.max_pairs=3")
+    there = transferred(constant, tmp_path)
+    gain = there.metrics["whole/rmse_improvement/population/mean"]
+    assert gain == pytest.approx(0, abs=1e-9)
+
+
 def test_drivers_of_the_same_names_are_said(strangers: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level("WARNING"):
         result = transferred(strangers, tmp_path)  # all synthetic recordings are called synthetic
