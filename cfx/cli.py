@@ -59,7 +59,9 @@ def _data(arguments: Sequence[str]) -> int:
     from cfx.datasets.describe import describe as describe_file
 
     for number, file in enumerate(options.files):
-        print(f"{chr(10) if number else ''}{describe_file(Path(file))}")
+        if number:
+            print()
+        print(describe_file(Path(file)))
     return 0
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from glob import has_magic
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -69,7 +68,7 @@ class FileDatasetSettings(DatasetSettings):
 
 
 def _matching(path: Path) -> list[Path]:
-    if path.exists() or not has_magic(str(path)):
+    if path.exists() or not any(mark in str(path) for mark in "*?["):
         return [path]
     found = sorted(file for file in Path(path.anchor).glob(str(path.relative_to(path.anchor))) if file.is_file())
     if not found:
