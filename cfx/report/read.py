@@ -75,7 +75,12 @@ class Job:
     name: str = ""
 
     def component(self, group: str) -> str:
-        """Returns the name of a component: of the group "model" for instance "w99"."""
+        """Returns the name of a component: of the group "model" for instance "w99".
+
+        It is "" for the learner of a job that trains nothing, whatever its configuration says.
+        """
+        if group == "learner" and self.component("protocol") == "transfer":
+            return ""
         node = self.config.get(group)
         return str(node.get("name", "")) if isinstance(node, Mapping) else ""
 

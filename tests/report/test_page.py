@@ -263,6 +263,9 @@ def test_the_page_says_who_was_trained_on_whom(tmp_path: Path) -> None:
     words = page_of(tmp_path / "b").words
     assert "gru, as it was learned in /runs/motorway" in words
     assert "nothing is trained" in words
+    names = [job.name for job in read_runs([tmp_path / "a", tmp_path / "b"]).jobs]
+    assert "imitation" in names[0]
+    assert "imitation" not in names[1]  # the learner of its configuration did nothing
 
 
 def test_unfinished_jobs_are_named_in_the_page(tmp_path: Path) -> None:
