@@ -101,8 +101,9 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
     device = _device(config.device)
     if config.threads is not None:
         torch.set_num_threads(config.threads)
-    config = _settled(config)
-    parts = _Parts.of(config)
+    protocol = cast(Protocol, registry.create("protocol", config.protocol))
+    config = _settled(config, protocol)
+    parts = _Parts.of(config, protocol)
     _writable(folder)
     _write(folder / "config.yaml", yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
     with Tracker.open(config, folder) as tracker:
@@ -137,7 +138,7 @@ class _Parts:
     protocol: Protocol
 
     @classmethod
-    def of(cls, config: JobConfig) -> _Parts:
+    def of(cls, config: JobConfig, protocol: Protocol) -> _Parts:
         model = cast(DrivingModel, registry.create("model", config.model))
         check_simulator(config, model)
         learner = cast(Learner, registry.create("learner", config.learner))
@@ -148,13 +149,13 @@ class _Parts:
             optimizer=cast(Optimizer, registry.create("optimizer", config.optimizer)),
             policy=cast(Policy, registry.create("policy", config.policy)),
             learner=learner,
-            protocol=cast(Protocol, registry.create("protocol", config.protocol)),
+            protocol=protocol,
         )
 
 
-def _settled(config: JobConfig) -> JobConfig:
+def _settled(config: JobConfig, protocol: Protocol) -> JobConfig:
     """Returns the configuration with what the protocol determines of it."""
-    determined = cast(Protocol, registry.create("protocol", config.protocol)).determines()
+    determined = protocol.determines()
     if not determined:
         return config
     named = ", ".join(f"{key}={value['name']}" if "name" in value else key for key, value in determined.items())

@@ -124,10 +124,12 @@ class NgsimDataset(Dataset):
 
     def read(self) -> PairSet:
         parts = _apart([read_ngsim(path, self.settings.location) for path in self.settings.files()])
-        for rows in parts if not self.settings.trim else ():
+        if self.settings.trim:
+            return joined([rows.trimmed(self.settings.trim).pairs() for rows in parts])
+        for rows in parts:
             if bent := rows.bent():
                 log.info("%s: %s", rows.source, bent)
-        return joined([rows.trimmed(self.settings.trim).pairs() for rows in parts])
+        return joined([rows.pairs() for rows in parts])
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from cfx.evaluation.result import METHODS, Drive, Evaluation
+from cfx.evaluation.result import Array, Drive, Evaluation
 from cfx.figures.look import INK, canvas, method_handles, method_line, styled
-
-Array = NDArray[np.float64]
 
 _LEAST = 0.9
 """Share of the pairs that must still drive for a moment to be drawn: with fewer, the errors would be other drivers'."""
@@ -25,7 +22,7 @@ def error_over_time(evaluation: Evaluation) -> Figure:
     policy gains may be gained in the first seconds: here it is seen.
     """
     figure = canvas(3.9)
-    methods = [method for method in METHODS if method in evaluation.methods]
+    methods = evaluation.methods
     for axes, signal, unit in zip(figure.subplots(1, 2), ("speed", "gap"), ("m/s", "m"), strict=True):
         for method in methods:
             seconds, error = errors_over_time(evaluation.drives, method, signal)

@@ -317,8 +317,8 @@ def _range(values: pd.Series[Any]) -> str:
 
 def _taught(job: Job) -> str:
     """Says how the policy was learned."""
-    elsewhere = job.setting("protocol.run") if job.component("protocol") == "transfer" else None
-    return f"as it was learned in {elsewhere}" if elsewhere else f"learned by {job.component('learner')}"
+    learner = job.component("learner")
+    return f"learned by {learner}" if learner else f"as it was learned in {job.setting('protocol.run')}"
 
 
 def _protocol(job: Job) -> str:
