@@ -127,6 +127,25 @@ class Material:
             members=members,
         )
 
+    def drawn(self, most: int | None, generator: torch.Generator) -> Tensor:
+        """Returns places of the drivers who drive in one gradient step, as many of each network, `(N, D)`.
+
+        Everybody in order, those kept for validation too (they have no weight), unless that is more than `most`: then as many of
+        those who are learned from.
+        """
+        networks, drivers = self.pair.shape
+        if most is None or drivers <= most:
+            return torch.arange(drivers, device=self.pair.device).expand(networks, drivers)
+        return _chosen(self.trains, most, generator)
+
+    def held(self, most: int | None, generator: torch.Generator) -> Tensor:
+        """Returns places of the drivers kept for validation, at most `most` of each network, `(N, D)`; D may be 0.
+
+        Where a network keeps fewer than another, some who are not kept make up for it; `validates` tells them apart.
+        """
+        count = int(self.validates.sum(1).max())
+        return _chosen(self.validates, count if most is None else min(most, count), generator)
+
     def of_drives(self, drives: Drives) -> tuple[Tensor, Tensor]:
         """Returns which pair each drive is of `(N, D)`, and the base that its driver is driven from `(N, D, n)`."""
         n = torch.arange(len(self.pair), device=self.pair.device)[:, None]
@@ -277,6 +296,10 @@ class BaseErrors:
         strange = familiar if lesson.base is None else placed(near.errors(pairs, start, windows))
         return cls(familiar, strange, placed(far.errors(pairs, start, windows[:1]))[:, :, 0])
 
+    def over_whole(self, drives: Drives) -> Tensor:
+        """Returns the errors of the population's set over each drive from the first frame to the last, `(N, D, 2)`."""
+        return self.whole[torch.arange(len(drives.place), device=drives.place.device)[:, None], drives.place]
+
     def over_horizon(self, drives: Drives) -> Tensor:
         """Returns the errors over the horizon from where each drive begins, `(N, D, 2)`."""
         places = (torch.arange(len(drives.place), device=drives.place.device)[:, None], drives.place, drives.start)
@@ -334,6 +357,12 @@ def _single(batch: PairBatch) -> PairBatch:
     names = [f.name for f in fields(batch) if f.name not in {"lengths", "mask", "dt"}]
     changed: dict[str, Any] = {name: getattr(batch, name).float() for name in names}
     return replace(batch, **changed)
+
+
+def _chosen(wanted: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Returns places of `count` drivers of each network, `(N, count)`, by lot; others than the `wanted`, `(N, B)`, where those are too few."""
+    lots = torch.rand(wanted.shape, generator=generator).to(wanted.device)
+    return torch.where(wanted, lots, -1.0).topk(count, dim=1).indices.sort(1).values
 
 
 def _held_out(lesson: Lesson, pair: Tensor, real: Tensor, share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:

@@ -65,8 +65,11 @@ class RolloutSettings(Settings):
         4, ge=1, description="networks of a committee, which answer together; each keeps other drivers for validation"
     )
     epochs: int = Field(16, ge=1, description="epochs at most; after each, every network is validated")
-    steps: int = Field(25, ge=1, description="gradient steps of an epoch; in each, every driver drives")
+    steps: int = Field(25, ge=1, description="gradient steps of an epoch")
     draws: int = Field(2, ge=1, description="drives of each driver and step, each from a random measured state")
+    drivers: int | None = Field(
+        256, ge=1, description="drivers of a network that drive in one step, and in validation, at most; null: all of them"
+    )
     horizon: int = Field(30, ge=1, description="windows that a drive lasts")
     reading: float | None = Field(
         20.0, gt=0, description="s of measured history that the policy reads before a drive in training, at most; null: all"
@@ -228,6 +231,7 @@ class RolloutModule(BatchedModule):
         if self._compiles():
             self.step.compile()
         self.errors = BaseErrors.of(lesson, material, settings.horizon) if settings.normalise else None
+        self.validated = material.held(settings.drivers, torch.Generator().manual_seed(self.seed))
         self.losses: list[Tensor] = []
 
     def _compiles(self) -> bool:
@@ -335,18 +339,17 @@ class RolloutModule(BatchedModule):
         """Draws the drives of one step; they follow from the seed and the step's number, whatever came before."""
         s, material = self.settings, self.material
         generator = torch.Generator().manual_seed(self._seed(step))
-        networks, drivers = material.pair.shape
-        shape, device = (networks, drivers * s.draws), material.pair.device
-        place = torch.arange(drivers, device=device).repeat(s.draws).expand(shape)
+        place = material.drawn(s.drivers, generator).repeat(1, s.draws)
+        shape, device = place.shape, place.device
         share = torch.rand(shape, generator=generator).to(device)
-        until = material.until.repeat(1, s.draws)
+        until = material.until.gather(1, place)
         latest = (until // self.step.stride - s.horizon // 2).clamp(min=1)
         stranger = torch.rand(shape, generator=generator).to(device) < (s.strangers if self.has_strangers else 0.0)
         scale = None
         if self.has_strangers and s.strangers > 0 and s.scaling > 0:
             drawn = torch.exp(s.scaling * torch.randn(shape, generator=generator)).to(device)
             scale = torch.where(stranger, drawn, 1.0)
-        weight = material.trains.float().repeat(1, s.draws)
+        weight = material.trains.gather(1, place).float()
         return Drives(place, (share * latest).long(), stranger, until, weight, scale)
 
     @torch.no_grad()
@@ -357,26 +360,42 @@ class RolloutModule(BatchedModule):
 
     def _validation_loss(self) -> Tensor:
         """Returns what the exact model makes of the validation drives, `(N,)`; NaN for a network that has none."""
-        s, material = self.settings, self.material
-        networks, drivers = material.pair.shape
-        place = torch.arange(drivers, device=material.pair.device).expand(networks, drivers)
-        began = torch.where(material.until < material.last, material.until, 0)
-        starts = [((began + share * (material.last - began)) / self.exact.stride).long() for share in _VALIDATED]
-        repeated = (x.repeat(1, len(starts)) for x in (place, material.last, material.validates.float()))
-        places, last, weight = repeated
-        never = torch.zeros_like(places, dtype=torch.bool)
-        drives = Drives(places, torch.cat(starts, 1), never, last, weight)
-        state = material.read(self.exact, drives)
-        loss = _mean(next(self.drive(self.exact, state, drives, s.horizon, self._scale(drives))), weight)
-        strangers = Drives(place, torch.zeros_like(place), never[:, :drivers] | True, material.last, weight[:, :drivers])
-        strangers = strangers._replace(weight=strangers.weight * (material.until == material.last))
-        if not (self.has_strangers and s.strangers > 0 and bool(strangers.weight.any())):
-            return loss
-        windows = -(-int(material.last.max()) // self.exact.stride)
-        scale = self.errors.whole if self.errors is not None else None
-        state = material.read(self.exact, strangers)
-        whole = _mean(next(self.drive(self.exact, state, strangers, windows, scale)), strangers.weight)
+        s = self.settings
+        if self.validated.shape[1] == 0:
+            return torch.full((len(self.validated),), torch.nan)
+        if not self.has_strangers or s.strangers == 0:
+            return self._validated_known()
+        whole = self._validated_strangers()
+        if s.strangers == 1 and not bool(whole.isnan().any()):
+            return whole
+        loss = self._validated_known()
         return torch.where(whole.isnan(), loss, (1.0 - s.strangers) * loss + s.strangers * whole)
+
+    def _validated_known(self) -> Tensor:
+        """Returns the loss of drives over the horizon, of which the part before was read."""
+        material, place = self.material, self.validated
+        last, until = material.last.gather(1, place), material.until.gather(1, place)
+        began = torch.where(until < last, until, 0)
+        starts = [((began + share * (last - began)) / self.exact.stride).long() for share in _VALIDATED]
+        places, lasts, weight = (x.repeat(1, len(starts)) for x in (place, last, self._weight()))
+        drives = Drives(places, torch.cat(starts, 1), torch.zeros_like(places, dtype=torch.bool), lasts, weight)
+        state = material.read(self.exact, drives)
+        return _mean(next(self.drive(self.exact, state, drives, self.settings.horizon, self._scale(drives))), weight)
+
+    def _validated_strangers(self) -> Tensor:
+        """Returns the loss of whole drives, of which nothing was read; NaN where drivers are few and none is kept whole."""
+        material, place = self.material, self.validated
+        last = material.last.gather(1, place)
+        weight = self._weight() * (material.until.gather(1, place) == last)
+        drives = Drives(place, torch.zeros_like(place), torch.ones_like(place, dtype=torch.bool), last, weight)
+        if not bool(weight.any()):
+            return weight.sum(1) * torch.nan
+        windows = -(-int(last.max()) // self.exact.stride)
+        scale = self.errors.over_whole(drives) if self.errors is not None else None
+        return _mean(next(self.drive(self.exact, material.read(self.exact, drives), drives, windows, scale)), weight)
+
+    def _weight(self) -> Tensor:
+        return self.material.validates.gather(1, self.validated).float()
 
 
 def _mean(values: Tensor, weight: Tensor) -> Tensor:

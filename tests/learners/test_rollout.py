@@ -193,6 +193,64 @@ def test_validation_drivers_teach_nothing() -> None:
     assert one.curves.validation_loss.tolist() != two.curves.validation_loss.tolist()
 
 
+def module_of(material: Lesson, **options: Any) -> RolloutModule:
+    policy, settings = gru(), RolloutSettings(**(QUICK | options))
+    generator = torch.Generator().manual_seed(0)
+    held = Material.of(material, policy, settings.validation, generator, settings.members)
+    blank = torch.full((len(held.pair), 2), 0.5)
+    network = policy.build(held.scaler.mean.shape[-1], blank[0], blank, generator)
+    with torch.no_grad():
+        network.get_parameter("w_out").uniform_(-1.0, 1.0, generator=generator)  # so that it does something
+    return RolloutModule(network, held, policy, material, settings)
+
+
+@pytest.mark.parametrize("strangers", [0.0, 0.4, 1.0])
+@pytest.mark.parametrize("second", ["aabcde", "aabbcc"], ids=["enough drivers", "few drivers"])
+def test_the_validation_loss_is_the_mean_over_validation_drivers(strangers: float, second: str) -> None:
+    """Each driven on his own: known, from fifths of what is validated on; as a stranger, whole, unless its end alone is kept."""
+    material = lesson(base=TRUE.repeat(2, 1) * 1.3, drivers=tuple("abcdef" + second))
+    module = module_of(material, validation=0.3, strangers=strangers)
+    held, expected = module.material, torch.zeros(2)
+    counts = held.validates.sum(1).tolist()
+    assert counts[0] != counts[1]
+    assert module.errors is not None
+    one, no = torch.ones(2, 1), torch.zeros(2, 1).bool()
+    with torch.no_grad():
+        for network, count in enumerate(counts):
+            for place in held.validates[network].nonzero()[:, 0].tolist():
+                until, last = int(held.until[network, place]), int(held.last[network, place])
+                began, here, end = (until if until < last else 0), torch.full((2, 1), place), torch.full((2, 1), last)
+                share = strangers if began == 0 else 0.0
+                for fifth in (0.2, 0.4, 0.6, 0.8):
+                    known = Drives(here, ((began + fifth * (end - began)) / 5).long(), no, end, one)
+                    (loss,) = module.drive(
+                        module.exact, held.read(module.exact, known), known, 12, module.errors.over_horizon(known)
+                    )
+                    expected[network] += (1 - share) * loss[network, 0] / (4 * count)
+                whole = Drives(here, end * 0, ~no, end, one)
+                (loss,) = module.drive(module.exact, held.read(module.exact, whole), whole, 52, module.errors.over_whole(whole))
+                expected[network] += share * loss[network, 0] / count
+        torch.testing.assert_close(module._validation_loss(), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_of_many_drivers_some_drive_in_each_step() -> None:
+    """Others in each step, all of whom are learned from; and some are validated, the same ones always."""
+    material = lesson(base=TRUE.repeat(2, 1))
+    module = module_of(material, drivers=2, draws=3, validation=0.5)
+    drawn = [module._draw(step) for step in range(12)]
+    assert all(drives.place.shape == (2, 6) for drives in drawn)
+    assert all(bool((drives.weight == 1).all()) for drives in drawn)
+    for network in range(2):
+        seen = {place for drives in drawn for place in drives.place[network].tolist()}
+        assert seen == set(module.material.trains[network].nonzero()[:, 0].tolist())
+        assert len(set(module.validated[network].tolist())) == 2
+        assert bool(module.material.validates[network, module.validated[network]].all())
+    assert torch.equal(module._draw(3).place, drawn[3].place)
+    everybody = module_of(material, drivers=6, draws=1, validation=0.5)._draw(0)
+    assert everybody.place.tolist() == [list(range(6))] * 2
+    assert everybody.weight.sum(1).tolist() == [3.0, 3.0]
+
+
 def test_members_of_a_committee_keep_other_drivers_for_validation_and_read_alike() -> None:
     material = lesson()
     placed = Material.of(material, gru(), 0.34, torch.Generator().manual_seed(0), members=5)
@@ -257,6 +315,7 @@ def test_errors_of_the_base_are_those_of_plain_drives() -> None:
         {"error": "huber"},
         {"normalise": False},
         {"truncation": 4},
+        {"drivers": 3},
         {"gradient_clip": None, "patience": None},
         {"validation": 0.0},
         {"strangers": 1.0},
