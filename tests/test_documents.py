@@ -1,4 +1,4 @@
-"""What README and CONTRIBUTING print works as printed."""
+"""What README, CONTRIBUTING and docs/ print works as printed."""
 
 from __future__ import annotations
 
@@ -28,16 +28,30 @@ def blocks(name: str, language: str) -> list[str]:
 
 
 def commands() -> list[str]:
-    lines = [line for block in blocks("README.md", "") for line in block.splitlines()]
+    lines = [line for name in ("README.md", "docs/results.md") for block in blocks(name, "") for line in block.splitlines()]
     return [line for line in lines if line.startswith("python -m cfx ")]
 
 
+def summarised() -> list[str]:
+    """Returns what follows `python -m cfx` in the README's table of results."""
+    section = (ROOT / "README.md").read_text(encoding="utf-8").partition("## Does it help?\n")[2].partition("\n## ")[0]
+    return re.findall(r"^\| [^|]* \| `([^`]+)` \|", section, flags=re.MULTILINE)
+
+
 def test_there_are_commands_to_check() -> None:
-    assert len(commands()) >= 3
+    assert len(commands()) >= 10
+    assert len(summarised()) == 5
 
 
-@pytest.mark.parametrize("command", commands())
-def test_the_readmes_commands_compose(command: str) -> None:
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "docs/results.md", "docs/tried.md"])
+def test_links_lead_somewhere(name: str) -> None:
+    text = (ROOT / name).read_text(encoding="utf-8")
+    links = [link.partition("#")[0] for link in re.findall(r"\]\(([^)\s]+)\)", text) if "://" not in link]
+    assert all((ROOT / name).parent.joinpath(link).exists() for link in links), links
+
+
+@pytest.mark.parametrize("command", [*commands(), *(f"python -m cfx {words}" for words in summarised())])
+def test_the_documents_commands_compose(command: str) -> None:
     overrides = [word.split(",")[0] for word in shlex.split(command)[3:] if word != "-m"]
     assert composed(overrides)
 
