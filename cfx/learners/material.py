@@ -360,7 +360,7 @@ def _single(batch: PairBatch) -> PairBatch:
 
 
 def _chosen(wanted: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Returns places of `count` drivers of each network, `(N, count)`, by lot; others than the `wanted`, `(N, B)`, where those are too few."""
+    """Returns places of `count` drivers of each network by lot, `(N, count)`: those `wanted`, `(N, B)`, and others if too few."""
     lots = torch.rand(wanted.shape, generator=generator).to(wanted.device)
     return torch.where(wanted, lots, -1.0).topk(count, dim=1).indices.sort(1).values
 
