@@ -124,8 +124,8 @@ class RolloutLearner(Learner):
 
     Networks answer offsets (`cfx.policies.offsets`): untrained, each driver is driven by his base parameters, so training starts
     from a fixed model. Before a drive the policy reads the driver's measured history up to there; strangers' drives begin with
-    none. The drivers of all networks (at most `drivers` of each) drive at once, from random measured states. Models with regimes are
-    smoothed meanwhile, and validated as they are.
+    none. The drivers of all networks (at most `drivers` of each) drive at once, from random measured states. Models with regimes
+    are smoothed meanwhile, and validated as they are.
 
     Training goes on where it was interrupted, and gives the same then, if the lesson has a workspace.
 
