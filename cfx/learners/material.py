@@ -51,6 +51,11 @@ class Drives(NamedTuple):
     weight: Tensor
     scale: Tensor | None = None
 
+    @property
+    def row(self) -> Tensor:
+        """The network of each drive, `(N, 1)`: with `place` it says where the drive's driver stands in a table of places."""
+        return torch.arange(len(self.place), device=self.place.device)[:, None]
+
 
 @dataclass
 class Material:
@@ -127,7 +132,7 @@ class Material:
             members=members,
         )
 
-    def drawn(self, most: int | None, generator: torch.Generator) -> Tensor:
+    def driving(self, most: int | None, generator: torch.Generator) -> Tensor:
         """Returns places of the drivers who drive in one gradient step, as many of each network, `(N, D)`.
 
         Everybody in order, those kept for validation too (they have no weight), unless that is more than `most`: then as many of
@@ -148,9 +153,8 @@ class Material:
 
     def of_drives(self, drives: Drives) -> tuple[Tensor, Tensor]:
         """Returns which pair each drive is of `(N, D)`, and the base that its driver is driven from `(N, D, n)`."""
-        n = torch.arange(len(self.pair), device=self.pair.device)[:, None]
-        base = torch.where(drives.stranger[..., None], self.start[:, None], self.base[n, drives.place])
-        return self.pair[n, drives.place], base
+        base = torch.where(drives.stranger[..., None], self.start[:, None], self.base[drives.row, drives.place])
+        return self.pair.gather(1, drives.place), base
 
     def read(self, step: WindowStep, drives: Drives, most: int | None = None) -> Tensor:
         """Lets the policy read what was measured before each drive; nothing, for a stranger.
@@ -298,13 +302,17 @@ class BaseErrors:
 
     def over_whole(self, drives: Drives) -> Tensor:
         """Returns the errors of the population's set over each drive from the first frame to the last, `(N, D, 2)`."""
-        return self.whole[torch.arange(len(drives.place), device=drives.place.device)[:, None], drives.place]
+        return _scaled(self.whole[drives.row, drives.place], drives)
 
     def over_horizon(self, drives: Drives) -> Tensor:
         """Returns the errors over the horizon from where each drive begins, `(N, D, 2)`."""
-        places = (torch.arange(len(drives.place), device=drives.place.device)[:, None], drives.place, drives.start)
+        places = (drives.row, drives.place, drives.start)
         errors = torch.where(drives.stranger[..., None], self.strange[places], self.familiar[places])
-        return errors if drives.scale is None else errors * drives.scale[..., None]
+        return _scaled(errors, drives)
+
+
+def _scaled(errors: Tensor, drives: Drives) -> Tensor:
+    return errors if drives.scale is None else errors * drives.scale[..., None]
 
 
 class _Constant:

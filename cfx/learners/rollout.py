@@ -339,7 +339,7 @@ class RolloutModule(BatchedModule):
         """Draws the drives of one step; they follow from the seed and the step's number, whatever came before."""
         s, material = self.settings, self.material
         generator = torch.Generator().manual_seed(self._seed(step))
-        place = material.drawn(s.drivers, generator).repeat(1, s.draws)
+        place = material.driving(s.drivers, generator).repeat(1, s.draws)
         shape, device = place.shape, place.device
         share = torch.rand(shape, generator=generator).to(device)
         until = material.until.gather(1, place)
@@ -389,7 +389,7 @@ class RolloutModule(BatchedModule):
         weight = self._weight() * (material.until.gather(1, place) == last)
         drives = Drives(place, torch.zeros_like(place), torch.ones_like(place, dtype=torch.bool), last, weight)
         if not bool(weight.any()):
-            return weight.sum(1) * torch.nan
+            return weight.new_full((len(weight),), torch.nan)
         windows = -(-int(last.max()) // self.exact.stride)
         scale = self.errors.over_whole(drives) if self.errors is not None else None
         return _mean(next(self.drive(self.exact, material.read(self.exact, drives), drives, windows, scale)), weight)
