@@ -95,11 +95,12 @@ class BatchedModule(pl.LightningModule):
         if self.training_settings.gradient_clip is not None:
             clip_each(self.network, self.training_settings.gradient_clip)
 
-    def judge(self, train: Tensor, validation: Tensor) -> None:
+    def judge(self, train: Tensor, validation: Tensor, *, hopeful: bool = False) -> None:
         """Ends an epoch: keeps the weights of each network's best one, and stops when no network has hope left.
 
         Args:
             train, validation: losses `(N,)` on the CPU; a network whose validation loss is NaN is judged by its training loss.
+            hopeful: no network loses patience in this epoch.
         """
         self.rows.append((train, validation))
         loss = torch.where(validation.isnan(), train, validation)
@@ -107,7 +108,7 @@ class BatchedModule(pl.LightningModule):
         active = torch.ones_like(self.stale, dtype=torch.bool) if patience is None else self.stale < patience
         better = (loss < self.best_loss) & active
         self.best_loss = torch.where(better, loss, self.best_loss)
-        self.stale = torch.where(better, 0, self.stale + active.long())
+        self.stale = torch.where(better, 0, self.stale + (active & (not hopeful)).long())
         for key, value in self.network.named_parameters():
             chosen = better.to(value.device).view(-1, *[1] * (value.dim() - 1))
             self.best[key] = torch.where(chosen, value.detach(), self.best[key].to(value.device))
@@ -173,7 +174,8 @@ def fit(
     """Trains with Lightning, quietly, and puts the best weights back.
 
     Args:
-        checkpoint: written after every epoch, so that interrupted training goes on there; removed at the end. None: no such file.
+        checkpoint: written after every epoch, so that interrupted training goes on there, and one that ended gives the same at
+            once. None: no such file.
     """
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.ERROR)
@@ -199,8 +201,6 @@ def fit(
             _run(trainer, module, data, checkpoint)
     module.restore_best()
     module.network.to(device).eval()
-    if checkpoint is not None:
-        checkpoint.unlink(missing_ok=True)
 
 
 class EveryEpoch(ModelCheckpoint):

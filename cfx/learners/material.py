@@ -132,6 +132,14 @@ class Material:
             members=members,
         )
 
+    def driven_from(self, base: Tensor) -> Material:
+        """Returns the same drivers, all driven from one base of another model, `(n,)` in its unit space."""
+        (networks, drivers), tokens = self.pair.shape, self.tokens.shape[-1]
+        appended = coordinates(base).expand(networks, -1)
+        means, scales = self.scaler.mean[:, :tokens], self.scaler.scale[:, :tokens]
+        scaler = Scaler(torch.cat([means, appended], -1), torch.cat([scales, torch.ones_like(appended)], -1))
+        return replace(self, base=base.expand(networks, drivers, -1), start=base.expand(networks, -1), scaler=scaler)
+
     def driving(self, most: int | None, generator: torch.Generator) -> Tensor:
         """Returns places of the drivers who drive in one gradient step, as many of each network, `(N, D)`.
 

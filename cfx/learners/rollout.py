@@ -14,14 +14,15 @@ import hashlib
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import lightning.pytorch as pl
 import pandas as pd
 import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
@@ -29,13 +30,15 @@ from cfx.component import Settings, content_key
 from cfx.learners.base import CURVE_COLUMNS, Learned, Learner, Lesson
 from cfx.learners.batched import BatchedModule, fit
 from cfx.learners.material import BaseErrors, Drives, Material, Real, Scene
+from cfx.learners.teacher import Teacher, apart
 from cfx.learners.window_step import Recent, WindowStep, bounded
+from cfx.models.direct import Direct
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.committee import Committee
 from cfx.policies.offsets import NONE, coordinates
 from cfx.policies.trained import Scaler
 from cfx.progress import Task
-from cfx.simulation.rollout import Compile, can_compile
+from cfx.simulation.rollout import Compile, Simulator, can_compile
 
 log = logging.getLogger(__name__)
 
@@ -65,6 +68,12 @@ class RolloutSettings(Settings):
         4, ge=1, description="networks of a committee, which answer together; each keeps other drivers for validation"
     )
     epochs: int = Field(16, ge=1, description="epochs at most; after each, every network is validated")
+    taught: int = Field(
+        0,
+        ge=0,
+        description="epochs, the first of them, in which networks learn to do what others would, which set the acceleration"
+        " itself (model=direct) and have learned from the same drives for as many epochs as remain; for models with regimes",
+    )
     steps: int = Field(25, ge=1, description="gradient steps of an epoch")
     draws: int = Field(2, ge=1, description="drives of each driver and step, each from a random measured state")
     drivers: int | None = Field(
@@ -118,6 +127,14 @@ class RolloutSettings(Settings):
     )
     compile: Compile = Field("auto", description="the window that training repeats: auto: where it pays; always; never")
 
+    @model_validator(mode="after")
+    def _drives_at_last(self) -> Self:
+        if self.taught >= self.epochs:
+            raise ValueError(
+                f"taught={self.taught} leaves none of epochs={self.epochs} to learn by driving; lower learner.taught"
+            )
+        return self
+
 
 class RolloutLearner(Learner):
     """Back-propagates the error of closed-loop drives into the policy.
@@ -125,7 +142,7 @@ class RolloutLearner(Learner):
     Networks answer offsets (`cfx.policies.offsets`): untrained, each driver is driven by his base parameters, so training starts
     from a fixed model. Before a drive the policy reads the driver's measured history up to there; strangers' drives begin with
     none. The drivers of all networks (at most `drivers` of each) drive at once, from random measured states. Models with regimes
-    are smoothed meanwhile, and validated as they are.
+    are smoothed meanwhile, and validated as they are; they can be `taught` first, by networks that set the acceleration itself.
 
     Training goes on where it was interrupted, and gives the same then, if the lesson has a workspace.
 
@@ -155,11 +172,52 @@ class RolloutLearner(Learner):
         network = policy.build(material.scaler.mean.shape[-1], default, blank, generator).to(device)
         if not any(parameter.requires_grad for parameter in network.parameters()):
             return _learned(network.eval(), material, lesson, pd.DataFrame(columns=CURVE_COLUMNS))
-        task = Task(f"Training ({len(material.pair)} networks, at most {s.epochs} epochs)", s.epochs)
-        module = RolloutModule(network, material, policy, lesson, s, on_epoch=task.advance)
+        errors = BaseErrors.of(lesson, material, s.horizon) if s.normalise else None
         kept = self.checkpoint(policy, lesson)
-        fit(module, _Steps(s.steps), epochs=s.epochs, seed=lesson.seed, device=device, task=task, checkpoint=kept)
+        of_teacher = kept.with_suffix(".teacher.ckpt") if kept is not None else None
+        teacher = self._teacher(policy, lesson, material, errors, of_teacher) if s.taught else None
+        module = self._trained("Training", network, policy, lesson, material, errors, kept, teacher)
+        for file in (kept, of_teacher):
+            if file is not None:
+                file.unlink(missing_ok=True)
         return _learned(module.network, material, lesson, module.curves())
+
+    def _trained(
+        self,
+        title: str,
+        network: PolicyNetwork,
+        policy: Policy,
+        lesson: Lesson,
+        material: Material,
+        errors: BaseErrors | None,
+        kept: Path | None,
+        teacher: Teacher | None = None,
+    ) -> RolloutModule:
+        """Trains, from the checkpoint `kept` on if it is there, and leaves it behind."""
+        s = self.settings
+        task = Task(f"{title} ({len(material.pair)} networks, at most {s.epochs} epochs)", s.epochs)
+        module = RolloutModule(network, material, policy, lesson, s, errors, teacher, on_epoch=task.advance)
+        device = lesson.batch.lengths.device
+        fit(module, _Steps(s.steps), epochs=s.epochs, seed=lesson.seed, device=device, task=task, checkpoint=kept)
+        return module
+
+    def _teacher(
+        self, policy: Policy, lesson: Lesson, material: Material, errors: BaseErrors | None, kept: Path | None
+    ) -> Teacher:
+        """Returns networks that set the acceleration and have learned from the same drives; from `kept` if they had before."""
+        s, simulator = self.settings, Simulator(Direct(), lesson.simulator.dt)
+        space = simulator.model.reach
+        default = space.defaults(dtype=lesson.fixed.dtype, device=lesson.fixed.device)
+        fixed = default.expand(len(lesson.fixed), -1)
+        theirs = replace(lesson, simulator=simulator, fixed=fixed, base=None if lesson.base is None else fixed)
+        steered = material.driven_from(space.to_unit(default).float())
+        blank = torch.full(steered.start.shape, NONE)
+        generator = torch.Generator().manual_seed(lesson.seed)
+        network = policy.build(steered.scaler.mean.shape[-1], blank[0], blank, generator).to(default.device)
+        learner = RolloutLearner(s.model_copy(update={"taught": 0, "epochs": s.epochs - s.taught}))
+        module = learner._trained("Training teachers", network, policy, theirs, steered, errors, kept)
+        module.network.requires_grad_(False)
+        return Teacher(module.step, steered)
 
     def checkpoint(self, policy: Policy, lesson: Lesson) -> Path | None:
         """Returns the file from which this very training goes on, or None without a workspace."""
@@ -205,8 +263,30 @@ class _Steps(pl.LightningDataModule):
         return DataLoader([0], batch_size=None)  # type: ignore[arg-type]  # a list is a dataset
 
 
+class _Stretch(NamedTuple):
+    """What was simulated between two truncations, `(N, D, frames)` each.
+
+    Attributes:
+        speed, gap: m/s and m.
+        measured: at the same frames.
+        wanted: the speeds at which a teacher would have driven each window, m/s; None if none is there.
+    """
+
+    speed: Tensor
+    gap: Tensor
+    measured: Real
+    wanted: Tensor | None
+
+
 class RolloutModule(BatchedModule):
-    """Trains N networks on random closed-loop drives."""
+    """Trains N networks on random closed-loop drives.
+
+    Args:
+        network, material, policy, lesson, settings: what is trained, from what, and how.
+        errors: what drives' errors are divided by, if they are; None: those of the lesson's own base.
+        teacher: who teaches in the first `settings.taught` epochs.
+        on_epoch: called after each epoch.
+    """
 
     def __init__(
         self,
@@ -215,6 +295,8 @@ class RolloutModule(BatchedModule):
         policy: Policy,
         lesson: Lesson,
         settings: RolloutSettings,
+        errors: BaseErrors | None = None,
+        teacher: Teacher | None = None,
         on_epoch: Callable[[], None] = lambda: None,
     ) -> None:
         super().__init__(network, lesson.names, settings, on_epoch, members=material.members)
@@ -230,7 +312,8 @@ class RolloutModule(BatchedModule):
         self.step = WindowStep(network, material.scaler, policy, smooth, lesson.windows, dt)
         if self._compiles():
             self.step.compile()
-        self.errors = BaseErrors.of(lesson, material, settings.horizon) if settings.normalise else None
+        self.errors = (errors or BaseErrors.of(lesson, material, settings.horizon)) if settings.normalise else None
+        self.teacher = teacher
         self.validated = material.held(settings.drivers, torch.Generator().manual_seed(self.seed))
         self.losses: list[Tensor] = []
 
@@ -256,7 +339,7 @@ class RolloutModule(BatchedModule):
 
     def simulate(self, step: WindowStep, state: Tensor, drives: Drives, windows: int) -> tuple[Tensor, Tensor]:
         """Simulates drives in closed loop, without gradients; returns speeds and gaps, `(N, D, H S)`."""
-        speeds, gaps, _ = next(self._stretches(step, state, drives, windows))
+        speeds, gaps, *_ = next(self._stretches(step, state, drives, windows))
         return speeds, gaps
 
     def drive(self, step: WindowStep, state: Tensor, drives: Drives, windows: int, scale: Tensor | None) -> Iterator[Tensor]:
@@ -271,31 +354,43 @@ class RolloutModule(BatchedModule):
         Yields:
             The loss of each drive, `(N, D)`, of each stretch between two truncations.
         """
-        for speeds, gaps, real in self._stretches(step, state, drives, windows):
+        for speeds, gaps, real, wanted in self._stretches(step, state, drives, windows):
             speed_error = _error(speeds - real.speed, real.counted, self.settings)
             gap_error = _error(gaps - real.gap, real.counted, self.settings)
             if scale is not None:
                 speed_error, gap_error = speed_error / (scale[..., 0] + _LEAST_SPEED), gap_error / (scale[..., 1] + _LEAST_GAP)
             loss = speed_error + self.settings.gap_weight * gap_error
-            yield loss + self.settings.jerk_weight * _rms_jerk(speeds, real.counted, step.dt)
+            loss = loss + self.settings.jerk_weight * _rms_jerk(speeds, real.counted, step.dt)
+            if wanted is None:
+                yield loss
+            else:  # what is reported is always the drive's loss; what is learned from is what the teacher would have done
+                lesson = _error(speeds - wanted, torch.ones_like(wanted), self.settings)
+                yield loss.detach() + (lesson - lesson.detach())
 
-    def _stretches(self, step: WindowStep, state: Tensor, drives: Drives, windows: int) -> Iterator[tuple[Tensor, Tensor, Real]]:
-        """Yields simulated speeds and gaps of each stretch, and what was measured there."""
+    def _stretches(self, step: WindowStep, state: Tensor, drives: Drives, windows: int) -> Iterator[_Stretch]:
         s, learning = self.settings, torch.is_grad_enabled()
         pair, base = self.material.of_drives(drives)
         scene = Scene.of(self.material.batch, pair, drives, step, windows)
         squashed, recent = coordinates(base), scene.recent(state)
         length = s.truncation if s.truncation and learning else windows
+        taught = self.teacher if learning and self.current_epoch < s.taught else None
+        watching = taught.watch(drives, scene.leader_length, self._most()) if taught is not None else None
         for first in range(0, windows, length):
-            speeds, gaps = [], []
+            speeds, gaps, wanted = [], [], []
             for window in range(first, min(first + length, windows)):
+                if watching is not None:
+                    wanted.append(watching.would_drive(recent, scene.ahead(window)))
                 recent, speed, gap = step.drive(recent, scene.ahead(window), scene.leader_length, base, squashed)
                 if learning:
                     recent = bounded(recent, s.damping, s.gradient_bound / drives.place.shape[1])
+                if watching is not None:
+                    recent = apart(recent)
                 speeds.append(speed)
                 gaps.append(gap)
             frames = slice(first * step.stride, (first + len(speeds)) * step.stride)
-            yield torch.cat(speeds, -1), torch.cat(gaps, -1), scene.real(frames)
+            yield _Stretch(
+                torch.cat(speeds, -1), torch.cat(gaps, -1), scene.real(frames), torch.cat(wanted, -1) if wanted else None
+            )
             recent = Recent(*(value.detach().requires_grad_(learning) for value in recent))
 
     def _scale(self, drives: Drives) -> Tensor | None:
@@ -356,7 +451,7 @@ class RolloutModule(BatchedModule):
     def validation_step(self, number: int, index: int) -> None:
         train = torch.stack(self.losses).mean(0)
         self.losses.clear()
-        self.judge(train, self._validation_loss().cpu())
+        self.judge(train, self._validation_loss().cpu(), hopeful=self.current_epoch < self.settings.taught)
 
     def _validation_loss(self) -> Tensor:
         """Returns what the exact model makes of the validation drives, `(N,)`; NaN for a network that has none."""

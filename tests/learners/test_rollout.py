@@ -14,8 +14,11 @@ from cfx.calibration.windows import Split, WindowSettings
 from cfx.errors import ConfigError
 from cfx.evaluation.closed_loop import ClosedLoop, drive
 from cfx.learners.base import Learned, Lesson
-from cfx.learners.material import BaseErrors, Drives, Material
+from cfx.learners.material import BaseErrors, Drives, Material, Scene
 from cfx.learners.rollout import RolloutLearner, RolloutModule, RolloutSettings
+from cfx.learners.teacher import Teacher, apart
+from cfx.learners.window_step import WindowStep
+from cfx.models.direct import Direct
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.pairs import PairBatch
@@ -153,8 +156,8 @@ def test_training_goes_on_where_it_was_interrupted(tmp_path: Path, monkeypatch: 
     broken = replace(whole, workspace=tmp_path / "broken")
     judge, epochs = RolloutModule.judge, []
 
-    def interrupt(self: RolloutModule, *losses: torch.Tensor) -> None:
-        judge(self, *losses)
+    def interrupt(self: RolloutModule, *losses: torch.Tensor, **options: bool) -> None:
+        judge(self, *losses, **options)
         epochs.append(len(self.rows))
         if len(epochs) == 3:
             raise KeyboardInterrupt
@@ -168,6 +171,31 @@ def test_training_goes_on_where_it_was_interrupted(tmp_path: Path, monkeypatch: 
     pd.testing.assert_frame_equal(again.curves, expected.curves)
     assert all(torch.equal(a, b) for a, b in zip(again.network.parameters(), expected.network.parameters(), strict=True))
     assert not list(tmp_path.glob("*/*"))  # nothing is kept of a training that ended
+
+
+def test_neither_teachers_nor_their_pupils_train_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, whole = gru(), lesson(networks=1, workspace=tmp_path / "whole")
+    learner = RolloutLearner(**(QUICK | {"epochs": 4, "taught": 2, "steps": 4}))
+    expected = learner.fit(policy, whole)
+    broken = replace(whole, workspace=tmp_path / "broken")
+    judge, epochs = RolloutModule.judge, []
+
+    def interrupt(self: RolloutModule, *losses: torch.Tensor, **options: bool) -> None:
+        judge(self, *losses, **options)
+        epochs.append(("pupil" if self.teacher else "teacher", len(self.rows)))
+        if len(epochs) in {2, 5}:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(RolloutModule, "judge", interrupt)
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            learner.fit(policy, broken)
+    again = learner.fit(policy, broken)
+    assert epochs[:4] == [("teacher", 1), ("teacher", 2), ("teacher", 2), ("pupil", 1)]
+    assert epochs[4:] == [("pupil", 2), ("pupil", 2), ("pupil", 3), ("pupil", 4)]
+    pd.testing.assert_frame_equal(again.curves, expected.curves)
+    assert all(torch.equal(a, b) for a, b in zip(again.network.parameters(), expected.network.parameters(), strict=True))
+    assert not list(tmp_path.glob("*/*"))
 
 
 def test_a_checkpoint_of_another_training_is_not_taken_up(tmp_path: Path) -> None:
@@ -320,6 +348,7 @@ def test_errors_of_the_base_are_those_of_plain_drives() -> None:
         {"validation": 0.0},
         {"strangers": 1.0},
         {"smoothing": 0.0},
+        {"taught": 1},
     ],
     ids=lambda options: next(iter(options)),
 )
@@ -366,3 +395,76 @@ def test_a_model_without_gradients_is_refused() -> None:
 
     with pytest.raises(ConfigError, match="the driving model has none"):
         RolloutLearner(**QUICK).fit(gru(), lesson(networks=1, model=Stepwise()))
+
+
+def taught_module(material: Lesson, **options: Any) -> RolloutModule:
+    """A module whose untrained networks are taught by others, untrained as well, that answer at random."""
+    module = module_of(material, **options)
+    steered = module.material.driven_from(torch.tensor([0.6]))
+    generator = torch.Generator().manual_seed(1)
+    blank = torch.full((len(steered.pair), 1), 0.5)
+    network = gru(start="middle").build(steered.scaler.mean.shape[-1], blank[0], blank, generator).requires_grad_(False)
+    module.teacher = Teacher(WindowStep(network, steered.scaler, gru(), Direct(), WINDOWS, 0.1), steered)
+    return module
+
+
+def test_a_teacher_says_what_he_would_do_where_the_pupil_stands() -> None:
+    """Beside a drive of his own he says exactly what he drives, from the same memory of what was read; elsewhere he does not."""
+    material = lesson(networks=1)
+    module = taught_module(material)
+    assert module.teacher is not None
+    step, known, place = module.teacher.step, module.teacher.material, torch.arange(6)[None]
+    stranger = torch.tensor([[False, False, False, True, True, True]])
+    start = torch.where(stranger, 0, 15)
+    drives = Drives(place, start, stranger, known.last, torch.ones_like(place).float())
+    with torch.no_grad():
+        pair, base = known.of_drives(drives)
+        scene = Scene.of(known.batch, pair, drives, step, 8)
+        own = scene.recent(known.read(step, drives))
+        watching = module.teacher.watch(drives, scene.leader_length, None)
+        for window in range(8):
+            wanted = watching.would_drive(own, scene.ahead(window))
+            own, speed, _ = step.drive(own, scene.ahead(window), scene.leader_length, base, coordinates(base))
+            torch.testing.assert_close(wanted, speed, rtol=0, atol=1e-6)
+        elsewhere = own._replace(speed=own.speed + 1.0)
+        assert not torch.allclose(watching.would_drive(elsewhere, scene.ahead(7)), speed, atol=0.1)
+
+
+def test_who_is_taught_learns_from_each_window_alone() -> None:
+    """The loss reported is the drive's, the gradient is not: it comes from what the teacher would have done, window by window."""
+    material = lesson(networks=1)
+    taught, alone = (make(material, taught=1, strangers=0.0) for make in (taught_module, module_of))
+    gradients, losses = [], []
+    for module in (taught, alone):
+        loss = next(module.losses_of(0))
+        loss.sum().backward()
+        losses.append(loss.detach())
+        gradients.append(module.network.b_out.grad)
+    torch.testing.assert_close(losses[0], losses[1])
+    assert not torch.allclose(gradients[0], gradients[1], rtol=0.1)
+    drives = taught._draw(0)
+    state = taught.material.read(taught.step, drives)
+    pair, _ = taught.material.of_drives(drives)
+    recent = Scene.of(taught.material.batch, pair, drives, taught.step, 1).recent(state)
+    assert not any(value.grad_fn for value in apart(recent)[:4])
+
+
+def test_patience_begins_when_the_teacher_has_gone() -> None:
+    policy, material = gru(), lesson(networks=1)
+    options = QUICK | {"epochs": 8, "taught": 4, "steps": 1, "learning_rate": 1e-12, "weight_decay": 0.0, "patience": 2}
+    curves = RolloutLearner(**options).fit(policy, material).curves
+    assert curves.epoch.max() + 1 == 6  # nothing gets better: four are taught, and two are waited for
+
+
+def test_what_was_taught_drives_better_than_it_began() -> None:
+    """The validation loss is of the pupil's own drives, while all that he learns is what his teacher would do."""
+    policy, material = gru(), lesson(networks=1)
+    began = untrained(material, policy).curves.validation_loss.iloc[0]
+    options = QUICK | {"epochs": 12, "taught": 6, "strangers": 0.0, "patience": None}
+    curves = RolloutLearner(**options).fit(policy, material).curves
+    assert curves.validation_loss[curves.epoch == 5].item() < 0.7 * began
+
+
+def test_somebody_must_drive_in_the_end() -> None:
+    with pytest.raises(ConfigError, match=r"learner.*taught=6 leaves none of epochs=6 to learn by driving; lower learner.taught"):
+        RolloutLearner(**(QUICK | {"taught": 6}))
