@@ -364,7 +364,7 @@ class RolloutModule(BatchedModule):
             if wanted is None:
                 yield loss
             else:  # what is reported is always the drive's loss; what is learned from is what the teacher would have done
-                lesson = _error(speeds - wanted, torch.ones_like(wanted), self.settings)
+                lesson = _error(speeds - wanted, real.counted, self.settings)
                 yield loss.detach() + (lesson - lesson.detach())
 
     def _stretches(self, step: WindowStep, state: Tensor, drives: Drives, windows: int) -> Iterator[_Stretch]:

@@ -11,7 +11,10 @@ from cfx.testing import LearnerContract
 
 # Kept for all tests, which then share a training.
 IMITATION = ImitationLearner(epochs=30, learning_rate=0.03)
-ROLLOUT = {members: RolloutLearner(**{**RolloutLearner.trial, "members": members}) for members in (1, 2)}
+ROLLOUT = {
+    name: RolloutLearner(**{**RolloutLearner.trial, **options})
+    for name, options in {"one": {"members": 1}, "committee": {"members": 2}, "taught": {"members": 1, "taught": 2}}.items()
+}
 
 
 class TestImitation(LearnerContract):
@@ -20,8 +23,8 @@ class TestImitation(LearnerContract):
         return IMITATION
 
 
-@pytest.mark.parametrize("members", ROLLOUT, ids=["one", "committee"], scope="class")
+@pytest.mark.parametrize("name", ROLLOUT, scope="class")
 class TestRollout(LearnerContract):
     @pytest.fixture
-    def learner(self, members: int) -> Learner:
-        return ROLLOUT[members]
+    def learner(self, name: str) -> Learner:
+        return ROLLOUT[name]

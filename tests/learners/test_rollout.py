@@ -449,6 +449,24 @@ def test_who_is_taught_learns_from_each_window_alone() -> None:
     assert not any(value.grad_fn for value in apart(recent)[:4])
 
 
+def test_nothing_is_taught_beyond_the_training_part() -> None:
+    """Drives may end behind it, where nothing counts: not what was measured there, nor what a teacher would do."""
+    gradients = []
+    for beyond in (0.0, 5.0):
+        module = taught_module(lesson(networks=1), taught=1, strangers=0.0)
+        material = module.material
+        ends = material.last - 100
+        material.last, material.until = ends, ends
+        frames = torch.arange(material.batch.mask.shape[1])
+        secret = frames > ends[0, material.pair[0].argsort()][:, None]
+        changed = {name: getattr(material.batch, name) + beyond * secret for name in ("leader_speed", "leader_position")}
+        material.batch = replace(material.batch, **changed)
+        assert bool((module._draw(0).start * WINDOWS.stride + 60 > ends[:, :1]).any())  # some drives do
+        next(module.losses_of(0)).sum().backward()
+        gradients.append(module.network.w_out.grad)
+    assert torch.equal(*gradients)
+
+
 def test_patience_begins_when_the_teacher_has_gone() -> None:
     policy, material = gru(), lesson(networks=1)
     options = QUICK | {"epochs": 8, "taught": 4, "steps": 1, "learning_rate": 1e-12, "weight_decay": 0.0, "patience": 2}
