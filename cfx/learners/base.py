@@ -95,6 +95,11 @@ class Learner(Component):
     needs_labels: ClassVar[bool] = False
     needs_gradients: ClassVar[bool] = False
 
+    @property
+    def reads_history(self) -> bool:
+        """Whether its networks learn from drives before which they read a driver's measured history."""
+        return True
+
     def require_gradients(self, model: DrivingModel, differentiable: bool) -> None:
         """Checks that there are gradients where they are needed; a job asks before any work begins.
 

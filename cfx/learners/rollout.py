@@ -33,6 +33,7 @@ from cfx.learners.material import BaseErrors, Drives, Material, Real, Scene
 from cfx.learners.teacher import Teacher, apart
 from cfx.learners.window_step import Recent, WindowStep, bounded
 from cfx.models.direct import Direct
+from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.committee import Committee
 from cfx.policies.offsets import NONE, coordinates
@@ -154,6 +155,10 @@ class RolloutLearner(Learner):
     needs_gradients = True
     trial: ClassVar[Mapping[str, Any]] = {"members": 2, "epochs": 4, "steps": 12, "horizon": 10, "learning_rate": 0.02}
 
+    @property
+    def reads_history(self) -> bool:
+        return self.settings.strangers < 1.0
+
     def fit(self, policy: Policy, lesson: Lesson) -> Learned:
         """As `Learner.fit`.
 
@@ -166,10 +171,7 @@ class RolloutLearner(Learner):
             log.info("The policy does not see the gap; it drives better with policy.inputs=situation")
         generator = torch.Generator().manual_seed(lesson.seed)
         material = Material.of(lesson, policy, s.validation, generator, s.members)
-        space, device = simulator.model.reach, lesson.batch.lengths.device
-        blank = torch.full((len(material.pair), len(space)), NONE)
-        default = space.to_unit(space.defaults()).float()
-        network = policy.build(material.scaler.mean.shape[-1], default, blank, generator).to(device)
+        network = _untrained(policy, material, simulator.model.reach, generator)
         if not any(parameter.requires_grad for parameter in network.parameters()):
             return _learned(network.eval(), material, lesson, pd.DataFrame(columns=CURVE_COLUMNS))
         errors = BaseErrors.of(lesson, material, s.horizon) if s.normalise else None
@@ -211,9 +213,7 @@ class RolloutLearner(Learner):
         fixed = default.expand(len(lesson.fixed), -1)
         theirs = replace(lesson, simulator=simulator, fixed=fixed, base=None if lesson.base is None else fixed)
         steered = material.driven_from(space.to_unit(default).float())
-        blank = torch.full(steered.start.shape, NONE)
-        generator = torch.Generator().manual_seed(lesson.seed)
-        network = policy.build(steered.scaler.mean.shape[-1], blank[0], blank, generator).to(default.device)
+        network = _untrained(policy, steered, space, torch.Generator().manual_seed(lesson.seed))
         learner = RolloutLearner(s.model_copy(update={"taught": 0, "epochs": s.epochs - s.taught}))
         module = learner._trained("Training teachers", network, policy, theirs, steered, errors, kept)
         module.network.requires_grad_(False)
@@ -241,6 +241,13 @@ class RolloutLearner(Learner):
         return lesson.workspace / f"{content_key(description)}.ckpt"
 
 
+def _untrained(policy: Policy, material: Material, space: ParameterSpace, generator: torch.Generator) -> PolicyNetwork:
+    """Returns networks that answer no offset, where the material is."""
+    blank = torch.full((len(material.pair), len(space)), NONE)
+    default = space.to_unit(space.defaults()).float()
+    return policy.build(material.scaler.mean.shape[-1], default, blank, generator).to(material.pair.device)
+
+
 def _learned(network: PolicyNetwork, material: Material, lesson: Lesson, curves: pd.DataFrame) -> Learned:
     """Returns the networks, those of a committee as one."""
     space, members = lesson.simulator.model.reach, material.members
@@ -263,7 +270,7 @@ class _Steps(pl.LightningDataModule):
         return DataLoader([0], batch_size=None)  # type: ignore[arg-type]  # a list is a dataset
 
 
-class _Stretch(NamedTuple):
+class Stretch(NamedTuple):
     """What was simulated between two truncations, `(N, D, frames)` each.
 
     Attributes:
@@ -337,11 +344,6 @@ class RolloutModule(BatchedModule):
         done = self.current_epoch / max(1, s.epochs - 1)
         self.softness.fill_(max(s.smoothing + done * (s.smoothing_end - s.smoothing), _LEAST_SOFTNESS))
 
-    def simulate(self, step: WindowStep, state: Tensor, drives: Drives, windows: int) -> tuple[Tensor, Tensor]:
-        """Simulates drives in closed loop, without gradients; returns speeds and gaps, `(N, D, H S)`."""
-        speeds, gaps, *_ = next(self._stretches(step, state, drives, windows))
-        return speeds, gaps
-
     def drive(self, step: WindowStep, state: Tensor, drives: Drives, windows: int, scale: Tensor | None) -> Iterator[Tensor]:
         """Simulates drives in closed loop.
 
@@ -354,7 +356,7 @@ class RolloutModule(BatchedModule):
         Yields:
             The loss of each drive, `(N, D)`, of each stretch between two truncations.
         """
-        for speeds, gaps, real, wanted in self._stretches(step, state, drives, windows):
+        for speeds, gaps, real, wanted in self.stretches(step, state, drives, windows):
             speed_error = _error(speeds - real.speed, real.counted, self.settings)
             gap_error = _error(gaps - real.gap, real.counted, self.settings)
             if scale is not None:
@@ -367,7 +369,8 @@ class RolloutModule(BatchedModule):
                 lesson = _error(speeds - wanted, real.counted, self.settings)
                 yield loss.detach() + (lesson - lesson.detach())
 
-    def _stretches(self, step: WindowStep, state: Tensor, drives: Drives, windows: int) -> Iterator[_Stretch]:
+    def stretches(self, step: WindowStep, state: Tensor, drives: Drives, windows: int) -> Iterator[Stretch]:
+        """Simulates drives in closed loop, as `drive` does; yields what came of them between two truncations."""
         s, learning = self.settings, torch.is_grad_enabled()
         pair, base = self.material.of_drives(drives)
         scene = Scene.of(self.material.batch, pair, drives, step, windows)
@@ -388,7 +391,7 @@ class RolloutModule(BatchedModule):
                 speeds.append(speed)
                 gaps.append(gap)
             frames = slice(first * step.stride, (first + len(speeds)) * step.stride)
-            yield _Stretch(
+            yield Stretch(
                 torch.cat(speeds, -1), torch.cat(gaps, -1), scene.real(frames), torch.cat(wanted, -1) if wanted else None
             )
             recent = Recent(*(value.detach().requires_grad_(learning) for value in recent))

@@ -187,6 +187,11 @@ class AcrossDrivers(Protocol):
             drivers=tuple(study.pairs[number].driver for number in index.tolist()),
             workspace=study.workspace,
         )
+        if not study.learner.reads_history and (self.settings.history != 0 or any(self.settings.histories)):
+            log.warning(
+                "This policy learns from no drive with history before it (rollout: learner.strangers=1), and drives badly after"
+                " reading any, as it will in the test; set protocol.history=0 protocol.histories=[], or lower learner.strangers"
+            )
         learned = study.learner.fit(study.policy, lesson)
         policy = study.ready(study.policy, learned, names)
         own = self.settings.base == "own"

@@ -395,6 +395,23 @@ def test_a_reach_without_offsets_is_said_to_change_nothing(tmp_path: Path, caplo
     assert result.policy.space == Krauss().space
 
 
+@pytest.mark.parametrize(
+    ("options", "warned"),
+    [
+        (["learner.strangers=1"], True),
+        (["learner.strangers=1", "protocol.history=0"], True),  # and 10 and 30 s, for comparison
+        (["learner.strangers=1", "protocol.history=0", "protocol.histories=[]"], False),
+        (["learner.strangers=0.9"], False),
+    ],
+)
+def test_reading_what_was_never_learned_to_read_is_warned_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, options: list[str], warned: bool
+) -> None:
+    short = ["protocol=across_drivers", "protocol.folds=2", "learner=rollout", "learner.epochs=1", "learner.steps=1"]
+    cfx.run([*QUICK, *short, *options, f"hydra.run.dir={tmp_path / 'job'}"])
+    assert ("with history before it" in caplog.text) == warned
+
+
 def test_drives_that_are_too_short_to_test_change_what_is_learned(tmp_path: Path) -> None:
     """All pairs are calibrated and learned from, the long ones alone stand in the results."""
     frames = [160, 200, 200, 200, 200]
