@@ -142,12 +142,15 @@ class _Parts:
         model = cast(DrivingModel, registry.create("model", config.model))
         check_simulator(config, model)
         learner = cast(Learner, registry.create("learner", config.learner))
+        policy = cast(Policy, registry.create("policy", config.policy))
         learner.require_gradients(model, not isinstance(config.simulator, SumoSettings))
+        if "policy" not in protocol.determines():  # or it has learned already
+            learner.require_no_traits(policy)
         return cls(
             dataset=cast(Dataset, registry.create("dataset", config.data)),
             model=model,
             optimizer=cast(Optimizer, registry.create("optimizer", config.optimizer)),
-            policy=cast(Policy, registry.create("policy", config.policy)),
+            policy=policy,
             learner=learner,
             protocol=protocol,
         )

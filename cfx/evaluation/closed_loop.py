@@ -56,7 +56,8 @@ def drive(
         first: `(P,)`, the frame of the last measured state.
         network: `(P,)`, which of the policy's networks drives each pair.
         base: `(P, n)` in SI units, what a policy's offsets are from; None: the policy's own base.
-        history: seconds of measured history before `first` that the policy reads; None: all there is.
+        history: seconds of measured history before `first` that the policy reads, and from which the driver's traits are
+            measured; None: all there is.
     """
     length, stride = policy.windows.length, policy.windows.stride
     steps = int((batch.lengths - 1 - first).max())
@@ -73,7 +74,7 @@ def drive(
     for buffer in (position, speed, acceleration):
         buffer[:, now + 1 :] = torch.nan  # nothing measured may be seen from here on
     since = None if history is None else (first - round(history / simulator.dt)).clamp(min=0)
-    state = policy.read(batch, first, policy.begin(network, base), since)
+    state = policy.read(batch, first, policy.begin(network, base, policy.traits_of(batch, first, since)), since)
     follower = simulator.begin(Start(position[:, now], speed[:, now], acceleration[:, now]))
     parameters = speed.new_empty((len(batch), steps + 1, len(policy.space)))
     gap = leader_position - batch.leader_length[:, None] - position

@@ -89,11 +89,13 @@ class Learner(Component):
     Attributes:
         needs_labels: whether the protocol must find window labels first.
         needs_gradients: whether it differentiates through the simulation.
+        reads_traits: whether its networks are told drivers' traits (`policy.traits`), and know what strangers are.
     """
 
     kind = "learner"
     needs_labels: ClassVar[bool] = False
     needs_gradients: ClassVar[bool] = False
+    reads_traits: ClassVar[bool] = False
 
     @property
     def reads_history(self) -> bool:
@@ -115,6 +117,18 @@ class Learner(Component):
             raise ConfigError(
                 f"this learner needs gradients, and {who} has none; choose a differentiable model and simulator=memory, or"
                 " learner=imitation"
+            )
+
+    def require_no_traits(self, policy: Policy) -> None:
+        """Checks that a policy is not to be told what this learner cannot tell it; a job asks before any work begins.
+
+        Raises:
+            ConfigError: the policy has traits.
+        """
+        if policy.traits and not self.reads_traits:
+            raise ConfigError(
+                f"policy.traits={list(policy.traits)}: this learner tells its networks nothing of drivers; choose"
+                " learner=rollout, or policy.traits=none"
             )
 
     @abstractmethod

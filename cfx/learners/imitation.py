@@ -64,6 +64,7 @@ class ImitationLearner(Learner):
     def fit(self, policy: Policy, lesson: Lesson) -> Learned:
         if lesson.labels is None:
             raise TypeError("imitation needs window labels")
+        self.require_no_traits(policy)
         material = _Material.of(policy, lesson, self.settings)
         generator = torch.Generator().manual_seed(lesson.seed)
         space = lesson.simulator.model.space

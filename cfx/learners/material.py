@@ -1,8 +1,8 @@
 """What is learned from when a policy learns by driving: drivers placed in networks, and drives drawn from their recordings.
 
 Letters: P pairs of the lesson, N networks (each member of a committee counts), B drivers of the largest, D drives, H windows of a
-drive, W windows of the longest pair, L frames that a token holds, S steps of a window, f features, n tuned parameters, s width of
-a policy's state, m of a model's memory.
+drive, W windows of the longest pair, L frames that a token holds, S steps of a window, f features, n tuned parameters, k traits,
+s width of a policy's state, m of a model's memory.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from cfx.policies.base import Policy
 from cfx.policies.features import tokens
 from cfx.policies.offsets import coordinates
 from cfx.policies.trained import Scaler, measured_history
+from cfx.policies.traits import measure
 from cfx.simulation.rollout import Start
 
 _FEW_DRIVERS = 5
@@ -70,7 +71,9 @@ class Material:
         base: each driver's base in unit space, `(N, B, n)`.
         start: the population's, `(N, n)`: of those who bring no base of their own.
         tokens: what was measured, `(P, W, f)`.
-        scaler: normalises tokens and the base in the squashed space, f + n features; alike for all members of a committee.
+        traits: of drivers, from their whole training parts, `(P, k)`; NaN where too little was measured.
+        scaler: normalises tokens, the base in the squashed space, and traits, f + n + k features; alike for all members of a
+            committee.
         members: networks of a committee, which stand behind one another.
     """
 
@@ -83,6 +86,7 @@ class Material:
     base: Tensor
     start: Tensor
     tokens: Tensor
+    traits: Tensor
     scaler: Scaler
     members: int = 1
 
@@ -114,10 +118,15 @@ class Material:
         seen = tokens(measured_history(batch, pairs[:, None], windows, lesson.windows.length), policy.inputs, policy.summary)
         trains = real & (few | ~held)
         until = torch.where(few, cut, last)
+        traits = _traits(lesson, policy, batch)
         features = torch.cat([seen, coordinates(own)[:, None].expand(-1, len(windows), -1)], -1)[pair[::members]]
         seen_by_any = trains.view(-1, members, trains.shape[1]).any(1)
-        shared = Scaler.of(features, seen_by_any[..., None] & (windows <= until[::members, :, None]))
-        scaler = Scaler(*(values.repeat_interleave(members, 0) for values in (shared.mean, shared.scale)))
+        there = seen_by_any[..., None] & (windows <= until[::members, :, None])
+        known = traits.isnan().logical_not().all(-1)[pair[::members]]
+        told = traits.nan_to_num()[pair[::members], None].expand(-1, -1, len(windows), -1)
+        scalers = Scaler.of(features, there), Scaler.of(told, there & known[..., None])
+        mean, scale = (torch.cat(values, -1) for values in zip(*((one.mean, one.scale) for one in scalers), strict=True))
+        scaler = Scaler(mean.repeat_interleave(members, 0), scale.repeat_interleave(members, 0))
         return cls(
             batch=batch,
             pair=pair,
@@ -128,16 +137,20 @@ class Material:
             base=own[pair],
             start=start,
             tokens=seen,
+            traits=traits,
             scaler=scaler,
             members=members,
         )
 
     def driven_from(self, base: Tensor) -> Material:
         """Returns the same drivers, all driven from one base of another model, `(n,)` in its unit space."""
-        (networks, drivers), tokens = self.pair.shape, self.tokens.shape[-1]
-        appended = coordinates(base).expand(networks, -1)
-        means, scales = self.scaler.mean[:, :tokens], self.scaler.scale[:, :tokens]
-        scaler = Scaler(torch.cat([means, appended], -1), torch.cat([scales, torch.ones_like(appended)], -1))
+        (networks, drivers), tokens, traits = self.pair.shape, self.tokens.shape[-1], self.tokens.shape[-1] + self.base.shape[-1]
+        told = coordinates(base).expand(networks, -1)
+        mean, scale = self.scaler.mean, self.scaler.scale
+        scaler = Scaler(
+            torch.cat([mean[:, :tokens], told, mean[:, traits:]], -1),
+            torch.cat([scale[:, :tokens], torch.ones_like(told), scale[:, traits:]], -1),
+        )
         return replace(self, base=base.expand(networks, drivers, -1), start=base.expand(networks, -1), scaler=scaler)
 
     def driving(self, most: int | None, generator: torch.Generator) -> Tensor:
@@ -159,10 +172,20 @@ class Material:
         count = int(self.validates.sum(1).max())
         return _chosen(self.validates, count if most is None else min(most, count), generator)
 
-    def of_drives(self, drives: Drives) -> tuple[Tensor, Tensor]:
-        """Returns which pair each drive is of `(N, D)`, and the base that its driver is driven from `(N, D, n)`."""
-        base = torch.where(drives.stranger[..., None], self.start[:, None], self.base[drives.row, drives.place])
-        return self.pair.gather(1, drives.place), base
+    def of_drives(self, drives: Drives) -> tuple[Tensor, Tensor, Tensor]:
+        """Says whose drives these are.
+
+        Returns:
+            Which pair each is of, `(N, D)`; the base that its driver is driven from, `(N, D, n)`; and what networks are told of
+            him in every window: that base in the squashed space, and his traits, `(N, D, n + k)`.
+        """
+        pair, stranger = self.pair.gather(1, drives.place), drives.stranger[..., None]
+        base = torch.where(stranger, self.start[:, None], self.base[drives.row, drives.place])
+        told = coordinates(base)
+        if (k := self.traits.shape[-1]) > 0:
+            traits = self.traits[pair]
+            told = torch.cat([told, torch.where(stranger | traits.isnan(), self.scaler.mean[:, None, -k:], traits)], -1)
+        return pair, base, told
 
     def read(self, step: WindowStep, drives: Drives, most: int | None = None) -> Tensor:
         """Lets the policy read what was measured before each drive; nothing, for a stranger.
@@ -175,16 +198,16 @@ class Material:
         Returns:
             The policy's state as each drive begins, `(N, D, s)`.
         """
-        pair, base = self.of_drives(drives)
+        pair, _, told = self.of_drives(drives)
         start = torch.where(drives.stranger, 0, drives.start)
         count = int(start.max()) if most is None else min(int(start.max()), most)
         windows = start - count + torch.arange(count, device=start.device)[:, None, None]
-        seen, squashed = self.tokens[pair, windows.clamp(min=0)], coordinates(base)
+        seen = self.tokens[pair, windows.clamp(min=0)]
         state = step.network.initial_state(*pair.shape)
         if state.is_floating_point() and torch.is_grad_enabled():
             state = state.detach().requires_grad_()  # as all later ones, so that one compiled function serves all
         for k in range(count):
-            state = step.read(seen[k], squashed, state, windows[k] >= 0)
+            state = step.read(seen[k], told, state, windows[k] >= 0)
         return state
 
 
@@ -373,6 +396,14 @@ def _single(batch: PairBatch) -> PairBatch:
     names = [f.name for f in fields(batch) if f.name not in {"lengths", "mask", "dt"}]
     changed: dict[str, Any] = {name: getattr(batch, name).float() for name in names}
     return replace(batch, **changed)
+
+
+def _traits(lesson: Lesson, policy: Policy, batch: PairBatch) -> Tensor:
+    """Returns what networks are told of the drivers, `(P, k)`."""
+    until = lesson.split.frame.to(batch.lengths.device)
+    if not policy.traits:
+        return until.new_empty((len(batch), 0), dtype=torch.float32)
+    return measure(batch, policy.traits, lesson.simulator.dt, torch.zeros_like(until), until).float()
 
 
 def _chosen(wanted: Tensor, count: int, generator: torch.Generator) -> Tensor:

@@ -36,7 +36,7 @@ from cfx.models.direct import Direct
 from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.committee import Committee
-from cfx.policies.offsets import NONE, coordinates
+from cfx.policies.offsets import NONE
 from cfx.policies.trained import Scaler
 from cfx.progress import Task
 from cfx.simulation.rollout import Compile, Simulator, can_compile
@@ -153,6 +153,7 @@ class RolloutLearner(Learner):
     schema: ClassVar[type[Settings]] = RolloutSettings
     settings: RolloutSettings
     needs_gradients = True
+    reads_traits = True
     trial: ClassVar[Mapping[str, Any]] = {"members": 2, "epochs": 4, "steps": 12, "horizon": 10, "learning_rate": 0.02}
 
     @property
@@ -372,9 +373,9 @@ class RolloutModule(BatchedModule):
     def stretches(self, step: WindowStep, state: Tensor, drives: Drives, windows: int) -> Iterator[Stretch]:
         """Simulates drives in closed loop, as `drive` does; yields what came of them between two truncations."""
         s, learning = self.settings, torch.is_grad_enabled()
-        pair, base = self.material.of_drives(drives)
+        pair, base, told = self.material.of_drives(drives)
         scene = Scene.of(self.material.batch, pair, drives, step, windows)
-        squashed, recent = coordinates(base), scene.recent(state)
+        recent = scene.recent(state)
         length = s.truncation if s.truncation and learning else windows
         taught = self.teacher if learning and self.current_epoch < s.taught else None
         watching = taught.watch(drives, scene.leader_length, self._most()) if taught is not None else None
@@ -383,7 +384,7 @@ class RolloutModule(BatchedModule):
             for window in range(first, min(first + length, windows)):
                 if watching is not None:
                     wanted.append(watching.would_drive(recent, scene.ahead(window)))
-                recent, speed, gap = step.drive(recent, scene.ahead(window), scene.leader_length, base, squashed)
+                recent, speed, gap = step.drive(recent, scene.ahead(window), scene.leader_length, base, told)
                 if learning:
                     recent = bounded(recent, s.damping, s.gradient_bound / drives.place.shape[1])
                 if watching is not None:

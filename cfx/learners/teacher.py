@@ -17,7 +17,6 @@ from torch import Tensor
 
 from cfx.learners.material import Drives, Material
 from cfx.learners.window_step import Ahead, Recent, WindowStep
-from cfx.policies.offsets import coordinates
 
 
 @dataclass(frozen=True)
@@ -35,8 +34,8 @@ class Teacher:
     @torch.no_grad()
     def watch(self, drives: Drives, leader_length: Tensor, most: int | None) -> Watching:
         """Begins to watch drives, having read what the pupil has; arguments as of `Material.read`, lengths `(N, D)` in m."""
-        _, base = self.material.of_drives(drives)
-        return Watching(self.step, base, coordinates(base), leader_length, None, self.material.read(self.step, drives, most))
+        _, base, told = self.material.of_drives(drives)
+        return Watching(self.step, base, told, leader_length, None, self.material.read(self.step, drives, most))
 
 
 @dataclass
@@ -45,7 +44,8 @@ class Watching:
 
     Attributes:
         step: drives one window.
-        base: in unit space, `(N, D, n)`; `squashed` the same in the squashed space.
+        base: in unit space, `(N, D, n)`.
+        told: the same in the squashed space, and the drivers' traits, `(N, D, n + k)`.
         leader_length: `(N, D)`, m.
         memory: of the teacher's model, `(N, D, m)`; None before the first window.
         state: of the teacher's networks, `(N, D, s)`.
@@ -53,7 +53,7 @@ class Watching:
 
     step: WindowStep
     base: Tensor
-    squashed: Tensor
+    told: Tensor
     leader_length: Tensor
     memory: Tensor | None
     state: Tensor
@@ -64,7 +64,7 @@ class Watching:
         position, speed, acceleration = (value.detach() for value in recent[:3])
         memory = self.step.model.initial_memory(speed[..., -1]) if self.memory is None else self.memory
         stands = Recent(position, speed, acceleration, memory, self.state)
-        after, wanted, _ = self.step.drive(stands, ahead, self.leader_length, self.base, self.squashed)
+        after, wanted, _ = self.step.drive(stands, ahead, self.leader_length, self.base, self.told)
         self.memory, self.state = after.memory, after.state
         return wanted
 

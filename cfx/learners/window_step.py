@@ -3,8 +3,8 @@
 This is what training by rollout repeats thousands of times, so it is one function of plain tensors that `torch.compile` turns
 into few kernels, forwards and backwards. It is the same loop as `cfx.evaluation.closed_loop.drive`; a test holds them equal.
 
-Letters: N networks, D drives of each, L frames that a token holds, S steps of a window, n tuned parameters, s width of the
-policy's state, m of the model's memory.
+Letters: N networks, D drives of each, L frames that a token holds, S steps of a window, n tuned parameters, k traits, s width of
+the policy's state, m of the model's memory.
 """
 
 from __future__ import annotations
@@ -72,26 +72,26 @@ class WindowStep:
         self.read = torch.compile(self.read, dynamic=False)  # type: ignore[method-assign]  # the compiled one takes its place
         self.drive = torch.compile(self.drive, dynamic=False)  # type: ignore[method-assign]  # likewise
 
-    def read(self, seen: Tensor, base: Tensor, state: Tensor, there: Tensor) -> Tensor:
+    def read(self, seen: Tensor, told: Tensor, state: Tensor, there: Tensor) -> Tensor:
         """Reads one token of each drive.
 
         Args:
             seen: `(N, D, f)`, not normalised.
-            base: the base in the squashed space, `(N, D, n)`.
+            told: the base in the squashed space, and traits, `(N, D, n + k)`.
             state: `(N, D, s)`.
             there: whether the drive has this token; where not, its state stays, bool `(N, D)`.
 
         Returns:
             The network's state afterwards.
         """
-        return torch.where(there[..., None], self._answer(seen, base, state)[1], state)
+        return torch.where(there[..., None], self._answer(seen, told, state)[1], state)
 
-    def _answer(self, seen: Tensor, base: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        answer, after = self.network(self.scaler(torch.cat([seen, base], -1)[:, :, None]), state)
+    def _answer(self, seen: Tensor, told: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        answer, after = self.network(self.scaler(torch.cat([seen, told], -1)[:, :, None]), state)
         return answer[:, :, 0], after
 
     def drive(
-        self, recent: Recent, ahead: Ahead, leader_length: Tensor, base: Tensor, squashed: Tensor
+        self, recent: Recent, ahead: Ahead, leader_length: Tensor, base: Tensor, told: Tensor
     ) -> tuple[Recent, Tensor, Tensor]:
         """Drives one window.
 
@@ -100,7 +100,7 @@ class WindowStep:
             ahead: the leader around the window.
             leader_length: `(N, D)`, m.
             base: in unit space, `(N, D, n)`.
-            squashed: the same in the squashed space.
+            told: the same in the squashed space, and traits, `(N, D, n + k)`.
 
         Returns:
             Where the drives stand afterwards; speed and gap at the S frames, `(N, D, S)`.
@@ -108,7 +108,7 @@ class WindowStep:
         length, stride, now = self.length, self.stride, self.length - 1
         gap = ahead.position[..., :length] - leader_length[..., None] - recent.position
         history = History(ahead.speed[..., :length], ahead.acceleration[..., :length], recent.speed, recent.acceleration, gap)
-        answer, state = self._answer(tokens(history, self.inputs, self.summary), squashed, recent.state)
+        answer, state = self._answer(tokens(history, self.inputs, self.summary), told, recent.state)
         p = self.space.unpack(self.low + moved(base, answer, self.free) * self.range)
         follower = Follower(recent.position[..., now], recent.speed[..., now], recent.acceleration[..., now], recent.memory)
         positions, speeds, accelerations = [], [], []

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from cfx.component import Component, Settings
 from cfx.policies.features import Summary, check_inputs, named_inputs
+from cfx.policies.traits import check_traits, named_traits
 
 
 class PolicyNetwork(nn.Module, ABC):
@@ -51,6 +52,11 @@ class PolicySettings(Settings):
         " follower_acceleration, inverse_time_to_collision; or situation: what learner=rollout drives best with",
     )
     summary: Summary = Field("frames", description="how a window's frames become features: frames (all), last, mean, mean_std")
+    traits: Annotated[tuple[str, ...], BeforeValidator(named_traits)] = Field(
+        (),
+        description="what the policy is told of a driver from his measured past (learner=rollout): time_headway, headway_spread,"
+        " time_gap, standstill_gap, speed_difference, acceleration, liveliness, response_time; or all. Strangers have none.",
+    )
 
 
 class Policy(Component):
@@ -72,11 +78,17 @@ class Policy(Component):
         super().__init__(settings, **options)
         if isinstance(self.settings, PolicySettings):
             check_inputs(self.settings.inputs)
+            check_traits(self.settings.traits)
 
     @property
     def inputs(self) -> tuple[str, ...]:
         """The signals that the policy sees."""
         return self.settings.inputs if isinstance(self.settings, PolicySettings) else ("follower_speed",)
+
+    @property
+    def traits(self) -> tuple[str, ...]:
+        """What the policy is told of a driver from his measured past (`cfx.policies.traits`)."""
+        return self.settings.traits if isinstance(self.settings, PolicySettings) else ()
 
     @property
     def summary(self) -> Summary:

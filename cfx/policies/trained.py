@@ -25,6 +25,7 @@ from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.committee import Committee
 from cfx.policies.features import History, token_width, tokens
 from cfx.policies.offsets import coordinates, drawn, moved
+from cfx.policies.traits import measure
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -68,12 +69,14 @@ class PolicyState(NamedTuple):
         place: `(D,)` int64.
         state: `(N, B, s)`.
         base: parameters that answers are offsets from, `(D, n)` in unit space; None where answers are the parameters themselves.
+        traits: the drivers' traits, `(D, k)`, or what stands for those of strangers; None where the policy is told none.
     """
 
     network: Tensor
     place: Tensor
     state: Tensor
     base: Tensor | None = None
+    traits: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -83,7 +86,8 @@ class TrainedPolicy:
     Attributes:
         policy: the component that built the networks.
         network: the networks themselves.
-        scaler: normalises tokens.
+        scaler: normalises what a network is shown: tokens, the base in the squashed space where answers are offsets, and traits,
+            one behind the other.
         model_node: config node of the driving model.
         space: the model's parameters; where answers are offsets, as far as they reach.
         windows: how often parameters change, and how many frames a token holds.
@@ -120,20 +124,41 @@ class TrainedPolicy:
         """Returns what offsets start from for drivers whose own parameters are these; both `(D, n)` in SI units."""
         return drawn(self.space, own, self.shrinkage)
 
-    def begin(self, network: Tensor, base: Tensor | None = None) -> PolicyState:
+    def traits_of(self, batch: PairBatch, until: Tensor, since: Tensor | None = None) -> Tensor | None:
+        """Measures what the policy is told of D drivers before they drive.
+
+        Args:
+            batch: their D pairs.
+            until: `(D,)`, the frame at which each will start to drive; those before it are measured.
+            since: `(D,)`, the frame from which on; None: from the first.
+
+        Returns:
+            Traits `(D, k)`, NaN for a driver of whom too little was measured; None if the policy is told none.
+        """
+        if not self.policy.traits:
+            return None
+        return measure(batch, self.policy.traits, self.dt, torch.zeros_like(until) if since is None else since, until)
+
+    def begin(self, network: Tensor, base: Tensor | None = None, traits: Tensor | None = None) -> PolicyState:
         """Returns the state of D drivers before their first window.
 
         Args:
             network: `(D,)`, which network drives each.
             base: `(D, n)` in SI units, what each driver's offsets start from (`base_of`); None: the policy's, for drivers of whom
                 nothing is known. Ignored where answers are not offsets.
+            traits: `(D, k)`, as `traits_of` measures them; NaN, or None: unknown. Then the mean of those stands for them whom the
+                network learned from.
         """
         place = driver_places(network)
         drivers = int(place.max()) + 1
         unit = None
         if self.base is not None:
             unit = self.space.to_unit((self.base[network] if base is None else base).double())
-        return PolicyState(network, place, self.network.initial_state(len(self.names), drivers), unit)
+        told = None
+        if self.policy.traits:
+            unknown = self.scaler.mean[network, -len(self.policy.traits) :].double()
+            told = unknown if traits is None else torch.where(traits.isnan(), unknown, traits.to(unknown))
+        return PolicyState(network, place, self.network.initial_state(len(self.names), drivers), unit, told)
 
     @torch.no_grad()
     def act(self, history: History, state: PolicyState) -> tuple[Tensor, PolicyState]:
@@ -149,6 +174,8 @@ class TrainedPolicy:
         seen = tokens(history, self.policy.inputs, self.policy.summary)
         if state.base is not None:
             seen = torch.cat([seen, coordinates(state.base).to(seen.dtype)], -1)
+        if state.traits is not None:
+            seen = torch.cat([seen, state.traits.to(seen.dtype)], -1)
         networks, drivers, _ = state.state.shape
         grid = seen.new_zeros((networks, drivers, 1, seen.shape[-1]), dtype=self.scaler.mean.dtype)
         grid[state.network, state.place, 0] = seen.to(grid.dtype)
@@ -204,7 +231,7 @@ class TrainedPolicy:
             )
         batch = PairBatch.of(pairs)
         until = batch.lengths - 1
-        state = self.read(batch, until, self.begin(self.networks_for(pairs)))
+        state = self.read(batch, until, self.begin(self.networks_for(pairs), traits=self.traits_of(batch, until)))
         chosen, _ = self.act(measured_history(batch, torch.arange(len(batch)), until, self.windows.length), state)
         return pd.DataFrame(
             {"pair_id": [pair.pair_id for pair in pairs], **dict(zip(self.space.names, chosen.T.tolist(), strict=True))}
@@ -318,6 +345,7 @@ class TrainedPolicy:
         base = weights.get("base")
         space = model.space if base is None else model.reach
         width = token_width(policy.inputs, policy.summary, windows.length) + (len(space) if base is not None else 0)
+        width += len(policy.traits)
         if features != width:
             raise DataError(f"{folder}: the weights read {features} features, the policy's settings give {width}")
         trained = {k.removeprefix("network."): v for k, v in weights.items() if k.startswith("network.")}

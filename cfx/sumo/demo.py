@@ -20,13 +20,14 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import torch
 
 import cfx
 from cfx.config import DemoSettings, JobConfig
 from cfx.errors import DataError, SumoError
 from cfx.evaluation.result import Drive, Evaluation
 from cfx.files import whole
-from cfx.pairs import Pair, PairSet
+from cfx.pairs import Pair, PairBatch, PairSet
 from cfx.policies.trained import ALL, TrainedPolicy
 from cfx.sumo.channel import Message, receive, send
 from cfx.sumo.installed import require_sumo
@@ -154,7 +155,8 @@ def drive_in_sumo(
         pair = by_id[drive.pair_id]
         base = _base(evaluation, pair.pair_id, known) if policy.base is not None else None
         request = _request(number, pair, drive, road) | {"network": networks[pair.pair_id], "base": base}
-        header["pairs"].append(request | {"renew": _renewed(request["first"], policy, known)})
+        traits = _traits(pair, request["first"], policy, known)
+        header["pairs"].append(request | {"traits": traits, "renew": _renewed(request["first"], policy, known)})
         arrays[f"{number}/leader"] = np.stack([pair.leader_position, pair.leader_speed, pair.leader_acceleration])
         arrays[f"{number}/follower"] = np.stack([pair.follower_position, pair.follower_speed, pair.follower_acceleration])
     found = _ask(Message(header, arrays)).arrays
@@ -207,12 +209,24 @@ def _base(evaluation: Evaluation, pair_id: str, known: Known) -> dict[str, float
     return {name: float(row[f"parameter_{name}"].iloc[0]) for name in evaluation.names} if len(row) else None
 
 
+def _since(first: int, policy: TrainedPolicy, known: Known) -> int:
+    """Returns the frame from which on the driver is known."""
+    return 0 if known.history is None else max(0, first - round(known.history / policy.dt))
+
+
+def _traits(pair: Pair, first: int, policy: TrainedPolicy, known: Known) -> dict[str, float] | None:
+    """Returns the traits that the policy was told of a pair's driver."""
+    until, since = (torch.tensor([frame]) for frame in (first, _since(first, policy, known)))
+    traits = policy.traits_of(PairBatch.of(PairSet((pair,), pair.recording)), until, since)
+    if traits is None or bool(traits.isnan().any()):
+        return None
+    return dict(zip(policy.policy.traits, traits[0].tolist(), strict=True))
+
+
 def _renewed(first: int, policy: TrainedPolicy, known: Known) -> int:
     """Returns the frame from which on the policy remembers: the first whole window of what it may read."""
-    if known.history is None:
-        return 0
-    since, stride = max(0, first - round(known.history / policy.dt)), policy.windows.stride
-    return min(first, -(-since // stride) * stride)
+    stride = policy.windows.stride
+    return min(first, -(-_since(first, policy, known) // stride) * stride)
 
 
 def _request(number: int, pair: Pair, drive: Drive, road: Motorway) -> dict[str, Any]:

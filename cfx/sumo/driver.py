@@ -111,6 +111,7 @@ class Driver:
         self._network = None if network is None else self._number(network)
         self._assigned: dict[str, int] = {}
         self._bases: dict[str, list[float]] = {}
+        self._traits: dict[str, list[float]] = {}
         self._speed_modes: dict[str, int] = {}
         self._slots: dict[str, int] = {}
         self._free: list[int] = []
@@ -192,7 +193,14 @@ class Driver:
         """The vehicles that are driven or watched now."""
         return tuple(self._slots)
 
-    def assign(self, vehicle: str, network: str | None = None, *, base: Mapping[str, float] | None = None) -> None:
+    def assign(
+        self,
+        vehicle: str,
+        network: str | None = None,
+        *,
+        base: Mapping[str, float] | None = None,
+        traits: Mapping[str, float] | None = None,
+    ) -> None:
         """Says how a vehicle is driven from when it begins.
 
         Args:
@@ -201,10 +209,13 @@ class Driver:
             base: a driver's own parameters, name -> SI value, that a policy of offsets (`learner=rollout`) starts from, drawn
                 towards the default as in training; None: what it has for strangers. Policies that answer parameters themselves
                 have no use for it.
+            traits: a driver's traits, name -> value, where the policy was trained to know some (`policy.traits`;
+                `TrainedPolicy.traits_of` measures them); None: those of a stranger. What a vehicle does while it is watched
+                changes nothing of them.
 
         Raises:
             DataError: the policy has no such network.
-            ParameterError: `base` is not a value for each tuned parameter.
+            ParameterError: `base` is not a value for each tuned parameter, or `traits` not one for each trait of the policy.
         """
         if network is not None:
             self._assigned[vehicle] = self._number(network)
@@ -213,6 +224,15 @@ class Driver:
                 raise ParameterError(f"base: give a value for each of {', '.join(self.policy.space.names)}, and nothing else")
             own = torch.tensor([[base[name] for name in self.policy.space.names]], dtype=torch.float64)
             self._bases[vehicle] = self.policy.base_of(own)[0].tolist()
+        if traits is not None:
+            if set(traits) != set(self.policy.policy.traits):
+                known = ", ".join(self.policy.policy.traits)
+                raise ParameterError(
+                    f"traits: give a value for each of {known}, and nothing else"
+                    if known
+                    else "traits: there are none that this policy was trained to know; leave them out"
+                )
+            self._traits[vehicle] = [traits[name] for name in self.policy.policy.traits]
 
     def renew(self, vehicle: str) -> None:
         """Lets the policy's memory of a vehicle begin anew; the frames of its last window stay."""
@@ -316,6 +336,7 @@ class Driver:
                 self.forget(gone)
                 self._assigned.pop(gone, None)
                 self._bases.pop(gone, None)
+                self._traits.pop(gone, None)
 
     def _look(self, connection: Connection, names: list[str]) -> tuple[list[str], Seen]:
         """Reads vehicles and leaders; one without a leader goes back to SUMO."""
@@ -395,13 +416,17 @@ class Driver:
             for slot, name in zip(slots.tolist(), names, strict=True):
                 if name in self._bases:
                     store.base[slot] = torch.tensor(self._bases[name], dtype=store.base.dtype)
+        store.traits[slots] = torch.nan
+        for slot, name in zip(slots.tolist(), names, strict=True):
+            if name in self._traits:
+                store.traits[slot] = torch.tensor(self._traits[name], dtype=store.traits.dtype)
         begun = self._begun(slots)
         store.state[slots] = begun.state[begun.network, begun.place]
 
     def _begun(self, slots: Tensor) -> PolicyState:
         """Returns the state of vehicles before their first window."""
         base = None if self.policy.base is None else self._store.base[slots]
-        return self.policy.begin(self._store.network[slots], base)
+        return self.policy.begin(self._store.network[slots], base, self._store.traits[slots])
 
     def _take_over(self, connection: Connection, name: str, slot: int) -> None:
         """From here on this vehicle is driven: with a new window and a new memory, however long it was watched."""
@@ -449,6 +474,7 @@ class _Store:
         state: `(C, s)`, the policy's.
         network: `(C,)` int64, which of the policy's networks drives.
         base: `(C, n)`, SI units, what a policy of offsets starts from.
+        traits: `(C, k)`, of the drivers; NaN for strangers.
         steps: `(C,)` int64, since the vehicle's first window.
         time: `(C,)` s, of the last frame; NaN before the first.
         driven: `(C,)` bool; the others are watched.
@@ -460,6 +486,7 @@ class _Store:
     state: Tensor
     network: Tensor
     base: Tensor
+    traits: Tensor
     steps: Tensor
     time: Tensor
     driven: Tensor
@@ -476,6 +503,7 @@ class _Store:
             state=state.new_zeros((count, state.shape[-1])),
             network=torch.zeros(count, dtype=torch.int64),
             base=torch.full((count, len(policy.space)), torch.nan, dtype=real),
+            traits=torch.full((count, len(policy.policy.traits)), torch.nan, dtype=real),
             steps=torch.zeros(count, dtype=torch.int64),
             time=torch.full((count,), torch.nan, dtype=real),
             driven=torch.zeros(count, dtype=torch.bool),

@@ -5,9 +5,9 @@ input and ends. `cfx.sumo.demo` asks.
 
 Request: header `dt`, `net`, `edges`, `tracks` (as in `Motorway`), `policy` (a folder), and `pairs`, each with its `scene`,
 `length` (of the leader, m), `first` (frame at which the drivers take over), `network`, `base` (parameters that offsets start
-from, or null), `renew` (frame at which the policy's memory begins), and for each of `FOLLOWERS` its `track` and `places` (edge
-and position on it of leader and follower at frame 0); arrays `I/leader` and `I/follower` `(3, T)` of pair I: position, speed,
-acceleration. Pairs of one scene are on the road together.
+from, or null), `traits` (of the driver, or null), `renew` (frame at which the policy's memory begins), and for each of
+`FOLLOWERS` its `track` and `places` (edge and position on it of leader and follower at frame 0); arrays `I/leader` and
+`I/follower` `(3, T)` of pair I: position, speed, acceleration. Pairs of one scene are on the road together.
 
 Answer: for pair I and each F of `FOLLOWERS` the arrays `I/F/motion` `(T, 2)` (speed, gap to the leader ahead) and `I/F/place`
 `(T, 2, 3)` (x, y and heading in degrees of leader and follower); `I/parameters` `(T, n)` of the policy, NaN where it does not
@@ -137,7 +137,7 @@ def _scene(
     roads = [Behind(i, kind, pair, arrays) for i, pair in pairs for kind in FOLLOWERS]
     chosen = {i: np.full((len(arrays[f"{i}/leader"][0]), len(policy.policy.space)), np.nan) for i, _ in pairs}
     for i, pair in pairs:
-        policy.assign(f"{i}/policy", pair["network"], base=pair["base"])
+        policy.assign(f"{i}/policy", pair["network"], base=pair["base"], traits=pair["traits"])
     with tempfile.TemporaryDirectory(prefix="cfx-sumo-") as folder:
         routes = Path(folder, "scene.rou.xml")
         routes.write_text(_routes(header, roads), encoding="utf-8")

@@ -28,6 +28,7 @@ from cfx.policies.gru import GruPolicy
 from cfx.policies.lstm import LstmPolicy
 from cfx.policies.offsets import coordinates
 from cfx.policies.trained import TrainedPolicy
+from cfx.policies.traits import measure
 from cfx.simulation.rollout import Simulator
 from tests.drives import wavy_pairs
 
@@ -108,23 +109,57 @@ def test_it_learns_to_drive_like_the_drivers() -> None:
     assert curves.validation_loss.min() < 0.8 * curves.validation_loss.iloc[0]
 
 
+@pytest.mark.parametrize("traits", [(), ("time_headway", "acceleration")], ids=["", "traits"])
 @pytest.mark.parametrize("model", [Krauss(), W99()], ids=["krauss", "w99"])
-def test_training_simulates_what_evaluation_simulates(model: Any) -> None:
+def test_training_simulates_what_evaluation_simulates(model: Any, traits: tuple[str, ...]) -> None:
     """The training step's closed loop and `closed_loop.drive` give the same speeds, gaps and memory of what was read."""
-    policy, material = gru(), lesson(model=model, networks=1)
+    policy, material = gru(traits=traits), lesson(model=model, networks=1)
     learned = RolloutLearner(**(QUICK | {"epochs": 1, "learning_rate": 0.05})).fit(policy, material)
     settings = RolloutSettings(**QUICK)
     held = Material.of(material, policy, settings.validation, torch.Generator().manual_seed(0))
     held.scaler = learned.scaler
     module = RolloutModule(learned.network, held, policy, material, settings)
     place = torch.arange(6)[None]
-    start, windows = torch.full_like(place, 20), 12
+    start, windows = torch.full_like(place, 40), 11
+    if traits:  # training measures whole drives, evaluation what was before
+        frame = torch.full_like(material.network, 200)
+        held.traits = measure(material.batch, traits, 0.1, 0 * frame, frame).float()
     drives = Drives(place, start, torch.zeros_like(place).bool(), held.last, torch.ones_like(place).float())
     with torch.no_grad():
         speeds, gaps, *_ = next(module.stretches(module.exact, held.read(module.exact, drives), drives, windows))
-    found = loop(learned, material, policy, first=100)
-    torch.testing.assert_close(speeds[0].double(), found.speed[:, 1:61], rtol=0, atol=2e-3)
-    torch.testing.assert_close(gaps[0].double(), found.gap[:, 1:61], rtol=0, atol=2e-3)
+    found = loop(learned, material, policy, first=200)
+    torch.testing.assert_close(speeds[0].double(), found.speed[:, 1:56], rtol=0, atol=2e-3)
+    torch.testing.assert_close(gaps[0].double(), found.gap[:, 1:56], rtol=0, atol=2e-3)
+
+
+def test_networks_are_told_how_each_of_their_drivers_drives() -> None:
+    """Of strangers, and of those who were hardly measured, the mean of the others, which is no news once it is normalised."""
+    material = lesson(networks=1, base=TRUE)
+    material.split.frame[1] = 120
+    policy, place = gru(traits=("time_gap", "time_headway")), torch.arange(6)[None]
+    held = Material.of(material, policy, 0.25, torch.Generator().manual_seed(0))
+    stranger = torch.tensor([[True, False, False, False, False, False]])
+    told = held.of_drives(Drives(place, 0 * place, stranger, held.last, torch.ones_like(place).float()))[2]
+    frame = material.split.frame
+    expected = measure(material.batch, policy.traits, 0.1, 0 * frame, frame).float()
+    torch.testing.assert_close(told[0, 2:, 2:], expected[held.pair[0, 2:]])
+    torch.testing.assert_close(told[0, :2, 2:], held.scaler.mean[:, -2:].expand(2, -1))
+    torch.testing.assert_close(told[0, 1:, :2], coordinates(held.base)[0, 1:])
+    learned_from = expected[held.pair[0, held.trains[0]]]
+    known = learned_from[~learned_from.isnan().any(-1)]
+    torch.testing.assert_close(held.scaler.mean[0, -2:], known.mean(0), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(held.scaler.scale[0, -2:], known.std(0, correction=0), rtol=1e-4, atol=1e-5)
+
+
+def test_who_is_told_how_drivers_differ_drives_more_like_each() -> None:
+    """All from one base and without a look at their past, which is all the same to networks that are told nothing."""
+    errors = []
+    for traits in ((), ("time_headway", "time_gap")):
+        policy, material = GruPolicy(inputs=INPUTS, hidden_size=12, traits=traits), lesson(networks=1, frames=400)
+        options = QUICK | {"epochs": 20, "strangers": 0.0, "reading": 0.5, "horizon": 20}
+        learned = RolloutLearner(**options).fit(policy, material)
+        errors.append(error(loop(learned, material, policy, first=300), material, first=300))
+    assert errors[1] < 0.9 * errors[0]
 
 
 def test_reading_at_most_some_windows_forgets_what_was_before() -> None:
@@ -418,7 +453,7 @@ def test_a_teacher_says_what_he_would_do_where_the_pupil_stands() -> None:
     start = torch.where(stranger, 0, 15)
     drives = Drives(place, start, stranger, known.last, torch.ones_like(place).float())
     with torch.no_grad():
-        pair, base = known.of_drives(drives)
+        pair, base, _ = known.of_drives(drives)
         scene = Scene.of(known.batch, pair, drives, step, 8)
         own = scene.recent(known.read(step, drives))
         watching = module.teacher.watch(drives, scene.leader_length, None)
@@ -444,7 +479,7 @@ def test_who_is_taught_learns_from_each_window_alone() -> None:
     assert not torch.allclose(gradients[0], gradients[1], rtol=0.1)
     drives = taught._draw(0)
     state = taught.material.read(taught.step, drives)
-    pair, _ = taught.material.of_drives(drives)
+    pair, *_ = taught.material.of_drives(drives)
     recent = Scene.of(taught.material.batch, pair, drives, taught.step, 1).recent(state)
     assert not any(value.grad_fn for value in apart(recent)[:4])
 

@@ -17,7 +17,13 @@ INPUTS = ("leader_speed", "follower_speed", "gap", "follower_acceleration", "lea
 
 
 def adaptive(
-    node: Mapping[str, Any], names: tuple[str, ...] = ("all",), *, dt: float = 0.1, length: int = 5, offsets: bool = False
+    node: Mapping[str, Any],
+    names: tuple[str, ...] = ("all",),
+    *,
+    dt: float = 0.1,
+    length: int = 5,
+    offsets: bool = False,
+    traits: tuple[str, ...] = (),
 ) -> TrainedPolicy:
     """Returns a GRU for each name; what it chooses depends on all it sees.
 
@@ -25,9 +31,9 @@ def adaptive(
     """
     model = registry.create("model", dict(node))
     assert isinstance(model, DrivingModel)
-    policy = GruPolicy(inputs=INPUTS, start="middle")
+    policy = GruPolicy(inputs=INPUTS, traits=traits, start="middle")
     networks = len(names)
-    features = length * len(INPUTS) + (len(model.space) if offsets else 0)
+    features = length * len(INPUTS) + (len(model.space) if offsets else 0) + len(traits)
     unit = model.space.to_unit(model.space.defaults())
     network = policy.build(features, unit, unit.expand(networks, -1), torch.Generator().manual_seed(3)).double().eval()
     with torch.no_grad():
@@ -39,7 +45,7 @@ def adaptive(
         network=network,
         scaler=scaler,
         model_node=dict(node),
-        policy_node={"name": "gru", "inputs": list(INPUTS), "start": "middle"},
+        policy_node={"name": "gru", "inputs": list(INPUTS), "traits": list(traits), "start": "middle"},
         space=model.space,
         windows=WindowSettings(length=length, stride=5),
         dt=dt,

@@ -332,12 +332,16 @@ def style_of(pairs: Sequence[Any]) -> StyleResult:
 
 
 @pytest.mark.parametrize(
-    ("node", "length", "frames", "history"),
-    [({"name": "krauss"}, 5, 250, 5.3), ({"name": "w99"}, 8, 1000, None)],
-    ids=["offsets from own parameters, after 5 s", "parameters, after all there is"],
+    ("node", "length", "frames", "history", "traits"),
+    [
+        ({"name": "krauss"}, 5, 250, 5.3, ()),
+        ({"name": "krauss"}, 5, 250, 12.7, ("acceleration", "time_gap")),
+        ({"name": "w99"}, 8, 1000, None, ("time_headway",)),
+    ],
+    ids=["offsets from own parameters, after 5 s", "with traits, after 13 s", "parameters and traits, after all there is"],
 )
 def test_in_sumo_a_policy_drives_as_in_memory(
-    node: dict[str, Any], length: int, frames: int, history: float | None, tmp_path: Path
+    node: dict[str, Any], length: int, frames: int, history: float | None, traits: tuple[str, ...], tmp_path: Path
 ) -> None:
     """Behind replayed leaders in libsumo, across edges and junctions of a road, after it has watched the first part: to 1e-9."""
     model = {"krauss": Krauss, "w99": W99}[node["name"]]()
@@ -345,7 +349,7 @@ def test_in_sumo_a_policy_drives_as_in_memory(
     true = (model.space.defaults() + 0.1 * (high - low) * torch.linspace(-1, 1, 4).double()[:, None]).clamp(low, high)
     pairs = wavy_pairs(model, true, frames=frames)
     batch = PairBatch.of(pairs)
-    policy = adaptive(node, tuple(pair.pair_id for pair in pairs), length=length, offsets=history is not None)
+    policy = adaptive(node, tuple(pair.pair_id for pair in pairs), length=length, offsets=history is not None, traits=traits)
     policy.save(tmp_path / "policy")
     first, own = torch.tensor([0, 215, 100, frames - 100]), torch.arange(4)
     simulator, base = Simulator(model, 0.1), model.space.defaults().expand(4, -1)

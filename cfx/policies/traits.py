@@ -1,0 +1,185 @@
+"""Traits: what a driver's measured past tells of him, in a few numbers that a policy knows from its first window on.
+
+A network that has to find out from its memory what sort of driver it imitates finds little in the end, and a driver's own fixed
+parameters tell it only as much as one minute determines them: of Wiedemann 99's ten hardly any. How far behind he keeps, how much
+his speed differs from his leader's, how hard he accelerates and how late he reacts can simply be measured. On the I-80 recordings
+his mean time headway of the first half of a drive correlates with that of the second by 0.76, most other traits by 0.4 to 0.6.
+
+Letters: P pairs, T frames, k traits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from cfx.errors import ConfigError, nearest
+from cfx.pairs import PairBatch
+from cfx.policies.features import History
+
+MOVING = 2.0
+"""m/s: frames in which the follower is slower say nothing of his time headway."""
+
+LEAST = 15.0
+"""s: who was measured for less while moving is unknown."""
+
+_ACCURACY = 0.05
+"""m/s and m/s2: added to a spread before its logarithm, which would make much of differences below it."""
+
+_FLAT = 2.0
+"""(m/s)2: weight of `_USUAL_GAP` in a regression of the gap on a speed that hardly varies."""
+
+_USUAL_GAP = 1.2
+"""s: by how much the gap grows with speed for a driver whose speed has not varied."""
+
+_DELAYS = 0.2, 4.0
+"""s: step and largest of the delays among which a driver's response time is sought."""
+
+_CLEARLY = 0.05, 0.1
+"""(m/s)2, and as a share of the least variance: delays whose variance exceeds the least by as much weigh 1/e of it."""
+
+
+class Measured(NamedTuple):
+    """Stretches of P drives.
+
+    Attributes:
+        signals: `(P, T)` each, SI units.
+        counted: which frames belong to the stretch, bool `(P, T)`.
+        dt: time step, s.
+    """
+
+    signals: History
+    counted: Tensor
+    dt: float
+
+    @property
+    def moving(self) -> Tensor:
+        """The frames of the stretch in which the follower moves, `(P, T)`."""
+        return self.counted & (self.signals.follower_speed > MOVING)
+
+
+def _mean(values: Tensor, counted: Tensor) -> Tensor:
+    """Returns the mean of each pair `(P,)` over the frames that count, both `(P, T)`; 0 where none does."""
+    return torch.where(counted, values, 0.0).sum(1) / counted.sum(1).clamp(min=1)
+
+
+def _log_headway(h: History) -> Tensor:
+    return torch.log(h.gap.clamp(min=0.5) / h.follower_speed.clamp(min=MOVING))
+
+
+def _log_rms(values: Tensor, counted: Tensor) -> Tensor:
+    return torch.log(_mean(values.square(), counted).sqrt() + _ACCURACY)
+
+
+def _time_headway(m: Measured) -> Tensor:
+    """The mean logarithm of gap (m) over speed (m/s)."""
+    return _mean(_log_headway(m.signals), m.moving)
+
+
+def _headway_spread(m: Measured) -> Tensor:
+    """The standard deviation of that logarithm."""
+    headway, moving = _log_headway(m.signals), m.moving
+    return _mean((headway - _mean(headway, moving)[:, None]).square(), moving).sqrt()
+
+
+def _time_gap(m: Measured) -> Tensor:
+    """By how much the gap grows with speed, s: a ridge regression around what is usual, as speed may hardly have varied."""
+    speed, gap = (values - _mean(values, m.counted)[:, None] for values in (m.signals.follower_speed, m.signals.gap))
+    return (_mean(speed * gap, m.counted) + _FLAT * _USUAL_GAP) / (_mean(speed.square(), m.counted) + _FLAT)
+
+
+def _standstill_gap(m: Measured) -> Tensor:
+    """What gap that regression leaves at standstill, m."""
+    return _mean(m.signals.gap, m.counted) - _time_gap(m) * _mean(m.signals.follower_speed, m.counted)
+
+
+def _speed_difference(m: Measured) -> Tensor:
+    """The logarithm of the root mean square of the difference to the leader's speed, m/s."""
+    return _log_rms(m.signals.leader_speed - m.signals.follower_speed, m.counted)
+
+
+def _acceleration(m: Measured) -> Tensor:
+    """The logarithm of the root mean square acceleration, m/s2."""
+    return _log_rms(m.signals.follower_acceleration, m.counted)
+
+
+def _liveliness(m: Measured) -> Tensor:
+    """The logarithm of how many times as hard as his leader he accelerates."""
+    return _log_rms(m.signals.follower_acceleration, m.counted) - _log_rms(m.signals.leader_acceleration, m.counted)
+
+
+def _response_time(m: Measured) -> Tensor:
+    """How long after his leader he does the same, s: the mean of delays, weighted by how little their speeds then differ."""
+    first, most = (max(1, round(delay / m.dt)) for delay in _DELAYS)
+    delays = range(0, min(most, m.counted.shape[1] - 1) + 1, first)
+    variances = []
+    for delay in delays:
+        both = m.counted[:, delay:] & m.counted[:, : m.counted.shape[1] - delay]
+        apart = m.signals.follower_speed[:, delay:] - m.signals.leader_speed[:, : m.counted.shape[1] - delay]
+        variances.append(_mean((apart - _mean(apart, both)[:, None]).square(), both))
+    variance = torch.stack(variances, 1)
+    least = variance.min(1, keepdim=True).values
+    weight = torch.softmax(-(variance - least) / (_CLEARLY[0] + _CLEARLY[1] * least), 1)
+    return weight @ torch.tensor([delay * m.dt for delay in delays], dtype=weight.dtype, device=weight.device)
+
+
+TRAITS: dict[str, Callable[[Measured], Tensor]] = {
+    "time_headway": _time_headway,
+    "headway_spread": _headway_spread,
+    "time_gap": _time_gap,
+    "standstill_gap": _standstill_gap,
+    "speed_difference": _speed_difference,
+    "acceleration": _acceleration,
+    "liveliness": _liveliness,
+    "response_time": _response_time,
+}
+"""Traits that a policy may know, each `(P,)`."""
+
+TRAIT_SETS: dict[str, tuple[str, ...]] = {"all": tuple(TRAITS), "none": ()}
+"""Traits that go by one name: `policy.traits=all`."""
+
+
+def named_traits(value: object) -> object:
+    """Returns the traits that a set's name stands for, and whatever else was given as it is.
+
+    Raises:
+        ValueError: it is a name, but not of a set.
+    """
+    if not isinstance(value, str):
+        return value
+    if value not in TRAIT_SETS:
+        hint = f" Write [{value}]." if value in TRAITS else nearest(value, [*TRAIT_SETS, *TRAITS])
+        raise ValueError(f"not a set of traits.{hint} Give {', '.join(TRAIT_SETS)}, or a list of {', '.join(TRAITS)}")
+    return TRAIT_SETS[value]
+
+
+def check_traits(names: Sequence[str]) -> None:
+    """Raises ConfigError if a name is no trait or stands twice."""
+    for name in names:
+        if name not in TRAITS:
+            raise ConfigError(f"policy.traits: unknown trait '{name}'.{nearest(name, TRAITS)} Known: {', '.join(TRAITS)}.")
+    if len(set(names)) != len(names):
+        raise ConfigError(f"policy.traits: a trait stands twice in {', '.join(names)}")
+
+
+def measure(batch: PairBatch, names: Sequence[str], dt: float, since: Tensor, until: Tensor) -> Tensor:
+    """Measures drivers' traits.
+
+    Args:
+        batch: P pairs.
+        names: the traits, k of `TRAITS`.
+        dt: the pairs' time step, s.
+        since, until: `(P,)`, the frames from which on and before which each driver is measured.
+
+    Returns:
+        `(P, k)` float64; NaN for a driver who moved for less than `LEAST` seconds of that.
+    """
+    signals = (batch.leader_speed, batch.leader_acceleration, batch.follower_speed, batch.follower_acceleration, batch.gap)
+    frame = torch.arange(batch.mask.shape[1], device=until.device)
+    counted = batch.mask & (frame >= since[:, None]) & (frame < until[:, None])
+    measured = Measured(History(*(signal.double() for signal in signals)), counted, dt)
+    known = measured.moving.sum(1) * dt >= LEAST
+    return torch.where(known[:, None], torch.stack([TRAITS[name](measured) for name in names], -1), torch.nan)

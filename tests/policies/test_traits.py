@@ -1,0 +1,165 @@
+"""What a policy is told of a driver: measured from his past alone, or unknown."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+from sklearn.linear_model import Ridge
+
+import cfx
+from cfx.errors import ConfigError
+from cfx.models.krauss import Krauss
+from cfx.pairs import PairBatch
+from cfx.policies.features import History
+from cfx.policies.gru import GruPolicy
+from cfx.policies.trained import TrainedPolicy
+from cfx.policies.traits import LEAST, MOVING, TRAITS, measure
+from tests.drives import straight_pairs, wavy_pairs
+from tests.sumo.policies import adaptive
+
+ALL = tuple(TRAITS)
+PARAMETERS = torch.tensor([[1.0, 0.1], [1.8, 0.5], [3.0, 0.4]]).double()
+BATCH = PairBatch.of(wavy_pairs(Krauss(), PARAMETERS, frames=300))
+frame = st.integers(0, 299)
+
+
+def measured(batch: PairBatch, since: int, until: int, names: tuple[str, ...] = ALL) -> torch.Tensor:
+    pairs = len(batch)
+    return measure(batch, names, 0.1, torch.full((pairs,), since), torch.full((pairs,), until))
+
+
+def by_hand(pair: int, since: int, until: int) -> dict[str, float]:
+    """The same from the signals, with NumPy, and scikit-learn's ridge regression around a slope of 1.2 s."""
+    speed, leader, acceleration, theirs, gap = (
+        signal[pair, since:until].double().numpy()
+        for signal in (
+            BATCH.follower_speed,
+            BATCH.leader_speed,
+            BATCH.follower_acceleration,
+            BATCH.leader_acceleration,
+            BATCH.gap,
+        )
+    )
+    moving = speed > MOVING
+    if moving.sum() * 0.1 < LEAST:
+        return dict.fromkeys(ALL, math.nan)
+    headway = np.log(np.maximum(gap[moving], 0.5) / speed[moving])
+    ridge = Ridge(alpha=2.0 * len(speed)).fit(speed[:, None], gap - 1.2 * speed)
+    rms = {
+        name: math.log(np.sqrt(np.mean(x**2)) + 0.05) for name, x in (("dv", leader - speed), ("a", acceleration), ("l", theirs))
+    }
+    return {
+        "time_headway": float(headway.mean()),
+        "headway_spread": float(headway.std()),
+        "time_gap": 1.2 + float(ridge.coef_[0]),
+        "standstill_gap": float(ridge.intercept_),
+        "speed_difference": rms["dv"],
+        "acceleration": rms["a"],
+        "liveliness": rms["a"] - rms["l"],
+    }
+
+
+@settings(deadline=None)
+@given(frame, frame, st.integers(0, 2))
+def test_any_stretch_has_the_traits_of_its_frames(one: int, other: int, pair: int) -> None:
+    since, until = sorted((one, other))
+    found = dict(zip(ALL, measured(BATCH, since, until)[pair].tolist(), strict=True))
+    expected = by_hand(pair, since, until)
+    assert {name: found[name] for name in expected} == pytest.approx(expected, rel=1e-6, abs=1e-6, nan_ok=True)
+
+
+@pytest.mark.parametrize("delay", [0.0, 1.0, 2.4])
+def test_who_repeats_what_his_leader_did_responds_after_as_long(delay: float) -> None:
+    frames = round(delay * 10)
+    speed = BATCH.leader_speed.roll(frames, 1)
+    speed[:, :frames] = BATCH.leader_speed[:, :1]
+    late = replace(BATCH, follower_speed=speed + 0.5)
+    found = measure(late, ("response_time",), 0.1, torch.full((3,), frames), torch.full((3,), 300))
+    assert found[:, 0].tolist() == pytest.approx([delay] * 3, abs=0.15)
+
+
+@settings(deadline=None)
+@given(frame, st.sampled_from(ALL))
+def test_what_is_still_to_come_tells_nothing(until: int, name: str) -> None:
+    later = torch.arange(BATCH.mask.shape[1]) >= until
+    signals = ("leader_speed", "leader_acceleration", "follower_speed", "follower_acceleration", "leader_position")
+    other = replace(BATCH, **{signal: getattr(BATCH, signal) + 7.0 * later for signal in signals})
+    one, same = (measured(batch, 0, until, (name,)) for batch in (BATCH, other))
+    torch.testing.assert_close(one, same, rtol=0, atol=0, equal_nan=True)
+
+
+def test_who_was_hardly_measured_or_stood_is_unknown() -> None:
+    moving, standing = (PairBatch.of(straight_pairs([400], speed)) for speed in (10.0, 1.0))
+    assert not bool(measured(moving, 0, 150).isnan().any())
+    assert bool(measured(moving, 0, 149).isnan().all())
+    assert bool(measured(moving, 100, 249).isnan().all())
+    assert bool(measured(standing, 0, 400).isnan().all())
+    still = [math.log(2.0), 0.0, 1.2, 8.0, math.log(0.05), math.log(0.05), 0.0]
+    assert measured(moving, 0, 200)[0, :-1].tolist() == pytest.approx(still, abs=1e-9)
+
+
+def one_that_knows(**options: Any) -> TrainedPolicy:
+    """Two networks for whom an unknown trait is 6, the mean of those they learned from."""
+    return adaptive({"name": "krauss"}, ("one", "all"), offsets=True, traits=("time_headway", "acceleration"), **options)
+
+
+def first_answer(policy: TrainedPolicy, traits: list[float] | None) -> list[float]:
+    now = History(*(torch.full((1, policy.windows.length), value).double() for value in (8.0, 0.1, 9.0, -0.2, 15.0)))
+    told = None if traits is None else torch.tensor([traits]).double()
+    return policy.act(now, policy.begin(torch.ones(1, dtype=torch.long), traits=told))[0][0].tolist()
+
+
+def test_a_stranger_is_taken_for_the_mean_of_those_who_were_learned_from() -> None:
+    policy = one_that_knows()
+    stranger = first_answer(policy, None)
+    assert stranger == first_answer(policy, [6.0, 6.0]) == first_answer(policy, [math.nan, math.nan])
+    assert stranger != pytest.approx(first_answer(policy, [0.7, -0.5]), rel=1e-4)
+    assert first_answer(policy, [math.nan, -0.5]) == first_answer(policy, [6.0, -0.5])
+
+
+def test_a_saved_policy_knows_the_same_traits(tmp_path: Path) -> None:
+    policy = one_that_knows()
+    policy.save(tmp_path)
+    for again in (TrainedPolicy.load(tmp_path), TrainedPolicy.load(tmp_path).for_strangers()):
+        told = replace(again, names=("one", "all")) if len(again.names) == 2 else again
+        now = History(*(torch.full((1, 5), value).double() for value in (8.0, 0.1, 9.0, -0.2, 15.0)))
+        network = torch.tensor([len(again.names) - 1])
+        answer, _ = told.act(now, told.begin(network, traits=torch.tensor([[0.7, -0.5]]).double()))
+        assert answer[0].tolist() == pytest.approx(first_answer(policy, [0.7, -0.5]), rel=1e-6)
+
+
+def test_how_much_history_is_read_says_how_much_is_measured() -> None:
+    policy, until = one_that_knows(), torch.tensor([290, 290, 290])
+    names = ("time_headway", "acceleration")
+    torch.testing.assert_close(policy.traits_of(BATCH, until, until - 210), measured(BATCH, 80, 290, names))
+    torch.testing.assert_close(policy.traits_of(BATCH, until), measured(BATCH, 0, 290, names))
+    nothing = policy.traits_of(BATCH, until, until)
+    assert nothing is not None
+    assert bool(nothing.isnan().all())
+    assert adaptive({"name": "krauss"}).traits_of(BATCH, until) is None
+
+
+def test_a_trait_that_is_none_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"policy.traits: unknown trait 'time_headwy'. Did you mean 'time_headway'"):
+        GruPolicy(traits=("time_headwy",))
+    with pytest.raises(ConfigError, match=r"policy.traits: a trait stands twice in time_gap, time_gap"):
+        GruPolicy(traits=("time_gap", "time_gap"))
+    with pytest.raises((ConfigError, ValidationError), match=r"not a set of traits. Write \[time_gap\]"):
+        GruPolicy(traits="time_gap")
+    assert GruPolicy(traits="all").traits == ALL
+    assert GruPolicy(traits="none").traits == ()
+
+
+def test_a_learner_that_tells_its_networks_nothing_refuses_traits(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"policy.traits=\['time_gap'\]: this learner tells its networks nothing of drivers"):
+        cfx.run(["debug=quick", "policy.traits=[time_gap]", "tracking.enabled=false", f"hydra.run.dir={tmp_path / 'job'}"])
+    assert not (tmp_path / "job" / "pairs.csv").exists()
