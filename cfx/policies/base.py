@@ -54,8 +54,8 @@ class PolicySettings(Settings):
     summary: Summary = Field("frames", description="how a window's frames become features: frames (all), last, mean, mean_std")
     traits: Annotated[tuple[str, ...], BeforeValidator(named_traits)] = Field(
         (),
-        description="what the policy is told of a driver from his measured past (learner=rollout): time_headway, headway_spread,"
-        " time_gap, standstill_gap, speed_difference, acceleration, liveliness, response_time; or all. Strangers have none.",
+        description="what the policy is told of a driver from his measured past (learner=rollout): time_headway, time_gap,"
+        " standstill_gap, speed_difference, acceleration, response_time; or all. Strangers have none.",
     )
 
 
