@@ -192,6 +192,11 @@ class AcrossDrivers(Protocol):
                 "This policy learns from no drive with history before it (rollout: learner.strangers=1), and drives badly after"
                 " reading any, as it will in the test; set protocol.history=0 protocol.histories=[], or lower learner.strangers"
             )
+        if study.policy.traits and (self.settings.history == 0 or not study.learner.reads_history):
+            log.warning(
+                "policy.traits are measured from a driver's history, of which nothing is known here (protocol.history=0, or"
+                " learner.strangers=1 of rollout); leave them out, or set protocol.history=null and lower learner.strangers"
+            )
         learned = study.learner.fit(study.policy, lesson)
         policy = study.ready(study.policy, learned, names)
         own = self.settings.base == "own"

@@ -412,6 +412,19 @@ def test_reading_what_was_never_learned_to_read_is_warned_of(
     assert ("with history before it" in caplog.text) == warned
 
 
+@pytest.mark.parametrize(
+    ("options", "warned"),
+    [(["protocol.history=0"], True), (["learner.strangers=1", "protocol.histories=[]"], True), ([], False)],
+)
+def test_traits_of_which_nothing_is_known_are_warned_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, options: list[str], warned: bool
+) -> None:
+    short = ["protocol=across_drivers", "protocol.folds=2", "learner=rollout", "learner.epochs=1", "learner.steps=1"]
+    result = cfx.run([*QUICK, *short, "policy.traits=all", *options, f"hydra.run.dir={tmp_path / 'job'}"])
+    assert ("policy.traits are measured from a driver's history" in caplog.text) == warned
+    assert len(cfx.load(result.folder).policy.policy.traits) == 6
+
+
 def test_drives_that_are_too_short_to_test_change_what_is_learned(tmp_path: Path) -> None:
     """All pairs are calibrated and learned from, the long ones alone stand in the results."""
     frames = [160, 200, 200, 200, 200]
