@@ -335,10 +335,10 @@ def style_of(pairs: Sequence[Any]) -> StyleResult:
     ("node", "length", "frames", "history", "traits"),
     [
         ({"name": "krauss"}, 5, 250, 5.3, ()),
-        ({"name": "krauss"}, 5, 250, 12.7, ("acceleration", "time_gap")),
+        ({"name": "krauss"}, 5, 250, 17.3, ("acceleration", "time_gap")),
         ({"name": "w99"}, 8, 1000, None, ("time_headway",)),
     ],
-    ids=["offsets from own parameters, after 5 s", "with traits, after 13 s", "parameters and traits, after all there is"],
+    ids=["offsets from own parameters, after 5 s", "with traits, after 17 s", "parameters and traits, after all there is"],
 )
 def test_in_sumo_a_policy_drives_as_in_memory(
     node: dict[str, Any], length: int, frames: int, history: float | None, traits: tuple[str, ...], tmp_path: Path
