@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from hypothesis import given, settings
@@ -16,12 +17,13 @@ from pydantic import ValidationError
 from sklearn.linear_model import Ridge
 
 import cfx
+from cfx.datasets.tidy import write_tidy
 from cfx.errors import ConfigError
 from cfx.models.krauss import Krauss
 from cfx.pairs import PairBatch
 from cfx.policies.features import History
 from cfx.policies.gru import GruPolicy
-from cfx.policies.trained import TrainedPolicy
+from cfx.policies.trained import TrainedPolicy, measured_history
 from cfx.policies.traits import LEAST, MOVING, TRAITS, measure
 from tests.drives import straight_pairs, wavy_pairs
 from tests.sumo.policies import adaptive
@@ -125,6 +127,21 @@ def test_a_saved_policy_knows_the_same_traits(tmp_path: Path) -> None:
         network = torch.tensor([len(again.names) - 1])
         answer, _ = told.act(now, told.begin(network, traits=torch.tensor([[0.7, -0.5]]).double()))
         assert answer[0].tolist() == pytest.approx(first_answer(policy, [0.7, -0.5]), rel=1e-6)
+
+
+def test_whoever_asks_with_a_table_is_answered_with_its_drivers_traits(tmp_path: Path) -> None:
+    write_tidy(wavy_pairs(Krauss(), PARAMETERS, frames=300), tmp_path / "pairs.parquet")
+    table = pd.read_parquet(tmp_path / "pairs.parquet")
+    policy = adaptive({"name": "krauss"}, traits=("time_headway", "response_time"))
+    until, network = BATCH.lengths - 1, torch.zeros(3, dtype=torch.long)
+    chosen = {}
+    for traits in (policy.traits_of(BATCH, until), None):
+        state = policy.read(BATCH, until, policy.begin(network, traits=traits))
+        now = measured_history(BATCH, torch.arange(3), until, policy.windows.length)
+        chosen[traits is None] = policy.act(now, state)[0][:, 0].tolist()
+    found = policy.predict_frame(table)["t_r"].tolist()
+    assert found == pytest.approx(chosen[False], rel=1e-6)
+    assert found != pytest.approx(chosen[True], rel=1e-3)
 
 
 def test_how_much_history_is_read_says_how_much_is_measured() -> None:
