@@ -6,7 +6,7 @@ Letters: f features of a token.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import torch
@@ -55,29 +55,39 @@ _SUMMARIES: dict[Summary, Callable[[Tensor], list[Tensor]]] = {
 }
 
 
-def named_inputs(value: object) -> object:
-    """Returns the inputs that a set's name stands for, and whatever else was given as it is.
+def of_set(value: object, sets: Mapping[str, tuple[str, ...]], known: Collection[str], what: str) -> object:
+    """Returns the names that a set's name stands for, and whatever else was given as it is.
 
     Raises:
         ValueError: it is a name, but not of a set.
     """
     if not isinstance(value, str):
         return value
-    if value not in INPUT_SETS:
-        hint = f" Write [{value}]." if value in INPUTS else nearest(value, [*INPUT_SETS, *INPUTS])
-        raise ValueError(f"not a set of inputs.{hint} Give {', '.join(INPUT_SETS)}, or a list of {', '.join(INPUTS)}")
-    return INPUT_SETS[value]
+    if value not in sets:
+        hint = f" Write [{value}]." if value in known else nearest(value, [*sets, *known])
+        raise ValueError(f"not a set of {what}s.{hint} Give {', '.join(sets)}, or a list of {', '.join(known)}")
+    return sets[value]
 
 
-def check_inputs(names: tuple[str, ...]) -> None:
-    """Raises ConfigError if a name is no input or stands twice."""
+def check_names(names: Sequence[str], known: Collection[str], what: str) -> None:
+    """Raises ConfigError if a name of `policy.{what}s` is unknown or stands twice."""
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"policy.{what}s: unknown {what} '{name}'.{nearest(name, known)} Known: {', '.join(known)}.")
+    if len(set(names)) != len(names):
+        raise ConfigError(f"policy.{what}s: {'an' if what[0] in 'aeiou' else 'a'} {what} stands twice in {', '.join(names)}")
+
+
+def named_inputs(value: object) -> object:
+    """As `of_set`, for inputs."""
+    return of_set(value, INPUT_SETS, INPUTS, "input")
+
+
+def check_inputs(names: Sequence[str]) -> None:
+    """As `check_names`, for inputs, of which there must be one."""
     if not names:
         raise ConfigError(f"policy.inputs: give at least one of {', '.join(INPUTS)}")
-    for name in names:
-        if name not in INPUTS:
-            raise ConfigError(f"policy.inputs: unknown input '{name}'.{nearest(name, INPUTS)} Known: {', '.join(INPUTS)}.")
-    if len(set(names)) != len(names):
-        raise ConfigError(f"policy.inputs: an input stands twice in {', '.join(names)}")
+    check_names(names, INPUTS, "input")
 
 
 def token_width(names: tuple[str, ...], summary: Summary, length: int) -> int:

@@ -16,9 +16,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cfx.errors import ConfigError, nearest
 from cfx.pairs import PairBatch
-from cfx.policies.features import History
+from cfx.policies.features import History, check_names, of_set
 
 MOVING = 2.0
 """m/s: frames in which the follower is slower say nothing of his time headway."""
@@ -128,26 +127,13 @@ TRAIT_SETS: dict[str, tuple[str, ...]] = {"all": tuple(TRAITS), "none": ()}
 
 
 def named_traits(value: object) -> object:
-    """Returns the traits that a set's name stands for, and whatever else was given as it is.
-
-    Raises:
-        ValueError: it is a name, but not of a set.
-    """
-    if not isinstance(value, str):
-        return value
-    if value not in TRAIT_SETS:
-        hint = f" Write [{value}]." if value in TRAITS else nearest(value, [*TRAIT_SETS, *TRAITS])
-        raise ValueError(f"not a set of traits.{hint} Give {', '.join(TRAIT_SETS)}, or a list of {', '.join(TRAITS)}")
-    return TRAIT_SETS[value]
+    """As `of_set`, for traits."""
+    return of_set(value, TRAIT_SETS, TRAITS, "trait")
 
 
 def check_traits(names: Sequence[str]) -> None:
-    """Raises ConfigError if a name is no trait or stands twice."""
-    for name in names:
-        if name not in TRAITS:
-            raise ConfigError(f"policy.traits: unknown trait '{name}'.{nearest(name, TRAITS)} Known: {', '.join(TRAITS)}.")
-    if len(set(names)) != len(names):
-        raise ConfigError(f"policy.traits: a trait stands twice in {', '.join(names)}")
+    """As `check_names`, for traits."""
+    check_names(names, TRAITS, "trait")
 
 
 def measure(batch: PairBatch, names: Sequence[str], dt: float, since: Tensor, until: Tensor) -> Tensor:
