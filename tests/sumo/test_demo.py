@@ -174,6 +174,7 @@ def test_what_sumo_refuses_is_one_sentence() -> None:
         "first": 5,
         "network": "all",
         "base": None,
+        "traits": None,
         "renew": 0,
         "track": tracks,
         "places": {kind: [(0, 60), (0, 30)] for kind in FOLLOWERS},
