@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from cfx.errors import ConfigError, nearest
+from cfx.pairs import PairBatch
 
 Summary = Literal["frames", "last", "mean", "mean_std"]
 
@@ -25,6 +26,12 @@ class History(NamedTuple):
     follower_speed: Tensor
     follower_acceleration: Tensor
     gap: Tensor
+
+    @classmethod
+    def of(cls, batch: PairBatch) -> History:
+        """Returns all that was measured of P pairs, `(P, T)` each."""
+        signals = (batch.leader_speed, batch.leader_acceleration, batch.follower_speed, batch.follower_acceleration)
+        return cls(*signals, batch.gap)
 
 
 _STANDING = 1.0

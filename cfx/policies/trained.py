@@ -391,8 +391,7 @@ def measured_history(batch: PairBatch, pair: Tensor, frame: Tensor, length: int)
         Signals of `(*shape, length)`.
     """
     index = (frame[..., None] + torch.arange(1 - length, 1, device=frame.device)).clamp(min=0)
-    signals = (batch.leader_speed, batch.leader_acceleration, batch.follower_speed, batch.follower_acceleration, batch.gap)
-    return History(*(signal[pair[..., None], index] for signal in signals))
+    return History(*(signal[pair[..., None], index] for signal in History.of(batch)))
 
 
 def driver_places(network: Tensor) -> Tensor:

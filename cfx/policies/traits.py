@@ -148,9 +148,8 @@ def measure(batch: PairBatch, names: Sequence[str], dt: float, since: Tensor, un
     Returns:
         `(P, k)` float64; NaN for a driver who moved for less than `LEAST` seconds of that.
     """
-    signals = (batch.leader_speed, batch.leader_acceleration, batch.follower_speed, batch.follower_acceleration, batch.gap)
     frame = torch.arange(batch.mask.shape[1], device=until.device)
     counted = batch.mask & (frame >= since[:, None]) & (frame < until[:, None])
-    measured = Measured(History(*(signal.double() for signal in signals)), counted, dt)
+    measured = Measured(History(*(signal.double() for signal in History.of(batch))), counted, dt)
     known = measured.moving.sum(1) * dt >= LEAST
     return torch.where(known[:, None], torch.stack([TRAITS[name](measured) for name in names], -1), torch.nan)

@@ -225,14 +225,12 @@ class Driver:
             own = torch.tensor([[base[name] for name in self.policy.space.names]], dtype=torch.float64)
             self._bases[vehicle] = self.policy.base_of(own)[0].tolist()
         if traits is not None:
-            if set(traits) != set(self.policy.policy.traits):
-                known = ", ".join(self.policy.policy.traits)
-                raise ParameterError(
-                    f"traits: give a value for each of {known}, and nothing else"
-                    if known
-                    else "traits: there are none that this policy was trained to know; leave them out"
-                )
-            self._traits[vehicle] = [traits[name] for name in self.policy.policy.traits]
+            known = self.policy.policy.traits
+            if not known:
+                raise ParameterError("traits: there are none that this policy was trained to know; leave them out")
+            if set(traits) != set(known):
+                raise ParameterError(f"traits: give a value for each of {', '.join(known)}, and nothing else")
+            self._traits[vehicle] = [traits[name] for name in known]
 
     def renew(self, vehicle: str) -> None:
         """Lets the policy's memory of a vehicle begin anew; the frames of its last window stay."""
@@ -413,13 +411,11 @@ class Driver:
         store.network[slots] = torch.tensor([self._drives(name) for name in names])
         if self.policy.base is not None:
             store.base[slots] = self.policy.base[store.network[slots]].to(store.base)
-            for slot, name in zip(slots.tolist(), names, strict=True):
-                if name in self._bases:
-                    store.base[slot] = torch.tensor(self._bases[name], dtype=store.base.dtype)
         store.traits[slots] = torch.nan
         for slot, name in zip(slots.tolist(), names, strict=True):
-            if name in self._traits:
-                store.traits[slot] = torch.tensor(self._traits[name], dtype=store.traits.dtype)
+            for column, assigned in ((store.base, self._bases), (store.traits, self._traits)):
+                if name in assigned:
+                    column[slot] = torch.tensor(assigned[name], dtype=column.dtype)
         begun = self._begun(slots)
         store.state[slots] = begun.state[begun.network, begun.place]
 

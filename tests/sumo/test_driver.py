@@ -234,6 +234,20 @@ def test_a_constant_driver_takes_parameters_by_name() -> None:
         Driver(adaptive({"name": "krauss"}, offsets=True)).assign("v0", base={"t_r": 1.0})
 
 
+def test_traits_are_told_by_name_to_a_policy_that_knows_them() -> None:
+    found = []
+    for traits in (None, {"time_gap": 0.5, "acceleration": -1.0}):
+        driver = Driver(adaptive({"name": "krauss"}, traits=("acceleration", "time_gap")))
+        driver.assign("v0", traits=traits)
+        driver.step(platoon(1), "v0")
+        found.append(driver.parameters("v0")["t_r"])
+    assert found[0] != pytest.approx(found[1], rel=1e-3)
+    with pytest.raises(ParameterError, match="traits: give a value for each of acceleration, time_gap, and nothing else"):
+        driver.assign("v0", traits={"time_gap": 0.5})
+    with pytest.raises(ParameterError, match="traits: there are none that this policy was trained to know"):
+        Driver(adaptive({"name": "krauss"})).assign("v0", traits={"time_gap": 0.5})
+
+
 def test_a_drivers_own_parameters_are_drawn_towards_the_default_as_in_training() -> None:
     plain = adaptive({"name": "krauss"}, offsets=True)
     own, found = torch.tensor([[4.0, 1.0]], dtype=torch.float64), []
