@@ -66,22 +66,14 @@ def _data(arguments: Sequence[str]) -> int:
 
 
 def _fetch(options: argparse.Namespace) -> int:
-    import logging
     import shlex
     from pathlib import Path
 
-    from cfx.console import ConsoleHandler
+    from cfx.console import told_on_the_console
     from cfx.datasets.fetch import URL, fetch_ngsim_i80
 
-    logger = logging.getLogger("cfx")
-    handler, level = ConsoleHandler(), logger.level
-    logger.addHandler(handler)
-    logger.setLevel(logging.INFO)
-    try:
+    with told_on_the_console():
         path = fetch_ngsim_i80(Path(options.folder).expanduser(), options.part, url=options.url or URL, force=options.force)
-    finally:
-        logger.removeHandler(handler)
-        logger.setLevel(level)
     print(f"Look at it: python -m cfx data describe {shlex.quote(str(path))}")
     print(f"Use it: python -m cfx data=ngsim data.path={shlex.quote(str(path))}")
     return 0

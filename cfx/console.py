@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import sys
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from rich.table import Table
 
 
@@ -24,6 +27,20 @@ class ConsoleHandler(logging.Handler):
                 _say(self.format(record), record.levelno)
         except Exception:  # logging's own rule: a handler never raises
             self.handleError(record)
+
+
+@contextlib.contextmanager
+def told_on_the_console() -> Iterator[None]:
+    """Prints cfx's own messages while a sub-command runs; jobs have their logging from Hydra."""
+    logger = logging.getLogger("cfx")
+    handler, level = ConsoleHandler(), logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
 
 
 def _say(message: str, level: int) -> None:

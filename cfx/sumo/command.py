@@ -23,23 +23,19 @@ def drive_scenario(options: argparse.Namespace, sumos: Sequence[str]) -> None:
     require_sumo()
     # libsumo does not get on with pyarrow, and pandas loads it where it finds it: this process does without.
     sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]  # Python's own way to say that a module is not there
-    import logging
-
-    from cfx.console import ConsoleHandler
+    from cfx.console import told_on_the_console
     from cfx.sumo.drive import drive, parse_drivers, report
 
-    logger = logging.getLogger("cfx")
-    logger.addHandler(ConsoleHandler())
-    logger.setLevel(logging.INFO)
-    report(
-        drive(
-            Path(options.scenario).expanduser(),
-            parse_drivers(options.drivers),
-            end=options.end,
-            seed=options.seed,
-            output=Path(options.output).expanduser() if options.output else None,
-            look_ahead=options.look_ahead,
-            speed_mode=options.speed_mode,
-            options=sumos,
+    with told_on_the_console():
+        report(
+            drive(
+                Path(options.scenario).expanduser(),
+                parse_drivers(options.drivers),
+                end=options.end,
+                seed=options.seed,
+                output=Path(options.output).expanduser() if options.output else None,
+                look_ahead=options.look_ahead,
+                speed_mode=options.speed_mode,
+                options=sumos,
+            )
         )
-    )

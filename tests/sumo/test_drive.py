@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import json
+import logging
 import subprocess
 import sys
 import textwrap
@@ -11,6 +12,7 @@ from typing import Any
 import pytest
 
 from cfx import cli
+from cfx.console import ConsoleHandler
 from cfx.errors import ConfigError
 from cfx.sumo.drive import Driven, Tally, parse_drivers, report
 from cfx.sumo.motorway import SHIPPED
@@ -123,6 +125,7 @@ def test_mistakes_are_told_before_sumo_starts(
     scenario: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(scenario)
+    monkeypatch.setitem(sys.modules, "pyarrow", sys.modules.get("pyarrow"))  # the command does without it, later tests do not
     with pytest.raises(ConfigError, match=r"--drivers calm: write TYPE=RUN"):
         parse_drivers(["calm"])
     with pytest.raises(ConfigError, match="'calm' stands twice"):
@@ -134,6 +137,7 @@ def test_mistakes_are_told_before_sumo_starts(
         without.setattr("importlib.metadata.version", _not_found)
         assert cli.main(["drive", "motorway.sumocfg", "--drivers", "calm=calm"]) == 2
     assert 'pip install "cfx-driving[sumo]"' in capsys.readouterr().err
+    assert not any(isinstance(handler, ConsoleHandler) for handler in logging.getLogger("cfx").handlers)  # nothing is left behind
 
 
 def _not_found(name: str) -> str:
