@@ -57,6 +57,13 @@ class Drives(NamedTuple):
         """The network of each drive, `(N, 1)`: with `place` it says where the drive's driver stands in a table of places."""
         return torch.arange(len(self.place), device=self.place.device)[:, None]
 
+    def weighed(self) -> Drives:
+        """Returns the drives that have weight, in order; others fill up a network that has fewer of them than another."""
+        has_weight = self.weight > 0
+        most = int(has_weight.sum(1).max())
+        kept = has_weight.long().argsort(dim=1, descending=True, stable=True)[:, :most].sort(1).values
+        return Drives._make(value if value is None else value.gather(1, kept) for value in self)
+
 
 @dataclass
 class Material:
@@ -154,10 +161,10 @@ class Material:
         return replace(self, base=base.expand(networks, drivers, -1), start=base.expand(networks, -1), scaler=scaler)
 
     def driving(self, most: int | None, generator: torch.Generator) -> Tensor:
-        """Returns places of the drivers who drive in one gradient step, as many of each network, `(N, D)`.
+        """Returns places of the drivers for whom drives are drawn in one gradient step, as many of each network, `(N, D)`.
 
-        Everybody in order, those kept for validation too (they have no weight), unless that is more than `most`: then as many of
-        those who are learned from.
+        Everybody in order, unless that is more than `most`: then as many of those who are learned from. Drives of those who are
+        kept for validation have no weight and are not simulated.
         """
         networks, drivers = self.pair.shape
         if most is None or drivers <= most:

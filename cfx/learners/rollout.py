@@ -322,6 +322,8 @@ class RolloutModule(BatchedModule):
             self.step.compile()
         self.errors = (errors or BaseErrors.of(lesson, material, settings.horizon)) if settings.normalise else None
         self.teacher = teacher
+        drawn = settings.draws * material.pair.shape[1]
+        self.bound = settings.gradient_bound / (min(drawn, settings.draws * settings.drivers) if settings.drivers else drawn)
         self.validated = material.held(settings.drivers, torch.Generator().manual_seed(self.seed))
         self.losses: list[Tensor] = []
 
@@ -386,7 +388,7 @@ class RolloutModule(BatchedModule):
                     wanted.append(watching.would_drive(recent, scene.ahead(window)))
                 recent, speed, gap = step.drive(recent, scene.ahead(window), scene.leader_length, base, told)
                 if learning:
-                    recent = bounded(recent, s.damping, s.gradient_bound / drives.place.shape[1])
+                    recent = bounded(recent, s.damping, self.bound)
                 if watching is not None:
                     recent = apart(recent)
                 speeds.append(speed)
@@ -449,7 +451,7 @@ class RolloutModule(BatchedModule):
             drawn = torch.exp(s.scaling * torch.randn(shape, generator=generator)).to(device)
             scale = torch.where(stranger, drawn, 1.0)
         weight = material.trains.gather(1, place).float()
-        return Drives(place, (share * latest).long(), stranger, until, weight, scale)
+        return Drives(place, (share * latest).long(), stranger, until, weight, scale).weighed()
 
     @torch.no_grad()
     def validation_step(self, number: int, index: int) -> None:

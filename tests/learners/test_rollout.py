@@ -310,8 +310,25 @@ def test_of_many_drivers_some_drive_in_each_step() -> None:
         assert bool(module.material.validates[network, module.validated[network]].all())
     assert torch.equal(module._draw(3).place, drawn[3].place)
     everybody = module_of(material, drivers=6, draws=1, validation=0.5)._draw(0)
-    assert everybody.place.tolist() == [list(range(6))] * 2
-    assert everybody.weight.sum(1).tolist() == [3.0, 3.0]
+    assert everybody.place.tolist() == [row.nonzero()[:, 0].tolist() for row in module.material.trains]
+    assert bool((everybody.weight == 1).all())
+
+
+def test_drives_without_weight_are_not_simulated() -> None:
+    """Unless another network has more with weight; what the others learn from is what it would be beside them."""
+    module = module_of(lesson(base=TRUE.repeat(2, 1), drivers=tuple("abcdefaabcde")), validation=0.3)
+    counts = module.material.trains.sum(1).tolist()
+    assert counts[0] != counts[1]
+    drives = module._draw(7)
+    assert drives.place.shape == (2, max(counts) * module.settings.draws)
+    assert (drives.weight.sum(1) / module.settings.draws).tolist() == counts
+    assert drives.scale is not None
+    weight = torch.tensor([[1.0, 0.0, 1.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
+    made = Drives(*(torch.arange(8.0).view(2, 4) + 10 * k for k in range(4)), weight=weight).weighed()
+    assert made.weight.tolist() == [[1.0, 1.0], [0.0, 1.0]]
+    assert made.place.tolist() == [[0.0, 2.0], [4.0, 6.0]]
+    assert made.last.tolist() == [[30.0, 32.0], [34.0, 36.0]]
+    assert made.scale is None
 
 
 def test_members_of_a_committee_keep_other_drivers_for_validation_and_read_alike() -> None:
