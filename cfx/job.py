@@ -48,6 +48,7 @@ from cfx.simulation.settings import SumoSettings
 from cfx.style.entropy import measure_style, select_cluster
 from cfx.style.result import StyleResult
 from cfx.tracking.provenance import version
+from cfx.tracking.store import folder_of, is_run_id
 
 if TYPE_CHECKING:
     from cfx.tracking.tracker import Tracker
@@ -101,7 +102,7 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
     device = _device(config.device)
     if config.threads is not None:
         torch.set_num_threads(config.threads)
-    protocol = cast(Protocol, registry.create("protocol", config.protocol))
+    protocol = _protocol(config)
     config = _settled(config, protocol)
     parts = _Parts.of(config, protocol)
     _writable(folder)
@@ -154,6 +155,21 @@ class _Parts:
             learner=learner,
             protocol=protocol,
         )
+
+
+def _protocol(config: JobConfig) -> Protocol:
+    """Returns the protocol, for which ids of MLflow runs have become folders.
+
+    Raises:
+        ConfigError: a setting is wrong.
+        TrackingError: there is no such run.
+    """
+    node = dict(config.protocol)
+    if isinstance(name := node.get("name"), str):
+        for setting in cast(type[Protocol], registry.get("protocol", name)).jobs:
+            if is_run_id(given := str(node.get(setting))):
+                node[setting] = folder_of(given, config.tracking.uri)
+    return cast(Protocol, registry.create("protocol", node))
 
 
 def _settled(config: JobConfig, protocol: Protocol) -> JobConfig:
@@ -411,11 +427,7 @@ def load(folder_or_run: str | Path) -> JobResult:
     Raises:
         DataError: there is no finished job.
     """
-    folder = Path(folder_or_run).expanduser()
-    if not folder.is_dir():
-        from cfx.tracking.tracker import download_run
-
-        folder = download_run(str(folder_or_run))
+    folder = folder_of(folder_or_run)
     try:
         defined = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
         pairs = pd.read_csv(folder / "pairs.csv", dtype={"leader_id": str, "follower_id": str})

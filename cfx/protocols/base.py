@@ -173,10 +173,13 @@ class Protocol(Component):
 
     Attributes:
         trains: whether it has a `trainable` policy trained; not if it brings one.
+        jobs: settings that name the output folders of finished jobs. Where one is the id of an MLflow run, the job puts the
+            folder with that run's files in its place.
     """
 
     kind = "protocol"
     trains: ClassVar[bool] = True
+    jobs: ClassVar[tuple[str, ...]] = ()
 
     def determines(self) -> Mapping[str, Any]:
         """Returns what this protocol determines of a job's configuration, whatever is chosen there: key -> value.

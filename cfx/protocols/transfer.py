@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 class TransferSettings(Settings):
     """Settings of `transfer`."""
 
-    run: FilePath = Field(description="output folder of the job whose policy drives; ~ and relative paths work")
+    run: FilePath = Field(description="output folder of the job whose policy drives, or the id of its MLflow run")
 
 
 class Transfer(Protocol):
@@ -49,6 +49,7 @@ class Transfer(Protocol):
     schema: ClassVar[type[Settings]] = TransferSettings
     settings: TransferSettings
     trains = False
+    jobs = ("run",)
 
     @cached_property
     def policy(self) -> TrainedPolicy:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from cfx.errors import TrackingError
 from cfx.report.read import Origin, Unfinished
-from cfx.tracking.store import open_store, sqlite_file, told, tracking_uri
-from cfx.tracking.tracker import download_run
+from cfx.tracking.store import download_run, is_run_id, open_store, sqlite_file, told, tracking_uri
 
 _MOST = 1000
 """Most jobs of one sweep that are asked for."""
@@ -24,7 +22,7 @@ def tracked_runs(run_id: str) -> list[tuple[Path, Origin] | Unfinished]:
     """
     uri = tracking_uri(None)
     file = sqlite_file(uri)
-    if not re.fullmatch(r"[0-9a-f]{32}", run_id) or (file is not None and not file.is_file()):
+    if not is_run_id(run_id) or (file is not None and not file.is_file()):
         return [(download_run(run_id), Origin(run_id))]  # it says what is wrong with the id or the store
     store = open_store(uri, "cfx")
     with told(f"read run {run_id} from {uri}"):

@@ -29,6 +29,7 @@ from cfx.policies.features import History
 from cfx.policies.fixed import FixedPolicy
 from cfx.policies.trained import ALL, PolicyState, Scaler, TrainedPolicy
 from cfx.simulation.threads import one_thread
+from cfx.tracking.store import folder_of
 
 Connection = Any
 """The module `libsumo`, the module `traci`, or a connection that `traci.getConnection` gives."""
@@ -516,11 +517,7 @@ def _trained(run: str | Path) -> TrainedPolicy:
     Raises:
         DataError: there is none, or the installed driving model has other parameters than it was trained for.
     """
-    folder = Path(run).expanduser()
-    if not folder.is_dir():
-        from cfx.tracking.tracker import download_run
-
-        folder = download_run(str(run))
+    folder = folder_of(run)
     if not (folder / "policy.json").is_file():
         folder /= "policy"
     policy = TrainedPolicy.load(folder)

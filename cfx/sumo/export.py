@@ -18,6 +18,7 @@ from cfx.errors import ConfigError, DataError, OutputError
 from cfx.files import whole
 from cfx.models.base import DrivingModel
 from cfx.models.vtype import InSumo, VType
+from cfx.tracking.store import folder_of
 
 NAME = "drivers.add.xml"
 
@@ -101,12 +102,8 @@ def _krauss(node: Mapping[str, Any], p: Mapping[str, Tensor]) -> tuple[DrivingMo
 
 def _folder(run: str | Path) -> tuple[Path, Path]:
     """Returns the folder of a job, and where its export goes unless told otherwise."""
-    folder = Path(run).expanduser()
-    if folder.is_dir():
-        return folder, folder
-    from cfx.tracking.tracker import download_run
-
-    return download_run(str(run)), Path()
+    folder = folder_of(run)
+    return folder, folder if Path(run).expanduser().is_dir() else Path()
 
 
 def _read(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import sqlite3
 import urllib.error
 import urllib.request
@@ -188,6 +189,48 @@ def told(doing: str) -> Iterator[None]:
             if "database is locked" in str(error):
                 reason = "the database is locked by another process; close what holds it and run again"
             raise TrackingError(f"MLflow could not {doing}: {reason[:300]}") from error
+
+
+def is_run_id(text: str) -> bool:
+    """Says whether this could be the id of an MLflow run."""
+    return re.fullmatch(r"[0-9a-f]{32}", text) is not None
+
+
+def download_run(run_id: str, uri: str | None = None) -> Path:
+    """Returns a folder with the files of a tracked job: `metrics.json`, `pairs.csv`, `config.yaml`, `figures/`, `policy/`.
+
+    Args:
+        run_id: MLflow's id of the run.
+        uri: of the store; None for `MLFLOW_TRACKING_URI`, else the database beside the outputs.
+
+    Raises:
+        TrackingError: there is no such run, or its files are gone.
+    """
+    address = tracking_uri(uri)
+    file = sqlite_file(address)
+    if file is not None and not file.is_file():
+        raise TrackingError(f"'{run_id}' is no folder, and there is no MLflow database at {file} in which it could be a run")
+    if not is_run_id(run_id):
+        raise TrackingError(
+            f"'{run_id}' is neither a job's output folder nor the id of an MLflow run (32 digits and letters a to f)"
+        )
+    store = open_store(address, "cfx")
+    with told(f"read run {run_id} from {address}"):
+        return Path(store.client.download_artifacts(run_id, ""))
+
+
+def folder_of(folder_or_run: str | Path, uri: str | None = None) -> Path:
+    """Returns the folder of a finished job, which may be given as the id of its MLflow run.
+
+    Args:
+        folder_or_run: an output folder, if it is there (`~` is the user's home); else a run.
+        uri: as `download_run` takes it.
+
+    Raises:
+        TrackingError: it is no folder, and there is no such run, or its files are gone.
+    """
+    folder = Path(folder_or_run).expanduser()
+    return folder if folder.is_dir() else download_run(str(folder_or_run), uri)
 
 
 def _import_mlflow() -> Any:

@@ -23,7 +23,7 @@ from cfx.errors import TrackingError
 from cfx.evaluation.result import Evaluation
 from cfx.learners.curves import over_networks
 from cfx.tracking import provenance
-from cfx.tracking.store import Store, open_store, sqlite_file, told, tracking_uri
+from cfx.tracking.store import Store, open_store, told, tracking_uri
 
 if TYPE_CHECKING:
     from cfx.config import JobConfig
@@ -333,29 +333,6 @@ def end_sweep(uri: str, experiment: str, sweep: str) -> tuple[str, ...]:
         _settle(store, str(parents[0].info.run_id), _safe(sweep))
     address, first = _address(store.uri)
     return (*first, f"All jobs of this sweep: {address}/{sweep_link(store.experiment_id, sweep)}")
-
-
-def download_run(run_id: str, uri: str | None = None) -> Path:
-    """Returns a folder with the files of a tracked job: `metrics.json`, `pairs.csv`, `config.yaml`, `figures/`, `policy/`.
-
-    Args:
-        run_id: MLflow's id of the run.
-        uri: of the store; None for `MLFLOW_TRACKING_URI`, else the database beside the outputs.
-
-    Raises:
-        TrackingError: there is no such run, or its files are gone.
-    """
-    address = tracking_uri(uri)
-    file = sqlite_file(address)
-    if file is not None and not file.is_file():
-        raise TrackingError(f"'{run_id}' is no folder, and there is no MLflow database at {file} in which it could be a run")
-    if not re.fullmatch(r"[0-9a-f]{32}", run_id):
-        raise TrackingError(
-            f"'{run_id}' is neither a job's output folder nor the id of an MLflow run (32 digits and letters a to f)"
-        )
-    store = open_store(address, "cfx")
-    with told(f"read run {run_id} from {address}"):
-        return Path(store.client.download_artifacts(run_id, ""))
 
 
 def _begin(store: Store, name: str, parameters: Mapping[str, str], tags: Mapping[str, str]) -> str:

@@ -14,7 +14,7 @@ import yaml
 import cfx
 from cfx.datasets.synthetic import SyntheticDataset
 from cfx.datasets.tidy import write_tidy
-from cfx.errors import CfxError, DataError
+from cfx.errors import CfxError, DataError, TrackingError
 from cfx.evaluation.closed_loop import drive
 from cfx.pairs import PairBatch, PairSet
 from cfx.policies.trained import ALL, TrainedPolicy
@@ -98,6 +98,17 @@ def test_model_policy_and_windows_are_those_it_was_trained_with(strangers: Path,
     assert (config["model"]["name"], config["policy"]["name"], config["windows"]["length"]) == ("krauss", "gru", 5)
     assert config["policy"]["inputs"] == "situation"
     assert json.loads((result.folder / "data.json").read_text())["protocol"]["pairs_learned_from"] == 6
+
+
+def test_the_job_may_be_named_by_its_mlflow_run(tmp_path: Path) -> None:
+    tracked = ["tracking.enabled=true", f"tracking.uri=sqlite:///{tmp_path / 'jobs.db'}"]
+    first = cfx.run([*TRAINED, "protocol.networks=all", f"hydra.run.dir={tmp_path / 'first'}", *tracked])
+    there = transferred(first.folder, tmp_path / "by folder")
+    named = cfx.run([*HERE, f"protocol.run={first.run_id}", f"hydra.run.dir={tmp_path / 'by id'}", *tracked])
+    pd.testing.assert_frame_equal(named.pairs, there.pairs)
+    assert yaml.safe_load((named.folder / "config.yaml").read_text())["protocol"]["run"] == first.run_id
+    with pytest.raises(TrackingError, match=r"could not read run f{32}"):
+        cfx.run([*HERE, f"protocol.run={'f' * 32}", f"hydra.run.dir={tmp_path / 'nothing'}", *tracked])
 
 
 def test_without_a_population_the_default_is_the_only_baseline_of_strangers(one_for_all: Path, tmp_path: Path) -> None:

@@ -26,8 +26,8 @@ from cfx.policies.features import token_width
 from cfx.policies.gru import GruPolicy
 from cfx.policies.trained import Scaler, TrainedPolicy
 from cfx.tracking import provenance
-from cfx.tracking.store import quiet, told
-from cfx.tracking.tracker import CURVE_POINTS, MlflowTracker, Tracker, download_run, sweep_link
+from cfx.tracking.store import download_run, quiet, told
+from cfx.tracking.tracker import CURVE_POINTS, MlflowTracker, Tracker, sweep_link
 from tests.drives import wavy_pairs
 from tests.made_up import make_curves, make_results
 
