@@ -322,8 +322,8 @@ class RolloutModule(BatchedModule):
             self.step.compile()
         self.errors = (errors or BaseErrors.of(lesson, material, settings.horizon)) if settings.normalise else None
         self.teacher = teacher
-        drawn = settings.draws * material.pair.shape[1]
-        self.bound = settings.gradient_bound / (min(drawn, settings.draws * settings.drivers) if settings.drivers else drawn)
+        drivers = material.pair.shape[1]  # for as many drives are drawn, with weight or without
+        self.bound = settings.gradient_bound / (settings.draws * min(drivers, settings.drivers or drivers))
         self.validated = material.held(settings.drivers, torch.Generator().manual_seed(self.seed))
         self.losses: list[Tensor] = []
 
