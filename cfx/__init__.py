@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from cfx.datasets.base import DatasetSettings as DatasetSettings
     from cfx.job import JobResult as JobResult
     from cfx.job import load as load
-    from cfx.learners.base import Learned as Learned
     from cfx.learners.base import Learner as Learner
-    from cfx.learners.base import Lesson as Lesson
+    from cfx.learners.base import TrainingData as TrainingData
+    from cfx.learners.base import TrainingResult as TrainingResult
     from cfx.models.base import DrivingModel as DrivingModel
     from cfx.models.base import Follower as Follower
     from cfx.models.base import Leader as Leader
@@ -40,9 +40,9 @@ if TYPE_CHECKING:
     from cfx.policies.base import Policy as Policy
     from cfx.policies.base import PolicyNetwork as PolicyNetwork
     from cfx.policies.base import PolicySettings as PolicySettings
-    from cfx.protocols.base import Outcome as Outcome
     from cfx.protocols.base import Protocol as Protocol
-    from cfx.protocols.base import Study as Study
+    from cfx.protocols.base import ProtocolContext as ProtocolContext
+    from cfx.protocols.base import ProtocolResult as ProtocolResult
     from cfx.registry import get as get
     from cfx.simulation.rollout import Start as Start
     from cfx.simulation.rollout import simulate as simulate
@@ -94,6 +94,8 @@ __all__ = [  # noqa: PLE0604 - the public names, from the one table that also sa
 
 
 def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        name = import_module("cfx.renamed").public(name) or name
     if name in _HOMES:
         value = getattr(import_module(_HOMES[name]), name)
     elif name in {"errors", "sumo"}:

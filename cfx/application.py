@@ -1,7 +1,7 @@
 """The Hydra application: composes, runs one job or many, and turns whatever happens into an exit code and one clear message.
 
 Hydra's own error handling prints tracebacks and exits with 1, so `HYDRA_FULL_ERROR` is set for the time of the call: exceptions
-then reach this module. A job itself never raises into Hydra; it leaves an `Outcome`, in a multirun as `outcome.json` in its
+then reach this module. A job itself never raises into Hydra; it leaves an `ProtocolResult`, in a multirun as `outcome.json` in its
 folder, which is how worker processes and other machines report too. So one failed job stops no other, and a multirun that was
 broken off goes on where it stopped: see `cfx.sweep`.
 """
@@ -29,10 +29,20 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from cfx import hydra_source, nodes
+from cfx import hydra_source, nodes, renamed
 from cfx.errors import CfxError, ConfigError
-from cfx.mistakes import explain, is_mistake
-from cfx.sweep import OUTCOME, Outcome, Record, Refused, SweepFolder, fingerprint, metrics_of, only_one, worker_of
+from cfx.sweep import (
+    STATUS,
+    JobStatus,
+    Record,
+    Refused,
+    SweepFolder,
+    fingerprint,
+    metrics_of,
+    only_one,
+    worker_of,
+)
+from cfx.user_errors import explain, is_user_error
 
 if TYPE_CHECKING:
     from cfx.job import JobResult
@@ -54,7 +64,7 @@ class JobFunction:
         self.multirun = multirun
         self.process = os.getpid()
         self.show_traceback = show_traceback
-        self.outcome: Outcome | None = None
+        self.status: JobStatus | None = None
 
     def __call__(self, config: DictConfig) -> float:
         """Runs one job; one of a multirun that was done before is not run again.
@@ -64,26 +74,46 @@ class JobFunction:
         """
         hydra_config = HydraConfig.get()
         folder = Path(hydra_config.runtime.output_dir)
-        given: Any = OmegaConf.to_container(hydra_config.overrides.task, resolve=False)  # as typed, `${...}` included
+        given: Any = OmegaConf.to_container(
+            hydra_config.overrides.task, resolve=False
+        )  # as typed, `${...}` included
         if hydra_config.mode == RunMode.MULTIRUN:
             record = Record.read(Path(str(hydra_config.sweep.dir)))
-            blank = Outcome(
-                0, "", "", tuple(given), self.multirun, record.command_hash if record else "", number=int(hydra_config.job.num)
+            blank = JobStatus(
+                0,
+                "",
+                "",
+                tuple(given),
+                self.multirun,
+                record.command_hash if record else "",
+                number=int(hydra_config.job.num),
             )
             with worker_of(self.process), only_one(folder):
-                metric, self.outcome = self._attempt(config, folder, blank, record.name if record else str(folder.parent))
-                self.outcome.write(folder)
+                metric, self.status = self._attempt(
+                    config, folder, blank, record.name if record else str(folder.parent)
+                )
+                self.status.write(folder)
             where = f"{blank.number} ({' '.join(given)}) "
         else:
-            metric, self.outcome = self._attempt(config, folder, Outcome(0, "", "", tuple(given)), "")
+            metric, self.status = self._attempt(
+                config, folder, JobStatus(0, "", "", tuple(given)), ""
+            )
             where = ""
-        if self.outcome.code:
-            detail = f"\n{self.outcome.detail}" if self.outcome.detail else ""
+        if self.status.code:
+            detail = f"\n{self.status.detail}" if self.status.detail else ""
             # A single job's message is printed by `start`, once.
-            log.error("job %sfailed: %s%s", where, self.outcome.message, detail, extra={"file_only": not where})
+            log.error(
+                "job %sfailed: %s%s",
+                where,
+                self.status.message,
+                detail,
+                extra={"file_only": not where},
+            )
         return metric
 
-    def _attempt(self, config: DictConfig, folder: Path, blank: Outcome, sweep: str) -> tuple[float, Outcome]:
+    def _attempt(
+        self, config: DictConfig, folder: Path, blank: JobStatus, sweep: str
+    ) -> tuple[float, JobStatus]:
         """Runs a job, or finds that it was done.
 
         Args:
@@ -92,10 +122,12 @@ class JobFunction:
         """
         began = time.monotonic()
 
-        def failed(code: int, message: str, *, show: bool = True) -> tuple[float, Outcome]:
+        def failed(code: int, message: str, *, show: bool = True) -> tuple[float, JobStatus]:
             detail = traceback.format_exc().rstrip() if show else ""
             seconds = time.monotonic() - began
-            return float("nan"), replace(blank, code=code, message=message, detail=detail, seconds=seconds)
+            return float("nan"), replace(
+                blank, code=code, message=message, detail=detail, seconds=seconds
+            )
 
         try:
             values: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
@@ -103,11 +135,17 @@ class JobFunction:
                 if values.get("tracking", {}).get("sweep", "") is None:
                     values["tracking"]["sweep"] = sweep
                 blank = replace(blank, fingerprint=fingerprint(values))
-                earlier = Outcome.read(folder)
-                if earlier is not None and earlier.code == 0 and earlier.fingerprint == blank.fingerprint:
+                earlier = JobStatus.read(folder)
+                if (
+                    earlier is not None
+                    and earlier.code == 0
+                    and earlier.fingerprint == blank.fingerprint
+                ):
                     log.info("job %d (%s) was done before", blank.number, " ".join(blank.overrides))
-                    return _metric(metrics_of(folder)), replace(blank, seconds=earlier.seconds, before=True)
-                (folder / OUTCOME).unlink(missing_ok=True)  # what it says is no longer so
+                    return _metric(metrics_of(folder)), replace(
+                        blank, seconds=earlier.seconds, before=True
+                    )
+                (folder / STATUS).unlink(missing_ok=True)  # what it says is no longer so
             result = _call(self.target, values, folder)
         except (Exception, SystemExit) as error:
             signalled = _signal_behind(error)
@@ -117,7 +155,9 @@ class JobFunction:
                 return failed(2, explain(error, ()), show=self.show_traceback)
             if isinstance(error, SystemExit):
                 return failed(1, f"the job called sys.exit({error.code!r})")
-            return failed(1, f"{type(error).__name__}: {error}")  # a bug: its traceback is printed, and the other jobs go on
+            return failed(
+                1, f"{type(error).__name__}: {error}"
+            )  # a bug: its traceback is printed, and the other jobs go on
         return _metric(result.metrics), replace(blank, seconds=time.monotonic() - began)
 
 
@@ -127,6 +167,7 @@ class Terminated(BaseException):
 
 def start(arguments: Sequence[str], *, target: str = JOB) -> int:
     """Runs the Hydra application and returns its exit code; prints each message once."""
+    arguments = renamed.overrides(arguments)
     overrides = [one for one in arguments if not one.startswith("-")]
     show_traceback = wants_traceback(arguments)
     job = JobFunction(target, uuid.uuid4().hex, show_traceback)
@@ -134,7 +175,9 @@ def start(arguments: Sequence[str], *, target: str = JOB) -> int:
     try:
         with _process_state(arguments):
             hydra_source.register()
-            hydra.main(config_path=str(nodes.conf_dir()), config_name="config", version_base="1.3")(job)()
+            hydra.main(config_path=str(nodes.conf_dir()), config_name="config", version_base="1.3")(
+                job
+            )()
         code = 0
     except SystemExit as error:
         # Hydra exits with 0 after --help and the like, with 1 or argparse's 2 after a message about a wrong flag.
@@ -147,13 +190,17 @@ def start(arguments: Sequence[str], *, target: str = JOB) -> int:
         raise  # the reader of stdout has gone; `cfx.cli.main` knows what that means
     except Exception as error:  # everything ends as an exit code
         signalled = _signal_behind(error)
-        code = _interrupted(signalled) if signalled is not None else _report(error, overrides, show_traceback)
+        code = (
+            _interrupted(signalled)
+            if signalled is not None
+            else _report(error, overrides, show_traceback)
+        )
     sweep = SweepFolder.take()
     if sweep is not None:
         return sweep.close(job.multirun, code, interrupted=code in {INTERRUPTED, TERMINATED})
-    if job.outcome is not None and job.outcome.code:
-        print(job.outcome.detail or job.outcome.message, file=sys.stderr)
-        return job.outcome.code
+    if job.status is not None and job.status.code:
+        print(job.status.detail or job.status.message, file=sys.stderr)
+        return job.status.code
     return code
 
 
@@ -168,13 +215,14 @@ def run(overrides: Sequence[str] = (), *, target: str = JOB) -> JobResult:
     """
     if isinstance(overrides, str):
         raise ConfigError(f"give a list of overrides: cfx.run({overrides.split()!r})")
+    overrides = renamed.overrides(overrides)
     try:
         config = hydra_source.composed(overrides)
         values = hydra_source.plain(config)
         with hydra_source.resolving(config):
             folder = _fresh(Path(str(config.hydra.run.dir)).absolute())
     except Exception as error:
-        if is_mistake(error) and not isinstance(error, CfxError):
+        if is_user_error(error) and not isinstance(error, CfxError):
             raise ConfigError(explain(error, overrides)) from None
         raise
     with _log_file(folder / "cfx.log"):
@@ -183,8 +231,12 @@ def run(overrides: Sequence[str] = (), *, target: str = JOB) -> JobResult:
 
 def wants_traceback(arguments: Sequence[str]) -> bool:
     """Says whether the user asked for tracebacks even of their own mistakes."""
-    asked = any(os.environ.get(name, "") not in {"", "0"} for name in ("CFX_TRACEBACK", "HYDRA_FULL_ERROR"))
-    return asked or any(one.startswith("hydra.verbose=") and not one.lower().endswith("=false") for one in arguments)
+    asked = any(
+        os.environ.get(name, "") not in {"", "0"} for name in ("CFX_TRACEBACK", "HYDRA_FULL_ERROR")
+    )
+    return asked or any(
+        one.startswith("hydra.verbose=") and not one.lower().endswith("=false") for one in arguments
+    )
 
 
 def _call(target: str, values: Any, folder: Path) -> Any:
@@ -197,7 +249,10 @@ def _call(target: str, values: Any, folder: Path) -> Any:
 
 def _interrupted(signalled: BaseException) -> int:
     terminated = isinstance(signalled, Terminated)
-    print(f"{'terminated' if terminated else 'interrupted'}; what was finished is kept", file=sys.stderr)
+    print(
+        f"{'terminated' if terminated else 'interrupted'}; what was finished is kept",
+        file=sys.stderr,
+    )
     return TERMINATED if terminated else INTERRUPTED
 
 
@@ -220,13 +275,16 @@ def _metric(metrics: Mapping[str, float]) -> float:
 
 def _report(error: BaseException | None, overrides: Sequence[str], show_traceback: bool) -> int:
     assert error is not None
-    if type(error).__name__ in {"TerminatedWorkerError", "BrokenProcessPool"}:  # joblib's; importing it takes a while
+    if type(error).__name__ in {
+        "TerminatedWorkerError",
+        "BrokenProcessPool",
+    }:  # joblib's; importing it takes a while
         print(
             "a worker process was killed, perhaps because memory ran out: hydra.launcher.n_jobs=N makes fewer at a time",
             file=sys.stderr,
         )
         return 1
-    mistake = is_mistake(error)
+    mistake = is_user_error(error)
     if show_traceback or not mistake:
         traceback.print_exception(error)
     if mistake:
@@ -246,7 +304,9 @@ def _fresh(folder: Path) -> Path:
             candidate.mkdir(parents=True)
         except FileExistsError:
             if not folder.is_dir():
-                raise ConfigError(f"{folder} is a file; choose another output folder with hydra.run.dir=FOLDER") from None
+                raise ConfigError(
+                    f"{folder} is a file; choose another output folder with hydra.run.dir=FOLDER"
+                ) from None
             number += 1
             candidate = folder.with_name(f"{folder.name}-{number}")
         except OSError as error:

@@ -45,9 +45,16 @@ def _data(arguments: Sequence[str]) -> int:
     actions = parser.add_subparsers(dest="action", required=True)
     describe = actions.add_parser("describe", help="what recordings hold")
     describe.add_argument("files", nargs="+", metavar="FILE")
-    fetch = actions.add_parser("fetch", help="download a public recording; nothing else in cfx uses the network unasked")
+    fetch = actions.add_parser(
+        "fetch", help="download a public recording; nothing else in cfx uses the network unasked"
+    )
     fetch.add_argument("recording", choices=["ngsim-i80"], metavar="ngsim-i80")
-    fetch.add_argument("--recording", dest="part", default="0400", help="0400 (default), 0500, 0515 (pm, 15 minutes each) or all")
+    fetch.add_argument(
+        "--recording",
+        dest="part",
+        default="0400",
+        help="0400 (default), 0500, 0515 (pm, 15 minutes each) or all",
+    )
     fetch.add_argument("--folder", default="data", help="where the file goes; default: data")
     fetch.add_argument("--url", help="of a mirror that speaks SODA, ending in .csv")
     fetch.add_argument("--force", action="store_true", help="download again and replace the file")
@@ -69,19 +76,28 @@ def _fetch(options: argparse.Namespace) -> int:
     import shlex
     from pathlib import Path
 
-    from cfx.console import told_on_the_console
+    from cfx.console import console_logging
     from cfx.datasets.fetch import URL, fetch_ngsim_i80
 
-    with told_on_the_console():
-        path = fetch_ngsim_i80(Path(options.folder).expanduser(), options.part, url=options.url or URL, force=options.force)
+    with console_logging():
+        path = fetch_ngsim_i80(
+            Path(options.folder).expanduser(),
+            options.part,
+            url=options.url or URL,
+            force=options.force,
+        )
     print(f"Look at it: python -m cfx data describe {shlex.quote(str(path))}")
     print(f"Use it: python -m cfx data=ngsim data.path={shlex.quote(str(path))}")
     return 0
 
 
 def _ui(arguments: Sequence[str]) -> int:
-    parser = argparse.ArgumentParser("cfx ui", description="Opens the tracked jobs in MLflow, on this machine only.")
-    parser.add_argument("--uri", help="tracking store; default: MLFLOW_TRACKING_URI, or SQLite beside the outputs")
+    parser = argparse.ArgumentParser(
+        "cfx ui", description="Opens the tracked jobs in MLflow, on this machine only."
+    )
+    parser.add_argument(
+        "--uri", help="tracking store; default: MLFLOW_TRACKING_URI, or SQLite beside the outputs"
+    )
     parser.add_argument("--port", type=int, default=5000)
     parser.add_argument("--open", action="store_true", help="open the first page in the browser")
     options = parser.parse_args(list(arguments))
@@ -92,9 +108,20 @@ def _ui(arguments: Sequence[str]) -> int:
 
 
 def _report(arguments: Sequence[str]) -> int:
-    parser = argparse.ArgumentParser("cfx report", description="Writes one HTML page about finished jobs, complete in itself.")
-    parser.add_argument("runs", nargs="+", metavar="RUN", help="output folder of a job or a sweep, or id of an MLflow run")
-    parser.add_argument("--output", metavar="FILE", help="default: report.html in the folder; for several, or a run: here")
+    parser = argparse.ArgumentParser(
+        "cfx report", description="Writes one HTML page about finished jobs, complete in itself."
+    )
+    parser.add_argument(
+        "runs",
+        nargs="+",
+        metavar="RUN",
+        help="output folder of a job or a sweep, or id of an MLflow run",
+    )
+    parser.add_argument(
+        "--output",
+        metavar="FILE",
+        help="default: report.html in the folder; for several, or a run: here",
+    )
     parser.add_argument("--title", help="of the page")
     options = parser.parse_args(list(arguments))
     from cfx.report.command import report
@@ -111,13 +138,34 @@ def _drive(arguments: Sequence[str]) -> int:
         epilog="What follows -- goes to SUMO as it is: cfx drive city.sumocfg --drivers calm=RUN -- --step-length 0.1",
     )
     parser.add_argument("scenario", help="SUMO's configuration, .sumocfg")
-    parser.add_argument("--drivers", nargs="+", required=True, metavar="TYPE=RUN", help="a vType, and who drives it: a job")
-    parser.add_argument("--end", type=float, metavar="SECONDS", help="of simulated time; default: the scenario's")
-    parser.add_argument("--seed", type=int, help="SUMO's; default: the scenario's")
-    parser.add_argument("--output", metavar="FILE", help="CSV: where each driven vehicle is at each step, and its parameters")
-    parser.add_argument("--look-ahead", type=float, default=200.0, metavar="METRES", help="farther is no leader; default: 200")
     parser.add_argument(
-        "--speed-mode", type=int, default=0, help="SUMO's bit set; 0 (default): exact; 31: SUMO's own checks bound each speed"
+        "--drivers",
+        nargs="+",
+        required=True,
+        metavar="TYPE=RUN",
+        help="a vType, and who drives it: a job",
+    )
+    parser.add_argument(
+        "--end", type=float, metavar="SECONDS", help="of simulated time; default: the scenario's"
+    )
+    parser.add_argument("--seed", type=int, help="SUMO's; default: the scenario's")
+    parser.add_argument(
+        "--output",
+        metavar="FILE",
+        help="CSV: where each driven vehicle is at each step, and its parameters",
+    )
+    parser.add_argument(
+        "--look-ahead",
+        type=float,
+        default=200.0,
+        metavar="METRES",
+        help="farther is no leader; default: 200",
+    )
+    parser.add_argument(
+        "--speed-mode",
+        type=int,
+        default=0,
+        help="SUMO's bit set; 0 (default): exact; 31: SUMO's own checks bound each speed",
     )
     given = list(arguments)
     cut = given.index("--") if "--" in given else len(given)
@@ -129,10 +177,23 @@ def _drive(arguments: Sequence[str]) -> int:
 
 
 def _export(arguments: Sequence[str]) -> int:
-    parser = argparse.ArgumentParser("cfx export", description="Writes a job's fixed parameters for another program.")
-    parser.add_argument("run", metavar="RUN", help="output folder of a job, or id of its MLflow run")
-    parser.add_argument("--to", choices=["sumo"], required=True, help="sumo: a vType distribution for each cluster (.add.xml)")
-    parser.add_argument("--output", metavar="FILE", help="default: drivers.add.xml in the job's folder; for an MLflow run: here")
+    parser = argparse.ArgumentParser(
+        "cfx export", description="Writes a job's fixed parameters for another program."
+    )
+    parser.add_argument(
+        "run", metavar="RUN", help="output folder of a job, or id of its MLflow run"
+    )
+    parser.add_argument(
+        "--to",
+        choices=["sumo"],
+        required=True,
+        help="sumo: a vType distribution for each cluster (.add.xml)",
+    )
+    parser.add_argument(
+        "--output",
+        metavar="FILE",
+        help="default: drivers.add.xml in the job's folder; for an MLflow run: here",
+    )
     options = parser.parse_args(list(arguments))
     from cfx.sumo.export import export
 
@@ -141,4 +202,11 @@ def _export(arguments: Sequence[str]) -> int:
     return 0
 
 
-_COMMANDS = {"plugins": _plugins, "data": _data, "report": _report, "ui": _ui, "drive": _drive, "export": _export}
+_COMMANDS = {
+    "plugins": _plugins,
+    "data": _data,
+    "report": _report,
+    "ui": _ui,
+    "drive": _drive,
+    "export": _export,
+}

@@ -27,7 +27,9 @@ class Settings(BaseModel):
     node and the line in `python -m cfx plugins show`.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False
+    )
 
 
 class Component:
@@ -58,7 +60,9 @@ class Component:
             raise TypeError("give either a Settings object or keyword options, not both")
         # A dataset's config group is `data`, as Hydra users expect; every other kind's is its own name.
         group = "data" if self.kind == "dataset" else self.kind
-        self.settings = settings if settings is not None else validate(self.schema, options, where=group)
+        self.settings = (
+            settings if settings is not None else validate(self.schema, options, where=group)
+        )
 
     def identity(self) -> dict[str, Any]:
         """Returns what results of this component depend on: its class, its settings and its code.
@@ -100,7 +104,9 @@ def validate(schema: type[Schema], values: Any, *, where: str) -> Schema:
     try:
         return schema.model_validate(values)
     except ValidationError as error:
-        raise ConfigError("\n".join(_sentence(schema, problem, where) for problem in error.errors())) from None
+        raise ConfigError(
+            "\n".join(_sentence(schema, problem, where) for problem in error.errors())
+        ) from None
 
 
 def _sentence(schema: type[BaseModel], problem: Any, where: str) -> str:
@@ -113,7 +119,9 @@ def _sentence(schema: type[BaseModel], problem: Any, where: str) -> str:
     if problem["type"] == "missing":
         return f"{path}: a value is required; give one as {path}=..."
     message = str(problem["msg"]).removeprefix("Value error, ").removeprefix("Input ")
-    if isinstance(problem["input"], Mapping):  # several settings contradict each other; the message names them
+    if isinstance(
+        problem["input"], Mapping
+    ):  # several settings contradict each other; the message names them
         return f"{message if message.startswith(path) else f'{path}: {message}'}."
     return f"{path}={problem['input']!r}: {message}."
 

@@ -22,7 +22,9 @@ Node = dict[str, Any]
 class SimulationSettings(Settings):
     """How rollouts are computed."""
 
-    compile: Literal["auto", "always", "never"] = Field("auto", description="compile the model's step: auto: where it pays")
+    compile: Literal["auto", "always", "never"] = Field(
+        "auto", description="compile the model's step: auto: where it pays"
+    )
     memory_mb: int = Field(1024, ge=16, description="bound for one chunk of problems, MB")
 
 
@@ -37,9 +39,13 @@ class TrackingSettings(Settings):
     """What MLflow keeps."""
 
     enabled: bool = Field(True, description="log the job to MLflow")
-    uri: str | None = Field(None, description="tracking store; null: MLFLOW_TRACKING_URI, or SQLite beside the outputs")
+    uri: str | None = Field(
+        None, description="tracking store; null: MLFLOW_TRACKING_URI, or SQLite beside the outputs"
+    )
     experiment: str = Field("cfx", min_length=1, description="MLflow's experiment")
-    sweep: str | None = Field(None, description="name that the jobs of a multirun share: they get a common parent run")
+    sweep: str | None = Field(
+        None, description="name that the jobs of a multirun share: they get a common parent run"
+    )
 
 
 class FigureSettings(Settings):
@@ -51,30 +57,41 @@ class FigureSettings(Settings):
 class DemoSettings(Settings):
     """The demonstration in SUMO that follows a job."""
 
-    enabled: bool = Field(False, description="show the job's drives on a motorway in SUMO; into the folder `sumo` of the job's")
+    enabled: bool = Field(
+        False,
+        description="show the job's drives on a motorway in SUMO; into the folder `sumo` of the job's",
+    )
     osm: Path | None = Field(
         None,
         description="an OpenStreetMap extract of your own (.osm.xml), or a SUMO network (.net.xml); null: a hand-made motorway",
     )
-    pairs: int = Field(6, ge=1, description="pairs at most, spread evenly from the best to the worst improvement")
+    pairs: int = Field(
+        6, ge=1, description="pairs at most, spread evenly from the best to the worst improvement"
+    )
 
 
 class JobConfig(Settings):
     """Everything that one job needs to know; `conf/config.yaml` says the same in YAML."""
 
-    preset: str | None = Field(None, description="the experiment that these settings come from; a report reads it")
+    preset: str | None = Field(
+        None, description="the experiment that these settings come from; a report reads it"
+    )
     data: Node = Field(description="the dataset's node")
     model: Node = Field(description="the driving model's node")
     policy: Node = Field(description="the policy's node")
     optimizer: Node = Field(description="the optimizer's node")
     learner: Node = Field(description="the learner's node")
     protocol: Node = Field(description="the protocol's node")
-    simulator: MemorySettings | SumoSettings = Field(MemorySettings(), description="what takes the steps")
+    simulator: MemorySettings | SumoSettings = Field(
+        MemorySettings(), description="what takes the steps"
+    )
     seed: int = Field(0, ge=0, lt=2**32, description="seed of everything random")
     device: str = Field("auto", description="auto, cpu, cuda or cuda:N")
     dtype: Literal["float32", "float64"] = Field("float64", description="precision of simulations")
     threads: int | None = Field(1, ge=1, description="torch's threads; null: torch's own choice")
-    split: float = Field(0.8, gt=0, lt=1, description="share of each pair that is calibrated and learned on")
+    split: float = Field(
+        0.8, gt=0, lt=1, description="share of each pair that is calibrated and learned on"
+    )
     windows: WindowSettings = Field(WindowSettings(), description="how drives are cut")
     style: StyleSettings = Field(StyleSettings(), description="driving style")
     simulation: SimulationSettings = Field(SimulationSettings(), description="rollouts")
@@ -97,7 +114,9 @@ class JobConfig(Settings):
             return node
         name = str(node.get("name"))
         if name not in SIMULATORS:
-            raise ValueError(f"there is no simulator '{name}'.{nearest(name, SIMULATORS)} Known: {', '.join(SIMULATORS)}")
+            raise ValueError(
+                f"there is no simulator '{name}'.{nearest(name, SIMULATORS)} Known: {', '.join(SIMULATORS)}"
+            )
         return validate(SIMULATORS[name], node, where="simulator")
 
     @classmethod
@@ -108,5 +127,7 @@ class JobConfig(Settings):
             ConfigError: one sentence for each key that is wrong, with its full path.
         """
         if not isinstance(values, Mapping):
-            raise ConfigError(f"a configuration is a mapping of keys to values, not {type(values).__name__}")
+            raise ConfigError(
+                f"a configuration is a mapping of keys to values, not {type(values).__name__}"
+            )
         return validate(cls, values, where="")

@@ -22,7 +22,11 @@ class ConsoleHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         try:
             ours = record.name.partition(".")[0] in {"cfx", "hydra", "hydra_plugins"}
-            wanted = ours or record.levelno >= logging.WARNING or logging.getLogger().isEnabledFor(logging.DEBUG)
+            wanted = (
+                ours
+                or record.levelno >= logging.WARNING
+                or logging.getLogger().isEnabledFor(logging.DEBUG)
+            )
             if wanted and not getattr(record, "file_only", False):
                 _say(self.format(record), record.levelno)
         except Exception:  # logging's own rule: a handler never raises
@@ -30,7 +34,7 @@ class ConsoleHandler(logging.Handler):
 
 
 @contextlib.contextmanager
-def told_on_the_console() -> Iterator[None]:
+def console_logging() -> Iterator[None]:
     """Prints cfx's own messages while a sub-command runs; jobs have their logging from Hydra."""
     logger = logging.getLogger("cfx")
     handler, level = ConsoleHandler(), logger.level

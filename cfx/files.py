@@ -18,7 +18,10 @@ def absolute(value: Any) -> Path:
     Raises:
         PydanticCustomError: it is no path.
     """
-    if value is None or str(value).strip() in {"", "???"}:  # "???" is how a config file says that a value is missing
+    if value is None or str(value).strip() in {
+        "",
+        "???",
+    }:  # "???" is how a config file says that a value is missing
         raise PydanticCustomError("missing", "a value is required")
     if not isinstance(value, str | Path):
         raise PydanticCustomError("path", "write a path")
@@ -30,7 +33,7 @@ FilePath = Annotated[Path, BeforeValidator(absolute)]
 
 
 @contextmanager
-def whole(path: Path) -> Iterator[Path]:
+def atomic_write(path: Path) -> Iterator[Path]:
     """Gives the block a name beside `path`, with the same suffixes, to write to; it takes its place if the block ends well.
 
     If the block fails, nothing of it is left and an earlier file stays as it was.

@@ -48,8 +48,14 @@ class ComponentSource(ConfigSource):
 
     def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
         path = config_path.strip("/")
-        groups = sorted(registry.GROUPS) if path == "" and results_filter != ObjectType.CONFIG else []
-        configs = list(registry.names(path)) if path in registry.GROUPS and results_filter != ObjectType.GROUP else []
+        groups = (
+            sorted(registry.GROUPS) if path == "" and results_filter != ObjectType.CONFIG else []
+        )
+        configs = (
+            list(registry.names(path))
+            if path in registry.GROUPS and results_filter != ObjectType.GROUP
+            else []
+        )
         return groups + configs
 
     def load_config(self, config_path: str) -> ConfigResult:
@@ -63,7 +69,12 @@ class ComponentSource(ConfigSource):
             raise ConfigLoadError(f"Config not found: {config_path}")
         name = name.removeprefix("_")
         text = nodes.render(registry.get(group, name), name)
-        return ConfigResult(provider=self.provider, path="cfx://", config=OmegaConf.create(text), header={"package": None})
+        return ConfigResult(
+            provider=self.provider,
+            path="cfx://",
+            config=OmegaConf.create(text),
+            header={"package": None},
+        )
 
 
 class ComponentSearchPath(SearchPathPlugin):
@@ -78,11 +89,16 @@ class ComponentSearchPath(SearchPathPlugin):
 def plugin_conf_dirs() -> dict[str, Path]:
     """Returns the `conf/` folder of every third party's top-level package that has one. Runs no code of theirs."""
     found: dict[str, Path] = {}
-    packages = sorted({entry.package for kind in registry.KINDS for entry in registry.entries(kind)} - {"cfx"})
+    packages = sorted(
+        {entry.package for kind in registry.KINDS for entry in registry.entries(kind)} - {"cfx"}
+    )
     for package in packages:
         try:
             spec = importlib.util.find_spec(package)
-        except (ImportError, ValueError):  # a broken distribution harms nobody who does not ask for it
+        except (
+            ImportError,
+            ValueError,
+        ):  # a broken distribution harms nobody who does not ask for it
             continue
         for location in (spec.submodule_search_locations or []) if spec is not None else []:
             folder = Path(location) / "conf"
@@ -105,7 +121,9 @@ def composed(overrides: Sequence[str]) -> DictConfig:
         HydraException: an override fits nothing.
         PluginError: a chosen component cannot be loaded.
     """
-    with initialize_config_dir(config_dir=str(nodes.conf_dir()), job_name="cfx", version_base="1.3"):
+    with initialize_config_dir(
+        config_dir=str(nodes.conf_dir()), job_name="cfx", version_base="1.3"
+    ):
         return compose("config", overrides=list(overrides), return_hydra_config=True)
 
 

@@ -22,7 +22,7 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
-from cfx import registry
+from cfx import registry, renamed
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.settings import WindowSettings
@@ -31,7 +31,7 @@ from cfx.datasets.base import Dataset
 from cfx.datasets.tidy import write_tidy
 from cfx.errors import ConfigError, DataError, OutputError, PluginError
 from cfx.evaluation.result import Evaluation, Improvement
-from cfx.files import whole
+from cfx.files import atomic_write
 from cfx.learners.base import Learner
 from cfx.learners.curves import best_losses
 from cfx.models.base import DrivingModel
@@ -41,7 +41,7 @@ from cfx.pairs import PairBatch, PairSet
 from cfx.policies.base import Policy
 from cfx.policies.trained import TrainedPolicy
 from cfx.progress import Task
-from cfx.protocols.base import Outcome, Protocol, Study
+from cfx.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.simulation.base import BaseSimulator
 from cfx.simulation.rollout import Simulator
 from cfx.simulation.settings import SumoSettings
@@ -55,7 +55,15 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_TRACKED = ("config.yaml", "metrics.json", "pairs.csv", "style.csv", "data.json", "drives.parquet", "curves.parquet")
+_TRACKED = (
+    "config.yaml",
+    "metrics.json",
+    "pairs.csv",
+    "style.csv",
+    "data.json",
+    "trajectories.parquet",
+    "curves.parquet",
+)
 """Files of a job's folder that MLflow keeps too, besides its figures and its policy."""
 
 _WINDOW_S = 0.5
@@ -114,13 +122,31 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
 
             check_demo(config.demo, pairs)
         tracker.set_tags(
-            {"dataset.fingerprint": pairs.fingerprint, "dataset.source": pairs.source, "dataset.pairs": str(len(pairs))}
+            {
+                "dataset.fingerprint": pairs.fingerprint,
+                "dataset.source": pairs.source,
+                "dataset.pairs": str(len(pairs)),
+            }
         )
-        study = _study(config, parts, pairs, style, device)
-        with closing(study.simulator):
-            outcome = _outcome(parts.protocol, study)
-        result = _keep(config, folder, pairs, style, outcome, tracker, follows=parts.model.follows)
-    report(result, outcome.evaluation, console, tracker, follows=parts.model.follows)
+        context = _context(config, parts, pairs, style, device)
+        with closing(context.simulator):
+            protocol_result = _protocol_result(parts.protocol, context)
+        result = _keep(
+            config,
+            folder,
+            pairs,
+            style,
+            protocol_result,
+            tracker,
+            has_constant_baseline=parts.model.has_constant_baseline,
+        )
+    report(
+        result,
+        protocol_result.evaluation,
+        console,
+        tracker,
+        has_constant_baseline=parts.model.has_constant_baseline,
+    )
     return result
 
 
@@ -146,7 +172,7 @@ class _Parts:
         policy = cast(Policy, registry.create("policy", config.policy))
         learner.require_gradients(model, not isinstance(config.simulator, SumoSettings))
         if "policy" not in protocol.determines():  # or it has learned already
-            learner.require_no_traits(policy)
+            learner.require_no_driver_features(policy)
         return cls(
             dataset=cast(Dataset, registry.create("dataset", config.data)),
             model=model,
@@ -177,7 +203,9 @@ def _settled(config: JobConfig, protocol: Protocol) -> JobConfig:
     determined = protocol.determines()
     if not determined:
         return config
-    named = ", ".join(f"{key}={value['name']}" if "name" in value else key for key, value in determined.items())
+    named = ", ".join(
+        f"{key}={value['name']}" if "name" in value else key for key, value in determined.items()
+    )
     log.info("The protocol determines %s", named)
     return JobConfig.of({**config.model_dump(), **determined})
 
@@ -188,13 +216,20 @@ def _device(name: str) -> torch.device:
     device = torch.device(name)
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
         found = torch.cuda.device_count()
-        raise ConfigError(f"device={name}: PyTorch finds {found} CUDA devices here; write device=cpu or device=auto")
+        raise ConfigError(
+            f"device={name}: PyTorch finds {found} CUDA devices here; write device=cpu or device=auto"
+        )
     return device
 
 
 def _pairs(dataset: Dataset, config: JobConfig) -> tuple[PairSet, StyleResult]:
     pairs = dataset.load()
-    log.info("%d pairs of %d drivers from %s", len(pairs), len({pair.driver for pair in pairs}), pairs.source)
+    log.info(
+        "%d pairs of %d drivers from %s",
+        len(pairs),
+        len({pair.driver for pair in pairs}),
+        pairs.source,
+    )
     style = measure_style(pairs, config.style)
     pairs = select_cluster(pairs, style, config.style.cluster)
     for drop in pairs.dropped:
@@ -212,7 +247,9 @@ def _pairs(dataset: Dataset, config: JobConfig) -> tuple[PairSet, StyleResult]:
     return pairs, style
 
 
-def _study(config: JobConfig, parts: _Parts, pairs: PairSet, style: StyleResult, device: torch.device) -> Study:
+def _context(
+    config: JobConfig, parts: _Parts, pairs: PairSet, style: StyleResult, device: torch.device
+) -> ProtocolContext:
     batch = PairBatch.of(pairs, dtype=getattr(torch, config.dtype), device=device)
     simulator = make_simulator(config, parts.model, batch.dt)
     calibrator = Calibrator(
@@ -223,7 +260,7 @@ def _study(config: JobConfig, parts: _Parts, pairs: PairSet, style: StyleResult,
         memory=config.simulation.memory_mb * 2**20,
         progress=Task,
     )
-    return Study(
+    return ProtocolContext(
         pairs=pairs,
         batch=batch,
         style=style,
@@ -236,7 +273,9 @@ def _study(config: JobConfig, parts: _Parts, pairs: PairSet, style: StyleResult,
         windows=config.windows,
         split=config.split,
         seed=config.seed,
-        workspace=Path(config.cache.folder).expanduser() / "training" if config.cache.enabled else None,
+        workspace=Path(config.cache.folder).expanduser() / "training"
+        if config.cache.enabled
+        else None,
     )
 
 
@@ -253,7 +292,9 @@ def check_simulator(config: JobConfig, model: DrivingModel) -> None:
         require_in_sumo(model)
     elif isinstance(model, SumoOnly):
         name = config.model.get("name")
-        raise ConfigError(f"model={name} has no equations in Python, SUMO alone drives it; add simulator=sumo")
+        raise ConfigError(
+            f"model={name} has no equations in Python, SUMO alone drives it; add simulator=sumo"
+        )
 
 
 def make_simulator(config: JobConfig, model: DrivingModel, dt: float) -> BaseSimulator:
@@ -265,11 +306,13 @@ def make_simulator(config: JobConfig, model: DrivingModel, dt: float) -> BaseSim
     return Simulator(model, dt, compile=config.simulation.compile)
 
 
-def _outcome(protocol: Protocol, study: Study) -> Outcome:
-    outcome: object = protocol.run(study)
-    if not isinstance(outcome, Outcome):
-        raise PluginError(f"{registry.origin(protocol)}: run must return a cfx.Outcome, but returned a {type(outcome).__name__}")
-    return outcome
+def _protocol_result(protocol: Protocol, context: ProtocolContext) -> ProtocolResult:
+    protocol_result: object = protocol.run(context)
+    if not isinstance(protocol_result, ProtocolResult):
+        raise PluginError(
+            f"{registry.origin(protocol)}: run must return a cfx.ProtocolResult, but returned a {type(protocol_result).__name__}"
+        )
+    return protocol_result
 
 
 def _keep(
@@ -277,49 +320,71 @@ def _keep(
     folder: Path,
     pairs: PairSet,
     style: StyleResult,
-    outcome: Outcome,
+    protocol_result: ProtocolResult,
     tracker: Tracker,
     *,
-    follows: bool,
+    has_constant_baseline: bool,
 ) -> JobResult:
     """Writes everything into the folder, then into MLflow."""
-    evaluation = outcome.evaluation
-    of_training = (outcome.labels.metrics() if outcome.labels is not None else {}) | best_losses(outcome.curves)
-    metrics = evaluation.metrics() | of_training
+    evaluation = protocol_result.evaluation
+    of_training = (
+        protocol_result.labels.metrics() if protocol_result.labels is not None else {}
+    ) | best_losses(protocol_result.curves)
+    metrics = renamed.Metrics(evaluation.metrics() | of_training)
     written = _Output(folder)
     written.file("pairs.csv", lambda path: evaluation.table.to_csv(path, index=False))
-    written.file("drives.parquet", lambda path: evaluation.drives_table().to_parquet(path, index=False))
-    written.file("curves.parquet", lambda path: _curves(outcome.curves).to_parquet(path, index=False))
+    written.file(
+        "trajectories.parquet",
+        lambda path: evaluation.trajectories_table().to_parquet(path, index=False),
+    )
+    written.file(
+        "curves.parquet", lambda path: _curves(protocol_result.curves).to_parquet(path, index=False)
+    )
     written.file("style.csv", lambda path: style.table.to_csv(path, index=False))
-    if outcome.labels is not None:
-        labels = outcome.labels.to_frame(pairs, evaluation.names)
+    if protocol_result.labels is not None:
+        labels = protocol_result.labels.to_frame(pairs, evaluation.names)
         written.file("labels.parquet", lambda path: labels.to_parquet(path, index=False))
     if any(pair.truth for pair in pairs):
         written.file("data.parquet", lambda path: write_tidy(pairs, path))
     further = _further(evaluation, written)
-    written.run(lambda: outcome.policy.save(folder / "policy"))
+    written.run(lambda: protocol_result.policy.save(folder / "policy"))
     figures: list[Path] = []
     if config.figures.enabled:
         from cfx.figures.write import write_figures
 
-        written.run(lambda: figures.extend(write_figures(folder / "figures", evaluation, style, outcome.curves)))
+        written.run(
+            lambda: figures.extend(
+                write_figures(folder / "figures", evaluation, style, protocol_result.curves)
+            )
+        )
     demo: list[Path] = []
     if config.demo.enabled:
         from cfx.sumo.demo import write_demo
 
         saved = folder / "policy"
-        written.run(lambda: demo.extend(write_demo(folder / "sumo", saved, pairs, outcome.policy, evaluation, config)))
+        written.run(
+            lambda: demo.extend(
+                write_demo(
+                    folder / "sumo", saved, pairs, protocol_result.policy, evaluation, config
+                )
+            )
+        )
     provenance = {
         "source": pairs.source,
         "fingerprint": pairs.fingerprint,
         "pairs": len(pairs),
-        "protocol": dict(outcome.notes),
-        "dropped": [{"reason": drop.reason, "count": drop.count, "unit": drop.unit} for drop in pairs.dropped],
+        "protocol": dict(protocol_result.notes),
+        "dropped": [
+            {"reason": drop.reason, "count": drop.count, "unit": drop.unit}
+            for drop in pairs.dropped
+        ],
         "parameters": [
             {"name": name, "unit": unit, "low": float(low), "high": float(high)}
-            for name, unit, low, high in zip(evaluation.names, evaluation.units, *evaluation.bounds, strict=True)
+            for name, unit, low, high in zip(
+                evaluation.names, evaluation.units, *evaluation.bounds, strict=True
+            )
         ],
-        "follows": follows,
+        "has_constant_baseline": has_constant_baseline,
         "cfx": version(),
     }
     written.file("data.json", lambda path: _dump(provenance, path))
@@ -328,11 +393,20 @@ def _keep(
     written.file("metrics.json", lambda path: _dump(defined, path))
     tracker.log_evaluation(evaluation)
     tracker.log_metrics(of_training)
-    tracker.log_curves(outcome.curves)
+    tracker.log_curves(protocol_result.curves)
     tracker.log_figures(figures)
     tracker.log_policy(folder / "policy")
     tracker.log_files([*(folder / name for name in _TRACKED), *further, *demo])
-    return JobResult(metrics, evaluation.table, outcome.policy, tuple(figures), folder, tracker.run_id, evaluation, style)
+    return JobResult(
+        metrics,
+        evaluation.table,
+        protocol_result.policy,
+        tuple(figures),
+        folder,
+        tracker.run_id,
+        evaluation,
+        style,
+    )
 
 
 def _further(evaluation: Evaluation, written: _Output) -> list[Path]:
@@ -349,36 +423,57 @@ def _further(evaluation: Evaluation, written: _Output) -> list[Path]:
     return paths
 
 
-def report(result: JobResult, evaluation: Evaluation, console: Console, tracker: Tracker, *, follows: bool = True) -> None:
-    """Prints the table, where the results are and how to open them; `follows` as `DrivingModel.follows`."""
+def report(
+    result: JobResult,
+    evaluation: Evaluation,
+    console: Console,
+    tracker: Tracker,
+    *,
+    has_constant_baseline: bool = True,
+) -> None:
+    """Prints the table, where the results are and how to open them; `has_constant_baseline` as `DrivingModel.has_constant_baseline`."""
     table = Table(
         title=f"{len(evaluation.drives)} pair{'s' * (len(evaluation.drives) != 1)}, test part in closed loop",
         title_justify="left",
     )
     m = result.metrics
     columns = {"RMSE speed [m/s]": "rmse_speed", "RMSE gap [m]": "rmse_gap"}
-    if evaluation.whole_improvements:
-        columns |= {"whole speed [m/s]": "whole/rmse_speed", "whole gap [m]": "whole/rmse_gap"}
+    if evaluation.full_trajectory_improvements:
+        columns |= {
+            "whole speed [m/s]": "full_trajectory/rmse_speed",
+            "whole gap [m]": "full_trajectory/rmse_gap",
+        }
     table.add_column("method")
     for heading in (*columns, "collisions"):
         table.add_column(heading, justify="right")
     for method in evaluation.methods:
-        values = [f"{m[f'{key}/{method}']:.3f}" if f"{key}/{method}" in m else "" for key in columns.values()]
+        values = [
+            f"{m[f'{key}/{method}']:.3f}" if f"{key}/{method}" in m else ""
+            for key in columns.values()
+        ]
         table.add_row(method, *values, f"{m[f'collisions/{method}']:.0f}")
     console.print(table)
-    if not follows:
+    if not has_constant_baseline:
         text = "With constant parameters the model follows no leader: compare the policy's RMSE with other jobs'."
         console.print(text, soft_wrap=True)
     else:
         _tell(evaluation.improvement, "fixed", console)
-        if "fixed" in evaluation.later_improvements:
-            _tell(evaluation.later_improvements["fixed"], "fixed beyond the first 5 s", console)
-        if "base" in evaluation.improvements:
-            _tell(evaluation.improvements["base"], "base (own, drawn towards the default)", console)
+        if "fixed" in evaluation.steady_improvements:
+            _tell(evaluation.steady_improvements["fixed"], "fixed beyond the first 5 s", console)
+        if "shrunk" in evaluation.improvements:
+            _tell(
+                evaluation.improvements["shrunk"],
+                "shrunk (own, shrunk towards the default)",
+                console,
+            )
         if "population" in evaluation.improvements:
             _tell(evaluation.improvements["population"], "population", console)
-        if "population" in evaluation.whole_improvements:
-            _tell(evaluation.whole_improvements["population"], "population on whole drives", console)
+        if "population" in evaluation.full_trajectory_improvements:
+            _tell(
+                evaluation.full_trajectory_improvements["population"],
+                "population on whole drives",
+                console,
+            )
     _warn(evaluation, m, console)
     console.print(f"Results: {result.folder}", soft_wrap=True, highlight=False)
     for line in tracker.how_to_open():
@@ -387,7 +482,11 @@ def report(result: JobResult, evaluation: Evaluation, console: Console, tracker:
 
 def _tell(i: Improvement, baseline: str, console: Console) -> None:
     known = math.isfinite(i.ci95_low)
-    interval = f"95 % interval {i.ci95_low:+.1%} to {i.ci95_high:+.1%}" if known else "no interval: it needs two drivers"
+    interval = (
+        f"95 % interval {i.ci95_low:+.1%} to {i.ci95_high:+.1%}"
+        if known
+        else "no interval: it needs two drivers"
+    )
     console.print(
         f"Improvement of policy over {baseline}, RMSE of speed: mean {i.mean:+.1%} ({interval}), trimmed mean"
         f" {i.trimmed_mean:+.1%}, median {i.median:+.1%}; better for {i.win_rate:.0%} of {i.pairs}"
@@ -396,7 +495,9 @@ def _tell(i: Improvement, baseline: str, console: Console) -> None:
         highlight=False,
     )
     if i.undefined:
-        console.print(f"{i.undefined} pairs have no improvement: a drive diverged, or {baseline} drives without any error.")
+        console.print(
+            f"{i.undefined} pairs have no improvement: a drive diverged, or {baseline} drives without any error."
+        )
 
 
 def _warn(evaluation: Evaluation, metrics: Mapping[str, float], console: Console) -> None:
@@ -404,7 +505,9 @@ def _warn(evaluation: Evaluation, metrics: Mapping[str, float], console: Console
 
     def listed(name: str, least: float, form: str) -> str:
         found = {method: metrics.get(f"{name}/{method}", 0.0) for method in evaluation.methods}
-        return ", ".join(f"{method} {value:{form}}" for method, value in found.items() if value >= least)
+        return ", ".join(
+            f"{method} {value:{form}}" for method, value in found.items() if value >= least
+        )
 
     braking, stuck = listed("hard_braking", 1, ".0f"), metrics.get("at_bounds/policy", 0.0) >= 0.01
     said = [f"Frames with an acceleration below -8 m/s2: {braking}."] if braking else []
@@ -415,7 +518,9 @@ def _warn(evaluation: Evaluation, metrics: Mapping[str, float], console: Console
 
 def _curves(curves: pd.DataFrame) -> pd.DataFrame:
     """Returns learning curves with the same column types whether anything was learned or not."""
-    return curves.astype({"network": str, "epoch": "int64", "train_loss": float, "validation_loss": float})
+    return curves.astype(
+        {"network": str, "epoch": "int64", "train_loss": float, "validation_loss": float}
+    )
 
 
 def load(folder_or_run: str | Path) -> JobResult:
@@ -431,9 +536,14 @@ def load(folder_or_run: str | Path) -> JobResult:
     try:
         defined = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
         pairs = pd.read_csv(folder / "pairs.csv", dtype={"leader_id": str, "follower_id": str})
+        pairs = renamed.results(pairs)
     except (OSError, ValueError, KeyError) as error:
-        raise DataError(f"{folder} holds no finished job ({error}); give the output folder that a job printed") from error
-    metrics = {name: math.nan if value is None else float(value) for name, value in defined.items()}
+        raise DataError(
+            f"{folder} holds no finished job ({error}); give the output folder that a job printed"
+        ) from error
+    metrics = renamed.metrics(
+        {name: math.nan if value is None else float(value) for name, value in defined.items()}
+    )
     figures = tuple(sorted((folder / "figures").glob("*.png")))
     return JobResult(metrics, pairs, TrainedPolicy.load(folder / "policy"), figures, folder)
 
@@ -446,7 +556,7 @@ class _Output:
 
     def file(self, name: str, write: Callable[[Path], object]) -> None:
         def write_whole() -> None:
-            with whole(self.folder / name) as temporary:
+            with atomic_write(self.folder / name) as temporary:
                 write(temporary)
 
         self.run(write_whole)
@@ -465,7 +575,9 @@ def _dump(values: Mapping[str, Any], path: Path) -> None:
 
 
 def _write(path: Path, text: str) -> None:
-    _Output(path.parent).file(path.name, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    _Output(path.parent).file(
+        path.name, lambda temporary: temporary.write_text(text, encoding="utf-8")
+    )
 
 
 def _writable(folder: Path) -> None:

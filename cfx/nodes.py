@@ -45,9 +45,15 @@ def render(cls: type[Component], name: str) -> str:
     """
     space = getattr(cls, "parameters", None)
     lines = [*_comment(_summary(cls)), f"name: {_scalar(name)}"]
-    lines += _settings(cls.schema, {}, skip={"parameters"} if isinstance(space, ParameterSpace) else set())
+    lines += _settings(
+        cls.schema, {}, skip={"parameters"} if isinstance(space, ParameterSpace) else set()
+    )
     if isinstance(space, ParameterSpace):
-        lines.append("parameters:" if space.parameters else "parameters: null  # required: {NAME: {low: , high: , default: }}")
+        lines.append(
+            "parameters:"
+            if space.parameters
+            else "parameters: null  # required: {NAME: {low: , high: , default: }}"
+        )
         for parameter in space:
             lines += [f"  {line}" for line in _parameter(parameter)]
     return "\n".join(lines) + "\n"
@@ -70,7 +76,12 @@ def file_path(entry: registry.Entry) -> Path:
 
 def built_in() -> list[registry.Entry]:
     """Returns the entries of cfx itself."""
-    return [entry for kind in registry.KINDS for entry in registry.entries(kind) if entry.distribution == DISTRIBUTION]
+    return [
+        entry
+        for kind in registry.KINDS
+        for entry in registry.entries(kind)
+        if entry.distribution == DISTRIBUTION
+    ]
 
 
 def write_all() -> int:
@@ -91,18 +102,27 @@ def write_all() -> int:
     return failed
 
 
-def _settings(schema: type[BaseModel], values: Mapping[str, Any], skip: set[str] | None = None) -> Iterator[str]:
+def _settings(
+    schema: type[BaseModel], values: Mapping[str, Any], skip: set[str] | None = None
+) -> Iterator[str]:
     for name, field in schema.model_fields.items():
         if name in (skip or set()):
             continue
         blank = field.is_required()
-        value = values.get(name, None if blank else field.get_default(call_default_factory=True, validated_data={}))
-        note = " ".join(part for part in ("required:" if blank else "", field.description or "") if part)
+        value = values.get(
+            name, None if blank else field.get_default(call_default_factory=True, validated_data={})
+        )
+        note = " ".join(
+            part for part in ("required:" if blank else "", field.description or "") if part
+        )
         if isinstance(value, BaseModel):
             yield from _comment(note)
             yield f"{_scalar(name)}:"
             yield from (
-                f"  {line}" for line in _settings(type(value), {key: getattr(value, key) for key in type(value).model_fields})
+                f"  {line}"
+                for line in _settings(
+                    type(value), {key: getattr(value, key) for key in type(value).model_fields}
+                )
             )
         else:
             yield from _line(name, _value(to_jsonable_python(value)), note)
@@ -110,7 +130,12 @@ def _settings(schema: type[BaseModel], values: Mapping[str, Any], skip: set[str]
 
 def _parameter(parameter: Parameter) -> list[str]:
     source = f" ({parameter.source})" if parameter.source else ""
-    node = {"low": parameter.low, "high": parameter.high, "default": parameter.default, "tuned": parameter.tuned}
+    node = {
+        "low": parameter.low,
+        "high": parameter.high,
+        "default": parameter.default,
+        "tuned": parameter.tuned,
+    }
     return [
         *_comment(f"{parameter.name}, {parameter.unit}: {parameter.meaning}{source}"),
         f"{_scalar(parameter.name)}: {_value(node)}",
@@ -138,14 +163,18 @@ def _summary(cls: type[Component]) -> str:
 def _value(value: Any) -> str:
     """Returns plain data as one line of YAML."""
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{_scalar(key)}: {_value(item)}" for key, item in value.items()) + "}"
+        return (
+            "{" + ", ".join(f"{_scalar(key)}: {_value(item)}" for key, item in value.items()) + "}"
+        )
     if isinstance(value, list):
         return "[" + ", ".join(_value(item) for item in value) + "]"
     return _scalar(value)
 
 
 def _scalar(value: Any) -> str:
-    if isinstance(value, str) and not (re.fullmatch(r"[A-Za-z_]\w*", value, re.ASCII) and yaml.safe_load(value) == value):
+    if isinstance(value, str) and not (
+        re.fullmatch(r"[A-Za-z_]\w*", value, re.ASCII) and yaml.safe_load(value) == value
+    ):
         return json.dumps(value.replace("${", r"\${"))  # quoted, and never an interpolation
     return str(yaml.safe_dump([value], default_flow_style=True).strip()[1:-1])
 

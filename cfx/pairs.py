@@ -68,7 +68,9 @@ class Pair:
     def __post_init__(self) -> None:
         shapes = {name: getattr(self, name).shape for name in SIGNALS}
         if len(set(shapes.values())) != 1 or len(shapes["leader_position"]) != 1:
-            raise DataError(f"pair {self.pair_id}: all signals must have the same length, got {shapes}")
+            raise DataError(
+                f"pair {self.pair_id}: all signals must have the same length, got {shapes}"
+            )
         if not self.dt > 0:
             raise DataError(f"pair {self.pair_id}: the time step must be positive, got {self.dt} s")
 
@@ -139,7 +141,11 @@ class PairSet(Sequence[Pair]):
         """Keeps the pairs marked True and counts the others under `reason`."""
         kept = tuple(pair for pair, wanted in zip(self.pairs, keep, strict=True) if wanted)
         lost = len(self.pairs) - len(kept)
-        return replace(self, pairs=kept, dropped=(*self.dropped, Dropped(reason, lost)) if lost else self.dropped)
+        return replace(
+            self,
+            pairs=kept,
+            dropped=(*self.dropped, Dropped(reason, lost)) if lost else self.dropped,
+        )
 
     @property
     def dt(self) -> float:
@@ -209,14 +215,21 @@ class PairBatch:
         pair_set = pairs if isinstance(pairs, PairSet) else PairSet(tuple(pairs), "pairs")
         dt = pair_set.dt
         length = max(len(pair) for pair in pair_set)
-        stacked = {name: np.stack([_extend(pair, name, length) for pair in pair_set]) for name in SIGNALS}
+        stacked = {
+            name: np.stack([_extend(pair, name, length) for pair in pair_set]) for name in SIGNALS
+        }
         lengths = torch.tensor([len(pair) for pair in pair_set])
         tensors = {
-            name: torch.as_tensor(values).to(device=device, dtype=dtype or torch.float64) for name, values in stacked.items()
+            name: torch.as_tensor(values).to(device=device, dtype=dtype or torch.float64)
+            for name, values in stacked.items()
         }
         return cls(
             **tensors,
-            leader_length=torch.tensor([pair.leader_length for pair in pair_set], dtype=dtype or torch.float64, device=device),
+            leader_length=torch.tensor(
+                [pair.leader_length for pair in pair_set],
+                dtype=dtype or torch.float64,
+                device=device,
+            ),
             lengths=lengths.to(device),
             mask=(torch.arange(length) < lengths[:, None]).to(device),
             dt=dt,

@@ -37,7 +37,7 @@ class Parameter:
         meaning: one line.
         source: where default and bounds come from.
         tuned: whether calibration and policies choose it; a constant otherwise.
-        held: whether policies of offsets leave it at their base (`ModelSettings.reach`).
+        held: whether policies of offsets leave it at their base (`ModelSettings.adaptation_bounds`).
     """
 
     name: str
@@ -52,9 +52,13 @@ class Parameter:
 
     def __post_init__(self) -> None:
         if not all(math.isfinite(value) for value in (self.low, self.high, self.default)):
-            raise ParameterError(f"parameter {self.name}: bounds and default must be finite numbers")
+            raise ParameterError(
+                f"parameter {self.name}: bounds and default must be finite numbers"
+            )
         if not self.low < self.high:
-            raise ParameterError(f"parameter {self.name}: low ({self.low}) must be below high ({self.high})")
+            raise ParameterError(
+                f"parameter {self.name}: low ({self.low}) must be below high ({self.high})"
+            )
         if not self.low <= self.default <= self.high:
             raise ParameterError(
                 f"parameter {self.name}: default {self.default} lies outside its bounds [{self.low}, {self.high}] {self.unit};"
@@ -67,7 +71,9 @@ class ParameterOverride(Settings):
 
     low: float | None = Field(None, description="lower bound")
     high: float | None = Field(None, description="upper bound")
-    default: float | None = Field(None, description="value of the method 'default', and of a parameter that is not tuned")
+    default: float | None = Field(
+        None, description="value of the method 'default', and of a parameter that is not tuned"
+    )
     tuned: bool | None = Field(None, description="whether calibration and policies choose it")
 
 
@@ -108,7 +114,9 @@ class ParameterSpace:
 
     def __getitem__(self, name: str) -> Parameter:
         if name not in self._by_name:
-            raise ParameterError(f"unknown parameter '{name}'.{nearest(name, self._by_name)} Known: {', '.join(self._by_name)}.")
+            raise ParameterError(
+                f"unknown parameter '{name}'.{nearest(name, self._by_name)} Known: {', '.join(self._by_name)}."
+            )
         return self._by_name[name]
 
     @property
@@ -138,13 +146,19 @@ class ParameterSpace:
         )
         space = ParameterSpace((*merged, *(_added(name, changes[name]) for name in added)))
         if not space.parameters:
-            raise ParameterError("give the parameters, such as model.parameters='{tau: {low: 0.5, high: 3, default: 1}}'")
+            raise ParameterError(
+                "give the parameters, such as model.parameters='{tau: {low: 0.5, high: 3, default: 1}}'"
+            )
         if not space.tuned:
-            raise ParameterError("no parameter is tuned; set model.parameters.NAME.tuned=true for at least one")
+            raise ParameterError(
+                "no parameter is tuned; set model.parameters.NAME.tuned=true for at least one"
+            )
         return space
 
-    def reaching(self, reach: Mapping[str, tuple[float, float] | None]) -> ParameterSpace:
-        """Returns the space in which policies of offsets move; see `ModelSettings.reach`.
+    def for_adaptation(
+        self, adaptation_space: Mapping[str, tuple[float, float] | None]
+    ) -> ParameterSpace:
+        """Returns the space in which policies of offsets move; see `ModelSettings.adaptation_bounds`.
 
         Args:
             reach: bounds, name -> (low, high), which move outwards as far as they are not there already; None: held.
@@ -152,16 +166,24 @@ class ParameterSpace:
         Raises:
             ParameterError: an unknown name, a lower bound that is not below the upper one, or nothing is left to move.
         """
-        for name, bounds in reach.items():
+        for name, bounds in adaptation_space.items():
             self[name]
-            if bounds is not None and not (math.isfinite(bounds[0]) and math.isfinite(bounds[1]) and bounds[0] < bounds[1]):
+            if bounds is not None and not (
+                math.isfinite(bounds[0]) and math.isfinite(bounds[1]) and bounds[0] < bounds[1]
+            ):
                 raise ParameterError(
-                    f"model.reach.{name}=[{bounds[0]}, {bounds[1]}]: the first must be below the second, and both finite"
+                    f"model.adaptation_bounds.{name}=[{bounds[0]}, {bounds[1]}]: the first must be below the second, and both finite"
                 )
-        space = replace(self, parameters=tuple(_reaching(p, reach[p.name]) if p.name in reach else p for p in self.parameters))
+        space = replace(
+            self,
+            parameters=tuple(
+                _for_adaptation(p, adaptation_space[p.name]) if p.name in adaptation_space else p
+                for p in self.parameters
+            ),
+        )
         if all(parameter.held for parameter in space.tuned):
             raise ParameterError(
-                "model.reach: every tuned parameter is null, so a policy of offsets could move none; leave one out"
+                "model.adaptation_bounds: every tuned parameter is null, so a policy of offsets could move none; leave one out"
             )
         return space
 
@@ -172,18 +194,24 @@ class ParameterSpace:
         held = [parameter.held for parameter in self.tuned]
         return ~torch.tensor(held, device=device) if any(held) else None
 
-    def bounds(self, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Tensor:
+    def bounds(
+        self, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None
+    ) -> Tensor:
         """Returns `(2, n)`: lower bounds, upper bounds."""
         import torch
 
         rows = [[p.low for p in self.tuned], [p.high for p in self.tuned]]
         return torch.tensor(rows, dtype=dtype or torch.float64, device=device)
 
-    def defaults(self, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Tensor:
+    def defaults(
+        self, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None
+    ) -> Tensor:
         """Returns `(n,)`: the default of each tuned parameter."""
         import torch
 
-        return torch.tensor([p.default for p in self.tuned], dtype=dtype or torch.float64, device=device)
+        return torch.tensor(
+            [p.default for p in self.tuned], dtype=dtype or torch.float64, device=device
+        )
 
     def to_unit(self, values: Tensor) -> Tensor:
         """Maps `(*batch, n)` from SI units to unit space."""
@@ -198,9 +226,14 @@ class ParameterSpace:
     def unpack(self, values: Tensor) -> dict[str, Tensor]:
         """Splits `(*batch, n)` into one tensor `(*batch,)` per parameter, constants (0-dimensional) included."""
         if values.shape[-1] != len(self):
-            raise ParameterError(f"expected {len(self)} parameters ({', '.join(self.names)}), got {values.shape[-1]}")
+            raise ParameterError(
+                f"expected {len(self)} parameters ({', '.join(self.names)}), got {values.shape[-1]}"
+            )
         tuned = dict(zip(self.names, values.unbind(-1), strict=True))
-        return {p.name: tuned[p.name] if p.tuned else values.new_tensor(p.default) for p in self.parameters}
+        return {
+            p.name: tuned[p.name] if p.tuned else values.new_tensor(p.default)
+            for p in self.parameters
+        }
 
     def check(self, values: Mapping[str, float]) -> None:
         """Raises ParameterError if a value lies outside its parameter's bounds or its name is unknown."""
@@ -212,15 +245,28 @@ class ParameterSpace:
                 )
 
 
-def _reaching(parameter: Parameter, bounds: tuple[float, float] | None) -> Parameter:
+def _for_adaptation(parameter: Parameter, bounds: tuple[float, float] | None) -> Parameter:
     if bounds is None:
         return replace(parameter, held=True)
-    return replace(parameter, low=min(parameter.low, bounds[0]), high=max(parameter.high, bounds[1]))
+    return replace(
+        parameter, low=min(parameter.low, bounds[0]), high=max(parameter.high, bounds[1])
+    )
 
 
 def _added(name: str, given: ParameterOverride) -> Parameter:
     """Returns a parameter that a config adds to an open space."""
     if given.low is None or given.high is None or given.default is None:
-        raise ParameterError(f"model.parameters.{name}: give low, high and default, as nobody else knows them")
+        raise ParameterError(
+            f"model.parameters.{name}: give low, high and default, as nobody else knows them"
+        )
     tuned = given.tuned is not False
-    return Parameter(name, "", given.low, given.high, given.default, "as the model defines it", "configuration", tuned)
+    return Parameter(
+        name,
+        "",
+        given.low,
+        given.high,
+        given.default,
+        "as the model defines it",
+        "configuration",
+        tuned,
+    )

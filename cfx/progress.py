@@ -8,7 +8,14 @@ from types import TracebackType
 from typing import Self
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 log = logging.getLogger(__name__)
 
@@ -55,9 +62,19 @@ class Task:
             self._bar.update(self._bar.task_ids[0], completed=self.done)
         elif self.total and now - self._told >= _LINE_EVERY:
             self._told = now
-            log.info("%s: %.0f %% after %.0f s", self.description, 100 * self.done / self.total, now - self._began)
+            log.info(
+                "%s: %.0f %% after %.0f s",
+                self.description,
+                100 * self.done / self.total,
+                now - self._began,
+            )
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         if self._bar is not None:
             self._bar.stop()
         if self.total and kind is None:

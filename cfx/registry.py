@@ -28,6 +28,7 @@ from typing import Any, get_args
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from cfx import renamed
 from cfx.component import API_VERSION, Component, Settings, validate
 from cfx.errors import CfxError, ConfigError, PluginError, nearest
 
@@ -56,16 +57,34 @@ class Kind:
     group: str
     entry_points: str
     base: str
-    probe: str = ""
+    smoke_check: str = ""
 
 
 KINDS: dict[str, Kind] = {
     kind.name: kind
     for kind in (
         Kind("dataset", "data", "cfx.datasets", "cfx.datasets.base:Dataset"),
-        Kind("model", "model", "cfx.models", "cfx.models.base:DrivingModel", "cfx.probes:probe_model"),
-        Kind("policy", "policy", "cfx.policies", "cfx.policies.base:Policy", "cfx.probes:probe_policy"),
-        Kind("optimizer", "optimizer", "cfx.optimizers", "cfx.optimizers.base:Optimizer", "cfx.probes:probe_optimizer"),
+        Kind(
+            "model",
+            "model",
+            "cfx.models",
+            "cfx.models.base:DrivingModel",
+            "cfx.smoke_checks:smoke_check_model",
+        ),
+        Kind(
+            "policy",
+            "policy",
+            "cfx.policies",
+            "cfx.policies.base:Policy",
+            "cfx.smoke_checks:smoke_check_policy",
+        ),
+        Kind(
+            "optimizer",
+            "optimizer",
+            "cfx.optimizers",
+            "cfx.optimizers.base:Optimizer",
+            "cfx.smoke_checks:smoke_check_optimizer",
+        ),
         Kind("learner", "learner", "cfx.learners", "cfx.learners.base:Learner"),
         Kind("protocol", "protocol", "cfx.protocols", "cfx.protocols.base:Protocol"),
     )
@@ -105,7 +124,7 @@ class Entry:
 
 
 _loaded: dict[Entry, type[Component]] = {}
-_probed: set[tuple[Entry, str]] = set()
+_smoke_checked: set[tuple[Entry, str]] = set()
 
 
 def kind_of(kind: str) -> Kind:
@@ -116,7 +135,9 @@ def kind_of(kind: str) -> Kind:
     """
     found = KINDS.get(kind) or GROUPS.get(kind)
     if found is None:
-        raise PluginError(f"there is no kind of component '{kind}'.{nearest(kind, KINDS)} Known: {', '.join(KINDS)}.")
+        raise PluginError(
+            f"there is no kind of component '{kind}'.{nearest(kind, KINDS)} Known: {', '.join(KINDS)}."
+        )
     return found
 
 
@@ -146,11 +167,17 @@ def entry(kind: str, name: str) -> Entry:
     if not found:
         known = names(kind)
         if not known:
-            raise PluginError(f"{group}={name}: no {what} is installed, not even cfx's own; run make run, or pip install -e .")
-        raise PluginError(f"{group}={name}: there is no {what} '{name}'.{nearest(name, known)} Known: {', '.join(known)}.")
+            raise PluginError(
+                f"{group}={name}: no {what} is installed, not even cfx's own; run make run, or pip install -e ."
+            )
+        raise PluginError(
+            f"{group}={name}: there is no {what} '{name}'.{nearest(name, known)} Known: {', '.join(known)}."
+        )
     if len(found) > 1:
         claims = " and ".join(f"{one.distribution} {one.version} ({one.target})" for one in found)
-        raise PluginError(f"{group}={name}: two distributions bring a {what} '{name}': {claims}; uninstall one of them")
+        raise PluginError(
+            f"{group}={name}: two distributions bring a {what} '{name}': {claims}; uninstall one of them"
+        )
     return found[0]
 
 
@@ -182,10 +209,16 @@ def create(kind: str, node: Mapping[str, Any]) -> Component:
     """
     group = kind_of(kind).group
     if not isinstance(node, Mapping):
-        raise ConfigError(f"{group}={node!r}: choose a {kind} by its name; known: {', '.join(names(kind))}")
+        raise ConfigError(
+            f"{group}={node!r}: choose a {kind} by its name; known: {', '.join(names(kind))}"
+        )
     name = node.get("name")
     if not isinstance(name, str):
-        raise ConfigError(f"{group}.name: a value is required; choose a {kind}: {', '.join(names(kind))}")
+        raise ConfigError(
+            f"{group}.name: a value is required; choose a {kind}: {', '.join(names(kind))}"
+        )
+    node = renamed.node(group, node)
+    name = str(node["name"])
     cls, found = get(kind, name), entry(kind, name)
     values = {key: value for key, value in node.items() if key != "name"}
     settings = validate(cls.schema, _without_blanks(cls.schema, values), where=group)
@@ -195,8 +228,10 @@ def create(kind: str, node: Mapping[str, Any]) -> Component:
     except CfxError:
         raise
     except Exception as error:
-        raise PluginError(f"{found} cannot be created: {in_words(error)}{_remedy(found)}") from error
-    _probe(found, component, settings)
+        raise PluginError(
+            f"{found} cannot be created: {in_words(error)}{_remedy(found)}"
+        ) from error
+    _smoke_check(found, component, settings)
     return component
 
 
@@ -246,7 +281,7 @@ def in_words(error: BaseException) -> str:
     return f"{type(error).__name__}: {first}".rstrip(": ")
 
 
-def _probe(found: Entry, component: Component, settings: BaseModel) -> None:
+def _smoke_check(found: Entry, component: Component, settings: BaseModel) -> None:
     """Tries a component once for each of its settings.
 
     Raises:
@@ -254,15 +289,17 @@ def _probe(found: Entry, component: Component, settings: BaseModel) -> None:
     """
     kind = KINDS[found.kind]
     key = (found, settings.model_dump_json())
-    if not kind.probe or key in _probed:
+    if not kind.smoke_check or key in _smoke_checked:
         return
     try:
-        _resolve(kind.probe)(component)
+        _resolve(kind.smoke_check)(component)
     except PluginError as broken:
         raise PluginError(f"{found} breaks its contract: {broken}{_remedy(found)}") from broken
     except Exception as error:  # a plugin may raise anything
-        raise PluginError(f"{found} breaks its contract: trying it raised {in_words(error)}{_remedy(found)}") from error
-    _probed.add(key)
+        raise PluginError(
+            f"{found} breaks its contract: trying it raised {in_words(error)}{_remedy(found)}"
+        ) from error
+    _smoke_checked.add(key)
 
 
 def _remedy(found: Entry) -> str:
@@ -274,14 +311,20 @@ def _warn_of_deprecated(found: Entry, cls: type[Component], settings: BaseModel)
     if cls.deprecated:
         log.warning("%s is deprecated: %s", found, cls.deprecated)
     for name, field in cls.schema.model_fields.items():
-        if field.deprecated and settings.__dict__[name] != field.get_default(call_default_factory=True, validated_data={}):
+        if field.deprecated and settings.__dict__[name] != field.get_default(
+            call_default_factory=True, validated_data={}
+        ):
             path = f"{kind_of(found.kind).group}.{name}"
             log.warning("%s of %s is deprecated: %s", path, found, field.deprecation_message)
 
 
 def _search_path() -> tuple[tuple[str, float], ...]:
     """Returns what changes when a distribution is installed, so that a new plugin is seen without a restart."""
-    return tuple((folder, Path(folder).stat().st_mtime) for folder in sys.path if folder and Path(folder).exists())
+    return tuple(
+        (folder, Path(folder).stat().st_mtime)
+        for folder in sys.path
+        if folder and Path(folder).exists()
+    )
 
 
 @functools.lru_cache(maxsize=1)
@@ -293,11 +336,16 @@ def _announced(search_path: tuple[tuple[str, float], ...]) -> dict[str, tuple[En
             announced = list(_entries(distribution))
         except Exception:  # noqa: S112 - metadata that cannot be read, whoever's it is, announces nothing and harms nobody
             continue
-        if announced and announced[0].distribution not in seen:  # the first on the search path is the one that is imported
+        if (
+            announced and announced[0].distribution not in seen
+        ):  # the first on the search path is the one that is imported
             seen.add(announced[0].distribution)
             for one in announced:
                 found[one.kind].append(one)
-    return {name: tuple(sorted(ones, key=attrgetter("name", "distribution"))) for name, ones in found.items()}
+    return {
+        name: tuple(sorted(ones, key=attrgetter("name", "distribution")))
+        for name, ones in found.items()
+    }
 
 
 def _entries(distribution: importlib.metadata.Distribution) -> Iterator[Entry]:
@@ -309,7 +357,15 @@ def _entries(distribution: importlib.metadata.Distribution) -> Iterator[Entry]:
             name, version = distribution.metadata["Name"], distribution.version
             if not isinstance(name, str) or not isinstance(version, str):
                 raise ValueError("the metadata name no distribution, or no version")
-            yield Entry(kinds[point.group], point.name, point.value, name, version, str(distribution.locate_file("")), api)
+            yield Entry(
+                kinds[point.group],
+                point.name,
+                point.value,
+                name,
+                version,
+                str(distribution.locate_file("")),
+                api,
+            )
 
 
 def _import(found: Entry) -> Any:
@@ -328,11 +384,15 @@ def _check(found: Entry, cls: Any) -> None:
     """Raises PluginError unless `cls` keeps the contract of its kind."""
     base = _resolve(KINDS[found.kind].base)
     if not inspect.isclass(cls):
-        raise PluginError(f"{found} is no class but {type(cls).__name__}; point its entry point at a subclass of {base.__name__}")
+        raise PluginError(
+            f"{found} is no class but {type(cls).__name__}; point its entry point at a subclass of {base.__name__}"
+        )
     if not issubclass(cls, Component) or not issubclass(cls, base):
         raise PluginError(f"{found} does not extend {base.__module__}.{base.__name__}")
     if cls.kind != base.kind:
-        raise PluginError(f"{found} says kind='{cls.kind}', but a {found.kind} keeps kind='{base.kind}' of its base class")
+        raise PluginError(
+            f"{found} says kind='{cls.kind}', but a {found.kind} keeps kind='{base.kind}' of its base class"
+        )
     missing = sorted(getattr(cls, "__abstractmethods__", ()) or _unimplemented(cls))
     if missing:
         raise PluginError(f"{found} does not implement {', '.join(missing)}")
@@ -340,7 +400,9 @@ def _check(found: Entry, cls: Any) -> None:
     if not (inspect.isclass(schema) and issubclass(schema, Settings)):
         raise PluginError(f"{found}: its schema must be a subclass of cfx.Settings, not {schema!r}")
     if "name" in schema.model_fields:
-        raise PluginError(f"{found}: its settings must not have a field 'name', which chooses the component itself")
+        raise PluginError(
+            f"{found}: its settings must not have a field 'name', which chooses the component itself"
+        )
     if found.kind == "model":
         _check_model(found, cls, base)
 
@@ -350,11 +412,15 @@ def _check_model(found: Entry, cls: Any, base: Any) -> None:
 
     space = getattr(cls, "parameters", None)
     if not isinstance(space, ParameterSpace):
-        raise PluginError(f"{found}: its attribute 'parameters' must be a cfx.ParameterSpace, not {type(space).__name__}")
+        raise PluginError(
+            f"{found}: its attribute 'parameters' must be a cfx.ParameterSpace, not {type(space).__name__}"
+        )
     if not space.tuned and not space.open:
         raise PluginError(f"{found}: at least one of its parameters must be tuned")
     if not issubclass(cls.schema, base.schema):
-        raise PluginError(f"{found}: its schema must extend {base.schema.__module__}.{base.schema.__name__}")
+        raise PluginError(
+            f"{found}: its schema must extend {base.schema.__module__}.{base.schema.__name__}"
+        )
 
 
 def _resolve(target: str) -> Any:
@@ -364,7 +430,11 @@ def _resolve(target: str) -> Any:
 
 def _unimplemented(cls: type) -> set[str]:
     """Returns names that are still marked abstract; `Component` needs no ABCMeta for its subclasses to be checked."""
-    return {name for name in dir(cls) if getattr(inspect.getattr_static(cls, name), "__isabstractmethod__", False)}
+    return {
+        name
+        for name in dir(cls)
+        if getattr(inspect.getattr_static(cls, name), "__isabstractmethod__", False)
+    }
 
 
 def _without_blanks(schema: type[BaseModel], values: Mapping[str, Any]) -> dict[str, Any]:
@@ -375,7 +445,9 @@ def _without_blanks(schema: type[BaseModel], values: Mapping[str, Any]) -> dict[
         if value is None and field is not None and is_blank(field):
             continue
         nested: Any = field.annotation if field is not None else None
-        is_settings = inspect.isclass(nested) and issubclass(nested, BaseModel) and isinstance(value, Mapping)
+        is_settings = (
+            inspect.isclass(nested) and issubclass(nested, BaseModel) and isinstance(value, Mapping)
+        )
         kept[key] = _without_blanks(nested, value) if is_settings else value
     return kept
 

@@ -40,7 +40,7 @@ from omegaconf.errors import OmegaConfBaseException
 from cfx.component import content_key
 from cfx.console import blank_table, put
 from cfx.errors import ConfigError
-from cfx.files import whole
+from cfx.files import atomic_write
 from cfx.hydra_source import resolving
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-OUTCOME, RECORD, SUMMARY = "outcome.json", "sweep.json", "summary.csv"
+STATUS, RECORD, SUMMARY = "outcome.json", "sweep.json", "summary.csv"
 """A job's marker in its folder; what the sweep is, and what came of it, in the sweep's."""
 
 _LOCK = ".lock"
@@ -62,7 +62,7 @@ _BASELINES = ("population", "fixed")
 
 
 @dataclass(frozen=True)
-class Outcome:
+class JobStatus:
     """How a job of a sweep ended.
 
     Attributes:
@@ -93,14 +93,14 @@ class Outcome:
     def read(cls, folder: Path) -> Self | None:
         """Returns the outcome of the job in `folder`; None if it left none that can be read."""
         try:
-            values = json.loads((folder / OUTCOME).read_text(encoding="utf-8"))
+            values = json.loads((folder / STATUS).read_text(encoding="utf-8"))
             return cls(**{**values, "overrides": tuple(values["overrides"])})
         except (OSError, ValueError, TypeError, KeyError):
             return None
 
     def write(self, folder: Path) -> None:
         """Writes it, whole, into the job's folder."""
-        _write_json(folder / OUTCOME, asdict(self))
+        _write_json(folder / STATUS, asdict(self))
 
     @property
     def state(self) -> str:
@@ -141,14 +141,21 @@ class Record:
         """Writes it, whole, into the sweep's folder."""
         _write_json(folder / RECORD, asdict(self))
 
-    def outcomes(self, folder: Path, multirun: str) -> dict[Path, Outcome]:
+    def statuses(self, folder: Path, multirun: str) -> dict[Path, JobStatus]:
         """Returns, by folder and in the sweep's order, the jobs that this start has seen and those that were done before."""
-        found = {path.parent: Outcome.read(path.parent) for path in sorted(folder.rglob(OUTCOME)) if _is_in(path.parent, folder)}
+        found = {
+            path.parent: JobStatus.read(path.parent)
+            for path in sorted(folder.rglob(STATUS))
+            if _is_in(path.parent, folder)
+        }
         ours = {
-            path: outcome if outcome.multirun == multirun else replace(outcome, before=True)
-            for path, outcome in found.items()
-            if outcome is not None
-            and (outcome.multirun == multirun or (outcome.code == 0 and outcome.command == self.command_hash))
+            path: status if status.multirun == multirun else replace(status, before=True)
+            for path, status in found.items()
+            if status is not None
+            and (
+                status.multirun == multirun
+                or (status.code == 0 and status.command == self.command_hash)
+            )
         }
         return dict(sorted(ours.items(), key=lambda item: item[1].number))
 
@@ -167,7 +174,15 @@ class Sweep:
         resumable: the folders of its jobs are named by what the jobs are.
     """
 
-    def __init__(self, folder: Path, lock: FileLock, record: Record, tracking: Mapping[str, Any], *, resumable: bool) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        lock: FileLock,
+        record: Record,
+        tracking: Mapping[str, Any],
+        *,
+        resumable: bool,
+    ) -> None:
         self.folder = folder
         self.record = record
         self.tracking = tracking
@@ -208,7 +223,10 @@ class Sweep:
         overrides = [one for one in given if not one.startswith("hydra.sweep.dir=")]
         with open_dict(config.hydra):
             config.hydra.sweep.dir = path
-            config.hydra.overrides.hydra = [*overrides, "hydra.sweep.dir='" + path.replace("'", "\\'") + "'"]
+            config.hydra.overrides.hydra = [
+                *overrides,
+                "hydra.sweep.dir='" + path.replace("'", "\\'") + "'",
+            ]
 
     def close(self, multirun: str, code: int, *, interrupted: bool) -> int:
         """Says how the sweep ended, on the terminal and in `summary.csv`, and lets go of its folder.
@@ -222,16 +240,19 @@ class Sweep:
             The exit code.
         """
         try:
-            outcomes = self.record.outcomes(self.folder, multirun)
-            lines = self._tracked() if outcomes or interrupted else ()
-            if not outcomes:
+            statuses = self.record.statuses(self.folder, multirun)
+            lines = self._tracked() if statuses or interrupted else ()
+            if not statuses:
                 return self._nothing(code, interrupted=interrupted)
-            table = rows(outcomes)
+            table = rows(statuses)
             write_summary(self.folder / SUMMARY, table)
             put(summary_table(table))
-            code = self._tell(outcomes, code)
-            if any(outcome.code == 0 for outcome in outcomes.values()):
-                for line in (*lines, f"Report of the whole sweep: python -m cfx report {shlex.quote(str(self.folder))}"):
+            code = self._tell(statuses, code)
+            if any(status.code == 0 for status in statuses.values()):
+                for line in (
+                    *lines,
+                    f"Report of the whole sweep: python -m cfx report {shlex.quote(str(self.folder))}",
+                ):
                     print(line)
             if code == 0:
                 replace(self.record, completed=_now()).write(self.folder)
@@ -241,21 +262,29 @@ class Sweep:
         finally:
             self._lock.release()
 
-    def _tell(self, outcomes: Mapping[Path, Outcome], code: int) -> int:
+    def _tell(self, statuses: Mapping[Path, JobStatus], code: int) -> int:
         """Prints how many jobs are done, and which failed and why; returns the exit code."""
-        failed = {path: outcome for path, outcome in outcomes.items() if outcome.code}
-        total = max(self.record.jobs or 0, len(outcomes))
-        print(f"{len(outcomes) - len(failed)} of {total} jobs done; their folders: {self.folder}")
-        for path, outcome in failed.items():
-            print(f"failed: {' '.join(outcome.overrides)}: {outcome.message} ({path})", file=sys.stderr)
-        if total > len(outcomes) and not code:
-            print(f"{total - len(outcomes)} jobs left no outcome; see the launcher's own logs", file=sys.stderr)
+        failed = {path: status for path, status in statuses.items() if status.code}
+        total = max(self.record.jobs or 0, len(statuses))
+        print(f"{len(statuses) - len(failed)} of {total} jobs done; their folders: {self.folder}")
+        for path, status in failed.items():
+            print(
+                f"failed: {' '.join(status.overrides)}: {status.message} ({path})", file=sys.stderr
+            )
+        if total > len(statuses) and not code:
+            print(
+                f"{total - len(statuses)} jobs left no outcome; see the launcher's own logs",
+                file=sys.stderr,
+            )
             code = 1
-        return worst(code, *(outcome.code for outcome in failed.values()))
+        return worst(code, *(status.code for status in failed.values()))
 
     def _nothing(self, code: int, *, interrupted: bool) -> int:
         if not code:
-            print(f"no job left its outcome in {self.folder}; see the launcher's own logs", file=sys.stderr)
+            print(
+                f"no job left its outcome in {self.folder}; see the launcher's own logs",
+                file=sys.stderr,
+            )
             return 1
         if not interrupted and not any(path.is_dir() for path in self.folder.iterdir()):
             # A wrong command line that no job was made of leaves no folder.
@@ -281,7 +310,11 @@ class Sweep:
                 return ()
             from cfx.tracking.tracker import end_sweep
 
-            return end_sweep(uri, str(self.tracking.get("experiment")), self.tracking.get("sweep") or self.record.name)
+            return end_sweep(
+                uri,
+                str(self.tracking.get("experiment")),
+                self.tracking.get("sweep") or self.record.name,
+            )
         except TrackingError as error:
             log.warning("%s", error)
             return ()
@@ -359,17 +392,26 @@ def fingerprint(values: Mapping[str, Any]) -> str:
     path = node.get("path") if isinstance(node, Mapping) else None
     state = None
     if path:
-        with contextlib.suppress(OSError):  # a file that is not there is the dataset's to complain about
+        with contextlib.suppress(
+            OSError
+        ):  # a file that is not there is the dataset's to complain about
             found = Path(str(path)).expanduser().stat()
             state = [found.st_size, found.st_mtime_ns]
-    parts = {"config": values, "cfx": provenance.version(), "plugins": provenance.distributions(values), "data": state}
+    parts = {
+        "config": values,
+        "cfx": provenance.version(),
+        "plugins": provenance.distributions(values),
+        "data": state,
+    }
     return content_key(parts)
 
 
 def job_name(_root_: Any) -> str:
     """Returns the end of a job folder's name, the same for the same overrides in any order: `${cfx_job:}` in Hydra's config."""
     task: Any = OmegaConf.to_container(_root_.hydra.overrides.task, resolve=False)
-    given = {one.partition("=")[0]: one for one in task}  # where a key is given twice the last one counts
+    given = {
+        one.partition("=")[0]: one for one in task
+    }  # where a key is given twice the last one counts
     return content_key([sorted(given.values()), *_sources(_root_)])[:8]
 
 
@@ -384,31 +426,45 @@ def metrics_of(folder: Path) -> dict[str, float]:
         return {}
     if not isinstance(values, dict):
         return {}
-    return {name: float(value) for name, value in values.items() if isinstance(value, int | float) and math.isfinite(value)}
+    return {
+        name: float(value)
+        for name, value in values.items()
+        if isinstance(value, int | float) and math.isfinite(value)
+    }
 
 
-def rows(outcomes: Mapping[Path, Outcome]) -> list[dict[str, Any]]:
+def rows(statuses: Mapping[Path, JobStatus]) -> list[dict[str, Any]]:
     """Returns a row per job of the summary: folder, the overrides that differ, improvement, RMSE of speed, seconds and state."""
-    given = [dict(one.partition("=")[::2] for one in outcome.overrides) for outcome in outcomes.values()]
+    given = [
+        dict(one.partition("=")[::2] for one in status.overrides) for status in statuses.values()
+    ]
     keys = list(dict.fromkeys(key for one in given for key in one))
     differing = [key for key in keys if len({one.get(key) for one in given}) > 1] or keys
     table = []
-    for (folder, outcome), own in zip(outcomes.items(), given, strict=True):
-        found = {} if outcome.code else metrics_of(folder)
+    for (folder, status), own in zip(statuses.items(), given, strict=True):
+        found = {} if status.code else metrics_of(folder)
         baseline = next((one for one in _BASELINES if f"rmse_improvement/{one}/mean" in found), "")
         prefix = f"rmse_improvement/{baseline}" if baseline else "rmse_improvement"
-        improvement = {f"improvement_{name}": found.get(f"{prefix}/{name}") for name in ("mean", "ci95_low", "ci95_high")}
-        rmse = {f"rmse_speed_{name}": found.get(f"rmse_speed/{name}") for name in ("default", "fixed", "population", "policy")}
+        improvement = {
+            f"improvement_{name}": found.get(f"{prefix}/{name}")
+            for name in ("mean", "ci95_low", "ci95_high")
+        }
+        rmse = {
+            f"rmse_speed_{name}": found.get(f"rmse_speed/{name}")
+            for name in ("default", "fixed", "population", "policy")
+        }
         table.append(
             {
                 "folder": folder.name,
                 **{key: own.get(key, "") for key in differing},
-                "improvement_over": (baseline or "fixed") if improvement["improvement_mean"] is not None else "",
+                "improvement_over": (baseline or "fixed")
+                if improvement["improvement_mean"] is not None
+                else "",
                 **improvement,
                 **rmse,
-                "seconds": round(outcome.seconds, 1),
-                "state": outcome.state,
-                "message": outcome.message,
+                "seconds": round(status.seconds, 1),
+                "state": status.state,
+                "message": status.message,
             }
         )
     return table
@@ -416,7 +472,7 @@ def rows(outcomes: Mapping[Path, Outcome]) -> list[dict[str, Any]]:
 
 def write_summary(path: Path, table: Sequence[Mapping[str, Any]]) -> None:
     """Writes `rows` as CSV; a cell without a value is empty."""
-    with whole(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, list(table[0]))
         writer.writeheader()
         writer.writerows(table)
@@ -437,7 +493,8 @@ def summary_table(table: Sequence[Mapping[str, Any]]) -> Table:
     for row in table:
         shown.add_row(
             *([str(row[column]) for column in columns] or [row["folder"]]),
-            _improvement(row) + (f" over {row['improvement_over']}" if several and row["improvement_over"] else ""),
+            _improvement(row)
+            + (f" over {row['improvement_over']}" if several and row["improvement_over"] else ""),
             *(_number(row[f"rmse_speed_{name}"]) for name in ("default", "fixed", "policy")),
             f"{row['seconds']:.1f}",
             row["state"],
@@ -476,7 +533,9 @@ def _command(config: DictConfig) -> tuple[tuple[str, ...], str, int | None]:
     """
     typed: Any = OmegaConf.to_container(config.hydra.overrides, resolve=False)
     sweeper: Any = OmegaConf.to_container(config.hydra.sweeper, resolve=False)
-    asked = [f"{key}={value}" for key, value in (sweeper.pop("params", None) or {}).items()] + typed["task"]
+    asked = [
+        f"{key}={value}" for key, value in (sweeper.pop("params", None) or {}).items()
+    ] + typed["task"]
     values: dict[str, list[str]] = {}
     parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())
     for override in parser.parse_overrides(asked):
@@ -487,7 +546,11 @@ def _command(config: DictConfig) -> tuple[tuple[str, ...], str, int | None]:
             values[key] = [str(override.input_line)]
     basic = str(sweeper.get("_target_", "")).endswith(".BasicSweeper")
     jobs = math.prod(len(set(one)) for one in values.values()) if basic else None
-    return (*typed["task"], *typed["hydra"]), content_key([values, sweeper, *_sources(config)]), jobs
+    return (
+        (*typed["task"], *typed["hydra"]),
+        content_key([values, sweeper, *_sources(config)]),
+        jobs,
+    )
 
 
 def _tracking(config: DictConfig) -> dict[str, Any]:
@@ -501,7 +564,11 @@ def _tracking(config: DictConfig) -> dict[str, Any]:
 
 def _sources(config: Any) -> tuple[Any, ...]:
     """Returns what else on the command line decides what the overrides mean: --config-name and --config-dir."""
-    given = [str(source.path) for source in config.hydra.runtime.config_sources if source.provider == "command-line"]
+    given = [
+        str(source.path)
+        for source in config.hydra.runtime.config_sources
+        if source.provider == "command-line"
+    ]
     return str(config.hydra.job.config_name), given
 
 
@@ -516,7 +583,11 @@ def _pattern(folder: str) -> str:
 def _left_over(pattern: str, command_hash: str) -> tuple[Path, FileLock] | None:
     """Returns, locked, the newest sweep of this command that no other process runs, unless it is complete."""
     folders = [Path(path) for path in glob.glob(pattern)]  # noqa: PTH207 - the pattern may be absolute, Path.glob takes none
-    known = [(record.started, folder) for folder in folders if (record := Record.read(folder)) is not None]
+    known = [
+        (record.started, folder)
+        for folder in folders
+        if (record := Record.read(folder)) is not None
+    ]
     for _, folder in sorted(known, reverse=True):
         record = Record.read(folder)
         if record is None or record.command_hash != command_hash:
@@ -550,7 +621,9 @@ def _asked_for(folder: Path, *, resumable: bool) -> tuple[Path, FileLock]:
     folder.mkdir(parents=True, exist_ok=True)
     lock = _try_lock(folder)
     if lock is None:
-        raise ConfigError(f"{folder}: another sweep runs in this folder; wait for it, or choose another hydra.sweep.dir")
+        raise ConfigError(
+            f"{folder}: another sweep runs in this folder; wait for it, or choose another hydra.sweep.dir"
+        )
     if not resumable and Record.read(folder) is not None:
         lock.release()
         raise ConfigError(
@@ -570,7 +643,7 @@ def _try_lock(folder: Path) -> FileLock | None:
 
 
 def _continuing(folder: Path, record: Record, earlier: Record) -> str:
-    done = sum(one.code == 0 for one in record.outcomes(folder, "").values())
+    done = sum(one.code == 0 for one in record.statuses(folder, "").values())
     if earlier.command_hash == record.command_hash:
         return f"continuing sweep {folder}: {done}{f' of {record.jobs}' if record.jobs else ''} jobs are done"
     return f"continuing in {folder}, which holds another command's sweep: jobs that both have in common are not run again"
@@ -579,7 +652,9 @@ def _continuing(folder: Path, record: Record, earlier: Record) -> str:
 def _is_in(job: Path, sweep: Path) -> bool:
     """Says whether a folder below a sweep's belongs to it, and not to another sweep below."""
     between = job.relative_to(sweep).parents
-    return not any((sweep / one / RECORD).exists() for one in [job.relative_to(sweep), *between][:-1])
+    return not any(
+        (sweep / one / RECORD).exists() for one in [job.relative_to(sweep), *between][:-1]
+    )
 
 
 def _now() -> str:
@@ -587,5 +662,5 @@ def _now() -> str:
 
 
 def _write_json(path: Path, values: Mapping[str, Any]) -> None:
-    with whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")

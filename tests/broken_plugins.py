@@ -115,7 +115,10 @@ class Broken:
     @property
     def entry_points(self) -> dict[str, dict[str, str]]:
         module = f"bad_{self.name}"
-        return {f"cfx.{self.kind}": {self.name: f"{module}:Bad"}, "cfx.api": dict.fromkeys(self.api, module)}
+        return {
+            f"cfx.{self.kind}": {self.name: f"{module}:Bad"},
+            "cfx.api": dict.fromkeys(self.api, module),
+        }
 
     @property
     def files(self) -> Mapping[str, str]:
@@ -127,13 +130,37 @@ def _model(name: str, returned: str, complaint: str) -> Broken:
 
 
 BROKEN = (
-    Broken("raises", "models", "raise RuntimeError('no luck')", "cannot be imported: RuntimeError: no luck"),
+    Broken(
+        "raises",
+        "models",
+        "raise RuntimeError('no luck')",
+        "cannot be imported: RuntimeError: no luck",
+    ),
     Broken("exits", "models", "raise SystemExit(0)", "cannot be imported: SystemExit: 0"),
-    Broken("unmade", "models", _MODEL.format("speed").replace("next_speed", "step"), "does not implement next_speed"),
-    _model("asks_more", "speed * p['b']", r"next_speed reads the parameter 'b', which is not in its `parameters` \(tau, a\)"),
-    _model("not_a_number", "speed * float('nan')", r"next_speed gives nan m/s in 24 of 24 ordinary states"),
-    _model("backwards", "speed - 100.0", r"next_speed gives -\d+\.?\d* m/s in 24 of 24 ordinary states"),
-    _model("wide", "speed[..., None]", r"next_speed gives the shape \(24, 1\); it must give \(\*batch,\), here \(24,\)"),
+    Broken(
+        "unmade",
+        "models",
+        _MODEL.format("speed").replace("next_speed", "step"),
+        "does not implement next_speed",
+    ),
+    _model(
+        "asks_more",
+        "speed * p['b']",
+        r"next_speed reads the parameter 'b', which is not in its `parameters` \(tau, a\)",
+    ),
+    _model(
+        "not_a_number",
+        "speed * float('nan')",
+        r"next_speed gives nan m/s in 24 of 24 ordinary states",
+    ),
+    _model(
+        "backwards", "speed - 100.0", r"next_speed gives -\d+\.?\d* m/s in 24 of 24 ordinary states"
+    ),
+    _model(
+        "wide",
+        "speed[..., None]",
+        r"next_speed gives the shape \(24, 1\); it must give \(\*batch,\), here \(24,\)",
+    ),
     _model("half", "speed.half()", r"next_speed gives torch\.float16 for torch\.float64"),
     _model("doubles", "speed.double()", r"next_speed gives torch\.float64 for torch\.float32"),
     _model("numpy", "speed.numpy()", r"next_speed gives a ndarray"),
@@ -147,7 +174,8 @@ BROKEN = (
     Broken(
         "unborn",
         "models",
-        _MODEL.format("speed") + "\n    def __init__(self, settings=None, **options):\n        raise OSError('no map')\n",
+        _MODEL.format("speed")
+        + "\n    def __init__(self, settings=None, **options):\n        raise OSError('no map')\n",
         "cannot be created: OSError: no map",
     ),
     Broken(
@@ -174,31 +202,59 @@ BROKEN = (
         api=("one",),
     ),
     Broken(
-        "policy_nan", "policies", _POLICY.format("answer * float('nan')"), r"forward answers NaN or a number outside \[0, 1\]"
+        "policy_nan",
+        "policies",
+        _POLICY.format("answer * float('nan')"),
+        r"forward answers NaN or a number outside \[0, 1\]",
     ),
-    Broken("policy_out", "policies", _POLICY.format("answer + 1.0"), r"forward answers NaN or a number outside \[0, 1\]"),
+    Broken(
+        "policy_out",
+        "policies",
+        _POLICY.format("answer + 1.0"),
+        r"forward answers NaN or a number outside \[0, 1\]",
+    ),
     Broken(
         "policy_more",
         "policies",
         _POLICY.format("torch.cat([answer, answer[..., :1]], -1)"),
         r"forward gives the shape \(3, 2, 4, 6\); it must give \(networks, drivers, windows, parameters\), here \(3, 2, 4, 5\)",
     ),
-    Broken("policy_float", "policies", _POLICY.format("answer.float()"), r"forward gives torch\.float32 for torch\.float64"),
-    Broken("policy_none", "policies", _POLICY.replace("return Network(fixed)", "return None"), "build returns a NoneType"),
+    Broken(
+        "policy_float",
+        "policies",
+        _POLICY.format("answer.float()"),
+        r"forward gives torch\.float32 for torch\.float64",
+    ),
+    Broken(
+        "policy_none",
+        "policies",
+        _POLICY.replace("return Network(fixed)", "return None"),
+        "build returns a NoneType",
+    ),
     Broken(
         "miscounts",
         "optimizers",
         _OPTIMIZER.format("return candidates[:, :3], objective(candidates[:, :3])"),
         r"solve must return candidates \(2, 4, 2\) and losses \(2, 4\) as evaluations\(\) says, but returned \(2, 3, 2\)",
     ),
-    Broken("floats", "optimizers", _OPTIMIZER.format("return candidates, objective(candidates).float()"), "must return float64"),
+    Broken(
+        "floats",
+        "optimizers",
+        _OPTIMIZER.format("return candidates, objective(candidates).float()"),
+        "must return float64",
+    ),
     Broken(
         "asks_wide",
         "optimizers",
         _OPTIMIZER.format("return candidates, objective(torch.cat([candidates, candidates], -1))"),
         r"it asked for candidates \(2, 4, 4\) in torch\.float64; it must ask for \(2, q, 2\) in float64",
     ),
-    Broken("asks_out", "optimizers", _OPTIMIZER.format("return candidates, objective(candidates + 1.0)"), "outside the bounds"),
+    Broken(
+        "asks_out",
+        "optimizers",
+        _OPTIMIZER.format("return candidates, objective(candidates + 1.0)"),
+        "outside the bounds",
+    ),
     Broken(
         "nan_loss",
         "optimizers",
@@ -211,7 +267,12 @@ BROKEN = (
         _OPTIMIZER.format("return None").replace("return 4", "return 4.5"),
         r"evaluations\(\) gives 4\.5; it must give a whole number",
     ),
-    Broken("no_pairs", "datasets", _DATASET.format("return [pair]"), r"read must return a cfx\.PairSet, but returned a list"),
+    Broken(
+        "no_pairs",
+        "datasets",
+        _DATASET.format("return [pair]"),
+        r"read must return a cfx\.PairSet, but returned a list",
+    ),
     Broken(
         "gaps",
         "datasets",
@@ -221,7 +282,7 @@ BROKEN = (
     Broken(
         "learns_nothing",
         "learners",
-        "from cfx import Learner\nclass Bad(Learner):\n    def fit(self, policy, lesson):\n        return None\n",
+        "from cfx import Learner\nclass Bad(Learner):\n    def fit(self, policy, training_data):\n        return None\n",
         r"fit must return a cfx\.Learned, but returned a NoneType",
     ),
     Broken(

@@ -67,7 +67,9 @@ def find_chromium() -> str | None:
     """Returns the path of a Chromium or Chrome on this machine, None if there is none."""
     named = os.environ.get("CFX_TEST_BROWSER")
     if named:
-        return shutil.which(named) or pytest.fail(f"CFX_TEST_BROWSER names {named}, which cannot be run", pytrace=False)
+        return shutil.which(named) or pytest.fail(
+            f"CFX_TEST_BROWSER names {named}, which cannot be run", pytrace=False
+        )
     return next(filter(None, map(shutil.which, NAMES)), None)
 
 
@@ -83,10 +85,14 @@ def browser() -> Iterator[Browser]:
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=path, args=list(OPTIONS), timeout=120_000)
+        chromium = playwright.chromium.launch(
+            executable_path=path, args=list(OPTIONS), timeout=120_000
+        )
         try:
             context = chromium.new_context(viewport={"width": 1600, "height": 1000}, locale="en-US")
-            context.set_default_timeout(60_000)  # a page that never comes is a failure, a slow machine is none
+            context.set_default_timeout(
+                60_000
+            )  # a page that never comes is a failure, a slow machine is none
             watched = Browser(context.new_page())
             _watch(context, watched)
             yield watched
@@ -97,5 +103,8 @@ def browser() -> Iterator[Browser]:
 def _watch(context: BrowserContext, watched: Browser) -> None:
     context.on("request", lambda request: watched.addresses.append(request.url))
     context.on("weberror", lambda error: watched.errors.append(str(error.error)))
-    context.on("console", lambda message: watched.errors.append(message.text) if message.type == "error" else None)
+    context.on(
+        "console",
+        lambda message: watched.errors.append(message.text) if message.type == "error" else None,
+    )
     watched.page.on("websocket", lambda socket: watched.addresses.append(socket.url))

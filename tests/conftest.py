@@ -37,7 +37,13 @@ class Installer:
         self._monkeypatch = monkeypatch
         monkeypatch.syspath_prepend(str(folder))
 
-    def __call__(self, name: str, entry_points: dict[str, dict[str, str]], files: dict[str, str], version: str = "1.0") -> None:
+    def __call__(
+        self,
+        name: str,
+        entry_points: dict[str, dict[str, str]],
+        files: dict[str, str],
+        version: str = "1.0",
+    ) -> None:
         """Installs a distribution: entry points by group, and its files' texts by path."""
         for path, text in files.items():
             target = self.folder / path
@@ -45,7 +51,9 @@ class Installer:
             target.write_text(textwrap.dedent(text), encoding="utf-8")
         info = self.folder / f"{name.replace('-', '_')}-{version}.dist-info"
         info.mkdir()
-        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n", encoding="utf-8")
+        (info / "METADATA").write_text(
+            f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n", encoding="utf-8"
+        )
         groups = [
             f"[{group}]\n" + "".join(f"{key} = {value}\n" for key, value in points.items())
             for group, points in entry_points.items()
@@ -55,7 +63,9 @@ class Installer:
 
 
 @pytest.fixture
-def install(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[Installer]:
+def install(
+    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Installer]:
     """Returns a function that installs a fabricated distribution for one test."""
     before = set(sys.modules)
     folder = tmp_path_factory.mktemp("site")

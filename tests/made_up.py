@@ -12,7 +12,8 @@ from cfx.parameters import Parameter, ParameterSpace
 from cfx.style.result import CLUSTERS, StyleResult
 
 TWO = ParameterSpace.of(
-    Parameter("t_r", "s", 0.1, 10.0, 1.5, "reaction time"), Parameter("t_i", "s", 0.0, 2.0, 0.15, "brake build-up time")
+    Parameter("t_r", "s", 0.1, 10.0, 1.5, "reaction time"),
+    Parameter("t_i", "s", 0.0, 2.0, 0.15, "brake build-up time"),
 )
 INDICATORS = (
     "mean_speed",
@@ -43,10 +44,14 @@ def make_results(
     """Makes up an evaluation, a style and learning curves (one network per pair unless told)."""
     rng = np.random.default_rng(seed)
     drives = tuple(make_drive(k, frames, space, rng, methods) for k in range(pairs))
-    table = pd.DataFrame([row for k, drive in enumerate(drives) for row in rows_of(k, drive, space)])
+    table = pd.DataFrame(
+        [row for k, drive in enumerate(drives) for row in rows_of(k, drive, space)]
+    )
     bounds = np.array([[p.low for p in space.tuned], [p.high for p in space.tuned]])
     improvements = {baseline: summarize(table) for baseline in methods if baseline != "policy"}
-    evaluation = Evaluation(table, improvements, drives, space.names, tuple(p.unit for p in space.tuned), bounds)
+    evaluation = Evaluation(
+        table, improvements, drives, space.names, tuple(p.unit for p in space.tuned), bounds
+    )
     curves = make_curves(pairs if networks is None else networks, epochs, seed)
     return MadeUp(evaluation, make_style([drive.driver for drive in drives], rng), curves)
 
@@ -64,7 +69,11 @@ def make_drive(
     smooth = np.convolve(np.pad(leader, (12, 0), mode="edge"), np.ones(13) / 13, "valid")
     real = np.clip(smooth + 0.15 * np.sin(2 * time), 0, None)
     real_gap = 12 + 2 * (k % 4) + 0.1 * np.cumsum(leader - real)
-    size = {"default": 2.6 * (1 + k % 3), "fixed": 0.9 * rng.uniform(0.6, 1.4), "policy": 0.75 * rng.uniform(0.5, 1.6)}
+    size = {
+        "default": 2.6 * (1 + k % 3),
+        "fixed": 0.9 * rng.uniform(0.6, 1.4),
+        "policy": 0.75 * rng.uniform(0.5, 1.6),
+    }
     size = {method: size.get(method, 1.3) for method in methods}
     wave = np.sin(0.45 * (time - time[0]) * (1 + 0.05 * k)) * (1 - np.exp(-(time - time[0]) / 2))
     speed = {method: np.clip(real + error * wave, 0, None) for method, error in size.items()}
@@ -77,11 +86,21 @@ def make_drive(
         "fixed": np.tile(best, (frames + 1, 1)),
         "policy": np.clip(best + wander * (high - low), low, high),
         "population": np.tile(low + 0.3 * (high - low), (frames + 1, 1)),
-        "base": np.tile(low + 0.4 * (high - low), (frames + 1, 1)),
+        "shrunk": np.tile(low + 0.4 * (high - low), (frames + 1, 1)),
     }
     parameters = {method: parameters[method] for method in methods}
     number = 1000 + 7 * k
-    return Drive(f"i80-0400-{number}-{number - 10}", f"i80-0400/{number}", time, leader, real, real_gap, speed, gap, parameters)
+    return Drive(
+        f"i80-0400-{number}-{number - 10}",
+        f"i80-0400/{number}",
+        time,
+        leader,
+        real,
+        real_gap,
+        speed,
+        gap,
+        parameters,
+    )
 
 
 def make_platoon(networks: dict[str, int], seconds: float = 40.0) -> Platoon:
@@ -96,14 +115,30 @@ def make_platoon(networks: dict[str, int], seconds: float = 40.0) -> Platoon:
         for k in range(count):
             name, factor = f"fold {k}", 0.9 + 0.1 * k
             for vehicle in range(11):
-                dip = (8.0 if vehicle == 0 else 8.0 * factor**vehicle) * np.exp(-(((time - 18 - vehicle) / 3) ** 2))
+                dip = (8.0 if vehicle == 0 else 8.0 * factor**vehicle) * np.exp(
+                    -(((time - 18 - vehicle) / 3) ** 2)
+                )
                 speed = 15.0 - np.where(time - vehicle > 12, dip, 0.0)
                 gap = np.full(len(time), np.nan if vehicle == 0 else 20.0 - 2.5 * k * vehicle)
                 about = {"method": method, "network": name, "vehicle": vehicle}
                 tables.append(pd.DataFrame({**about, "time_s": time, "speed": speed, "gap": gap}))
-            row = {"method": method, "network": name, "drop_leader": 8.0, "drop_first": 8 * factor, "drop_last": 8 * factor**10}
-            row |= {"amplification": factor**9, "head_to_tail": factor**10, "string_stable": float(k < 2), "settled": 1.0}
-            measures.append(row | {"min_gap": 20 - 25.0 * k, "collisions": 3.0 * (k > 0), "hard_braking": 2.0 * k})
+            row = {
+                "method": method,
+                "network": name,
+                "drop_leader": 8.0,
+                "drop_first": 8 * factor,
+                "drop_last": 8 * factor**10,
+            }
+            row |= {
+                "amplification": factor**9,
+                "head_to_tail": factor**10,
+                "string_stable": float(k < 2),
+                "settled": 1.0,
+            }
+            measures.append(
+                row
+                | {"min_gap": 20 - 25.0 * k, "collisions": 3.0 * (k > 0), "hard_braking": 2.0 * k}
+            )
     return Platoon(pd.concat(tables, ignore_index=True), pd.DataFrame(measures))
 
 
@@ -126,11 +161,19 @@ def make_history(drives: tuple[Drive, ...], gains: dict[tuple[str, str], float])
     return pd.DataFrame(rows)
 
 
-GAINS = {("own", "0 s"): -0.1, ("own", "10 s"): 0.1, ("own", "80 %"): 0.2, ("population", "80 %"): 0.05}
+GAINS = {
+    ("own", "0 s"): -0.1,
+    ("own", "10 s"): 0.1,
+    ("own", "80 %"): 0.2,
+    ("population", "80 %"): 0.05,
+}
 
 
 def rows_of(k: int, drive: Drive, space: ParameterSpace) -> list[dict[str, object]]:
-    rmse = {method: float(np.sqrt(np.mean((drive.speed[method] - drive.real_speed) ** 2))) for method in drive.speed}
+    rmse = {
+        method: float(np.sqrt(np.mean((drive.speed[method] - drive.real_speed) ** 2)))
+        for method in drive.speed
+    }
     follower, leader = drive.pair_id.split("-")[-2:]
     return [
         {
@@ -148,7 +191,10 @@ def rows_of(k: int, drive: Drive, space: ParameterSpace) -> list[dict[str, objec
             "collisions": int((drive.gap[method] < 0).any()),
             "frames": len(drive.time) - 1,
             "fold": 0,
-            **{f"parameter_{p.name}": float(drive.parameters[method][:, j].mean()) for j, p in enumerate(space.tuned)},
+            **{
+                f"parameter_{p.name}": float(drive.parameters[method][:, j].mean())
+                for j, p in enumerate(space.tuned)
+            },
         }
         for method in drive.speed
     ]
@@ -159,10 +205,17 @@ def make_style(drivers: list[str], rng: np.random.Generator) -> StyleResult:
     cuts = (float(np.quantile(scores, 0.25)), float(np.quantile(scores, 0.75)))
     cluster = np.digitize(scores, cuts)
     table = pd.DataFrame(
-        {"driver": drivers, "score": scores, "cluster": cluster, "cluster_name": [CLUSTERS[c] for c in cluster]}
+        {
+            "driver": drivers,
+            "score": scores,
+            "cluster": cluster,
+            "cluster_name": [CLUSTERS[c] for c in cluster],
+        }
         | {name: rng.uniform(0.1, 5, len(drivers)) for name in INDICATORS}
     )
-    return StyleResult(table, dict(zip(INDICATORS, rng.dirichlet(np.full(6, 4.0)), strict=True)), cuts)
+    return StyleResult(
+        table, dict(zip(INDICATORS, rng.dirichlet(np.full(6, 4.0)), strict=True)), cuts
+    )
 
 
 def summarize(table: pd.DataFrame) -> Improvement:
@@ -191,12 +244,25 @@ def summarize(table: pd.DataFrame) -> Improvement:
 def make_curves(networks: int, epochs: int, seed: int = 0) -> pd.DataFrame:
     """Learning curves; validation every second epoch, and some networks stopped early."""
     rng = np.random.default_rng(seed)
-    frames = [pd.DataFrame({"network": [], "epoch": [], "train_loss": [], "validation_loss": []})][: 0 if networks else 1]
+    frames = [pd.DataFrame({"network": [], "epoch": [], "train_loss": [], "validation_loss": []})][
+        : 0 if networks else 1
+    ]
     for k in range(networks):
         stop = epochs if k % 3 else max(1, epochs * 2 // 3)
         epoch = np.arange(stop)
-        train = rng.uniform(0.02, 0.05) + rng.uniform(0.3, 0.7) * np.exp(-epoch / rng.uniform(6, 12))
+        train = rng.uniform(0.02, 0.05) + rng.uniform(0.3, 0.7) * np.exp(
+            -epoch / rng.uniform(6, 12)
+        )
         train *= rng.lognormal(0, 0.05, stop)
         validation = np.where(epoch % 2 == 0, 1.2 * train + 0.0004 * epoch, np.nan)
-        frames.append(pd.DataFrame({"network": f"pair {k}", "epoch": epoch, "train_loss": train, "validation_loss": validation}))
+        frames.append(
+            pd.DataFrame(
+                {
+                    "network": f"pair {k}",
+                    "epoch": epoch,
+                    "train_loss": train,
+                    "validation_loss": validation,
+                }
+            )
+        )
     return pd.concat(frames, ignore_index=True)

@@ -12,7 +12,9 @@ PAGE = """<!doctype html><title>a page</title><p id="text"></p>
 <script>document.getElementById("text").textContent = "drawn by a script"; {more}</script>"""
 
 
-def test_a_page_is_drawn_and_a_complete_one_asks_for_nothing(browser: Browser, tmp_path: Path) -> None:
+def test_a_page_is_drawn_and_a_complete_one_asks_for_nothing(
+    browser: Browser, tmp_path: Path
+) -> None:
     file = tmp_path / "page.html"
     file.write_text(PAGE.format(more=""), encoding="utf-8")
     browser.page.goto(file.as_uri())
@@ -21,7 +23,9 @@ def test_a_page_is_drawn_and_a_complete_one_asks_for_nothing(browser: Browser, t
     assert browser.over_network() == browser.outside() == browser.errors == []
 
 
-def test_what_a_page_asks_for_outside_is_seen_and_not_reached(browser: Browser, tmp_path: Path) -> None:
+def test_what_a_page_asks_for_outside_is_seen_and_not_reached(
+    browser: Browser, tmp_path: Path
+) -> None:
     file = tmp_path / "page.html"
     more = """fetch("https://example.org/x").catch(() => { document.title = "refused" }); new WebSocket("wss://example.org/y");
     fetch("http://127.0.0.1:9/").catch(() => 0); undefined_name()"""

@@ -68,7 +68,9 @@ def outputs(folder: Path) -> list[Path]:
     return sorted(path.parent for path in folder.rglob("metrics.json"))
 
 
-def test_a_job_that_ends_well_exits_with_0_and_leaves_its_log(run: Run, tmp_path: Path, capsys) -> None:
+def test_a_job_that_ends_well_exits_with_0_and_leaves_its_log(
+    run: Run, tmp_path: Path, capsys
+) -> None:
     assert run("model=w99") == 0
     (folder,) = outputs(tmp_path)
     assert folder.name.endswith("-w99-gru")
@@ -78,7 +80,9 @@ def test_a_job_that_ends_well_exits_with_0_and_leaves_its_log(run: Run, tmp_path
     assert printed.err == ""
 
 
-def test_a_users_mistake_in_a_job_is_one_sentence_on_stderr_and_in_the_log(run: Run, tmp_path: Path, capsys) -> None:
+def test_a_users_mistake_in_a_job_is_one_sentence_on_stderr_and_in_the_log(
+    run: Run, tmp_path: Path, capsys
+) -> None:
     assert run("seed=1") == 2
     assert capsys.readouterr().err == "pairs.csv, row 3: the gap is negative\n"
     (log,) = tmp_path.rglob("cfx.log")
@@ -86,7 +90,9 @@ def test_a_users_mistake_in_a_job_is_one_sentence_on_stderr_and_in_the_log(run: 
 
 
 @pytest.mark.parametrize("how", ["hydra.verbose=true", "CFX_TRACEBACK", "HYDRA_FULL_ERROR"])
-def test_the_whole_traceback_is_shown_on_request(run: Run, how: str, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+def test_the_whole_traceback_is_shown_on_request(
+    run: Run, how: str, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
     arguments = [how] if "=" in how else []
     if not arguments:
         monkeypatch.setenv(how, "1")
@@ -115,21 +121,36 @@ def test_ctrl_c_and_sigterm_have_their_exit_codes(run: Run, seed: int, code: int
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["modle=w99"], "modle=w99: there is no key 'modle'. Did you mean 'model'? Known keys: cache"),
+        (
+            ["modle=w99"],
+            "modle=w99: there is no key 'modle'. Did you mean 'model'? Known keys: cache",
+        ),
         (["model=kraus"], "model=kraus: there is no model 'kraus'. Did you mean 'krauss'? Known: "),
-        (["policy.hiden_size=3"], "'policy.hiden_size'. Did you mean 'policy.hidden_size'? Known keys of policy: "),
-        (["modl.parameters.t_r.low=3"], "'modl.parameters.t_r.low'. Did you mean 'model.parameters.t_r.low'?"),
+        (
+            ["policy.hiden_size=3"],
+            "'policy.hiden_size'. Did you mean 'policy.hidden_size'? Known keys of policy: ",
+        ),
+        (
+            ["modl.parameters.t_r.low=3"],
+            "'modl.parameters.t_r.low'. Did you mean 'model.parameters.t_r.low'?",
+        ),
         (["modle=w99", "policy=nope"], "policy=nope: there is no policy 'nope'."),
         (["seed=-1"], "seed=-1: should be greater than or equal to 0."),
         (["+sede=1"], "sede: unknown key. Did you mean 'seed'?"),
-        (["plugin"], "plugin: neither key=value nor a sub-command. Did you mean 'plugins'? See cfx --help."),
+        (
+            ["plugin"],
+            "plugin: neither key=value nor a sub-command. Did you mean 'plugins'? See cfx --help.",
+        ),
         (["model=krauss,w99"], "model=krauss,w99: several values need a multirun; add -m"),
         (["seed=choice(1,2)"], "seed=choice(1,2): several values need a multirun; add -m"),
         (["seed=[1"], "seed=[1: cannot be read as key=value (no viable alternative at input '[1')"),
         (["model=3"], "choose an option by its name, such as model=w99"),
         (["seed=${nowhere}"], "Interpolation key 'nowhere' not found"),
         (["hydra.run.dir=outputs/${nowhere}"], "Interpolation key 'nowhere' not found"),
-        (["hydra/launcher=jobli"], "hydra/launcher=jobli: there is no hydra/launcher 'jobli'. Did you mean 'joblib'?"),
+        (
+            ["hydra/launcher=jobli"],
+            "hydra/launcher=jobli: there is no hydra/launcher 'jobli'. Did you mean 'joblib'?",
+        ),
         (["--config-name", "nope"], "Cannot find primary config 'nope'"),
         (["--config-dir", "nope"], "Additional config directory"),
         (["--cfg", "job", "--multirun"], "Only one of --run, --multirun, --cfg"),
@@ -138,7 +159,9 @@ def test_ctrl_c_and_sigterm_have_their_exit_codes(run: Run, seed: int, code: int
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
-def test_a_wrong_command_line_is_one_sentence_and_exit_code_2(run: Run, arguments: list[str], message: str, capsys) -> None:
+def test_a_wrong_command_line_is_one_sentence_and_exit_code_2(
+    run: Run, arguments: list[str], message: str, capsys
+) -> None:
     assert run(*arguments) == 2
     printed = capsys.readouterr().err
     assert message in printed
@@ -152,7 +175,9 @@ def test_a_flag_that_does_not_exist_exits_with_2(run: Run, capsys) -> None:
 
 
 @pytest.mark.parametrize("key", ["hydra.run.dir", "hydra.sweep.dir"])
-def test_an_output_folder_that_cannot_be_written_is_a_sentence(run: Run, tmp_path: Path, key: str, capsys) -> None:
+def test_an_output_folder_that_cannot_be_written_is_a_sentence(
+    run: Run, tmp_path: Path, key: str, capsys
+) -> None:
     (tmp_path / "file").write_text("here already")
     several = ["-m", "seed=7,8"] if key == "hydra.sweep.dir" else []
     assert run(*several, f"{key}={tmp_path}/file/below") == 2
@@ -171,7 +196,11 @@ def test_a_users_yaml_that_is_no_yaml_is_named(run: Run, tmp_path: Path, capsys)
 
 
 def test_a_broken_plugin_stops_only_the_job_that_names_it(run: Run, install, capsys) -> None:
-    install("bad-models", {"cfx.models": {"bad": "bad_models:Bad"}}, {"bad_models.py": "raise SystemExit(0)"})
+    install(
+        "bad-models",
+        {"cfx.models": {"bad": "bad_models:Bad"}},
+        {"bad_models.py": "raise SystemExit(0)"},
+    )
     assert run("model=bad") == 2
     assert "bad-models 1.0 cannot be imported: SystemExit: 0" in capsys.readouterr().err
     assert run("model=krauss") == 0
@@ -179,7 +208,9 @@ def test_a_broken_plugin_stops_only_the_job_that_names_it(run: Run, install, cap
     assert "bad" in capsys.readouterr().out
 
 
-def test_a_multirun_goes_on_after_a_failed_job_and_tells_all_failures(run: Run, tmp_path: Path, capsys) -> None:
+def test_a_multirun_goes_on_after_a_failed_job_and_tells_all_failures(
+    run: Run, tmp_path: Path, capsys
+) -> None:
     assert run("-m", "seed=0,1,2,7") == 1
     printed = capsys.readouterr()
     assert len(outputs(tmp_path)) == 2
@@ -202,7 +233,9 @@ def test_a_multirun_in_small_batches_goes_on_too(run: Run, tmp_path: Path) -> No
     assert len(outputs(tmp_path)) == 2
 
 
-def test_outcomes_of_an_earlier_multirun_in_the_same_folder_do_not_count(run: Run, tmp_path: Path, capsys) -> None:
+def test_outcomes_of_an_earlier_multirun_in_the_same_folder_do_not_count(
+    run: Run, tmp_path: Path, capsys
+) -> None:
     again = f"hydra.sweep.dir={tmp_path}/sweep"
     assert run("-m", "seed=0,1,1", again) == 2
     assert run("-m", "seed=0", again) == 0
@@ -218,18 +251,31 @@ PLUGIN = """
 """
 
 
-def test_a_multirun_in_worker_processes_composes_a_plugin_and_reports_failures(run: Run, install, tmp_path: Path) -> None:
+def test_a_multirun_in_worker_processes_composes_a_plugin_and_reports_failures(
+    run: Run, install, tmp_path: Path
+) -> None:
     install("mine-data", {"cfx.datasets": {"mine": "mine_data:Mine"}}, {"mine_data.py": PLUGIN})
     script = "import sys; from cfx.application import start; sys.exit(start(sys.argv[1:], target='jobs_stub:run_job'))"
-    arguments = ["-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "data=mine,synthetic", "seed=0,1"]
-    environment = {**os.environ, "PYTHONPATH": str(install.folder)}  # joblib's workers outlive the call: a process of its own
+    arguments = [
+        "-m",
+        "hydra/launcher=joblib",
+        "hydra.launcher.n_jobs=2",
+        "data=mine,synthetic",
+        "seed=0,1",
+    ]
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(install.folder),
+    }  # joblib's workers outlive the call: a process of its own
     command = [sys.executable, "-c", script, *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     assert done.returncode == 2, done.stderr
     assert "2 of 4 jobs done" in done.stdout
     assert sum(line.startswith("failed: data=") for line in done.stderr.splitlines()) == 2
     assert len(outputs(tmp_path)) == 2
-    assert all(int((folder / "metrics.json").read_text()) != os.getpid() for folder in outputs(tmp_path))
+    assert all(
+        int((folder / "metrics.json").read_text()) != os.getpid() for folder in outputs(tmp_path)
+    )
 
 
 def test_help_lists_the_groups_and_names_only_keys_that_exist(run: Run, capsys) -> None:
@@ -239,20 +285,30 @@ def test_help_lists_the_groups_and_names_only_keys_that_exist(run: Run, capsys) 
     listed = {group: set(names.split(", ")) for group, _, names in lines}
     assert listed["model"] >= {"krauss", "w74", "w99"}  # and those of plugins
     assert listed["policy"] >= {"default", "fixed", "gru", "lstm"}
-    for override in ("style.cluster=aggressive", "model.parameters.t_r.high=12", "seed=1", "device=cuda", "split=0.7"):
+    for override in (
+        "style.cluster=aggressive",
+        "model.parameters.t_r.high=12",
+        "seed=1",
+        "device=cuda",
+        "split=0.7",
+    ):
         assert override in printed
         assert run("--cfg", "job", override) == 0
 
 
 @pytest.mark.parametrize(
-    "arguments", [["--cfg", "job"], ["--info", "searchpath"], ["--info", "defaults"], ["--hydra-help"]], ids=" ".join
+    "arguments",
+    [["--cfg", "job"], ["--info", "searchpath"], ["--info", "defaults"], ["--hydra-help"]],
+    ids=" ".join,
 )
 def test_hydras_own_flags_work(run: Run, arguments: list[str], capsys) -> None:
     assert run(*arguments) == 0
     assert capsys.readouterr().out
 
 
-def test_tab_completion_knows_plugins(run: Run, install, capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tab_completion_knows_plugins(
+    run: Run, install, capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
     install("mine-data", {"cfx.datasets": {"mine": "mine_data:Mine"}}, {"mine_data.py": PLUGIN})
     monkeypatch.setenv("COMP_LINE", "cfx data=")
     monkeypatch.setenv("COMP_POINT", "9")
@@ -268,10 +324,16 @@ def test_the_process_is_left_as_it_was(run: Run) -> None:
     assert (sys.argv, list(logging.getLogger().handlers), Path.cwd()) == before
 
 
-def test_cfx_run_runs_the_same_job_into_a_fresh_folder(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(HydraConfig.instance(), "cfg", None)  # as in a process where Hydra never ran
+def test_cfx_run_runs_the_same_job_into_a_fresh_folder(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        HydraConfig.instance(), "cfg", None
+    )  # as in a process where Hydra never ran
     first = application.run(["model=w99", "seed=7"], target="jobs_stub:run_job")
-    again = application.run(["model=w99", f"hydra.run.dir={first.folder}"], target="jobs_stub:run_job")
+    again = application.run(
+        ["model=w99", f"hydra.run.dir={first.folder}"], target="jobs_stub:run_job"
+    )
     assert first.config.model["name"] == "w99"  # type: ignore[attr-defined]  # the stub's result
     assert first.folder.is_relative_to(tmp_path)
     assert again.folder == first.folder.with_name(f"{first.folder.name}-2")
@@ -299,7 +361,9 @@ def test_cfx_run_raises_what_the_command_line_would_print(
     assert cfx.run is application.run
 
 
-def test_main_takes_its_arguments_from_the_command_line(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+def test_main_takes_its_arguments_from_the_command_line(
+    monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
     monkeypatch.setattr(sys, "argv", ["cfx", "plugins"])
     assert cli.main() == 0
     assert "krauss" in capsys.readouterr().out
@@ -314,14 +378,18 @@ def test_main_takes_its_arguments_from_the_command_line(monkeypatch: pytest.Monk
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
-def test_a_sub_commands_mistake_is_one_sentence_and_exit_code_2(arguments: list[str], message: str, capsys) -> None:
+def test_a_sub_commands_mistake_is_one_sentence_and_exit_code_2(
+    arguments: list[str], message: str, capsys
+) -> None:
     assert cli.main(arguments) == 2
     printed = capsys.readouterr().err
     assert message in printed
     assert len(printed.splitlines()) == 1
 
 
-def test_data_describe_takes_several_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_data_describe_takes_several_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     files = [str(tmp_path / f"{name}.csv") for name in "ab"]
     for file, frames in zip(files, (50, 60), strict=True):
         write_tidy(straight_pairs([frames]), file)
@@ -335,9 +403,13 @@ def test_data_describe_prints_what_a_recording_holds(shared_data: Path, capsys) 
     assert "pairs" in capsys.readouterr().out
 
 
-def test_ui_starts_mlflow_on_this_machine_only_and_prints_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+def test_ui_starts_mlflow_on_this_machine_only_and_prints_links(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
     started: list[tuple[list[str], dict[str, str]]] = []
-    monkeypatch.setattr(os, "execve", lambda path, command, environment: started.append((command, environment)))
+    monkeypatch.setattr(
+        os, "execve", lambda path, command, environment: started.append((command, environment))
+    )
     monkeypatch.setattr(ui, "_links", lambda store, port: [f"links for {store}"])
     store = f"sqlite:///{tmp_path}/mlflow.db"
     open_store(store, "cfx")
@@ -370,12 +442,16 @@ def test_ui_without_any_tracked_job_or_with_a_taken_port_says_so(tmp_path: Path,
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        assert cli.main(["ui", "--uri", f"sqlite:///{tmp_path}/mlflow.db", "--port", str(port)]) == 2
+        assert (
+            cli.main(["ui", "--uri", f"sqlite:///{tmp_path}/mlflow.db", "--port", str(port)]) == 2
+        )
     assert f"--port {port} cannot be used" in capsys.readouterr().err
 
 
 def test_ui_on_a_foreign_file_says_so(tmp_path: Path, capsys) -> None:
-    (tmp_path / "notes.db").write_text("not a database, but some text that is long enough to look like a file")
+    (tmp_path / "notes.db").write_text(
+        "not a database, but some text that is long enough to look like a file"
+    )
     assert cli.main(["ui", "--uri", f"sqlite:///{tmp_path}/notes.db"]) == 2
     assert "notes.db" in capsys.readouterr().err
 

@@ -45,7 +45,9 @@ def test_config_yaml_says_the_same_as_the_class() -> None:
     kinds = set(registry.GROUPS)
     assert set(values) == set(JobConfig.model_fields)
     written = yaml.safe_load(config.model_dump_json(exclude=kinds))
-    declared = yaml.safe_load(JobConfig(**{group: {} for group in kinds}).model_dump_json(exclude=kinds))
+    declared = yaml.safe_load(
+        JobConfig(**{group: {} for group in kinds}).model_dump_json(exclude=kinds)
+    )
     folder = Path(written["cache"].pop("folder"))
     assert folder == Path.cwd() / declared["cache"].pop("folder")
     assert written == declared
@@ -67,7 +69,10 @@ def test_a_job_config_cannot_be_changed() -> None:
         ("dtype=float16", r"^dtype='float16': should be 'float32' or 'float64'"),
         ("threads=0", r"^threads=0: "),
         ("windows.length=0", r"^windows\.length=0: "),
-        ("style.cluster=agressive", r"^style\.cluster='agressive': should be 'all', 'conservative'"),
+        (
+            "style.cluster=agressive",
+            r"^style\.cluster='agressive': should be 'all', 'conservative'",
+        ),
         ("style.percentiles=[75,25]", r"^style.*percentiles"),
         ("+style.clster=all", r"^style\.clster: unknown key\. Did you mean 'cluster'\?"),
         ("+sede=1", r"^sede: unknown key\. Did you mean 'seed'\?"),
@@ -100,8 +105,12 @@ def _option(path: Path) -> tuple[str, str]:
 OPTIONS = sorted(_option(path) for path in CONF.rglob("*.yaml") if path.parent != CONF)
 
 
-@pytest.mark.parametrize(("group", "name"), OPTIONS, ids=[f"{group}={name}" for group, name in OPTIONS])
-def test_every_file_in_conf_composes_and_its_components_can_be_created(group: str, name: str) -> None:
+@pytest.mark.parametrize(
+    ("group", "name"), OPTIONS, ids=[f"{group}={name}" for group, name in OPTIONS]
+)
+def test_every_file_in_conf_composes_and_its_components_can_be_created(
+    group: str, name: str
+) -> None:
     values = values_of(f"{group}={name}")
     config = JobConfig.of(values)
     for key, kind in registry.GROUPS.items():
@@ -116,7 +125,9 @@ def test_every_file_in_conf_composes_and_its_components_can_be_created(group: st
 
 @pytest.mark.parametrize("entry", nodes.built_in(), ids=lambda entry: f"{entry.kind}-{entry.name}")
 def test_the_file_of_a_built_in_component_is_what_its_class_says(entry: registry.Entry) -> None:
-    assert nodes.file_path(entry).read_text(encoding="utf-8") == nodes.file_text(entry), "run `make conf`"
+    assert nodes.file_path(entry).read_text(encoding="utf-8") == nodes.file_text(entry), (
+        "run `make conf`"
+    )
 
 
 def test_conf_holds_no_file_of_a_component_that_is_gone() -> None:
@@ -135,7 +146,9 @@ def test_every_bound_of_a_models_parameters_is_overridden_without_a_plus() -> No
         space = registry.get("model", model).parameters  # type: ignore[attr-defined]  # a DrivingModel
         keys = {parameter.name: f"model.parameters.{parameter.name}" for parameter in space}
         highs = [f"{keys[parameter.name]}.high={parameter.high + 1}" for parameter in space]
-        node = values_of(f"model={model}", *highs, *(f"{key}.tuned=false" for key in keys.values()))["model"]
+        node = values_of(
+            f"model={model}", *highs, *(f"{key}.tuned=false" for key in keys.values())
+        )["model"]
         for parameter in space:
             assert node["parameters"][parameter.name]["high"] == parameter.high + 1
             assert node["parameters"][parameter.name]["tuned"] is False
@@ -162,7 +175,9 @@ class _Odd(DrivingModel):
     """Has every sort of setting."""
 
     schema = _OddSettings
-    parameters = ParameterSpace.of(Parameter("yes", "1", -1e-9, 1e22, 0.0, "a name that YAML reads as true", "here"))
+    parameters = ParameterSpace.of(
+        Parameter("yes", "1", -1e-9, 1e22, 0.0, "a name that YAML reads as true", "here")
+    )
 
 
 def test_a_node_reads_back_as_the_defaults_of_its_class() -> None:
@@ -191,7 +206,12 @@ def test_a_third_partys_model_is_an_option_and_its_node_is_written_from_its_clas
     install("mine-models", {"cfx.models": {"mine": "mine_models:Mine"}}, {"mine_models.py": PLUGIN})
     node = values_of("model=mine", "model.parameters.tau.high=9", "model.mood=wild")["model"]
     tau = {"low": 0.5, "high": 9, "default": 1.0, "tuned": True}
-    assert node == {"name": "mine", "reach": None, "mood": "wild", "parameters": {"tau": tau}}
+    assert node == {
+        "name": "mine",
+        "adaptation_bounds": None,
+        "mood": "wild",
+        "parameters": {"tau": tau},
+    }
 
 
 def test_a_plugins_own_yaml_wins_and_may_extend_the_generated_node(install) -> None:
@@ -205,15 +225,21 @@ def test_a_plugins_own_yaml_wins_and_may_extend_the_generated_node(install) -> N
     far = values_of("model=mine_far", "model.parameters.tau.low=0.7")["model"]
     assert far == {
         "name": "mine",
-        "reach": None,
+        "adaptation_bounds": None,
         "mood": "wild",
         "parameters": {"tau": {"low": 0.7, "high": 8.0, "default": 1.0, "tuned": True}},
     }
 
 
 def test_a_broken_plugin_harms_no_composition_that_does_not_choose_it(install) -> None:
-    files = {"bad_models/__init__.py": "raise SystemExit(5)", "bad_models/conf/model/other.yaml": "name: krauss\n"}
-    points = {"cfx.models": {"bad": "bad_models:Bad"}, "cfx.policies": {"ghost": "not_there_at_all:Ghost"}}
+    files = {
+        "bad_models/__init__.py": "raise SystemExit(5)",
+        "bad_models/conf/model/other.yaml": "name: krauss\n",
+    }
+    points = {
+        "cfx.models": {"bad": "bad_models:Bad"},
+        "cfx.policies": {"ghost": "not_there_at_all:Ghost"},
+    }
     install("bad-models", points, files)
     assert values_of()["model"]["name"] == "krauss"
     assert values_of("model=other")["model"] == {"name": "krauss"}

@@ -23,18 +23,32 @@ from tests.drives import straight_pairs
 def blocks(name: str, language: str) -> list[str]:
     text = (ROOT / name).read_text(encoding="utf-8")
     return [
-        body for found, body in re.findall(r"^```(\w*)\n(.*?)^```$", text, flags=re.DOTALL | re.MULTILINE) if found == language
+        body
+        for found, body in re.findall(
+            r"^```(\w*)\n(.*?)^```$", text, flags=re.DOTALL | re.MULTILINE
+        )
+        if found == language
     ]
 
 
 def commands() -> list[str]:
-    lines = [line for name in ("README.md", "docs/results.md") for block in blocks(name, "") for line in block.splitlines()]
+    lines = [
+        line
+        for name in ("README.md", "docs/results.md")
+        for block in blocks(name, "")
+        for line in block.splitlines()
+    ]
     return [line for line in lines if line.startswith("python -m cfx ")]
 
 
 def summarised() -> list[str]:
     """Returns what follows `python -m cfx` in the README's table of results."""
-    section = (ROOT / "README.md").read_text(encoding="utf-8").partition("## Does it help?\n")[2].partition("\n## ")[0]
+    section = (
+        (ROOT / "README.md")
+        .read_text(encoding="utf-8")
+        .partition("## Does it help?\n")[2]
+        .partition("\n## ")[0]
+    )
     return re.findall(r"^\| [^|]* \| `([^`]+)` \|", section, flags=re.MULTILINE)
 
 
@@ -43,20 +57,28 @@ def test_there_are_commands_to_check() -> None:
     assert len(summarised()) == 6
 
 
-@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "docs/results.md", "docs/tried.md"])
+@pytest.mark.parametrize(
+    "name", ["README.md", "CONTRIBUTING.md", "docs/results.md", "docs/tried.md"]
+)
 def test_links_lead_somewhere(name: str) -> None:
     text = (ROOT / name).read_text(encoding="utf-8")
-    links = [link.partition("#")[0] for link in re.findall(r"\]\(([^)\s]+)\)", text) if "://" not in link]
+    links = [
+        link.partition("#")[0] for link in re.findall(r"\]\(([^)\s]+)\)", text) if "://" not in link
+    ]
     assert all((ROOT / name).parent.joinpath(link).exists() for link in links), links
 
 
-@pytest.mark.parametrize("command", [*commands(), *(f"python -m cfx {words}" for words in summarised())])
+@pytest.mark.parametrize(
+    "command", [*commands(), *(f"python -m cfx {words}" for words in summarised())]
+)
 def test_the_documents_commands_compose(command: str) -> None:
     overrides = [word.split(",")[0] for word in shlex.split(command)[3:] if word != "-m"]
     assert composed(overrides)
 
 
-def test_the_readmes_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_readmes_python_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     (block,) = blocks("README.md", "python")
     names: dict[str, object] = {}
@@ -69,18 +91,26 @@ def test_the_readmes_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_the_model_in_contributing_drives() -> None:
-    (block,) = [one for one in blocks("CONTRIBUTING.md", "python") if "class Pipes(DrivingModel)" in one]
+    (block,) = [
+        one for one in blocks("CONTRIBUTING.md", "python") if "class Pipes(DrivingModel)" in one
+    ]
     names: dict[str, object] = {"__name__": "example"}
     exec(block, names)  # noqa: S102 - it is our own document
     kind = names["Pipes"]
     assert isinstance(kind, type)
     assert issubclass(kind, DrivingModel)
     batch = cfx.PairBatch.of(straight_pairs([600]))
-    leader = cfx.Leader(batch.leader_position, batch.leader_speed, batch.leader_acceleration, batch.leader_length)
-    start = cfx.Start(batch.follower_position[:, 0], batch.follower_speed[:, 0], batch.follower_acceleration[:, 0])
+    leader = cfx.Leader(
+        batch.leader_position, batch.leader_speed, batch.leader_acceleration, batch.leader_length
+    )
+    start = cfx.Start(
+        batch.follower_position[:, 0], batch.follower_speed[:, 0], batch.follower_acceleration[:, 0]
+    )
     drive = cfx.simulate(kind(), {"headway": 2.0}, leader, start, batch.dt)
     assert not bool(drive.collided.any())
-    torch.testing.assert_close(drive.gap[0, -1], torch.tensor(20.0, dtype=torch.float64), atol=0.5, rtol=0)
+    torch.testing.assert_close(
+        drive.gap[0, -1], torch.tensor(20.0, dtype=torch.float64), atol=0.5, rtol=0
+    )
 
 
 def test_the_table_of_kinds_names_what_is_there() -> None:
@@ -88,12 +118,21 @@ def test_the_table_of_kinds_names_what_is_there() -> None:
 
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (\w+) \| `cfx\.(\w+)` \| .* \| `(\w+)` \|$", text, flags=re.MULTILINE)
-    assert [kind for kind, _, _ in rows] == ["dataset", "model", "optimizer", "policy", "learner", "protocol"]
+    assert [kind for kind, _, _ in rows] == [
+        "dataset",
+        "model",
+        "optimizer",
+        "policy",
+        "learner",
+        "protocol",
+    ]
     for kind, base, suite in rows:
         assert getattr(cfx, base).kind == kind
         assert hasattr(getattr(cfx.testing, suite), kind)
     assert f"`cfx.API_VERSION` ({cfx.API_VERSION})" in text
-    (declared,) = re.findall(r'^\[project\.entry-points\."cfx\.api"\]\n(\d+) = ', text, flags=re.MULTILINE)
+    (declared,) = re.findall(
+        r'^\[project\.entry-points\."cfx\.api"\]\n(\d+) = ', text, flags=re.MULTILINE
+    )
     assert int(declared) == cfx.API_VERSION
 
 
@@ -110,20 +149,41 @@ def test_the_guide_to_a_plugin_works_as_printed(tmp_path: Path) -> None:
     home = tmp_path / "env"
     venv.create(home, with_pip=False, symlinks=True)
     (site,) = home.glob("lib/python*/site-packages")
-    (site / "all.pth").write_text(f"import site; site.addsitedir({sysconfig.get_path('purelib')!r})\n", encoding="utf-8")
+    (site / "all.pth").write_text(
+        f"import site; site.addsitedir({sysconfig.get_path('purelib')!r})\n", encoding="utf-8"
+    )
     pip = home / "bin" / "pip"
     pip.write_text(f'#!/bin/sh\nexec {home}/bin/python -m pip "$@"\n', encoding="utf-8")
     pip.chmod(0o755)
-    offline = {"PIP_NO_INDEX": "1", "PIP_NO_DEPS": "1", "PIP_NO_BUILD_ISOLATION": "0", "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
+    offline = {
+        "PIP_NO_INDEX": "1",
+        "PIP_NO_DEPS": "1",
+        "PIP_NO_BUILD_ISOLATION": "0",
+        "PIP_DISABLE_PIP_VERSION_CHECK": "1",
+    }
     search = f"{home / 'bin'}{os.pathsep}{os.environ['PATH']}"
-    environment = {**os.environ, **offline, "PATH": search, "MLFLOW_TRACKING_URI": f"sqlite:///{tmp_path}/mlflow.db"}
+    environment = {
+        **os.environ,
+        **offline,
+        "PATH": search,
+        "MLFLOW_TRACKING_URI": f"sqlite:///{tmp_path}/mlflow.db",
+    }
     steps = guide()
     assert [language for language, _ in steps] == ["sh", "python", "python", "sh"]
     for language, block in steps:
         if language == "python":
-            (tmp_path / block.partition("\n")[0].removeprefix("# ")).write_text(block, encoding="utf-8")
+            (tmp_path / block.partition("\n")[0].removeprefix("# ")).write_text(
+                block, encoding="utf-8"
+            )
             continue
-        done = subprocess.run(["sh", "-ec", block], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            ["sh", "-ec", block],
+            cwd=tmp_path,
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
         assert done.returncode == 0, done.stdout + done.stderr
     assert (tmp_path / "outputs" / "pipes" / "report.html").is_file()
     assert "pipes" in (tmp_path / "outputs" / "pipes" / "report.html").read_text(encoding="utf-8")

@@ -28,9 +28,15 @@ def test_every_experiment_says_its_question_command_and_duration(name: str) -> N
 
 @pytest.mark.parametrize("name", ["paper/pair", "paper/pairs", "paper/clusters", "paper/grid"])
 def test_the_papers_experiments_train_as_the_paper_does(name: str) -> None:
-    values = hydra_source.plain(hydra_source.composed([f"experiment={name}", "data=tidy", "data.path=pairs.csv"]))
+    values = hydra_source.plain(
+        hydra_source.composed([f"experiment={name}", "data=tidy", "data.path=pairs.csv"])
+    )
     own = hydra_source.plain(hydra_source.composed(["experiment=paper/imitation"]))
-    assert (values["learner"], values["policy"], values["windows"]) == (own["learner"], own["policy"], own["windows"])
+    assert (values["learner"], values["policy"], values["windows"]) == (
+        own["learner"],
+        own["policy"],
+        own["windows"],
+    )
     assert values["data"]["name"] == "tidy", "the command line's data wins over the experiment's"
 
 
@@ -39,12 +45,20 @@ def test_an_experiment_sweeps_without_being_told(
 ) -> None:
     """The clusters of a small synthetic data set, two folds each: six jobs from one command."""
     monkeypatch.chdir(tmp_path)
-    small = ["data.pairs=8", "data.frames=60", "protocol.folds=2", "tracking.enabled=false", "hydra.sweep.dir=out"]
+    small = [
+        "data.pairs=8",
+        "data.frames=60",
+        "protocol.folds=2",
+        "tracking.enabled=false",
+        "hydra.sweep.dir=out",
+    ]
     assert cli.main(["experiment=paper/clusters", *SMALL, *small]) == 0
     assert "6 of 6 jobs done" in capsys.readouterr().out
     summary = pd.read_csv(tmp_path / "out" / "summary.csv")
     assert sorted(zip(summary["model"], summary["style.cluster"], strict=True)) == [
-        (model, cluster) for model in ("krauss", "w99") for cluster in ("aggressive", "conservative", "normal")
+        (model, cluster)
+        for model in ("krauss", "w99")
+        for cluster in ("aggressive", "conservative", "normal")
     ]
     for folder in summary["folder"]:
         job = tmp_path / "out" / folder
@@ -52,7 +66,9 @@ def test_an_experiment_sweeps_without_being_told(
         assert "rmse_improvement/population/mean" in json.loads((job / "metrics.json").read_text())
 
 
-def test_one_pair_has_its_table_and_its_speed_plots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_pair_has_its_table_and_its_speed_plots(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     few = ["data.frames=120", "tracking.enabled=false", "figures.enabled=true"]
     result = cfx.run(["experiment=paper/pair", *SMALL, *few])

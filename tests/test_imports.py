@@ -15,7 +15,7 @@ import cfx
 PACKAGE = Path(cfx.__file__).parent
 
 FLOORS = (
-    ("errors",),
+    ("errors", "renamed"),
     ("component",),
     ("parameters", "pairs", "progress", "console", "files"),
     ("registry",),
@@ -23,17 +23,27 @@ FLOORS = (
     ("simulation",),
     ("datasets", "style", "optimizers", "calibration"),
     ("policies", "learners"),
-    ("evaluation", "probes"),
+    ("evaluation", "smoke_checks"),
     ("protocols",),
     ("tracking", "figures"),
     ("config", "nodes", "ui", "testing", "report"),
-    ("job", "hydra_source", "mistakes", "sweep", "application", "plugins", "cli", "sumo"),
+    ("job", "hydra_source", "user_errors", "sweep", "application", "plugins", "cli", "sumo"),
 )
 """From the ground up; a room may use rooms on its own floor and below."""
 
 HEIGHT = {room: height for height, floor in enumerate(FLOORS) for room in floor}
 
-HEAVY = ("torch", "lightning", "botorch", "gpytorch", "mlflow", "pandas", "matplotlib", "scipy", "plotly")
+HEAVY = (
+    "torch",
+    "lightning",
+    "botorch",
+    "gpytorch",
+    "mlflow",
+    "pandas",
+    "matplotlib",
+    "scipy",
+    "plotly",
+)
 
 
 def modules() -> list[str]:
@@ -55,12 +65,18 @@ def imported_by(path: Path) -> set[str]:
     """Returns the rooms that a file imports when it runs, also inside functions; annotations alone do not count."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for node in ast.walk(tree):
-        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+        if (
+            isinstance(node, ast.If)
+            and isinstance(node.test, ast.Name)
+            and node.test.id == "TYPE_CHECKING"
+        ):
             node.body = []
     rooms = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            rooms |= {room(alias.name) for alias in node.names if alias.name.partition(".")[0] == "cfx"}
+            rooms |= {
+                room(alias.name) for alias in node.names if alias.name.partition(".")[0] == "cfx"
+            }
         elif isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "cfx":
             rooms |= {room(f"{node.module}.{alias.name}") for alias in node.names}
     return rooms - {""}
@@ -104,7 +120,9 @@ def test_every_module_imports_from_clean() -> None:
                 failed.append(name)
         sys.exit(f"cannot be imported alone: {{failed}}" if failed else 0)
     """
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -122,7 +140,9 @@ def test_every_module_imports_from_clean() -> None:
 def test_what_must_answer_at_once_imports_nothing_heavy(code: str) -> None:
     heavy = tuple(set(HEAVY) - {"pandas", "scipy"})
     script = f"{code}\nimport sys\nloaded = sys.modules.keys() & set({heavy!r})\nsys.exit(str(loaded) if loaded else 0)"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
 
 

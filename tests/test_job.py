@@ -56,7 +56,9 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> cfx.JobResult:
         "hydra.run.dir=out",
     ]
     environment = {key: value for key, value in os.environ.items() if key != "MLFLOW_TRACKING_URI"}
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     (folder / "stdout.txt").write_text(done.stdout)
     (folder / "stderr.txt").write_text(done.stderr)
@@ -66,7 +68,14 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> cfx.JobResult:
 def test_the_folder_holds_what_the_contract_says(finished: cfx.JobResult) -> None:
     folder = finished.folder
     names = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
-    assert {"config.yaml", "metrics.json", "pairs.csv", "policy/policy.pt", "policy/policy.json", "cfx.log"} <= names
+    assert {
+        "config.yaml",
+        "metrics.json",
+        "pairs.csv",
+        "policy/policy.pt",
+        "policy/policy.json",
+        "cfx.log",
+    } <= names
     assert {path.name for path in finished.figures} >= {
         "style_distribution.png", "drives.png", "chosen_parameters.png", "improvement_per_driver.png", "learning_curve.png"
     }  # fmt: skip
@@ -75,16 +84,38 @@ def test_the_folder_holds_what_the_contract_says(finished: cfx.JobResult) -> Non
     assert config["model"]["name"] == "krauss"
     assert config["learner"]["epochs"] == 3
     metrics = json.loads((folder / "metrics.json").read_text())
-    expected = {f"{what}/{method}" for what in ("rmse_speed", "rmse_gap") for method in ("default", "fixed", "policy")}
+    expected = {
+        f"{what}/{method}"
+        for what in ("rmse_speed", "rmse_gap")
+        for method in ("default", "fixed", "policy")
+    }
     expected |= {
-        f"rmse_improvement/{name}" for name in ("mean", "trimmed_mean", "median", "ci95_low", "ci95_high", "win_rate", "p_value")
+        f"rmse_improvement/{name}"
+        for name in (
+            "mean",
+            "trimmed_mean",
+            "median",
+            "ci95_low",
+            "ci95_high",
+            "win_rate",
+            "p_value",
+        )
     }
     assert expected | {"collisions/policy"} <= set(metrics)
 
 
 def test_the_terminal_says_what_matters(finished: cfx.JobResult) -> None:
     text = (finished.folder.parent / "stdout.txt").read_text()
-    for word in ("default", "fixed", "policy", "RMSE speed", "95 % interval", "Results:", "cfx ui", "http://127.0.0.1:5000"):
+    for word in (
+        "default",
+        "fixed",
+        "policy",
+        "RMSE speed",
+        "95 % interval",
+        "Results:",
+        "cfx ui",
+        "http://127.0.0.1:5000",
+    ):
         assert word in text, text
     assert "Traceback" not in (finished.folder.parent / "stderr.txt").read_text()
 
@@ -100,8 +131,10 @@ def test_every_window_has_its_label_and_spread(finished: cfx.JobResult) -> None:
     labels = pd.read_parquet(finished.folder / "labels.parquet")
     # 200 frames are 39 windows of 5 steps, of which the first 80 % are calibrated.
     assert labels.groupby("pair_id").size().tolist() == [31, 31, 31]
-    assert {"time_s", "parameter_t_r", "parameter_t_i", "loss_mps", "spread_mps"} <= set(labels.columns)
-    assert bool((labels.spread_mps >= 0).all())
+    assert {"time_s", "parameter_t_r", "parameter_t_i", "loss_mps", "sensitivity_mps"} <= set(
+        labels.columns
+    )
+    assert bool((labels.sensitivity_mps >= 0).all())
     assert finished.metrics["labels/loss"] == pytest.approx(labels.loss_mps.mean())
 
 
@@ -110,9 +143,15 @@ def test_synthetic_data_keeps_its_truth(finished: cfx.JobResult) -> None:
     assert {"true_t_r", "true_t_i", "true_model"} <= set(table.columns)
 
 
-@pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy:sqlalchemy.exc.SADeprecationWarning")  # inside MLflow
-@pytest.mark.filterwarnings("ignore:.*Any type hint is inferred as AnyType:UserWarning")  # inside MLflow, at its import
-def test_the_policy_in_mlflow_predicts_the_same(finished: cfx.JobResult, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.filterwarnings(
+    "ignore:The ``noload`` loader strategy:sqlalchemy.exc.SADeprecationWarning"
+)  # inside MLflow
+@pytest.mark.filterwarnings(
+    "ignore:.*Any type hint is inferred as AnyType:UserWarning"
+)  # inside MLflow, at its import
+def test_the_policy_in_mlflow_predicts_the_same(
+    finished: cfx.JobResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import mlflow
 
     home = finished.folder.parent
@@ -122,7 +161,9 @@ def test_the_policy_in_mlflow_predicts_the_same(finished: cfx.JobResult, monkeyp
     assert experiment is not None
     (tracked,) = client.search_runs([experiment.experiment_id])
     assert tracked.info.status == "FINISHED"
-    assert tracked.data.metrics["rmse_speed/fixed"] == pytest.approx(finished.metrics["rmse_speed/fixed"])
+    assert tracked.data.metrics["rmse_speed/fixed"] == pytest.approx(
+        finished.metrics["rmse_speed/fixed"]
+    )
     assert tracked.data.params["model.name"] == "krauss"
     before = mlflow.get_tracking_uri()
     mlflow.set_tracking_uri(uri)
@@ -140,7 +181,11 @@ def test_the_policy_in_mlflow_predicts_the_same(finished: cfx.JobResult, monkeyp
 
 
 def test_the_same_seed_gives_the_same_metrics() -> None:
-    one, two, other = run("cache.enabled=false"), run("cache.enabled=false"), run("seed=1", "cache.enabled=false")
+    one, two, other = (
+        run("cache.enabled=false"),
+        run("cache.enabled=false"),
+        run("seed=1", "cache.enabled=false"),
+    )
     texts = [(result.folder / "metrics.json").read_text() for result in (one, two, other)]
     assert one.folder != two.folder
     assert texts[0] == texts[1]
@@ -156,13 +201,21 @@ def test_a_baseline_as_policy_equals_itself(policy: str) -> None:
         assert result.metrics["rmse_improvement/p_value"] == 1
 
 
-@pytest.mark.parametrize("overrides", [["model=w99", "policy=lstm"], ["model=w74", "protocol.networks=all"], ["dtype=float32"]])
+@pytest.mark.parametrize(
+    "overrides",
+    [["model=w99", "policy=lstm"], ["model=w74", "protocol.networks=all"], ["dtype=float32"]],
+)
 def test_other_components_run_too(overrides: list[str]) -> None:
     result = run(*overrides)
-    assert all(math.isfinite(result.metrics[f"rmse_speed/{method}"]) for method in ("default", "fixed", "policy"))
+    assert all(
+        math.isfinite(result.metrics[f"rmse_speed/{method}"])
+        for method in ("default", "fixed", "policy")
+    )
     loaded = cfx.load(result.folder)
     table = pd.read_parquet(result.folder / "data.parquet")
-    pd.testing.assert_frame_equal(loaded.policy.predict_frame(table), result.policy.predict_frame(table))
+    pd.testing.assert_frame_equal(
+        loaded.policy.predict_frame(table), result.policy.predict_frame(table)
+    )
 
 
 def test_two_policies_calibrate_once(caplog: pytest.LogCaptureFixture) -> None:
@@ -172,18 +225,27 @@ def test_two_policies_calibrate_once(caplog: pytest.LogCaptureFixture) -> None:
         caplog.clear()
         run("policy=lstm")
     assert any("Window labels" in message for message in first)
-    assert not [message for message in caplog.messages if "problems): done" in message and "0 problems" not in message]
+    assert not [
+        message
+        for message in caplog.messages
+        if "problems): done" in message and "0 problems" not in message
+    ]
 
 
-def test_other_time_steps_are_said_and_can_be_brought_to_the_usual_one(caplog: pytest.LogCaptureFixture) -> None:
+def test_other_time_steps_are_said_and_can_be_brought_to_the_usual_one(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     fine = ["data.dt=0.04", "data.frames=500", "data.min_frames=200", "policy=fixed"]
     with caplog.at_level("INFO"):
         run(*fine)
-        assert any("5 steps lasts 0.2 s" in message and "data.time_step=0.1" in message for message in caplog.messages)
+        assert any(
+            "5 steps lasts 0.2 s" in message and "data.time_step=0.1" in message
+            for message in caplog.messages
+        )
         caplog.clear()
         result = run(*fine, "data.time_step=0.1")
     assert not any("data.time_step" in message for message in caplog.messages)
-    times = pd.read_parquet(result.folder / "drives.parquet").groupby("pair_id")["time_s"]
+    times = pd.read_parquet(result.folder / "trajectories.parquet").groupby("pair_id")["time_s"]
     assert times.diff().dropna().round(6).unique().tolist() == [0.1]
 
 
@@ -232,7 +294,10 @@ def _set(row: int, column: str, value: object) -> Change:
 
 
 BROKEN_TABLES: dict[str, tuple[Change, str]] = {
-    "wrong column": (lambda t: t.rename(columns={"leader_speed_mps": "leader_sped_mps"}), "leader_speed_mps"),
+    "wrong column": (
+        lambda t: t.rename(columns={"leader_speed_mps": "leader_sped_mps"}),
+        "leader_speed_mps",
+    ),
     "NaN": (_set(7, "follower_speed_mps", math.nan), "follower_speed_mps"),
     "infinite": (_set(7, "leader_position_m", math.inf), "leader_position_m"),
     "text": (_set(7, "leader_position_m", "far"), "leader_position_m"),
@@ -240,7 +305,10 @@ BROKEN_TABLES: dict[str, tuple[Change, str]] = {
     "gap in frames": (lambda t: t.drop(index=50), "frame"),
     "leader behind": (_set(9, "leader_position_m", -1e4), "behind"),
     "negative speed": (_set(9, "leader_speed_mps", -3.0), "leader_speed_mps"),
-    "wrong unit": (lambda t: t.assign(**{c: t[c] * 3.6 for c in ("leader_speed_mps", "follower_speed_mps")}), "km/h"),
+    "wrong unit": (
+        lambda t: t.assign(**{c: t[c] * 3.6 for c in ("leader_speed_mps", "follower_speed_mps")}),
+        "km/h",
+    ),
     "no rows": (lambda t: t.iloc[:0], "pairs.csv"),
 }
 
@@ -277,7 +345,11 @@ def test_a_broken_table_is_told(name: str, tidy: Path, capsys: pytest.CaptureFix
 )
 @pytest.mark.parametrize("dataset", ["tidy", "ngsim"])
 def test_an_unreadable_file_is_told(
-    name: str, content: bytes | None, dataset: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str,
+    content: bytes | None,
+    dataset: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     if content is not None:
         (tmp_path / name).write_bytes(content)
@@ -310,16 +382,22 @@ def test_a_wrong_separator_is_told(tidy: Path, capsys: pytest.CaptureFixture[str
         (["device=cuda:99"], "device"),
     ],
 )  # fmt: skip
-def test_a_wrong_setting_is_told(arguments: list[str], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_wrong_setting_is_told(
+    arguments: list[str], expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert expected in fails(capsys, *arguments)
 
 
-def test_an_output_folder_that_cannot_be_made_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_output_folder_that_cannot_be_made_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "file").write_text("")
     assert "file" in fails(capsys, f"hydra.run.dir={tmp_path}/file/out")
 
 
-def test_a_foreign_database_is_told_before_any_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_foreign_database_is_told_before_any_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "other.db"
     with sqlite3.connect(path) as connection:
         connection.execute("create table recipes (name text)")

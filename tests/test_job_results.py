@@ -21,11 +21,17 @@ class Untracked:
         return ()
 
 
-def said(evaluation: Evaluation, *, follows: bool = True) -> str:
+def said(evaluation: Evaluation, *, has_constant_baseline: bool = True) -> str:
     """Returns what a job prints."""
     out = io.StringIO()
     result = JobResult(evaluation.metrics(), evaluation.table, cast(Any, None), (), Path("folder"))
-    report(result, evaluation, Console(file=out, width=200), cast(Any, Untracked()), follows=follows)
+    report(
+        result,
+        evaluation,
+        Console(file=out, width=200),
+        cast(Any, Untracked()),
+        has_constant_baseline=has_constant_baseline,
+    )
     return out.getvalue()
 
 
@@ -45,7 +51,11 @@ def test_a_safe_drive_is_not_talked_about() -> None:
 
 
 def test_hard_braking_and_parameters_at_bounds_are_told() -> None:
-    text = said(measured({"default": 0, "fixed": 1, "policy": 2}, {"default": 0.0, "fixed": 0.25, "policy": 0.5}))
+    text = said(
+        measured(
+            {"default": 0, "fixed": 1, "policy": 2}, {"default": 0.0, "fixed": 0.25, "policy": 0.5}
+        )
+    )
     assert "Frames with an acceleration below -8 m/s2: fixed 4, policy 8." in text
     assert "Parameters at their bounds: fixed 25%, policy 50%." in text
 
@@ -53,7 +63,7 @@ def test_hard_braking_and_parameters_at_bounds_are_told() -> None:
 def test_a_model_that_follows_nobody_is_not_compared_with_its_fixed_parameters() -> None:
     evaluation = make_results(pairs=4, frames=20).evaluation
     assert "Improvement of policy over fixed" in said(evaluation)
-    text = said(evaluation, follows=False)
+    text = said(evaluation, has_constant_baseline=False)
     assert "Improvement" not in text
     assert "compare the policy's RMSE with other jobs'" in text
 
@@ -66,9 +76,18 @@ def test_platoon_and_history_are_written_and_old_ones_go(tmp_path: Path, present
         (tmp_path / name).write_bytes(b"of an earlier job")
     if present:
         history = make_history(evaluation.drives, GAINS)
-        evaluation = dataclasses.replace(evaluation, platoon=make_platoon({"policy": 1}), history=history)
+        evaluation = dataclasses.replace(
+            evaluation, platoon=make_platoon({"policy": 1}), history=history
+        )
     written = _further(evaluation, _Output(tmp_path))
     assert written == ([tmp_path / name for name in names] if present else [])
     assert sorted(path.name for path in tmp_path.iterdir()) == (sorted(names) if present else [])
     if present:
-        assert set(pd.read_parquet(tmp_path / "platoon.parquet")) == {"method", "network", "vehicle", "time_s", "speed", "gap"}
+        assert set(pd.read_parquet(tmp_path / "platoon.parquet")) == {
+            "method",
+            "network",
+            "vehicle",
+            "time_s",
+            "speed",
+            "gap",
+        }

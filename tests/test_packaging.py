@@ -32,9 +32,15 @@ def pins() -> dict[str, str]:
 
 
 def test_entry_points_of_pyproject_are_the_installed_ones() -> None:
-    declared = {group: set(points.items()) for group, points in PYPROJECT["project"]["entry-points"].items()}
+    declared = {
+        group: set(points.items()) for group, points in PYPROJECT["project"]["entry-points"].items()
+    }
     for kind in registry.KINDS.values():
-        installed = {(one.name, one.target) for one in registry.entries(kind.name) if one.distribution == nodes.DISTRIBUTION}
+        installed = {
+            (one.name, one.target)
+            for one in registry.entries(kind.name)
+            if one.distribution == nodes.DISTRIBUTION
+        }
         assert installed == declared[kind.entry_points], "install again: pip install -e ."
     assert set(declared) == {kind.entry_points for kind in registry.KINDS.values()}
     (script,) = metadata.entry_points(group="console_scripts", name="cfx")
@@ -43,24 +49,39 @@ def test_entry_points_of_pyproject_are_the_installed_ones() -> None:
 
 def test_the_wheel_holds_the_package_and_its_config_files(tmp_path: Path) -> None:
     script = "import sys; from hatchling.build import build_wheel; print(build_wheel(sys.argv[1]))"
-    done = subprocess.run([sys.executable, "-c", script, tmp_path], cwd=ROOT, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", script, tmp_path],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     (wheel,) = tmp_path.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
-    conf = {f"cfx/conf/{path.relative_to(ROOT / 'conf').as_posix()}" for path in (ROOT / "conf").rglob("*.yaml")}
+    conf = {
+        f"cfx/conf/{path.relative_to(ROOT / 'conf').as_posix()}"
+        for path in (ROOT / "conf").rglob("*.yaml")
+    }
     assert conf <= names
     assert {"cfx/cli.py", "cfx/py.typed", "cfx/models/krauss.py"} <= names
     for room in ("report", "sumo"):
         assets = ROOT / "cfx" / room / "assets"
-        found = {f"cfx/{room}/assets/{path.relative_to(assets).as_posix()}" for path in assets.rglob("*") if path.is_file()}
+        found = {
+            f"cfx/{room}/assets/{path.relative_to(assets).as_posix()}"
+            for path in assets.rglob("*")
+            if path.is_file()
+        }
         assert found, room
         assert found <= names
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert not [name for name in names if name.startswith(("tests/", "conf/", "outputs/"))]
 
 
-def test_conf_is_found_in_a_checkout_and_in_an_installed_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_conf_is_found_in_a_checkout_and_in_an_installed_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert (nodes.conf_dir() / "config.yaml").is_file()
     (tmp_path / "cfx" / "conf").mkdir(parents=True)
     monkeypatch.setattr(nodes, "__file__", str(tmp_path / "cfx" / "nodes.py"))
@@ -76,7 +97,9 @@ def test_every_dependency_is_pinned_within_its_range() -> None:
         name = canonicalize_name(requirement.name)
         if name != "cfx-driving":
             assert name in pinned, f"{name}: make lock"
-            assert requirement.specifier.contains(pinned[name], prereleases=True), f"{name}=={pinned[name]}: make lock"
+            assert requirement.specifier.contains(pinned[name], prereleases=True), (
+                f"{name}=={pinned[name]}: make lock"
+            )
 
 
 def test_pins_are_plain_versions() -> None:

@@ -18,7 +18,9 @@ from cfx import registry
 
 ROOT = Path(__file__).resolve().parent.parent
 PLUGINS = sorted(path.parent for path in (ROOT / "plugins").glob("*/pyproject.toml"))
-PUBLIC_MODULES = {"cfx", "cfx.errors"} | {kind.base.partition(":")[0] for kind in registry.KINDS.values()}
+PUBLIC_MODULES = {"cfx", "cfx.errors"} | {
+    kind.base.partition(":")[0] for kind in registry.KINDS.values()
+}
 """What a plugin may import from: the top level, the errors, the base classes; and `cfx.testing`, whole."""
 
 BUILD = """
@@ -32,7 +34,9 @@ for source in sys.argv[2:]:
 
 def project(plugin: Path) -> dict[str, object]:
     """Returns the table `project` of a plugin's pyproject.toml."""
-    table: dict[str, object] = tomllib.loads((plugin / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    table: dict[str, object] = tomllib.loads(
+        (plugin / "pyproject.toml").read_text(encoding="utf-8")
+    )["project"]
     return table
 
 
@@ -40,19 +44,27 @@ def project(plugin: Path) -> dict[str, object]:
 def wheels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Builds all wheels in one process, without isolation and so without the network; by distribution."""
     folder = tmp_path_factory.mktemp("wheels")
-    done = subprocess.run([sys.executable, "-c", BUILD, folder, *PLUGINS], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", BUILD, folder, *PLUGINS], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     return {path.name.split("-")[0].replace("_", "-"): path for path in folder.glob("*.whl")}
 
 
 def test_there_are_plugins_and_no_other_folders() -> None:
     assert len(PLUGINS) >= 2
-    folders = {path for path in (ROOT / "plugins").iterdir() if path.is_dir() and path.name != "__pycache__"}
+    folders = {
+        path
+        for path in (ROOT / "plugins").iterdir()
+        if path.is_dir() and path.name != "__pycache__"
+    }
     assert folders == set(PLUGINS), "a folder in plugins/ is a distribution, with a pyproject.toml"
 
 
 @pytest.mark.parametrize("plugin", PLUGINS, ids=lambda path: path.name)
-def test_the_wheel_holds_the_package_its_licence_and_its_entry_points(plugin: Path, wheels: dict[str, Path]) -> None:
+def test_the_wheel_holds_the_package_its_licence_and_its_entry_points(
+    plugin: Path, wheels: dict[str, Path]
+) -> None:
     declared = project(plugin)
     assert declared["name"] == plugin.name
     package = plugin.name.replace("-", "_")
@@ -62,13 +74,20 @@ def test_the_wheel_holds_the_package_its_licence_and_its_entry_points(plugin: Pa
         metadata = Parser().parsestr(archive.read(f"{info}/METADATA").decode("utf-8"))
         points = configparser.ConfigParser(delimiters=("=",))
         points.read_string(archive.read(f"{info}/entry_points.txt").decode("utf-8"))
-    source = {path.relative_to(plugin).as_posix() for path in (plugin / package).rglob("*") if path.suffix in {".py", ".yaml"}}
+    source = {
+        path.relative_to(plugin).as_posix()
+        for path in (plugin / package).rglob("*")
+        if path.suffix in {".py", ".yaml"}
+    }
     assert source <= names
     assert {f"{package}/py.typed", f"{info}/licenses/LICENSE"} <= names
     assert not [name for name in names if name.startswith("tests/")]
     assert {group: dict(points[group]) for group in points.sections()} == declared["entry-points"]
     assert metadata["Version"] == declared["version"]
-    assert any(text.replace(" ", "").startswith("cfx-driving") for text in metadata.get_all("Requires-Dist", []))
+    assert any(
+        text.replace(" ", "").startswith("cfx-driving")
+        for text in metadata.get_all("Requires-Dist", [])
+    )
     assert len(metadata.get_payload()) > 500, "the README is the page of the distribution"
 
 
@@ -82,7 +101,9 @@ def test_what_it_announces_is_installed_here_and_loads(plugin: Path) -> None:
     for group, announced in points.items():
         for name, target in announced.items():
             found = registry.entry(groups[group], name)
-            assert (found.distribution, found.target) == (plugin.name, target), "install again: make test"
+            assert (found.distribution, found.target) == (plugin.name, target), (
+                "install again: make test"
+            )
             assert registry.get(groups[group], name).kind == groups[group]
 
 
@@ -92,12 +113,26 @@ def private_uses(path: Path) -> list[str]:
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         used: list[tuple[str, str]] = []
         if isinstance(node, ast.Import):
-            used = [(alias.name, "") for alias in node.names if alias.name.partition(".")[0] == "cfx"]
-        elif isinstance(node, ast.ImportFrom) and node.module is not None and node.module.partition(".")[0] == "cfx":
+            used = [
+                (alias.name, "") for alias in node.names if alias.name.partition(".")[0] == "cfx"
+            ]
+        elif (
+            isinstance(node, ast.ImportFrom)
+            and node.module is not None
+            and node.module.partition(".")[0] == "cfx"
+        ):
             used = [(node.module, alias.name) for alias in node.names]
-        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "cfx":
+        elif (
+            isinstance(node, ast.Attribute)
+            and isinstance(node.value, ast.Name)
+            and node.value.id == "cfx"
+        ):
             used = [("cfx", node.attr)]
-        wrong += [f"{path.name}:{node.lineno}: {module} {name}".rstrip() for module, name in used if not is_public(module, name)]  # type: ignore[attr-defined]  # statements and expressions have a line
+        wrong += [
+            f"{path.name}:{node.lineno}: {module} {name}".rstrip()
+            for module, name in used
+            if not is_public(module, name)
+        ]  # type: ignore[attr-defined]  # statements and expressions have a line
     return wrong
 
 

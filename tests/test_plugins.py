@@ -48,8 +48,12 @@ def job(override: str, *, policy: str = "fixed") -> list[str]:
 def twins(install: Installer) -> None:
     """Two third parties who chose the same name, and one who chose krauss."""
     install("twin-one", {"cfx.models": {"twin": "twin_one:Mine"}}, {"twin_one.py": MODEL})
-    install("twin-two", {"cfx.models": {"twin": "twin_two:Mine"}}, {"twin_two.py": MODEL}, version="2.0")
-    install("usurper", {"cfx.models": {"krauss": "usurper:Mine"}}, {"usurper.py": "raise SystemExit(0)"})
+    install(
+        "twin-two", {"cfx.models": {"twin": "twin_two:Mine"}}, {"twin_two.py": MODEL}, version="2.0"
+    )
+    install(
+        "usurper", {"cfx.models": {"krauss": "usurper:Mine"}}, {"usurper.py": "raise SystemExit(0)"}
+    )
 
 
 @pytest.mark.parametrize("broken", BROKEN, ids=lambda broken: broken.name)
@@ -65,7 +69,9 @@ def test_who_asks_for_a_broken_plugin_gets_one_sentence_that_names_its_distribut
     assert len(sentence.splitlines()) == 1
 
 
-def test_all_broken_plugins_at_once_harm_nobody_else(install: Installer, twins: None, tmp_path: Path) -> None:
+def test_all_broken_plugins_at_once_harm_nobody_else(
+    install: Installer, twins: None, tmp_path: Path
+) -> None:
     """In a process of its own, where nothing was imported before: tables, help, completion, and a job that asks for none."""
     for broken in BROKEN:
         put(install, broken)
@@ -73,7 +79,9 @@ def test_all_broken_plugins_at_once_harm_nobody_else(install: Installer, twins: 
         info = install.folder / f"{name}-1.0.dist-info"
         info.mkdir()
         (info / "METADATA").write_text(metadata, encoding="latin-1")
-        (info / "entry_points.txt").write_text("[cfx.models]\nkrauss = nowhere:Krauss\n", encoding="utf-8")
+        (info / "entry_points.txt").write_text(
+            "[cfx.models]\nkrauss = nowhere:Krauss\n", encoding="utf-8"
+        )
     script = """
         import os, sys
         from cfx.cli import main
@@ -87,7 +95,13 @@ def test_all_broken_plugins_at_once_harm_nobody_else(install: Installer, twins: 
         sys.exit(code)
     """
     done = subprocess.run(
-        [sys.executable, "-c", "\n".join(line[8:] for line in script.splitlines()), *QUICK, "model=krauss"],
+        [
+            sys.executable,
+            "-c",
+            "\n".join(line[8:] for line in script.splitlines()),
+            *QUICK,
+            "model=krauss",
+        ],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(install.folder)},
         capture_output=True,
@@ -96,7 +110,9 @@ def test_all_broken_plugins_at_once_harm_nobody_else(install: Installer, twins: 
     )
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
-    assert re.search(r"^ *model +raises +bad-raises +1\.0 .* not loaded *$", done.stdout, re.MULTILINE)
+    assert re.search(
+        r"^ *model +raises +bad-raises +1\.0 .* not loaded *$", done.stdout, re.MULTILINE
+    )
     assert re.search(r"^ *model +newer +bad-newer +1\.0 .* broken *$", done.stdout, re.MULTILINE)
     assert len(re.findall(r"^ *model +twin .* shadowed *$", done.stdout, re.MULTILINE)) == 2
     assert re.search(r"^ *model +krauss +usurper .* shadowed *$", done.stdout, re.MULTILINE)
@@ -119,14 +135,21 @@ def test_check_finds_every_broken_plugin_and_says_one_sentence_each(
     printed = capsys.readouterr()
     complaints = printed.err.splitlines()
     for distribution, name in expected.items():
-        assert sum(f"{distribution} 1.0" in line for line in complaints) == 1, (distribution, printed.err)
+        assert sum(f"{distribution} 1.0" in line for line in complaints) == 1, (
+            distribution,
+            printed.err,
+        )
         assert re.search(rf"^ *{kind} +{name} .* broken *$", printed.out, re.MULTILINE)
     if kind == "model":
         assert re.search(r"^ *model +krauss +cfx-driving .* fine *$", printed.out, re.MULTILINE)
-        assert "usurper 1.0 is never used, because cfx has a model 'krauss' of its own" in printed.err
+        assert (
+            "usurper 1.0 is never used, because cfx has a model 'krauss' of its own" in printed.err
+        )
 
 
-def test_check_exits_with_1_only_if_something_is_broken(install: Installer, twins: None, capsys) -> None:
+def test_check_exits_with_1_only_if_something_is_broken(
+    install: Installer, twins: None, capsys
+) -> None:
     assert cli.main(["plugins", "check", "model", "w99"]) == 0
     assert cli.main(["plugins", "check", "policy"]) == 0
     assert cli.main(["plugins", "check", "learner"]) == 0
@@ -134,24 +157,52 @@ def test_check_exits_with_1_only_if_something_is_broken(install: Installer, twin
     assert cli.main(["plugins", "check", "model", "twin"]) == 1
     complaints = capsys.readouterr().err.splitlines()
     assert len(complaints) == 2
-    assert "twin-one 1.0 cannot be used, because twin-two 2.0 brings a model of that name too" in complaints[0]
+    assert (
+        "twin-one 1.0 cannot be used, because twin-two 2.0 brings a model of that name too"
+        in complaints[0]
+    )
 
 
-def test_check_runs_the_contract_and_hints_at_what_could_be_better(install: Installer, capsys) -> None:
-    careless = MODEL.replace('"made up"))', '"", ))').replace('reference = "made up"', "differentiable = False")
+def test_check_runs_the_contract_and_hints_at_what_could_be_better(
+    install: Installer, capsys
+) -> None:
+    careless = MODEL.replace('"made up"))', '"", ))').replace(
+        'reference = "made up"', "differentiable = False"
+    )
     install("mine-models", {"cfx.models": {"mine": "mine_models:Mine"}}, {"mine_models.py": MODEL})
-    install("careless-models", {"cfx.models": {"careless": "careless_models:Mine"}}, {"careless_models.py": careless})
+    install(
+        "careless-models",
+        {"cfx.models": {"careless": "careless_models:Mine"}},
+        {"careless_models.py": careless},
+    )
     assert cli.main(["plugins", "check", "model", "careless"]) == 1
-    assert "careless-models 1.0 breaks its contract: parameter tau has no source" in capsys.readouterr().err
-    registry.create("model", {"name": "careless"})  # a job may use it all the same: its numbers are sound
+    assert (
+        "careless-models 1.0 breaks its contract: parameter tau has no source"
+        in capsys.readouterr().err
+    )
+    registry.create(
+        "model", {"name": "careless"}
+    )  # a job may use it all the same: its numbers are sound
     assert cli.main(["plugins", "check", "data", "tidy"]) == 0
-    assert "Hint: dataset 'tidy' was loaded but not tried: it needs data.path." in capsys.readouterr().out
+    assert (
+        "Hint: dataset 'tidy' was loaded but not tried: it needs data.path."
+        in capsys.readouterr().out
+    )
 
 
-def test_a_distribution_that_declares_no_api_counts_as_current_and_gets_a_hint(install: Installer, capsys) -> None:
-    install("mine-data", {"cfx.protocols": {"mine": "mine_protocol:Mine"}}, {"mine_protocol.py": PROTOCOL})
+def test_a_distribution_that_declares_no_api_counts_as_current_and_gets_a_hint(
+    install: Installer, capsys
+) -> None:
+    install(
+        "mine-data",
+        {"cfx.protocols": {"mine": "mine_protocol:Mine"}},
+        {"mine_protocol.py": PROTOCOL},
+    )
     assert cli.main(["plugins", "check", "protocol", "mine"]) == 0
-    assert "mine-data declares no version of cfx's plugin API and counts as built for the current one" in capsys.readouterr().out
+    assert (
+        "mine-data declares no version of cfx's plugin API and counts as built for the current one"
+        in capsys.readouterr().out
+    )
 
 
 PROTOCOL = """
@@ -159,7 +210,7 @@ PROTOCOL = """
 
     class Mine(cfx.Protocol):
         def run(self, study):
-            return cfx.get("protocol", "within_driver")().run(study)
+            return cfx.get("protocol", "within_driver")().run(context)
 """
 
 
@@ -195,7 +246,9 @@ def test_a_wrong_sub_command_is_one_sentence(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "here"]
 
 
-def test_a_package_that_is_installed_already_is_not_written_again(install: Installer, tmp_path: Path) -> None:
+def test_a_package_that_is_installed_already_is_not_written_again(
+    install: Installer, tmp_path: Path
+) -> None:
     install("cfx-mine", {}, {"cfx_mine/__init__.py": ""})
     with pytest.raises(PluginError, match="a package cfx_mine is installed already"):
         create("model", "mine", tmp_path / "mine")
@@ -215,14 +268,18 @@ def test_show_tells_everything_about_every_component(capsys) -> None:
     assert "Choose it with model=w99." in printed
     assert "sumo: CC8 caps" in printed
     assert cli.main(["plugins", "show", "data", "tidy"]) == 0
-    (row,) = [line for line in capsys.readouterr().out.splitlines() if line.strip().startswith("path ")]
+    (row,) = [
+        line for line in capsys.readouterr().out.splitlines() if line.strip().startswith("path ")
+    ]
     assert "required" in row
     for kind in registry.KINDS:
         for name in registry.names(kind):
             assert cli.main(["plugins", "show", kind, name]) == 0
             printed = capsys.readouterr().out
             for setting in registry.get(kind, name).schema.model_fields:
-                assert (kind, setting) == ("model", "parameters") or re.search(rf"^ *{setting}[ .]", printed, re.MULTILINE)
+                assert (kind, setting) == ("model", "parameters") or re.search(
+                    rf"^ *{setting}[ .]", printed, re.MULTILINE
+                )
     assert cli.main(["plugins", "show", "optimizer", "random"]) == 0
     printed = capsys.readouterr().out
     assert "Sobol'" in printed
@@ -230,10 +287,23 @@ def test_show_tells_everything_about_every_component(capsys) -> None:
 
 
 def test_plugins_lists_metadata_and_loads_nothing(install: Installer, capsys) -> None:
-    install("bad-models", {"cfx.models": {"bad": "bad_models:Bad"}}, {"bad_models.py": "raise SystemExit(0)"}, version="3.1")
+    install(
+        "bad-models",
+        {"cfx.models": {"bad": "bad_models:Bad"}},
+        {"bad_models.py": "raise SystemExit(0)"},
+        version="3.1",
+    )
     assert cli.main(["plugins"]) == 0
     (bad,) = [line for line in capsys.readouterr().out.splitlines() if " bad " in line]
-    assert bad.split() == ["model", "bad", "bad-models", "3.1", str(install.folder), "not", "loaded"]
+    assert bad.split() == [
+        "model",
+        "bad",
+        "bad-models",
+        "3.1",
+        str(install.folder),
+        "not",
+        "loaded",
+    ]
     assert "bad_models" not in sys.modules
 
 
@@ -285,7 +355,20 @@ def test_a_new_package_installs_and_its_tests_pass(kind: str, tmp_path: Path, ca
     folder = create(kind, f"novel_{kind}", tmp_path / "package")
     assert f"python -m cfx plugins check {kind} novel_{kind}" in capsys.readouterr().out
     environment = installed(folder, tmp_path / "site")
-    tests = run([sys.executable, "-m", "pytest", "-q", "-W", "error", "-p", "no:cacheprovider", str(folder)], environment)
+    tests = run(
+        [
+            sys.executable,
+            "-m",
+            "pytest",
+            "-q",
+            "-W",
+            "error",
+            "-p",
+            "no:cacheprovider",
+            str(folder),
+        ],
+        environment,
+    )
     assert " passed" in tests
     assert "failed" not in tests
     group = registry.kind_of(kind).group
@@ -293,20 +376,38 @@ def test_a_new_package_installs_and_its_tests_pass(kind: str, tmp_path: Path, ca
     script = "import sys; from cfx.cli import main; sys.exit(max(main(words.split()) for words in sys.argv[1:]))"
     words = [f"plugins check {kind} novel_{kind}", f"--cfg job {group}={preset.stem}"]
     said = run([sys.executable, "-c", script, *words], environment)
-    assert re.search(rf"{kind} +novel_{kind} +cfx-novel-{kind} +0\.1\.0 .* fine *$", said, re.MULTILINE)
+    assert re.search(
+        rf"{kind} +novel_{kind} +cfx-novel-{kind} +0\.1\.0 .* fine *$", said, re.MULTILINE
+    )
     assert "declares no version" not in said
     assert f"name: novel_{kind}" in said
 
 
 def installed(folder: Path, site: Path) -> dict[str, str]:
     """Installs a package as a user would, but without the network; returns an environment that has it."""
-    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--no-build-isolation"]
+    pip = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-index",
+        "--no-deps",
+        "--no-build-isolation",
+    ]
     run([*pip, "--disable-pip-version-check", "--target", str(site), str(folder)], dict(os.environ))
     return {**os.environ, "PYTHONPATH": str(site)}
 
 
 def run(command: list[str], environment: dict[str, str]) -> str:
-    done = subprocess.run(command, env=environment, cwd=environment.get("HOME"), capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command,
+        env=environment,
+        cwd=environment.get("HOME"),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -317,12 +418,18 @@ def test_a_new_package_declares_what_it_is(kind: str, tmp_path: Path) -> None:
     project = tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert project["name"] == "cfx-novel"
     assert any(one.startswith("cfx-driving>=") and "<" in one for one in project["dependencies"])
-    assert project["entry-points"][registry.KINDS[kind].entry_points] == {"novel": f"cfx_novel.{kind}:Novel"}
+    assert project["entry-points"][registry.KINDS[kind].entry_points] == {
+        "novel": f"cfx_novel.{kind}:Novel"
+    }
     assert project["entry-points"]["cfx.api"] == {str(cfx.API_VERSION): "cfx_novel"}
     written = [path for path in folder.rglob("*") if path.is_file()]
-    assert {"README.md", ".gitignore", "pyproject.toml", "test_novel.py"} <= {path.name for path in written}
+    assert {"README.md", ".gitignore", "pyproject.toml", "test_novel.py"} <= {
+        path.name for path in written
+    }
     for path in written:
-        assert not re.search(r"\{\{|\{%|\.jinja", path.name + path.read_text(encoding="utf-8")), path
+        assert not re.search(r"\{\{|\{%|\.jinja", path.name + path.read_text(encoding="utf-8")), (
+            path
+        )
     assert "Licence" in (folder / "README.md").read_text(encoding="utf-8")
     assert [path.name for path in (tmp_path / "deep").iterdir()] == ["package"]
 
@@ -331,12 +438,18 @@ def test_the_templates_are_in_the_wheel(tmp_path: Path) -> None:
     import zipfile
 
     script = "import sys; from hatchling.build import build_wheel; print(build_wheel(sys.argv[1]))"
-    subprocess.run([sys.executable, "-c", script, tmp_path], cwd=ROOT, capture_output=True, check=True)
+    subprocess.run(
+        [sys.executable, "-c", script, tmp_path], cwd=ROOT, capture_output=True, check=True
+    )
     (wheel,) = tmp_path.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
     template = ROOT / "cfx" / "plugins" / "template"
-    expected = {f"cfx/plugins/template/{path.relative_to(template).as_posix()}" for path in template.rglob("*") if path.is_file()}
+    expected = {
+        f"cfx/plugins/template/{path.relative_to(template).as_posix()}"
+        for path in template.rglob("*")
+        if path.is_file()
+    }
     assert len(expected) > 20
     assert expected <= names
 
@@ -359,16 +472,24 @@ DEPRECATED = """
 """
 
 
-def test_what_is_deprecated_still_works_and_is_named_with_its_distribution(install: Installer, caplog, capsys) -> None:
+def test_what_is_deprecated_still_works_and_is_named_with_its_distribution(
+    install: Installer, caplog, capsys
+) -> None:
     old = DEPRECATED.format('deprecated = "use model=new"')
     install("old-models", {"cfx.models": {"old": "old_models:Old"}}, {"old_models.py": old})
-    install("some-models", {"cfx.models": {"some": "some_models:Old"}}, {"some_models.py": DEPRECATED.format("")})
+    install(
+        "some-models",
+        {"cfx.models": {"some": "some_models:Old"}},
+        {"some_models.py": DEPRECATED.format("")},
+    )
     registry.create("model", {"name": "some", "mood": "calm"})
     assert caplog.messages == []
     registry.create("model", {"name": "some", "mood": "angry"})
     registry.create("model", {"name": "old"})
     first, second = caplog.messages
-    assert first.startswith("model.mood of model 'some' (some_models:Old) of the distribution some-models 1.0 is deprecated: use")
+    assert first.startswith(
+        "model.mood of model 'some' (some_models:Old) of the distribution some-models 1.0 is deprecated: use"
+    )
     assert second.endswith("of the distribution old-models 1.0 is deprecated: use model=new")
     assert cli.main(["plugins", "show", "model", "old"]) == 0
     printed = capsys.readouterr().out
@@ -376,10 +497,20 @@ def test_what_is_deprecated_still_works_and_is_named_with_its_distribution(insta
     assert "how it drives (deprecated: use model.style)" in printed
 
 
-def test_a_name_of_cfxs_own_always_means_cfxs_own(twins: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_name_of_cfxs_own_always_means_cfxs_own(
+    twins: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert registry.get("model", "krauss").__module__ == "cfx.models.krauss"
     result = application.run(QUICK)
-    assert json.loads((result.folder / "metrics.json").read_text(encoding="utf-8"))["rmse_speed/policy"] > 0
-    with pytest.raises(PluginError, match=r"two distributions bring a model 'twin': twin-one 1\.0 .* and twin-two 2\.0"):
+    assert (
+        json.loads((result.folder / "metrics.json").read_text(encoding="utf-8"))[
+            "rmse_speed/policy"
+        ]
+        > 0
+    )
+    with pytest.raises(
+        PluginError,
+        match=r"two distributions bring a model 'twin': twin-one 1\.0 .* and twin-two 2\.0",
+    ):
         registry.get("model", "twin")

@@ -33,8 +33,16 @@ MODEL = '''
 
 def test_every_kind_has_the_built_in_components_of_pyproject() -> None:
     assert set(registry.names("model")) >= {"krauss", "w99", "w74"}
-    assert set(registry.names("dataset")) == set(registry.names("data")) >= {"tidy", "ngsim", "synthetic"}
-    built_in = {entry.name: entry for entry in registry.entries("policy") if entry.distribution == "cfx-driving"}
+    assert (
+        set(registry.names("dataset"))
+        == set(registry.names("data"))
+        >= {"tidy", "ngsim", "synthetic"}
+    )
+    built_in = {
+        entry.name: entry
+        for entry in registry.entries("policy")
+        if entry.distribution == "cfx-driving"
+    }
     assert set(built_in) >= {"default", "fixed", "gru", "lstm"}
     assert all(entry.version for entry in built_in.values())
 
@@ -44,10 +52,16 @@ def test_a_third_partys_model_is_listed_without_running_its_code_and_then_create
     assert "mine" in registry.names("model")
     assert "mine_models" not in sys.modules
     entry = registry.entry("model", "mine")
-    assert (entry.distribution, entry.version, entry.package) == ("mine-models", "1.0", "mine_models")
+    assert (entry.distribution, entry.version, entry.package) == (
+        "mine-models",
+        "1.0",
+        "mine_models",
+    )
     assert not registry.is_loaded(entry)
 
-    model = registry.create("model", {"name": "mine", "map": "x.osm", "parameters": {"tau": {"high": 4.0}}})
+    model = registry.create(
+        "model", {"name": "mine", "map": "x.osm", "parameters": {"tau": {"high": 4.0}}}
+    )
     assert registry.get("model", "mine") is type(model)
     assert registry.is_loaded(entry)
     assert model.space["tau"].high == 4.0  # type: ignore[attr-defined]  # a DrivingModel
@@ -62,9 +76,16 @@ def test_unknown_names_are_answered_with_the_nearest() -> None:
 
 def test_a_name_that_two_distributions_claim_fails_only_when_it_is_asked_for(install) -> None:
     install(
-        "first-models", {"cfx.models": {"mine": "first_models:Mine", "first": "first_models:Mine"}}, {"first_models.py": MODEL}
+        "first-models",
+        {"cfx.models": {"mine": "first_models:Mine", "first": "first_models:Mine"}},
+        {"first_models.py": MODEL},
     )
-    install("second-models", {"cfx.models": {"mine": "second_models:Mine"}}, {"second_models.py": MODEL}, version="2.0")
+    install(
+        "second-models",
+        {"cfx.models": {"mine": "second_models:Mine"}},
+        {"second_models.py": MODEL},
+        version="2.0",
+    )
     with pytest.raises(PluginError, match=r"first-models 1\.0 .*and second-models 2\.0"):
         registry.get("model", "mine")
     assert registry.get("model", "first").kind == "model"
@@ -82,18 +103,26 @@ def test_a_name_that_two_distributions_claim_fails_only_when_it_is_asked_for(ins
         ("", "AttributeError: module 'bad_models' has no attribute 'Bad'"),
     ],
 )
-def test_a_plugin_that_cannot_be_imported_is_named_and_harms_nobody_else(install, code: str, cause: str) -> None:
+def test_a_plugin_that_cannot_be_imported_is_named_and_harms_nobody_else(
+    install, code: str, cause: str
+) -> None:
     install("bad-models", {"cfx.models": {"bad": "bad_models:Bad"}}, {"bad_models.py": code})
     assert "bad" in registry.names("model")
     assert registry.create("model", {"name": "krauss"}).kind == "model"
-    with pytest.raises(PluginError, match=r"of the distribution bad-models 1\.0 cannot be imported") as caught:
+    with pytest.raises(
+        PluginError, match=r"of the distribution bad-models 1\.0 cannot be imported"
+    ) as caught:
         registry.get("model", "bad")
     assert cause in str(caught.value)
     assert caught.value.__cause__ is not None
 
 
 def test_ctrl_c_while_a_plugin_is_imported_stays_ctrl_c(install) -> None:
-    install("slow-models", {"cfx.models": {"slow": "slow_models:Slow"}}, {"slow_models.py": "raise KeyboardInterrupt"})
+    install(
+        "slow-models",
+        {"cfx.models": {"slow": "slow_models:Slow"}},
+        {"slow_models.py": "raise KeyboardInterrupt"},
+    )
     with pytest.raises(KeyboardInterrupt):
         registry.get("model", "slow")
 
@@ -104,7 +133,10 @@ def test_ctrl_c_while_a_plugin_is_imported_stays_ctrl_c(install) -> None:
         ("Bad = 3", "is no class but int"),
         ("class Bad: pass", "does not extend cfx.models.base.DrivingModel"),
         ("from cfx import Optimizer as Bad", "does not extend cfx.models.base.DrivingModel"),
-        ("from cfx import DrivingModel\nclass Bad(DrivingModel): pass", "does not implement next_speed"),
+        (
+            "from cfx import DrivingModel\nclass Bad(DrivingModel): pass",
+            "does not implement next_speed",
+        ),
         (
             "from cfx import DrivingModel\nclass Bad(DrivingModel):\n  kind = 'optimizer'\n  def next_speed(self, *a): pass",
             "says kind='optimizer'",
@@ -148,17 +180,31 @@ def test_a_class_that_breaks_its_contract_is_refused(install, code: str, complai
 
 def test_a_required_setting_that_a_node_leaves_null_is_asked_for(install) -> None:
     install("mine-models", {"cfx.models": {"mine": "mine_models:Mine"}}, {"mine_models.py": MODEL})
-    with pytest.raises(ConfigError, match=r"model\.map: a value is required; give one as model\.map=\.\.\."):
+    with pytest.raises(
+        ConfigError, match=r"model\.map: a value is required; give one as model\.map=\.\.\."
+    ):
         registry.create("model", {"name": "mine", "map": None})
 
 
 @pytest.mark.parametrize(
     ("node", "message"),
     [
-        ({"name": "krauss", "varaint": "sumo"}, r"model\.varaint: unknown key\. Did you mean 'variant'\?"),
-        ({"name": "krauss", "variant": "car"}, r"model\.variant='car': should be 'paper' or 'sumo'"),
-        ({"name": "krauss", "parameters": {"t_r": {"hgh": 3}}}, r"model\.parameters\.t_r\.hgh: unknown key\."),
-        ({"name": "krauss", "parameters": {"t_r": {"high": float("nan")}}}, r"model\.parameters\.t_r\.high"),
+        (
+            {"name": "krauss", "varaint": "sumo"},
+            r"model\.varaint: unknown key\. Did you mean 'variant'\?",
+        ),
+        (
+            {"name": "krauss", "variant": "car"},
+            r"model\.variant='car': should be 'paper' or 'sumo'",
+        ),
+        (
+            {"name": "krauss", "parameters": {"t_r": {"hgh": 3}}},
+            r"model\.parameters\.t_r\.hgh: unknown key\.",
+        ),
+        (
+            {"name": "krauss", "parameters": {"t_r": {"high": float("nan")}}},
+            r"model\.parameters\.t_r\.high",
+        ),
         ({}, r"model\.name: a value is required; choose a model: .*krauss, "),
         ("krauss", r"model='krauss': choose a model by its name"),
     ],
@@ -169,13 +215,20 @@ def test_a_wrong_node_is_explained_with_its_full_key(node: dict[str, object], me
 
 
 def test_bounds_that_exclude_the_default_are_explained() -> None:
-    with pytest.raises(ParameterError, match=r"default 1\.5 lies outside its bounds \[0\.1, 0\.5\]"):
+    with pytest.raises(
+        ParameterError, match=r"default 1\.5 lies outside its bounds \[0\.1, 0\.5\]"
+    ):
         registry.create("model", {"name": "krauss", "parameters": {"t_r": {"high": 0.5}}})
 
 
-def test_without_any_installed_component_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_any_installed_component_the_message_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(registry, "entries", lambda kind: ())
-    with pytest.raises(PluginError, match=r"no model is installed, not even cfx's own; run make run, or pip install -e"):
+    with pytest.raises(
+        PluginError,
+        match=r"no model is installed, not even cfx's own; run make run, or pip install -e",
+    ):
         registry.get("model", "krauss")
 
 

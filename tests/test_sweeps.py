@@ -89,7 +89,9 @@ def summary(folder: Path) -> list[dict[str, str]]:
 
 
 @pytest.mark.parametrize("how", ["interrupt", "muddle"])
-def test_an_interrupted_sweep_goes_on_whatever_the_order_of_its_overrides(run: Run, how: str, capsys) -> None:
+def test_an_interrupted_sweep_goes_on_whatever_the_order_of_its_overrides(
+    run: Run, how: str, capsys
+) -> None:
     Path(f"{how}-2").touch()
     assert run("-m", "seed=0,1,2,3", "model=w99") == 130
     assert ran() == ["0", "1", "2"]
@@ -116,7 +118,9 @@ def test_an_interrupted_sweep_goes_on_whatever_the_order_of_its_overrides(run: R
     assert len(sweeps()) == 2
 
 
-def test_after_failures_only_the_failed_jobs_run_again_also_with_another_launcher(run: Run, capsys) -> None:
+def test_after_failures_only_the_failed_jobs_run_again_also_with_another_launcher(
+    run: Run, capsys
+) -> None:
     Path("fail-1").touch()
     assert run("-m", "seed=0,1,2") == 2
     assert "failed: seed=1: drive 1 is broken" in capsys.readouterr().err
@@ -153,24 +157,40 @@ def test_a_sweep_that_an_experiment_file_asks_for_goes_on_too(run: Run) -> None:
     assert [row["state"] for row in summary(folder)] == ["done before", "done", "done"]
 
 
-def test_a_folder_that_was_asked_for_is_continued_even_if_complete(run: Run, tmp_path: Path, capsys) -> None:
+def test_a_folder_that_was_asked_for_is_continued_even_if_complete(
+    run: Run, tmp_path: Path, capsys
+) -> None:
     assert run("-m", "seed=0,1", "hydra.sweep.dir=it's mine") == 2  # not Hydra's grammar
     assert run("-m", "seed=0,1", "hydra.sweep.dir='my sweep'") == 0
     assert ran() == ["0", "1"]
     assert run("-m", "seed=0,1", f"hydra.sweep.dir='{tmp_path}/my sweep'") == 0
     assert ran() == []
     capsys.readouterr()
-    assert run("-m", "seed=1,2", "hydra.sweep.dir='my sweep'") == 0  # another command shares a job with it
+    assert (
+        run("-m", "seed=1,2", "hydra.sweep.dir='my sweep'") == 0
+    )  # another command shares a job with it
     assert ran() == ["2"]
     assert "2 of 2 jobs done" in capsys.readouterr().out
-    told = {(folder / "told").read_text().split(" None")[0].split(" 1")[0] for folder in jobs(tmp_path / "my sweep")}
+    told = {
+        (folder / "told").read_text().split(" None")[0].split(" 1")[0]
+        for folder in jobs(tmp_path / "my sweep")
+    }
     assert told == {"my sweep"}  # one name in MLflow, however the folder was written
 
 
-def test_a_job_runs_again_if_anything_differs_that_its_results_depend_on(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_job_runs_again_if_anything_differs_that_its_results_depend_on(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     Path("drives.csv").write_text("a")
     monkeypatch.setenv("CFX_FRAMES", "100")
-    command = ["-m", "seed=0,1", "data=tidy", "data.path=drives.csv", "data.min_frames=${oc.env:CFX_FRAMES}", "hydra.sweep.dir=s"]
+    command = [
+        "-m",
+        "seed=0,1",
+        "data=tidy",
+        "data.path=drives.csv",
+        "data.min_frames=${oc.env:CFX_FRAMES}",
+        "hydra.sweep.dir=s",
+    ]
 
     def runs() -> int:
         assert run(*command) == 0
@@ -189,7 +209,7 @@ def test_a_job_runs_again_if_anything_differs_that_its_results_depend_on(run: Ru
     monkeypatch.setattr(provenance, "distributions", lambda values: {"cfx-idm": "0.3"})
     assert runs() == 2
     assert runs() == 0
-    (jobs(Path("s"))[0] / sweep.OUTCOME).write_text('{"code": 0')
+    (jobs(Path("s"))[0] / sweep.STATUS).write_text('{"code": 0')
     assert runs() == 1
     assert len(jobs(Path("s"))) == 2
 
@@ -203,7 +223,10 @@ def test_a_sweep_that_runs_is_left_alone(run: Run, capsys) -> None:
     capsys.readouterr()
     with FileLock(first / ".lock"), FileLock("s/.lock"):
         assert run("-m", "seed=0,1", "hydra.sweep.dir=s") == 2
-        assert capsys.readouterr().err == "s: another sweep runs in this folder; wait for it, or choose another hydra.sweep.dir\n"
+        assert (
+            capsys.readouterr().err
+            == "s: another sweep runs in this folder; wait for it, or choose another hydra.sweep.dir\n"
+        )
         assert ran() == []
         assert run("-m", "seed=0,1") == 2
         assert ran() == ["0", "1"]
@@ -217,7 +240,9 @@ def test_folders_that_are_named_by_number_are_never_overwritten(run: Run, capsys
     before = [(folder / "metrics.json").read_text() for folder in jobs(Path("s"))]
     capsys.readouterr()
     assert run("-m", "seed=1,0", *command) == 2
-    assert "jobs of another order would overwrite; end it with -${cfx_job:}" in capsys.readouterr().err
+    assert (
+        "jobs of another order would overwrite; end it with -${cfx_job:}" in capsys.readouterr().err
+    )
     assert [(folder / "metrics.json").read_text() for folder in jobs(Path("s"))] == before
 
 
@@ -275,7 +300,9 @@ def test_a_wrong_command_line_leaves_no_folder(run: Run, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    "arguments", [["--cfg", "job"], ["--cfg", "all", "-p", "hydra.sweep"], ["--help"], ["--info", "searchpath"]], ids=" ".join
+    "arguments",
+    [["--cfg", "job"], ["--cfg", "all", "-p", "hydra.sweep"], ["--help"], ["--info", "searchpath"]],
+    ids=" ".join,
 )
 def test_looking_makes_no_folder(run: Run, arguments: list[str], tmp_path: Path) -> None:
     assert run(*arguments) == 0
@@ -286,7 +313,11 @@ def test_looking_makes_no_folder(run: Run, arguments: list[str], tmp_path: Path)
 
 
 def started(command: list[str], install_folder: Path, **environment: str) -> subprocess.Popen[str]:
-    kept = {key: value for key, value in os.environ.items() if not key.endswith(("_NUM_THREADS", "TRACKING_URI"))}
+    kept = {
+        key: value
+        for key, value in os.environ.items()
+        if not key.endswith(("_NUM_THREADS", "TRACKING_URI"))
+    }
     return subprocess.Popen(
         [sys.executable, *command],
         env={**kept, "PYTHONPATH": str(install_folder), **environment},
@@ -309,9 +340,18 @@ def processes() -> Iterator[list[subprocess.Popen[str]]]:
 
 
 @pytest.mark.parametrize("killed", ["everything", "the main process"])
-def test_a_killed_sweep_of_worker_processes_is_made_up_for(run: Run, install, processes: list[Any], killed: str) -> None:
+def test_a_killed_sweep_of_worker_processes_is_made_up_for(
+    run: Run, install, processes: list[Any], killed: str
+) -> None:
     script = "import sys; from cfx.application import start; sys.exit(start(sys.argv[1:], target='sweep_stub:run_job'))"
-    command = ["-c", script, "-m", "seed=0,1,2,3,4", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
+    command = [
+        "-c",
+        script,
+        "-m",
+        "seed=0,1,2,3,4",
+        "hydra/launcher=joblib",
+        "hydra.launcher.n_jobs=2",
+    ]
     for seed in (1, 3):
         Path(f"wait-{seed}").touch()
     first = started(command, install.folder)
@@ -323,7 +363,9 @@ def test_a_killed_sweep_of_worker_processes_is_made_up_for(run: Run, install, pr
     first.wait()
     for seed in (1, 3):
         Path(f"wait-{seed}").unlink()
-    first.communicate(timeout=60)  # the workers of a main process that is gone end their jobs, and then themselves
+    first.communicate(
+        timeout=60
+    )  # the workers of a main process that is gone end their jobs, and then themselves
     assert sorted(ran()) == ["0", "1", "2", "3"]
     second = started(command, install.folder)
     processes.append(second)
@@ -366,18 +408,25 @@ def test_twelve_jobs_killed_half_way_end_as_twelve(
     os.killpg(first.pid, signal.SIGKILL)
     first.communicate()
     (folder,) = sweeps()
-    finished = {job.name: (job / "metrics.json").stat().st_mtime_ns for job in jobs(folder) if (job / sweep.OUTCOME).exists()}
+    finished = {
+        job.name: (job / "metrics.json").stat().st_mtime_ns
+        for job in jobs(folder)
+        if (job / sweep.STATUS).exists()
+    }
     assert 6 <= len(finished) < 12
 
     assert continued(command, tmp_path, processes) == 0
     assert sweeps() == [folder]
     assert len(jobs(folder)) == 12
-    assert all((folder / name / "metrics.json").stat().st_mtime_ns == written for name, written in finished.items())
+    assert all(
+        (folder / name / "metrics.json").stat().st_mtime_ns == written
+        for name, written in finished.items()
+    )
     assert len(summary(folder)) == 12
     assert statuses(folder) == ["FINISHED"] * 12
 
     # A job whose marker was lost after its run was closed runs again, and is there once all the same.
-    (jobs(folder)[0] / sweep.OUTCOME).unlink()
+    (jobs(folder)[0] / sweep.STATUS).unlink()
     assert continued([*command, f"hydra.sweep.dir={folder}"], tmp_path, processes) == 0
     assert statuses(folder) == ["FINISHED"] * 12
 
@@ -403,6 +452,8 @@ def statuses(folder: Path) -> list[str]:
     assert parent.data.tags["cfx.sweep_parent"] == str(folder)
     children = [one for one in runs if one.data.tags.get("cfx.sweep") == str(folder)]
     assert {one.data.tags["mlflow.parentRunId"] for one in children} == {parent.info.run_id}
-    assert {Path(one.data.tags["cfx.folder"]).name for one in children} == {job.name for job in jobs(folder)}
+    assert {Path(one.data.tags["cfx.folder"]).name for one in children} == {
+        job.name for job in jobs(folder)
+    }
     assert json.loads((folder / sweep.RECORD).read_text())["completed"]
     return [one.info.status for one in children]

@@ -41,30 +41,45 @@ class Served:
     def link(self, name: str, after: str) -> str:
         """Returns the page `name` of the first entry whose title starts with `after`."""
         start = next(k for k, line in enumerate(self.lines) if line.startswith(after))
-        return next(line.split()[1] for line in self.lines[start:] if line.strip().startswith(f"{name}:"))
+        return next(
+            line.split()[1] for line in self.lines[start:] if line.strip().startswith(f"{name}:")
+        )
 
 
 def fill(store: str) -> str:
     """Tracks a sweep of three jobs, a single job, and one whose process was killed; returns the last one's id."""
     for model, improvement in IMPROVEMENTS.items():
         tags = {"model": model, "cfx.folder": model}
-        with MlflowTracker.run(store, run_name=f"{model}-gru", parameters={"model.name": model}, tags=tags, sweep=SWEEP) as run:
-            run.log_metrics({"rmse_improvement/mean": improvement, "rmse_speed/policy": 1.5, "rmse_speed/fixed": 1.75})
+        with MlflowTracker.run(
+            store, run_name=f"{model}-gru", parameters={"model.name": model}, tags=tags, sweep=SWEEP
+        ) as run:
+            run.log_metrics(
+                {
+                    "rmse_improvement/mean": improvement,
+                    "rmse_speed/policy": 1.5,
+                    "rmse_speed/fixed": 1.75,
+                }
+            )
     with MlflowTracker.run(store, run_name="a single job", parameters={"seed": "7"}) as run:
         run.log_metrics({"rmse_improvement/mean": 0.3})
     with MlflowTracker.run(store, run_name="killed", parameters={}) as run:
         pass
     # What a killed process leaves: a run that says RUNNING, and by which process, long gone.
-    dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True, check=True)
+    dead = subprocess.run(
+        [sys.executable, "-c", "import os; print(os.getpid())"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     run.store.client.set_tag(run.run_id, "cfx.process", f"{dead.stdout.strip()}@1000000000")
     run.store.client.update_run(run.run_id, status="RUNNING")
     return run.run_id
 
 
 def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    with socket.socket() as smoke_check:
+        smoke_check.bind(("127.0.0.1", 0))
+        return int(smoke_check.getsockname()[1])
 
 
 @pytest.fixture(scope="module")
@@ -74,13 +89,21 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     store = f"sqlite:///{folder}/outputs/mlflow.db"
     abandoned = fill(store)
     stand_in, opened, said = folder / "browser", folder / "opened", folder / "said"
-    stand_in.write_text(f'#!/bin/sh\necho "$1" > {opened}.part && mv {opened}.part {opened}\n', encoding="utf-8")
+    stand_in.write_text(
+        f'#!/bin/sh\necho "$1" > {opened}.part && mv {opened}.part {opened}\n', encoding="utf-8"
+    )
     stand_in.chmod(0o755)
-    environment = {**os.environ, "BROWSER": str(stand_in), "PYTHONPATH": str(Path(__file__).resolve().parent.parent)}
+    environment = {
+        **os.environ,
+        "BROWSER": str(stand_in),
+        "PYTHONPATH": str(Path(__file__).resolve().parent.parent),
+    }
     environment.pop("MLFLOW_TRACKING_URI", None)
     with said.open("w") as output:
         command = [sys.executable, "-m", "cfx", "ui", "--port", str(port), "--open"]
-        server = subprocess.Popen(command, cwd=folder, env=environment, stdout=output, stderr=subprocess.STDOUT)
+        server = subprocess.Popen(
+            command, cwd=folder, env=environment, stdout=output, stderr=subprocess.STDOUT
+        )
     try:
         wait_for(server, f"http://127.0.0.1:{port}/health", said)
         yield Served(store, said.read_text().splitlines(), opened, abandoned)
@@ -104,7 +127,12 @@ def wait_for(server: subprocess.Popen[bytes], address: str, said: Path) -> None:
 def test_what_is_printed_is_short_and_runs_of_killed_processes_are_closed(served: Served) -> None:
     printed = [line for line in served.lines if line.startswith(("sweep", "job", "all jobs", "  "))]
     titles = [line.split(",")[0] for line in printed if not line.startswith(" ")]
-    assert titles == [f"sweep {SWEEP}", "job killed", "job a single job", "all jobs of experiment cfx"]
+    assert titles == [
+        f"sweep {SWEEP}",
+        "job killed",
+        "job a single job",
+        "all jobs of experiment cfx",
+    ]
     assert printed[0].endswith(": 3 jobs, best improvement 23.4%")
     assert len(printed) == 10
     assert any(line.startswith("job killed") and line.endswith(", KILLED") for line in printed)
@@ -112,12 +140,17 @@ def test_what_is_printed_is_short_and_runs_of_killed_processes_are_closed(served
         from mlflow import MlflowClient
 
         run = MlflowClient(served.store).get_run(served.abandoned)
-    assert (run.info.status, run.data.tags["cfx.failure"]) == ("KILLED", "the process ended without closing the run")
+    assert (run.info.status, run.data.tags["cfx.failure"]) == (
+        "KILLED",
+        "the process ended without closing the run",
+    )
 
 
 def test_a_store_that_is_none_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["ui", "--uri", "outputs/mlflow.db"]) == 2
-    assert capsys.readouterr().err.startswith("--uri=outputs/mlflow.db: MLflow needs a database or a server; write sqlite:///")
+    assert capsys.readouterr().err.startswith(
+        "--uri=outputs/mlflow.db: MLflow needs a database or a server; write sqlite:///"
+    )
 
 
 def test_the_first_page_opens_in_the_browser_when_asked(served: Served) -> None:
@@ -127,14 +160,18 @@ def test_the_first_page_opens_in_the_browser_when_asked(served: Served) -> None:
     assert served.opened.read_text().strip() == served.link("table", "sweep")
 
 
-def test_a_browser_shows_the_sweeps_improvements_in_a_table_and_in_charts(served: Served, browser: Browser) -> None:
+def test_a_browser_shows_the_sweeps_improvements_in_a_table_and_in_charts(
+    served: Served, browser: Browser
+) -> None:
     page = browser.page
     page.goto(served.link("table", "sweep"))
     cells = page.locator("[role=gridcell][col-id='metrics.`rmse_improvement/mean`']")
     cells.nth(2).wait_for()
     heading = page.locator("[role=columnheader][col-id='metrics.`rmse_improvement/mean`']")
     assert heading.inner_text().strip() == "rmse_improvement/mean"
-    assert [float(text) for text in cells.all_inner_texts()] == pytest.approx([0.2345, 0.1234, -0.0567], abs=6e-4)
+    assert [float(text) for text in cells.all_inner_texts()] == pytest.approx(
+        [0.2345, 0.1234, -0.0567], abs=6e-4
+    )
     names = page.locator("[role=gridcell][col-id='attributes.`Run Name`']").all_inner_texts()
     assert [name.split()[-1] for name in names] == ["w99-gru", "krauss-gru", "w74-gru"]
     page.goto(served.link("charts", "sweep"))
@@ -145,7 +182,9 @@ def test_a_browser_shows_the_sweeps_improvements_in_a_table_and_in_charts(served
     assert browser.outside() == []
 
 
-def test_a_browser_compares_a_sweeps_jobs_and_shows_all_jobs(served: Served, browser: Browser) -> None:
+def test_a_browser_compares_a_sweeps_jobs_and_shows_all_jobs(
+    served: Served, browser: Browser
+) -> None:
     page = browser.page
     page.goto(served.link("compare", "sweep"))
     page.get_by_text("Comparing 3 Runs from 1 Experiment").wait_for()
@@ -153,7 +192,13 @@ def test_a_browser_compares_a_sweeps_jobs_and_shows_all_jobs(served: Served, bro
     page.goto(served.link("table", "all jobs"))
     page.get_by_role("link", name="a single job").wait_for()
     names = page.locator("[role=gridcell][col-id='attributes.`Run Name`']").all_inner_texts()
-    assert [name.split("\n")[-1] for name in names] == ["a single job", "w99-gru", "krauss-gru", "w74-gru", "killed"]
+    assert [name.split("\n")[-1] for name in names] == [
+        "a single job",
+        "w99-gru",
+        "krauss-gru",
+        "w74-gru",
+        "killed",
+    ]
     page.goto(served.link("page", "job a single"))
     page.get_by_text("rmse_improvement/mean").first.wait_for()
     assert browser.outside() == []

@@ -23,7 +23,7 @@ from filelock import FileLock, Timeout
 from numpy.typing import NDArray
 
 from cfx.errors import OutputError
-from cfx.files import whole
+from cfx.files import atomic_write
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +66,7 @@ class Cache:
             return
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with whole(path) as temporary:
+            with atomic_write(path) as temporary:
                 np.savez(temporary, **arrays)  # type: ignore[arg-type]  # the stubs take every name for `allow_pickle`
         except OSError as error:
             raise self._unwritable(error) from error
@@ -82,7 +82,9 @@ class Cache:
         for position, key in enumerate(keys):
             share = int(key[:8], 16) % _SHARES if self.folder is not None else 0
             # Three digits: there are never more than 4096 lock files, however many calibrations the cache sees.
-            parts.setdefault(hashlib.sha256(f"{scope} {share}".encode()).hexdigest()[:3], []).append(position)
+            parts.setdefault(
+                hashlib.sha256(f"{scope} {share}".encode()).hexdigest()[:3], []
+            ).append(position)
         return parts
 
     @contextmanager
@@ -103,7 +105,9 @@ class Cache:
             claimed: list[str] = []
             problems = 0
             for name, size in sizes.items():
-                if (not claimed or problems + size <= enough) and self._acquire(held, name, wait=False):
+                if (not claimed or problems + size <= enough) and self._acquire(
+                    held, name, wait=False
+                ):
                     claimed.append(name)
                     problems += size
             if not claimed:

@@ -45,21 +45,30 @@ class Labels:
     windows: Windows
     parameters: Tensor
     loss: Tensor
-    spread: Tensor
+    sensitivity: Tensor
     diverged: Tensor
 
     def select(self, pairs: Tensor) -> Labels:
         """Returns the labels of some pairs, `(D,)` int64, which are numbered anew; a pair may stand there more than once."""
         windows, places = self.windows.select(pairs.cpu())
         places = places.to(self.loss.device)
-        return Labels(windows, self.parameters[places], self.loss[places], self.spread[places], self.diverged[places])
+        return Labels(
+            windows,
+            self.parameters[places],
+            self.loss[places],
+            self.sensitivity[places],
+            self.diverged[places],
+        )
 
     def metrics(self) -> dict[str, float]:
-        """Returns the means over windows, m/s: `labels/loss` and `labels/spread`."""
-        return {"labels/loss": float(self.loss.mean()), "labels/spread": float(self.spread.mean())}
+        """Returns the means over windows, m/s: `labels/loss` and `labels/sensitivity`."""
+        return {
+            "labels/loss": float(self.loss.mean()),
+            "labels/sensitivity": float(self.sensitivity.mean()),
+        }
 
     def to_frame(self, pairs: PairSet, names: tuple[str, ...]) -> pd.DataFrame:
-        """Returns a row per window: pair_id, window, time_s (its start), `parameter_NAME`, loss_mps, spread_mps, diverged."""
+        """Returns a row per window: pair_id, window, time_s (its start), `parameter_NAME`, loss_mps, sensitivity_mps, diverged."""
         windows = self.windows
         ids = [pair.pair_id for pair in pairs]
         return pd.DataFrame(
@@ -67,9 +76,12 @@ class Labels:
                 "pair_id": [ids[index] for index in windows.pair.tolist()],
                 "window": windows.number.numpy(),
                 "time_s": windows.first.numpy() * pairs.dt,
-                **{f"parameter_{name}": column.cpu().numpy() for name, column in zip(names, self.parameters.T, strict=True)},
+                **{
+                    f"parameter_{name}": column.cpu().numpy()
+                    for name, column in zip(names, self.parameters.T, strict=True)
+                },
                 "loss_mps": self.loss.cpu().numpy(),
-                "spread_mps": self.spread.cpu().numpy(),
+                "sensitivity_mps": self.sensitivity.cpu().numpy(),
                 "diverged": self.diverged.cpu().numpy(),
             }
         )
@@ -122,17 +134,24 @@ class Calibrator:
         """
         device = batch.lengths.device
         last = last.to(device)
-        keys = [self._key("fixed", pair.fingerprint, frames=int(end)) for pair, end in zip(pairs, last, strict=True)]
+        keys = [
+            self._key("fixed", pair.fingerprint, frames=int(end))
+            for pair, end in zip(pairs, last, strict=True)
+        ]
         guess = self.space.to_unit(self.space.defaults(device=device))[None, None, :]
 
         def solve(chosen: Tensor, report: Progress) -> list[Arrays]:
             chosen = chosen.to(device)
-            objective = DriveObjective.of_segments(self.simulator, batch, chosen, torch.zeros_like(chosen), last[chosen])
+            objective = DriveObjective.of_segments(
+                self.simulator, batch, chosen, torch.zeros_like(chosen), last[chosen]
+            )
             found = self._minimize(objective, guess.expand(len(chosen), 1, -1), report)
             return [{name: values[i] for name, values in found.items()} for i in range(len(chosen))]
 
         results = self._cached("Fixed parameters", keys, [1] * len(pairs), solve)
-        return torch.stack([torch.as_tensor(entry["parameters"], device=device) for entry in results])
+        return torch.stack(
+            [torch.as_tensor(entry["parameters"], device=device) for entry in results]
+        )
 
     def population(self, pairs: PairSet, batch: PairBatch, last: Tensor, members: Tensor) -> Tensor:
         """Finds one parameter set for each of K groups of pairs, calibrated jointly: see `JointObjective`.
@@ -149,7 +168,13 @@ class Calibrator:
         device = batch.lengths.device
         members, last = members.cpu(), last.to(device)
         keys = [
-            self._key("population", "", pairs=sorted((pairs[i].fingerprint, int(last[i])) for i in row.nonzero()[:, 0].tolist()))
+            self._key(
+                "population",
+                "",
+                pairs=sorted(
+                    (pairs[i].fingerprint, int(last[i])) for i in row.nonzero()[:, 0].tolist()
+                ),
+            )
             for row in members
         ]
         guess = self.space.to_unit(self.space.defaults(device=device))[None, None, :]
@@ -157,13 +182,17 @@ class Calibrator:
         def solve(chosen: Tensor, report: Progress) -> list[Arrays]:
             groups = members[chosen.cpu()].to(device)
             drives = groups.any(0).nonzero()[:, 0]
-            segments = DriveObjective.of_segments(self.simulator, batch, drives, torch.zeros_like(drives), last[drives])
+            segments = DriveObjective.of_segments(
+                self.simulator, batch, drives, torch.zeros_like(drives), last[drives]
+            )
             objective = JointObjective(segments, groups[:, drives], self.memory)
             found = self._minimize(objective, guess.expand(len(chosen), 1, -1), report)
             return [{name: values[i] for name, values in found.items()} for i in range(len(chosen))]
 
         results = self._cached("Population's parameters", keys, [1] * len(members), solve)
-        return torch.stack([torch.as_tensor(entry["parameters"], device=device) for entry in results])
+        return torch.stack(
+            [torch.as_tensor(entry["parameters"], device=device) for entry in results]
+        )
 
     def labels(self, pairs: PairSet, batch: PairBatch, windows: Windows, fixed: Tensor) -> Labels:
         """Finds the parameters of each window; ties go to the pair's fixed parameters.
@@ -178,10 +207,14 @@ class Calibrator:
         counts = torch.bincount(windows.pair, minlength=len(pairs))
         description = windows.settings.model_dump()
         keys = [
-            self._key("labels", pair.fingerprint, windows=int(count), fixed=row.tolist(), **description)
+            self._key(
+                "labels", pair.fingerprint, windows=int(count), fixed=row.tolist(), **description
+            )
             for pair, count, row in zip(pairs, counts, fixed, strict=True)
         ]
-        guesses = self.space.to_unit(torch.stack([fixed, self.space.defaults(device=device).expand_as(fixed)], dim=1))
+        guesses = self.space.to_unit(
+            torch.stack([fixed, self.space.defaults(device=device).expand_as(fixed)], dim=1)
+        )
 
         def solve(chosen: Tensor, report: Progress) -> list[Arrays]:
             own = torch.isin(windows.pair, chosen)
@@ -190,14 +223,24 @@ class Calibrator:
                 self.simulator, batch, pair, first, torch.full_like(first, windows.settings.length)
             )
             found = self._minimize(objective, guesses[pair], report, windows.settings.tie_tolerance)
-            return [{name: values[windows.pair[own] == p] for name, values in found.items()} for p in chosen]
+            return [
+                {name: values[windows.pair[own] == p] for name, values in found.items()}
+                for p in chosen
+            ]
 
         results = self._cached("Window labels", keys, counts.tolist(), solve, **description)
-        joined = {name: torch.cat([torch.as_tensor(entry[name]) for entry in results]).to(device) for name in results[0]}
+        joined = {
+            name: torch.cat([torch.as_tensor(entry[name]) for entry in results]).to(device)
+            for name in results[0]
+        }
         return Labels(windows=windows, **joined)
 
     def _minimize(
-        self, objective: DriveObjective | JointObjective, guesses: Tensor, report: Progress, tolerance: float = 0.0
+        self,
+        objective: DriveObjective | JointObjective,
+        guesses: Tensor,
+        report: Progress,
+        tolerance: float = 0.0,
     ) -> Arrays:
         solution = self.optimizer.minimize(
             objective,
@@ -211,7 +254,7 @@ class Calibrator:
         found = {
             "parameters": self.space.from_unit(solution.best),
             "loss": solution.loss,
-            "spread": solution.spread,
+            "sensitivity": solution.sensitivity,
             "diverged": solution.diverged,
         }
         return {name: values.cpu().numpy() for name, values in found.items()}
@@ -235,17 +278,29 @@ class Calibrator:
         todo = sum(problems[index] for index in missing)
         each = self.optimizer.evaluations()
         shares = self.cache.shares([keys[index] for index in missing], self._key(what, "", **scope))
-        wanted = {name: [missing[position] for position in positions] for name, positions in shares.items()}
+        wanted = {
+            name: [missing[position] for position in positions]
+            for name, positions in shares.items()
+        }
         with self.progress(f"{what} ({self.optimizer_name}, {todo} problems)", todo * each) as task:
             while wanted:
-                sizes = {name: sum(problems[index] for index in indices) for name, indices in wanted.items()}
+                sizes = {
+                    name: sum(problems[index] for index in indices)
+                    for name, indices in wanted.items()
+                }
                 with self.cache.claim(sizes, _GROUP) as claimed:
                     mine = sorted(index for name in claimed for index in wanted.pop(name))
                     for index in mine:  # another process may have solved them before the claim
                         entries[index] = self.cache.get(keys[index])
-                    task.advance(each * sum(problems[index] for index in mine if entries[index] is not None))
-                    for group in _groups([index for index in mine if entries[index] is None], problems):
-                        for index, entry in zip(group, solve(torch.tensor(group), task.advance), strict=True):
+                    task.advance(
+                        each * sum(problems[index] for index in mine if entries[index] is not None)
+                    )
+                    for group in _groups(
+                        [index for index in mine if entries[index] is None], problems
+                    ):
+                        for index, entry in zip(
+                            group, solve(torch.tensor(group), task.advance), strict=True
+                        ):
                             self.cache.put(keys[index], entry)
                             entries[index] = entry
         return [entry for entry in entries if entry is not None]

@@ -85,7 +85,9 @@ class DriveObjective:
         return self._cut(problems)
 
     def _cut(self, which: slice | Tensor) -> DriveObjective:
-        cut = {f.name: getattr(self, f.name)[..., which] for f in fields(self) if f.name != "simulator"}
+        cut = {
+            f.name: getattr(self, f.name)[..., which] for f in fields(self) if f.name != "simulator"
+        }
         return DriveObjective(self.simulator, **cut)
 
     @torch.no_grad()
@@ -93,12 +95,28 @@ class DriveObjective:
         """Returns losses `(P, q)`, m/s, of candidates `(P, q, n)` in unit space."""
         space = self.simulator.model.space
         p = {
-            name: value.contiguous() for name, value in space.unpack(space.from_unit(candidates.to(self.observed.dtype))).items()
+            name: value.contiguous()
+            for name, value in space.unpack(
+                space.from_unit(candidates.to(self.observed.dtype))
+            ).items()
         }
         shape = candidates.shape[:2]
-        start = Start(*(x[:, None].expand(shape) for x in (self.start_position, self.start_speed, self.start_acceleration)))
+        start = Start(
+            *(
+                x[:, None].expand(shape)
+                for x in (self.start_position, self.start_speed, self.start_acceleration)
+            )
+        )
         leader = Leader(
-            *(x[..., None] for x in (self.leader_position, self.leader_speed, self.leader_acceleration, self.leader_length))
+            *(
+                x[..., None]
+                for x in (
+                    self.leader_position,
+                    self.leader_speed,
+                    self.leader_acceleration,
+                    self.leader_length,
+                )
+            )
         )
         _, _, speed = self.simulator.advance(self.simulator.begin(start), leader, p)
         error = (speed - self.observed[..., None]).square_() * self.counted[..., None]
@@ -148,7 +166,9 @@ class JointObjective:
         if bool((candidates == candidates[:1]).all()):
             used = self.members.any(0)
             simulated, place = used.nonzero()[:, 0], used.cumsum(0) - 1
-            losses = self._simulated(simulated, torch.zeros_like(simulated), candidates)[place[drive]]
+            losses = self._simulated(simulated, torch.zeros_like(simulated), candidates)[
+                place[drive]
+            ]
         else:
             losses = self._simulated(drive, problem, candidates)
         total = losses.new_zeros(candidates.shape[:2]).index_add_(0, problem, losses)
@@ -158,6 +178,10 @@ class JointObjective:
         """Returns the losses `(S, q)` of S simulations, each of a drive `(S,)` with a problem's candidates `(S,)`."""
         drives, count = self.drives.take(drive), candidates.shape[1]
         # The turns are small, but there are many: together they may be worth compiling for, which none of them is alone.
-        drives = replace(drives, simulator=drives.simulator.for_work(len(drives.observed) * len(drive) * count))
+        drives = replace(
+            drives, simulator=drives.simulator.for_work(len(drives.observed) * len(drive) * count)
+        )
         turn = max(1, min(self.memory, _TURN) // (drives.bytes_per_candidate * len(drive)))
-        return torch.cat([drives(block[problem]) for block in torch.split(candidates, turn, dim=1)], dim=1)
+        return torch.cat(
+            [drives(block[problem]) for block in torch.split(candidates, turn, dim=1)], dim=1
+        )

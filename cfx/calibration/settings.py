@@ -11,7 +11,11 @@ class WindowSettings(Settings):
     """How drives are cut; both 5 steps (0.5 s at NGSIM's 0.1 s) in the paper."""
 
     length: int = Field(5, ge=1, description="steps that a window simulates")
-    stride: int = Field(5, ge=1, description="steps from one window's start to the next; parameters change this often")
+    stride: int = Field(
+        5,
+        ge=1,
+        description="steps from one window's start to the next; parameters change this often",
+    )
     tie_tolerance: float = Field(
         0.05,
         ge=0,

@@ -1,7 +1,7 @@
 """Windows: the short stretches of a drive for which one set of parameters holds.
 
 A window starts at a measured state and spans `length` steps; one starts every `stride` steps. Window k of a pair starts at frame
-`k stride` and is compared at the `length` frames after it. Letters: P pairs, W windows of all pairs together.
+`k stride` and is compared at the `length` frames after it. Shapes: P pairs, W windows of all pairs together.
 """
 
 from __future__ import annotations

@@ -25,7 +25,9 @@ def _files(value: Any) -> Path | tuple[Path, ...]:
     if several and not value:
         raise PydanticCustomError("path", "the list is empty; write at least one file")
     if not all(isinstance(one, str | Path | None) for one in (value if several else [value])):
-        raise PydanticCustomError("path", "write a file, a list of files, or a pattern such as 'i-80/*.txt'")
+        raise PydanticCustomError(
+            "path", "write a file, a list of files, or a pattern such as 'i-80/*.txt'"
+        )
     return tuple(absolute(one) for one in value) if several else absolute(value)
 
 
@@ -36,13 +38,19 @@ FilePaths = Annotated[Path | tuple[Path, ...], BeforeValidator(_files)]
 class DatasetSettings(Settings):
     """What every dataset lets its user select."""
 
-    min_frames: int = Field(700, ge=2, description="shortest pair that is kept, frames; the paper keeps 700")
+    min_frames: int = Field(
+        700, ge=2, description="shortest pair that is kept, frames; the paper keeps 700"
+    )
     time_step: float | None = Field(
-        None, gt=0, description="s: bring all pairs to this step, in which windows and policies count too; null: as recorded"
+        None,
+        gt=0,
+        description="s: bring all pairs to this step, in which windows and policies count too; null: as recorded",
     )
     recording: str | None = Field(None, description="keep this recording alone; null: all")
     lanes: list[int] | None = Field(None, description="keep pairs in these lanes alone; null: all")
-    pair_ids: list[str] | None = Field(None, description="keep these pairs alone, by their ids; null: all")
+    pair_ids: list[str] | None = Field(
+        None, description="keep these pairs alone, by their ids; null: all"
+    )
     max_pairs: int | None = Field(None, ge=1, description="keep the first so many pairs; null: all")
 
 
@@ -70,7 +78,11 @@ class FileDatasetSettings(DatasetSettings):
 def _matching(path: Path) -> list[Path]:
     if path.exists() or not any(mark in str(path) for mark in "*?["):
         return [path]
-    found = sorted(file for file in Path(path.anchor).glob(str(path.relative_to(path.anchor))) if file.is_file())
+    found = sorted(
+        file
+        for file in Path(path.anchor).glob(str(path.relative_to(path.anchor)))
+        if file.is_file()
+    )
     if not found:
         raise DataError(f"data.path={path}: no file matches this pattern")
     return found
@@ -121,7 +133,9 @@ class Dataset(Component):
 
     def _check(self, pairs: Any) -> None:
         if not isinstance(pairs, PairSet):
-            raise PluginError(f"{registry.origin(self)}: read must return a cfx.PairSet, but returned a {type(pairs).__name__}")
+            raise PluginError(
+                f"{registry.origin(self)}: read must return a cfx.PairSet, but returned a {type(pairs).__name__}"
+            )
         for pair in pairs:
             for name in SIGNALS:
                 if not bool(np.isfinite(getattr(pair, name)).all()):
@@ -147,8 +161,14 @@ def joined(parts: Sequence[PairSet]) -> PairSet:
             for key in (pair.pair_id, pair.content):
                 if key in seen:
                     source, name = seen[key]
-                    which = f"pair '{name}'" if name == pair.pair_id else f"pair '{name}', there '{pair.pair_id}',"
-                    raise DataError(f"{source} and {part.source}: {which} stands in both files; leave it out of one of them")
+                    which = (
+                        f"pair '{name}'"
+                        if name == pair.pair_id
+                        else f"pair '{name}', there '{pair.pair_id}',"
+                    )
+                    raise DataError(
+                        f"{source} and {part.source}: {which} stands in both files; leave it out of one of them"
+                    )
                 here[key] = (part.source, pair.pair_id)
         seen |= here
     counts: dict[tuple[str, str], int] = {}
@@ -162,7 +182,11 @@ def joined(parts: Sequence[PairSet]) -> PairSet:
 
 
 def _why(dropped: Sequence[Dropped]) -> str:
-    return f" (left out: {'; '.join(f'{d.count:,} {d.unit}: {d.reason}' for d in dropped)})" if dropped else ""
+    return (
+        f" (left out: {'; '.join(f'{d.count:,} {d.unit}: {d.reason}' for d in dropped)})"
+        if dropped
+        else ""
+    )
 
 
 def listed(values: Iterable[object], limit: int = 12) -> str:
@@ -179,7 +203,9 @@ def _select_recording(pairs: PairSet, recording: str) -> PairSet:
             f"data.recording={recording}: {pairs.source} has no such recording.{nearest(recording, known)}"
             f" Known: {listed(known)}."
         )
-    return pairs.select([pair.recording == recording for pair in pairs], f"other recordings than '{recording}'")
+    return pairs.select(
+        [pair.recording == recording for pair in pairs], f"other recordings than '{recording}'"
+    )
 
 
 def _select_lanes(pairs: PairSet, lanes: Sequence[int]) -> PairSet:
@@ -190,21 +216,33 @@ def _select_lanes(pairs: PairSet, lanes: Sequence[int]) -> PairSet:
         )
     strange = [lane for lane in lanes if lane not in known]
     if strange or not lanes:
-        raise DataError(f"data.lanes={list(lanes)}: {pairs.source} has pairs in lanes {listed(known)} only; choose among these")
-    return pairs.select([pair.lane in lanes for pair in pairs], f"in other lanes than {listed(sorted(set(lanes)))}")
+        raise DataError(
+            f"data.lanes={list(lanes)}: {pairs.source} has pairs in lanes {listed(known)} only; choose among these"
+        )
+    return pairs.select(
+        [pair.lane in lanes for pair in pairs], f"in other lanes than {listed(sorted(set(lanes)))}"
+    )
 
 
 def _select_ids(pairs: PairSet, wanted: Sequence[str]) -> PairSet:
     known = [pair.pair_id for pair in pairs]
     strange = [name for name in wanted if name not in known]
     if strange or not wanted:
-        what = f"there is no pair '{strange[0]}'.{nearest(strange[0], known)}" if strange else "the list is empty."
-        raise DataError(f"data.pair_ids={list(wanted)}: {pairs.source}: {what} Known: {listed(known)}.")
+        what = (
+            f"there is no pair '{strange[0]}'.{nearest(strange[0], known)}"
+            if strange
+            else "the list is empty."
+        )
+        raise DataError(
+            f"data.pair_ids={list(wanted)}: {pairs.source}: {what} Known: {listed(known)}."
+        )
     return pairs.select([name in wanted for name in known], "other pairs than data.pair_ids")
 
 
 def _select_long(pairs: PairSet, min_frames: int) -> PairSet:
-    long = pairs.select([len(pair) >= min_frames for pair in pairs], f"shorter than {min_frames} frames")
+    long = pairs.select(
+        [len(pair) >= min_frames for pair in pairs], f"shorter than {min_frames} frames"
+    )
     if not len(long):
         longest: Pair = max(pairs, key=len)
         raise DataError(

@@ -67,7 +67,9 @@ def describe(path: Path) -> str:
 def _read(path: Path) -> _Contents:
     if magic(path) == PARQUET or _looks_tidy(sniff(path).header):
         pairs = read_tidy(path)
-        vehicles = {(p.recording, vehicle) for p in pairs for vehicle in (p.leader_id, p.follower_id)}
+        vehicles = {
+            (p.recording, vehicle) for p in pairs for vehicle in (p.leader_id, p.follower_id)
+        }
         return _Contents("tidy", pairs, sum(map(len, pairs)), len(vehicles))
     rows = read_ngsim(path)
     return _Contents("ngsim", rows.pairs(), rows.rows_read, rows.vehicles, rows.bent())
@@ -81,18 +83,29 @@ def _overview(contents: _Contents) -> Table:
     pairs = contents.pairs
     table = Table.grid(padding=(0, 3))
     recordings = list(dict.fromkeys(pair.recording for pair in pairs))
-    counted = [f"{name} ({sum(pair.recording == name for pair in pairs)} pairs)" for name in recordings]
+    counted = [
+        f"{name} ({sum(pair.recording == name for pair in pairs)} pairs)" for name in recordings
+    ]
     lanes = sorted({pair.lane for pair in pairs if pair.lane is not None})
     steps = sorted({pair.dt for pair in pairs})
-    table.add_row("layout", {"tidy": "tidy pairs (SI units)", "ngsim": "NGSIM (feet)"}[contents.layout])
+    table.add_row(
+        "layout", {"tidy": "tidy pairs (SI units)", "ngsim": "NGSIM (feet)"}[contents.layout]
+    )
     table.add_row("rows", f"{contents.rows:,}")
     table.add_row("vehicles", f"{contents.vehicles:,}")
-    table.add_row("recordings", f"{len(recordings)}: {listed(counted, 6)}" if counted else "none with pairs")
+    table.add_row(
+        "recordings", f"{len(recordings)}: {listed(counted, 6)}" if counted else "none with pairs"
+    )
     table.add_row("lanes", listed(lanes) if lanes else "not known")
-    table.add_row("pairs", f"{len(pairs):,} of {len({pair.driver for pair in pairs}):,} drivers, {sum(map(len, pairs)):,} frames")
+    table.add_row(
+        "pairs",
+        f"{len(pairs):,} of {len({pair.driver for pair in pairs}):,} drivers, {sum(map(len, pairs)):,} frames",
+    )
     table.add_row("time step", listed([f"{step:g} s" for step in steps]) if steps else "-")
     for frames in _THRESHOLDS:
-        table.add_row(f"  of at least {frames} frames", f"{sum(len(pair) >= frames for pair in pairs):,}")
+        table.add_row(
+            f"  of at least {frames} frames", f"{sum(len(pair) >= frames for pair in pairs):,}"
+        )
     truth = {pair.truth_model for pair in pairs if pair.truth}
     if truth:
         table.add_row("true parameters", f"known, of {listed(sorted(truth))}")
@@ -103,11 +116,18 @@ def _motion(pairs: PairSet) -> Table:
     table = Table(box=None, padding=(0, 2), header_style="")
     table.add_column("over all pairs")
     for quantile in _QUANTILES:
-        table.add_column({0.0: "least", 0.5: "median", 1.0: "most"}.get(quantile, f"{quantile:.0%}"), justify="right")
+        table.add_column(
+            {0.0: "least", 0.5: "median", 1.0: "most"}.get(quantile, f"{quantile:.0%}"),
+            justify="right",
+        )
     for name, values in _quantities(pairs):
         if len(values):
             table.add_row(
-                name, *(f"{value:.0f}" if name == "frames" else f"{value:.2f}" for value in np.quantile(values, _QUANTILES))
+                name,
+                *(
+                    f"{value:.0f}" if name == "frames" else f"{value:.2f}"
+                    for value in np.quantile(values, _QUANTILES)
+                ),
             )
     return table
 
@@ -134,13 +154,20 @@ def _joined(pairs: PairSet, name: str) -> Floats:
 def _left_out(pairs: PairSet) -> list[str]:
     if not pairs.dropped:
         return ["Left out: nothing"]
-    return ["Left out:", *(f"  {drop.count:,} {drop.unit}: {drop.reason}" for drop in pairs.dropped)]
+    return [
+        "Left out:",
+        *(f"  {drop.count:,} {drop.unit}: {drop.reason}" for drop in pairs.dropped),
+    ]
 
 
 def _problems(contents: _Contents) -> list[str]:
     """Returns what a recording may hold but rarely should."""
     found = [*_suspicions(contents.pairs), *([contents.problem] if contents.problem else [])]
-    return ["Problems:", *(f"  {sentence}" for sentence in found)] if found else ["Problems: none found"]
+    return (
+        ["Problems:", *(f"  {sentence}" for sentence in found)]
+        if found
+        else ["Problems: none found"]
+    )
 
 
 def _suspicions(pairs: PairSet) -> Iterator[str]:
@@ -154,13 +181,23 @@ def _suspicions(pairs: PairSet) -> Iterator[str]:
         yield f"leaders are typically {lengths:.1f} m long: feet, or lorries only?"
     yield from _counted(pairs, "frames with a gap below 0.5 m", lambda pair: pair.gap < 0.5)
     yield from _counted(
-        pairs, "frames with a speed above 50 m/s", lambda pair: np.maximum(pair.leader_speed, pair.follower_speed) > 50
+        pairs,
+        "frames with a speed above 50 m/s",
+        lambda pair: np.maximum(pair.leader_speed, pair.follower_speed) > 50,
     )
     yield from _counted(
-        pairs, "frames with an acceleration or braking above 8 m/s2", lambda pair: np.abs(pair.follower_acceleration) > 8
+        pairs,
+        "frames with an acceleration or braking above 8 m/s2",
+        lambda pair: np.abs(pair.follower_acceleration) > 8,
     )
-    yield from _counted(pairs, "steps in which a position moves 1 m more or less than its speed says", _jumps)
-    yield from _counted(pairs, "steps in which a vehicle moves backwards", lambda pair: np.diff(pair.follower_position) < 0)
+    yield from _counted(
+        pairs, "steps in which a position moves 1 m more or less than its speed says", _jumps
+    )
+    yield from _counted(
+        pairs,
+        "steps in which a vehicle moves backwards",
+        lambda pair: np.diff(pair.follower_position) < 0,
+    )
 
 
 def _jumps(pair: Pair) -> Marks:

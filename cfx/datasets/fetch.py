@@ -25,7 +25,7 @@ from urllib.parse import urlsplit
 from filelock import FileLock, Timeout
 
 from cfx.errors import ConfigError, DataError, OutputError
-from cfx.files import whole
+from cfx.files import atomic_write
 from cfx.progress import Task
 
 if TYPE_CHECKING:
@@ -43,8 +43,27 @@ TOKEN = "SOCRATA_APP_TOKEN"  # noqa: S105 - the name of the environment variable
 """With an application token in this environment variable the service lets one ask more often; it is not needed."""
 
 COLUMNS = (
-    *("Vehicle_ID", "Frame_ID", "Total_Frames", "Global_Time", "Local_X", "Local_Y", "Global_X", "Global_Y"),
-    *("v_Length", "v_Width", "v_Class", "v_Vel", "v_Acc", "Lane_ID", "Preceding", "Following", "Space_Headway"),
+    *(
+        "Vehicle_ID",
+        "Frame_ID",
+        "Total_Frames",
+        "Global_Time",
+        "Local_X",
+        "Local_Y",
+        "Global_X",
+        "Global_Y",
+    ),
+    *(
+        "v_Length",
+        "v_Width",
+        "v_Class",
+        "v_Vel",
+        "v_Acc",
+        "Lane_ID",
+        "Preceding",
+        "Following",
+        "Space_Headway",
+    ),
     *("Time_Headway", "Location"),
 )
 """NGSIM's columns for a highway; the service writes them in small letters."""
@@ -55,7 +74,10 @@ _START_MS = {"0400": 1_113_433_200_000, "0500": 1_113_436_800_000, "0515": 1_113
 
 RECORDINGS = (*_START_MS, "all")
 
-_BEFORE_MS, _AFTER_MS = 180_000, 300_000  # recordings start up to a minute early, and follow the last vehicles out of the picture
+_BEFORE_MS, _AFTER_MS = (
+    180_000,
+    300_000,
+)  # recordings start up to a minute early, and follow the last vehicles out of the picture
 _EDGE_MS = 1_000
 _TRIES = 3
 _TIMEOUTS = (15.0, 180.0)
@@ -80,7 +102,10 @@ class Query:
 
     def pages(self) -> list[tuple[int, int]]:
         """Returns `(offset, rows)` of each page."""
-        return [(first, min(self.page_rows, self.rows - first)) for first in range(0, self.rows, self.page_rows)]
+        return [
+            (first, min(self.page_rows, self.rows - first))
+            for first in range(0, self.rows, self.page_rows)
+        ]
 
 
 class Service:
@@ -149,14 +174,19 @@ class Service:
         for attempt in range(_TRIES):
             try:
                 answer = self._session.get(self.url, params=asked, timeout=_TIMEOUTS)
-            except (ChunkedEncodingError, ContentDecodingError) as error:  # the connection broke in the middle of a page
+            except (
+                ChunkedEncodingError,
+                ContentDecodingError,
+            ) as error:  # the connection broke in the middle of a page
                 if attempt == _TRIES - 1:
                     raise self._unreachable(_reason(error)) from None
             except RequestException as error:
                 raise self._unreachable(_reason(error)) from None
             else:
                 if answer.status_code in _BUSY:
-                    raise self._unreachable(f"it answers {answer.status_code} {answer.reason}, again and again")
+                    raise self._unreachable(
+                        f"it answers {answer.status_code} {answer.reason}, again and again"
+                    )
                 if not answer.ok:
                     raise DataError(
                         f"{self.name} refuses the query ({_complaint(answer)}); is {self.url} the data set's address?"
@@ -180,7 +210,13 @@ class Service:
 
 
 def fetch_ngsim_i80(
-    folder: Path, recording: str = "0400", *, url: str = URL, force: bool = False, page_rows: int = PAGE_ROWS, wait_s: float = 1.0
+    folder: Path,
+    recording: str = "0400",
+    *,
+    url: str = URL,
+    force: bool = False,
+    page_rows: int = PAGE_ROWS,
+    wait_s: float = 1.0,
 ) -> Path:
     """Downloads a recording of I-80, or all three, into one CSV file in NGSIM's layout; a finished one is left alone.
 
@@ -210,7 +246,9 @@ def fetch_ngsim_i80(
     with closing(Service(url, kept, wait_s)) as service:
         query = Query(url, _where(recording), service.count(_where(recording)), page_rows)
         if not query.rows:
-            raise DataError(f"{service.name} has no rows for {query.where}; is {url} the data set's address?")
+            raise DataError(
+                f"{service.name} has no rows for {query.where}; is {url} the data set's address?"
+            )
         with _writing(folder), _alone(kept):
             _fetch_pages(service, query, kept)
             _check_unchanged(service, query)
@@ -237,13 +275,15 @@ def _fetch_pages(service: Service, query: Query, kept: Path) -> None:
     """Downloads the pages that are not there yet."""
     _start_over_if_changed(query, kept)
     pages = query.pages()
-    missing = [(offset, rows) for offset, rows in pages if not _is_whole(_page(kept, offset), query, rows)]
+    missing = [
+        (offset, rows) for offset, rows in pages if not _is_whole(_page(kept, offset), query, rows)
+    ]
     here = f", {len(pages) - len(missing)} are here already" if len(missing) < len(pages) else ""
     log.info("%s: %s rows in %s pages%s", service.name, f"{query.rows:,}", len(pages), here)
     with Task(f"downloading from {service.name}", sum(rows for _, rows in missing)) as task:
         for offset, rows in missing:
             text = service.page(query, offset, rows)
-            with whole(_page(kept, offset)) as partial:
+            with atomic_write(_page(kept, offset)) as partial:
                 partial.write_text(text, encoding="utf-8", newline="")
             task.advance(rows)
 
@@ -267,7 +307,7 @@ def _start_over_if_changed(query: Query, kept: Path) -> None:
         log.info("%s: the service's data or the question has changed; starting over", kept)
     for page in old:
         page.unlink()
-    with whole(note) as partial:
+    with atomic_write(note) as partial:
         partial.write_text(now, encoding="utf-8")
 
 
@@ -285,7 +325,7 @@ def _is_whole(page: Path, query: Query, rows: int) -> bool:
 def _join(kept: Path, query: Query, path: Path, recording: str) -> int:
     """Writes the pages' rows that are of the recording to one file; returns their number."""
     written, earliest, latest = 0, float("inf"), 0.0
-    with whole(path) as partial, partial.open("w", encoding="utf-8", newline="") as file:
+    with atomic_write(path) as partial, partial.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
         for offset, _ in query.pages():
@@ -293,7 +333,11 @@ def _join(kept: Path, query: Query, path: Path, recording: str) -> int:
                 clock, of = _recording(row)
                 if recording in (of, "all"):
                     writer.writerow(row)
-                    written, earliest, latest = written + 1, min(earliest, clock), max(latest, clock)
+                    written, earliest, latest = (
+                        written + 1,
+                        min(earliest, clock),
+                        max(latest, clock),
+                    )
         _check_margins(recording, written, earliest, latest)
     return written
 
@@ -304,9 +348,14 @@ def _recording(row: Sequence[str]) -> tuple[float, str]:
     The time alone would not do: vehicles of one recording are still followed when the next has begun.
     """
     try:
-        frame, clock = float(row[COLUMNS.index("Frame_ID")]), float(row[COLUMNS.index("Global_Time")])
+        frame, clock = (
+            float(row[COLUMNS.index("Frame_ID")]),
+            float(row[COLUMNS.index("Global_Time")]),
+        )
     except ValueError:
-        raise DataError(f"the service sent a row without a frame or a time: {','.join(row)}") from None
+        raise DataError(
+            f"the service sent a row without a frame or a time: {','.join(row)}"
+        ) from None
     return clock, min(_START_MS, key=lambda name: abs(clock - 100 * frame - _START_MS[name]))
 
 
@@ -317,7 +366,9 @@ def _check_margins(recording: str, rows: int, earliest: float, latest: float) ->
     if recording != "all":
         first, last = _window(recording)
         if earliest < first + _EDGE_MS or latest > last - _EDGE_MS:
-            raise DataError(f"recording {recording} is longer than known and would be cut; use --recording all")
+            raise DataError(
+                f"recording {recording} is longer than known and would be cut; use --recording all"
+            )
 
 
 def _table(text: str) -> list[list[str]]:
@@ -325,7 +376,9 @@ def _table(text: str) -> list[list[str]]:
 
 
 def _has_columns(table: Sequence[Sequence[str]], columns: Sequence[str]) -> bool:
-    return bool(table) and [name.strip().lower() for name in table[0]] == [name.lower() for name in columns]
+    return bool(table) and [name.strip().lower() for name in table[0]] == [
+        name.lower() for name in columns
+    ]
 
 
 def _session(wait_s: float) -> Session:
@@ -354,7 +407,9 @@ def _reason(error: BaseException) -> str:
     """Returns the innermost reason of an error of requests, without its objects' addresses."""
     inner: BaseException = error
     while True:
-        deeper = getattr(inner, "reason", None) or next((one for one in inner.args if isinstance(one, BaseException)), None)
+        deeper = getattr(inner, "reason", None) or next(
+            (one for one in inner.args if isinstance(one, BaseException)), None
+        )
         if not isinstance(deeper, BaseException):
             break
         inner = deeper
@@ -391,4 +446,6 @@ def _alone(kept: Path) -> Iterator[None]:
         with FileLock(kept / "lock", timeout=0):
             yield
     except Timeout:
-        raise DataError(f"{kept}: another process is downloading the same recording; wait for it") from None
+        raise DataError(
+            f"{kept}: another process is downloading the same recording; wait for it"
+        ) from None

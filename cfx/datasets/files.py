@@ -73,7 +73,9 @@ def magic(path: Path) -> bytes:
         with path.open("rb") as file:
             start = file.read(4)
     except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
+        raise DataError(
+            f"{path}: cannot be read ({error.strerror}); check its permissions"
+        ) from None
     if not start:
         raise DataError(f"{path}: the file is empty; download or write it again")
     return start
@@ -101,12 +103,18 @@ def sniff(path: Path) -> TextTable:
     first = next((line for line in text.splitlines() if line.strip()), "")
     if not first:
         raise DataError(f"{path}: the file holds no rows")
-    has_header = any(character.isalpha() for character in first.lower().replace("e+", "").replace("e-", ""))
+    has_header = any(
+        character.isalpha() for character in first.lower().replace("e+", "").replace("e-", "")
+    )
     for separator, plural in _OTHER_SEPARATORS.items():
         if "," not in first and separator in first and (has_header or separator != "\t"):
-            raise DataError(f"{path}: the columns are separated by {plural}; write the file with commas")
+            raise DataError(
+                f"{path}: the columns are separated by {plural}; write the file with commas"
+            )
     if "," in first:
-        cells = next(iter(pa.csv.read_csv(_one_line(first), read_options=_no_names()).to_pylist())).values()
+        cells = next(
+            iter(pa.csv.read_csv(_one_line(first), read_options=_no_names()).to_pylist())
+        ).values()
         names = tuple(str(cell).strip() for cell in cells)
         return TextTable(path, ",", names if has_header else None, len(names))
     names = tuple(first.split())
@@ -126,11 +134,15 @@ def _decoded(path: Path, head: bytes) -> str:
     try:
         text = head.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        if error.start < len(head) - 4:  # a character cut in two at the end of the block is none of the file's faults
+        if (
+            error.start < len(head) - 4
+        ):  # a character cut in two at the end of the block is none of the file's faults
             control = len(head)
         text = head.decode("utf-8-sig", errors="ignore")
     if control:
-        raise DataError(f"{path}: is a binary file, not text; give a CSV or text file (gzip is fine), or parquet for data=tidy")
+        raise DataError(
+            f"{path}: is a binary file, not text; give a CSV or text file (gzip is fine), or parquet for data=tidy"
+        )
     return text
 
 
@@ -175,7 +187,9 @@ class _Lines(io.RawIOBase):
 
     def _take(self, block: bytes) -> None:
         cut = block.rfind(b"\n") + 1 if block else 0
-        text, self._rest = (self._rest + block[:cut], block[cut:]) if cut else (self._rest + block, b"")
+        text, self._rest = (
+            (self._rest + block[:cut], block[cut:]) if cut else (self._rest + block, b"")
+        )
         if block and not cut:  # no line ends in this block: wait for more
             text, self._rest = b"", text
         if text and self._fresh:
@@ -202,13 +216,19 @@ def read_columns(
     """
     try:
         batches = _batches(table, numbers, labels, pa.float64())
-    except pa.ArrowInvalid:  # some cell is no plain number: read these columns as text and look closer
+    except (
+        pa.ArrowInvalid
+    ):  # some cell is no plain number: read these columns as text and look closer
         batches = _batches(table, numbers, labels, pa.string())
     columns = {name: batches.column(f"c{at}") for name, at in (*numbers.items(), *labels.items())}
-    return {name: _as_floats(table, name, columns[name]) for name in numbers}, {name: as_labels(columns[name]) for name in labels}
+    return {name: _as_floats(table, name, columns[name]) for name in numbers}, {
+        name: as_labels(columns[name]) for name in labels
+    }
 
 
-def _batches(table: TextTable, numbers: Mapping[str, int], labels: Mapping[str, int], number_type: Any) -> Any:
+def _batches(
+    table: TextTable, numbers: Mapping[str, int], labels: Mapping[str, int], number_type: Any
+) -> Any:
     """Returns the columns as one pyarrow table with columns c0, c1, ..."""
     broken: list[Any] = []
 
@@ -231,7 +251,9 @@ def _batches(table: TextTable, numbers: Mapping[str, int], labels: Mapping[str, 
                     skip_rows=0 if table.header is None else 1,
                 ),
                 parse_options=pa.csv.ParseOptions(invalid_row_handler=note),
-                convert_options=pa.csv.ConvertOptions(column_types=types, include_columns=list(types)),
+                convert_options=pa.csv.ConvertOptions(
+                    column_types=types, include_columns=list(types)
+                ),
             )
             return reader.read_all()
     except pa.ArrowInvalid as error:
@@ -250,7 +272,10 @@ def _as_floats(table: TextTable, name: str, column: Any) -> Floats:
     if pa.types.is_floating(column.type):
         return cast(Floats, column.to_numpy().astype(np.float64, copy=False))
     return parsed(
-        column, lambda index, cell: f"{table.path}, row {table.row(index)}, column {name}: '{cell}' is not a number; correct it"
+        column,
+        lambda index, cell: (
+            f"{table.path}, row {table.row(index)}, column {name}: '{cell}' is not a number; correct it"
+        ),
     )
 
 
@@ -261,7 +286,9 @@ def parsed(column: Any, complaint: Callable[[int, str], str]) -> Floats:
         DataError: a cell is no number; `complaint(index, cell)` is the message.
     """
     text = pc.replace_substring(pc.utf8_trim_whitespace(column), ",", "").to_pandas()
-    values: Floats = pd.to_numeric(text, errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
+    values: Floats = pd.to_numeric(text, errors="coerce").to_numpy(
+        dtype=np.float64, na_value=np.nan
+    )
     absent = text.isna() | text.str.lower().isin(["", "nan", "na", "null", "none", "n/a", "#n/a"])
     wrong = np.flatnonzero(np.isnan(values) & ~absent.to_numpy(dtype=bool))
     if len(wrong):
@@ -271,12 +298,22 @@ def parsed(column: Any, complaint: Callable[[int, str], str]) -> Floats:
 
 def as_labels(column: Any) -> Labels:
     """Turns a pyarrow column of text into codes and names; names keep the order in which they first appear."""
-    encoded = column if pa.types.is_dictionary(column.type) else pc.dictionary_encode(column.cast(pa.string()))
-    encoded = encoded.unify_dictionaries().combine_chunks() if isinstance(encoded, pa.ChunkedArray) else encoded
+    encoded = (
+        column
+        if pa.types.is_dictionary(column.type)
+        else pc.dictionary_encode(column.cast(pa.string()))
+    )
+    encoded = (
+        encoded.unify_dictionaries().combine_chunks()
+        if isinstance(encoded, pa.ChunkedArray)
+        else encoded
+    )
     if isinstance(encoded, pa.ChunkedArray):  # no chunk at all
         return Labels(np.zeros(0, np.int64), [])
     written = [str(name).strip() for name in encoded.dictionary.to_pylist()]
-    merged, names = pd.factorize(np.array([name or None for name in written], dtype=object))  # an empty name has code -1
+    merged, names = pd.factorize(
+        np.array([name or None for name in written], dtype=object)
+    )  # an empty name has code -1
     codes = pc.fill_null(encoded.indices, len(written)).to_numpy(zero_copy_only=False)
     return Labels(np.append(merged, -1).astype(np.int64)[codes], list(names))
 

@@ -21,7 +21,17 @@ from pydantic import Field
 
 from cfx.component import Settings
 from cfx.datasets.base import Dataset, FileDatasetSettings, joined, listed
-from cfx.datasets.files import PARQUET, Floats, Ints, Labels, TextTable, bad_cells, magic, read_columns, sniff
+from cfx.datasets.files import (
+    PARQUET,
+    Floats,
+    Ints,
+    Labels,
+    TextTable,
+    bad_cells,
+    magic,
+    read_columns,
+    sniff,
+)
 from cfx.errors import DataError, nearest
 from cfx.pairs import Dropped, Pair, PairSet
 
@@ -46,12 +56,39 @@ _HIGHWAY = (
         "v_Length",
         "v_Width",
     ),
-    *("v_Class", "v_Vel", "v_Acc", "Lane_ID", "Preceding", "Following", "Space_Headway", "Time_Headway"),
+    *(
+        "v_Class",
+        "v_Vel",
+        "v_Acc",
+        "Lane_ID",
+        "Preceding",
+        "Following",
+        "Space_Headway",
+        "Time_Headway",
+    ),
 )
-_ARTERIAL = (*_HIGHWAY[:14], "O_Zone", "D_Zone", "Int_ID", "Section_ID", "Direction", "Movement", *_HIGHWAY[14:])
+_ARTERIAL = (
+    *_HIGHWAY[:14],
+    "O_Zone",
+    "D_Zone",
+    "Int_ID",
+    "Section_ID",
+    "Direction",
+    "Movement",
+    *_HIGHWAY[14:],
+)
 """Arterial recordings (Lankershim, Peachtree) have six columns more, in the middle."""
 
-_NUMBERS = ("Vehicle_ID", "Frame_ID", "Local_Y", "v_Length", "v_Vel", "v_Acc", "Lane_ID", "Preceding")
+_NUMBERS = (
+    "Vehicle_ID",
+    "Frame_ID",
+    "Local_Y",
+    "v_Length",
+    "v_Vel",
+    "v_Acc",
+    "Lane_ID",
+    "Preceding",
+)
 _CLOCK, _LOCATION = "Global_Time", "Location"
 _SPELLINGS = {
     "preceeding": "preceding",
@@ -84,10 +121,13 @@ class NgsimSettings(FileDatasetSettings):
     """Which part of an NGSIM file to read."""
 
     location: str | None = Field(
-        None, description="keep this location of a multi-location export alone (i-80, us-101); null: all"
+        None,
+        description="keep this location of a multi-location export alone (i-80, us-101); null: all",
     )
     trim: float = Field(
-        0.0, ge=0, description="s: leave so much out at both ends of each vehicle's rows, where smoothing has bent its speeds"
+        0.0,
+        ge=0,
+        description="s: leave so much out at both ends of each vehicle's rows, where smoothing has bent its speeds",
     )
 
 
@@ -169,7 +209,11 @@ class Rows:
         return int(np.count_nonzero(_changes(self.recording, self.vehicle)))
 
     def take(self, index: NDArray[Any]) -> Rows:
-        cut = {f.name: getattr(self, f.name)[index] for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)}
+        cut = {
+            f.name: getattr(self, f.name)[index]
+            for f in fields(self)
+            if isinstance(getattr(self, f.name), np.ndarray)
+        }
         return replace(self, **cut)
 
     def trimmed(self, seconds: float) -> Rows:
@@ -178,14 +222,20 @@ class Rows:
         near = np.minimum(begun, left) < round(seconds / DT)
         if not near.any():
             return self
-        lost = Dropped(f"within {seconds:g} s of their vehicle's first or last row", int(near.sum()), "rows")
+        lost = Dropped(
+            f"within {seconds:g} s of their vehicle's first or last row", int(near.sum()), "rows"
+        )
         return replace(self.take(np.flatnonzero(~near)), dropped=(*self.dropped, lost))
 
     def bent(self) -> str:
         """Says that speeds are bent at the ends of vehicles' rows, "" where they are not: see `NgsimDataset`."""
         begun, left = self._since_and_until()
-        reach = round(_EDGE_S / DT)
-        ends = (begun < reach, left < reach, (begun >= reach) & (left >= reach))
+        adaptation_space = round(_EDGE_S / DT)
+        ends = (
+            begun < adaptation_space,
+            left < adaptation_space,
+            (begun >= adaptation_space) & (left >= adaptation_space),
+        )
         if not all(end.any() for end in ends):
             return ""
         first, last, between = (float(self.acceleration[end].mean()) for end in ends)
@@ -200,29 +250,45 @@ class Rows:
         """Returns frames since the first and until the last row of each row's vehicle, `(N,)`."""
         starts = np.flatnonzero(_changes(self.recording, self.vehicle))
         sizes = np.diff(np.append(starts, len(self)))
-        return self.frame - np.repeat(self.frame[starts], sizes), np.repeat(self.frame[starts + sizes - 1], sizes) - self.frame
+        return self.frame - np.repeat(self.frame[starts], sizes), np.repeat(
+            self.frame[starts + sizes - 1], sizes
+        ) - self.frame
 
     def pairs(self) -> PairSet:
         """Cuts the rows into pairs: see `NgsimDataset`."""
         ahead, known = self._leader_rows()
         same_lane = known & (self.lane[ahead] == self.lane)
         gap = self.position[ahead] - self.length[ahead] - self.position
-        follows = same_lane & (gap > 0)
-        follower = self.take(follows)
-        leader = self.take(ahead[follows])
+        has_constant_baseline = same_lane & (gap > 0)
+        follower = self.take(has_constant_baseline)
+        leader = self.take(ahead[has_constant_baseline])
         starts = np.flatnonzero(
             _changes(
-                follower.recording, follower.vehicle, follower.leader, follower.lane, follower.frame - np.arange(len(follower))
+                follower.recording,
+                follower.vehicle,
+                follower.leader,
+                follower.lane,
+                follower.frame - np.arange(len(follower)),
             )
         )
         sizes = np.diff(np.append(starts, len(follower)))
         single = int(np.count_nonzero(sizes < 2))
         dropped = (
             Dropped("no vehicle ahead", int(np.count_nonzero(self.leader == 0)), "rows"),
-            Dropped("the vehicle ahead has no row at that frame", int(np.count_nonzero((self.leader != 0) & ~known)), "rows"),
-            Dropped("the vehicle ahead is in another lane", int(np.count_nonzero(known & ~same_lane)), "rows"),
             Dropped(
-                "the leader is behind its follower (gap of 0 or less)", int(np.count_nonzero(same_lane & ~(gap > 0))), "rows"
+                "the vehicle ahead has no row at that frame",
+                int(np.count_nonzero((self.leader != 0) & ~known)),
+                "rows",
+            ),
+            Dropped(
+                "the vehicle ahead is in another lane",
+                int(np.count_nonzero(known & ~same_lane)),
+                "rows",
+            ),
+            Dropped(
+                "the leader is behind its follower (gap of 0 or less)",
+                int(np.count_nonzero(same_lane & ~(gap > 0))),
+                "rows",
             ),
             Dropped("a single frame makes no pair", single, "rows"),
         )
@@ -238,7 +304,9 @@ class Rows:
         _, ids = np.unique(np.concatenate([self.vehicle, self.leader]), return_inverse=True)
         vehicle, leader = ids[: len(self)], ids[len(self) :]
         vehicles = int(ids.max(initial=0)) + 1
-        keys = (self.recording * vehicles + vehicle) * frames + self.frame  # sorted, as the rows are
+        keys = (
+            self.recording * vehicles + vehicle
+        ) * frames + self.frame  # sorted, as the rows are
         wanted = (self.recording * vehicles + leader) * frames + self.frame
         at = np.searchsorted(keys, wanted)
         at[at == len(keys)] = 0
@@ -256,7 +324,9 @@ def read_ngsim(path: Path, location: str | None = None) -> Rows:
         DataError: see `NgsimDataset`; the message names file, row and column.
     """
     if magic(path) == PARQUET:
-        raise DataError(f"{path}: is a parquet file; NGSIM publishes text. Pairs in the tidy layout are read with data=tidy")
+        raise DataError(
+            f"{path}: is a parquet file; NGSIM publishes text. Pairs in the tidy layout are read with data=tidy"
+        )
     table = sniff(path)
     positions = _columns(table)
     place = {_LOCATION: positions.pop(_LOCATION)} if _LOCATION in positions else {}
@@ -270,7 +340,11 @@ def read_ngsim(path: Path, location: str | None = None) -> Rows:
     row = np.arange(count)
     if location is not None:
         row = np.flatnonzero(where.codes == _location_code(table, where, location))
-        dropped += [Dropped(f"other locations than '{location}'", count - len(row), "rows")] if len(row) < count else []
+        dropped += (
+            [Dropped(f"other locations than '{location}'", count - len(row), "rows")]
+            if len(row) < count
+            else []
+        )
     columns = {name: values[row] for name, values in numbers.items()}
     recording, names = _recordings(columns, where.codes[row], where.names)
     order, again = _sorted(table, columns, recording, row)
@@ -306,7 +380,10 @@ def _apart(parts: Sequence[Rows]) -> list[Rows]:
     result = []
     for rows in parts:
         stem = _stem(Path(rows.source))
-        own = tuple(name if names[name] == 1 else stem if name == stem else f"{stem}-{name}" for name in rows.recordings)
+        own = tuple(
+            name if names[name] == 1 else stem if name == stem else f"{stem}-{name}"
+            for name in rows.recordings
+        )
         clash = next((name for name in own if name in named), None)
         if clash is not None:
             raise DataError(
@@ -344,7 +421,9 @@ def _columns(table: TextTable) -> dict[str, int]:
     if missing:
         hint = nearest(missing[0], names) if len(names) > 1 else ""
         tidy = " This is the tidy pair layout: use data=tidy." if "pairid" in found else ""
-        raise DataError(f"{table.path}: column {missing[0]} is missing.{hint}{tidy} Columns found: {listed(names, 30)}.")
+        raise DataError(
+            f"{table.path}: column {missing[0]} is missing.{hint}{tidy} Columns found: {listed(names, 30)}."
+        )
     wanted = (*_NUMBERS, _CLOCK, _LOCATION)
     return {name: found[_plain(name)] for name in wanted if _plain(name) in found}
 
@@ -359,15 +438,25 @@ def _check(table: TextTable, numbers: Mapping[str, Floats], where: Labels) -> No
                 " correct it or remove the row"
             )
     for name in ("Vehicle_ID", "Frame_ID", "Lane_ID", "Preceding"):
-        _reject(table, numbers, name, (numbers[name] != np.floor(numbers[name])) | (numbers[name] < 0), "is no whole number")
+        _reject(
+            table,
+            numbers,
+            name,
+            (numbers[name] != np.floor(numbers[name])) | (numbers[name] < 0),
+            "is no whole number",
+        )
     _reject(table, numbers, "v_Vel", numbers["v_Vel"] < 0, "is negative: a speed cannot be")
     _reject(table, numbers, "v_Length", numbers["v_Length"] <= 0, "is no vehicle length")
     nowhere = np.flatnonzero(where.codes < 0)
     if len(nowhere):
-        raise DataError(f"{table.path}, row {table.row(nowhere[0])}, column {_LOCATION}: the cell is empty; correct it")
+        raise DataError(
+            f"{table.path}, row {table.row(nowhere[0])}, column {_LOCATION}: the cell is empty; correct it"
+        )
 
 
-def _reject(table: TextTable, numbers: Mapping[str, Floats], name: str, wrong: NDArray[np.bool_], why: str) -> None:
+def _reject(
+    table: TextTable, numbers: Mapping[str, Floats], name: str, wrong: NDArray[np.bool_], why: str
+) -> None:
     at = np.flatnonzero(wrong)
     if len(at):
         raise DataError(
@@ -386,7 +475,9 @@ def _location_code(table: TextTable, where: Labels, location: str) -> int:
     return matches[0]
 
 
-def _recordings(columns: Mapping[str, Floats], location: Ints, names: Sequence[str]) -> tuple[Ints, tuple[str, ...]]:
+def _recordings(
+    columns: Mapping[str, Floats], location: Ints, names: Sequence[str]
+) -> tuple[Ints, tuple[str, ...]]:
     """Returns the recording `(N,)` of each row as an index, and the recordings' names: see `NgsimDataset`."""
     start = np.zeros(len(location))
     if _CLOCK in columns and _clock_ticks(columns, location):
@@ -400,19 +491,28 @@ def _recordings(columns: Mapping[str, Floats], location: Ints, names: Sequence[s
     place = location[order][np.append(True, begins[1:])] if len(order) else location
     number = np.arange(len(place)) - np.searchsorted(place, place) + 1
     several = np.bincount(place)[place] > 1 if len(place) else place
-    return recording, tuple(f"{names[p]}-{k}" if many else names[p] for p, k, many in zip(place, number, several, strict=True))
+    return recording, tuple(
+        f"{names[p]}-{k}" if many else names[p]
+        for p, k, many in zip(place, number, several, strict=True)
+    )
 
 
 def _clock_ticks(columns: Mapping[str, Floats], location: Ints) -> bool:
     """Says whether `Global_Time` advances by 100 ms from one frame of a vehicle to its next."""
     clock, frame, vehicle = columns[_CLOCK], columns["Frame_ID"], columns["Vehicle_ID"]
     order = np.lexsort((frame, clock, vehicle, location))
-    successive = (np.diff(vehicle[order]) == 0) & (np.diff(location[order]) == 0) & (np.diff(frame[order]) == 1)
+    successive = (
+        (np.diff(vehicle[order]) == 0)
+        & (np.diff(location[order]) == 0)
+        & (np.diff(frame[order]) == 1)
+    )
     ticks = np.diff(clock[order])[successive]
     return bool(len(ticks)) and abs(float(np.median(ticks)) - _FRAME_MS) < 0.1 * _FRAME_MS
 
 
-def _sorted(table: TextTable, columns: Mapping[str, Floats], recording: Ints, row: Ints) -> tuple[Ints, int]:
+def _sorted(
+    table: TextTable, columns: Mapping[str, Floats], recording: Ints, row: Ints
+) -> tuple[Ints, int]:
     """Returns the order by recording, vehicle and frame without duplicates, and how many duplicates there were."""
     order = np.lexsort((columns["Frame_ID"], columns["Vehicle_ID"], recording))
     same = ~_changes(recording[order], columns["Vehicle_ID"][order], columns["Frame_ID"][order])
@@ -446,7 +546,11 @@ def _check_units(rows: Rows) -> None:
             f"{rows.source}, column v_Length: vehicles are typically {typical:.1f} long, which looks like metres; NGSIM's files"
             " are in feet. Convert the file back, or write its pairs in the tidy layout (SI units) and use data=tidy"
         )
-    step = ~_changes(rows.recording, rows.vehicle)[1:] & (np.diff(rows.frame) == 1) & (rows.speed[1:] > _DRIVING_MPS)
+    step = (
+        ~_changes(rows.recording, rows.vehicle)[1:]
+        & (np.diff(rows.frame) == 1)
+        & (rows.speed[1:] > _DRIVING_MPS)
+    )
     ratios = np.abs(np.diff(rows.position)[step]) / (rows.speed[1:][step] * DT)
     ratio = float(np.median(ratios)) if len(ratios) else 1.0
     if not 0.8 < ratio < 1.25:

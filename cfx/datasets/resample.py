@@ -35,7 +35,9 @@ def _pair(pair: Pair, step: float) -> Pair | None:
     from scipy.interpolate import PchipInterpolator
 
     last = len(pair) - 1
-    at = np.arange(int(last * pair.dt / step + _ROUNDING) + 1) * (step / pair.dt)  # in recorded frames
+    at = np.arange(int(last * pair.dt / step + _ROUNDING) + 1) * (
+        step / pair.dt
+    )  # in recorded frames
     if len(at) < 2:
         return None
     at = at.clip(max=last)

@@ -35,7 +35,10 @@ HOLD_S = 0.5
 
 _WARM_UP_S = 60.0  # drivers settle behind their leaders before the recording begins
 _CRUISE_MPS = (9.0, 16.0)  # congested motorway
-_CRAWL_MPS = (1.5, 5.0)  # speed in the slow phase of a wave; above 0, where Krauss's gap would vanish
+_CRAWL_MPS = (
+    1.5,
+    5.0,
+)  # speed in the slow phase of a wave; above 0, where Krauss's gap would vanish
 _GO_S, _SLOW_S = 25.0, 10.0  # mean lengths of the two phases
 _SPEED_SD_MPS, _SPEED_SCALE_S = 0.8, 6.0  # the leader's own restlessness
 _ACCELERATION_MPS2, _BRAKING_MPS2, _JERK_MPS3 = 1.8, 2.5, 1.5
@@ -52,12 +55,24 @@ class SyntheticSettings(DatasetSettings):
     pairs: int = Field(8, ge=1, description="number of leader-follower pairs")
     frames: int = Field(600, ge=2, description="frames of each pair")
     dt: float = Field(0.1, gt=0, le=1, description="time step, s")
-    platoon_size: int = Field(4, ge=1, description="followers in a platoon; each is the leader of the next")
-    model: Literal["krauss", "w99"] = Field("krauss", description="the driving model that the drivers truly follow")
-    variation: float = Field(0.4, ge=0, le=1, description="how much true parameters drift in time; 0: constant")
-    heterogeneity: float = Field(0.6, ge=0, le=1, description="how much drivers differ; 0: all at the model's defaults")
-    noise_position_m: float = Field(0.0, ge=0, description="standard deviation of measured positions, m")
-    noise_speed_mps: float = Field(0.0, ge=0, description="standard deviation of measured speeds, m/s")
+    platoon_size: int = Field(
+        4, ge=1, description="followers in a platoon; each is the leader of the next"
+    )
+    model: Literal["krauss", "w99"] = Field(
+        "krauss", description="the driving model that the drivers truly follow"
+    )
+    variation: float = Field(
+        0.4, ge=0, le=1, description="how much true parameters drift in time; 0: constant"
+    )
+    heterogeneity: float = Field(
+        0.6, ge=0, le=1, description="how much drivers differ; 0: all at the model's defaults"
+    )
+    noise_position_m: float = Field(
+        0.0, ge=0, description="standard deviation of measured positions, m"
+    )
+    noise_speed_mps: float = Field(
+        0.0, ge=0, description="standard deviation of measured speeds, m/s"
+    )
 
 
 class SyntheticDataset(Dataset):
@@ -82,11 +97,15 @@ class SyntheticDataset(Dataset):
         platoons = -(-s.pairs // s.platoon_size)
         traffic = _simulate(s, platoons, rng)
         measured = _measure(traffic, s, rng)
-        pairs = [_pair(measured, s, k // s.platoon_size, k % s.platoon_size) for k in range(s.pairs)]
+        pairs = [
+            _pair(measured, s, k // s.platoon_size, k % s.platoon_size) for k in range(s.pairs)
+        ]
         sound = [pair for pair in pairs if (pair.gap > 0).all()]
         lost = len(pairs) - len(sound)
         reason = "measurement noise puts the leader behind its follower"
-        return PairSet(tuple(sound), f"synthetic (seed {s.seed})", (Dropped(reason, lost),) if lost else ())
+        return PairSet(
+            tuple(sound), f"synthetic (seed {s.seed})", (Dropped(reason, lost),) if lost else ()
+        )
 
 
 @dataclass(frozen=True)
@@ -123,10 +142,17 @@ def _simulate(s: SyntheticSettings, platoons: int, rng: np.random.Generator) -> 
     parameters = model.space.from_unit(torch.from_numpy(unit))
     length = torch.from_numpy(rng.uniform(*_LENGTH_M, (platoons, s.platoon_size + 1)))
     speed = torch.from_numpy(leader_speed(platoons, frames, s.dt, rng))
-    position = torch.cat([torch.zeros(platoons, 1, dtype=speed.dtype), (speed[:, 1:] * s.dt).cumsum(1)], 1)
+    position = torch.cat(
+        [torch.zeros(platoons, 1, dtype=speed.dtype), (speed[:, 1:] * s.dt).cumsum(1)], 1
+    )
     positions, speeds = [position], [speed]
     for k in range(s.platoon_size):
-        ahead = Leader(positions[k], speeds[k], torch.from_numpy(differences(speeds[k].numpy(), s.dt)), length[:, k])
+        ahead = Leader(
+            positions[k],
+            speeds[k],
+            torch.from_numpy(differences(speeds[k].numpy(), s.dt)),
+            length[:, k],
+        )
         begin = positions[k][:, 0] - length[:, k] - 5.0 - 2.0 * speeds[k][:, 0]
         start = Start(begin, speeds[k][:, 0], torch.zeros(platoons, dtype=speed.dtype))
         # Never compiled: eager arithmetic gives the same bits wherever there is the same seed.
@@ -168,18 +194,27 @@ def differences(speed: Floats, dt: float) -> Floats:
 
 
 def _true_parameters(
-    space: ParameterSpace, drivers: tuple[int, ...], windows: int, step: float, s: SyntheticSettings, rng: np.random.Generator
+    space: ParameterSpace,
+    drivers: tuple[int, ...],
+    windows: int,
+    step: float,
+    s: SyntheticSettings,
+    rng: np.random.Generator,
 ) -> Floats:
     """Returns true parameters in unit space, `(*drivers, windows, n)`."""
     default = np.array([(p.default - p.low) / (p.high - p.low) for p in space.tuned])
-    reach = 0.5 * np.minimum(default, 1.0 - default)
+    adaptation_space = 0.5 * np.minimum(default, 1.0 - default)
     own = rng.uniform(-1.0, 1.0, (*drivers, 1, len(space)))
-    drift = np.tanh(0.7 * smooth_noise((*drivers, len(space)), windows, step / _DRIFT_SCALE_S, rng)).swapaxes(-1, -2)
-    unit: Floats = default + reach * (s.heterogeneity * own + s.variation * drift)
+    drift = np.tanh(
+        0.7 * smooth_noise((*drivers, len(space)), windows, step / _DRIFT_SCALE_S, rng)
+    ).swapaxes(-1, -2)
+    unit: Floats = default + adaptation_space * (s.heterogeneity * own + s.variation * drift)
     return unit
 
 
-def smooth_noise(batch: tuple[int, ...], steps: int, step: float, rng: np.random.Generator) -> Floats:
+def smooth_noise(
+    batch: tuple[int, ...], steps: int, step: float, rng: np.random.Generator
+) -> Floats:
     """Returns a stationary smooth Gaussian process `(*batch, steps)` with mean 0 and variance 1.
 
     A critically damped second-order autoregression with pole phi = exp(-step); its variance for unit noise is
@@ -212,14 +247,24 @@ def leader_speed(platoons: int, frames: int, dt: float, rng: np.random.Generator
 def _wanted_speed(platoons: int, frames: int, dt: float, rng: np.random.Generator) -> Floats:
     cruise = rng.uniform(*_CRUISE_MPS, (platoons, 1))
     restless = _SPEED_SD_MPS * smooth_noise((platoons,), frames, dt / _SPEED_SCALE_S, rng)
-    waves = int(np.ceil(3.0 * frames * dt / (_GO_S + _SLOW_S))) + 10  # three times as many as fit on average
-    phases = np.stack([rng.gamma(4.0, _GO_S / 4.0, (platoons, waves)), rng.gamma(4.0, _SLOW_S / 4.0, (platoons, waves))], -1)
+    waves = (
+        int(np.ceil(3.0 * frames * dt / (_GO_S + _SLOW_S))) + 10
+    )  # three times as many as fit on average
+    phases = np.stack(
+        [
+            rng.gamma(4.0, _GO_S / 4.0, (platoons, waves)),
+            rng.gamma(4.0, _SLOW_S / 4.0, (platoons, waves)),
+        ],
+        -1,
+    )
     ends = phases.reshape(platoons, 2 * waves).cumsum(1) - rng.uniform(0.0, _GO_S, (platoons, 1))
     crawl = rng.uniform(*_CRAWL_MPS, (platoons, waves))
     time = np.arange(frames) * dt
     # Shifting each platoon's row beyond the one before makes one sorted array of all, so that one search serves.
     shift = np.arange(platoons)[:, None] * (ends.max() - ends.min() + frames * dt + 1.0)
-    found = np.searchsorted((ends + shift).ravel(), (time + shift).ravel(), side="right").reshape(platoons, frames)
+    found = np.searchsorted((ends + shift).ravel(), (time + shift).ravel(), side="right").reshape(
+        platoons, frames
+    )
     phase = np.clip(found - 2 * waves * np.arange(platoons)[:, None], 0, 2 * waves - 1)
     slow = np.take_along_axis(crawl, phase // 2, axis=1)
     wanted: Floats = np.maximum(np.where(phase % 2 == 1, slow, cruise) + restless, 0.0)
@@ -261,6 +306,9 @@ def _pair(traffic: _Traffic, s: SyntheticSettings, platoon: int, place: int) -> 
         leader_length=float(traffic.length[platoon, place]),
         **signals(place, "leader"),
         **signals(place + 1, "follower"),
-        truth={name: np.ascontiguousarray(traffic.truth[platoon, place, :, at]) for at, name in enumerate(traffic.names)},
+        truth={
+            name: np.ascontiguousarray(traffic.truth[platoon, place, :, at])
+            for at, name in enumerate(traffic.names)
+        },
         truth_model=s.model,
     )

@@ -33,9 +33,20 @@ from numpy.typing import NDArray
 
 from cfx.component import Settings
 from cfx.datasets.base import Dataset, FileDatasetSettings, joined, listed
-from cfx.datasets.files import PARQUET, Floats, Ints, Labels, as_labels, bad_cells, magic, parsed, read_columns, sniff
+from cfx.datasets.files import (
+    PARQUET,
+    Floats,
+    Ints,
+    Labels,
+    as_labels,
+    bad_cells,
+    magic,
+    parsed,
+    read_columns,
+    sniff,
+)
 from cfx.errors import DataError, OutputError, nearest
-from cfx.files import whole
+from cfx.files import atomic_write
 from cfx.pairs import SIGNALS, Dropped, Pair, PairSet
 
 LABELS = ("recording", "pair_id", "leader_id", "follower_id")
@@ -88,7 +99,11 @@ class _Table:
         """Says where a row is: file, row, pair and frame."""
         pair = self.labels["pair_id"]
         code = pair.codes[index]
-        named = f" (pair '{pair.names[code]}', frame {self.numbers['frame'][index]:g})" if code >= 0 else ""
+        named = (
+            f" (pair '{pair.names[code]}', frame {self.numbers['frame'][index]:g})"
+            if code >= 0
+            else ""
+        )
         return f"{self.source}, row {int(index) + self.first_row}{f', column {column}' if column else ''}{named}"
 
 
@@ -117,7 +132,9 @@ def pairs_from_frame(frame: pd.DataFrame, source: str = "table") -> PairSet:
     try:
         columns = pa.Table.from_pandas(frame.set_axis(names, axis=1)[wanted], preserve_index=False)
     except pa.ArrowException as error:
-        raise DataError(f"{source}: a column mixes numbers and text ({_first_line(error)}); give each column one type") from None
+        raise DataError(
+            f"{source}: a column mixes numbers and text ({_first_line(error)}); give each column one type"
+        ) from None
     return _pairs(_from_arrow(source, columns, ignored))
 
 
@@ -129,7 +146,13 @@ def _pairs(table: _Table) -> PairSet:
     _check_pairs(table, order, starts)
     _check_motion(table, order, starts)
     dropped = (
-        (Dropped(f"not part of the layout: {listed(table.ignored)}", len(table.ignored), "columns"),) if table.ignored else ()
+        (
+            Dropped(
+                f"not part of the layout: {listed(table.ignored)}", len(table.ignored), "columns"
+            ),
+        )
+        if table.ignored
+        else ()
     )
     return PairSet(tuple(_build(table, order, starts)), table.source, dropped)
 
@@ -145,12 +168,16 @@ def _roles(source: str, names: Sequence[str]) -> tuple[dict[str, int], dict[str,
     """
     twice = sorted({name for name in names if list(names).count(name) > 1})
     if twice:
-        raise DataError(f"{source}: column {twice[0]} stands in the file more than once; remove one of them")
+        raise DataError(
+            f"{source}: column {twice[0]} stands in the file more than once; remove one of them"
+        )
     missing = [name for name in (*LABELS, *NUMBERS) if name not in names]
     if missing:
         spare = [name for name in names if name not in (*LABELS, *NUMBERS)]
         ngsim = (
-            " This looks like an NGSIM file: use data=ngsim." if {n.lower() for n in names} & {"vehicle_id", "local_y"} else ""
+            " This looks like an NGSIM file: use data=ngsim."
+            if {n.lower() for n in names} & {"vehicle_id", "local_y"}
+            else ""
         )
         others = f" So are {listed(missing[1:], 5)}." if len(missing) > 1 else ""
         raise DataError(
@@ -168,7 +195,9 @@ def _roles(source: str, names: Sequence[str]) -> tuple[dict[str, int], dict[str,
 def _read_text(path: Path) -> _Table:
     table = sniff(path)
     if table.header is None:
-        raise DataError(f"{path}: the first row must hold the column names of the tidy layout: {listed((*LABELS, *NUMBERS), 20)}")
+        raise DataError(
+            f"{path}: the first row must hold the column names of the tidy layout: {listed((*LABELS, *NUMBERS), 20)}"
+        )
     if table.delimiter == " " and table.width > 1:
         raise DataError(f"{path}: the columns are separated by spaces; write the file with commas")
     numbers, labels, ignored = _roles(str(path), table.header)
@@ -180,10 +209,14 @@ def _read_parquet(path: Path) -> _Table:
     try:
         file = pq.ParquetFile(path)
         numbers, labels, _ = _roles(str(path), file.schema_arrow.names)
-        ignored = [name for name in file.schema_arrow.names if name not in numbers and name not in labels]
+        ignored = [
+            name for name in file.schema_arrow.names if name not in numbers and name not in labels
+        ]
         columns = file.read(columns=[*numbers, *labels])
     except (pa.ArrowException, OSError) as error:
-        raise DataError(f"{path}: the parquet file is cut off or damaged ({_first_line(error)}); write it again") from None
+        raise DataError(
+            f"{path}: the parquet file is cut off or damaged ({_first_line(error)}); write it again"
+        ) from None
     return _from_arrow(str(path), columns, ignored)
 
 
@@ -194,7 +227,9 @@ def _from_arrow(source: str, columns: Any, ignored: Sequence[str]) -> _Table:
         {name: as_labels(_text(columns.column(name))) for name in labels},
         {name: _floats(source, name, columns.column(name)) for name in numbers},
         1,
-        [name for name in ignored if name != "__index_level_0__"],  # pandas' own row index, not the user's column
+        [
+            name for name in ignored if name != "__index_level_0__"
+        ],  # pandas' own row index, not the user's column
     )
 
 
@@ -214,11 +249,18 @@ def _floats(source: str, name: str, column: Any) -> Floats:
     if pa.types.is_dictionary(column.type):
         column = column.cast(column.type.value_type)
     if pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
-        return parsed(column, lambda at, cell: f"{source}, row {at + 1}, column {name}: '{cell}' is not a number; correct it")
+        return parsed(
+            column,
+            lambda at, cell: (
+                f"{source}, row {at + 1}, column {name}: '{cell}' is not a number; correct it"
+            ),
+        )
     try:
         return cast(Floats, column.cast(pa.float64()).to_numpy())
     except (pa.ArrowException, ValueError):
-        raise DataError(f"{source}, column {name}: holds {column.type}, not numbers; write it as numbers") from None
+        raise DataError(
+            f"{source}, column {name}: holds {column.type}, not numbers; write it as numbers"
+        ) from None
 
 
 # --- checks ----------------------------------------------------------------------------------------------------------
@@ -229,7 +271,9 @@ def _check_cells(table: _Table) -> None:
     for name in LABELS:
         empty = np.flatnonzero(table.labels[name].codes < 0)
         if len(empty):
-            raise DataError(f"{table.at(empty[0], name)}: the cell is empty ({len(empty)} such cells); give a name")
+            raise DataError(
+                f"{table.at(empty[0], name)}: the cell is empty ({len(empty)} such cells); give a name"
+            )
     for name in NUMBERS:
         if bad := bad_cells(table.numbers[name]):
             index, count, what = bad
@@ -237,10 +281,25 @@ def _check_cells(table: _Table) -> None:
                 f"{table.at(index, name)}: is {what} ({count} such cells in this column); correct it or leave out the pair"
             )
     frame = table.numbers["frame"]
-    _reject(table, "frame", frame != np.floor(frame), "is no whole number; number the frames 0, 1, 2, ...")
+    _reject(
+        table,
+        "frame",
+        frame != np.floor(frame),
+        "is no whole number; number the frames 0, 1, 2, ...",
+    )
     for name in ("leader_speed_mps", "follower_speed_mps"):
-        _reject(table, name, table.numbers[name] < 0, "is negative; speeds count along the lane and must be 0 or more")
-    _reject(table, "leader_length_m", table.numbers["leader_length_m"] <= 0, "is no vehicle length; give metres")
+        _reject(
+            table,
+            name,
+            table.numbers[name] < 0,
+            "is negative; speeds count along the lane and must be 0 or more",
+        )
+    _reject(
+        table,
+        "leader_length_m",
+        table.numbers["leader_length_m"] <= 0,
+        "is no vehicle length; give metres",
+    )
 
 
 def _reject(table: _Table, name: str, wrong: NDArray[np.bool_], why: str) -> None:
@@ -307,8 +366,12 @@ def _time_steps(time: Floats, starts: Ints) -> Floats:
 def _check_pairs(table: _Table, order: Ints, starts: Ints) -> None:
     """Raises DataError if what describes a pair as a whole changes within it."""
     first = np.repeat(order[starts], np.diff(np.append(starts, len(order))))
-    described: dict[str, NDArray[Any]] = {name: labels.codes for name, labels in table.labels.items() if name != "pair_id"}
-    described |= {name: table.numbers[name] for name in ("leader_length_m", _LANE) if name in table.numbers}
+    described: dict[str, NDArray[Any]] = {
+        name: labels.codes for name, labels in table.labels.items() if name != "pair_id"
+    }
+    described |= {
+        name: table.numbers[name] for name in ("leader_length_m", _LANE) if name in table.numbers
+    }
     for name, values in described.items():
         differs = values[order] != values[first]
         if values.dtype.kind == "f":
@@ -335,7 +398,10 @@ def _check_motion(table: _Table, order: Ints, starts: Ints) -> None:
     within[starts] = False
     time = table.numbers["time_s"][order]
     for who in ("leader", "follower"):
-        position, speed = table.numbers[f"{who}_position_m"][order], table.numbers[f"{who}_speed_mps"][order]
+        position, speed = (
+            table.numbers[f"{who}_position_m"][order],
+            table.numbers[f"{who}_speed_mps"][order],
+        )
         driven = float(np.diff(position)[within[1:]].sum())
         expected = float((0.5 * (speed[1:] + speed[:-1]) * np.diff(time))[within[1:]].sum())
         if expected < 10 and abs(driven) < 10:  # too little movement to tell
@@ -343,14 +409,24 @@ def _check_motion(table: _Table, order: Ints, starts: Ints) -> None:
         ratio = driven / expected if expected > 0 else np.inf
         if 0.8 < ratio < 1.25:
             continue
-        guess = next((text for factor, text in _FACTORS.items() if abs(ratio / factor - 1) < 0.05), "")
+        guess = next(
+            (text for factor, text in _FACTORS.items() if abs(ratio / factor - 1) < 0.05), ""
+        )
         if not guess:
-            guess = "positions must grow along the lane" if ratio < 0 else "positions must be in m, speeds in m/s and times in s"
+            guess = (
+                "positions must grow along the lane"
+                if ratio < 0
+                else "positions must be in m, speeds in m/s and times in s"
+            )
         raise DataError(
             f"{table.source}, columns {who}_position_m and {who}_speed_mps: the distance driven is {ratio:.3g} times speed times"
             f" time: {guess}"
         )
-    gap = table.numbers["leader_position_m"] - table.numbers["leader_length_m"] - table.numbers["follower_position_m"]
+    gap = (
+        table.numbers["leader_position_m"]
+        - table.numbers["leader_length_m"]
+        - table.numbers["follower_position_m"]
+    )
     if len(at := np.flatnonzero(~(gap > 0))):
         raise DataError(
             f"{table.at(at[0])}: the leader is behind its follower, or overlaps it: the gap is {gap[at[0]]:.2f} m ({len(at)} such"
@@ -372,7 +448,8 @@ def _build(table: _Table, order: Ints, starts: Ints) -> list[Pair]:
     pairs = []
     for start, end, step in zip(starts.tolist(), ends.tolist(), steps.tolist(), strict=True):
         label = {
-            name: labels.names[code] if (code := labels.codes[order[start]]) >= 0 else "" for name, labels in table.labels.items()
+            name: labels.names[code] if (code := labels.codes[order[start]]) >= 0 else ""
+            for name, labels in table.labels.items()
         }
         truth = {
             name.removeprefix(_TRUE): numbers[name][start:end]
@@ -380,7 +457,9 @@ def _build(table: _Table, order: Ints, starts: Ints) -> list[Pair]:
             if not np.isnan(numbers[name][start])
         }
         lane = numbers[_LANE][start] if _LANE in numbers else np.nan
-        signals: dict[str, Any] = {signal: numbers[column][start:end] for signal, column in _SIGNAL_COLUMNS.items()}
+        signals: dict[str, Any] = {
+            signal: numbers[column][start:end] for signal, column in _SIGNAL_COLUMNS.items()
+        }
         pairs.append(
             Pair(
                 pair_id=label["pair_id"],
@@ -427,7 +506,7 @@ def write_tidy(pairs: PairSet, path: Path | str) -> None:
         raise OutputError(f"{path}: a tidy file is named .parquet, .csv or .csv.gz")
     table = _as_table(pairs)
     try:
-        with whole(path) as temporary:
+        with atomic_write(path) as temporary:
             _write(table, temporary, path.name.lower())
     except OSError as error:
         raise OutputError(
@@ -439,7 +518,9 @@ def _write(table: Any, temporary: Path, name: str) -> None:
     if name.endswith(".parquet"):
         pq.write_table(table, temporary, compression="zstd")
         return
-    with pa.output_stream(str(temporary), compression="gzip" if name.endswith(".gz") else None) as stream:
+    with pa.output_stream(
+        str(temporary), compression="gzip" if name.endswith(".gz") else None
+    ) as stream:
         pa.csv.write_csv(table, stream)
 
 
@@ -453,15 +534,26 @@ def _as_table(pairs: PairSet) -> Any:
         return pa.array(np.concatenate(arrays) if arrays else np.zeros(0), pa.float64())
 
     frames = [pair.first_frame + np.arange(len(pair)) for pair in pairs]
-    columns: dict[str, Any] = {name: per_pair([getattr(pair, name) for pair in pairs], pa.string()) for name in LABELS}
-    columns["frame"] = pa.array(np.concatenate(frames) if frames else np.zeros(0, np.int64), pa.int64())
-    columns["time_s"] = over_time([np.asarray(frame * pair.dt, np.float64) for frame, pair in zip(frames, pairs, strict=True)])
-    columns |= {column: over_time([getattr(pair, signal) for pair in pairs]) for signal, column in _SIGNAL_COLUMNS.items()}
+    columns: dict[str, Any] = {
+        name: per_pair([getattr(pair, name) for pair in pairs], pa.string()) for name in LABELS
+    }
+    columns["frame"] = pa.array(
+        np.concatenate(frames) if frames else np.zeros(0, np.int64), pa.int64()
+    )
+    columns["time_s"] = over_time(
+        [np.asarray(frame * pair.dt, np.float64) for frame, pair in zip(frames, pairs, strict=True)]
+    )
+    columns |= {
+        column: over_time([getattr(pair, signal) for pair in pairs])
+        for signal, column in _SIGNAL_COLUMNS.items()
+    }
     columns["leader_length_m"] = per_pair([pair.leader_length for pair in pairs], pa.float64())
     if any(pair.lane is not None for pair in pairs):
         columns[_LANE] = per_pair([pair.lane for pair in pairs], pa.int64())
     if any(pair.truth_model for pair in pairs):
         columns[_TRUE_MODEL] = per_pair([pair.truth_model for pair in pairs], pa.string())
     for name in dict.fromkeys(name for pair in pairs for name in pair.truth):
-        columns[_TRUE + name] = over_time([pair.truth.get(name, np.full(len(pair), np.nan)) for pair in pairs])
+        columns[_TRUE + name] = over_time(
+            [pair.truth.get(name, np.full(len(pair), np.nan)) for pair in pairs]
+        )
     return pa.table(columns)

@@ -56,7 +56,7 @@ def drive(
         first: `(P,)`, the frame of the last measured state.
         network: `(P,)`, which of the policy's networks drives each pair.
         base: `(P, n)` in SI units, what a policy's offsets are from; None: the policy's own base.
-        history: seconds of measured history before `first` that the policy reads, and from which the driver's traits are
+        history: seconds of measured history before `first` that the policy reads, and from which the driver's driver features are
             measured; None: all there is.
     """
     length, stride = policy.windows.length, policy.windows.stride
@@ -64,7 +64,8 @@ def drive(
     frames = first[:, None] + torch.arange(1 - length, steps + 1, device=first.device)
     index = frames.clamp(min=0, max=batch.mask.shape[1] - 1)
     leader_position, leader_speed, leader_acceleration = (
-        signal.gather(1, index) for signal in (batch.leader_position, batch.leader_speed, batch.leader_acceleration)
+        signal.gather(1, index)
+        for signal in (batch.leader_position, batch.leader_speed, batch.leader_acceleration)
     )
     # Columns of these buffers: `length - 1` measured frames, frame 0, and then what is simulated.
     position = batch.follower_position.gather(1, index)
@@ -74,7 +75,12 @@ def drive(
     for buffer in (position, speed, acceleration):
         buffer[:, now + 1 :] = torch.nan  # nothing measured may be seen from here on
     since = None if history is None else (first - round(history / simulator.dt)).clamp(min=0)
-    state = policy.read(batch, first, policy.begin(network, base, policy.traits_of(batch, first, since)), since)
+    state = policy.read(
+        batch,
+        first,
+        policy.begin(network, base, policy.driver_features_of(batch, first, since)),
+        since,
+    )
     follower = simulator.begin(Start(position[:, now], speed[:, now], acceleration[:, now]))
     parameters = speed.new_empty((len(batch), steps + 1, len(policy.space)))
     gap = leader_position - batch.leader_length[:, None] - position
@@ -82,14 +88,23 @@ def drive(
         end = min(begin + stride, steps)
         recent = slice(begin, begin + length)
         seen = History(
-            leader_speed[:, recent], leader_acceleration[:, recent], speed[:, recent], acceleration[:, recent], gap[:, recent]
+            leader_speed[:, recent],
+            leader_acceleration[:, recent],
+            speed[:, recent],
+            acceleration[:, recent],
+            gap[:, recent],
         )
         chosen, state = policy.act(seen, state)
         ahead = slice(now + begin, now + end)
         leader = Leader(
-            leader_position[:, ahead].T, leader_speed[:, ahead].T, leader_acceleration[:, ahead].T, batch.leader_length
+            leader_position[:, ahead].T,
+            leader_speed[:, ahead].T,
+            leader_acceleration[:, ahead].T,
+            batch.leader_length,
         )
-        follower, positions, speeds = simulator.advance(follower, leader, policy.space.unpack(chosen))
+        follower, positions, speeds = simulator.advance(
+            follower, leader, policy.space.unpack(chosen)
+        )
         done = slice(now + begin + 1, now + end + 1)
         position[:, done] = positions.T
         speed[:, done] = speeds.T

@@ -24,12 +24,16 @@ _TRIMMED = 0.1
 
 _RESAMPLES = 9_999
 
-START_S = 5.0
+TRANSIENT_S = 5.0
 """How long the start of a test part is: constant parameters leave the measured state for their own within some such time."""
 
 
 def improvement_statistics(
-    baseline: NDArray[np.float64], policy: NDArray[np.float64], drivers: Sequence[str] | None = None, *, seed: int
+    baseline: NDArray[np.float64],
+    policy: NDArray[np.float64],
+    drivers: Sequence[str] | None = None,
+    *,
+    seed: int,
 ) -> Improvement:
     """Compares two methods over P pairs.
 
@@ -44,8 +48,14 @@ def improvement_statistics(
     before, after = baseline[counts], policy[counts]
     if not counts.any():
         nan = float("nan")
-        return Improvement(nan, nan, nan, nan, nan, nan, nan, pairs=0, undefined=len(baseline), drivers=0)
-    who = np.unique(np.asarray(drivers)[counts], return_inverse=True)[1] if drivers is not None else np.arange(len(before))
+        return Improvement(
+            nan, nan, nan, nan, nan, nan, nan, pairs=0, undefined=len(baseline), drivers=0
+        )
+    who = (
+        np.unique(np.asarray(drivers)[counts], return_inverse=True)[1]
+        if drivers is not None
+        else np.arange(len(before))
+    )
     gain = (before - after) / before
     low, high = _interval(gain, who, seed)
     number = np.bincount(who)
@@ -59,14 +69,18 @@ def improvement_statistics(
         ci95_low=low,
         ci95_high=high,
         win_rate=float((gain > 0).mean()),
-        p_value=float(stats.wilcoxon(before, after, zero_method="zsplit").pvalue) if different else 1.0,
+        p_value=float(stats.wilcoxon(before, after, zero_method="zsplit").pvalue)
+        if different
+        else 1.0,
         pairs=int(counts.sum()),
         undefined=int((~counts).sum()),
         drivers=len(number),
     )
 
 
-def mean_interval(values: Sequence[float], drivers: Sequence[str], *, seed: int) -> tuple[float, float, float]:
+def mean_interval(
+    values: Sequence[float], drivers: Sequence[str], *, seed: int
+) -> tuple[float, float, float]:
     """Returns the mean over pairs and its 95 % interval, drivers drawn with all their pairs; NaN where it is not defined.
 
     Args:
@@ -88,7 +102,9 @@ def _interval(gain: NDArray[np.float64], who: NDArray[np.intp], seed: int) -> tu
     if len(number) < 2:
         return float("nan"), float("nan")
 
-    def mean(total: NDArray[np.float64], pairs: NDArray[np.float64], axis: int = -1) -> NDArray[np.float64]:
+    def mean(
+        total: NDArray[np.float64], pairs: NDArray[np.float64], axis: int = -1
+    ) -> NDArray[np.float64]:
         return np.asarray(total.sum(axis) / pairs.sum(axis))
 
     interval = stats.bootstrap(
@@ -116,13 +132,13 @@ def closed_loop_errors(batch: PairBatch, first: Tensor, loop: ClosedLoop) -> tup
 class _Errors:
     """What each method did over the frames that its closed loops have, `(P,)` each; `counted` as in `ClosedLoop`.
 
-    `speed` and `gap` are RMSEs; `later` is that of speed beyond the start (`START_S`), NaN for a drive that is no longer;
+    `speed` and `gap` are RMSEs; `later` is that of speed beyond the start (`TRANSIENT_S`), NaN for a drive that is no longer;
     `real_jerk` is the recorded drivers', m/s3.
     """
 
     speed: Mapping[str, Array]
     gap: Mapping[str, Array]
-    later: Mapping[str, Array]
+    steady: Mapping[str, Array]
     safety: Mapping[str, Safety]
     real_jerk: Array
     counted: Tensor
@@ -130,18 +146,28 @@ class _Errors:
 
     @classmethod
     def of(
-        cls, batch: PairBatch, first: Tensor, loops: Mapping[str, ClosedLoop], space: ParameterSpace, reach: ParameterSpace
+        cls,
+        batch: PairBatch,
+        first: Tensor,
+        loops: Mapping[str, ClosedLoop],
+        space: ParameterSpace,
+        adaptation_space: ParameterSpace,
     ) -> _Errors:
         counted = next(iter(loops.values())).counted
         frames = first[:, None] + torch.arange(counted.shape[1], device=first.device)
         index = frames.clamp(max=batch.mask.shape[1] - 1)
         real_speed, real_gap = batch.follower_speed.gather(1, index), batch.gap.gather(1, index)
-        later = counted & (torch.arange(counted.shape[1], device=first.device) * batch.dt > START_S + 1e-6)
+        steady = counted & (
+            torch.arange(counted.shape[1], device=first.device) * batch.dt > TRANSIENT_S + 1e-6
+        )
         return cls(
             {m: _rmse(loop.speed, real_speed, counted) for m, loop in loops.items()},
             {m: _rmse(loop.gap, real_gap, counted) for m, loop in loops.items()},
-            {m: _rmse(loop.speed, real_speed, later) for m, loop in loops.items()},
-            {m: Safety.of(loop, reach if m == "policy" else space, batch.dt) for m, loop in loops.items()},
+            {m: _rmse(loop.speed, real_speed, steady) for m, loop in loops.items()},
+            {
+                m: Safety.of(loop, adaptation_space if m == "policy" else space, batch.dt)
+                for m, loop in loops.items()
+            },
             rms_jerk(real_speed, counted, batch.dt),
             counted,
             index,
@@ -154,7 +180,7 @@ class _Errors:
             "frames": int(self.counted[i].sum()),
             "rmse_speed": float(after),
             "rmse_gap": float(self.gap[method][i]),
-            "later_rmse_speed": float(self.later[method][i]),
+            "steady_rmse_speed": float(self.steady[method][i]),
             "improvement": _gain(before, after),
         }
         for other in (name for name in self.speed if name not in {"fixed", "policy"}):
@@ -167,19 +193,23 @@ class _Errors:
             "at_bounds": float(safety.at_bounds[i]),
         }
 
-    def whole_row(self, i: int, method: str) -> dict[str, float]:
+    def full_trajectory_row(self, i: int, method: str) -> dict[str, float]:
         """Returns what the table says of the whole drive of pair i; NaN for a method that did not drive it."""
         names = ("rmse_speed", "rmse_gap", "collisions", "hard_braking")
         if method not in self.speed:
             return {f"whole_{name}": float("nan") for name in names}
         safety = self.safety[method]
         found = (self.speed[method], self.gap[method], safety.collided, safety.hard_braking)
-        return {f"whole_{name}": float(values[i]) for name, values in zip(names, found, strict=True)}
+        return {
+            f"whole_{name}": float(values[i]) for name, values in zip(names, found, strict=True)
+        }
 
-    def improvements(self, drivers: Sequence[str], seed: int, *, later: bool = False) -> dict[str, Improvement]:
+    def improvements(
+        self, drivers: Sequence[str], seed: int, *, steady: bool = False
+    ) -> dict[str, Improvement]:
         """Returns the policy's improvement over every other method; `later`: beyond the start, empty if no drive is longer."""
-        errors = self.later if later else self.speed
-        if later and not np.isfinite(errors["policy"]).any():
+        errors = self.steady if steady else self.speed
+        if steady and not np.isfinite(errors["policy"]).any():
             return {}
         return {
             method: improvement_statistics(before, errors["policy"], drivers, seed=seed)
@@ -197,7 +227,7 @@ def evaluate(
     style: StyleResult,
     *,
     seed: int,
-    reach: ParameterSpace | None = None,
+    adaptation_space: ParameterSpace | None = None,
     fold: Tensor | None = None,
     whole: Mapping[str, ClosedLoop] | None = None,
     platoon: Platoon | None = None,
@@ -219,9 +249,13 @@ def evaluate(
         platoon, history: further results, handed on; see `Evaluation`.
     """
     loops = {method: loops[method] for method in METHODS if method in loops}
-    reach = space if reach is None else reach
-    errors = _Errors.of(batch, first, loops, space, reach)
-    errors_whole = _Errors.of(batch, torch.zeros_like(first), whole, space, reach) if whole else None
+    adaptation_space = space if adaptation_space is None else adaptation_space
+    errors = _Errors.of(batch, first, loops, space, adaptation_space)
+    errors_full_trajectory = (
+        _Errors.of(batch, torch.zeros_like(first), whole, space, adaptation_space)
+        if whole
+        else None
+    )
     means = {m: _mean(loop.parameters, errors.counted) for m, loop in loops.items()}
     by_driver = style.table.set_index("driver")
     rows = []
@@ -238,18 +272,30 @@ def evaluate(
         }
         for method in loops:
             row = about | {"method": method} | errors.row(i, method)
-            row |= {f"parameter_{name}": float(v) for name, v in zip(space.names, means[method][i], strict=True)}
-            rows.append(row | (errors_whole.whole_row(i, method) if errors_whole is not None else {}))
+            row |= {
+                f"parameter_{name}": float(v)
+                for name, v in zip(space.names, means[method][i], strict=True)
+            }
+            rows.append(
+                row
+                | (
+                    errors_full_trajectory.full_trajectory_row(i, method)
+                    if errors_full_trajectory is not None
+                    else {}
+                )
+            )
     drivers = [pair.driver for pair in pairs]
     return Evaluation(
         table=pd.DataFrame(rows),
         improvements=errors.improvements(drivers, seed),
-        later_improvements=errors.improvements(drivers, seed, later=True),
+        steady_improvements=errors.improvements(drivers, seed, steady=True),
         drives=_drives(pairs, batch, first, errors.index, loops),
         names=space.names,
         units=tuple(parameter.unit for parameter in space.tuned),
-        bounds=reach.bounds().numpy(),
-        whole_improvements=errors_whole.improvements(drivers, seed) if errors_whole is not None else {},
+        bounds=adaptation_space.bounds().numpy(),
+        full_trajectory_improvements=errors_full_trajectory.improvements(drivers, seed)
+        if errors_full_trajectory is not None
+        else {},
         platoon=platoon,
         history=history,
     )
@@ -266,17 +312,23 @@ def _rmse(simulated: Tensor, real: Tensor, counted: Tensor) -> NDArray[np.float6
 
 def _mean(parameters: Tensor, counted: Tensor) -> NDArray[np.float64]:
     weight = counted[..., None]
-    return np.asarray((torch.where(weight, parameters, 0.0).sum(1) / weight.sum(1)).double().cpu().numpy())
+    return np.asarray(
+        (torch.where(weight, parameters, 0.0).sum(1) / weight.sum(1)).double().cpu().numpy()
+    )
 
 
-def _drives(pairs: PairSet, batch: PairBatch, first: Tensor, index: Tensor, loops: Mapping[str, ClosedLoop]) -> tuple[Drive, ...]:
+def _drives(
+    pairs: PairSet, batch: PairBatch, first: Tensor, index: Tensor, loops: Mapping[str, ClosedLoop]
+) -> tuple[Drive, ...]:
     def rows(values: Tensor) -> list[NDArray[np.float64]]:
         ends = (batch.lengths - first).tolist()
         return [row[:end].double().cpu().numpy() for row, end in zip(values, ends, strict=True)]
 
     leader = rows(batch.leader_speed.gather(1, index))
     speed, gap = rows(batch.follower_speed.gather(1, index)), rows(batch.gap.gather(1, index))
-    simulated = {m: (rows(loop.speed), rows(loop.gap), rows(loop.parameters)) for m, loop in loops.items()}
+    simulated = {
+        m: (rows(loop.speed), rows(loop.gap), rows(loop.parameters)) for m, loop in loops.items()
+    }
     return tuple(
         Drive(
             pair_id=pair.pair_id,

@@ -5,7 +5,7 @@ disturbance multiplies. A platoon is string stable if nobody slows down more tha
 before the leader brakes, or in which vehicles collide, does not count as stable.
 
 Information flows downstream only, and a model sees its leader at t: so all vehicles of all platoons take each step at once.
-Letters: N platoons, V vehicles of each, T frames.
+Shapes: N platoons, V vehicles of each, T frames.
 """
 
 from __future__ import annotations
@@ -63,10 +63,21 @@ class Manoeuvre:
 
     def speed(self, dt: float) -> Array:
         """Returns the leader's speed `(T,)`, m/s, in steps of `dt` s."""
-        braking, recovering = (self.low - self.cruise) / self.brake, (self.cruise - self.low) / self.recover
-        phases = [(self.settle, 0.0), (braking, self.brake), (self.hold, 0.0), (recovering, self.recover), (self.after, 0.0)]
+        braking, recovering = (
+            (self.low - self.cruise) / self.brake,
+            (self.cruise - self.low) / self.recover,
+        )
+        phases = [
+            (self.settle, 0.0),
+            (braking, self.brake),
+            (self.hold, 0.0),
+            (recovering, self.recover),
+            (self.after, 0.0),
+        ]
         times = np.cumsum([0.0, *(length for length, _ in phases)])
-        speeds = self.cruise + np.cumsum([0.0, *(length * acceleration for length, acceleration in phases)])
+        speeds = self.cruise + np.cumsum(
+            [0.0, *(length * acceleration for length, acceleration in phases)]
+        )
         return np.asarray(np.interp(np.arange(round(times[-1] / dt) + 1) * dt, times, speeds))
 
 
@@ -76,10 +87,14 @@ class _Road:
     def __init__(self, leader_speed: Tensor, platoons: int, dt: float) -> None:
         frames = len(leader_speed)
         shape = (VEHICLES + 1, platoons, frames)
-        self.position, self.speed, self.acceleration = (leader_speed.new_full(shape, torch.nan) for _ in range(3))
+        self.position, self.speed, self.acceleration = (
+            leader_speed.new_full(shape, torch.nan) for _ in range(3)
+        )
         cruise = leader_speed[0]
         spacing = LENGTH + START_HEADWAY * cruise
-        self.position[..., 0] = -spacing * torch.arange(VEHICLES + 1, dtype=cruise.dtype, device=cruise.device)[:, None]
+        self.position[..., 0] = (
+            -spacing * torch.arange(VEHICLES + 1, dtype=cruise.dtype, device=cruise.device)[:, None]
+        )
         self.speed[..., 0], self.acceleration[..., 0] = cruise, 0.0
         self.speed[0] = leader_speed
         self.acceleration[0, :, 1:] = leader_speed.diff() / dt
@@ -93,16 +108,25 @@ class _Road:
 
     def leader(self, frame: int) -> Leader:
         """Returns whom each follower follows, one frame `(1, V N)`."""
-        position, speed, acceleration = (x[:-1, :, frame].reshape(1, -1) for x in (self.position, self.speed, self.acceleration))
+        position, speed, acceleration = (
+            x[:-1, :, frame].reshape(1, -1) for x in (self.position, self.speed, self.acceleration)
+        )
         return Leader(position, speed, acceleration, self.position.new_tensor(LENGTH))
 
     def start(self) -> Start:
         """Returns the followers' first state, `(V N,)`."""
-        return Start(*(signal[1:, :, 0].reshape(-1) for signal in (self.position, self.speed, self.acceleration)))
+        return Start(
+            *(
+                signal[1:, :, 0].reshape(-1)
+                for signal in (self.position, self.speed, self.acceleration)
+            )
+        )
 
     def put(self, frame: int, follower: Follower) -> None:
         """Writes down where the followers are."""
-        for signal, value in zip((self.position, self.speed, self.acceleration), follower, strict=False):
+        for signal, value in zip(
+            (self.position, self.speed, self.acceleration), follower, strict=False
+        ):
             signal[1:, :, frame] = value.view(VEHICLES, -1)
 
     def history(self, frame: int, length: int, platoons: slice) -> History:
@@ -111,7 +135,9 @@ class _Road:
         The first frame stands for those before it.
         """
         index = torch.arange(frame - length + 1, frame + 1, device=self.speed.device).clamp(min=0)
-        speed, acceleration, position = (x[:, platoons, index] for x in (self.speed, self.acceleration, self.position))
+        speed, acceleration, position = (
+            x[:, platoons, index] for x in (self.speed, self.acceleration, self.position)
+        )
         gap = position[:-1] - LENGTH - position[1:]
         seen = (speed[:-1], acceleration[:-1], speed[1:], acceleration[1:], gap)
         return History(*(signal.reshape(-1, length) for signal in seen))
@@ -136,8 +162,13 @@ def measure_platoons(
         return None
     chosen = {method: policies[method] for method in METHODS if method in policies}
     dt = next(iter(chosen.values()))[0].dt
-    drives = drive_platoons(model, [policy for policy, _ in chosen.values()], manoeuvre or Manoeuvre())
-    found = [(method, names, *drive) for (method, (_, names)), drive in zip(chosen.items(), drives, strict=True)]
+    drives = drive_platoons(
+        model, [policy for policy, _ in chosen.values()], manoeuvre or Manoeuvre()
+    )
+    found = [
+        (method, names, *drive)
+        for (method, (_, names)), drive in zip(chosen.items(), drives, strict=True)
+    ]
     return Platoon(
         pd.concat([_table(*one, dt) for one in found], ignore_index=True),
         pd.concat([_measures(*one, dt) for one in found], ignore_index=True),
@@ -146,7 +177,9 @@ def measure_platoons(
 
 @torch.no_grad()
 @one_thread()
-def drive_platoons(model: DrivingModel, policies: Sequence[TrainedPolicy], manoeuvre: Manoeuvre) -> list[tuple[Tensor, Tensor]]:
+def drive_platoons(
+    model: DrivingModel, policies: Sequence[TrainedPolicy], manoeuvre: Manoeuvre
+) -> list[tuple[Tensor, Tensor]]:
     """Lets each network of each policy drive a platoon. It has read no history: it knows only what it sees here.
 
     Returns:
@@ -158,21 +191,31 @@ def drive_platoons(model: DrivingModel, policies: Sequence[TrainedPolicy], manoe
     parts = [slice(sum(sizes[:k]), sum(sizes[: k + 1])) for k in range(len(sizes))]
     road = _Road(torch.as_tensor(manoeuvre.speed(dt), device=device), sum(sizes), dt)
     simulator = Simulator(model, dt, compile="never")
-    states = [policy.begin(torch.arange(n, device=device).repeat(VEHICLES)) for policy, n in zip(policies, sizes, strict=True)]
+    states = [
+        policy.begin(torch.arange(n, device=device).repeat(VEHICLES))
+        for policy, n in zip(policies, sizes, strict=True)
+    ]
     follower, parameters = simulator.begin(road.start()), {}
     for frame in range(road.speed.shape[-1] - 1):
         if frame % windows.stride == 0:
             seen = [road.history(frame, windows.length, part) for part in parts]
-            answers = [policy.act(history, state) for policy, history, state in zip(policies, seen, states, strict=True)]
+            answers = [
+                policy.act(history, state)
+                for policy, history, state in zip(policies, seen, states, strict=True)
+            ]
             states = [state for _, state in answers]
-            chosen = [answer.view(VEHICLES, n, -1) for (answer, _), n in zip(answers, sizes, strict=True)]
+            chosen = [
+                answer.view(VEHICLES, n, -1) for (answer, _), n in zip(answers, sizes, strict=True)
+            ]
             parameters = model.space.unpack(torch.cat(chosen, dim=1).flatten(0, 1))
         follower, _, _ = simulator.advance(follower, road.leader(frame), parameters)
         road.put(frame + 1, follower)
     return [(road.speed[:, part], road.gap[:, part]) for part in parts]
 
 
-def _table(method: str, names: Sequence[str], speed: Tensor, gap: Tensor, dt: float) -> pd.DataFrame:
+def _table(
+    method: str, names: Sequence[str], speed: Tensor, gap: Tensor, dt: float
+) -> pd.DataFrame:
     """Returns the drives in long form, single precision."""
     vehicles, platoons, frames = speed.shape
     nobody = torch.full_like(gap[:1], torch.nan)
@@ -189,7 +232,9 @@ def _table(method: str, names: Sequence[str], speed: Tensor, gap: Tensor, dt: fl
     )
 
 
-def _measures(method: str, names: Sequence[str], speed: Tensor, gap: Tensor, dt: float) -> pd.DataFrame:
+def _measures(
+    method: str, names: Sequence[str], speed: Tensor, gap: Tensor, dt: float
+) -> pd.DataFrame:
     """Returns a row per platoon; the columns are those of `Platoon.measures`."""
     cruise = speed[0, 0, 0]
     braking = int((speed[0, 0] < cruise).int().argmax()) - 1
@@ -205,7 +250,9 @@ def _measures(method: str, names: Sequence[str], speed: Tensor, gap: Tensor, dt:
         "drop_first": first,
         "drop_last": last,
         # Who does not slow down at all does not follow, and has nothing to amplify; who has driven through another neither.
-        "amplification": torch.where((first > TOLERANCE) & (collisions == 0), last / first, torch.nan),
+        "amplification": torch.where(
+            (first > TOLERANCE) & (collisions == 0), last / first, torch.nan
+        ),
         "head_to_tail": torch.where(collisions == 0, last / drop[0], torch.nan),
         "string_stable": (drop.diff(dim=0) <= TOLERANCE).all(0) & settled & (collisions == 0),
         "settled": settled,

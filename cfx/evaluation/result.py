@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-METHODS = ("default", "population", "fixed", "base", "policy")
+METHODS = ("default", "population", "fixed", "shrunk", "policy")
 """What an evaluation may compare, in the order in which it is shown; always on the same frames from the same measured state.
 
 `default`: the model's default parameters. `population`: one set calibrated jointly on the training drivers, none of whom is
@@ -127,7 +127,9 @@ class Platoon:
         values: dict[str, float] = {}
         for column, summary in _PLATOON_SUMMARIES.items():
             found = self.measures.groupby("method")[column].agg(summary)
-            values |= {f"platoon/{column}/{method}": float(found[method]) for method in self.methods}
+            values |= {
+                f"platoon/{column}/{method}": float(found[method]) for method in self.methods
+            }
         return values
 
 
@@ -141,20 +143,20 @@ class Evaluation:
         `collisions/METHOD`: number of pairs. `hard_braking/METHOD`: number of frames with an acceleration below -8 m/s2.
         `jerk/METHOD`, `jerk/real`: m/s3, mean over pairs of the root mean square jerk; that of the recorded drivers.
         `at_bounds/METHOD`: share of the tuned parameters' values within 1 % of their range of a bound, mean over pairs.
-        `later/rmse_speed/METHOD`, `later/rmse_improvement/BASELINE/STATISTIC`: the same beyond the first five seconds of the test
+        `steady/rmse_speed/METHOD`, `steady/rmse_improvement/BASELINE/STATISTIC`: the same beyond the first five seconds of the test
             part, where that is longer. At first a driver still comes from where he was measured.
-        `whole/...`: the same over whole drives, where those were driven.
+        `full_trajectory/...`: the same over whole drives, where those were driven.
         `platoon/MEASURE/METHOD`: see `Platoon`.
         `history/BASE/AMOUNT/rmse_improvement`: see `history`; of "80 %" the name is `80pct`, of "10 s" `10s`.
 
     Attributes:
         table: a row per pair and method: pair_id, recording, leader_id, follower_id, driver, cluster, style_score, fold, method,
-            frames, rmse_speed (m/s), rmse_gap (m), later_rmse_speed (beyond the first five seconds; NaN if there is no more),
+            frames, rmse_speed (m/s), rmse_gap (m), steady_rmse_speed (beyond the first five seconds; NaN if there is no more),
             improvement (against fixed, a fraction), `improvement_over_BASELINE` for the other baselines, collisions (1 if the gap
             became negative), hard_braking (frames with an acceleration below -8 m/s2), rms_jerk and real_rms_jerk (m/s3; of the
             simulated and of the recorded follower), at_bounds (share of the tuned parameters' values at a bound), and one column
-            `parameter_NAME` with the mean of each tuned parameter; where whole drives were driven too, `whole_rmse_speed`,
-            `whole_rmse_gap`, `whole_collisions` and `whole_hard_braking`.
+            `parameter_NAME` with the mean of each tuned parameter; where whole drives were driven too, `full_trajectory_rmse_speed`,
+            `full_trajectory_rmse_gap`, `full_trajectory_collisions` and `full_trajectory_hard_braking`.
         improvements: statistics of the policy's improvement over each baseline.
         drives: the closed loops themselves, in the order of the pairs.
         names: the tuned parameters' names.
@@ -175,10 +177,10 @@ class Evaluation:
     names: tuple[str, ...]
     units: tuple[str, ...]
     bounds: Array
-    whole_improvements: Mapping[str, Improvement] = field(default_factory=dict)
+    full_trajectory_improvements: Mapping[str, Improvement] = field(default_factory=dict)
     platoon: Platoon | None = None
     history: pd.DataFrame | None = None
-    later_improvements: Mapping[str, Improvement] = field(default_factory=dict)
+    steady_improvements: Mapping[str, Improvement] = field(default_factory=dict)
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -201,17 +203,27 @@ class Evaluation:
         for baseline, improvement in self.improvements.items():
             prefix = "rmse_improvement" if baseline == "fixed" else f"rmse_improvement/{baseline}"
             values |= {f"{prefix}/{name}": value for name, value in improvement.metrics().items()}
-        if self.later_improvements:
-            means = by_method["later_rmse_speed"].mean()
-            values |= {f"later/rmse_speed/{method}": float(means[method]) for method in self.methods}
-        for part, improvements in (("later", self.later_improvements), ("whole", self.whole_improvements)):
+        if self.steady_improvements:
+            means = by_method["steady_rmse_speed"].mean()
+            values |= {
+                f"steady/rmse_speed/{method}": float(means[method]) for method in self.methods
+            }
+        for part, improvements in (
+            ("steady", self.steady_improvements),
+            ("full_trajectory", self.full_trajectory_improvements),
+        ):
             for baseline, improvement in improvements.items():
-                values |= {f"{part}/rmse_improvement/{baseline}/{name}": v for name, v in improvement.metrics().items()}
+                values |= {
+                    f"{part}/rmse_improvement/{baseline}/{name}": v
+                    for name, v in improvement.metrics().items()
+                }
         values |= self._safety_metrics()
-        if self.whole_improvements:
+        if self.full_trajectory_improvements:
             for column in ("rmse_speed", "rmse_gap"):
                 means = by_method[f"whole_{column}"].mean()
-                values |= {f"whole/{column}/{m}": float(means[m]) for m in self._whole_methods}
+                values |= {
+                    f"whole/{column}/{m}": float(means[m]) for m in self._full_trajectory_methods
+                }
         if self.platoon is not None:
             values |= self.platoon.metrics()
         if self.history is not None:
@@ -221,8 +233,8 @@ class Evaluation:
         return values
 
     @property
-    def _whole_methods(self) -> tuple[str, ...]:
-        return (*self.whole_improvements, "policy")
+    def _full_trajectory_methods(self) -> tuple[str, ...]:
+        return (*self.full_trajectory_improvements, "policy")
 
     def _safety_metrics(self) -> dict[str, float]:
         """Returns counts and means of what a protocol measured; one that makes its own table may leave all but collisions out."""
@@ -233,22 +245,29 @@ class Evaluation:
                 found = by_method[column].agg(summary)
                 values |= {f"{name}/{method}": float(found[method]) for method in self.methods}
         if "real_rms_jerk" in self.table:
-            values["jerk/real"] = float(self.table.drop_duplicates("pair_id")["real_rms_jerk"].mean())
+            values["jerk/real"] = float(
+                self.table.drop_duplicates("pair_id")["real_rms_jerk"].mean()
+            )
         for column in ("collisions", "hard_braking"):
-            if self.whole_improvements and f"whole_{column}" in self.table:
+            if self.full_trajectory_improvements and f"whole_{column}" in self.table:
                 found = by_method[f"whole_{column}"].sum()
-                values |= {f"whole/{column}/{method}": float(found[method]) for method in self._whole_methods}
+                values |= {
+                    f"whole/{column}/{method}": float(found[method])
+                    for method in self._full_trajectory_methods
+                }
         return values
 
-    def drives_table(self) -> pd.DataFrame:
+    def trajectories_table(self) -> pd.DataFrame:
         """Returns the closed loops in long form, SI units.
 
         Columns: pair_id, time_s, leader_speed, real_speed, real_gap; for each method speed_METHOD, gap_METHOD and, for each tuned
         parameter, NAME_METHOD. A pair's first row is the last measured state before the simulation takes over.
         """
-        return pd.concat([self._drive_table(drive) for drive in self.drives], ignore_index=True)
+        return pd.concat(
+            [self._trajectory_table(drive) for drive in self.drives], ignore_index=True
+        )
 
-    def _drive_table(self, drive: Drive) -> pd.DataFrame:
+    def _trajectory_table(self, drive: Drive) -> pd.DataFrame:
         columns: dict[str, object] = {
             "pair_id": drive.pair_id,
             "time_s": drive.time,
@@ -258,5 +277,8 @@ class Evaluation:
         }
         for method in self.methods:
             columns |= {f"speed_{method}": drive.speed[method], f"gap_{method}": drive.gap[method]}
-            columns |= {f"{name}_{method}": drive.parameters[method][:, k] for k, name in enumerate(self.names)}
+            columns |= {
+                f"{name}_{method}": drive.parameters[method][:, k]
+                for k, name in enumerate(self.names)
+            }
         return pd.DataFrame(columns)

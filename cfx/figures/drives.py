@@ -29,7 +29,7 @@ from cfx.figures.look import (
 )
 
 Array = NDArray[np.float64]
-_SHOWN = tuple(method for method in METHODS if method != "base")
+_SHOWN = tuple(method for method in METHODS if method != "shrunk")
 """The methods whose lines share axes: one more than these and nobody tells them apart. Tables and pages have them all."""
 
 _ROOM = 1.5
@@ -37,7 +37,9 @@ _ROOM = 1.5
 
 
 @styled
-def drives(evaluation: Evaluation, pair_id: str | Sequence[str] | None = None, n: int = 3) -> Figure:
+def drives(
+    evaluation: Evaluation, pair_id: str | Sequence[str] | None = None, n: int = 3
+) -> Figure:
     """Speed and gap over the test part: the real driver against default, fixed and policy; a row per pair.
 
     Args:
@@ -55,7 +57,10 @@ def drives(evaluation: Evaluation, pair_id: str | Sequence[str] | None = None, n
         rows = _rows(evaluation, drive.pair_id)
         methods = _shown(drive.speed)
         method_line(speed_axes, "leader", drive.time, drive.leader_speed)
-        for axes, real, simulated in ((speed_axes, drive.real_speed, drive.speed), (gap_axes, drive.real_gap, drive.gap)):
+        for axes, real, simulated in (
+            (speed_axes, drive.real_speed, drive.speed),
+            (gap_axes, drive.real_gap, drive.gap),
+        ):
             method_line(axes, "real", drive.time, real)
             for method in methods:
                 method_line(axes, method, drive.time, _finite(simulated[method]))
@@ -72,7 +77,11 @@ def drives(evaluation: Evaluation, pair_id: str | Sequence[str] | None = None, n
         gap_axes.set_ylabel("gap (m)")
         improvement = rows["policy"]["improvement"]
         change = percent(improvement) if np.isfinite(improvement) else "improvement undefined"
-        _two_line_title(speed_axes, f"{label}{short(drive.pair_id)}:  {change}", _rmse(rows, "rmse_speed", "m/s"))
+        _two_line_title(
+            speed_axes,
+            f"{label}{short(drive.pair_id)}:  {change}",
+            _rmse(rows, "rmse_speed", "m/s"),
+        )
         _two_line_title(gap_axes, "", _rmse(rows, "rmse_gap", "m"))
         for axes in (speed_axes, gap_axes):
             axes.margins(x=0.01)
@@ -106,7 +115,9 @@ def speeds(evaluation: Evaluation, pair_id: str | None = None) -> Figure:
         method_line(axes, "real", drive.time, drive.real_speed)
         method_line(axes, method, drive.time, _finite(drive.speed[method]))
         _frame(axes, [drive.real_speed, drive.speed[method]], None, "m/s")
-        _two_line_title(axes, "", f"{LABELS[method]}: RMSE of speed {rows[method]['rmse_speed']:.3f} m/s")
+        _two_line_title(
+            axes, "", f"{LABELS[method]}: RMSE of speed {rows[method]['rmse_speed']:.3f} m/s"
+        )
         axes.set_ylabel("speed (m/s)")
         axes.margins(x=0.01)
     panels[-1].set_xlabel("time from the start of the pair (s)")
@@ -144,7 +155,11 @@ def chosen_parameters(evaluation: Evaluation, pair_id: str | None = None) -> Fig
     # The speeds take the cells that the parameters leave over, so that the grid has no hole.
     span = rows * columns - count
     speeds = figure.add_subplot(grid[0, :span])
-    for signal, values in (("leader", drive.leader_speed), ("real", drive.real_speed), ("policy", drive.speed.get("policy"))):
+    for signal, values in (
+        ("leader", drive.leader_speed),
+        ("real", drive.real_speed),
+        ("policy", drive.speed.get("policy")),
+    ):
         if values is not None:
             method_line(speeds, signal, drive.time, _finite(values))
     speeds.set_title("speed (m/s)")
@@ -153,7 +168,9 @@ def chosen_parameters(evaluation: Evaluation, pair_id: str | None = None) -> Fig
         axes = figure.add_subplot(grid[divmod(k + span, columns)], sharex=speeds)
         _parameter(axes, drive, k, name, unit, evaluation.bounds[:, k])
         panels.append(axes)
-    speeds.xaxis.set_major_locator(MaxNLocator(12 // columns, integer=True))  # shared by all; labels of small axes must not touch
+    speeds.xaxis.set_major_locator(
+        MaxNLocator(12 // columns, integer=True)
+    )  # shared by all; labels of small axes must not touch
     for axes in panels:
         axes.margins(x=0.01)
         axes.tick_params(labelbottom=axes in panels[-columns:])
@@ -190,7 +207,9 @@ def _parameter(axes: Axes, drive: Drive, k: int, name: str, unit: str, bounds: A
     axes.set_title(f"{unit_label(name, unit)}, {number(low)} to {number(high)}")
 
 
-def _choose(evaluation: Evaluation, pair_id: str | Sequence[str] | None, n: int) -> list[tuple[str, Drive]]:
+def _choose(
+    evaluation: Evaluation, pair_id: str | Sequence[str] | None, n: int
+) -> list[tuple[str, Drive]]:
     """Returns (label, drive) of the pairs to show."""
     by_id = {drive.pair_id: drive for drive in evaluation.drives}
     if pair_id is not None:
@@ -201,10 +220,18 @@ def _choose(evaluation: Evaluation, pair_id: str | Sequence[str] | None, n: int)
         return [("pair ", by_id[name]) for name in wanted]
     policy = evaluation.table[evaluation.table["method"] == "policy"]
     improvement = pd.Series(policy["improvement"].to_numpy(dtype=float), index=policy["pair_id"])
-    ranked = [name for name in improvement[np.isfinite(improvement)].sort_values(ascending=False).index if name in by_id]
+    ranked = [
+        name
+        for name in improvement[np.isfinite(improvement)].sort_values(ascending=False).index
+        if name in by_id
+    ]
     if not ranked:
         return [("pair ", drive) for drive in evaluation.drives[:n]]
-    places = [len(ranked) // 2] if n == 1 else sorted({round(x) for x in np.linspace(0, len(ranked) - 1, min(n, len(ranked)))})
+    places = (
+        [len(ranked) // 2]
+        if n == 1
+        else sorted({round(x) for x in np.linspace(0, len(ranked) - 1, min(n, len(ranked)))})
+    )
     return [(_rank(place, len(ranked), n), by_id[ranked[place]]) for place in places]
 
 
@@ -225,15 +252,25 @@ def _shown(present: Collection[str]) -> list[str]:
 
 def _rows(evaluation: Evaluation, pair_id: str) -> dict[str, dict[str, float]]:
     """Returns method -> column -> value of one pair."""
-    rows = evaluation.table[evaluation.table["pair_id"] == pair_id].drop_duplicates("method").set_index("method")
+    rows = (
+        evaluation.table[evaluation.table["pair_id"] == pair_id]
+        .drop_duplicates("method")
+        .set_index("method")
+    )
     columns = ("rmse_speed", "rmse_gap", "improvement")
-    return {str(method): {column: float(rows[column][method]) for column in columns} for method in rows.index}
+    return {
+        str(method): {column: float(rows[column][method]) for column in columns}
+        for method in rows.index
+    }
 
 
 def _rmse(rows: dict[str, dict[str, float]], column: str, unit: str) -> str:
     values = [(method, rows[method][column]) for method in _shown(rows)]
     what = "speed" if column == "rmse_speed" else "gap"
-    listed = ", ".join(f"{method} {value:.2f}" if np.isfinite(value) else f"{method} none" for method, value in values)
+    listed = ", ".join(
+        f"{method} {value:.2f}" if np.isfinite(value) else f"{method} none"
+        for method, value in values
+    )
     return f"RMSE of {what}: {listed} {unit}"
 
 

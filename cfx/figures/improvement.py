@@ -43,11 +43,18 @@ def improvement_per_driver(evaluation: Evaluation) -> Figure:
     low, high = _limits(shown, evaluation.improvement)
     clipped = np.clip(shown, low, high)
     places = np.arange(len(shown), dtype=float)
-    axes.bar(places, clipped, width=0.82, color=np.where(shown > 0, COLOURS["policy"], COLOURS["fixed"]).tolist())
+    axes.bar(
+        places,
+        clipped,
+        width=0.82,
+        color=np.where(shown > 0, COLOURS["policy"], COLOURS["fixed"]).tolist(),
+    )
     axes.axhline(0, color=INK, linewidth=0.9)
     _label_clipped(axes, places, shown, low, high)
     handles = [
-        Patch(color=COLOURS["policy"], label=f"policy closer to the driver: {int((shown > 0).sum())}"),
+        Patch(
+            color=COLOURS["policy"], label=f"policy closer to the driver: {int((shown > 0).sum())}"
+        ),
         Patch(color=COLOURS["fixed"], label=f"fixed closer, or equal: {int((shown <= 0).sum())}"),
         *_statistics(axes, evaluation.improvement, low),
     ]
@@ -56,7 +63,9 @@ def improvement_per_driver(evaluation: Evaluation) -> Figure:
     middle, half = (len(shown) - 1) / 2, max(len(shown), 8) / 2 + 0.3
     axes.set_xlim(middle - half, middle + half)
     axes.grid(visible=False, axis="x")
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: percent(value) if value else "0 %"))
+    axes.yaxis.set_major_formatter(
+        FuncFormatter(lambda value, _: percent(value) if value else "0 %")
+    )
     axes.set_ylabel("improvement of the RMSE of speed\nover fixed parameters (%)")
     if named:
         axes.set_xticks(places, ticks, rotation=90, fontsize=8.5)
@@ -66,10 +75,22 @@ def improvement_per_driver(evaluation: Evaluation) -> Figure:
     undefined = int((~finite).sum())
     note = f"; {undefined} without a defined improvement" if undefined else ""
     where = f" of {short(prefix.rstrip(_SEPARATORS), 30)}" if prefix and named else ""
-    axes.set_xlabel(f"{len(shown)} pair{'' if len(shown) == 1 else 's'}{where}, best to worst{note}")
+    axes.set_xlabel(
+        f"{len(shown)} pair{'' if len(shown) == 1 else 's'}{where}, best to worst{note}"
+    )
     if not len(shown):
-        axes.text(0.5, 0.75, "no pair has a defined improvement", transform=axes.transAxes, ha="center", va="center", color=INK)
-    figure.legend(handles=handles, loc="outside upper center", ncols=3, columnspacing=1.8, handlelength=1.8)
+        axes.text(
+            0.5,
+            0.75,
+            "no pair has a defined improvement",
+            transform=axes.transAxes,
+            ha="center",
+            va="center",
+            color=INK,
+        )
+    figure.legend(
+        handles=handles, loc="outside upper center", ncols=3, columnspacing=1.8, handlelength=1.8
+    )
     return figure
 
 
@@ -79,7 +100,10 @@ def _common_prefix(names: list[str]) -> str:
         return ""
     # The first and the last in alphabetical order differ earliest.
     first, last = min(names), max(names)
-    same = next((k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), min(len(first), len(last)))
+    same = next(
+        (k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b),
+        min(len(first), len(last)),
+    )
     return first[: max(first.rfind(mark, 0, same) for mark in _SEPARATORS) + 1]
 
 
@@ -107,7 +131,14 @@ def _limits(values: Array, summary: Improvement) -> tuple[float, float]:
 def _label_clipped(axes: Axes, places: Array, values: Array, low: float, high: float) -> None:
     cut = np.flatnonzero(values < low)
     for rank, index in enumerate(cut):
-        axes.plot(places[index], low + 0.035 * (high - low), marker="v", color="white", markersize=5, zorder=4)
+        axes.plot(
+            places[index],
+            low + 0.035 * (high - low),
+            marker="v",
+            color="white",
+            markersize=5,
+            zorder=4,
+        )
         if len(cut) <= 8 or rank == len(cut) - 1:
             axes.annotate(
                 percent(float(values[index])),
@@ -128,7 +159,14 @@ def _statistics(axes: Axes, summary: Improvement, low: float) -> list[Line2D | P
     """Draws the summary's lines and returns their legend entries, which carry the numbers."""
     handles: list[Line2D | Patch] = []
     if np.isfinite(summary.ci95_low) and np.isfinite(summary.ci95_high):
-        axes.axhspan(summary.ci95_low, summary.ci95_high, color="#000000", alpha=0.13, linewidth=0, zorder=0.5)
+        axes.axhspan(
+            summary.ci95_low,
+            summary.ci95_high,
+            color="#000000",
+            alpha=0.13,
+            linewidth=0,
+            zorder=0.5,
+        )
         text = f"95 % interval of the mean: {percent(summary.ci95_low, 1)} to {percent(summary.ci95_high, 1)}"
         handles.append(Patch(color="#000000", alpha=0.13, label=text))
     lines: tuple[tuple[str, float, Any, float], ...] = (
@@ -142,5 +180,14 @@ def _statistics(axes: Axes, summary: Improvement, low: float) -> list[Line2D | P
             axes.axhline(value, color="black", linestyle=dash, linewidth=width, zorder=3)
             outside = " (below the axis)" if value < low else ""
         text = percent(value, 1) if np.isfinite(value) else "undefined"
-        handles.append(Line2D([], [], color="black", linestyle=dash, linewidth=width, label=f"{name} {text}{outside}"))
+        handles.append(
+            Line2D(
+                [],
+                [],
+                color="black",
+                linestyle=dash,
+                linewidth=width,
+                label=f"{name} {text}{outside}",
+            )
+        )
     return handles

@@ -11,7 +11,10 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from cfx.figures.look import INK, TRAIN_COLOUR, VALIDATION_COLOUR, canvas, styled
 from cfx.learners.curves import over_networks
 
-_COLUMNS = {"train_loss": ("training", TRAIN_COLOUR), "validation_loss": ("validation", VALIDATION_COLOUR)}
+_COLUMNS = {
+    "train_loss": ("training", TRAIN_COLOUR),
+    "validation_loss": ("validation", VALIDATION_COLOUR),
+}
 
 
 @styled
@@ -37,7 +40,15 @@ def learning_curve(curves: pd.DataFrame) -> Figure:
     axes.set_ylabel("loss (as the learner defines it)")
     axes.margins(x=0.01)
     if not len(values):
-        axes.text(0.5, 0.5, "no loss was measured", transform=axes.transAxes, ha="center", va="center", color=INK)
+        axes.text(
+            0.5,
+            0.5,
+            "no loss was measured",
+            transform=axes.transAxes,
+            ha="center",
+            va="center",
+            color=INK,
+        )
     what = f"{networks} networks: median and quartiles" if networks > 1 else "one network"
     figure.legend(loc="outside upper center", ncols=2, title=what, title_fontsize=10.5)
     return figure
@@ -50,7 +61,15 @@ def _curve(axes: Axes, losses: pd.DataFrame, label: str, colour: str) -> np.ndar
     q1, median, q3 = (losses.quantile(q, axis=1).to_numpy() for q in (0.25, 0.5, 0.75))
     epochs = losses.index.to_numpy()
     few = len(epochs) < 3
-    axes.plot(epochs, median, color=colour, linewidth=2.0, marker="o" if few else None, label=label, zorder=3)
+    axes.plot(
+        epochs,
+        median,
+        color=colour,
+        linewidth=2.0,
+        marker="o" if few else None,
+        label=label,
+        zorder=3,
+    )
     if losses.shape[1] > 1:
         axes.fill_between(epochs, q1, q3, color=colour, alpha=0.25, linewidth=0)
     return np.concatenate([q1, median, q3])

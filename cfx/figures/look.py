@@ -27,7 +27,7 @@ COLOURS = {
     "default": "#009e73",
     "population": "#aa4499",
     "fixed": "#0072b2",
-    "base": "#7a5c3e",
+    "shrunk": "#7a5c3e",
     "policy": "#d55e00",
 }
 DASHES: dict[str, Any] = {
@@ -36,17 +36,25 @@ DASHES: dict[str, Any] = {
     "default": (0, (1.2, 1.4)),
     "population": (0, (6.0, 1.5, 1.2, 1.5)),
     "fixed": (0, (5.0, 1.8)),
-    "base": (0, (8.0, 1.5, 1.2, 1.5, 1.2, 1.5)),
+    "shrunk": (0, (8.0, 1.5, 1.2, 1.5, 1.2, 1.5)),
     "policy": "solid",
 }
-WIDTHS = {"real": 1.8, "leader": 1.0, "default": 1.6, "population": 1.6, "fixed": 1.6, "base": 1.6, "policy": 1.8}
+WIDTHS = {
+    "real": 1.8,
+    "leader": 1.0,
+    "default": 1.6,
+    "population": 1.6,
+    "fixed": 1.6,
+    "shrunk": 1.6,
+    "policy": 1.8,
+}
 LABELS = {
     "real": "real driver",
     "leader": "leader",
     "default": "default parameters",
     "population": "population's parameters",
     "fixed": "own fixed parameters",
-    "base": "own parameters, drawn",
+    "shrunk": "own parameters, shrunk",
     "policy": "policy",
 }
 CLUSTER_COLOURS = ("#56b4e9", "#8c8c8c", "#e69f00")
@@ -107,7 +115,15 @@ def canvas(height: float, width: float = WIDTH) -> Figure:
 def method_line(axes: Axes, method: str, time: Any, values: Any, *, steps: bool = False) -> None:
     """Draws a method's signal in its colour and dash; `steps` for what holds until the next frame."""
     # The real driver lies on top of leader and baselines, and below the policy that is compared with it.
-    order = {"leader": 2.0, "default": 2.2, "population": 2.25, "fixed": 2.3, "base": 2.35, "real": 2.4, "policy": 2.5}[method]
+    order = {
+        "leader": 2.0,
+        "default": 2.2,
+        "population": 2.25,
+        "fixed": 2.3,
+        "shrunk": 2.35,
+        "real": 2.4,
+        "policy": 2.5,
+    }[method]
     axes.plot(
         time,
         values,
@@ -121,7 +137,17 @@ def method_line(axes: Axes, method: str, time: Any, values: Any, *, steps: bool 
 
 def method_handles(methods: Iterable[str]) -> list[Line2D]:
     """Returns legend entries."""
-    return [Line2D([], [], color=COLOURS[m], linestyle=DASHES[m], linewidth=WIDTHS[m] + 0.4, label=LABELS[m]) for m in methods]
+    return [
+        Line2D(
+            [],
+            [],
+            color=COLOURS[m],
+            linestyle=DASHES[m],
+            linewidth=WIDTHS[m] + 0.4,
+            label=LABELS[m],
+        )
+        for m in methods
+    ]
 
 
 def short(name: str, limit: int = 26) -> str:

@@ -43,7 +43,9 @@ def worst_platoon(table: pd.DataFrame) -> tuple[pd.DataFrame, str]:
     Args:
         table: one method's rows of a platoon's table.
     """
-    last = table[(table["vehicle"] == table["vehicle"].max()) & (table["time_s"] >= braking_time(table))]
+    last = table[
+        (table["vehicle"] == table["vehicle"].max()) & (table["time_s"] >= braking_time(table))
+    ]
     network = last.loc[last["speed"].idxmin(), "network"]
     return table[table["network"] == network], str(network)
 
@@ -68,20 +70,34 @@ def _speeds(axes: Axes, rows: pd.DataFrame) -> None:
         k = int(str(vehicle))
         colour = COLOURS["real"] if k == 0 else vehicle_colour(k, last)
         axes.plot(
-            drive["time_s"] - begin, drive["speed"], color=colour, linewidth=2.0 if k == 0 else 1.3, zorder=3 if k == 0 else 2
+            drive["time_s"] - begin,
+            drive["speed"],
+            color=colour,
+            linewidth=2.0 if k == 0 else 1.3,
+            zorder=3 if k == 0 else 2,
         )
     crashed = shown[shown["gap"] < 0]
     for _, drive in crashed.groupby("vehicle"):
         hit = drive.iloc[0]
         axes.plot(
-            hit["time_s"] - begin, hit["speed"], marker="X", color="#d00000", markeredgecolor="white", markersize=9, zorder=4
+            hit["time_s"] - begin,
+            hit["speed"],
+            marker="X",
+            color="#d00000",
+            markeredgecolor="white",
+            markersize=9,
+            zorder=4,
         )
     axes.margins(x=0.01)
 
 
 def _title(method: str, measures: pd.DataFrame, network: str) -> str:
     many, stable = len(measures) > 1, int(measures["string_stable"].sum())
-    said = f"{stable} of {len(measures)} platoons are string stable" if many else f"{'' if stable else 'not '}string stable"
+    said = (
+        f"{stable} of {len(measures)} platoons are string stable"
+        if many
+        else f"{'' if stable else 'not '}string stable"
+    )
     factor = float(measures.set_index("network")["head_to_tail"][network])
     times = f"{number(factor)} times the leader's drop" if np.isfinite(factor) else "undefined"
     return f"{LABELS[method]}\n{said}\nlast follower: {times}"
@@ -92,5 +108,14 @@ def _handles() -> list[Line2D]:
         Line2D([], [], color=COLOURS["real"], linewidth=2.0, label="leader"),
         Line2D([], [], color=vehicle_colour(1, 10), linewidth=1.6, label="first follower"),
         Line2D([], [], color=vehicle_colour(10, 10), linewidth=1.6, label="last follower"),
-        Line2D([], [], color="#d00000", marker="X", linestyle="none", markeredgecolor="white", markersize=9, label="collision"),
+        Line2D(
+            [],
+            [],
+            color="#d00000",
+            marker="X",
+            linestyle="none",
+            markeredgecolor="white",
+            markersize=9,
+            label="collision",
+        ),
     ]

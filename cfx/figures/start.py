@@ -23,7 +23,9 @@ def error_over_time(evaluation: Evaluation) -> Figure:
     """
     figure = canvas(3.9)
     methods = evaluation.methods
-    for axes, signal, unit in zip(figure.subplots(1, 2), ("speed", "gap"), ("m/s", "m"), strict=True):
+    for axes, signal, unit in zip(
+        figure.subplots(1, 2), ("speed", "gap"), ("m/s", "m"), strict=True
+    ):
         for method in methods:
             seconds, error = errors_over_time(evaluation.drives, method, signal)
             method_line(axes, method, seconds, error)
@@ -48,4 +50,6 @@ def errors_over_time(drives: Sequence[Drive], method: str, signal: str) -> tuple
         real = drive.real_speed if signal == "speed" else drive.real_gap
         row[: len(real)] = getattr(drive, signal)[method] - real
     frames = int((np.isfinite(errors).mean(0) >= _LEAST).sum())
-    return longest.time[:frames] - longest.time[0], np.sqrt(np.nanmean(errors[:, :frames] ** 2, axis=0))
+    return longest.time[:frames] - longest.time[0], np.sqrt(
+        np.nanmean(errors[:, :frames] ** 2, axis=0)
+    )

@@ -61,13 +61,25 @@ def _histogram(axes: Axes, style: StyleResult) -> None:
         if np.isfinite(cut):
             axes.axvline(cut, color=INK, linestyle=(0, (4, 2)), linewidth=1.2)
             gap = " " if side == "left" else ""
-            axes.text(cut, 1.19 * top, f"{gap}{cut:.3f}{' ' if not gap else ''}", ha=side, va="top", color=INK)
+            axes.text(
+                cut,
+                1.19 * top,
+                f"{gap}{cut:.3f}{' ' if not gap else ''}",
+                ha=side,
+                va="top",
+                color=INK,
+            )
     axes.yaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     axes.grid(visible=False, axis="x")
     missing = int((~finite).sum())
-    axes.set_xlabel("style score (0 calm, 1 aggressive)" + (f"; {missing} drivers without a score" if missing else ""))
+    axes.set_xlabel(
+        "style score (0 calm, 1 aggressive)"
+        + (f"; {missing} drivers without a score" if missing else "")
+    )
     axes.set_ylabel("drivers")
-    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, handlelength=1.0, columnspacing=1.4)
+    axes.legend(
+        loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, handlelength=1.0, columnspacing=1.4
+    )
 
 
 def _edges(scores: np.ndarray) -> np.ndarray:

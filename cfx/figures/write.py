@@ -19,11 +19,13 @@ from cfx.figures.look import DPI, look
 from cfx.figures.platoon import platoons
 from cfx.figures.start import error_over_time
 from cfx.figures.style import style_distribution
-from cfx.files import whole
+from cfx.files import atomic_write
 from cfx.style.result import StyleResult
 
 
-def write_figures(folder: Path, evaluation: Evaluation, style: StyleResult, curves: pd.DataFrame) -> list[Path]:
+def write_figures(
+    folder: Path, evaluation: Evaluation, style: StyleResult, curves: pd.DataFrame
+) -> list[Path]:
     """Draws and writes all figures of a job as PNG; returns their paths.
 
     Args:
@@ -60,7 +62,7 @@ def write_figure(figure: Figure, path: Path) -> Path:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with whole(path) as partial, look(), warnings.catch_warnings():
+        with atomic_write(path) as partial, look(), warnings.catch_warnings():
             # A name in a script that the font lacks shows boxes; the names themselves are in pairs.csv.
             warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
             figure.savefig(partial, format="png", dpi=DPI, metadata={"Software": None})

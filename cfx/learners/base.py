@@ -1,6 +1,6 @@
 """The contract of a learner: it trains the networks that a policy builds.
 
-Letters: P pairs, N networks, W windows of the longest training part, n tuned parameters.
+Shapes: P pairs, N networks, W windows of the longest training part, n tuned parameters.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ CURVE_COLUMNS = ["network", "epoch", "train_loss", "validation_loss"]
 
 
 @dataclass(frozen=True)
-class Lesson:
+class TrainingData:
     """What a learner may see: the training part of some pairs.
 
     Attributes:
@@ -62,7 +62,7 @@ class Lesson:
 
 
 @dataclass(frozen=True)
-class Learned:
+class TrainingResult:
     """What a learner returns.
 
     Attributes:
@@ -70,7 +70,7 @@ class Learned:
         scaler: how their tokens are normalised.
         curves: columns network, epoch, train_loss, validation_loss (NaN where not measured).
         base: `(N, n)`, SI units: the parameters that answers are offsets from (`cfx.policies.offsets`) for a driver who brings
-            none of his own; the networks then read tokens with the base appended, and answer in the model's `reach`. None:
+            none of his own; the networks then read tokens with the base appended, and answer in the model's `adaptation_bounds`. None:
             answers are the parameters themselves, in its `space`.
     """
 
@@ -83,19 +83,19 @@ class Learned:
 class Learner(Component):
     """Base of every learner.
 
-    Life cycle: a protocol makes a `Lesson` (with window labels if `needs_labels`) and calls `fit` once. Networks are
+    Life cycle: a protocol makes a `TrainingData` (with window labels if `needs_labels`) and calls `fit` once. Networks are
     independent: what one learns does not depend on which others are trained beside it.
 
     Attributes:
         needs_labels: whether the protocol must find window labels first.
         needs_gradients: whether it differentiates through the simulation.
-        reads_traits: whether its networks are told drivers' traits (`policy.traits`), and know what strangers are.
+        uses_driver_features: whether its networks are told drivers' driver features (`policy.driver_features`), and know what unseen drivers are.
     """
 
     kind = "learner"
     needs_labels: ClassVar[bool] = False
     needs_gradients: ClassVar[bool] = False
-    reads_traits: ClassVar[bool] = False
+    uses_driver_features: ClassVar[bool] = False
 
     @property
     def reads_history(self) -> bool:
@@ -119,18 +119,18 @@ class Learner(Component):
                 " learner=imitation"
             )
 
-    def require_no_traits(self, policy: Policy) -> None:
+    def require_no_driver_features(self, policy: Policy) -> None:
         """Checks that a policy is not to be told what this learner cannot tell it; a job asks before any work begins.
 
         Raises:
-            ConfigError: the policy has traits.
+            ConfigError: the policy has driver features.
         """
-        if policy.traits and not self.reads_traits:
+        if policy.driver_features and not self.uses_driver_features:
             raise ConfigError(
-                f"policy.traits={list(policy.traits)}: this learner tells its networks nothing of drivers; choose"
-                " learner=rollout, or policy.traits=none"
+                f"policy.driver_features={list(policy.driver_features)}: this learner tells its networks nothing of drivers; choose"
+                " learner=rollout, or policy.driver_features=none"
             )
 
     @abstractmethod
-    def fit(self, policy: Policy, lesson: Lesson) -> Learned:
-        """Trains the networks of `policy` on `lesson`."""
+    def fit(self, policy: Policy, training_data: TrainingData) -> TrainingResult:
+        """Trains the networks of `policy` on `training data`."""

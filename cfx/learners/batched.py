@@ -19,7 +19,7 @@ import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from torch import Tensor
 
-from cfx.files import whole
+from cfx.files import atomic_write
 from cfx.learners.base import CURVE_COLUMNS
 from cfx.policies.base import PolicyNetwork
 from cfx.policies.trained import driver_places
@@ -46,7 +46,9 @@ class Grid:
 
     def mean(self, values: Tensor) -> Tensor:
         """Returns the mean of `(P, n)` over each network's pairs, `(N, n)`."""
-        total = values.new_zeros((self.shape[0], values.shape[1])).index_add_(0, self.network, values)
+        total = values.new_zeros((self.shape[0], values.shape[1])).index_add_(
+            0, self.network, values
+        )
         return total / torch.bincount(self.network, minlength=self.shape[0])[:, None]
 
 
@@ -73,22 +75,24 @@ class BatchedModule(pl.LightningModule):
         settings: Training,
         on_epoch: Callable[[], None] = lambda: None,
         *,
-        members: int = 1,
+        ensemble_size: int = 1,
     ) -> None:
         super().__init__()
         self.network = network
         self.names = names
-        self.members = members
+        self.ensemble_size = ensemble_size
         self.training_settings = settings
         self.on_epoch = on_epoch
         self.best = {key: value.detach().clone() for key, value in network.named_parameters()}
-        self.best_loss = torch.full((len(names) * members,), math.inf)
-        self.stale = torch.zeros(len(names) * members, dtype=torch.int64)
+        self.best_loss = torch.full((len(names) * ensemble_size,), math.inf)
+        self.stale = torch.zeros(len(names) * ensemble_size, dtype=torch.int64)
         self.rows: list[tuple[Tensor, Tensor]] = []
 
     def configure_optimizers(self) -> Any:
         s = self.training_settings
-        return torch.optim.AdamW(self.network.parameters(), lr=s.learning_rate, weight_decay=s.weight_decay)
+        return torch.optim.AdamW(
+            self.network.parameters(), lr=s.learning_rate, weight_decay=s.weight_decay
+        )
 
     def configure_gradient_clipping(self, optimizer: Any, *args: Any, **kwargs: Any) -> None:
         """Clips each network's gradient on its own: a norm over all would couple them."""
@@ -105,7 +109,11 @@ class BatchedModule(pl.LightningModule):
         self.rows.append((train, validation))
         loss = torch.where(validation.isnan(), train, validation)
         patience = self.training_settings.patience
-        active = torch.ones_like(self.stale, dtype=torch.bool) if patience is None else self.stale < patience
+        active = (
+            torch.ones_like(self.stale, dtype=torch.bool)
+            if patience is None
+            else self.stale < patience
+        )
         better = (loss < self.best_loss) & active
         self.best_loss = torch.where(better, loss, self.best_loss)
         self.stale = torch.where(better, 0, self.stale + (active & (not hopeful)).long())
@@ -123,7 +131,12 @@ class BatchedModule(pl.LightningModule):
                 value.copy_(self.best[key])
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        kept = {"best": self.best, "best_loss": self.best_loss, "stale": self.stale, "rows": self.rows}
+        kept = {
+            "best": self.best,
+            "best_loss": self.best_loss,
+            "stale": self.stale,
+            "rows": self.rows,
+        }
         checkpoint["batched"] = kept
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -146,16 +159,20 @@ class BatchedModule(pl.LightningModule):
             )
             for epoch, (train, validation) in enumerate(self.rows)
         ]
-        return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=CURVE_COLUMNS)
+        return (
+            pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=CURVE_COLUMNS)
+        )
 
     def _mean(self, losses: Tensor) -> list[float]:
-        return losses.view(-1, self.members).mean(1).tolist()
+        return losses.view(-1, self.ensemble_size).mean(1).tolist()
 
 
 def clip_each(network: PolicyNetwork, largest: float) -> None:
     """Scales each network's gradient to a norm of at most `largest`; a gradient that is not finite becomes 0."""
     gradients = [parameter.grad for parameter in network.parameters() if parameter.grad is not None]
-    norm = torch.stack([gradient.square().flatten(1).sum(1) for gradient in gradients]).sum(0).sqrt()
+    norm = (
+        torch.stack([gradient.square().flatten(1).sum(1) for gradient in gradients]).sum(0).sqrt()
+    )
     scale = torch.where(norm.isfinite(), (largest / norm.clamp(min=1e-12)).clamp(max=1.0), 0.0)
     for gradient in gradients:
         gradient.nan_to_num_(0.0, 0.0, 0.0).mul_(scale.view(-1, *[1] * (gradient.dim() - 1)))
@@ -197,7 +214,9 @@ def fit(
         with warnings.catch_warnings(), one_thread(), task:
             warnings.filterwarnings("ignore", module=r"lightning\.")
             # torch's compiler looks at everything that it is given.
-            warnings.filterwarnings("ignore", message=r"The \.grad attribute of a Tensor that is not a leaf")
+            warnings.filterwarnings(
+                "ignore", message=r"The \.grad attribute of a Tensor that is not a leaf"
+            )
             _run(trainer, module, data, checkpoint)
     module.restore_best()
     module.network.to(device).eval()
@@ -215,17 +234,24 @@ class EveryEpoch(ModelCheckpoint):
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        with whole(self.path) as temporary:
+        with atomic_write(self.path) as temporary:
             trainer.save_checkpoint(temporary)
 
 
-def _run(trainer: pl.Trainer, module: BatchedModule, data: pl.LightningDataModule, checkpoint: Path | None) -> None:
+def _run(
+    trainer: pl.Trainer,
+    module: BatchedModule,
+    data: pl.LightningDataModule,
+    checkpoint: Path | None,
+) -> None:
     """Fits, from the checkpoint if there is one; Ctrl-C, which Lightning turns into an exit, stays what it is."""
     started = checkpoint is not None and checkpoint.is_file()
     if started:
         log.info("Training goes on from %s", checkpoint)
     try:
-        trainer.fit(module, datamodule=data, ckpt_path=checkpoint if started else None, weights_only=True)
+        trainer.fit(
+            module, datamodule=data, ckpt_path=checkpoint if started else None, weights_only=True
+        )
     except SystemExit as error:
         if isinstance(error.__context__, KeyboardInterrupt):
             raise KeyboardInterrupt from None

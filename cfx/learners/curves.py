@@ -17,7 +17,11 @@ def over_networks(curves: pd.DataFrame, column: str) -> pd.DataFrame:
     """
     values = curves[column].astype(float)
     measured = curves[np.isfinite(values)]
-    return measured.pivot_table(index="epoch", columns="network", values=column, aggfunc="last").sort_index().ffill()
+    return (
+        measured.pivot_table(index="epoch", columns="network", values=column, aggfunc="last")
+        .sort_index()
+        .ffill()
+    )
 
 
 def best_losses(curves: pd.DataFrame) -> dict[str, float]:

@@ -19,7 +19,7 @@ from torch.utils.data import DataLoader
 
 from cfx.component import Settings
 from cfx.errors import DataError
-from cfx.learners.base import CURVE_COLUMNS, Learned, Learner, Lesson
+from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.learners.batched import BatchedModule, Grid, fit
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import token_width, tokens
@@ -30,7 +30,9 @@ from cfx.progress import Task
 class ImitationSettings(Settings):
     """Settings of `imitation`."""
 
-    epochs: int = Field(200, ge=1, description="passes over the training windows at most; 500 in the paper")
+    epochs: int = Field(
+        200, ge=1, description="passes over the training windows at most; 500 in the paper"
+    )
     batch_size: int | None = Field(
         16,
         ge=1,
@@ -39,21 +41,31 @@ class ImitationSettings(Settings):
     )
     learning_rate: float = Field(3e-3, gt=0, description="of Adam")
     weight_decay: float = Field(0.0, ge=0, description="of AdamW, decoupled")
-    validation: float = Field(0.1, ge=0, lt=1, description="share of the training windows, the last ones, kept for validation")
+    validation: float = Field(
+        0.1,
+        ge=0,
+        lt=1,
+        description="share of the training windows, the last ones, kept for validation",
+    )
     patience: int | None = Field(
-        30, ge=1, description="epochs without a better validation loss after which a network stops; null: never"
+        30,
+        ge=1,
+        description="epochs without a better validation loss after which a network stops; null: never",
     )
-    weight_by_spread: bool = Field(
-        True, description="weight each window by how much the choice of parameters matters in it; false in the paper"
+    weight_by_sensitivity: bool = Field(
+        True,
+        description="weight each window by how much the choice of parameters matters in it; false in the paper",
     )
-    gradient_clip: float | None = Field(1.0, gt=0, description="largest gradient norm of a network; null: none")
+    gradient_clip: float | None = Field(
+        1.0, gt=0, description="largest gradient norm of a network; null: none"
+    )
 
 
 class ImitationLearner(Learner):
     """Learns window labels by mean squared error in unit space.
 
     Differences from the paper: windows can be weighted by their loss spread, because the labels of windows that do not
-    determine the parameters are arbitrary (`weight_by_spread=false` gives the paper's plain error); the weights of the epoch
+    determine the parameters are arbitrary (`weight_by_sensitivity=false` gives the paper's plain error); the weights of the epoch
     with the smallest validation loss are kept, for each network on its own.
     """
 
@@ -61,28 +73,42 @@ class ImitationLearner(Learner):
     settings: ImitationSettings
     needs_labels = True
 
-    def fit(self, policy: Policy, lesson: Lesson) -> Learned:
-        if lesson.labels is None:
+    def fit(self, policy: Policy, training_data: TrainingData) -> TrainingResult:
+        if training_data.labels is None:
             raise TypeError("imitation needs window labels")
-        self.require_no_traits(policy)
-        material = _Material.of(policy, lesson, self.settings)
-        generator = torch.Generator().manual_seed(lesson.seed)
-        space = lesson.simulator.model.space
+        self.require_no_driver_features(policy)
+        dataset = _ImitationDataset.of(policy, training_data, self.settings)
+        generator = torch.Generator().manual_seed(training_data.seed)
+        space = training_data.simulator.model.space
         unit_default = space.to_unit(space.defaults()).float()
-        grid = Grid(lesson.network.to(lesson.fixed.device), len(lesson.names))
-        unit_fixed = grid.mean(space.to_unit(lesson.fixed)).float()
-        network = policy.build(material.tokens.shape[-1], unit_default, unit_fixed.cpu(), generator)
+        grid = Grid(training_data.network.to(training_data.fixed.device), len(training_data.names))
+        unit_fixed = grid.mean(space.to_unit(training_data.fixed)).float()
+        network = policy.build(dataset.tokens.shape[-1], unit_default, unit_fixed.cpu(), generator)
         if not any(parameter.requires_grad for parameter in network.parameters()):
-            return Learned(network.eval(), material.scaler, pd.DataFrame(columns=CURVE_COLUMNS))
-        task = Task(f"Training ({len(lesson.names)} networks, at most {self.settings.epochs} epochs)", self.settings.epochs)
-        module = ImitationModule(network, material, self.settings, lesson.names, on_epoch=task.advance)
-        data = SegmentData(material.windows, self.settings.batch_size)
-        device = material.tokens.device
-        fit(module, data, epochs=self.settings.epochs, seed=lesson.seed, device=device, task=task)
-        return Learned(module.network, material.scaler.to(device), module.curves())
+            return TrainingResult(
+                network.eval(), dataset.scaler, pd.DataFrame(columns=CURVE_COLUMNS)
+            )
+        task = Task(
+            f"Training ({len(training_data.names)} networks, at most {self.settings.epochs} epochs)",
+            self.settings.epochs,
+        )
+        module = ImitationModule(
+            network, dataset, self.settings, training_data.names, on_epoch=task.advance
+        )
+        data = SegmentData(dataset.windows, self.settings.batch_size)
+        device = dataset.tokens.device
+        fit(
+            module,
+            data,
+            epochs=self.settings.epochs,
+            seed=training_data.seed,
+            device=device,
+            task=task,
+        )
+        return TrainingResult(module.network, dataset.scaler.to(device), module.curves())
 
 
-class _Material(nn.Module):
+class _ImitationDataset(nn.Module):
     """Training tensors as N networks by B drivers by W windows; buffers, so that Lightning moves them with the module."""
 
     tokens: Tensor
@@ -90,7 +116,14 @@ class _Material(nn.Module):
     train_weight: Tensor
     validation_weight: Tensor
 
-    def __init__(self, scaler: Scaler, tokens: Tensor, labels: Tensor, train_weight: Tensor, validation_weight: Tensor) -> None:
+    def __init__(
+        self,
+        scaler: Scaler,
+        tokens: Tensor,
+        labels: Tensor,
+        train_weight: Tensor,
+        validation_weight: Tensor,
+    ) -> None:
         super().__init__()
         self.scaler = scaler
         self.register_buffer("tokens", tokens)
@@ -103,19 +136,25 @@ class _Material(nn.Module):
         return self.tokens.shape[2]
 
     @classmethod
-    def of(cls, policy: Policy, lesson: Lesson, settings: ImitationSettings) -> _Material:
-        assert lesson.labels is not None
-        labels, batch = lesson.labels, lesson.batch
+    def of(
+        cls, policy: Policy, training_data: TrainingData, settings: ImitationSettings
+    ) -> _ImitationDataset:
+        assert training_data.labels is not None
+        labels, batch = training_data.labels, training_data.batch
         device = batch.lengths.device
         pairs = len(batch)
         where = labels.windows
-        history = measured_history(batch, where.pair.to(device), where.first.to(device), lesson.windows.length)
+        history = measured_history(
+            batch, where.pair.to(device), where.first.to(device), training_data.windows.length
+        )
         seen = tokens(history, policy.inputs, policy.summary).float()
-        assert seen.shape[-1] == token_width(policy.inputs, policy.summary, lesson.windows.length)
-        unit = lesson.simulator.model.space.to_unit(labels.parameters).float()
+        assert seen.shape[-1] == token_width(
+            policy.inputs, policy.summary, training_data.windows.length
+        )
+        unit = training_data.simulator.model.space.to_unit(labels.parameters).float()
         token_grid, mask = where.to_grid(seen, pairs)
         label_grid, _ = where.to_grid(unit, pairs)
-        spread_grid, _ = where.to_grid(labels.spread.float(), pairs)
+        sensitivity_grid, _ = where.to_grid(labels.sensitivity.float(), pairs)
         number = torch.arange(mask.shape[1], device=device)
         counts = mask.sum(1)
         kept = (counts * settings.validation).round().long()
@@ -129,8 +168,12 @@ class _Material(nn.Module):
             )
         train = mask & (number < (counts - kept)[:, None])
         validation = mask & ~train
-        weight = _spread_weight(spread_grid, train) if settings.weight_by_spread else torch.ones_like(spread_grid)
-        grid = Grid(lesson.network.to(device), len(lesson.names))
+        weight = (
+            _sensitivity_weight(sensitivity_grid, train)
+            if settings.weight_by_sensitivity
+            else torch.ones_like(sensitivity_grid)
+        )
+        grid = Grid(training_data.network.to(device), len(training_data.names))
         train_grid = grid.scatter(train)
         scaler = Scaler.of(grid.scatter(token_grid), train_grid)
         return cls(
@@ -142,14 +185,16 @@ class _Material(nn.Module):
         )
 
 
-def _spread_weight(spread: Tensor, train: Tensor) -> Tensor:
+def _sensitivity_weight(sensitivity: Tensor, train: Tensor) -> Tensor:
     """Returns weights `(P, W)` in proportion to the loss spread.
 
     Their mean is 1 over each pair's training windows; they are ones if all spreads are 0.
     """
     count = train.sum(1, keepdim=True)
-    mean = (spread * train).sum(1, keepdim=True) / count
-    return torch.where(mean > 0, spread / mean.clamp(min=torch.finfo(spread.dtype).tiny), 1.0)
+    mean = (sensitivity * train).sum(1, keepdim=True) / count
+    return torch.where(
+        mean > 0, sensitivity / mean.clamp(min=torch.finfo(sensitivity.dtype).tiny), 1.0
+    )
 
 
 class SegmentData(pl.LightningDataModule):
@@ -174,38 +219,41 @@ class ImitationModule(BatchedModule):
     def __init__(
         self,
         network: PolicyNetwork,
-        material: _Material,
+        dataset: _ImitationDataset,
         settings: ImitationSettings,
         names: tuple[str, ...],
         on_epoch: Callable[[], None] = lambda: None,
     ) -> None:
         super().__init__(network, names, settings, on_epoch)
-        self.material = material
+        self.dataset = dataset
         self.state: Tensor | None = None
         self.train_sum = torch.zeros(len(names))
         self.train_weight = torch.zeros(len(names))
 
     def training_step(self, segment: tuple[int, int], index: int) -> Tensor:
         first, last = segment
-        networks, drivers = self.material.tokens.shape[:2]
+        networks, drivers = self.dataset.tokens.shape[:2]
         if first == 0 or self.state is None:
             self.state = self.network.initial_state(networks, drivers)
-        out, state = self.network(self.material.tokens[:, :, first:last], self.state)
+        out, state = self.network(self.dataset.tokens[:, :, first:last], self.state)
         self.state = state.detach()
-        weight = self.material.train_weight[:, :, first:last]
-        error = _weighted_error(out, self.material.labels[:, :, first:last], weight)
+        weight = self.dataset.train_weight[:, :, first:last]
+        error = _weighted_error(out, self.dataset.labels[:, :, first:last], weight)
         total = weight.sum((1, 2))
         self.train_sum += error.detach().cpu()
         self.train_weight += total.detach().cpu()
         return (error / total.clamp(min=1e-9)).sum()
 
     def validation_step(self, segment: tuple[int, int], index: int) -> None:
-        networks, drivers = self.material.tokens.shape[:2]
-        out, _ = self.network(self.material.tokens, self.network.initial_state(networks, drivers))
-        weight = self.material.validation_weight
+        networks, drivers = self.dataset.tokens.shape[:2]
+        out, _ = self.network(self.dataset.tokens, self.network.initial_state(networks, drivers))
+        weight = self.dataset.validation_weight
         total = weight.sum((1, 2))
-        loss = _weighted_error(out, self.material.labels, weight) / total.clamp(min=1e-9)
-        self.judge(self.train_sum / self.train_weight.clamp(min=1e-9), torch.where(total > 0, loss, math.nan).cpu())
+        loss = _weighted_error(out, self.dataset.labels, weight) / total.clamp(min=1e-9)
+        self.judge(
+            self.train_sum / self.train_weight.clamp(min=1e-9),
+            torch.where(total > 0, loss, math.nan).cpu(),
+        )
         self.train_sum.zero_()
         self.train_weight.zero_()
 

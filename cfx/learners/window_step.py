@@ -3,7 +3,7 @@
 This is what training by rollout repeats thousands of times, so it is one function of plain tensors that `torch.compile` turns
 into few kernels, forwards and backwards. It is the same loop as `cfx.evaluation.closed_loop.drive`; a test holds them equal.
 
-Letters: N networks, D drives of each, L frames that a token holds, S steps of a window, n tuned parameters, k traits, s width of
+Shapes: N networks, D drives of each, L frames that a token holds, S steps of a window, n tuned parameters, k driver features, s width of
 the policy's state, m of the model's memory.
 """
 
@@ -51,7 +51,13 @@ class WindowStep:
     """Reads and drives one window; `network` and `scaler` are shared, not copied."""
 
     def __init__(
-        self, network: PolicyNetwork, scaler: Scaler, policy: Policy, model: DrivingModel, windows: WindowSettings, dt: float
+        self,
+        network: PolicyNetwork,
+        scaler: Scaler,
+        policy: Policy,
+        model: DrivingModel,
+        windows: WindowSettings,
+        dt: float,
     ) -> None:
         self.network = network
         self.scaler = scaler
@@ -59,7 +65,7 @@ class WindowStep:
         self.inputs, self.summary = policy.inputs, policy.summary
         self.length, self.stride = windows.length, windows.stride
         self.dt = dt
-        self.space = model.reach
+        self.space = model.adaptation_space
         low, high = self.space.bounds(dtype=scaler.mean.dtype, device=scaler.mean.device)
         self.low, self.range = low, high - low
         self.free = self.space.free(device=low.device)
@@ -67,7 +73,9 @@ class WindowStep:
     def compile(self) -> None:
         """Lets `torch.compile` make one function of each of the two."""
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # torch's own, about itself, as it imports its compiler
+            warnings.simplefilter(
+                "ignore", DeprecationWarning
+            )  # torch's own, about itself, as it imports its compiler
             importlib.import_module("torch._inductor.compile_fx")
         self.read = torch.compile(self.read, dynamic=False)  # type: ignore[method-assign]  # the compiled one takes its place
         self.drive = torch.compile(self.drive, dynamic=False)  # type: ignore[method-assign]  # likewise
@@ -77,7 +85,7 @@ class WindowStep:
 
         Args:
             seen: `(N, D, f)`, not normalised.
-            told: the base in the squashed space, and traits, `(N, D, n + k)`.
+            told: the base in the squashed space, and driver features, `(N, D, n + k)`.
             state: `(N, D, s)`.
             there: whether the drive has this token; where not, its state stays, bool `(N, D)`.
 
@@ -100,29 +108,54 @@ class WindowStep:
             ahead: the leader around the window.
             leader_length: `(N, D)`, m.
             base: in unit space, `(N, D, n)`.
-            told: the same in the squashed space, and traits, `(N, D, n + k)`.
+            told: the same in the squashed space, and driver features, `(N, D, n + k)`.
 
         Returns:
             Where the drives stand afterwards; speed and gap at the S frames, `(N, D, S)`.
         """
         length, stride, now = self.length, self.stride, self.length - 1
         gap = ahead.position[..., :length] - leader_length[..., None] - recent.position
-        history = History(ahead.speed[..., :length], ahead.acceleration[..., :length], recent.speed, recent.acceleration, gap)
+        history = History(
+            ahead.speed[..., :length],
+            ahead.acceleration[..., :length],
+            recent.speed,
+            recent.acceleration,
+            gap,
+        )
         answer, state = self._answer(tokens(history, self.inputs, self.summary), told, recent.state)
         p = self.space.unpack(self.low + moved(base, answer, self.free) * self.range)
-        follower = Follower(recent.position[..., now], recent.speed[..., now], recent.acceleration[..., now], recent.memory)
+        follower = Follower(
+            recent.position[..., now],
+            recent.speed[..., now],
+            recent.acceleration[..., now],
+            recent.memory,
+        )
         positions, speeds, accelerations = [], [], []
         for k in range(now, now + stride):
-            leader = Leader(ahead.position[..., k], ahead.speed[..., k], ahead.acceleration[..., k], leader_length)
+            leader = Leader(
+                ahead.position[..., k],
+                ahead.speed[..., k],
+                ahead.acceleration[..., k],
+                leader_length,
+            )
             speed = self.model.next_speed(follower, leader, p, self.dt)
             memory = self.model.next_memory(follower, leader, p, self.dt, speed)
-            follower = Follower(follower.position + speed * self.dt, speed, (speed - follower.speed) / self.dt, memory)
+            follower = Follower(
+                follower.position + speed * self.dt,
+                speed,
+                (speed - follower.speed) / self.dt,
+                memory,
+            )
             positions.append(follower.position)
             speeds.append(speed)
             accelerations.append(follower.acceleration)
-        position, speed, acceleration = (torch.stack(frames, -1) for frames in (positions, speeds, accelerations))
+        position, speed, acceleration = (
+            torch.stack(frames, -1) for frames in (positions, speeds, accelerations)
+        )
         frames = zip(recent[:3], (position, speed, acceleration), strict=True)
-        carried = [torch.cat([before, after], -1)[..., stride:].contiguous() for before, after in frames]
+        carried = [
+            torch.cat([before, after], -1)[..., stride:].contiguous() for before, after in frames
+        ]
         last = Recent(carried[0], carried[1], carried[2], follower.memory, state)
         return last, speed, ahead.position[..., length:] - leader_length[..., None] - position
 
@@ -131,20 +164,20 @@ class _Bounded(torch.autograd.Function):
     """The identity, whose gradient is damped and bounded on its way back."""
 
     @staticmethod
-    def forward(ctx, value, damping, bound):  # type: ignore[no-untyped-def]  # torch's signature
-        ctx.damping, ctx.bound = damping, bound
+    def forward(ctx, value, gradient_decay, bound):  # type: ignore[no-untyped-def]  # torch's signature
+        ctx.gradient_decay, ctx.bound = gradient_decay, bound
         return value.view_as(value)
 
     @staticmethod
     def backward(ctx, gradient):  # type: ignore[no-untyped-def]  # torch's signature
-        gradient = torch.nan_to_num(gradient, 0.0, 0.0, 0.0) * ctx.damping
+        gradient = torch.nan_to_num(gradient, 0.0, 0.0, 0.0) * ctx.gradient_decay
         return gradient.clamp(-ctx.bound, ctx.bound), None, None
 
 
-def bounded(recent: Recent, damping: float, bound: float) -> Recent:
+def bounded(recent: Recent, gradient_decay: float, bound: float) -> Recent:
     """Returns the same state; what gradients bring back through it is multiplied by `damping` and kept within `bound`.
 
     A closed loop of many windows multiplies Jacobians, and behind a regime switch these can be large: without this, W99's
     gradients overflow. A damping of g per window makes gradients forget with a time constant of -1 / ln g windows.
     """
-    return Recent(*(_Bounded.apply(value, damping, bound) for value in recent))  # type: ignore[no-untyped-call]
+    return Recent(*(_Bounded.apply(value, gradient_decay, bound) for value in recent))  # type: ignore[no-untyped-call]

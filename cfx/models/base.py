@@ -3,7 +3,7 @@
 A model is a pure function of (follower state, leader state, parameters, time step), batched over any leading
 dimensions, differentiable almost everywhere, on any device and dtype. It never integrates: `cfx.simulation` does.
 
-Letters: `*batch` are the leading dimensions; leader tensors and parameters may have fewer of them and broadcast.
+Shapes: `*batch` are the leading dimensions; leader tensors and parameters may have fewer of them and broadcast.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pydantic import Field
 from torch import Tensor
 
 from cfx.component import Component, Settings
-from cfx.models.regimes import Softness
+from cfx.models.regimes import Temperature
 from cfx.parameters import ParameterOverride, ParameterSpace
 
 
@@ -58,9 +58,10 @@ class ModelSettings(Settings):
     """Settings that every model has."""
 
     parameters: dict[str, ParameterOverride] = Field(
-        default_factory=dict, description="changes to the model's parameters: bounds, default, tuned or constant"
+        default_factory=dict,
+        description="changes to the model's parameters: bounds, default, tuned or constant",
     )
-    reach: dict[str, tuple[float, float] | None] | None = Field(
+    adaptation_space: dict[str, tuple[float, float] | None] | None = Field(
         None,
         description="what a policy of offsets (learner=rollout) may move, where that is not what calibration may:"
         " {NAME: [low, high]}, farther; {NAME: null}, not at all",
@@ -84,7 +85,7 @@ class DrivingModel(Component):
         follows: with constant parameters the model reacts to its leader. A model without that has parameters that are the control
             itself: constant ones are no baseline, and reports do not compare with them. Tested.
         reference: where the equations come from.
-        softness: how gradually regimes switch; 0, the exact model, everywhere but in a learner's training (`smoothed`).
+        temperature: how gradually regimes switch; 0, the exact model, everywhere but in a learner's training (`smoothed`).
     """
 
     kind = "model"
@@ -95,35 +96,39 @@ class DrivingModel(Component):
     memory_size: ClassVar[int] = 0
     differentiable: ClassVar[bool] = True
     collision_free: ClassVar[bool] = False
-    follows: ClassVar[bool] = True
+    has_constant_baseline: ClassVar[bool] = True
     reference: ClassVar[str] = ""
-    softness: Softness = 0.0
+    temperature: Temperature = 0.0
 
     def __init__(self, settings: Settings | None = None, **options: object) -> None:
         super().__init__(settings, **options)
         self.space = self.parameters.override(self.settings.parameters)
-        self.space.reaching(self.settings.reach or {})  # says now what is wrong with it
+        self.space.for_adaptation(
+            self.settings.adaptation_space or {}
+        )  # says now what is wrong with it
 
     @property
-    def reach(self) -> ParameterSpace:
+    def adaptation_space(self) -> ParameterSpace:
         """The parameters in the bounds within which a policy of offsets moves them: those of `space` and beyond."""
-        return self.space.reaching(self.settings.reach or {})
+        return self.space.for_adaptation(self.settings.adaptation_space or {})
 
-    def smoothed(self, softness: Softness) -> Self:
+    def at_temperature(self, temperature: Temperature) -> Self:
         """Returns the model with its regime switches smoothed, for training by gradients.
 
-        A model that chooses between cases reads `self.softness` in `next_speed` and, where it is not 0, mixes the cases near
+        A model that chooses between cases reads `self.temperature` in `next_speed` and, where it is not 0, mixes the cases near
         their thresholds (`cfx.models.regimes`). In all others nothing changes.
 
         Args:
-            softness: how gradual the switches are, in multiples of the model's own scales; 0 is the exact model.
+            temperature: how gradual the switches are, in multiples of the model's own scales; 0 is the exact model.
         """
         model = copy.copy(self)
-        model.softness = softness
+        model.temperature = temperature
         return model
 
     @abstractmethod
-    def next_speed(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float) -> Tensor:
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
         """Returns the follower's speed one time step later.
 
         Args:
@@ -135,7 +140,9 @@ class DrivingModel(Component):
             `(*batch,)`, m/s, not negative, in the dtype of the states.
         """
 
-    def next_memory(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float, speed: Tensor) -> Tensor:
+    def next_memory(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float, speed: Tensor
+    ) -> Tensor:
         """Returns the memory `(*batch, m)` one time step later; `speed` is what `next_speed` returned."""
         return follower.memory
 

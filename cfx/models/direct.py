@@ -22,17 +22,36 @@ class Direct(DrivingModel):
     than those it has learned from, from driving senselessly.
 
     With constant parameters it holds a constant acceleration, whatever its leader does. So its `default`, `population` and
-    `fixed` are no baselines and improvements over them mean nothing (`follows = False`; reports leave them out). Compare its
+    `fixed` are no baselines and improvements over them mean nothing (`has_constant_baseline = False`; reports leave them out). Compare its
     absolute RMSE with other jobs' on the same data.
     """
 
     reference = "longitudinal kinematics, forward Euler"
-    follows = False
+    has_constant_baseline = False
 
     parameters = ParameterSpace.of(
-        Parameter("acceleration", "m/s2", -8.0, 4.0, 0.0, "acceleration until the next choice", "what tyres and engine give"),
-        Parameter("v_max", "m/s", 5.0, 70.0, 55.0, "maximum speed", "SUMO's default passenger car", tuned=False),
+        Parameter(
+            "acceleration",
+            "m/s2",
+            -8.0,
+            4.0,
+            0.0,
+            "acceleration until the next choice",
+            "what tyres and engine give",
+        ),
+        Parameter(
+            "v_max",
+            "m/s",
+            5.0,
+            70.0,
+            55.0,
+            "maximum speed",
+            "SUMO's default passenger car",
+            tuned=False,
+        ),
     )
 
-    def next_speed(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float) -> Tensor:
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
         return torch.minimum(follower.speed + p["acceleration"] * dt, p["v_max"]).clamp(min=0.0)

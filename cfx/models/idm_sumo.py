@@ -34,7 +34,9 @@ class IdmSumo(DrivingModel):
     1 mm, or none, counts as 1 mm.
     """
 
-    reference = "Treiber, Hennecke and Helbing (2000), Phys. Rev. E 62(2); SUMO's carFollowModel IDM"
+    reference = (
+        "Treiber, Hennecke and Helbing (2000), Phys. Rev. E 62(2); SUMO's carFollowModel IDM"
+    )
     collision_free = True
 
     parameters = ParameterSpace.of(
@@ -42,24 +44,42 @@ class IdmSumo(DrivingModel):
         Parameter("accel", "m/s2", 0.1, 6.0, 2.6, "maximum acceleration", _BOUNDS),
         Parameter("decel", "m/s2", 0.1, 6.0, 4.5, "comfortable deceleration", _BOUNDS),
         Parameter("minGap", "m", 0.1, 8.0, 2.5, "gap at standstill", _BOUNDS),
-        Parameter("maxSpeed", "m/s", 1.0, 70.0, 33.3, "desired speed on a free road", "120 km/h; bounds: as tau's"),
+        Parameter(
+            "maxSpeed",
+            "m/s",
+            1.0,
+            70.0,
+            33.3,
+            "desired speed on a free road",
+            "120 km/h; bounds: as tau's",
+        ),
         Parameter("delta", "1", 1.0, 8.0, 4.0, "acceleration exponent", "SUMO", tuned=False),
         Parameter("emergencyDecel", "m/s2", 1.0, 20.0, 9.0, "brake cap", _SUMO, tuned=False),
     )
 
-    def next_speed(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float) -> Tensor:
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
         start, v_l = follower.speed, leader.speed
         parts = max(1, int(dt / _STEPPING + 0.5))
-        softness = 2.0 * torch.sqrt(p["accel"] * p["decel"])
+        temperature = 2.0 * torch.sqrt(p["accel"] * p["decel"])
         v, gap = start, bumper_gap(follower, leader)
         for _ in range(parts):
-            wanted_gap = p["minGap"] + (v * p["tau"] + v * (v - v_l) / softness).clamp(min=0.0)
+            wanted_gap = p["minGap"] + (v * p["tau"] + v * (v - v_l) / temperature).clamp(min=0.0)
             crowding = wanted_gap / gap.clamp(min=_CLOSEST)
-            acceleration = p["accel"] * (1.0 - torch.pow(v / p["maxSpeed"], p["delta"]) - crowding * crowding)
+            acceleration = p["accel"] * (
+                1.0 - torch.pow(v / p["maxSpeed"], p["delta"]) - crowding * crowding
+            )
             v = (v + acceleration * (dt / parts)).clamp(min=0.0)
             gap = gap - ((v - v_l) * (dt / parts)).clamp(min=0.0)
         return sumo_speed(
-            start, v, accel=p["accel"], decel=p["decel"], emergency_decel=p["emergencyDecel"], v_max=p["maxSpeed"], dt=dt
+            start,
+            v,
+            accel=p["accel"],
+            decel=p["decel"],
+            emergency_decel=p["emergencyDecel"],
+            v_max=p["maxSpeed"],
+            dt=dt,
         )
 
     def sumo_vtype(self, p: Mapping[str, Tensor]) -> VType:

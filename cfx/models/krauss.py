@@ -33,7 +33,9 @@ class KraussSettings(ModelSettings):
         description="paper: the equations as derived; sumo: with KraussOrig1's brake cap, standing-leader rule and rounding",
     )
     leader_deceleration: float | None = Field(
-        None, gt=0, description="b_l, m/s2: deceleration expected of the leader; null: the same as b"
+        None,
+        gt=0,
+        description="b_l, m/s2: deceleration expected of the leader; null: the same as b",
     )
 
 
@@ -66,13 +68,35 @@ class Krauss(DrivingModel):
         Parameter("t_r", "s", 0.1, 10.0, 1.5, "reaction time; the equilibrium time gap", _PAPER),
         Parameter("t_i", "s", 0.0, 2.0, 0.15, "brake build-up time", _PAPER),
         Parameter("a", "m/s2", 0.5, 6.0, 2.6, "maximum acceleration", _SUMO, tuned=False),
-        Parameter("b", "m/s2", 1.0, 9.0, 4.5, "deceleration the follower plans with", _SUMO, tuned=False),
+        Parameter(
+            "b", "m/s2", 1.0, 9.0, 4.5, "deceleration the follower plans with", _SUMO, tuned=False
+        ),
         Parameter("v_max", "m/s", 5.0, 70.0, 55.0, "maximum speed", _SUMO, tuned=False),
-        Parameter("min_gap", "m", 0.0, 10.0, 0.0, "gap kept at standstill; 2.5 in SUMO", "Yang et al. (2021)", tuned=False),
-        Parameter("b_max", "m/s2", 1.0, 20.0, 9.0, "brake cap, in variant=sumo only", "SUMO's emergencyDecel", tuned=False),
+        Parameter(
+            "min_gap",
+            "m",
+            0.0,
+            10.0,
+            0.0,
+            "gap kept at standstill; 2.5 in SUMO",
+            "Yang et al. (2021)",
+            tuned=False,
+        ),
+        Parameter(
+            "b_max",
+            "m/s2",
+            1.0,
+            20.0,
+            9.0,
+            "brake cap, in variant=sumo only",
+            "SUMO's emergencyDecel",
+            tuned=False,
+        ),
     )
 
-    def next_speed(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float) -> Tensor:
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
         b = p["b"]
         b_l = b if self.settings.leader_deceleration is None else self.settings.leader_deceleration
         g = bumper_gap(follower, leader) - p["min_gap"]
@@ -84,15 +108,29 @@ class Krauss(DrivingModel):
             return torch.minimum(torch.minimum(v + p["a"] * dt, p["v_max"]), v_safe).clamp(min=0.0)
         creep = torch.where(g <= b * dt, torch.minimum(b * dt, g / dt), v_safe)
         v_safe = torch.where(v_l == 0, torch.where(g < 0.01, 0.0, creep), v_safe)
-        return sumo_speed(v, v_safe, accel=p["a"], decel=b, emergency_decel=p["b_max"], v_max=p["v_max"], dt=dt)
+        return sumo_speed(
+            v, v_safe, accel=p["a"], decel=b, emergency_decel=p["b_max"], v_max=p["v_max"], dt=dt
+        )
 
     def sumo_vtype(self, p: Mapping[str, Tensor]) -> VType:
         lag = self.space["t_i"]
-        if self.settings.variant != "sumo" or self.settings.leader_deceleration is not None or lag.tuned or lag.default != 0:
+        if (
+            self.settings.variant != "sumo"
+            or self.settings.leader_deceleration is not None
+            or lag.tuned
+            or lag.default != 0
+        ):
             raise ConfigError(
                 "simulator=sumo: SUMO has model=krauss (its KraussOrig1) only without a brake build-up time; add"
                 " model.variant=sumo model.leader_deceleration=null model.parameters.t_i.default=0"
                 " model.parameters.t_i.tuned=false, or choose model=krauss_sumo"
             )
-        names = {"t_r": "tau", "a": "accel", "b": "decel", "v_max": "maxSpeed", "min_gap": "minGap", "b_max": "emergencyDecel"}
+        names = {
+            "t_r": "tau",
+            "a": "accel",
+            "b": "decel",
+            "v_max": "maxSpeed",
+            "min_gap": "minGap",
+            "b_max": "emergencyDecel",
+        }
         return VType("KraussOrig1", {theirs: p[ours] for ours, theirs in names.items()})

@@ -48,10 +48,21 @@ class KraussSumo(DrivingModel):
         Parameter("minGap", "m", 0.0, 10.0, 2.5, "gap kept at standstill", _SUMO),
         Parameter("maxSpeed", "m/s", 5.0, 70.0, 55.0, "maximum speed", _SUMO, tuned=False),
         Parameter("emergencyDecel", "m/s2", 1.0, 20.0, 9.0, "brake cap", _SUMO, tuned=False),
-        Parameter("decel_leader", "m/s2", 1.0, 9.0, 4.5, "deceleration expected of the leader", _SUMO, tuned=False),
+        Parameter(
+            "decel_leader",
+            "m/s2",
+            1.0,
+            9.0,
+            4.5,
+            "deceleration expected of the leader",
+            _SUMO,
+            tuned=False,
+        ),
     )
 
-    def next_speed(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float) -> Tensor:
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
         v, v_l, decel = follower.speed, leader.speed, p["decel"]
         gap = bumper_gap(follower, leader) - p["minGap"]
         ahead = _stopping(v_l, torch.maximum(decel, p["decel_leader"]) * dt, dt)
@@ -62,11 +73,20 @@ class KraussSumo(DrivingModel):
         wanted = torch.where(needed > decel + _MARGIN, hard, safe)
         wanted = torch.where(gap < 0, 0.0, wanted)
         return sumo_speed(
-            v, wanted, accel=p["accel"], decel=decel, emergency_decel=p["emergencyDecel"], v_max=p["maxSpeed"], dt=dt
+            v,
+            wanted,
+            accel=p["accel"],
+            decel=decel,
+            emergency_decel=p["emergencyDecel"],
+            v_max=p["maxSpeed"],
+            dt=dt,
         )
 
     def sumo_vtype(self, p: Mapping[str, Tensor]) -> VType:
-        own = {name: p[name] for name in ("tau", "accel", "decel", "minGap", "maxSpeed", "emergencyDecel")}
+        own = {
+            name: p[name]
+            for name in ("tau", "accel", "decel", "minGap", "maxSpeed", "emergencyDecel")
+        }
         return VType("Krauss", own, leader={"decel": p["decel_leader"]})
 
 

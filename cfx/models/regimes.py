@@ -2,7 +2,7 @@
 
 A regime model (Wiedemann's) takes one of several accelerations, whichever case holds. The choice is a step, so its gradient with
 respect to the thresholds is 0 almost everywhere and says nothing of the jump: gradient descent cannot see that a shorter time
-gap would have ended the braking. For training, a model can be asked for its smoothed self (`DrivingModel.smoothed`): each case
+gap would have ended the braking. For training, a model can be asked for its smoothed self (`DrivingModel.at_temperature`): each case
 then counts with a weight between 0 and 1, a logistic function of the distance from its threshold. Simulation, calibration and
 evaluation always take the exact choice.
 """
@@ -12,37 +12,53 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-Softness = float | Tensor
+Temperature = float | Tensor
 """How gradually regimes switch, in multiples of the scales below; 0 is exact. A 0-dimensional tensor may change while compiled
 code runs, and is never exact."""
 
 SPACING = 2.0
-"""m: how gradually a threshold of distance is crossed at softness 1."""
+"""m: how gradually a threshold of distance is crossed at temperature 1."""
 
 SPEED = 0.5
 """m/s: the same for a threshold of relative speed."""
 
 
-def exact(softness: Softness) -> bool:
+def exact(temperature: Temperature) -> bool:
     """Says whether regimes switch exactly."""
-    return not isinstance(softness, Tensor) and softness == 0
+    return not isinstance(temperature, Tensor) and temperature == 0
 
 
-def below(value: Tensor, threshold: Tensor, yes: Tensor, no: Tensor, *, scale: float, softness: Softness) -> Tensor:
-    """Returns `yes` where `value < threshold`, else `no`; with softness, a mixture of both near the threshold.
+def below(
+    value: Tensor,
+    threshold: Tensor,
+    yes: Tensor,
+    no: Tensor,
+    *,
+    scale: float,
+    temperature: Temperature,
+) -> Tensor:
+    """Returns `yes` where `value < threshold`, else `no`; with temperature, a mixture of both near the threshold.
 
     Args:
         value, threshold, yes, no: `(*batch,)`, broadcasting; finite.
-        scale: width of the transition at softness 1, in the unit of `value`.
-        softness: how gradual.
+        scale: width of the transition at temperature 1, in the unit of `value`.
+        temperature: how gradual.
     """
-    if exact(softness):
+    if exact(temperature):
         return torch.where(value < threshold, yes, no)
-    return torch.lerp(no, yes, torch.sigmoid((threshold - value) / (scale * softness)))
+    return torch.lerp(no, yes, torch.sigmoid((threshold - value) / (scale * temperature)))
 
 
-def up_to(value: Tensor, threshold: Tensor, yes: Tensor, no: Tensor, *, scale: float, softness: Softness) -> Tensor:
+def up_to(
+    value: Tensor,
+    threshold: Tensor,
+    yes: Tensor,
+    no: Tensor,
+    *,
+    scale: float,
+    temperature: Temperature,
+) -> Tensor:
     """As `below`, for `value <= threshold`."""
-    if exact(softness):
+    if exact(temperature):
         return torch.where(value <= threshold, yes, no)
-    return below(value, threshold, yes, no, scale=scale, softness=softness)
+    return below(value, threshold, yes, no, scale=scale, temperature=temperature)

@@ -7,7 +7,14 @@ from torch import Tensor
 
 
 def sumo_speed(
-    v: Tensor, wanted: Tensor, *, accel: Tensor, decel: Tensor, emergency_decel: Tensor, v_max: Tensor, dt: float
+    v: Tensor,
+    wanted: Tensor,
+    *,
+    accel: Tensor,
+    decel: Tensor,
+    emergency_decel: Tensor,
+    v_max: Tensor,
+    dt: float,
 ) -> Tensor:
     """Returns the speed `(*batch,)` that SUMO realises when a car-following model wants `wanted`, both m/s.
 

@@ -16,7 +16,18 @@ from cfx.models.vtype import SumoOnly, VType
 from cfx.parameters import ParameterOverride, ParameterSpace
 
 _UNITS = {
-    **dict.fromkeys(("tau", "actionStepLength", "startupDelay", "treaction", "tpreview", "tPersDrive", "tPersEstimate"), "s"),
+    **dict.fromkeys(
+        (
+            "tau",
+            "actionStepLength",
+            "startupDelay",
+            "treaction",
+            "tpreview",
+            "tPersDrive",
+            "tPersEstimate",
+        ),
+        "s",
+    ),
     **dict.fromkeys(("accel", "decel", "emergencyDecel", "apparentDecel", "taccmax"), "m/s2"),
     **dict.fromkeys(("maxSpeed", "desiredMaxSpeed"), "m/s"),
     **dict.fromkeys(("speedFactor", "sigma", "delta", "collisionMinGapFactor", "ccoolness"), "1"),
@@ -24,14 +35,22 @@ _UNITS = {
     "jerkmax": "m/s3",
     "stepping": "s",
 }
-_DRAWN = ("sigmaleader", "sigmagap", "sigmaerror")  # of EIDM; `sigma` of others is 0 unless it is given, too
+_DRAWN = (
+    "sigmaleader",
+    "sigmagap",
+    "sigmaerror",
+)  # of EIDM; `sigma` of others is 0 unless it is given, too
 
 
 class SumoVTypeSettings(ModelSettings):
     """Settings of `sumo_vtype`."""
 
-    car_follow_model: str = Field("EIDM", description="SUMO's name of the model: Krauss, IDM, EIDM, W99, Wiedemann, ACC ...")
-    parameters: dict[str, ParameterOverride] = Field(description="vType attributes with low, high and default, by SUMO's names")
+    car_follow_model: str = Field(
+        "EIDM", description="SUMO's name of the model: Krauss, IDM, EIDM, W99, Wiedemann, ACC ..."
+    )
+    parameters: dict[str, ParameterOverride] = Field(
+        description="vType attributes with low, high and default, by SUMO's names"
+    )
     attributes: dict[str, float | str] | None = Field(
         None, description="vType attributes that stay as they are; all others are SUMO's defaults"
     )
@@ -57,17 +76,31 @@ class SumoVType(SumoOnly):
 
     def __init__(self, settings: Settings | None = None, **options: object) -> None:
         super().__init__(settings, **options)
-        named = (replace(one, unit=_UNITS.get(one.name, "SUMO's unit"), meaning=f"SUMO's {one.name}") for one in self.space)
+        named = (
+            replace(one, unit=_UNITS.get(one.name, "SUMO's unit"), meaning=f"SUMO's {one.name}")
+            for one in self.space
+        )
         self.space = ParameterSpace(tuple(named))
-        twice = sorted((self.settings.attributes or {}).keys() & {parameter.name for parameter in self.space})
+        twice = sorted(
+            (self.settings.attributes or {}).keys() & {parameter.name for parameter in self.space}
+        )
         if twice:
-            raise ConfigError(f"model.attributes.{twice[0]}: it is among model.parameters too; give it once")
+            raise ConfigError(
+                f"model.attributes.{twice[0]}: it is among model.parameters too; give it once"
+            )
 
-    def next_speed(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float) -> NoReturn:
-        raise ConfigError("model=sumo_vtype has no equations in Python, SUMO alone drives it; add simulator=sumo")
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> NoReturn:
+        raise ConfigError(
+            "model=sumo_vtype has no equations in Python, SUMO alone drives it; add simulator=sumo"
+        )
 
     def sumo_vtype(self, p: Mapping[str, Tensor]) -> VType:
         name = self.settings.car_follow_model
         still = dict.fromkeys(_DRAWN, "0") if name == "EIDM" else {}
-        given = {key: value if isinstance(value, str) else repr(value) for key, value in (self.settings.attributes or {}).items()}
+        given = {
+            key: value if isinstance(value, str) else repr(value)
+            for key, value in (self.settings.attributes or {}).items()
+        }
         return VType(name, {**still, **given, **p}, remembers=True)

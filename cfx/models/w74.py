@@ -23,9 +23,7 @@ from cfx.parameters import Parameter, ParameterSpace
 
 _NEAREST_ROOM = 1e-3  # m: bounds quotients (and their gradients) beside a threshold; the brake cap acts long before
 
-_VISSIM = (
-    "default: PTV Vissim's Wiedemann 74 (ax 2 m, bx 2 + 3 z with z = 0.5); bounds: wide enough for drivers who stay far behind"
-)
+_VISSIM = "default: PTV Vissim's Wiedemann 74 (ax 2 m, bx 2 + 3 z with z = 0.5); bounds: wide enough for drivers who stay far behind"
 _REITER = "default: Wiedemann and Reiter (1992), the middle of the drivers; bounds: wide"
 
 
@@ -78,17 +76,87 @@ class W74(DrivingModel):
 
     parameters = ParameterSpace.of(
         Parameter("ax_add", "m", 0.5, 10.0, 2.0, "gap at standstill", _VISSIM),
-        Parameter("bx_add", "(m s)^0.5", 0.1, 12.0, 3.5, "growth of the least spacing with the root of speed", _VISSIM),
-        Parameter("sdx_mult", "1", 1.05, 4.0, 1.5, "spacing at which following ends, as a multiple of ABX", _REITER),
-        Parameter("cx", "(m s)^0.5", 10.0, 120.0, 50.0, "perception of speed differences; larger notices smaller ones", _REITER),
-        Parameter("opdv_add", "1", 0.1, 5.0, 1.5, "how much larger an opening speed must be to be noticed", _REITER),
-        Parameter("b_max", "m/s2", 0.5, 6.0, 2.6, "free acceleration from standstill", "SUMO's passenger car", tuned=False),
-        Parameter("v_desired", "m/s", 5.0, 70.0, 33.3, "speed wanted on a free road", "120 km/h", tuned=False),
-        Parameter("b_null", "m/s2", 0.01, 1.0, 0.25, "acceleration while following", "Vissim's CC7", tuned=False),
-        Parameter("b_min", "m/s2", -20.0, -1.0, -9.0, "hardest braking, negative", "SUMO's emergencyDecel", tuned=False),
+        Parameter(
+            "bx_add",
+            "(m s)^0.5",
+            0.1,
+            12.0,
+            3.5,
+            "growth of the least spacing with the root of speed",
+            _VISSIM,
+        ),
+        Parameter(
+            "sdx_mult",
+            "1",
+            1.05,
+            4.0,
+            1.5,
+            "spacing at which following ends, as a multiple of ABX",
+            _REITER,
+        ),
+        Parameter(
+            "cx",
+            "(m s)^0.5",
+            10.0,
+            120.0,
+            50.0,
+            "perception of speed differences; larger notices smaller ones",
+            _REITER,
+        ),
+        Parameter(
+            "opdv_add",
+            "1",
+            0.1,
+            5.0,
+            1.5,
+            "how much larger an opening speed must be to be noticed",
+            _REITER,
+        ),
+        Parameter(
+            "b_max",
+            "m/s2",
+            0.5,
+            6.0,
+            2.6,
+            "free acceleration from standstill",
+            "SUMO's passenger car",
+            tuned=False,
+        ),
+        Parameter(
+            "v_desired",
+            "m/s",
+            5.0,
+            70.0,
+            33.3,
+            "speed wanted on a free road",
+            "120 km/h",
+            tuned=False,
+        ),
+        Parameter(
+            "b_null",
+            "m/s2",
+            0.01,
+            1.0,
+            0.25,
+            "acceleration while following",
+            "Vissim's CC7",
+            tuned=False,
+        ),
+        Parameter(
+            "b_min",
+            "m/s2",
+            -20.0,
+            -1.0,
+            -9.0,
+            "hardest braking, negative",
+            "SUMO's emergencyDecel",
+            tuned=False,
+        ),
     )
 
-    def next_speed(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float) -> Tensor:
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
         b_min, b_null = p["b_min"], p["b_null"]
         v, v_l, a_l = follower.speed, leader.speed, leader.acceleration
         s = leader.position - follower.position
@@ -104,16 +172,26 @@ class W74(DrivingModel):
         following = torch.where(follower.acceleration > 0, b_null, -b_null)
         approaching = a_l - 0.5 * closing.square() / (s - abx).clamp(min=_NEAREST_ROOM)
         lack = ((abx - s) / bx.clamp(min=_NEAREST_ROOM)).clamp(0.0, 1.0)
-        emergency = a_l - 0.5 * closing.clamp(min=0.0).square() / (s - ax).clamp(min=_NEAREST_ROOM) + b_min * lack
+        emergency = (
+            a_l
+            - 0.5 * closing.clamp(min=0.0).square() / (s - ax).clamp(min=_NEAREST_ROOM)
+            + b_min * lack
+        )
         emergency = torch.where(s <= ax, b_min, emergency.clamp(max=0.0))
 
         most = torch.maximum(free, b_null)
-        if not exact(self.softness):  # they are mixed, so each must be something that the vehicle can do
-            approaching, emergency = (a.maximum(b_min).minimum(most) for a in (approaching, emergency))
+        if not exact(
+            self.temperature
+        ):  # they are mixed, so each must be something that the vehicle can do
+            approaching, emergency = (
+                a.maximum(b_min).minimum(most) for a in (approaching, emergency)
+            )
         # Nested, not joined by `&`, as in w99: masks of doubles are slow to join.
-        near_by, slower = (partial(below, scale=scale, softness=self.softness) for scale in (SPACING, SPEED))
+        near_by, slower = (
+            partial(below, scale=scale, temperature=self.temperature) for scale in (SPACING, SPEED)
+        )
         calm = slower(opdv, closing, near_by(s, sdx, following, free), free)
         calm = slower(sdv, closing, approaching, calm)
-        acceleration = up_to(s, abx, emergency, calm, scale=SPACING, softness=self.softness)
+        acceleration = up_to(s, abx, emergency, calm, scale=SPACING, temperature=self.temperature)
         acceleration = torch.maximum(torch.minimum(acceleration, most), b_min)
         return (v + acceleration * dt).clamp(min=0.0)

@@ -33,7 +33,8 @@ class W99Settings(ModelSettings):
     """Settings of `w99`."""
 
     variant: Literal["sumo", "vissim"] = Field(
-        "sumo", description="sumo: CC8 caps every acceleration, so CC9 has no effect; vissim: CC8 at standstill to CC9 at 80 km/h"
+        "sumo",
+        description="sumo: CC8 caps every acceleration, so CC9 has no effect; vissim: CC8 at standstill to CC9 at 80 km/h",
     )
 
 
@@ -77,35 +78,105 @@ class W99(DrivingModel):
     parameters = ParameterSpace.of(
         Parameter("cc0", "m", 0.1, 5.0, 2.5, "gap at standstill", "default: SUMO's minGap"),
         Parameter("cc1", "s", 0.1, 6.0, 1.3, "time gap kept above cc0", _VISSIM),
-        Parameter("cc2", "m", 0.5, 20.0, 8.0, "how far the gap oscillates above the safe one", _VISSIM),
-        Parameter("cc3", "s", -30.0, -2.0, -12.0, "perception threshold: how early braking for a slower leader begins", _VISSIM),
-        Parameter("cc4", "m/s", -2.0, -0.01, -0.25, "negative speed difference perceived while following", _VISSIM),
-        Parameter("cc5", "m/s", 0.01, 2.0, 0.35, "positive speed difference perceived while following", _VISSIM),
-        Parameter("cc6", "1e-4/(m s)", 0.0, 20.0, 6.0, "how much perception worsens with distance", _VISSIM),
+        Parameter(
+            "cc2", "m", 0.5, 20.0, 8.0, "how far the gap oscillates above the safe one", _VISSIM
+        ),
+        Parameter(
+            "cc3",
+            "s",
+            -30.0,
+            -2.0,
+            -12.0,
+            "perception threshold: how early braking for a slower leader begins",
+            _VISSIM,
+        ),
+        Parameter(
+            "cc4",
+            "m/s",
+            -2.0,
+            -0.01,
+            -0.25,
+            "negative speed difference perceived while following",
+            _VISSIM,
+        ),
+        Parameter(
+            "cc5",
+            "m/s",
+            0.01,
+            2.0,
+            0.35,
+            "positive speed difference perceived while following",
+            _VISSIM,
+        ),
+        Parameter(
+            "cc6",
+            "1e-4/(m s)",
+            0.0,
+            20.0,
+            6.0,
+            "how much perception worsens with distance",
+            _VISSIM,
+        ),
         Parameter("cc7", "m/s2", 0.01, 1.0, 0.25, "acceleration while oscillating", _VISSIM),
-        Parameter("cc8", "m/s2", 0.5, 5.0, 2.0, "acceleration from standstill; cap on every acceleration", _VISSIM),
-        Parameter("cc9", "m/s2", 0.1, 4.0, 1.5, "acceleration at 80 km/h; no effect in variant=sumo", _VISSIM),
-        Parameter("b", "m/s2", 1.0, 9.0, 4.5, "deceleration above which braking counts as an emergency", _SUMO, tuned=False),
-        Parameter("b_max", "m/s2", 1.0, 20.0, 9.0, "brake cap", "SUMO's emergencyDecel", tuned=False),
+        Parameter(
+            "cc8",
+            "m/s2",
+            0.5,
+            5.0,
+            2.0,
+            "acceleration from standstill; cap on every acceleration",
+            _VISSIM,
+        ),
+        Parameter(
+            "cc9",
+            "m/s2",
+            0.1,
+            4.0,
+            1.5,
+            "acceleration at 80 km/h; no effect in variant=sumo",
+            _VISSIM,
+        ),
+        Parameter(
+            "b",
+            "m/s2",
+            1.0,
+            9.0,
+            4.5,
+            "deceleration above which braking counts as an emergency",
+            _SUMO,
+            tuned=False,
+        ),
+        Parameter(
+            "b_max", "m/s2", 1.0, 20.0, 9.0, "brake cap", "SUMO's emergencyDecel", tuned=False
+        ),
         Parameter("v_max", "m/s", 5.0, 70.0, 55.0, "maximum speed", _SUMO, tuned=False),
     )
 
-    def next_speed(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float) -> Tensor:
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
         cc0, cc4, cc5, cc7, cc8 = p["cc0"], p["cc4"], p["cc5"], p["cc7"], p["cc8"]
         dx = bumper_gap(follower, leader)
-        v, v_l, a_l, a_old = follower.speed, leader.speed, leader.acceleration, follower.acceleration
+        v, v_l, a_l, a_old = (
+            follower.speed,
+            leader.speed,
+            leader.acceleration,
+            follower.acceleration,
+        )
         dv = v_l - v
         near = torch.where(v_l > 0, cc0 + p["cc1"] * v, cc0)
         far = near + p["cc2"]
         perceived = far + p["cc3"] * (dv - cc4)
-        spread = p["cc6"] * dx * dx * 1e-4
-        closing_threshold = torch.where(v > 0, cc4 - spread, 0.0)
-        opening_threshold = torch.where(v_l > cc5, spread + cc5, spread)
+        sensitivity = p["cc6"] * dx * dx * 1e-4
+        closing_threshold = torch.where(v > 0, cc4 - sensitivity, 0.0)
+        opening_threshold = torch.where(v_l > cc5, sensitivity + cc5, sensitivity)
 
         # 1. Too close. One step more at this speed ends less than a tenth of CC0 behind where the leader is now: brake.
         held = torch.where(dx < v * dt + _RESERVE * cc0, -p["b_max"], 0.0)
         beyond = dx > cc0
-        brake = a_l + torch.where(beyond, dv * dv / divisor(cc0 - dx, beyond), 0.5 * (dv - opening_threshold))
+        brake = a_l + torch.where(
+            beyond, dv * dv / divisor(cc0 - dx, beyond), 0.5 * (dv - opening_threshold)
+        )
         brake = torch.where(dv < 0, brake.clamp(max=0.0), held)
         brake = torch.where(brake > -cc7, -cc7, torch.maximum(brake, 0.5 * root(v) - 10.0))
         too_close = torch.where(v_l > 0, brake, held)
@@ -125,19 +196,29 @@ class W99(DrivingModel):
         free = torch.where(inside, torch.minimum(dv * dv / divisor(far - dx, inside), a_max), a_max)
         free = torch.where(dx > near, free, 0.0)
 
-        if not exact(self.softness):  # they are mixed, so each must be something that the vehicle can do
-            approaching, too_close, free = (a.clamp(min=-p["b_max"]).minimum(cap) for a in (approaching, too_close, free))
+        if not exact(
+            self.temperature
+        ):  # they are mixed, so each must be something that the vehicle can do
+            approaching, too_close, free = (
+                a.clamp(min=-p["b_max"]).minimum(cap) for a in (approaching, too_close, free)
+            )
         # Nested, not joined by `&`: compiled in float64 that is three times as fast (masks of doubles are joined as integers).
-        near_by, slower = (partial(below, scale=scale, softness=self.softness) for scale in (SPACING, SPEED))
+        near_by, slower = (
+            partial(below, scale=scale, temperature=self.temperature) for scale in (SPACING, SPEED)
+        )
         rest = slower(dv, opening_threshold, near_by(dx, far, following, free), free)
         rest = slower(dv, closing_threshold, near_by(dx, perceived, approaching, rest), rest)
-        too_near = up_to(dx, near, too_close, rest, scale=SPACING, softness=self.softness)
+        too_near = up_to(dx, near, too_close, rest, scale=SPACING, temperature=self.temperature)
         acceleration = slower(dv, opening_threshold, too_near, rest)
         wanted = v + acceleration * dt
-        return sumo_speed(v, wanted, accel=cap, decel=p["b"], emergency_decel=p["b_max"], v_max=p["v_max"], dt=dt)
+        return sumo_speed(
+            v, wanted, accel=cap, decel=p["b"], emergency_decel=p["b_max"], v_max=p["v_max"], dt=dt
+        )
 
     def sumo_vtype(self, p: Mapping[str, Tensor]) -> VType:
         if self.settings.variant != "sumo":
-            raise ConfigError(f"simulator=sumo: SUMO has model=w99 as variant=sumo only, not {self.settings.variant}")
+            raise ConfigError(
+                f"simulator=sumo: SUMO has model=w99 as variant=sumo only, not {self.settings.variant}"
+            )
         names = {"cc0": "minGap", "b": "decel", "b_max": "emergencyDecel", "v_max": "maxSpeed"}
         return VType("W99", {names.get(ours, ours): value for ours, value in p.items()})

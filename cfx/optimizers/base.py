@@ -1,6 +1,6 @@
 """The contract of an optimizer: many independent bounded problems in one call.
 
-Letters: P problems, q candidates for each in one call, n parameters, g guesses, e evaluations of each problem in all.
+Shapes: P problems, q candidates for each in one call, n parameters, g guesses, e evaluations of each problem in all.
 Everything here is float64: Gaussian processes need it, and losses of neighbouring candidates differ by little.
 """
 
@@ -62,12 +62,16 @@ class Solution:
     diverged: Tensor
 
     @property
-    def spread(self) -> Tensor:
+    def sensitivity(self) -> Tensor:
         """How much the choice of parameters matters, `(P,)`: the median loss of the space-filling candidates minus `loss`.
 
         In the unit of the loss, never negative; 0 where nothing tells candidates apart or every candidate diverged.
         """
-        return (self.filling[:, 1] - self.loss).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0).clamp(min=0.0)
+        return (
+            (self.filling[:, 1] - self.loss)
+            .nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+            .clamp(min=0.0)
+        )
 
 
 class Optimizer(Component):
@@ -192,7 +196,9 @@ def _reduce(
     usable = filled.isnan().logical_not().any(dim=1)
     low = filled.nan_to_num(nan=torch.inf).amin(dim=1)
     high = filled.nan_to_num(nan=-torch.inf).amax(dim=1)
-    filling = torch.stack([low, filled.nanmedian(dim=1).values, high], dim=1).where(usable[:, None], torch.nan)
+    filling = torch.stack([low, filled.nanmedian(dim=1).values, high], dim=1).where(
+        usable[:, None], torch.nan
+    )
     return best, loss, filling, (~finite).sum(dim=1)
 
 
@@ -211,17 +217,25 @@ class _Guarded:
 
     def __call__(self, candidates: Tensor) -> Tensor:
         shape = tuple(candidates.shape)
-        if candidates.dtype != torch.float64 or len(shape) != 3 or (shape[0], shape[2]) != (self.problems, self._n):
+        if (
+            candidates.dtype != torch.float64
+            or len(shape) != 3
+            or (shape[0], shape[2]) != (self.problems, self._n)
+        ):
             raise PluginError(
                 f"{self._optimizer}: it asked for candidates {shape} in {candidates.dtype}; it must ask for"
                 f" ({self.problems}, q, {self._n}) in float64"
             )
         # Written so that NaN fails too.
         if not bool(((candidates >= 0) & (candidates <= 1)).all()):
-            raise PluginError(f"{self._optimizer}: it asked for a candidate outside the bounds [0, 1] of unit space")
+            raise PluginError(
+                f"{self._optimizer}: it asked for a candidate outside the bounds [0, 1] of unit space"
+            )
         losses = self._objective(candidates).to(torch.float64)
         self._progress(losses.numel())
         return losses.nan_to_num(nan=torch.inf, posinf=torch.inf, neginf=torch.inf)
 
     def select(self, first: int, last: int) -> Objective:
-        return _Guarded(self._objective.select(first, last), self._progress, self._n, self._optimizer)
+        return _Guarded(
+            self._objective.select(first, last), self._progress, self._n, self._optimizer
+        )

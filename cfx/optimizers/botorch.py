@@ -58,19 +58,37 @@ _COORDINATES_CHANGED = 3
 class BotorchSettings(Settings):
     """Settings of `BotorchOptimizer`."""
 
-    initial: int = Field(10, ge=1, description="evaluations before the first Gaussian process: the guesses, then Sobol points")
-    iterations: int = Field(30, ge=0, description="evaluations chosen by Gaussian process and LogEI, one after the other")
+    initial: int = Field(
+        10,
+        ge=1,
+        description="evaluations before the first Gaussian process: the guesses, then Sobol points",
+    )
+    iterations: int = Field(
+        30,
+        ge=0,
+        description="evaluations chosen by Gaussian process and LogEI, one after the other",
+    )
     screening: int = Field(
         2048,
         ge=0,
         description="further Sobol points evaluated at the start; the first Gaussian process sees the best of them. Nearly free"
         " where simulation is batched, and w99 needs it; 0 where each evaluation is dear",
     )
-    first_fit_steps: int = Field(60, ge=1, description="steps of Adam in the first fit of a Gaussian process")
-    fit_steps: int = Field(10, ge=1, description="steps of Adam after each evaluation, from the last lengthscales on")
-    raw_samples: int = Field(512, ge=2, description="points where LogEI is compared: a quarter anywhere, the rest near the best")
+    first_fit_steps: int = Field(
+        60, ge=1, description="steps of Adam in the first fit of a Gaussian process"
+    )
+    fit_steps: int = Field(
+        10, ge=1, description="steps of Adam after each evaluation, from the last lengthscales on"
+    )
+    raw_samples: int = Field(
+        512,
+        ge=2,
+        description="points where LogEI is compared: a quarter anywhere, the rest near the best",
+    )
     restarts: int = Field(4, ge=1, description="best of these points from which LogEI is climbed")
-    climb_steps: int = Field(15, ge=0, description="steps of each climb; 0 takes the best of the raw samples")
+    climb_steps: int = Field(
+        15, ge=0, description="steps of each climb; 0 takes the best of the raw samples"
+    )
 
 
 class BotorchOptimizer(Optimizer):
@@ -132,7 +150,9 @@ class BotorchOptimizer(Optimizer):
 class _Search:
     """What a chunk's Gaussian processes have seen, and what they propose next."""
 
-    def __init__(self, settings: BotorchSettings, tried: Tensor, losses: Tensor, *, guesses: int, seed: int) -> None:
+    def __init__(
+        self, settings: BotorchSettings, tried: Tensor, losses: Tensor, *, guesses: int, seed: int
+    ) -> None:
         self._settings = settings
         self._generator = torch.Generator().manual_seed(seed)
         kept = _best_of(losses, guesses, settings.initial)
@@ -150,10 +170,14 @@ class _Search:
 
     def ask(self) -> Tensor:
         """Returns the candidates `(P, 1, n)` with the greatest expected improvement."""
-        values = Standardize(1, batch_shape=self._seen.shape[:1])(_values(self._losses)[..., None])[0]
+        values = Standardize(1, batch_shape=self._seen.shape[:1])(_values(self._losses)[..., None])[
+            0
+        ]
         with _quiet_and_patient():
             process = _MarginalGP(self._seen, values, self._mean, self._kernel)
-            _fit(process, self._settings.fit_steps if self._fits else self._settings.first_fit_steps)
+            _fit(
+                process, self._settings.fit_steps if self._fits else self._settings.first_fit_steps
+            )
             self._fits += 1
             improvement = LogExpectedImprovement(_Marginals(process), best_f=values.amax(dim=1))
             return self._maximise(improvement)
@@ -169,7 +193,9 @@ class _Search:
             climbed = start.clone().requires_grad_()
             adam = torch.optim.Adam([climbed], lr=0.01)
             for _ in range(self._settings.climb_steps):
-                (climbed.grad,) = torch.autograd.grad(-improvement(climbed[..., None, :]).sum(), climbed)
+                (climbed.grad,) = torch.autograd.grad(
+                    -improvement(climbed[..., None, :]).sum(), climbed
+                )
                 adam.step()
                 with torch.no_grad():
                     climbed.clamp_(0.0, 1.0)
@@ -195,7 +221,9 @@ class _Search:
         step = torch.randn(near, n, generator=self._generator, dtype=torch.float64) * size * changed
         best = self._seen.gather(1, self._losses.argmin(dim=1)[:, None, None].expand(-1, 1, n))
         anywhere = draw(everywhere, 1, n).to(best.device).expand(-1, problems, -1)
-        return torch.cat([anywhere, (best.transpose(0, 1) + step[:, None].to(best.device)).clamp(0.0, 1.0)])
+        return torch.cat(
+            [anywhere, (best.transpose(0, 1) + step[:, None].to(best.device)).clamp(0.0, 1.0)]
+        )
 
 
 def _best_of(losses: Tensor, guesses: int, count: int) -> Tensor:
@@ -218,7 +246,11 @@ def _values(losses: Tensor) -> Tensor:
     lowest = 0.5 * losses.amin(dim=1, keepdim=True)
     excess = 0.5 * losses - lowest.clamp(max=0.0)
     median = excess.median(dim=1, keepdim=True).values
-    scale = torch.where(lowest > 0, torch.maximum(lowest, 1e-4 * median), torch.where(lowest < 0, 0.1 * median, 1e-4 * median))
+    scale = torch.where(
+        lowest > 0,
+        torch.maximum(lowest, 1e-4 * median),
+        torch.where(lowest < 0, 0.1 * median, 1e-4 * median),
+    )
     return -torch.hypot(excess, scale).clamp(min=1e-200).log()
 
 
@@ -228,8 +260,16 @@ def _kernel(n: int, batch: torch.Size) -> Kernel:
     As BoTorch's `get_covar_module_with_dim_scaled_prior`, but for the smoothness, and fitted in the logarithm of the lengthscale.
     """
     prior = LogNormalPrior(loc=math.sqrt(2) + 0.5 * math.log(n), scale=math.sqrt(3))
-    constraint = GreaterThan(2.5e-2, transform=torch.exp, inv_transform=torch.log, initial_value=prior.mode)
-    return MaternKernel(nu=1.5, ard_num_dims=n, batch_shape=batch, lengthscale_prior=prior, lengthscale_constraint=constraint)
+    constraint = GreaterThan(
+        2.5e-2, transform=torch.exp, inv_transform=torch.log, initial_value=prior.mode
+    )
+    return MaternKernel(
+        nu=1.5,
+        ard_num_dims=n,
+        batch_shape=batch,
+        lengthscale_prior=prior,
+        lengthscale_constraint=constraint,
+    )
 
 
 def _fit(process: SingleTaskGP, steps: int) -> None:
@@ -260,13 +300,24 @@ class _MarginalGP(SingleTaskGP):
 
     def __init__(self, seen: Tensor, values: Tensor, mean: Mean, kernel: Kernel) -> None:
         noise = torch.full_like(values, _NOISE)
-        super().__init__(seen, values, noise, mean_module=mean, covar_module=kernel, outcome_transform=None)
+        super().__init__(
+            seen, values, noise, mean_module=mean, covar_module=kernel, outcome_transform=None
+        )
 
-    def _get_test_prior_mean_and_covariances(self, train_inputs: Any, test_inputs: Any, **_: Any) -> Any:
+    def _get_test_prior_mean_and_covariances(
+        self, train_inputs: Any, test_inputs: Any, **_: Any
+    ) -> Any:
         (seen,), (query,) = train_inputs, test_inputs
         among = DiagLinearOperator(self.covar_module(query, diag=True))
         to_seen = self.covar_module(query, seen).evaluate_kernel()
-        return self.mean_module(query), among, to_seen, query.shape[:-2], query.shape[-2:-1], MultivariateNormal
+        return (
+            self.mean_module(query),
+            among,
+            to_seen,
+            query.shape[:-2],
+            query.shape[-2:-1],
+            MultivariateNormal,
+        )
 
 
 class _Marginals(Model):
@@ -288,7 +339,9 @@ class _Marginals(Model):
         # Without this, the few queries of a climb would be taken as dense and their diagonal covariance filled up.
         with max_eager_kernel_size(0):
             found = self._process.posterior(X.squeeze(-2).transpose(0, 1))
-            return _Normal(found.mean.transpose(0, 1)[..., None], found.variance.transpose(0, 1)[..., None])
+            return _Normal(
+                found.mean.transpose(0, 1)[..., None], found.variance.transpose(0, 1)[..., None]
+            )
 
 
 class _Normal(Posterior):
@@ -315,4 +368,6 @@ class _Normal(Posterior):
 
     def rsample(self, sample_shape: torch.Size | None = None) -> Tensor:
         shape = (*(sample_shape or ()), *self._mean.shape)
-        return self._mean + self._variance.sqrt() * torch.randn(shape, dtype=self.dtype, device=self.device)
+        return self._mean + self._variance.sqrt() * torch.randn(
+            shape, dtype=self.dtype, device=self.device
+        )

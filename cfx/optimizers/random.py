@@ -61,7 +61,9 @@ def evaluate_in_blocks(objective: Objective, candidates: Tensor) -> Tensor:
 def check_room(evaluations: int, guesses: int, *, key: str) -> None:
     """Raises ConfigError if the setting `key` allows fewer evaluations than there are first guesses."""
     if evaluations < guesses:
-        raise ConfigError(f"optimizer.{key}={evaluations}: there are {guesses} first guesses; set optimizer.{key} >= {guesses}")
+        raise ConfigError(
+            f"optimizer.{key}={evaluations}: there are {guesses} first guesses; set optimizer.{key} >= {guesses}"
+        )
 
 
 def sobol(count: int, n: int, *, seed: int, like: Tensor) -> Tensor:

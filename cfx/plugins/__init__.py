@@ -37,15 +37,21 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser("cfx plugins", description="Shows the installed components, without importing any.")
+    parser = argparse.ArgumentParser(
+        "cfx plugins", description="Shows the installed components, without importing any."
+    )
     actions = parser.add_subparsers(dest="action")
-    check = actions.add_parser("check", help="load components and try each for a moment; exit code 1 if one is broken")
+    check = actions.add_parser(
+        "check", help="load components and try each for a moment; exit code 1 if one is broken"
+    )
     check.add_argument("kind", nargs="?", help=f"{_KINDS}; all kinds if left out")
     check.add_argument("name", nargs="?", help="one component; all of the kind if left out")
     show = actions.add_parser("show", help="a component's parameters, settings and reference")
     show.add_argument("kind", help=_KINDS)
     show.add_argument("name")
-    new = actions.add_parser("new", help="write a package for a component of your own, with tests that pass")
+    new = actions.add_parser(
+        "new", help="write a package for a component of your own, with tests that pass"
+    )
     new.add_argument("kind", help=_KINDS)
     new.add_argument("name", help="as in model=NAME: lower-case letters, digits and _")
     new.add_argument("--folder", type=Path, help="where to write it; default: cfx-NAME, here")

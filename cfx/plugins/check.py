@@ -41,7 +41,9 @@ def check(kind: str | None = None, name: str | None = None) -> int:
         ConfigError: Python was started with -O.
     """
     if not __debug__:
-        raise ConfigError("cfx plugins check is made of assertions, which python -O removes; start python without -O")
+        raise ConfigError(
+            "cfx plugins check is made of assertions, which python -O removes; start python without -O"
+        )
     chosen = _chosen(kind, name)
     verdicts = []
     with Task("Checking components", len(chosen)) as task:
@@ -51,7 +53,9 @@ def check(kind: str | None = None, name: str | None = None) -> int:
     rows = blank_table("kind", "name", "distribution", "version", "from", "state")
     for one in verdicts:
         entry = one.entry
-        rows.add_row(entry.kind, entry.name, entry.distribution, entry.version, entry.location, one.state)
+        rows.add_row(
+            entry.kind, entry.name, entry.distribution, entry.version, entry.location, one.state
+        )
     put(rows)
     for hint in dict.fromkeys(one.hint for one in verdicts if one.hint):
         print(f"Hint: {hint}")
@@ -63,7 +67,12 @@ def check(kind: str | None = None, name: str | None = None) -> int:
 
 def _chosen(kind: str | None, name: str | None) -> list[registry.Entry]:
     kinds = registry.KINDS if kind is None else [registry.kind_of(kind).name]
-    found = [entry for one in kinds for entry in registry.entries(one) if name is None or entry.name == name]
+    found = [
+        entry
+        for one in kinds
+        for entry in registry.entries(one)
+        if name is None or entry.name == name
+    ]
     if not found and kind is not None and name is not None:
         registry.entry(kind, name)  # says which names there are
     return found
@@ -77,7 +86,9 @@ def examine(entry: registry.Entry) -> Verdict:
     try:
         cls = registry.get(entry.kind, entry.name)
         nodes.render(cls, entry.name)
-        required = [name for name, field in cls.schema.model_fields.items() if registry.is_blank(field)]
+        required = [
+            name for name, field in cls.schema.model_fields.items() if registry.is_blank(field)
+        ]
         if required:
             return Verdict(entry, "fine", hint=_not_tried(entry, required))
         component = registry.create(entry.kind, {"name": entry.name, **cls.trial})
@@ -88,7 +99,11 @@ def examine(entry: registry.Entry) -> Verdict:
             complaint = f"{entry}: {complaint}"
     except Exception as error:  # a plugin may raise anything
         complaint = f"{entry} cannot be used with its default settings: {registry.in_words(error)}"
-    return Verdict(entry, "broken", complaint) if complaint else Verdict(entry, "fine", hint=_undeclared(entry))
+    return (
+        Verdict(entry, "broken", complaint)
+        if complaint
+        else Verdict(entry, "fine", hint=_undeclared(entry))
+    )
 
 
 def _shadow(entry: registry.Entry) -> str:
@@ -107,7 +122,10 @@ def _shadow(entry: registry.Entry) -> str:
 def _broken_contract(entry: registry.Entry, component: object) -> str:
     from cfx.testing import contract_for, violations
 
-    found = [f"{' '.join(sentence.split())} ({check})" for check, sentence in violations(contract_for(entry.kind), component)]
+    found = [
+        f"{' '.join(sentence.split())} ({check})"
+        for check, sentence in violations(contract_for(entry.kind), component)
+    ]
     if not found:
         return ""
     more = f"; and {len(found) - 1} more" if len(found) > 1 else ""

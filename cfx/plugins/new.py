@@ -45,7 +45,9 @@ def create(kind: str, name: str, folder: Path | None = None) -> Path:
     words = _words(found, name)
     target = (folder or Path(words["distribution"])).expanduser()
     if target.exists():
-        raise OutputError(f"{target} exists already; choose another folder with --folder, or remove it")
+        raise OutputError(
+            f"{target} exists already; choose another folder with --folder, or remove it"
+        )
     try:
         _write(found, words, target)
     except OSError as error:
@@ -57,10 +59,16 @@ def create(kind: str, name: str, folder: Path | None = None) -> Path:
 
 
 def _check_name(name: str) -> None:
-    if re.fullmatch(r"[a-z][a-z0-9_]*", name) and not keyword.iskeyword(name) and name not in _RESERVED:
+    if (
+        re.fullmatch(r"[a-z][a-z0-9_]*", name)
+        and not keyword.iskeyword(name)
+        and name not in _RESERVED
+    ):
         return
     better = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_0123456789")
-    advice = f", such as {better}" if better and better != name and not keyword.iskeyword(better) else ""
+    advice = (
+        f", such as {better}" if better and better != name and not keyword.iskeyword(better) else ""
+    )
     raise ConfigError(
         f"'{name}' cannot be a component's name: it must be an identifier in lower-case letters, digits and _{advice}"
     )
@@ -74,7 +82,9 @@ def _check_free(kind: registry.Kind, name: str) -> None:
         )
     package = f"cfx_{name}"
     if importlib.util.find_spec(package) is not None:
-        raise PluginError(f"a package {package} is installed already, so '{name}' would take its place; choose another name")
+        raise PluginError(
+            f"a package {package} is installed already, so '{name}' would take its place; choose another name"
+        )
 
 
 def _words(kind: registry.Kind, name: str) -> dict[str, Any]:
@@ -113,7 +123,9 @@ def _write(kind: registry.Kind, words: dict[str, Any], target: Path) -> None:
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".cfx-new-") as temporary:
         draft = Path(temporary) / "package"
         for part in ("common", kind.name):
-            run_copy(str(_TEMPLATE / part), draft, data=words, defaults=True, overwrite=True, quiet=True)
+            run_copy(
+                str(_TEMPLATE / part), draft, data=words, defaults=True, overwrite=True, quiet=True
+            )
         draft.rename(target)
 
 

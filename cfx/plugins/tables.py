@@ -57,7 +57,13 @@ def show(kind: str, name: str) -> None:
         print(f"{line}\n")
     if entry.kind == "model":
         put(_parameters(cls))
-    settings = blank_table("setting", "default", "values", "meaning", title=f"Settings (set with {group}.SETTING=VALUE)")
+    settings = blank_table(
+        "setting",
+        "default",
+        "values",
+        "meaning",
+        title=f"Settings (set with {group}.SETTING=VALUE)",
+    )
     for row in _settings(cls.schema, skip=["parameters"] if entry.kind == "model" else []):
         settings.add_row(*row)
     if settings.row_count:
@@ -78,20 +84,45 @@ def _reference(cls: type[Component]) -> Iterator[str]:
 
 
 def _parameters(cls: Any) -> Table:
-    rows = blank_table("parameter", "unit", "low", "high", "default", "tuned", "meaning", "source", title="Parameters")
+    rows = blank_table(
+        "parameter",
+        "unit",
+        "low",
+        "high",
+        "default",
+        "tuned",
+        "meaning",
+        "source",
+        title="Parameters",
+    )
     for p in cls.parameters:
         tuned = "yes" if p.tuned else "constant"
-        rows.add_row(p.name, p.unit, f"{p.low:g}", f"{p.high:g}", f"{p.default:g}", tuned, p.meaning, p.source)
+        rows.add_row(
+            p.name,
+            p.unit,
+            f"{p.low:g}",
+            f"{p.high:g}",
+            f"{p.default:g}",
+            tuned,
+            p.meaning,
+            p.source,
+        )
     rows.caption = "Change one with model.parameters.NAME.{low,high,default,tuned}=VALUE"
     rows.caption_justify = "left"
     return rows
 
 
-def _settings(schema: type[BaseModel], path: str = "", skip: Collection[str] = ()) -> Iterator[tuple[str, str, str, str]]:
+def _settings(
+    schema: type[BaseModel], path: str = "", skip: Collection[str] = ()
+) -> Iterator[tuple[str, str, str, str]]:
     for name, field in schema.model_fields.items():
         if name in skip:
             continue
-        default = None if field.is_required() else field.get_default(call_default_factory=True, validated_data={})
+        default = (
+            None
+            if field.is_required()
+            else field.get_default(call_default_factory=True, validated_data={})
+        )
         if isinstance(default, BaseModel):
             yield from _settings(type(default), f"{path}{name}.")
             continue
@@ -110,7 +141,12 @@ def _values(field: FieldInfo) -> str:
     """Returns the type and the bounds that a setting must keep."""
     kind: Any = field.annotation
     words = " or ".join(_type(one) for one in get_args(kind)) if _is_union(kind) else _type(kind)
-    bounds = [f"{sign} {getattr(rule, key)}" for rule in field.metadata for key, sign in _SIGNS.items() if hasattr(rule, key)]
+    bounds = [
+        f"{sign} {getattr(rule, key)}"
+        for rule in field.metadata
+        for key, sign in _SIGNS.items()
+        if hasattr(rule, key)
+    ]
     return ", ".join([words, *bounds])
 
 

@@ -1,6 +1,6 @@
 """The contract of a policy: recent states in, parameters for the next window out.
 
-Letters: N independent networks, B drivers of each, W windows, f features of a token, n tuned parameters, s width of the state. N
+Shapes: N independent networks, B drivers of each, W windows, f features of a token, n tuned parameters, s width of the state. N
 networks are trained and driven as one batched network: 94 pairs with a network each cost about as much as one.
 """
 
@@ -14,8 +14,8 @@ from pydantic import BeforeValidator, Field
 from torch import Tensor, nn
 
 from cfx.component import Component, Settings
+from cfx.policies.driver_features import check_driver_features, named_driver_features
 from cfx.policies.features import Summary, check_inputs, named_inputs
-from cfx.policies.traits import check_traits, named_traits
 
 
 class PolicyNetwork(nn.Module, ABC):
@@ -51,11 +51,14 @@ class PolicySettings(Settings):
         description="signals that the policy sees; also: gap, relative_speed, time_headway, leader_acceleration,"
         " follower_acceleration, inverse_time_to_collision; or situation: what learner=rollout drives best with",
     )
-    summary: Summary = Field("frames", description="how a window's frames become features: frames (all), last, mean, mean_std")
-    traits: Annotated[tuple[str, ...], BeforeValidator(named_traits)] = Field(
+    summary: Summary = Field(
+        "frames",
+        description="how a window's frames become features: frames (all), last, mean, mean_std",
+    )
+    driver_features: Annotated[tuple[str, ...], BeforeValidator(named_driver_features)] = Field(
         (),
         description="what the policy is told of a driver from his measured past (learner=rollout): time_headway, time_gap,"
-        " standstill_gap, speed_difference, acceleration, response_time; or all. Strangers have none.",
+        " standstill_gap, speed_difference, acceleration, response_time; or all. Unseen drivers have none.",
     )
 
 
@@ -78,17 +81,21 @@ class Policy(Component):
         super().__init__(settings, **options)
         if isinstance(self.settings, PolicySettings):
             check_inputs(self.settings.inputs)
-            check_traits(self.settings.traits)
+            check_driver_features(self.settings.driver_features)
 
     @property
     def inputs(self) -> tuple[str, ...]:
         """The signals that the policy sees."""
-        return self.settings.inputs if isinstance(self.settings, PolicySettings) else ("follower_speed",)
+        return (
+            self.settings.inputs
+            if isinstance(self.settings, PolicySettings)
+            else ("follower_speed",)
+        )
 
     @property
-    def traits(self) -> tuple[str, ...]:
-        """What the policy is told of a driver from his measured past (`cfx.policies.traits`)."""
-        return self.settings.traits if isinstance(self.settings, PolicySettings) else ()
+    def driver_features(self) -> tuple[str, ...]:
+        """What the policy is told of a driver from his measured past (`cfx.policies.driver_features`)."""
+        return self.settings.driver_features if isinstance(self.settings, PolicySettings) else ()
 
     @property
     def summary(self) -> Summary:
@@ -96,7 +103,9 @@ class Policy(Component):
         return self.settings.summary if isinstance(self.settings, PolicySettings) else "last"
 
     @abstractmethod
-    def build(self, features: int, default: Tensor, fixed: Tensor, generator: torch.Generator) -> PolicyNetwork:
+    def build(
+        self, features: int, default: Tensor, fixed: Tensor, generator: torch.Generator
+    ) -> PolicyNetwork:
         """Makes N networks.
 
         Args:

@@ -1,7 +1,7 @@
 """What a policy sees: the recent states of leader and follower, one token per window.
 
 The token of a window holds the last `length` frames up to and including the window's first, so it never looks ahead.
-Letters: f features of a token.
+Shapes: f features of a token.
 """
 
 from __future__ import annotations
@@ -30,7 +30,12 @@ class History(NamedTuple):
     @classmethod
     def of(cls, batch: PairBatch) -> History:
         """Returns all that was measured of P pairs, `(P, T)` each."""
-        signals = (batch.leader_speed, batch.leader_acceleration, batch.follower_speed, batch.follower_acceleration)
+        signals = (
+            batch.leader_speed,
+            batch.leader_acceleration,
+            batch.follower_speed,
+            batch.follower_acceleration,
+        )
         return cls(*signals, batch.gap)
 
 
@@ -45,12 +50,21 @@ INPUTS: dict[str, Callable[[History], Tensor]] = {
     "gap": lambda h: h.gap,
     "relative_speed": lambda h: h.leader_speed - h.follower_speed,
     "time_headway": lambda h: h.gap / h.follower_speed.clamp(min=_STANDING),
-    "inverse_time_to_collision": lambda h: (h.follower_speed - h.leader_speed) / h.gap.clamp(min=_STANDING),
+    "inverse_time_to_collision": lambda h: (
+        (h.follower_speed - h.leader_speed) / h.gap.clamp(min=_STANDING)
+    ),
 }
 """Signals that a policy may see, each `(*batch, length)`."""
 
 INPUT_SETS: dict[str, tuple[str, ...]] = {
-    "situation": ("leader_speed", "relative_speed", "gap", "time_headway", "follower_acceleration", "leader_acceleration"),
+    "situation": (
+        "leader_speed",
+        "relative_speed",
+        "gap",
+        "time_headway",
+        "follower_acceleration",
+        "leader_acceleration",
+    ),
 }
 """Inputs that go by one name: `policy.inputs=situation`."""
 
@@ -62,7 +76,9 @@ _SUMMARIES: dict[Summary, Callable[[Tensor], list[Tensor]]] = {
 }
 
 
-def of_set(value: object, sets: Mapping[str, tuple[str, ...]], known: Collection[str], what: str) -> object:
+def of_set(
+    value: object, sets: Mapping[str, tuple[str, ...]], known: Collection[str], what: str
+) -> object:
     """Returns the names that a set's name stands for, and whatever else was given as it is.
 
     Raises:
@@ -72,7 +88,9 @@ def of_set(value: object, sets: Mapping[str, tuple[str, ...]], known: Collection
         return value
     if value not in sets:
         hint = f" Write [{value}]." if value in known else nearest(value, [*sets, *known])
-        raise ValueError(f"not a set of {what}s.{hint} Give {', '.join(sets)}, or a list of {', '.join(known)}")
+        raise ValueError(
+            f"not a set of {what}s.{hint} Give {', '.join(sets)}, or a list of {', '.join(known)}"
+        )
     return sets[value]
 
 
@@ -80,9 +98,13 @@ def check_names(names: Sequence[str], known: Collection[str], what: str) -> None
     """Raises ConfigError if a name of `policy.{what}s` is unknown or stands twice."""
     for name in names:
         if name not in known:
-            raise ConfigError(f"policy.{what}s: unknown {what} '{name}'.{nearest(name, known)} Known: {', '.join(known)}.")
+            raise ConfigError(
+                f"policy.{what}s: unknown {what} '{name}'.{nearest(name, known)} Known: {', '.join(known)}."
+            )
     if len(set(names)) != len(names):
-        raise ConfigError(f"policy.{what}s: {'an' if what[0] in 'aeiou' else 'a'} {what} stands twice in {', '.join(names)}")
+        raise ConfigError(
+            f"policy.{what}s: {'an' if what[0] in 'aeiou' else 'a'} {what} stands twice in {', '.join(names)}"
+        )
 
 
 def named_inputs(value: object) -> object:
@@ -104,4 +126,6 @@ def token_width(names: tuple[str, ...], summary: Summary, length: int) -> int:
 
 def tokens(history: History, names: tuple[str, ...], summary: Summary) -> Tensor:
     """Returns tokens `(*batch, f)`."""
-    return torch.stack([value for name in names for value in _SUMMARIES[summary](INPUTS[name](history))], dim=-1)
+    return torch.stack(
+        [value for name in names for value in _SUMMARIES[summary](INPUTS[name](history))], dim=-1
+    )

@@ -17,5 +17,7 @@ class FixedPolicy(Policy):
     schema: ClassVar[type[Settings]] = Settings
     trainable = False
 
-    def build(self, features: int, default: Tensor, fixed: Tensor, generator: torch.Generator) -> PolicyNetwork:
+    def build(
+        self, features: int, default: Tensor, fixed: Tensor, generator: torch.Generator
+    ) -> PolicyNetwork:
         return ConstantNetwork(fixed)

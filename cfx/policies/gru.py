@@ -21,7 +21,9 @@ class GruNetwork(RecurrentNetwork):
     def cell(self, projected: Tensor, layer: RecurrentLayer, carried: Tensor) -> Tensor:
         recurrent = layer.recur(carried)
         h = self.hidden
-        reset, update = (projected[..., : 2 * h] + recurrent[..., : 2 * h]).sigmoid().chunk(2, dim=-1)
+        reset, update = (
+            (projected[..., : 2 * h] + recurrent[..., : 2 * h]).sigmoid().chunk(2, dim=-1)
+        )
         new = torch.tanh(projected[..., 2 * h :] + reset * recurrent[..., 2 * h :])
         return torch.lerp(new, carried, update)
 
@@ -37,5 +39,7 @@ class GruPolicy(Policy):
     schema: ClassVar[type[Settings]] = RecurrentSettings
     settings: RecurrentSettings
 
-    def build(self, features: int, default: Tensor, fixed: Tensor, generator: torch.Generator) -> PolicyNetwork:
+    def build(
+        self, features: int, default: Tensor, fixed: Tensor, generator: torch.Generator
+    ) -> PolicyNetwork:
         return GruNetwork(features, fixed, self.settings, generator)

@@ -33,5 +33,7 @@ class LstmPolicy(Policy):
     schema: ClassVar[type[Settings]] = RecurrentSettings
     settings: RecurrentSettings
 
-    def build(self, features: int, default: Tensor, fixed: Tensor, generator: torch.Generator) -> PolicyNetwork:
+    def build(
+        self, features: int, default: Tensor, fixed: Tensor, generator: torch.Generator
+    ) -> PolicyNetwork:
         return LstmNetwork(features, fixed, self.settings, generator)

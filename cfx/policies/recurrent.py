@@ -24,9 +24,12 @@ class RecurrentSettings(PolicySettings):
 
     hidden_size: int = Field(32, ge=1, description="units of each recurrent layer")
     layers: int = Field(1, ge=1, description="recurrent layers")
-    dropout: float = Field(0.0, ge=0, lt=1, description="dropout before the output layer while training")
+    dropout: float = Field(
+        0.0, ge=0, lt=1, description="dropout before the output layer while training"
+    )
     start: Literal["fixed", "middle"] = Field(
-        "fixed", description="what an untrained network answers: the fixed parameters, or about the middle of the bounds (paper)"
+        "fixed",
+        description="what an untrained network answers: the fixed parameters, or about the middle of the bounds (paper)",
     )
 
 
@@ -38,7 +41,9 @@ def _uniform(shape: tuple[int, ...], width: int, generator: torch.Generator) -> 
 class RecurrentLayer(nn.Module):
     """One recurrent layer of N networks with `gates` gates."""
 
-    def __init__(self, networks: int, inputs: int, hidden: int, gates: int, generator: torch.Generator) -> None:
+    def __init__(
+        self, networks: int, inputs: int, hidden: int, gates: int, generator: torch.Generator
+    ) -> None:
         super().__init__()
         self.w_input = _uniform((networks, inputs, gates * hidden), hidden, generator)
         self.w_hidden = _uniform((networks, hidden, gates * hidden), hidden, generator)
@@ -62,13 +67,17 @@ class RecurrentNetwork(PolicyNetwork):
     states: int
     """Tensors of width `hidden` that one layer carries from window to window."""
 
-    def __init__(self, features: int, fixed: Tensor, settings: RecurrentSettings, generator: torch.Generator) -> None:
+    def __init__(
+        self, features: int, fixed: Tensor, settings: RecurrentSettings, generator: torch.Generator
+    ) -> None:
         """Takes the networks' fixed parameters in unit space, `(N, n)`."""
         super().__init__()
         networks, parameters = fixed.shape
         self.hidden = settings.hidden_size
         widths = [features, *[settings.hidden_size] * (settings.layers - 1)]
-        self.layers = nn.ModuleList(RecurrentLayer(networks, width, self.hidden, self.gates, generator) for width in widths)
+        self.layers = nn.ModuleList(
+            RecurrentLayer(networks, width, self.hidden, self.gates, generator) for width in widths
+        )
         self.dropout = nn.Dropout(settings.dropout)
         weights = _uniform((networks, self.hidden, parameters), self.hidden, generator)
         if settings.start == "fixed":
@@ -80,7 +89,9 @@ class RecurrentNetwork(PolicyNetwork):
             self.b_out = nn.Parameter(torch.zeros((networks, 1, parameters)))
 
     def initial_state(self, networks: int, drivers: int) -> Tensor:
-        return self.w_out.new_zeros((networks, drivers, self.hidden * self.states * len(self.layers)))
+        return self.w_out.new_zeros(
+            (networks, drivers, self.hidden * self.states * len(self.layers))
+        )
 
     def forward(self, tokens: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         x = tokens

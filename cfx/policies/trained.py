@@ -14,18 +14,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from cfx import registry
+from cfx import registry, renamed
 from cfx.calibration.windows import WindowSettings
 from cfx.errors import DataError
-from cfx.files import whole
+from cfx.files import atomic_write
 from cfx.models.base import DrivingModel
 from cfx.pairs import PairBatch, PairSet
 from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy, PolicyNetwork
-from cfx.policies.committee import Committee
+from cfx.policies.driver_features import measure
+from cfx.policies.ensemble import Ensemble
 from cfx.policies.features import History, token_width, tokens
 from cfx.policies.offsets import coordinates, drawn, moved
-from cfx.policies.traits import measure
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -69,14 +69,14 @@ class PolicyState(NamedTuple):
         place: `(D,)` int64.
         state: `(N, B, s)`.
         base: parameters that answers are offsets from, `(D, n)` in unit space; None where answers are the parameters themselves.
-        traits: the drivers' traits, `(D, k)`, or what stands for those of strangers; None where the policy is told none.
+        driver features: the drivers' driver features, `(D, k)`, or what stands for those of unseen drivers; None where the policy is told none.
     """
 
     network: Tensor
     place: Tensor
     state: Tensor
     base: Tensor | None = None
-    traits: Tensor | None = None
+    driver_features: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class TrainedPolicy:
     Attributes:
         policy: the component that built the networks.
         network: the networks themselves.
-        scaler: normalises what a network is shown: tokens, the base in the squashed space where answers are offsets, and traits,
+        scaler: normalises what a network is shown: tokens, the base in the squashed space where answers are offsets, and driver features,
             one behind the other.
         model_node: config node of the driving model.
         space: the model's parameters; where answers are offsets, as far as they reach.
@@ -124,7 +124,9 @@ class TrainedPolicy:
         """Returns what offsets start from for drivers whose own parameters are these; both `(D, n)` in SI units."""
         return drawn(self.space, own, self.shrinkage)
 
-    def traits_of(self, batch: PairBatch, until: Tensor, since: Tensor | None = None) -> Tensor | None:
+    def driver_features_of(
+        self, batch: PairBatch, until: Tensor, since: Tensor | None = None
+    ) -> Tensor | None:
         """Measures what the policy is told of D drivers before they drive.
 
         Args:
@@ -133,20 +135,28 @@ class TrainedPolicy:
             since: `(D,)`, the frame from which on; None: from the first.
 
         Returns:
-            Traits `(D, k)`, NaN for a driver of whom too little was measured; None if the policy is told none.
+            Driver features `(D, k)`, NaN for a driver of whom too little was measured; None if the policy is told none.
         """
-        if not self.policy.traits:
+        if not self.policy.driver_features:
             return None
-        return measure(batch, self.policy.traits, self.dt, torch.zeros_like(until) if since is None else since, until)
+        return measure(
+            batch,
+            self.policy.driver_features,
+            self.dt,
+            torch.zeros_like(until) if since is None else since,
+            until,
+        )
 
-    def begin(self, network: Tensor, base: Tensor | None = None, traits: Tensor | None = None) -> PolicyState:
+    def begin(
+        self, network: Tensor, base: Tensor | None = None, driver_features: Tensor | None = None
+    ) -> PolicyState:
         """Returns the state of D drivers before their first window.
 
         Args:
             network: `(D,)`, which network drives each.
             base: `(D, n)` in SI units, what each driver's offsets start from (`base_of`); None: the policy's, for drivers of whom
                 nothing is known. Ignored where answers are not offsets.
-            traits: `(D, k)`, as `traits_of` measures them; NaN, or None: unknown. Then the mean of those stands for them whom the
+            driver features: `(D, k)`, as `traits_of` measures them; NaN, or None: unknown. Then the mean of those stands for them whom the
                 network learned from.
         """
         place = driver_places(network)
@@ -155,10 +165,16 @@ class TrainedPolicy:
         if self.base is not None:
             unit = self.space.to_unit((self.base[network] if base is None else base).double())
         told = None
-        if self.policy.traits:
-            unknown = self.scaler.mean[network, -len(self.policy.traits) :].double()
-            told = unknown if traits is None else torch.where(traits.isnan(), unknown, traits.to(unknown))
-        return PolicyState(network, place, self.network.initial_state(len(self.names), drivers), unit, told)
+        if self.policy.driver_features:
+            unknown = self.scaler.mean[network, -len(self.policy.driver_features) :].double()
+            told = (
+                unknown
+                if driver_features is None
+                else torch.where(driver_features.isnan(), unknown, driver_features.to(unknown))
+            )
+        return PolicyState(
+            network, place, self.network.initial_state(len(self.names), drivers), unit, told
+        )
 
     @torch.no_grad()
     def act(self, history: History, state: PolicyState) -> tuple[Tensor, PolicyState]:
@@ -174,18 +190,22 @@ class TrainedPolicy:
         seen = tokens(history, self.policy.inputs, self.policy.summary)
         if state.base is not None:
             seen = torch.cat([seen, coordinates(state.base).to(seen.dtype)], -1)
-        if state.traits is not None:
-            seen = torch.cat([seen, state.traits.to(seen.dtype)], -1)
+        if state.driver_features is not None:
+            seen = torch.cat([seen, state.driver_features.to(seen.dtype)], -1)
         networks, drivers, _ = state.state.shape
         grid = seen.new_zeros((networks, drivers, 1, seen.shape[-1]), dtype=self.scaler.mean.dtype)
         grid[state.network, state.place, 0] = seen.to(grid.dtype)
         unit, after = self.network(self.scaler(grid), state.state)
         chosen = unit[state.network, state.place, 0].to(seen.dtype)
         if state.base is not None:
-            chosen = moved(state.base, chosen.double(), self.space.free(device=chosen.device)).to(seen.dtype)
+            chosen = moved(state.base, chosen.double(), self.space.free(device=chosen.device)).to(
+                seen.dtype
+            )
         return self.space.from_unit(chosen), state._replace(state=after)
 
-    def read(self, batch: PairBatch, until: Tensor, state: PolicyState, since: Tensor | None = None) -> PolicyState:
+    def read(
+        self, batch: PairBatch, until: Tensor, state: PolicyState, since: Tensor | None = None
+    ) -> PolicyState:
         """Lets D drivers read their measured history before they drive.
 
         Args:
@@ -198,10 +218,16 @@ class TrainedPolicy:
         begin = 0 if since is None else int(since.min()) // stride * stride
         each = torch.arange(len(batch), device=until.device)
         for first in range(begin, int(until.max()), stride):
-            _, after = self.act(measured_history(batch, each, torch.full_like(until, first), self.windows.length), state)
+            _, after = self.act(
+                measured_history(batch, each, torch.full_like(until, first), self.windows.length),
+                state,
+            )
             reading = ((first < until) & (first >= (0 if since is None else since)))[:, None]
             merged = state.state.clone()
-            kept, new = state.state[state.network, state.place], after.state[state.network, state.place]
+            kept, new = (
+                state.state[state.network, state.place],
+                after.state[state.network, state.place],
+            )
             merged[state.network, state.place] = torch.where(reading, new, kept)
             state = state._replace(state=merged)
         return state
@@ -231,10 +257,21 @@ class TrainedPolicy:
             )
         batch = PairBatch.of(pairs)
         until = batch.lengths - 1
-        state = self.read(batch, until, self.begin(self.networks_for(pairs), traits=self.traits_of(batch, until)))
-        chosen, _ = self.act(measured_history(batch, torch.arange(len(batch)), until, self.windows.length), state)
+        state = self.read(
+            batch,
+            until,
+            self.begin(
+                self.networks_for(pairs), driver_features=self.driver_features_of(batch, until)
+            ),
+        )
+        chosen, _ = self.act(
+            measured_history(batch, torch.arange(len(batch)), until, self.windows.length), state
+        )
         return pd.DataFrame(
-            {"pair_id": [pair.pair_id for pair in pairs], **dict(zip(self.space.names, chosen.T.tolist(), strict=True))}
+            {
+                "pair_id": [pair.pair_id for pair in pairs],
+                **dict(zip(self.space.names, chosen.T.tolist(), strict=True)),
+            }
         )
 
     def networks_for(self, pairs: PairSet) -> Tensor:
@@ -254,7 +291,7 @@ class TrainedPolicy:
             )
         return torch.tensor([number.get(pair.pair_id, number.get(ALL, 0)) for pair in pairs])
 
-    def for_strangers(self) -> TrainedPolicy:
+    def for_unseen_drivers(self) -> TrainedPolicy:
         """Returns the one network that drives anybody: the only one there is, or the one named `all`.
 
         Raises:
@@ -268,12 +305,14 @@ class TrainedPolicy:
                 " protocol.networks=all or protocol=across_drivers"
             )
         at = torch.tensor([self.names.index(ALL)], device=self.scaler.mean.device)
-        size = self.network.size if isinstance(self.network, Committee) else 1
+        size = self.network.size if isinstance(self.network, Ensemble) else 1
         members = (at[:, None] * size + torch.arange(size, device=at.device)).flatten()
         weights = {name: value[members] for name, value in self.network.state_dict().items()}
         return replace(
             self,
-            network=_network(self.policy, weights, size, self.scaler.mean[at], self.space).to(at.device),
+            network=_network(self.policy, weights, size, self.scaler.mean[at], self.space).to(
+                at.device
+            ),
             scaler=Scaler(self.scaler.mean[at], self.scaler.scale[at]),
             names=(ALL,),
             base=self.base[at] if self.base is not None else None,
@@ -292,13 +331,17 @@ class TrainedPolicy:
 
     def save(self, folder: Path) -> None:
         """Writes `policy.pt` and `policy.json`; each appears whole."""
-        weights = {f"network.{key}": value.cpu() for key, value in self.network.state_dict().items()}
+        weights = {
+            f"network.{key}": value.cpu() for key, value in self.network.state_dict().items()
+        }
         weights |= {f"scaler.{key}": value.cpu() for key, value in self.scaler.state_dict().items()}
         weights |= {
-            name: value.cpu() for name, value in {"base": self.base, "population": self.population}.items() if value is not None
+            name: value.cpu()
+            for name, value in {"base": self.base, "population": self.population}.items()
+            if value is not None
         }
         folder.mkdir(parents=True, exist_ok=True)
-        with whole(folder / "policy.pt") as temporary:
+        with atomic_write(folder / "policy.pt") as temporary:
             torch.save(weights, temporary)
         description = {
             "format": _FORMAT,
@@ -308,13 +351,13 @@ class TrainedPolicy:
             "windows": self.windows.model_dump(),
             "dt": self.dt,
             "names": list(self.names),
-            "members": self.network.size if isinstance(self.network, Committee) else 1,
+            "ensemble_size": self.network.size if isinstance(self.network, Ensemble) else 1,
             "shrinkage": self.shrinkage,
             "own": self.own,
             "history": self.history,
             "learned_from": dict(self.learned_from),
         }
-        with whole(folder / "policy.json") as temporary:
+        with atomic_write(folder / "policy.json") as temporary:
             temporary.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
 
     @classmethod
@@ -330,31 +373,41 @@ class TrainedPolicy:
             description = json.loads((folder / "policy.json").read_text(encoding="utf-8"))
             weights = torch.load(folder / "policy.pt", weights_only=True, map_location="cpu")
         except (OSError, ValueError, RuntimeError) as error:
-            raise DataError(f"{folder} holds no policy that can be read ({error}); give a job's folder") from error
+            raise DataError(
+                f"{folder} holds no policy that can be read ({error}); give a job's folder"
+            ) from error
         if description.get("format") != _FORMAT:
             raise DataError(
                 f"{folder}/policy.json has format {description.get('format')}; this version of cfx reads format {_FORMAT}"
             )
-        policy = registry.create("policy", description["policy"])
-        model = registry.create("model", description["model"])
+        policy_node = renamed.node("policy", description["policy"])
+        model_node = renamed.node("model", description["model"])
+        policy = registry.create("policy", policy_node)
+        model = registry.create("model", model_node)
         assert isinstance(policy, Policy)
         assert isinstance(model, DrivingModel)
         windows = WindowSettings(**description["windows"])
         mean = weights["scaler.mean"]
         features = mean.shape[1]
         base = weights.get("base")
-        space = model.space if base is None else model.reach
-        width = token_width(policy.inputs, policy.summary, windows.length) + (len(space) if base is not None else 0)
-        width += len(policy.traits)
+        space = model.space if base is None else model.adaptation_space
+        width = token_width(policy.inputs, policy.summary, windows.length) + (
+            len(space) if base is not None else 0
+        )
+        width += len(policy.driver_features)
         if features != width:
-            raise DataError(f"{folder}: the weights read {features} features, the policy's settings give {width}")
-        trained = {k.removeprefix("network."): v for k, v in weights.items() if k.startswith("network.")}
+            raise DataError(
+                f"{folder}: the weights read {features} features, the policy's settings give {width}"
+            )
+        trained = {
+            k.removeprefix("network."): v for k, v in weights.items() if k.startswith("network.")
+        }
         return cls(
             policy=policy,
-            network=_network(policy, trained, description.get("members", 1), mean, space),
+            network=_network(policy, trained, _ensemble_size(description), mean, space),
             scaler=Scaler(mean, weights["scaler.scale"]),
-            model_node=description["model"],
-            policy_node=description["policy"],
+            model_node=model_node,
+            policy_node=policy_node,
             space=space,
             windows=windows,
             dt=description["dt"],
@@ -368,12 +421,21 @@ class TrainedPolicy:
         )
 
 
-def _network(policy: Policy, weights: Mapping[str, Tensor], size: int, mean: Tensor, space: ParameterSpace) -> PolicyNetwork:
-    """Returns networks with these weights, committees of `size` each; `mean` `(N, f)` says how many, and what they read."""
+def _ensemble_size(description: Mapping[str, Any]) -> int:
+    """Returns how many networks answer together; the version before called them members."""
+    return int(description.get("ensemble_size", description.get("members", 1)))
+
+
+def _network(
+    policy: Policy, weights: Mapping[str, Tensor], size: int, mean: Tensor, space: ParameterSpace
+) -> PolicyNetwork:
+    """Returns networks with these weights, ensembles of `size` each; `mean` `(N, f)` says how many, and what they read."""
     networks, features = mean.shape
     blank = torch.zeros((networks * size, len(space)), dtype=mean.dtype)
-    network = policy.build(features, blank[0], blank, torch.Generator().manual_seed(0)).to(blank.dtype)
-    network = Committee(network, size) if size > 1 else network
+    network = policy.build(features, blank[0], blank, torch.Generator().manual_seed(0)).to(
+        blank.dtype
+    )
+    network = Ensemble(network, size) if size > 1 else network
     network.load_state_dict(dict(weights))
     return network.eval()
 

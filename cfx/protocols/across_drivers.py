@@ -19,11 +19,11 @@ from cfx.calibration.calibrator import Labels
 from cfx.calibration.windows import Split
 from cfx.component import Settings
 from cfx.errors import DataError
-from cfx.learners.base import Learned, Lesson
+from cfx.learners.base import TrainingData, TrainingResult
 from cfx.pairs import Pair, PairSet
 from cfx.policies.offsets import drawn
 from cfx.policies.trained import ALL, TrainedPolicy
-from cfx.protocols.base import Outcome, Protocol, Study
+from cfx.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.protocols.held_out import HeldOut
 
 log = logging.getLogger(__name__)
@@ -32,19 +32,23 @@ log = logging.getLogger(__name__)
 class AcrossDriversSettings(Settings):
     """Settings of `across_drivers`."""
 
-    folds: int = Field(5, ge=2, description="parts that the drivers are divided into; each is tested once")
+    folds: int = Field(
+        5, ge=2, description="parts that the drivers are divided into; each is tested once"
+    )
     together: Literal["driver", "platoon", "recording"] = Field(
         "driver",
         description="what a fold keeps together: driver: all pairs of one follower; platoon: also all who follow each other;"
         " recording: all drivers of a recording, so that whole recordings are tested which nobody learned from",
     )
     min_test_frames: int | None = Field(
-        None, ge=1, description="frames a pair must have to be tested; shorter ones are only learned from; null: all are tested"
+        None,
+        ge=1,
+        description="frames a pair must have to be tested; shorter ones are only learned from; null: all are tested",
     )
     base: Literal["own", "population", "default"] = Field(
         "own",
         description="what a policy of offsets starts from, for a driver whose history it has read: his own fixed parameters, the"
-        " population's, or the model's default ones; for strangers it is the population's, or the default ones",
+        " population's, or the model's default ones; for unseen drivers it is the population's, or the default ones",
     )
     shrinkage: float = Field(
         0.7,
@@ -54,10 +58,13 @@ class AcrossDriversSettings(Settings):
         " space); 0: not at all. The baseline `fixed` is never drawn.",
     )
     history: float | None = Field(
-        None, ge=0, description="s of measured history before the test part that the policy reads; null: all there is"
+        None,
+        ge=0,
+        description="s of measured history before the test part that the policy reads; null: all there is",
     )
     histories: tuple[float, ...] = Field(
-        (0.0, 10.0, 30.0), description="s: other amounts of history to compare, for policies of offsets; empty: none"
+        (0.0, 10.0, 30.0),
+        description="s: other amounts of history to compare, for policies of offsets; empty: none",
     )
 
 
@@ -84,27 +91,36 @@ class AcrossDrivers(Protocol):
     schema: ClassVar[type[Settings]] = AcrossDriversSettings
     settings: AcrossDriversSettings
 
-    def run(self, study: Study) -> Outcome:
-        pairs, batch = study.pairs, study.batch
-        fold = self.folds(pairs, seed=study.seed)
+    def run(self, context: ProtocolContext) -> ProtocolResult:
+        pairs, batch = context.pairs, context.batch
+        fold = self.folds(pairs, seed=context.seed)
         # Row k: the pairs that network k learns from; the last network learns from all.
         numbers = torch.arange(self.settings.folds + 1)[:, None]
         members = ((fold != numbers) & (fold != -2 - numbers)) | (numbers == self.settings.folds)
         notes = _overlap(pairs, fold, apart=self.settings.together == "recording")
-        split, whole = Split.of(pairs, study.windows, study.split), Split.none(pairs, study.windows)
-        fixed = study.calibrator.fixed(pairs, batch, split.frame)
-        population = study.calibrator.population(pairs, batch, whole.frame, members)
-        labels = study.labels(whole.windows, fixed)
+        split, whole = (
+            Split.of(pairs, context.windows, context.split),
+            Split.none(pairs, context.windows),
+        )
+        fixed = context.calibrator.fixed(pairs, batch, split.frame)
+        population = context.calibrator.population(pairs, batch, whole.frame, members)
+        labels = context.labels(whole.windows, fixed)
         names = (*(f"fold {k}" for k in range(self.settings.folds)), ALL)
-        default = study.space.defaults(dtype=population.dtype, device=population.device).expand_as(population)
+        default = context.space.defaults(
+            dtype=population.dtype, device=population.device
+        ).expand_as(population)
         strange = default if self.settings.base == "default" else population
-        own = drawn(study.simulator.model.reach, fixed, self.settings.shrinkage) if self.settings.base == "own" else None
-        policy, learned = self._learn(study, whole, members, strange, own, labels, names)
+        own = (
+            drawn(context.simulator.model.adaptation_space, fixed, self.settings.shrinkage)
+            if self.settings.base == "own"
+            else None
+        )
+        policy, training_result = self._learn(context, whole, members, strange, own, labels, names)
         policy = replace(policy, population=population)
 
         tested = (fold >= 0).nonzero()[:, 0]
         test = HeldOut(
-            study=study,
+            context=context,
             pairs=replace(pairs, pairs=tuple(pairs[int(number)] for number in tested)),
             batch=batch[tested.to(batch.lengths.device)],
             network=fold[tested].to(batch.lengths.device),
@@ -116,7 +132,7 @@ class AcrossDrivers(Protocol):
             policy=policy,
         )
         evaluation = test.evaluation(self.settings.histories, fold=fold[tested])
-        return Outcome(evaluation, policy, learned.curves, labels, notes)
+        return ProtocolResult(evaluation, policy, training_result.curves, labels, notes)
 
     def folds(self, pairs: PairSet, *, seed: int) -> Tensor:
         """Returns in which fold each pair is tested, `(P,)` int64; -1 for a pair that is only learned from.
@@ -133,7 +149,9 @@ class AcrossDrivers(Protocol):
         tested = [number for number, pair in enumerate(pairs) if len(pair) >= least]
         found = len({groups[number] for number in tested})
         if found < self.settings.folds:
-            what = f"{together}{'s' * (found != 1)}{f' with {least} frames or more' if least else ''}"
+            what = (
+                f"{together}{'s' * (found != 1)}{f' with {least} frames or more' if least else ''}"
+            )
             raise DataError(
                 f"protocol.folds={self.settings.folds}: {pairs.source} has only {found} {what} here; lower protocol.folds"
                 f" (2 at least) or use more {'recordings' if together == 'recording' else 'pairs'}"
@@ -146,67 +164,83 @@ class AcrossDrivers(Protocol):
         long_enough = set(tested)
         return torch.tensor(
             [
-                of_group[group] if number in long_enough else -2 - of_group[group] if group in of_group else -1
+                of_group[group]
+                if number in long_enough
+                else -2 - of_group[group]
+                if group in of_group
+                else -1
                 for number, group in enumerate(groups)
             ]
         )
 
     def _learn(
         self,
-        study: Study,
+        context: ProtocolContext,
         whole: Split,
         members: Tensor,
         start: Tensor,
         base: Tensor | None,
         labels: Labels | None,
         names: tuple[str, ...],
-    ) -> tuple[TrainedPolicy, Learned]:
+    ) -> tuple[TrainedPolicy, TrainingResult]:
         """Trains a network for each row of `members` `(K, P)` on these pairs' whole drives.
 
         Args:
             start: what each network starts from, `(K, n)`.
             base: drivers' own bases, `(P, n)`, if they have any.
         """
-        if not study.policy.trainable:
-            learned = study.untrained(study.policy, start)
-            return study.ready(study.policy, learned, names), learned
+        if not context.policy.trainable:
+            training_result = context.untrained(context.policy, start)
+            return context.ready(context.policy, training_result, names), training_result
         network, index = members.nonzero().unbind(1)
-        device = study.batch.lengths.device
-        lesson = Lesson(
-            simulator=study.simulator,
-            batch=study.batch[index.to(device)],
+        device = context.batch.lengths.device
+        training_data = TrainingData(
+            simulator=context.simulator,
+            batch=context.batch[index.to(device)],
             split=whole[index],
-            windows=study.windows,
+            windows=context.windows,
             fixed=start[network.to(device)],
             labels=labels.select(index) if labels is not None else None,
             network=network.to(device),
             names=names,
-            seed=study.seed,
-            # Also where both are the same: strangers differ in that nothing of their history was read.
+            seed=context.seed,
+            # Also where both are the same: unseen drivers differ in that nothing of their history was read.
             base=base[index.to(device)] if base is not None else start[network.to(device)],
-            drivers=tuple(study.pairs[number].driver for number in index.tolist()),
-            workspace=study.workspace,
+            drivers=tuple(context.pairs[number].driver for number in index.tolist()),
+            workspace=context.workspace,
         )
-        if not study.learner.reads_history and (self.settings.history != 0 or any(self.settings.histories)):
+        if not context.learner.reads_history and (
+            self.settings.history != 0 or any(self.settings.histories)
+        ):
             log.warning(
-                "This policy learns from no drive with history before it (rollout: learner.strangers=1), and drives badly after"
-                " reading any, as it will in the test; set protocol.history=0 protocol.histories=[], or lower learner.strangers"
+                "This policy learns from no drive with history before it (rollout: learner.cold_start_fraction=1), and drives badly after"
+                " reading any, as it will in the test; set protocol.history=0 protocol.histories=[], or lower learner.cold_start_fraction"
             )
-        if study.policy.traits and (self.settings.history == 0 or not study.learner.reads_history):
+        if context.policy.driver_features and (
+            self.settings.history == 0 or not context.learner.reads_history
+        ):
             log.warning(
-                "policy.traits are measured from a driver's history, of which nothing is known here (protocol.history=0, or"
-                " learner.strangers=1 of rollout); leave them out, or set protocol.history=null and lower learner.strangers"
+                "policy.driver_features are measured from a driver's history, of which nothing is known here (protocol.history=0, or"
+                " learner.cold_start_fraction=1 of rollout); leave them out, or set protocol.history=null and lower learner.cold_start_fraction"
             )
-        learned = study.learner.fit(study.policy, lesson)
-        policy = study.ready(study.policy, learned, names)
+        training_result = context.learner.fit(context.policy, training_data)
+        policy = context.ready(context.policy, training_result, names)
         own = self.settings.base == "own"
-        return replace(policy, shrinkage=self.settings.shrinkage if own else 0.0, own=own, history=self.settings.history), learned
+        return replace(
+            policy,
+            shrinkage=self.settings.shrinkage if own else 0.0,
+            own=own,
+            history=self.settings.history,
+        ), training_result
 
 
 def _platoons(pairs: Sequence[Pair]) -> list[int]:
     """Numbers the platoon of each pair: vehicles of a recording that follow one another, directly or through others."""
     names = [(f"{pair.recording}/{pair.leader_id}", pair.driver) for pair in pairs]
-    number = {name: index for index, name in enumerate(sorted({vehicle for both in names for vehicle in both}))}
+    number = {
+        name: index
+        for index, name in enumerate(sorted({vehicle for both in names for vehicle in both}))
+    }
     edges = np.array([[number[leader], number[follower]] for leader, follower in names]).T
     graph = coo_array((np.ones(len(names)), (edges[0], edges[1])), shape=(len(number), len(number)))
     _, platoon = connected_components(graph, directed=False)
@@ -230,11 +264,13 @@ def _overlap(pairs: PairSet, fold: Tensor, *, apart: bool) -> dict[str, Any]:
     places = [int(number) for number in fold]
     tested = {pair.driver: k for pair, k in zip(pairs, places, strict=True) if k >= 0}
     # Of whom somebody learns: in which fold they do not.
-    learned = {pair.driver: k if k >= 0 else -2 - k for pair, k in zip(pairs, places, strict=True)}
+    training_result = {
+        pair.driver: k if k >= 0 else -2 - k for pair, k in zip(pairs, places, strict=True)
+    }
     behind_trained, leaders = 0, set()
     for pair, k in zip(pairs, places, strict=True):
         leader = f"{pair.recording}/{pair.leader_id}"
-        behind_trained += k >= 0 and leader in learned and learned[leader] != k
+        behind_trained += k >= 0 and leader in training_result and training_result[leader] != k
         if leader in tested and tested[leader] not in {k, -2 - k}:
             leaders.add(leader)
     folds, count = max(places) + 1, sum(k >= 0 for k in places)
@@ -248,10 +284,15 @@ def _overlap(pairs: PairSet, fold: Tensor, *, apart: bool) -> dict[str, Any]:
     )
     if count < len(pairs):
         log.info("%d shorter pairs are only learned from", len(pairs) - count)
-    recordings = [sorted({p.recording for p, k in zip(pairs, places, strict=True) if k == number}) for number in range(folds)]
+    recordings = [
+        sorted({p.recording for p, k in zip(pairs, places, strict=True) if k == number})
+        for number in range(folds)
+    ]
     if apart:
         for number, names in enumerate(recordings):
-            log.info("Fold %d is tested on %s, of which it learns nothing", number, ", ".join(names))
+            log.info(
+                "Fold %d is tested on %s, of which it learns nothing", number, ", ".join(names)
+            )
     return {
         "folds": folds,
         "recordings_per_fold": recordings,

@@ -19,7 +19,7 @@ from cfx.calibration.windows import Windows, WindowSettings
 from cfx.component import Component
 from cfx.errors import PluginError
 from cfx.evaluation.result import Evaluation
-from cfx.learners.base import CURVE_COLUMNS, Learned, Learner
+from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingResult
 from cfx.pairs import PairBatch, PairSet
 from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Study:
+class ProtocolContext:
     """Everything that a protocol composes.
 
     Attributes:
@@ -75,8 +75,10 @@ class Study:
         """
         if not (self.policy.trainable and self.learner.needs_labels):
             return None
-        labels = self.calibrator.labels(self.pairs, self.batch, Windows.of(counts, self.windows), fixed)
-        told = float((labels.spread > self.windows.tie_tolerance).double().mean())
+        labels = self.calibrator.labels(
+            self.pairs, self.batch, Windows.of(counts, self.windows), fixed
+        )
+        told = float((labels.sensitivity > self.windows.tie_tolerance).double().mean())
         log.info(
             "Window labels: %d windows; parameters matter by more than %g m/s in %.0f %% of them",
             len(labels.windows),
@@ -92,45 +94,64 @@ class Study:
             policy: the component.
             parameters: `(N, n)`, SI units: what `fixed` answers, and recurrent networks start from; one network for each row.
         """
-        return self.ready(policy, self.untrained(policy, parameters), tuple(str(number) for number in range(len(parameters))))
+        return self.ready(
+            policy,
+            self.untrained(policy, parameters),
+            tuple(str(number) for number in range(len(parameters))),
+        )
 
-    def untrained(self, policy: Policy, parameters: Tensor) -> Learned:
+    def untrained(self, policy: Policy, parameters: Tensor) -> TrainingResult:
         """Returns a policy's networks as built, in float64, so that constants stay what calibration found; see `constant`."""
         space = self.simulator.model.space
         width = token_width(policy.inputs, policy.summary, self.windows.length)
         unit = space.to_unit(parameters.cpu())
-        network = policy.build(width, space.to_unit(space.defaults()), unit, torch.Generator().manual_seed(self.seed))
+        network = policy.build(
+            width, space.to_unit(space.defaults()), unit, torch.Generator().manual_seed(self.seed)
+        )
         scaler = Scaler(unit.new_zeros((len(unit), width)), unit.new_ones((len(unit), width)))
         device = parameters.device
-        return Learned(network.to(device).eval(), scaler.to(device), pd.DataFrame(columns=CURVE_COLUMNS))
+        return TrainingResult(
+            network.to(device).eval(), scaler.to(device), pd.DataFrame(columns=CURVE_COLUMNS)
+        )
 
-    def ready(self, policy: Policy, learned: Learned, names: tuple[str, ...]) -> TrainedPolicy:
+    def ready(
+        self, policy: Policy, training_result: TrainingResult, names: tuple[str, ...]
+    ) -> TrainedPolicy:
         """Returns networks that are ready to drive; `names` says what each is for.
 
         Raises:
             PluginError: the learner or the policy did not deliver such networks.
         """
-        _check_learned(registry.origin(self.learner if policy.trainable else policy), learned, len(names), len(self.space))
-        reach = self.simulator.model.reach
-        if policy.trainable and learned.base is None and reach != self.space:
-            log.info("model.reach changes nothing here: this policy answers parameters, not offsets (learner=rollout)")
+        _check_training_result(
+            registry.origin(self.learner if policy.trainable else policy),
+            training_result,
+            len(names),
+            len(self.space),
+        )
+        adaptation_space = self.simulator.model.adaptation_space
+        if policy.trainable and training_result.base is None and adaptation_space != self.space:
+            log.info(
+                "model.adaptation_bounds changes nothing here: this policy answers parameters, not offsets (learner=rollout)"
+            )
         return TrainedPolicy(
             policy=policy,
-            network=learned.network,
-            scaler=learned.scaler,
+            network=training_result.network,
+            scaler=training_result.scaler,
             model_node=self.model_node,
             policy_node=self.policy_node,
-            space=self.space if learned.base is None else reach,
+            space=self.space if training_result.base is None else adaptation_space,
             windows=self.windows,
             dt=self.simulator.dt,
             names=names,
-            base=learned.base,
-            learned_from={pair.content: pair.driver for pair in self.pairs},  # constants are calibrated on them, too
+            base=training_result.base,
+            learned_from={
+                pair.content: pair.driver for pair in self.pairs
+            },  # constants are calibrated on them, too
         )
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ProtocolResult:
     """What a protocol delivers.
 
     Attributes:
@@ -149,14 +170,21 @@ class Outcome:
 
 
 @torch.no_grad()
-def _check_learned(who: str, learned: object, networks: int, parameters: int) -> None:
+def _check_training_result(
+    who: str, training_result: object, networks: int, parameters: int
+) -> None:
     """Asks the networks about one window, so that a wrong shape or dtype ends in a sentence."""
-    if not isinstance(learned, Learned):
-        raise PluginError(f"{who}: fit must return a cfx.Learned, but returned a {type(learned).__name__}")
-    mean = learned.scaler.mean
+    if not isinstance(training_result, TrainingResult):
+        raise PluginError(
+            f"{who}: fit must return a cfx.TrainingResult, but returned a {type(training_result).__name__}"
+        )
+    mean = training_result.scaler.mean
     expected = (networks, 1, 1, parameters)
     if mean.shape[0] == networks:
-        answer, _ = learned.network(mean.new_zeros((networks, 1, 1, mean.shape[1])), learned.network.initial_state(networks, 1))
+        answer, _ = training_result.network(
+            mean.new_zeros((networks, 1, 1, mean.shape[1])),
+            training_result.network.initial_state(networks, 1),
+        )
         if answer.shape == expected and answer.dtype == mean.dtype:
             return
         got = f"its networks answer {tuple(answer.shape)} in {answer.dtype} where {expected} in {mean.dtype} are wanted"
@@ -190,5 +218,5 @@ class Protocol(Component):
         return {}
 
     @abstractmethod
-    def run(self, study: Study) -> Outcome:
+    def run(self, context: ProtocolContext) -> ProtocolResult:
         """Calibrates, trains and evaluates."""

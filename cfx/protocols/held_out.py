@@ -18,7 +18,7 @@ from cfx.pairs import PairBatch, PairSet
 from cfx.policies.default import DefaultPolicy
 from cfx.policies.fixed import FixedPolicy
 from cfx.policies.trained import TrainedPolicy
-from cfx.protocols.base import Study
+from cfx.protocols.base import ProtocolContext
 
 
 @dataclass(frozen=True)
@@ -30,13 +30,13 @@ class HeldOut:
         network: which of the policy's N networks, and of the populations, drives each, `(Q,)`.
         first: the last measured frame before the test part, `(Q,)`.
         fixed: each driver's own set, `(Q, n)`.
-        base: what offsets start from for him, if not from what they do for a stranger, `(Q, n)`.
+        base: what offsets start from for him, if not from what they do for an unseen driver, `(Q, n)`.
         strange: what offsets start from for a driver of whom nothing is known, `(Q, n)`.
         population: of each network, `(N, n)`; None if there is none.
         policy: what was learned.
     """
 
-    study: Study
+    context: ProtocolContext
     pairs: PairSet
     batch: PairBatch
     network: Tensor
@@ -47,47 +47,69 @@ class HeldOut:
     population: Tensor | None
     policy: TrainedPolicy
 
-    def evaluation(self, histories: Sequence[float] = (), *, fold: Tensor | None = None) -> Evaluation:
+    def evaluation(
+        self, histories: Sequence[float] = (), *, fold: Tensor | None = None
+    ) -> Evaluation:
         """Drives all methods and compares them.
 
         Args:
             histories: s, other amounts of history to compare, for policies of offsets.
             fold: in which fold each pair is tested, `(Q,)`; None: there are none.
         """
-        study, batch, first, network = self.study, self.batch, self.first, self.network
-        names, model = self.policy.names, study.simulator.model
-        defaults = study.space.defaults(dtype=self.fixed.dtype, device=self.fixed.device)
-        strangers = {"default": study.constant(DefaultPolicy(), defaults.expand(len(names), -1)), "policy": self.policy}
+        context, batch, first, network = self.context, self.batch, self.first, self.network
+        names, model = self.policy.names, context.simulator.model
+        defaults = context.space.defaults(dtype=self.fixed.dtype, device=self.fixed.device)
+        cold_start_fraction = {
+            "default": context.constant(DefaultPolicy(), defaults.expand(len(names), -1)),
+            "policy": self.policy,
+        }
         platoons: dict[str, tuple[TrainedPolicy, Sequence[str]]] = {
-            "default": (study.constant(DefaultPolicy(), defaults[None]), ("any",)),
+            "default": (context.constant(DefaultPolicy(), defaults[None]), ("any",)),
             "policy": (self.policy, names),
         }
         if self.population is not None:
-            strangers["population"] = study.constant(FixedPolicy(), self.population)
-            platoons["population"] = (strangers["population"], names)
+            cold_start_fraction["population"] = context.constant(FixedPolicy(), self.population)
+            platoons["population"] = (cold_start_fraction["population"], names)
         base = self.strange if self.base is None else self.base
         loops = {
-            name: drive(study.simulator, one, batch, first, network, base=base, history=self.policy.history)
-            for name, one in strangers.items()
+            name: drive(
+                context.simulator,
+                one,
+                batch,
+                first,
+                network,
+                base=base,
+                history=self.policy.history,
+            )
+            for name, one in cold_start_fraction.items()
         }
         each = torch.arange(len(first), device=first.device)
-        loops["fixed"] = drive(study.simulator, study.constant(FixedPolicy(), self.fixed), batch, first, each)
+        loops["fixed"] = drive(
+            context.simulator, context.constant(FixedPolicy(), self.fixed), batch, first, each
+        )
         if self.base is not None and self.policy.base is not None and self.policy.shrinkage > 0:
-            loops["base"] = drive(study.simulator, study.constant(FixedPolicy(), self.base), batch, first, each)
-        whole = {name: drive(study.simulator, one, batch, torch.zeros_like(first), network) for name, one in strangers.items()}
+            loops["shrunk"] = drive(
+                context.simulator, context.constant(FixedPolicy(), self.base), batch, first, each
+            )
+        whole = {
+            name: drive(context.simulator, one, batch, torch.zeros_like(first), network)
+            for name, one in cold_start_fraction.items()
+        }
         return evaluate(
             self.pairs,
             batch,
             first,
             loops,
-            study.space,
-            study.style,
-            reach=self.policy.space,
-            seed=study.seed,
+            context.space,
+            context.style,
+            adaptation_space=self.policy.space,
+            seed=context.seed,
             fold=fold,
             whole=whole,
             platoon=measure_platoons(model, platoons),
-            history=self.history(histories, loops["fixed"]) if self.policy.base is not None and histories else None,
+            history=self.history(histories, loops["fixed"])
+            if self.policy.base is not None and histories
+            else None,
         )
 
     def history(self, histories: Sequence[float], fixed: ClosedLoop) -> pd.DataFrame:
@@ -97,15 +119,23 @@ class HeldOut:
             histories: s; besides them, all there is.
             fixed: what the drivers' own sets drove there.
         """
-        study, batch, first, network = self.study, self.batch, self.first, self.network
+        context, batch, first, network = self.context, self.batch, self.first, self.network
         own, _ = closed_loop_errors(batch, first, fixed)
         bases = {"own": self.base} if self.base is not None else {}
         rows = []
         for base, values in {**bases, "population": self.strange}.items():
             for amount in (*sorted(histories), None):
-                loop = drive(study.simulator, self.policy, batch, first, network, base=values, history=amount)
+                loop = drive(
+                    context.simulator,
+                    self.policy,
+                    batch,
+                    first,
+                    network,
+                    base=values,
+                    history=amount,
+                )
                 speed, gap = closed_loop_errors(batch, first, loop)
-                read = first.cpu().numpy() * study.simulator.dt
+                read = first.cpu().numpy() * context.simulator.dt
                 rows.append(
                     pd.DataFrame(
                         {
@@ -113,10 +143,14 @@ class HeldOut:
                             "driver": [pair.driver for pair in self.pairs],
                             "base": base,
                             "history_s": read if amount is None else np.minimum(read, amount),
-                            "amount": f"{study.split:.0%}".replace("%", " %") if amount is None else f"{amount:g} s",
+                            "amount": f"{context.split:.0%}".replace("%", " %")
+                            if amount is None
+                            else f"{amount:g} s",
                             "rmse_speed": speed,
                             "rmse_gap": gap,
-                            "improvement": np.divide(own - speed, own, out=np.full_like(own, np.nan), where=own > 0),
+                            "improvement": np.divide(
+                                own - speed, own, out=np.full_like(own, np.nan), where=own > 0
+                            ),
                         }
                     )
                 )

@@ -18,7 +18,7 @@ from cfx.files import FilePath
 from cfx.learners.base import CURVE_COLUMNS
 from cfx.pairs import PairSet
 from cfx.policies.trained import TrainedPolicy
-from cfx.protocols.base import Outcome, Protocol, Study
+from cfx.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.protocols.held_out import HeldOut
 
 log = logging.getLogger(__name__)
@@ -27,13 +27,15 @@ log = logging.getLogger(__name__)
 class TransferSettings(Settings):
     """Settings of `transfer`."""
 
-    run: FilePath = Field(description="output folder of the job whose policy drives, or the id of its MLflow run")
+    run: FilePath = Field(
+        description="output folder of the job whose policy drives, or the id of its MLflow run"
+    )
 
 
 class Transfer(Protocol):
     """A finished job's policy drives recordings that it has never seen; nothing is trained.
 
-    Model, policy and windows are that job's, whatever else is chosen. Its network for strangers (`all`, or the only one) drives
+    Model, policy and windows are that job's, whatever else is chosen. Its network for unseen drivers (`all`, or the only one) drives
     as its protocol let it: from each driver's own parameters or from the population's, after as much history. The baselines are
     the model's default parameters, `population`, the constant ones that were calibrated on those whom the policy learned from
     (where there are any), and the driver's own fixed parameters, from the first 80 % of his drive here. All drive the last
@@ -59,25 +61,29 @@ class Transfer(Protocol):
             DataError: the folder holds none, or none for other drivers than those it was trained for.
         """
         try:
-            return TrainedPolicy.load(self.settings.run / "policy").for_strangers()
+            return TrainedPolicy.load(self.settings.run / "policy").for_unseen_drivers()
         except DataError as error:
             raise DataError(f"protocol.run={self.settings.run}: {error}") from None
 
     def determines(self) -> Mapping[str, Any]:
         policy = self.policy
-        return {"model": dict(policy.model_node), "policy": dict(policy.policy_node), "windows": policy.windows.model_dump()}
+        return {
+            "model": dict(policy.model_node),
+            "policy": dict(policy.policy_node),
+            "windows": policy.windows.model_dump(),
+        }
 
-    def run(self, study: Study) -> Outcome:
-        policy, pairs, batch = self.policy, study.pairs, study.batch
+    def run(self, context: ProtocolContext) -> ProtocolResult:
+        policy, pairs, batch = self.policy, context.pairs, context.batch
         self._check(policy, pairs)
         device = batch.lengths.device
         policy = policy.to(device)
-        split = Split.of(pairs, study.windows, study.split)
-        fixed = study.calibrator.fixed(pairs, batch, split.frame)
-        default = study.space.defaults(dtype=fixed.dtype, device=fixed.device)
+        split = Split.of(pairs, context.windows, context.split)
+        fixed = context.calibrator.fixed(pairs, batch, split.frame)
+        default = context.space.defaults(dtype=fixed.dtype, device=fixed.device)
         start = default[None] if policy.base is None else policy.base.to(fixed.dtype)
         test = HeldOut(
-            study=study,
+            context=context,
             pairs=pairs,
             batch=batch,
             network=torch.zeros(len(pairs), dtype=torch.int64, device=device),
@@ -93,7 +99,9 @@ class Transfer(Protocol):
             "pairs_learned_from": len(policy.learned_from),
             "drivers_named_as_some_learned_from": _named_alike(policy, pairs),
         }
-        return Outcome(test.evaluation(), policy, pd.DataFrame(columns=CURVE_COLUMNS), None, notes)
+        return ProtocolResult(
+            test.evaluation(), policy, pd.DataFrame(columns=CURVE_COLUMNS), None, notes
+        )
 
     def _check(self, policy: TrainedPolicy, pairs: PairSet) -> None:
         """Raises DataError if the policy cannot drive these pairs, or has learned from some of them."""
@@ -110,7 +118,10 @@ class Transfer(Protocol):
                 f" them '{known[0]}'; test it on others (data.recording, data.pair_ids)"
             )
         if not policy.learned_from:
-            log.info("%s does not say which pairs its policy has learned from; see to it yourself that these are others", where)
+            log.info(
+                "%s does not say which pairs its policy has learned from; see to it yourself that these are others",
+                where,
+            )
         if alike := _named_alike(policy, pairs):
             log.warning(
                 "%d drivers are called, recording and all, as some that the policy has learned from; if they are the same, as"

@@ -12,18 +12,19 @@ from cfx.component import Settings
 from cfx.evaluation.closed_loop import drive
 from cfx.evaluation.metrics import evaluate
 from cfx.evaluation.platoon import measure_platoons
-from cfx.learners.base import Lesson
+from cfx.learners.base import TrainingData
 from cfx.policies.default import DefaultPolicy
 from cfx.policies.fixed import FixedPolicy
 from cfx.policies.trained import ALL, group_by
-from cfx.protocols.base import Outcome, Protocol, Study
+from cfx.protocols.base import Protocol, ProtocolContext, ProtocolResult
 
 
 class WithinDriverSettings(Settings):
     """Settings of `within_driver`."""
 
     networks: Literal["pair", "all"] = Field(
-        "pair", description="pair: a network for each pair, as in the paper; all: one network for all pairs"
+        "pair",
+        description="pair: a network for each pair, as in the paper; all: one network for all pairs",
     )
 
 
@@ -37,47 +38,58 @@ class WithinDriver(Protocol):
     schema: ClassVar[type[Settings]] = WithinDriverSettings
     settings: WithinDriverSettings
 
-    def run(self, study: Study) -> Outcome:
-        pairs, batch = study.pairs, study.batch
-        split = Split.of(pairs, study.windows, study.split)
-        fixed = study.calibrator.fixed(pairs, batch, split.frame)
-        labels = study.labels(split.windows, fixed)
+    def run(self, context: ProtocolContext) -> ProtocolResult:
+        pairs, batch = context.pairs, context.batch
+        split = Split.of(pairs, context.windows, context.split)
+        fixed = context.calibrator.fixed(pairs, batch, split.frame)
+        labels = context.labels(split.windows, fixed)
         device = batch.lengths.device
         own = torch.arange(len(pairs), device=device)
         network, groups = own, tuple(pair.pair_id for pair in pairs)
-        if study.policy.trainable:
+        if context.policy.trainable:
             if self.settings.networks == "all":
                 network, groups = group_by([ALL] * len(pairs))
                 network = network.to(device)
-            lesson = Lesson(
-                simulator=study.simulator,
+            training_data = TrainingData(
+                simulator=context.simulator,
                 batch=batch,
                 split=split,
-                windows=study.windows,
+                windows=context.windows,
                 fixed=fixed,
                 labels=labels,
                 network=network,
                 names=groups,
-                seed=study.seed,
+                seed=context.seed,
                 base=fixed if self.settings.networks == "all" else None,
                 drivers=tuple(pair.driver for pair in pairs),
-                workspace=study.workspace,
+                workspace=context.workspace,
             )
-            learned = study.learner.fit(study.policy, lesson)
+            training_result = context.learner.fit(context.policy, training_data)
         else:
-            learned = study.untrained(study.policy, fixed)
-        policy = study.ready(study.policy, learned, groups)
+            training_result = context.untrained(context.policy, fixed)
+        policy = context.ready(context.policy, training_result, groups)
         first = split.frame.to(device)
         loops = {
-            name: drive(study.simulator, study.constant(constant, fixed), batch, first, own)
+            name: drive(context.simulator, context.constant(constant, fixed), batch, first, own)
             for name, constant in {"default": DefaultPolicy(), "fixed": FixedPolicy()}.items()
         }
-        loops["policy"] = drive(study.simulator, policy, batch, first, network, base=fixed)
+        loops["policy"] = drive(context.simulator, policy, batch, first, network, base=fixed)
         platoon = None
-        if self.settings.networks == "all" and study.policy.trainable:
-            default = study.constant(DefaultPolicy(), fixed[:1])
-            platoon = measure_platoons(study.simulator.model, {"default": (default, ("any",)), "policy": (policy, policy.names)})
+        if self.settings.networks == "all" and context.policy.trainable:
+            default = context.constant(DefaultPolicy(), fixed[:1])
+            platoon = measure_platoons(
+                context.simulator.model,
+                {"default": (default, ("any",)), "policy": (policy, policy.names)},
+            )
         evaluation = evaluate(
-            pairs, batch, first, loops, study.space, study.style, reach=policy.space, seed=study.seed, platoon=platoon
+            pairs,
+            batch,
+            first,
+            loops,
+            context.space,
+            context.style,
+            adaptation_space=policy.space,
+            seed=context.seed,
+            platoon=platoon,
         )
-        return Outcome(evaluation, policy, learned.curves, labels)
+        return ProtocolResult(evaluation, policy, training_result.curves, labels)

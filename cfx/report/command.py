@@ -27,5 +27,9 @@ def report(runs: Sequence[str], output: str | None = None, title: str | None = N
     folder = Path(runs[0]).expanduser()
     home = folder if len(runs) == 1 and folder.is_dir() else Path()
     path = write_report(found, Path(output).expanduser() if output else home / NAME, title)
-    left_out = f"; {len(found.unfinished)} unfinished ones are named in it" if found.unfinished else ""
-    return [f"Report of {len(found.jobs)} job{'' if len(found.jobs) == 1 else 's'}{left_out}: {path.absolute()}"]
+    left_out = (
+        f"; {len(found.unfinished)} unfinished ones are named in it" if found.unfinished else ""
+    )
+    return [
+        f"Report of {len(found.jobs)} job{'' if len(found.jobs) == 1 else 's'}{left_out}: {path.absolute()}"
+    ]

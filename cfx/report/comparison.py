@@ -21,13 +21,24 @@ _WIDE = 1.6
 
 def closeness(jobs: Sequence[Job]) -> Sheet:
     """Returns a row per job: the errors of each method, and the policy's improvement. The numbers are those of `metrics.json`."""
-    shown = {where: [m for m in METHODS if any(_known(job, f"{where}rmse_speed", m) for job in jobs)] for where in ("", "whole/")}
+    shown = {
+        where: [m for m in METHODS if any(_known(job, f"{where}rmse_speed", m) for job in jobs)]
+        for where in ("", "whole/")
+    }
     gains = [
         (b, where)
-        for b, where in (("fixed", ""), ("base", ""), ("population", ""), ("population", "whole/"))
+        for b, where in (
+            ("fixed", ""),
+            ("shrunk", ""),
+            ("population", ""),
+            ("population", "whole/"),
+        )
         if _compared(jobs, b, where)
     ]
-    frames = {"": tested(jobs), "whole/": "the whole drive of drivers whom nothing was fitted to, from its first frame on"}
+    frames = {
+        "": tested(jobs),
+        "whole/": "the whole drive of drivers whom nothing was fitted to, from its first frame on",
+    }
     columns = [Column("Job", "", number=False)]
     for where, methods in shown.items():
         columns += [Column(_name(m), f"{_said(m)}: RMSE over {frames[where]}.") for m in methods]
@@ -54,11 +65,22 @@ def closeness(jobs: Sequence[Job]) -> Sheet:
 
 def safety(jobs: Sequence[Job]) -> Sheet:
     """Returns a row per job: what the policy does that is not safe or not smooth, and below it what a baseline does."""
-    kinds = [kind for kind in _SAFETY if any(_known(job, f"{kind[0]}{kind[1]}", "policy") for job in jobs)]
+    kinds = [
+        kind
+        for kind in _SAFETY
+        if any(_known(job, f"{kind[0]}{kind[1]}", "policy") for job in jobs)
+    ]
     columns = [Column("Job", "", number=False)]
-    columns += [Column(name, f"{meaning} Below it the same for {_said(base)}.") for _, _, base, name, meaning, _ in kinds]
+    columns += [
+        Column(name, f"{meaning} Below it the same for {_said(base)}.")
+        for _, _, base, name, meaning, _ in kinds
+    ]
     rows = [
-        (text(job.name), *(_pair(job, f"{where}{name}", base, form) for where, name, base, _, _, form in kinds)) for job in jobs
+        (
+            text(job.name),
+            *(_pair(job, f"{where}{name}", base, form) for where, name, base, _, _, form in kinds),
+        )
+        for job in jobs
     ]
     platoon = sum(kind[0] == "platoon/" for kind in kinds)
     groups = (("", 1), (_RECORDED, len(kinds) - platoon), (_IN_PLATOON, platoon))
@@ -68,14 +90,19 @@ def safety(jobs: Sequence[Job]) -> Sheet:
 _RECORDED = "Behind recorded leaders; below it own fixed, on whole drives population"
 _IN_PLATOON = "Platoon behind a braking leader; below it population"
 _PLATOON = "Ten followers in a row, all driven by the policy, behind a leader that brakes from 15 to 7 m/s and recovers."
-_AMPLIFICATION = (
-    "By how many times as much as the leader the last follower slows down, mean over the networks; above 1 the platoon amplifies."
-)
+_AMPLIFICATION = "By how many times as much as the leader the last follower slows down, mean over the networks; above 1 the platoon amplifies."
 _STABLE = "Share of the networks with a string stable platoon: nobody slows down more than the vehicle ahead (by over 0.1 m/s)."
 
 
 _SAFETY = (
-    ("", "collisions", "fixed", "Collisions", "Pairs in which the simulated gap becomes negative, on the test part.", ".0f"),
+    (
+        "",
+        "collisions",
+        "fixed",
+        "Collisions",
+        "Pairs in which the simulated gap becomes negative, on the test part.",
+        ".0f",
+    ),
     ("whole/", "collisions", "population", "whole drives", "The same over whole drives.", ".0f"),
     (
         "",
@@ -86,22 +113,64 @@ _SAFETY = (
         ".0f",
     ),
     ("whole/", "hard_braking", "population", "whole drives", "The same over whole drives.", ".0f"),
-    ("", "jerk", "fixed", "Jerk (m/s³)", "Root mean square jerk on the test part, mean over the pairs.", ".2f"),
-    ("", "at_bounds", "fixed", "At bounds", "Share of the tuned parameters' values within 1 % of a bound.", ".0%"),
-    ("platoon/", "head_to_tail", "population", "Amplification", f"{_PLATOON} {_AMPLIFICATION}", ".2f"),
+    (
+        "",
+        "jerk",
+        "fixed",
+        "Jerk (m/s³)",
+        "Root mean square jerk on the test part, mean over the pairs.",
+        ".2f",
+    ),
+    (
+        "",
+        "at_bounds",
+        "fixed",
+        "At bounds",
+        "Share of the tuned parameters' values within 1 % of a bound.",
+        ".0%",
+    ),
+    (
+        "platoon/",
+        "head_to_tail",
+        "population",
+        "Amplification",
+        f"{_PLATOON} {_AMPLIFICATION}",
+        ".2f",
+    ),
     ("platoon/", "string_stable", "population", "Stable", f"{_PLATOON} {_STABLE}", ".0%"),
-    ("platoon/", "min_gap", "population", "Least gap (m)", f"{_PLATOON} The least gap of all.", ".1f"),
-    ("platoon/", "collisions", "population", "Collisions", f"{_PLATOON} Followers that collide, of all platoons.", ".0f"),
+    (
+        "platoon/",
+        "min_gap",
+        "population",
+        "Least gap (m)",
+        f"{_PLATOON} The least gap of all.",
+        ".1f",
+    ),
+    (
+        "platoon/",
+        "collisions",
+        "population",
+        "Collisions",
+        f"{_PLATOON} Followers that collide, of all platoons.",
+        ".0f",
+    ),
 )
 """Columns: where it was measured, the metric, the baseline below, the heading, what it means, how it is written."""
 
 
 def safety_of_methods(jobs: Sequence[Job]) -> Sheet:
     """Returns a row per job and method, with the recorded drivers for comparison."""
-    columns = [Column("Job", "", number=False), Column("Driven by", "The method; real: the recorded drivers.", number=False)]
+    columns = [
+        Column("Job", "", number=False),
+        Column("Driven by", "The method; real: the recorded drivers.", number=False),
+    ]
     columns += [Column(name, "") for name, _, _ in _OF_METHODS]
     platoon = sum(key.startswith("platoon/") for _, key, _ in _OF_METHODS)
-    groups = (("", 2), ("Behind recorded leaders, test part", len(_OF_METHODS) - platoon), ("Platoon", platoon))
+    groups = (
+        ("", 2),
+        ("Behind recorded leaders, test part", len(_OF_METHODS) - platoon),
+        ("Platoon", platoon),
+    )
     rows = []
     for job in jobs:
         for method in ("real", *_methods(job)):
@@ -131,11 +200,15 @@ def absolute(jobs: Sequence[Job]) -> Plot:
     kinds = {
         "speed, test part": ("rmse_speed", "m/s"),
         "gap, test part": ("rmse_gap", "m"),
-        "speed, test part beyond the first 5 s": ("later/rmse_speed", "m/s"),
-        "speed, whole drives": ("whole/rmse_speed", "m/s"),
-        "gap, whole drives": ("whole/rmse_gap", "m"),
+        "speed, test part beyond the first 5 s": ("steady/rmse_speed", "m/s"),
+        "speed, whole drives": ("full_trajectory/rmse_speed", "m/s"),
+        "gap, whole drives": ("full_trajectory/rmse_gap", "m"),
     }
-    known = {name: kind for name, kind in kinds.items() if any(_known(job, kind[0], "policy") for job in jobs)}
+    known = {
+        name: kind
+        for name, kind in kinds.items()
+        if any(_known(job, kind[0], "policy") for job in jobs)
+    }
     views = {name: _absolute_view(jobs, metric, unit) for name, (metric, unit) in known.items()}
     return Plot(views, 110 + 30 * len(jobs), "Errors of every job and method", chooser="RMSE of")
 
@@ -143,10 +216,16 @@ def absolute(jobs: Sequence[Job]) -> Plot:
 def _absolute_view(jobs: Sequence[Job], metric: str, unit: str) -> dict[str, Any]:
     places = np.arange(len(jobs))[::-1]
     data: list[Trace] = []
-    values = {m: np.array([_metric(job, f"{metric}/{m}") if m in _methods(job) else math.nan for job in jobs]) for m in METHODS}
+    values = {
+        m: np.array(
+            [_metric(job, f"{metric}/{m}") if m in _methods(job) else math.nan for job in jobs]
+        )
+        for m in METHODS
+    }
     for method in (m for m in METHODS if np.isfinite(values[m]).any()):
         hover = [
-            f"<b>{safe(job.name)}</b><br>{LABELS[method]}: {v:.3f} {unit}" for job, v in zip(jobs, values[method], strict=True)
+            f"<b>{safe(job.name)}</b><br>{LABELS[method]}: {v:.3f} {unit}"
+            for job, v in zip(jobs, values[method], strict=True)
         ]
         data.append(
             {
@@ -168,12 +247,27 @@ def _absolute_view(jobs: Sequence[Job], metric: str, unit: str) -> dict[str, Any
     end = _WIDE * float(near.max(initial=1e-9))
     off = finite(values["default"])
     off = off[off > end]
-    right = end if len(off) else 1.06 * float(max(near.max(initial=1e-9), finite(values["default"]).max(initial=0.0)))
-    beyond = f" {len(off)} default parameters are further off, up to {off.max():.3g} {unit}." if len(off) else ""
+    right = (
+        end
+        if len(off)
+        else 1.06 * float(max(near.max(initial=1e-9), finite(values["default"]).max(initial=0.0)))
+    )
+    beyond = (
+        f" {len(off)} default parameters are further off, up to {off.max():.3g} {unit}."
+        if len(off)
+        else ""
+    )
     layout = {
-        "xaxis": axis(f"RMSE ({unit}), mean over pairs; further left is closer to the real driver", range=[0, right]),
+        "xaxis": axis(
+            f"RMSE ({unit}), mean over pairs; further left is closer to the real driver",
+            range=[0, right],
+        ),
         "yaxis": axis(
-            tickvals=places, ticktext=[safe(job.name) for job in jobs], range=[-0.6, len(jobs) - 0.4], showgrid=True, ticks=""
+            tickvals=places,
+            ticktext=[safe(job.name) for job in jobs],
+            range=[-0.6, len(jobs) - 0.4],
+            showgrid=True,
+            ticks="",
         ),
     }
     return view(data, layout, beyond.strip())
@@ -181,7 +275,7 @@ def _absolute_view(jobs: Sequence[Job], metric: str, unit: str) -> dict[str, Any
 
 def _methods(job: Job) -> tuple[str, ...]:
     """Returns the methods of a job that mean something."""
-    return job.methods if job.follows else ("policy",)
+    return job.methods if job.has_constant_baseline else ("policy",)
 
 
 def _name(method: str) -> str:
@@ -214,7 +308,10 @@ def _error(job: Job, where: str, method: str) -> Cell:
 def _gain(job: Job, baseline: str, where: str) -> Cell:
     if baseline not in job.baselines(where):
         return number(math.nan, "")
-    mean, low, high = (_metric(job, f"{improvement_of(baseline, where)}/{name}") for name in ("mean", "ci95_low", "ci95_high"))
+    mean, low, high = (
+        _metric(job, f"{improvement_of(baseline, where)}/{name}")
+        for name in ("mean", "ci95_low", "ci95_high")
+    )
     second = f"{_bare(low)} to {_bare(high)}" if math.isfinite(low) and math.isfinite(high) else ""
     return replace(number(mean, percent(mean, 1)), second=second)
 
@@ -229,7 +326,9 @@ def _cell(job: Job, metric: str, form: str) -> Cell:
 
 
 def _formed(value: float, form: str) -> str:
-    return (f"{value:{form}}".replace("%", " %") if math.isfinite(value) else NOTHING).replace("-", "\N{MINUS SIGN}")
+    return (f"{value:{form}}".replace("%", " %") if math.isfinite(value) else NOTHING).replace(
+        "-", "\N{MINUS SIGN}"
+    )
 
 
 def _pair(job: Job, metric: str, baseline: str, form: str) -> Cell:
@@ -239,15 +338,29 @@ def _pair(job: Job, metric: str, baseline: str, form: str) -> Cell:
     return replace(cell, second=_formed(_metric(job, f"{metric}/{baseline}"), form))
 
 
-def _with_best(rows: Sequence[tuple[Cell, ...]], jobs: Sequence[Job], columns: Sequence[Column]) -> tuple[tuple[Cell, ...], ...]:
+def _with_best(
+    rows: Sequence[tuple[Cell, ...]], jobs: Sequence[Job], columns: Sequence[Column]
+) -> tuple[tuple[Cell, ...], ...]:
     """Marks the policy's smallest error and largest improvement, where all jobs drove the same pairs."""
-    same = len({(str(job.data.get("fingerprint")), frozenset(job.pairs["pair_id"]), job.split) for job in jobs}) == 1
+    same = (
+        len(
+            {
+                (str(job.data.get("fingerprint")), frozenset(job.pairs["pair_id"]), job.split)
+                for job in jobs
+            }
+        )
+        == 1
+    )
     if len(rows) < 2 or not same:
         return tuple(rows)
     marked = []
     for column, cells in zip(columns, zip(*rows, strict=True), strict=True):
         known = [float(cell.sort) for cell in cells if cell.number and cell.sort]
-        choose = {"p": min, "o": max}.get(column.heading[0]) if column.heading.startswith(("policy", "over")) else None
+        choose = (
+            {"p": min, "o": max}.get(column.heading[0])
+            if column.heading.startswith(("policy", "over"))
+            else None
+        )
         best = repr(choose(known)) if choose is not None and known else None
         marked.append([replace(cell, best=cell.number and cell.sort == best) for cell in cells])
     return tuple(zip(*marked, strict=True))

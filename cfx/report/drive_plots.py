@@ -19,7 +19,7 @@ _DASHES = {
     "default": "dot",
     "population": "dashdot",
     "fixed": "dash",
-    "base": "longdashdot",
+    "shrunk": "longdashdot",
     "policy": "solid",
 }
 _WIDTHS = {"real": 2.2, "leader": 1.2, "policy": 2.2}
@@ -34,7 +34,7 @@ class Chosen:
     improvement: float
 
 
-def chosen_drives(job: Job) -> list[Chosen]:
+def chosen_trajectories(job: Job) -> list[Chosen]:
     """Returns the best, the median and the worst pair by improvement over the fixed parameters; fewer if there are fewer."""
     if job.drives is None:
         return []
@@ -43,9 +43,15 @@ def chosen_drives(job: Job) -> list[Chosen]:
     table = table[table["pair_id"].isin(known) & np.isfinite(table["improvement/fixed"])]
     ranked = table.sort_values("improvement/fixed", ascending=False, kind="stable")
     count = len(ranked)
-    places = {0: "best", count // 2: "median", count - 1: "worst"} if count > 2 else dict(enumerate(("best", "worst")[:count]))
+    places = (
+        {0: "best", count // 2: "median", count - 1: "worst"}
+        if count > 2
+        else dict(enumerate(("best", "worst")[:count]))
+    )
     return [
-        Chosen(rank, str(ranked["pair_id"].iloc[place]), float(ranked["improvement/fixed"].iloc[place]))
+        Chosen(
+            rank, str(ranked["pair_id"].iloc[place]), float(ranked["improvement/fixed"].iloc[place])
+        )
         for place, rank in sorted(places.items())
     ]
 
@@ -66,13 +72,23 @@ def drive(job: Job, pair_id: str) -> Plot:
     columns = 2 if len(names) <= 4 else 4
     rows = -(-len(names) // columns)
     grid = _Grid(columns, rows)
-    known = {str(one.get("name")): one for one in job.data.get("parameters") or () if isinstance(one, Mapping)}
-    data = _lines(frames, "speed", methods, "", leader=True) + _lines(frames, "gap", methods, "2", leader=False)
+    known = {
+        str(one.get("name")): one
+        for one in job.data.get("parameters") or ()
+        if isinstance(one, Mapping)
+    }
+    data = _lines(frames, "speed", methods, "", leader=True) + _lines(
+        frames, "gap", methods, "2", leader=False
+    )
     layout: dict[str, Any] = {
         "xaxis": axis(domain=grid.half(0), anchor="y"),
-        "yaxis": axis("speed (m/s)", domain=grid.top(), anchor="x", **_window(frames, "speed", methods)),
+        "yaxis": axis(
+            "speed (m/s)", domain=grid.top(), anchor="x", **_window(frames, "speed", methods)
+        ),
         "xaxis2": axis(domain=grid.half(1), anchor="y2", matches="x"),
-        "yaxis2": axis("gap (m)", domain=grid.top(), anchor="x2", **_window(frames, "gap", methods)),
+        "yaxis2": axis(
+            "gap (m)", domain=grid.top(), anchor="x2", **_window(frames, "gap", methods)
+        ),
         "annotations": [],
         "margin": {"l": 56, "r": 12, "t": 30, "b": 44},
         "hovermode": "x",
@@ -114,7 +130,9 @@ def drive(job: Job, pair_id: str) -> Plot:
             "showarrow": False,
         }
     )
-    return Plot({"": view(data, layout)}, grid.height, f"Speed, gap and parameters of pair {pair_id}")
+    return Plot(
+        {"": view(data, layout)}, grid.height, f"Speed, gap and parameters of pair {pair_id}"
+    )
 
 
 class _Grid:
@@ -146,10 +164,16 @@ def parameter_names(drives: pd.DataFrame, methods: Sequence[str]) -> list[str]:
     """Returns the tuned parameters: what has a column for every method, besides speed and gap."""
     suffix = f"_{methods[-1]}"
     names = [str(column).removesuffix(suffix) for column in drives if str(column).endswith(suffix)]
-    return [name for name in names if name not in {"speed", "gap"} and all(f"{name}_{m}" in drives for m in methods)]
+    return [
+        name
+        for name in names
+        if name not in {"speed", "gap"} and all(f"{name}_{m}" in drives for m in methods)
+    ]
 
 
-def _lines(frames: pd.DataFrame, signal: str, methods: Sequence[str], axis: str, *, leader: bool) -> list[Trace]:
+def _lines(
+    frames: pd.DataFrame, signal: str, methods: Sequence[str], axis: str, *, leader: bool
+) -> list[Trace]:
     shown = [
         *([("leader", "leader_speed")] if leader else []),
         ("real", f"real_{signal}"),
@@ -158,10 +182,14 @@ def _lines(frames: pd.DataFrame, signal: str, methods: Sequence[str], axis: str,
     return [_line(frames, column, method, axis, legend=leader) for method, column in shown]
 
 
-def _line(frames: pd.DataFrame, column: str, method: str, axis: str, *, legend: bool, steps: bool = False) -> Trace:
+def _line(
+    frames: pd.DataFrame, column: str, method: str, axis: str, *, legend: bool, steps: bool = False
+) -> Trace:
     time, values = frames["time_s"].to_numpy(dtype=float), frames[column].to_numpy(dtype=float)
     values = np.where(np.isfinite(values), values, np.nan)
-    if steps and len(values) > 2 and bool((values == values[0]).all()):  # a constant needs its two ends alone
+    if (
+        steps and len(values) > 2 and bool((values == values[0]).all())
+    ):  # a constant needs its two ends alone
         time, values = time[[0, -1]], values[[0, -1]]
     label = LABELS.get(method, safe(method))
     return {
@@ -184,13 +212,22 @@ def _line(frames: pd.DataFrame, column: str, method: str, axis: str, *, legend: 
     }
 
 
-def _parameter_lines(frames: pd.DataFrame, name: str, methods: Sequence[str], axis: str) -> list[Trace]:
-    return [_line(frames, f"{name}_{method}", method, axis, legend=False, steps=True) for method in methods]
+def _parameter_lines(
+    frames: pd.DataFrame, name: str, methods: Sequence[str], axis: str
+) -> list[Trace]:
+    return [
+        _line(frames, f"{name}_{method}", method, axis, legend=False, steps=True)
+        for method in methods
+    ]
 
 
-def _at_least(frames: pd.DataFrame, name: str, methods: Sequence[str], parameter: Mapping[str, Any]) -> dict[str, Any]:
+def _at_least(
+    frames: pd.DataFrame, name: str, methods: Sequence[str], parameter: Mapping[str, Any]
+) -> dict[str, Any]:
     """Returns a range of at least a fifth of the parameter's; nothing if its bounds are not known."""
-    values = finite(frames[[f"{name}_{method}" for method in methods]].to_numpy(dtype=float).ravel())
+    values = finite(
+        frames[[f"{name}_{method}" for method in methods]].to_numpy(dtype=float).ravel()
+    )
     low, high = parameter.get("low"), parameter.get("high")
     if not (len(values) and isinstance(low, int | float) and isinstance(high, int | float)):
         return {}
@@ -213,6 +250,10 @@ def _window(frames: pd.DataFrame, signal: str, methods: Sequence[str]) -> dict[s
     if not len(close):
         return {}
     height = max(float(np.ptp(close)), 1.0)
-    low = max(min(float(close.min()), float(far.min(initial=np.inf))), float(close.min()) - 1.5 * height)
-    high = min(max(float(close.max()), float(far.max(initial=-np.inf))), float(close.max()) + 1.5 * height)
+    low = max(
+        min(float(close.min()), float(far.min(initial=np.inf))), float(close.min()) - 1.5 * height
+    )
+    high = min(
+        max(float(close.max()), float(far.max(initial=-np.inf))), float(close.max()) + 1.5 * height
+    )
     return {"range": [low - 0.06 * height, high + 0.06 * height]}

@@ -20,7 +20,17 @@ Array = NDArray[np.float64]
 Trace = dict[str, Any]
 
 
-JOB_COLOURS = ("#332288", "#cc6677", "#117733", "#ddaa33", "#88ccee", "#882255", "#44aa99", "#999933", "#777777")
+JOB_COLOURS = (
+    "#332288",
+    "#cc6677",
+    "#117733",
+    "#ddaa33",
+    "#88ccee",
+    "#882255",
+    "#44aa99",
+    "#999933",
+    "#777777",
+)
 """Tol's muted colours, told apart by readers with any colour vision, none a method's."""
 
 _SYMBOLS = ("circle", "square", "diamond", "cross", "x", "star", "hexagon", "pentagon")
@@ -71,7 +81,14 @@ def view(data: Sequence[Trace], layout: Mapping[str, Any], note: str = "") -> di
 
 def axis(title: str = "", **more: Any) -> dict[str, Any]:
     """Returns an axis in the common look; `more` are settings of Plotly's axes."""
-    common = {"gridcolor": PALE, "zeroline": False, "automargin": True, "linecolor": "#9a9a9a", "ticks": "outside", "ticklen": 4}
+    common = {
+        "gridcolor": PALE,
+        "zeroline": False,
+        "automargin": True,
+        "linecolor": "#9a9a9a",
+        "ticks": "outside",
+        "ticklen": 4,
+    }
     return common | {"tickcolor": "#9a9a9a", "title": {"text": title, "standoff": 8}} | more
 
 
@@ -104,7 +121,10 @@ def cut(values: Array, what: str) -> tuple[float, str]:
     if lowest >= fence:
         return min(lowest, 0.0), ""
     count = int((known < fence).sum())
-    return fence, f"The axis is cut at {percent(fence)}: {count} of {len(known)} {what}, the lowest to {percent(lowest)}."
+    return (
+        fence,
+        f"The axis is cut at {percent(fence)}: {count} of {len(known)} {what}, the lowest to {percent(lowest)}.",
+    )
 
 
 def improvement_axis(baseline: str, low: float, high: float) -> dict[str, Any]:

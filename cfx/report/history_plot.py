@@ -32,7 +32,13 @@ def history(job: Job) -> Plot:
                 "name": label,
                 "x": [safe(amount) for amount in means.index],
                 "y": mean,
-                "error_y": {"type": "data", "symmetric": False, "array": high - mean, "arrayminus": mean - low, "width": 5},
+                "error_y": {
+                    "type": "data",
+                    "symmetric": False,
+                    "array": high - mean,
+                    "arrayminus": mean - low,
+                    "width": 5,
+                },
                 "marker": {"size": 9, "color": colour},
                 "line": {"color": colour, "width": 2},
                 "text": [
@@ -45,7 +51,12 @@ def history(job: Job) -> Plot:
         )
     order = [safe(amount) for amount in amounts_of(job.history)]
     layout = {
-        "xaxis": axis("measured history read before the test part", type="category", categoryorder="array", categoryarray=order),
+        "xaxis": axis(
+            "measured history read before the test part",
+            type="category",
+            categoryorder="array",
+            categoryarray=order,
+        ),
         "yaxis": axis("improvement over own fixed", tickformat=".0%"),
         "shapes": [zero_line("y")],
     }
@@ -59,9 +70,19 @@ def histories(jobs: Sequence[Job]) -> Sheet:
     columns = (
         Column("Job", "", number=False),
         Column("Base", "What the policy's answers are offsets from.", number=False),
-        Column("History read", "Measured history before the test part; a share is of the whole drive.", number=False),
-        Column("Mean", "Mean improvement of the RMSE of speed over the driver's own fixed parameters, on the test part."),
-        Column("95 % interval", "Bootstrap confidence interval of the mean; drivers are drawn, each with all his pairs."),
+        Column(
+            "History read",
+            "Measured history before the test part; a share is of the whole drive.",
+            number=False,
+        ),
+        Column(
+            "Mean",
+            "Mean improvement of the RMSE of speed over the driver's own fixed parameters, on the test part.",
+        ),
+        Column(
+            "95 % interval",
+            "Bootstrap confidence interval of the mean; drivers are drawn, each with all his pairs.",
+        ),
         Column("Pairs", "Pairs whose improvement is defined."),
     )
     rows = [

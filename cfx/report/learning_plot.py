@@ -23,7 +23,9 @@ def learning(curves: pd.DataFrame) -> Plot:
     ):
         losses = over_networks(curves, column)
         if not losses.empty:
-            kept = np.unique(np.linspace(0, len(losses) - 1, min(_CURVE_POINTS, len(losses))).round().astype(int))
+            kept = np.unique(
+                np.linspace(0, len(losses) - 1, min(_CURVE_POINTS, len(losses))).round().astype(int)
+            )
             data += _loss_traces(losses.iloc[kept], name, colour, dash)
     values = np.concatenate([np.empty(0), *(trace["y"] for trace in data)])
     layout = {"xaxis": axis("epoch"), "yaxis": _loss_axis(values), "hovermode": "x unified"}
@@ -43,8 +45,17 @@ def _loss_traces(losses: pd.DataFrame, name: str, colour: str, dash: str) -> lis
     if losses.shape[1] == 1:
         return [mean]
     low, high = (losses.quantile(q, axis=1).to_numpy() for q in (0.1, 0.9))
-    band = common | {"mode": "lines", "line": {"width": 0}, "hoverinfo": "skip", "showlegend": False}
-    return [band | {"y": low}, band | {"y": high, "fill": "tonexty", "fillcolor": _faint(colour)}, mean]
+    band = common | {
+        "mode": "lines",
+        "line": {"width": 0},
+        "hoverinfo": "skip",
+        "showlegend": False,
+    }
+    return [
+        band | {"y": low},
+        band | {"y": high, "fill": "tonexty", "fillcolor": _faint(colour)},
+        mean,
+    ]
 
 
 def _loss_axis(values: Array) -> dict[str, Any]:
@@ -55,7 +66,13 @@ def _loss_axis(values: Array) -> dict[str, Any]:
     digits = (1, 2, 5) if high < 1e3 * low else (1,)
     powers = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
     ticks = [digit * 10.0**power for power in powers for digit in digits]
-    return axis("loss, logarithmic", type="log", tickmode="array", tickvals=ticks, ticktext=[f"{tick:.2g}" for tick in ticks])
+    return axis(
+        "loss, logarithmic",
+        type="log",
+        tickmode="array",
+        tickvals=ticks,
+        ticktext=[f"{tick:.2g}" for tick in ticks],
+    )
 
 
 def _faint(colour: str) -> str:

@@ -22,7 +22,9 @@ SEPARATOR = " · "
 def named(jobs: Sequence[Job]) -> tuple[Job, ...]:
     """Gives every job a short name: its driving model, and what else differs between the jobs."""
     parts = differences(jobs)
-    names = [SEPARATOR.join(part if len(part) <= _MOST else [*part[: _MOST - 1], "…"]) for part in parts]
+    names = [
+        SEPARATOR.join(part if len(part) <= _MOST else [*part[: _MOST - 1], "…"]) for part in parts
+    ]
     unique = []
     for k, name in enumerate(names):
         same = [i for i, other in enumerate(names) if other == name]
@@ -47,7 +49,10 @@ def differences(jobs: Sequence[Job], ignored: Sequence[str] = ()) -> list[list[s
             continue
         group = key.partition(".")[0]
         peers = [job.component(group) if group in GROUPS else "" for job in jobs]
-        if any(len({v.get(key, "") for v, p in zip(flat, peers, strict=True) if p == peer}) > 1 for peer in set(peers)):
+        if any(
+            len({v.get(key, "") for v, p in zip(flat, peers, strict=True) if p == peer}) > 1
+            for peer in set(peers)
+        ):
             _add(parts, [_said(key, values) for values in flat])
     return parts
 

@@ -19,9 +19,9 @@ import yaml
 
 from cfx.errors import OutputError
 from cfx.figures.look import CLUSTER_COLOURS, COLOURS, LABELS, percent
-from cfx.files import whole
+from cfx.files import atomic_write
 from cfx.report import comparison, paper, tables
-from cfx.report.drive_plots import chosen_drives, drive
+from cfx.report.drive_plots import chosen_trajectories, drive
 from cfx.report.figure import Plot
 from cfx.report.history_plot import histories, history
 from cfx.report.improvement_plots import overview, per_cluster, per_driver
@@ -66,10 +66,12 @@ def write_report(runs: Runs, output: Path, title: str | None = None) -> Path:
         output.parent.mkdir(parents=True, exist_ok=True)
         if output.is_dir():
             raise IsADirectoryError(None, "it is a folder", str(output))
-        with whole(output) as partial:
+        with atomic_write(output) as partial:
             partial.write_text(page, encoding="utf-8")
     except OSError as error:
-        raise OutputError(f"{output}: the report cannot be written ({error.strerror or error}); name another --output") from error
+        raise OutputError(
+            f"{output}: the report cannot be written ({error.strerror or error}); name another --output"
+        ) from error
     return output
 
 
@@ -116,7 +118,10 @@ def _scripts() -> list[Any]:
 
 def _policy(scripts: Sequence[str]) -> str:
     """Returns the Content-Security-Policy: only these very scripts run, and nothing is ever asked from a network."""
-    allowed = " ".join(f"'sha256-{base64.b64encode(hashlib.sha256(one.encode()).digest()).decode()}'" for one in scripts)
+    allowed = " ".join(
+        f"'sha256-{base64.b64encode(hashlib.sha256(one.encode()).digest()).decode()}'"
+        for one in scripts
+    )
     return (
         f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none';"
         " form-action 'none'"
@@ -127,7 +132,7 @@ def _content(runs: Runs, title: str | None) -> dict[str, Any]:
     jobs = runs.jobs
     scripts = _scripts()
     models = " and ".join(dict.fromkeys(job.component("model") for job in jobs))
-    compared = [job for job in jobs if job.follows]
+    compared = [job for job in jobs if job.has_constant_baseline]
     common, own = facts(jobs)
     return {
         "title": title or f"Parameters that adapt: {models}",
@@ -148,15 +153,21 @@ def _content(runs: Runs, title: str | None) -> dict[str, Any]:
         "platoons": [(job.name, platoon(job)) for job in jobs if job.platoon is not None],
         "histories": [(job.name, history(job)) for job in jobs if job.history is not None],
         "history_sheet": histories(jobs),
-        "not_following": [job.name for job in jobs if not job.follows],
+        "not_following": [job.name for job in jobs if not job.has_constant_baseline],
         "errors": tables.errors(jobs),
         "compared": _compared(compared) if compared else None,
         "styles": _styles(jobs),
         "drives": [_drives(job) for job in jobs if job.drives is not None],
-        "curves": [(job.name, curves["network"].nunique(), learning(curves)) for job, curves in _learned(jobs)],
-        "nothing_learned": [job.name for job in jobs if job.curves is not None and not len(job.curves)],
+        "curves": [
+            (job.name, curves["network"].nunique(), learning(curves))
+            for job, curves in _training_result(jobs)
+        ],
+        "nothing_learned": [
+            job.name for job in jobs if job.curves is not None and not len(job.curves)
+        ],
         "without": {
-            file: [job.name for job in jobs if file in job.missing] for file in ("style.csv", "drives.parquet", "curves.parquet")
+            file: [job.name for job in jobs if file in job.missing]
+            for file in ("style.csv", "trajectories.parquet", "curves.parquet")
         },
         "paper": paper.comparisons(jobs),
     }
@@ -171,39 +182,48 @@ def _compared(jobs: Sequence[Job]) -> dict[str, Any]:
         "improvements": tables.improvements(jobs),
         "per_driver": per_driver(jobs),
         "per_cluster": per_cluster(series, baselines),
-        "cluster_sheets": [(LABELS.get(one, one), tables.clusters(series, one)) for one in baselines],
+        "cluster_sheets": [
+            (LABELS.get(one, one), tables.clusters(series, one)) for one in baselines
+        ],
     }
 
 
 def _method_colours() -> str:
     return "".join(
-        f'\n[data-colour="{method}"]::before {{ background: {colour}; }}' for method, colour in COLOURS.items()
+        f'\n[data-colour="{method}"]::before {{ background: {colour}; }}'
+        for method, colour in COLOURS.items()
     ) + "".join(
         f'\n[data-colour="{cluster}"]::before {{ background: {colour}; }}'
         for cluster, colour in zip(CLUSTERS, CLUSTER_COLOURS, strict=True)
     )
 
 
-def _learned(jobs: Sequence[Job]) -> list[tuple[Job, pd.DataFrame]]:
+def _training_result(jobs: Sequence[Job]) -> list[tuple[Job, pd.DataFrame]]:
     return [(job, job.curves) for job in jobs if job.curves is not None and len(job.curves)]
 
 
 def summary(jobs: Sequence[Job]) -> list[str]:
     """Says in a few sentences what came out, against the driver's own fixed parameters and against the population's."""
-    first = (
-        f"{_amount(jobs)}: does a policy that adapts the parameters drive closer to the real driver than {BASELINES['fixed']}?"
-    )
-    following = [job for job in jobs if job.follows]
-    marks = [_mark(job) for job in jobs if not job.follows]
+    first = f"{_amount(jobs)}: does a policy that adapts the parameters drive closer to the real driver than {BASELINES['fixed']}?"
+    following = [job for job in jobs if job.has_constant_baseline]
+    marks = [_mark(job) for job in jobs if not job.has_constant_baseline]
     if len(following) <= 3:
         return [first, *(_verdict(job) for job in following), *marks]
     said = []
-    for baseline, against in (("fixed", ""), ("population", "; against the population's parameters")):
+    for baseline, against in (
+        ("fixed", ""),
+        ("population", "; against the population's parameters"),
+    ):
         sides = [_side(job, baseline) for job in following if baseline in job.baselines()]
         if sides:
             counts = f"yes in {sides.count('yes')}, no in {sides.count('no')}, undecided in {sides.count('undecided')}"
             said.append(f"{against or f'Of {len(following)} jobs'}: {counts}")
-    best = max(following, key=lambda job: float(np.nan_to_num(job.metrics.get("rmse_improvement/mean", np.nan), nan=-np.inf)))
+    best = max(
+        following,
+        key=lambda job: float(
+            np.nan_to_num(job.metrics.get("rmse_improvement/mean", np.nan), nan=-np.inf)
+        ),
+    )
     counted = f"{''.join(said)} (by the 95 % interval of the mean improvement)."
     return [first, counted, f"The best mean: {_verdict(best)}", *marks]
 
@@ -218,8 +238,14 @@ def _mark(job: Job) -> str:
 
 
 def _amount(jobs: Sequence[Job]) -> str:
-    pairs = {(str(job.data.get("source", "")), pair) for job in jobs for pair in job.pairs["pair_id"].unique()}
-    sources = list(dict.fromkeys(str(job.data.get("source", "")) for job in jobs if job.data.get("source")))
+    pairs = {
+        (str(job.data.get("source", "")), pair)
+        for job in jobs
+        for pair in job.pairs["pair_id"].unique()
+    }
+    sources = list(
+        dict.fromkeys(str(job.data.get("source", "")) for job in jobs if job.data.get("source"))
+    )
     where = f" from {Path(sources[0]).name}" if len(sources) == 1 else ""
     return f"{len(pairs)} pair{'' if len(pairs) == 1 else 's'} of leader and follower{where}"
 
@@ -237,13 +263,23 @@ def _side(job: Job, baseline: str = "fixed") -> str:
 def _verdict(job: Job) -> str:
     if not np.isfinite(_statistic(job, "mean")):
         return f"{job.name}: no pair has a defined improvement."
-    population = f"; against the population's parameters {_gain(job, 'population')}" if "population" in job.baselines() else ""
+    population = (
+        f"; against the population's parameters {_gain(job, 'population')}"
+        if "population" in job.baselines()
+        else ""
+    )
     return f"{job.name}: {_side(job)}. Improvement of the RMSE of speed: {_gain(job, 'fixed')}{population}."
 
 
 def _gain(job: Job, baseline: str) -> str:
-    mean, low, high = (_statistic(job, name, baseline) for name in ("mean", "ci95_low", "ci95_high"))
-    sure = f"95 % interval {percent(low, 1)} to {percent(high, 1)}" if np.isfinite(low) else "no interval for a single driver"
+    mean, low, high = (
+        _statistic(job, name, baseline) for name in ("mean", "ci95_low", "ci95_high")
+    )
+    sure = (
+        f"95 % interval {percent(low, 1)} to {percent(high, 1)}"
+        if np.isfinite(low)
+        else "no interval for a single driver"
+    )
     return f"{percent(mean, 1)} on average ({sure})" if np.isfinite(mean) else "not defined"
 
 
@@ -268,7 +304,9 @@ def _facts(job: Job, jobs: Sequence[Job]) -> dict[str, str]:
     table = job.pairs.drop_duplicates("pair_id")
     dropped = job.data.get("dropped") or []
     left_out = "; ".join(
-        f"{one.get('count')} {one.get('unit')} ({one.get('reason')})" for one in dropped if isinstance(one, Mapping)
+        f"{one.get('count')} {one.get('unit')} ({one.get('reason')})"
+        for one in dropped
+        if isinstance(one, Mapping)
     )
     return {
         "Started": f"{job.started:%Y-%m-%d %H:%M}" if job.started else "not recorded",
@@ -318,13 +356,19 @@ def _range(values: pd.Series[Any]) -> str:
 def _taught(job: Job) -> str:
     """Says how the policy was learned."""
     learner = job.component("learner")
-    return f"learned by {learner}" if learner else f"as it was learned in {job.setting('protocol.run')}"
+    return (
+        f"learned by {learner}"
+        if learner
+        else f"as it was learned in {job.setting('protocol.run')}"
+    )
 
 
 def _protocol(job: Job) -> str:
     name = job.component("protocol")
     train, test = (f"{100 * share:.3g} %" for share in (job.split, 1 - job.split))
-    apart = {"platoon": " of whole platoons", "recording": " of whole recordings"}.get(str(job.setting("protocol.together")), "")
+    apart = {"platoon": " of whole platoons", "recording": " of whole recordings"}.get(
+        str(job.setting("protocol.together")), ""
+    )
     parts = f"the driver's own fixed parameters come from the first {train} of his drive, the test part is the last {test}"
     said = {
         "within_driver": f"calibrated and learned on the first {train} of each pair, tested on the last {test}",
@@ -365,7 +409,11 @@ def cluster_series(jobs: Sequence[Job]) -> dict[str, dict[str, pd.DataFrame]]:
     series: dict[str, dict[str, pd.DataFrame]] = {}
     for job, family in zip(jobs, families, strict=True):
         table = job.by_pair
-        found = {cluster: table[table["cluster"] == cluster] for cluster in CLUSTERS if cluster in set(table["cluster"])}
+        found = {
+            cluster: table[table["cluster"] == cluster]
+            for cluster in CLUSTERS
+            if cluster in set(table["cluster"])
+        }
         alone = job.setting("style.cluster") in {None, "all"}
         name = job.name if alone else f"{family}, a job for each cluster"
         if not alone and set(found) & set(series.get(name, {})):
@@ -382,17 +430,22 @@ def _styles(jobs: Sequence[Job]) -> list[tuple[str, Plot]]:
             continue
         given = job.setting("style.percentiles")
         percentiles = given if isinstance(given, list) else (25.0, 75.0)
-        key = hashlib.sha256(job.style[["driver", "score", "cluster"]].to_csv().encode()).hexdigest()
+        key = hashlib.sha256(
+            job.style[["driver", "score", "cluster"]].to_csv().encode()
+        ).hexdigest()
         found.setdefault(key, ([], style(job.style, percentiles)))[0].append(job.name)
-    return [("all jobs" if len(names) == len(jobs) else ", ".join(names), plot) for names, plot in found.values()]
+    return [
+        ("all jobs" if len(names) == len(jobs) else ", ".join(names), plot)
+        for names, plot in found.values()
+    ]
 
 
 def _drives(job: Job) -> Drives:
     shown = []
-    for chosen in chosen_drives(job):
+    for chosen in chosen_trajectories(job):
         row = job.by_pair.set_index("pair_id").loc[chosen.pair_id]
         errors = ", ".join(f"{method} {row[f'rmse_speed/{method}']:.3f}" for method in job.methods)
-        over = f", {percent(chosen.improvement, 1)} over fixed" if job.follows else ""
+        over = f", {percent(chosen.improvement, 1)} over fixed" if job.has_constant_baseline else ""
         heading = f"{chosen.rank}: pair {chosen.pair_id}{over}; RMSE of speed (m/s): {errors}"
         shown.append((heading[:1].upper() + heading[1:], drive(job, chosen.pair_id)))
     return Drives(job.name, tuple(shown))

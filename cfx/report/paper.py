@@ -40,7 +40,12 @@ class Comparison:
 def comparisons(jobs: Sequence[Job]) -> list[Comparison]:
     """Returns a comparison for each of the paper's experiments among the jobs' `experiment`."""
     made = []
-    for experiment, compare in {"pair": _pair, "pairs": _pairs, "clusters": _clusters, "grid": _grid}.items():
+    for experiment, compare in {
+        "pair": _pair,
+        "pairs": _pairs,
+        "clusters": _clusters,
+        "grid": _grid,
+    }.items():
         chosen = [job for job in jobs if job.experiment == f"paper/{experiment}"]
         if chosen:
             made.append(compare(chosen))
@@ -54,15 +59,28 @@ def _pair(jobs: Sequence[Job]) -> Comparison:
         Column("Improvement over fixed", "(fixed \N{MINUS SIGN} policy) / fixed."),
     )
     published = (PAIR_11["fixed"] - PAIR_11["policy"]) / PAIR_11["fixed"]
-    rows = [(text("paper: pair 11/1, Krauss"), *(number(v, f"{v:.3f}") for v in PAIR_11.values()), share(published))]
+    rows = [
+        (
+            text("paper: pair 11/1, Krauss"),
+            *(number(v, f"{v:.3f}") for v in PAIR_11.values()),
+            share(published),
+        )
+    ]
     verdicts = []
     for job in jobs:
         values = [job.metrics.get(f"rmse_speed/{method}", math.nan) for method in PAIR_11]
         gain = job.metrics.get("rmse_improvement/mean", math.nan)
-        rows.append((text(f"here: {job.name}"), *(number(v, f"{v:.3f}") for v in values), share(gain)))
-        verdicts.append(f"{job.name}: {_which_pair(job)}; {_side(gain)}, in the paper it is closer by {100 * published:.1f} %.")
+        rows.append(
+            (text(f"here: {job.name}"), *(number(v, f"{v:.3f}") for v in values), share(gain))
+        )
+        verdicts.append(
+            f"{job.name}: {_which_pair(job)}; {_side(gain)}, in the paper it is closer by {100 * published:.1f} %."
+        )
     return Comparison(
-        "One pair: follower 11 behind leader 1", Sheet(columns, tuple(rows)), tuple(verdicts), _explanation(jobs, 1)
+        "One pair: follower 11 behind leader 1",
+        Sheet(columns, tuple(rows)),
+        tuple(verdicts),
+        _explanation(jobs, 1),
     )
 
 
@@ -88,18 +106,36 @@ def _pairs(jobs: Sequence[Job]) -> Comparison:
         Column("Driving model", "", number=False),
         Column("Pairs", ""),
         Column("Mean improvement", "Over the driver's own fixed parameters."),
-        Column("Trimmed mean", "Without the top and the bottom tenth, which the paper leaves out as outliers."),
+        Column(
+            "Trimmed mean",
+            "Without the top and the bottom tenth, which the paper leaves out as outliers.",
+        ),
     )
     rows = [
-        (text("paper"), text(model), number(PAPER_PAIRS, str(PAPER_PAIRS)), Cell("below 0 %", number=True), Cell("", number=True))
+        (
+            text("paper"),
+            text(model),
+            number(PAPER_PAIRS, str(PAPER_PAIRS)),
+            Cell("below 0 %", number=True),
+            Cell("", number=True),
+        )
         for model in ("Krauss", "Wiedemann 99")
     ]
     verdicts = []
     for job in jobs:
-        mean, trimmed = (job.metrics.get(f"rmse_improvement/{name}", math.nan) for name in ("mean", "trimmed_mean"))
+        mean, trimmed = (
+            job.metrics.get(f"rmse_improvement/{name}", math.nan)
+            for name in ("mean", "trimmed_mean")
+        )
         count = job.pairs["pair_id"].nunique()
         rows.append(
-            (text(f"here: {job.name}"), text(job.component("model")), number(count, str(count)), share(mean), share(trimmed))
+            (
+                text(f"here: {job.name}"),
+                text(job.component("model")),
+                number(count, str(count)),
+                share(mean),
+                share(trimmed),
+            )
         )
         below = sum(value < 0 for value in (mean, trimmed))
         agrees = {2: "below 0 %, as in the paper", 0: "not below 0 %, unlike the paper's"}.get(
@@ -107,7 +143,12 @@ def _pairs(jobs: Sequence[Job]) -> Comparison:
         )
         if math.isfinite(mean):
             verdicts.append(f"{job.name}: the average improvement is {agrees}.")
-    return Comparison("A network for each pair", Sheet(columns, tuple(rows)), tuple(verdicts), _explanation(jobs, PAPER_PAIRS))
+    return Comparison(
+        "A network for each pair",
+        Sheet(columns, tuple(rows)),
+        tuple(verdicts),
+        _explanation(jobs, PAPER_PAIRS),
+    )
 
 
 def _clusters(jobs: Sequence[Job]) -> Comparison:
@@ -146,7 +187,10 @@ def _clusters(jobs: Sequence[Job]) -> Comparison:
     gains: dict[tuple[str, str], float] = {}
     for job in jobs:
         cluster, count = str(job.setting("style.cluster") or "all"), job.pairs["pair_id"].nunique()
-        gain, own = (job.metrics.get(f"{improvement_of(name)}/mean", math.nan) for name in ("population", "fixed"))
+        gain, own = (
+            job.metrics.get(f"{improvement_of(name)}/mean", math.nan)
+            for name in ("population", "fixed")
+        )
         rows.append(
             (
                 text(f"here: {job.name}"),
@@ -171,17 +215,23 @@ def _cluster_verdicts(gains: Mapping[tuple[str, str], float]) -> list[str]:
     verdicts = []
     if known:
         above = sum(gain > 0 for gain in known.values())
-        verdicts.append(f"Above 0 % in {above} of {len(known)} jobs here; in all clusters in the paper.")
+        verdicts.append(
+            f"Above 0 % in {above} of {len(known)} jobs here; in all clusters in the paper."
+        )
     for model in dict.fromkeys(model for model, _ in known):
         low, high = known.get((model, CLUSTERS[0])), known.get((model, CLUSTERS[2]))
         if low is not None and high is not None:
             does = "fares better" if high > low else "fares no better"
-            verdicts.append(f"{model}: the policy {does} with aggressive than conservative drivers here; better in the paper.")
+            verdicts.append(
+                f"{model}: the policy {does} with aggressive than conservative drivers here; better in the paper."
+            )
     for cluster in dict.fromkeys(cluster for _, cluster in known):
         krauss, w99 = known.get(("krauss", cluster)), known.get(("w99", cluster))
         if krauss is not None and w99 is not None:
             does = "fares better" if w99 > krauss else "fares no better"
-            verdicts.append(f"{cluster}: the policy {does} with Wiedemann 99 than with Krauss here; better in the paper.")
+            verdicts.append(
+                f"{cluster}: the policy {does} with Wiedemann 99 than with Krauss here; better in the paper."
+            )
     return verdicts
 
 
@@ -197,14 +247,33 @@ def _grid(jobs: Sequence[Job]) -> Comparison:
         ),
     )
     unknown = Cell("", number=True)
-    rows: list[tuple[Cell, ...]] = [(text("paper: the best found"), number(500, "500"), number(1, "1"), unknown, unknown)]
+    rows: list[tuple[Cell, ...]] = [
+        (text("paper: the best found"), number(500, "500"), number(1, "1"), unknown, unknown)
+    ]
     losses = {job.name: job.metrics.get("validation_loss/best", math.nan) for job in jobs}
-    for job in sorted(jobs, key=lambda job: (not math.isfinite(losses[job.name]), losses[job.name])):
-        settings = [str(job.setting(path)) for path in ("learner.epochs", "learner.batch_size", "policy.hidden_size")]
-        rows.append((text(f"here: {job.name}"), *(Cell(one, one, number=True) for one in settings), _loss(losses[job.name])))
+    for job in sorted(
+        jobs, key=lambda job: (not math.isfinite(losses[job.name]), losses[job.name])
+    ):
+        settings = [
+            str(job.setting(path))
+            for path in ("learner.epochs", "learner.batch_size", "policy.hidden_size")
+        ]
+        rows.append(
+            (
+                text(f"here: {job.name}"),
+                *(Cell(one, one, number=True) for one in settings),
+                _loss(losses[job.name]),
+            )
+        )
     known = {name: loss for name, loss in losses.items() if math.isfinite(loss)}
-    verdicts = (f"The smallest validation loss here: {min(known, key=lambda name: known[name])}.",) if known else ()
-    return Comparison("Grid search of the training", Sheet(columns, tuple(rows)), verdicts, _explanation(jobs, 1))
+    verdicts = (
+        (f"The smallest validation loss here: {min(known, key=lambda name: known[name])}.",)
+        if known
+        else ()
+    )
+    return Comparison(
+        "Grid search of the training", Sheet(columns, tuple(rows)), verdicts, _explanation(jobs, 1)
+    )
 
 
 def _loss(value: float) -> Cell:
@@ -223,17 +292,27 @@ def _explanation(jobs: Sequence[Job], pairs: int) -> str:
     counts = sorted({job.pairs["pair_id"].nunique() for job in jobs})
     parts = []
     if said["sources"]:
-        parts.append(f"the recordings (here {', '.join(said['sources'])}; there NGSIM I-80, 13 April 2005, 4:00 to 4:15 p.m.)")
+        parts.append(
+            f"the recordings (here {', '.join(said['sources'])}; there NGSIM I-80, 13 April 2005, 4:00 to 4:15 p.m.)"
+        )
     if counts != [pairs] and pairs > 1:
-        parts.append(f"the number of pairs (here {' or '.join(map(str, counts))} in a job; there {pairs} in all)")
+        parts.append(
+            f"the number of pairs (here {' or '.join(map(str, counts))} in a job; there {pairs} in all)"
+        )
     if said["optimizers"] != ["botorch"]:
-        parts.append(f"the search (here {', '.join(said['optimizers'])}; there Bayesian optimization)")
+        parts.append(
+            f"the search (here {', '.join(said['optimizers'])}; there Bayesian optimization)"
+        )
     if said["learners"] != ["imitation"]:
-        parts.append(f"how the policy learns (here {', '.join(said['learners'])}; there from the windows' best parameters)")
+        parts.append(
+            f"how the policy learns (here {', '.join(said['learners'])}; there from the windows' best parameters)"
+        )
     if said["epochs"] != ["500"] or said["batches"] != ["1"]:
         parts.append(
             f"the training (here {' or '.join(said['epochs'])} epochs, batch size {' or '.join(said['batches'])}; there 500, 1)"
         )
-    parts.append("what the paper does not print, such as the parameters' bounds and the number of evaluations of its search")
+    parts.append(
+        "what the paper does not print, such as the parameters' bounds and the number of evaluations of its search"
+    )
     listed = "; ".join(parts)
     return f"The numbers need not agree, because these things differ, or may: {listed}."

@@ -17,17 +17,37 @@ import pandas as pd
 import yaml
 from numpy.typing import NDArray
 
+from cfx import renamed
 from cfx.errors import DataError
 from cfx.evaluation.result import METHODS
 from cfx.style.result import CLUSTERS
 
 T = TypeVar("T")
 
-_PAIR_COLUMNS = ("pair_id", "driver", "cluster", "method", "rmse_speed", "rmse_gap", "improvement", "collisions", "frames")
+_PAIR_COLUMNS = (
+    "pair_id",
+    "driver",
+    "cluster",
+    "method",
+    "rmse_speed",
+    "rmse_gap",
+    "improvement",
+    "collisions",
+    "frames",
+)
 _STYLE_COLUMNS = ("driver", "score", "cluster")
 _DRIVE_COLUMNS = ("pair_id", "time_s", "leader_speed", "real_speed", "real_gap")
 _PLATOON_COLUMNS = ("method", "network", "vehicle", "time_s", "speed", "gap")
-_HISTORY_COLUMNS = ("pair_id", "driver", "base", "history_s", "amount", "rmse_speed", "rmse_gap", "improvement")
+_HISTORY_COLUMNS = (
+    "pair_id",
+    "driver",
+    "base",
+    "history_s",
+    "amount",
+    "rmse_speed",
+    "rmse_gap",
+    "improvement",
+)
 _CURVE_COLUMNS = ("network", "epoch", "train_loss", "validation_loss")
 _PASSWORD = re.compile(r"(://[^/@\s:]*):[^/@\s]+@")
 
@@ -95,23 +115,32 @@ class Job:
     def methods(self) -> tuple[str, ...]:
         """The methods that were compared, in the order in which they are shown."""
         present = [str(method) for method in self.pairs["method"].unique()]
-        return tuple(sorted(present, key=lambda method: METHODS.index(method) if method in METHODS else len(METHODS)))
+        return tuple(
+            sorted(
+                present,
+                key=lambda method: METHODS.index(method) if method in METHODS else len(METHODS),
+            )
+        )
 
     @property
-    def follows(self) -> bool:
+    def has_constant_baseline(self) -> bool:
         """Says whether the model follows its leader with constant parameters, so that those are baselines."""
-        return self.data.get("follows") is not False
+        return renamed.data(self.data).get("has_constant_baseline") is not False
 
     def baselines(self, where: str = "") -> tuple[str, ...]:
-        """Returns what the policy was compared with, the driver's own fixed parameters first; nothing if `follows` is false.
+        """Returns what the policy was compared with, the driver's own fixed parameters first; nothing if `has_constant_baseline` is false.
 
         Args:
             where: "" for the test part, "later/" for what of it is beyond the first 5 s, "whole/" for whole drives.
         """
-        if not self.follows:
+        if not self.has_constant_baseline:
             return ()
         found = ("fixed", *(method for method in self.methods if method not in {"fixed", "policy"}))
-        known = {baseline for baseline in found if f"{improvement_of(baseline, where)}/mean" in self.metrics}
+        known = {
+            baseline
+            for baseline in found
+            if f"{improvement_of(baseline, where)}/mean" in self.metrics
+        }
         return tuple(baseline for baseline in found if baseline in known & set(self.methods))
 
     @property
@@ -127,7 +156,9 @@ class Job:
         Columns: pair_id, driver, cluster, style_score, `rmse_speed/METHOD`, `rmse_gap/METHOD`, `improvement/BASELINE`.
         """
         first = self.pairs.drop_duplicates("pair_id").set_index("pair_id")
-        table = first[[name for name in ("driver", "cluster", "style_score") if name in first]].copy()
+        table = first[
+            [name for name in ("driver", "cluster", "style_score") if name in first]
+        ].copy()
         for method, rows in self.pairs.groupby("method"):
             of_method = rows.drop_duplicates("pair_id").set_index("pair_id")
             for column in ("rmse_speed", "rmse_gap"):
@@ -168,7 +199,9 @@ class Origin:
 
 def improvement_of(baseline: str, where: str = "") -> str:
     """Returns how the metrics of the improvement over a baseline begin."""
-    return f"{where}rmse_improvement" + ("" if baseline == "fixed" and not where else f"/{baseline}")
+    return f"{where}rmse_improvement" + (
+        "" if baseline == "fixed" and not where else f"/{baseline}"
+    )
 
 
 def improvement_column(baseline: str) -> str:
@@ -189,14 +222,19 @@ def read_job(folder: Path, origin: Origin) -> Job:
     config, data = _yaml(folder / "config.yaml"), _optional(folder / "data.json", read_json) or {}
     optional = {
         "style.csv": _optional(folder / "style.csv", lambda path: _table(path, _STYLE_COLUMNS)),
-        "drives.parquet": _optional(folder / "drives.parquet", lambda path: _table(path, _DRIVE_COLUMNS)),
-        "curves.parquet": _optional(folder / "curves.parquet", lambda path: _table(path, _CURVE_COLUMNS)),
+        "trajectories.parquet": _optional(
+            renamed.file(folder / "trajectories.parquet"),
+            lambda path: _table(path, _DRIVE_COLUMNS),
+        ),
+        "curves.parquet": _optional(
+            folder / "curves.parquet", lambda path: _table(path, _CURVE_COLUMNS)
+        ),
     }
     hydra = origin.hydra if origin.hydra is not None else folder
     started, seconds = _times(hydra / "cfx.log")
-    outcome = _optional(hydra / "outcome.json", read_json) or {}
-    if isinstance(outcome.get("seconds"), int | float):
-        seconds = float(outcome["seconds"])
+    status = _optional(hydra / "outcome.json", read_json) or {}
+    if isinstance(status.get("seconds"), int | float):
+        seconds = float(status["seconds"])
     if origin.started is not None:
         started, seconds = origin.started, origin.seconds
     overrides = _optional(hydra / ".hydra" / "overrides.yaml", _yaml_list)
@@ -207,11 +245,13 @@ def read_job(folder: Path, origin: Origin) -> Job:
         metrics=_metrics(folder / "metrics.json"),
         pairs=_pairs(folder / "pairs.csv"),
         style=optional["style.csv"],
-        drives=optional["drives.parquet"],
+        drives=optional["trajectories.parquet"],
         curves=optional["curves.parquet"],
         platoon=_optional(folder / "platoon.parquet", lambda path: _table(path, _PLATOON_COLUMNS)),
         history=_optional(folder / "history.parquet", lambda path: _table(path, _HISTORY_COLUMNS)),
-        overrides=None if overrides is None else tuple(without_password(str(one)) for one in overrides),
+        overrides=None
+        if overrides is None
+        else tuple(without_password(str(one)) for one in overrides),
         experiment=_experiment(config, hydra),
         started=started,
         seconds=seconds,
@@ -247,7 +287,11 @@ def _times(log: Path) -> tuple[datetime | None, float | None]:
 
 def _metrics(path: Path) -> dict[str, float]:
     try:
-        return {str(name): math.nan if value is None else float(value) for name, value in read_json(path).items()}
+        values = {
+            str(name): math.nan if value is None else float(value)
+            for name, value in read_json(path).items()
+        }
+        return renamed.metrics(values)
     except (TypeError, ValueError) as error:
         raise DataError(f"{path} is damaged: a metric is no number ({error})") from error
 
@@ -261,7 +305,20 @@ def _pairs(path: Path) -> pd.DataFrame:
     return table
 
 
-_TEXT = dict.fromkeys(("pair_id", "recording", "leader_id", "follower_id", "driver", "method", "network", "base", "amount"), str)
+_TEXT = dict.fromkeys(
+    (
+        "pair_id",
+        "recording",
+        "leader_id",
+        "follower_id",
+        "driver",
+        "method",
+        "network",
+        "base",
+        "amount",
+    ),
+    str,
+)
 
 
 def _table(path: Path, columns: Iterable[str]) -> pd.DataFrame:
@@ -270,9 +327,21 @@ def _table(path: Path, columns: Iterable[str]) -> pd.DataFrame:
             table = pd.read_parquet(path)
         else:
             # An id such as "NA" is an id, and "007" is no number.
-            table = pd.read_csv(path, dtype=_TEXT, keep_default_na=False, na_values={key: ["", "nan"] for key in _numbers(path)})
-    except (OSError, ValueError, ArithmeticError) as error:  # pyarrow's and pandas' errors are ValueErrors or OSErrors
-        raise DataError(f"{path} cannot be read ({_first_line(error)}); run the job again, or leave it out") from error
+            table = pd.read_csv(
+                path,
+                dtype=_TEXT,
+                keep_default_na=False,
+                na_values={key: ["", "nan"] for key in _numbers(path)},
+            )
+    except (
+        OSError,
+        ValueError,
+        ArithmeticError,
+    ) as error:  # pyarrow's and pandas' errors are ValueErrors or OSErrors
+        raise DataError(
+            f"{path} cannot be read ({_first_line(error)}); run the job again, or leave it out"
+        ) from error
+    table = renamed.results(table)
     lacking = [column for column in columns if column not in table]
     if lacking:
         raise DataError(f"{path} is damaged: it has no column '{lacking[0]}'")
@@ -281,7 +350,9 @@ def _table(path: Path, columns: Iterable[str]) -> pd.DataFrame:
         try:
             table[column] = table[column].astype(float)
         except (TypeError, ValueError) as error:
-            raise DataError(f"{path} is damaged: column '{column}' holds something else than numbers ({error})") from error
+            raise DataError(
+                f"{path} is damaged: column '{column}' holds something else than numbers ({error})"
+            ) from error
     for column in {*_TEXT} & set(table.columns):
         table[column] = table[column].astype(str).astype(object)
     return table
@@ -321,7 +392,9 @@ def _read(path: Path, parse: Callable[[str], Any]) -> Any:
     try:
         return parse(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, yaml.YAMLError) as error:
-        raise DataError(f"{path} cannot be read ({_first_line(error)}); run the job again, or leave it out") from error
+        raise DataError(
+            f"{path} cannot be read ({_first_line(error)}); run the job again, or leave it out"
+        ) from error
 
 
 def _optional(path: Path, read: Callable[[Path], T]) -> T | None:
@@ -329,7 +402,9 @@ def _optional(path: Path, read: Callable[[Path], T]) -> T | None:
 
 
 def _first_line(error: Exception) -> str:
-    return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
+    return next(
+        (line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__
+    )
 
 
 def _public(values: Mapping[str, Any]) -> dict[str, Any]:

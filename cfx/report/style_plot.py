@@ -23,7 +23,10 @@ def style(table: pd.DataFrame, percentiles: Sequence[float]) -> Plot:
         table: a row per driver: score, cluster (0, 1, 2).
         percentiles: of the scores, where the clusters are cut.
     """
-    scores, cluster = table["score"].to_numpy(dtype=float), table["cluster"].astype(float).astype(int).to_numpy()
+    scores, cluster = (
+        table["score"].to_numpy(dtype=float),
+        table["cluster"].astype(float).astype(int).to_numpy(),
+    )
     known = finite(scores)
     bins = int(np.clip(2 * np.sqrt(len(known)), 8, 24))
     edges = np.histogram_bin_edges(known if len(known) else np.array([0.0, 1.0]), bins)
@@ -48,19 +51,38 @@ def style(table: pd.DataFrame, percentiles: Sequence[float]) -> Plot:
     layout = {
         "barmode": "stack",
         # Plotly would put its ticks in the middle of the bars.
-        "xaxis": axis("style score (0 conservative, 1 aggressive)", tick0=0, dtick=0.1 if np.ptp(edges) > 0.5 else 0.05),
+        "xaxis": axis(
+            "style score (0 conservative, 1 aggressive)",
+            tick0=0,
+            dtick=0.1 if np.ptp(edges) > 0.5 else 0.05,
+        ),
         "yaxis": axis("drivers", range=[0, 1.15 * max(most, 1)], tick0=0, dtick=max(1, most // 5)),
-        "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom", "traceorder": "normal"},
+        "legend": {
+            "orientation": "h",
+            "x": 0,
+            "y": 1.0,
+            "yanchor": "bottom",
+            "traceorder": "normal",
+        },
         **_cuts(np.percentile(known, list(percentiles)) if len(known) else np.empty(0)),
     }
     return Plot({"": view(data, layout)}, 330, "Distribution of the style scores")
 
 
 def _cuts(cuts: Array) -> dict[str, Any]:
-    line = {"type": "line", "y0": 0, "y1": 1, "yref": "paper", "line": {"color": INK, "width": 1.4, "dash": "dash"}}
+    line = {
+        "type": "line",
+        "y0": 0,
+        "y1": 1,
+        "yref": "paper",
+        "line": {"color": INK, "width": 1.4, "dash": "dash"},
+    }
     text = {"y": 1, "yref": "paper", "showarrow": False, "yanchor": "top"}
     sides = zip(cuts, ("right", "left"), (-4, 4), strict=False)
     return {
         "shapes": [line | {"x0": cut, "x1": cut} for cut in cuts],
-        "annotations": [text | {"x": cut, "text": f"{cut:.3f}", "xanchor": side, "xshift": shift} for cut, side, shift in sides],
+        "annotations": [
+            text | {"x": cut, "text": f"{cut:.3f}", "xanchor": side, "xshift": shift}
+            for cut, side, shift in sides
+        ],
     }

@@ -19,11 +19,11 @@ BASELINES = {
     "default": "the model's default parameters",
     "population": "one set of parameters for all, calibrated jointly on the training drivers",
     "fixed": "the driver's own fixed parameters, calibrated on the first part of his own drive",
-    "base": "the driver's own fixed parameters drawn towards the default, which the policy starts from",
+    "shrunk": "the driver's own fixed parameters shrunk towards the default, which the policy starts from",
 }
 """What the policy is compared with, in words that end a sentence."""
 
-SHORT = {"fixed": "own fixed", "base": "own, drawn"}
+SHORT = {"fixed": "own fixed", "shrunk": "own, shrunk"}
 """Methods in a table, where their own name says too little."""
 
 
@@ -81,7 +81,11 @@ def tested(jobs: Iterable[Job]) -> str:
     """Says which frames the errors are measured on, for instance "the last 20 % of each pair's frames"."""
     splits = sorted({job.split for job in jobs if math.isfinite(job.split)})
     parts = " or ".join(f"{100 * (1 - split):.3g}" for split in splits)
-    return f"the last {parts} % of each pair's frames" if parts else "the test part of each pair's frames"
+    return (
+        f"the last {parts} % of each pair's frames"
+        if parts
+        else "the test part of each pair's frames"
+    )
 
 
 def errors(jobs: Sequence[Job]) -> Sheet:
@@ -104,16 +108,26 @@ def errors(jobs: Sequence[Job]) -> Sheet:
     if whole:
         meaning = "The same over the whole drive of drivers that nothing was fitted to, from its first frame on."
         columns += [
-            Column("Whole drive: RMSE of speed (m/s)", meaning + " The driver's own fixed parameters do not compete here."),
+            Column(
+                "Whole drive: RMSE of speed (m/s)",
+                meaning + " The driver's own fixed parameters do not compete here.",
+            ),
             Column("Whole drive: RMSE of gap (m)", "The same for the gap."),
         ]
-    rows = [_error_row(job, method, whole) for job in jobs for method in (job.methods if job.follows else ("policy",))]
+    rows = [
+        _error_row(job, method, whole)
+        for job in jobs
+        for method in (job.methods if job.has_constant_baseline else ("policy",))
+    ]
     return Sheet(tuple(columns), tuple(rows))
 
 
 def _methods(jobs: Sequence[Job]) -> str:
     said = BASELINES | {"policy": "parameters that the policy chooses anew as it drives"}
-    return "; ".join(f"{SHORT.get(m, m)}: {said.get(m, m)}" for m in dict.fromkeys(m for job in jobs for m in job.methods))
+    return "; ".join(
+        f"{SHORT.get(m, m)}: {said.get(m, m)}"
+        for m in dict.fromkeys(m for job in jobs for m in job.methods)
+    )
 
 
 def _error_row(job: Job, method: str, whole: bool) -> tuple[Cell, ...]:
@@ -131,21 +145,32 @@ def _error_row(job: Job, method: str, whole: bool) -> tuple[Cell, ...]:
         number(collisions, f"{collisions:.0f}"),
     ]
     if whole:
-        row += [number(value(f"whole/{name}"), f"{value(f'whole/{name}'):.3f}") for name in ("rmse_speed", "rmse_gap")]
+        row += [
+            number(value(f"whole/{name}"), f"{value(f'whole/{name}'):.3f}")
+            for name in ("rmse_speed", "rmse_gap")
+        ]
     return tuple(row)
 
 
 def improvements(jobs: Sequence[Job]) -> Sheet:
     """Returns the policy's improvement: a row per job, baseline and kind of frames. The numbers are those of `metrics.json`."""
     whole = any(job.baselines("whole/") for job in jobs)
-    present = dict.fromkeys(baseline for job in jobs for where in ("", "whole/") for baseline in job.baselines(where))
+    present = dict.fromkeys(
+        baseline for job in jobs for where in ("", "whole/") for baseline in job.baselines(where)
+    )
     against = "; ".join(f"{SHORT.get(name, name)}: {BASELINES.get(name, name)}" for name in present)
     frames = f"The frames that count: test part: {tested(jobs)}"
     columns = (
         Column("Job", "", number=False),
         Column("Policy against", f"The baseline. {against}.", number=False),
         *(
-            (Column("Frames", f"{frames}; whole drive: from its first frame on, of unseen drivers.", number=False),)
+            (
+                Column(
+                    "Frames",
+                    f"{frames}; whole drive: from its first frame on, of unseen drivers.",
+                    number=False,
+                ),
+            )
             if whole
             else ()
         ),
@@ -154,15 +179,31 @@ def improvements(jobs: Sequence[Job]) -> Sheet:
             "Improvement of a pair: (RMSE of the baseline \N{MINUS SIGN} RMSE of the policy) / RMSE of the baseline, RMSE of the"
             f" speed over {tested(jobs)}. Above 0 the policy is closer to the real driver. Here the mean over the pairs.",
         ),
-        Column("95 % interval", "Bootstrap confidence interval of that mean; drivers are drawn, each with all his pairs."),
-        Column("Trimmed mean", "Mean without the top and the bottom tenth of the pairs, as the paper averages."),
+        Column(
+            "95 % interval",
+            "Bootstrap confidence interval of that mean; drivers are drawn, each with all his pairs.",
+        ),
+        Column(
+            "Trimmed mean",
+            "Mean without the top and the bottom tenth of the pairs, as the paper averages.",
+        ),
         Column("Median", "Half of the pairs improve more."),
         Column("Better for", "Share of the pairs with an improvement above 0."),
-        Column("p", "Two-sided Wilcoxon signed-rank test of the baseline's RMSE against the policy's."),
-        Column("Pairs", "Pairs that count. One does not if the baseline drives it without error, or a simulation diverges."),
+        Column(
+            "p", "Two-sided Wilcoxon signed-rank test of the baseline's RMSE against the policy's."
+        ),
+        Column(
+            "Pairs",
+            "Pairs that count. One does not if the baseline drives it without error, or a simulation diverges.",
+        ),
     )
     kinds = [(baseline, where) for where in ("", "whole/") for baseline in present]
-    rows = [_improvement_row(job, b, where, whole) for b, where in kinds for job in jobs if b in job.baselines(where)]
+    rows = [
+        _improvement_row(job, b, where, whole)
+        for b, where in kinds
+        for job in jobs
+        if b in job.baselines(where)
+    ]
     return Sheet(columns, tuple(rows))
 
 
@@ -171,7 +212,11 @@ def _improvement_row(job: Job, baseline: str, where: str, whole: bool) -> tuple[
         return job.metrics.get(f"{improvement_of(baseline, where)}/{name}", math.nan)
 
     count = counted(job, baseline, where)
-    frames = (text("whole\N{NO-BREAK SPACE}drive" if where else "test\N{NO-BREAK SPACE}part"),) if whole else ()
+    frames = (
+        (text("whole\N{NO-BREAK SPACE}drive" if where else "test\N{NO-BREAK SPACE}part"),)
+        if whole
+        else ()
+    )
     return (
         text(job.name),
         Cell(SHORT.get(baseline, baseline), colour=baseline),
@@ -189,8 +234,12 @@ def _improvement_row(job: Job, baseline: str, where: str, whole: bool) -> tuple[
 def counted(job: Job, baseline: str, where: str = "") -> int:
     """Returns the number of pairs whose improvement over a baseline is defined."""
     if not where:
-        return int(np.isfinite(job.by_pair.get(f"improvement/{baseline}", pd.Series(dtype=float))).sum())
-    speeds = job.pairs.pivot_table(index="pair_id", columns="method", values="whole_rmse_speed", aggfunc="first")
+        return int(
+            np.isfinite(job.by_pair.get(f"improvement/{baseline}", pd.Series(dtype=float))).sum()
+        )
+    speeds = job.pairs.pivot_table(
+        index="pair_id", columns="method", values="full_trajectory_rmse_speed", aggfunc="first"
+    )
     before, after = (speeds.get(method, pd.Series(dtype=float)) for method in (baseline, "policy"))
     return int((np.isfinite(before) & np.isfinite(after) & (before > 0)).sum())
 
@@ -198,7 +247,11 @@ def counted(job: Job, baseline: str, where: str = "") -> int:
 def interval(low: float, high: float) -> Cell:
     """Returns a cell with an interval, sorted by its lower end."""
     known = math.isfinite(low) and math.isfinite(high)
-    return Cell(f"{percent(low, 1)} to {percent(high, 1)}" if known else NOTHING, repr(low) if known else "", number=True)
+    return Cell(
+        f"{percent(low, 1)} to {percent(high, 1)}" if known else NOTHING,
+        repr(low) if known else "",
+        number=True,
+    )
 
 
 def probability(value: float) -> str:
@@ -230,13 +283,19 @@ def clusters(series: Mapping[str, Mapping[str, pd.DataFrame]], baseline: str) ->
     rows = []
     for name, by_cluster in series.items():
         for cluster, table in by_cluster.items():
-            if f"rmse_speed/{baseline}" not in table:  # these jobs have no such baseline; others beside them have
+            if (
+                f"rmse_speed/{baseline}" not in table
+            ):  # these jobs have no such baseline; others beside them have
                 continue
             found = statistics(table, baseline)
             rows.append(
                 (
                     text(name),
-                    Cell(cluster, str(CLUSTERS.index(cluster)) if cluster in CLUSTERS else cluster, colour=cluster),
+                    Cell(
+                        cluster,
+                        str(CLUSTERS.index(cluster)) if cluster in CLUSTERS else cluster,
+                        colour=cluster,
+                    ),
                     number(found.pairs, str(found.pairs)),
                     share(found.mean),
                     interval(found.ci95_low, found.ci95_high),
@@ -257,5 +316,9 @@ def statistics(table: pd.DataFrame, baseline: str) -> Improvement:
     """
     from cfx.evaluation.metrics import improvement_statistics  # imports torch
 
-    before, after = (table[f"rmse_speed/{method}"].to_numpy(dtype=float) for method in (baseline, "policy"))
-    return improvement_statistics(before, after, [str(driver) for driver in table["driver"]], seed=0)
+    before, after = (
+        table[f"rmse_speed/{method}"].to_numpy(dtype=float) for method in (baseline, "policy")
+    )
+    return improvement_statistics(
+        before, after, [str(driver) for driver in table["driver"]], seed=0
+    )

@@ -36,7 +36,9 @@ class BaseSimulator(ABC):
         return Follower(*start, self.model.initial_memory(start.speed))
 
     @abstractmethod
-    def advance(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor]) -> tuple[Follower, Tensor, Tensor]:
+    def advance(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor]
+    ) -> tuple[Follower, Tensor, Tensor]:
         """Takes K steps with constant parameters.
 
         Args:

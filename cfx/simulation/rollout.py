@@ -89,25 +89,46 @@ class Simulator(BaseSimulator):
     def for_work(self, steps: int) -> Simulator:
         return Simulator(self.model, self.dt, compile="always") if self._pays(steps) else self
 
-    def advance(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor]) -> tuple[Follower, Tensor, Tensor]:
+    def advance(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor]
+    ) -> tuple[Follower, Tensor, Tensor]:
         steps, batch = len(leader.position), follower.speed.shape
         if steps == 0:
             nothing = follower.speed.new_empty((0, *batch))
             return follower, nothing, nothing
         eager = _stepper(self.model, self.dt)
-        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (*follower, *leader, *p.values())):
+        if torch.is_grad_enabled() and any(
+            tensor.requires_grad for tensor in (*follower, *leader, *p.values())
+        ):
             return eager(follower, leader, dict(p))
         with torch.no_grad():
             compiled = self._compiles(steps, follower.speed)
             size = _tile_size(follower.speed)
             if not compiled and follower.speed.numel() <= size:
                 return eager(follower, leader, dict(p))
-            end = Follower(*(torch.empty_like(state, memory_format=torch.contiguous_format) for state in follower))
+            end = Follower(
+                *(
+                    torch.empty_like(state, memory_format=torch.contiguous_format)
+                    for state in follower
+                )
+            )
             position, speed = (follower.speed.new_empty((steps, *batch)) for _ in range(2))
             with one_thread():
                 for tile in _tiles(batch, size):
-                    drive = self._compiled_drive if compiled and len(tile) > 1 else self._eager_drive
-                    tile.put(end, drive(tile, follower, leader, tile.parameters(p), tile.rows(position), tile.rows(speed)))
+                    drive = (
+                        self._compiled_drive if compiled and len(tile) > 1 else self._eager_drive
+                    )
+                    tile.put(
+                        end,
+                        drive(
+                            tile,
+                            follower,
+                            leader,
+                            tile.parameters(p),
+                            tile.rows(position),
+                            tile.rows(speed),
+                        ),
+                    )
         return end, position, speed
 
     def _compiles(self, steps: int, like: Tensor) -> bool:
@@ -117,20 +138,37 @@ class Simulator(BaseSimulator):
         return self._mode == "always" or (self._mode == "auto" and steps >= _WORTH_COMPILING)
 
     def _eager_drive(
-        self, tile: _Tile, follower: Follower, leader: Leader, p: _Parameters, position: Tensor, speed: Tensor
+        self,
+        tile: _Tile,
+        follower: Follower,
+        leader: Leader,
+        p: _Parameters,
+        position: Tensor,
+        speed: Tensor,
     ) -> Follower:
         """Takes all steps of one tile; writes positions and speeds `(time, rows, columns)`."""
-        last, at, fast = _stepper(self.model, self.dt)(tile.follower(follower), tile.leader(leader, 0, len(position)), p)
+        last, at, fast = _stepper(self.model, self.dt)(
+            tile.follower(follower), tile.leader(leader, 0, len(position)), p
+        )
         position.copy_(at.view_as(position))
         speed.copy_(fast.view_as(speed))
         return last
 
     def _compiled_drive(
-        self, tile: _Tile, follower: Follower, leader: Leader, p: _Parameters, position: Tensor, speed: Tensor
+        self,
+        tile: _Tile,
+        follower: Follower,
+        leader: Leader,
+        p: _Parameters,
+        position: Tensor,
+        speed: Tensor,
     ) -> Follower:
         """As `_eager_drive`, in compiled blocks; what is left over goes step by step."""
         steps = len(position)
-        cuts = [*range(0, steps - steps % _BLOCK, _BLOCK), *range(steps - steps % _BLOCK, steps + 1)]
+        cuts = [
+            *range(0, steps - steps % _BLOCK, _BLOCK),
+            *range(steps - steps % _BLOCK, steps + 1),
+        ]
         current = tile.follower(follower)
         for first, last in itertools.pairwise(cuts):
             take = _compiled_stepper(self.model, self.dt, last - first)
@@ -149,7 +187,12 @@ def _stepper(model: DrivingModel, dt: float) -> _Step:
             now = Leader(leader.position[k], leader.speed[k], leader.acceleration[k], leader.length)
             next_speed = model.next_speed(follower, now, p, dt)
             next_memory = model.next_memory(follower, now, p, dt, next_speed)
-            follower = Follower(follower.position + next_speed * dt, next_speed, (next_speed - follower.speed) / dt, next_memory)
+            follower = Follower(
+                follower.position + next_speed * dt,
+                next_speed,
+                (next_speed - follower.speed) / dt,
+                next_memory,
+            )
             positions.append(follower.position)
             speeds.append(next_speed)
         return follower, torch.stack(positions), torch.stack(speeds)
@@ -162,11 +205,19 @@ _COMPILED: dict[tuple[type[DrivingModel], str, float, float, int], _Step] = {}
 
 def _compiled_stepper(model: DrivingModel, dt: float, steps: int) -> _Step:
     """Returns `_stepper`, compiled for a number of steps; equal models share it."""
-    key = (type(model), model.settings.model_dump_json(exclude={"parameters"}), float(model.softness), dt, steps)
+    key = (
+        type(model),
+        model.settings.model_dump_json(exclude={"parameters"}),
+        float(model.temperature),
+        dt,
+        steps,
+    )
     if key not in _COMPILED:
         # Each model and block has a cache of its own: torch counts recompilations per function, and gives up after eight.
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # torch's own, about itself, as it imports its compiler
+            warnings.simplefilter(
+                "ignore", DeprecationWarning
+            )  # torch's own, about itself, as it imports its compiler
             _COMPILED[key] = torch.compile(  # type: ignore[call-overload]  # torch's overloads leave isolate_recompiles out
                 _stepper(model, dt), dynamic=True, isolate_recompiles=True
             )
@@ -206,23 +257,32 @@ class _Tile:
         position, speed, acceleration = (self._flat(state) for state in follower[:3])
         width = follower.memory.shape[-1]
         memory = follower.memory.new_empty((len(self), width))
-        memory.view(*self.shape, width).copy_(follower.memory.reshape(*self._grid, width)[self._rows, self._columns])
+        memory.view(*self.shape, width).copy_(
+            follower.memory.reshape(*self._grid, width)[self._rows, self._columns]
+        )
         return Follower(position, speed, acceleration, memory)
 
     def leader(self, leader: Leader, first: int, last: int) -> Leader:
-        position, speed, acceleration = (self._flat_frames(signal[first:last]) for signal in leader[:3])
+        position, speed, acceleration = (
+            self._flat_frames(signal[first:last]) for signal in leader[:3]
+        )
         return Leader(position, speed, acceleration, self._flat(leader.length))
 
     def parameters(self, p: Mapping[str, Tensor]) -> _Parameters:
         """Constants stay 0-dimensional: they cost no memory traffic."""
-        return {name: value.clone() if value.dim() == 0 else self._flat(value) for name, value in p.items()}
+        return {
+            name: value.clone() if value.dim() == 0 else self._flat(value)
+            for name, value in p.items()
+        }
 
     def put(self, end: Follower, last: Follower) -> None:
         """Writes the tile's last state into the whole batch's."""
         for whole, part in zip(end[:3], last[:3], strict=True):
             self.rows(whole[None])[0].copy_(part.view(self.shape))
         width = end.memory.shape[-1]
-        end.memory.view(*self._grid, width)[self._rows, self._columns].copy_(last.memory.view(*self.shape, width))
+        end.memory.view(*self._grid, width)[self._rows, self._columns].copy_(
+            last.memory.view(*self.shape, width)
+        )
 
     def _flat(self, value: Tensor) -> Tensor:
         return self._copy(value.expand(self._batch).reshape(self._grid))
@@ -255,11 +315,18 @@ def _tiles(batch: torch.Size, size: int) -> Iterator[_Tile]:
     height = max(1, size // max(1, width)) if width == columns else 1
     for top in range(0, rows, height):
         for left in range(0, columns, width):
-            yield _Tile(batch, slice(top, min(top + height, rows)), slice(left, min(left + width, columns)))
+            yield _Tile(
+                batch, slice(top, min(top + height, rows)), slice(left, min(left + width, columns))
+            )
 
 
 def _frames(leader: Leader, first: int, last: int) -> Leader:
-    return Leader(leader.position[first:last], leader.speed[first:last], leader.acceleration[first:last], leader.length)
+    return Leader(
+        leader.position[first:last],
+        leader.speed[first:last],
+        leader.acceleration[first:last],
+        leader.length,
+    )
 
 
 def simulate(
@@ -301,7 +368,12 @@ def simulate(
     batch = torch.broadcast_shapes(*shapes)  # type: ignore[no-untyped-call]  # torch leaves it untyped
     simulator = Simulator(model, dt, compile=compile)
     follower = simulator.begin(Start(*(state.expand(batch) for state in start)))
-    in_time = Leader(_time_first(leader.position), _time_first(leader.speed), _time_first(leader.acceleration), leader.length)
+    in_time = Leader(
+        _time_first(leader.position),
+        _time_first(leader.speed),
+        _time_first(leader.acceleration),
+        leader.length,
+    )
     positions, speeds = [follower.position[None]], [follower.speed[None]]
     for first, last, p in windows:
         follower, position, speed = simulator.advance(follower, _frames(in_time, first, last), p)
@@ -329,7 +401,12 @@ def _windows(
         given = dict(parameters or {})
         for name in given:
             space[name]
-        named = {p.name: torch.as_tensor(given.get(p.name, p.default), dtype=like.dtype, device=like.device) for p in space}
+        named = {
+            p.name: torch.as_tensor(
+                given.get(p.name, p.default), dtype=like.dtype, device=like.device
+            )
+            for p in space
+        }
         return [(0, steps, named)]
     if window is None:
         return [(0, steps, space.unpack(_columns(parameters)))]
@@ -343,7 +420,10 @@ def _windows(
     cuts = [*range(0, min(steps, count * window), window)]
     ends = [*cuts[1:], steps]
     columns = _columns(parameters)
-    return [(a, b, space.unpack(columns[..., k, :])) for k, (a, b) in enumerate(zip(cuts, ends, strict=True))]
+    return [
+        (a, b, space.unpack(columns[..., k, :]))
+        for k, (a, b) in enumerate(zip(cuts, ends, strict=True))
+    ]
 
 
 def _columns(parameters: Tensor) -> Tensor:

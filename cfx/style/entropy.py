@@ -3,7 +3,7 @@
 An indicator weighs the more, the more unevenly it is spread over the drivers: its weight comes from the Shannon entropy of its
 normalised column (C. E. Shannon, 1948; as used for driving style by the paper's reference on entropy weights).
 
-Letters: m drivers, n = 6 indicators.
+Shapes: m drivers, n = 6 indicators.
 
 Differences from the paper: the normalisation prints `Min = max(...)` and chooses its case by the sign of the value; here Min is
 the minimum, and the case goes by the indicator (`direction=signed`) or, as printed, by the value's sign (`direction=printed`).
@@ -63,7 +63,9 @@ def measure_style(pairs: PairSet, settings: StyleSettings) -> StyleResult:
     if not len(pairs):
         raise DataError(f"{pairs.source}: no pairs, so no driving style to measure")
     table = indicators(pairs)
-    normalised = normalise(table[[i.name for i in INDICATORS]].to_numpy(dtype=np.float64), settings.direction)
+    normalised = normalise(
+        table[[i.name for i in INDICATORS]].to_numpy(dtype=np.float64), settings.direction
+    )
     weights = entropy_weights(normalised)
     score = (normalised * weights).sum(axis=1)
     low, high = (float(cut) for cut in np.percentile(score, settings.percentiles))
@@ -71,7 +73,9 @@ def measure_style(pairs: PairSet, settings: StyleSettings) -> StyleResult:
     table.insert(1, "score", score)
     table.insert(2, "cluster", cluster)
     table.insert(3, "cluster_name", [CLUSTERS[c] for c in cluster])
-    return StyleResult(table, {i.name: float(w) for i, w in zip(INDICATORS, weights, strict=True)}, (low, high))
+    return StyleResult(
+        table, {i.name: float(w) for i, w in zip(INDICATORS, weights, strict=True)}, (low, high)
+    )
 
 
 def select_cluster(pairs: PairSet, style: StyleResult, cluster: str) -> PairSet:
@@ -115,7 +119,9 @@ def indicators(pairs: PairSet) -> pd.DataFrame:
 
     frames = np.bincount(code, minlength=len(drivers))
     counted = np.bincount(code[moving], minlength=len(drivers))
-    mean_speed, mean_acceleration, mean_space = (total(x) / frames for x in (speed, acceleration, space))
+    mean_speed, mean_acceleration, mean_space = (
+        total(x) / frames for x in (speed, acceleration, space)
+    )
     return pd.DataFrame(
         {
             "driver": drivers,
@@ -124,7 +130,9 @@ def indicators(pairs: PairSet) -> pd.DataFrame:
             "mean_acceleration": mean_acceleration,
             "variance_acceleration": total((acceleration - mean_acceleration[code]) ** 2) / frames,
             "mean_space_headway": mean_space,
-            "mean_time_headway": np.where(counted > 0, total(time) / np.maximum(counted, 1), mean_space / STANDING_MPS),
+            "mean_time_headway": np.where(
+                counted > 0, total(time) / np.maximum(counted, 1), mean_space / STANDING_MPS
+            ),
             "frames": frames,
             "standing_frames": frames - counted,
         }
@@ -138,11 +146,15 @@ def normalise(raw: Floats, direction: Literal["signed", "printed"] = "signed") -
     column with both signs is then not monotonic.
     """
     low, high = raw.min(axis=0), raw.max(axis=0)
-    spread = high - low
+    sensitivity = high - low
     # What rounding alone can cause is no spread.
-    varies = spread > 1e-9 * np.maximum(np.abs(low), np.abs(high)) + 1e-12
-    backwards = raw < 0 if direction == "printed" else np.array([i.sign for i in INDICATORS])[: raw.shape[1]] < 0
-    rise = np.where(backwards, high - raw, raw - low) / np.where(varies, spread, 1.0)
+    varies = sensitivity > 1e-9 * np.maximum(np.abs(low), np.abs(high)) + 1e-12
+    backwards = (
+        raw < 0
+        if direction == "printed"
+        else np.array([i.sign for i in INDICATORS])[: raw.shape[1]] < 0
+    )
+    rise = np.where(backwards, high - raw, raw - low) / np.where(varies, sensitivity, 1.0)
     scaled: Floats = np.where(varies, np.clip(rise, 0.0, 1.0), 0.0)
     return scaled
 

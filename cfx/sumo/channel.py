@@ -32,14 +32,18 @@ class Message(NamedTuple):
     arrays: dict[str, Array]
 
 
-def send(stream: IO[bytes], header: Mapping[str, Any], arrays: Mapping[str, Array] | None = None) -> None:
+def send(
+    stream: IO[bytes], header: Mapping[str, Any], arrays: Mapping[str, Array] | None = None
+) -> None:
     """Writes a message.
 
     Raises:
         OSError: nobody reads the stream any more.
     """
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **{_HEADER: np.array(json.dumps(header))}, **dict(arrays or {}))
+    np.savez(
+        buffer, allow_pickle=False, **{_HEADER: np.array(json.dumps(header))}, **dict(arrays or {})
+    )
     data = buffer.getvalue()
     stream.write(_LENGTH.pack(len(data)))
     stream.write(data)

@@ -23,10 +23,10 @@ def drive_scenario(options: argparse.Namespace, sumos: Sequence[str]) -> None:
     require_sumo()
     # libsumo does not get on with pyarrow, and pandas loads it where it finds it: this process does without.
     sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]  # Python's own way to say that a module is not there
-    from cfx.console import told_on_the_console
+    from cfx.console import console_logging
     from cfx.sumo.drive import drive, parse_drivers, report
 
-    with told_on_the_console():
+    with console_logging():
         report(
             drive(
                 Path(options.scenario).expanduser(),

@@ -26,7 +26,7 @@ import cfx
 from cfx.config import DemoSettings, JobConfig
 from cfx.errors import DataError, SumoError
 from cfx.evaluation.result import Drive, Evaluation
-from cfx.files import whole
+from cfx.files import atomic_write
 from cfx.pairs import Pair, PairBatch, PairSet
 from cfx.policies.trained import ALL, TrainedPolicy
 from cfx.sumo.channel import Message, receive, send
@@ -54,7 +54,12 @@ def check_demo(settings: DemoSettings, pairs: PairSet) -> None:
 
 
 def write_demo(
-    folder: Path, policy_folder: Path, pairs: PairSet, policy: TrainedPolicy, evaluation: Evaluation, config: JobConfig
+    folder: Path,
+    policy_folder: Path,
+    pairs: PairSet,
+    policy: TrainedPolicy,
+    evaluation: Evaluation,
+    config: JobConfig,
 ) -> list[Path]:
     """Drives in SUMO what a job has evaluated, and shows it.
 
@@ -78,11 +83,19 @@ def write_demo(
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="cfx-sumo-") as scratch:
         road = read_motorway(config.demo.osm, Path(scratch))
-        shown = drive_in_sumo(policy_folder, pairs, policy, evaluation, road, config.demo.pairs, known=Known.of(config.protocol))
-        with whole(folder / "motorway.net.xml") as partial:
+        shown = drive_in_sumo(
+            policy_folder,
+            pairs,
+            policy,
+            evaluation,
+            road,
+            config.demo.pairs,
+            known=Known.of(config.protocol),
+        )
+        with atomic_write(folder / "motorway.net.xml") as partial:
             shutil.copyfile(road.net, partial)
     table = pd.concat([one.table for one in shown], ignore_index=True)
-    with whole(folder / "demo_rmse.csv") as partial:
+    with atomic_write(folder / "demo_rmse.csv") as partial:
         table.to_csv(partial, index=False)
     log.info(
         "SUMO: %d pairs drove as in memory; largest difference of a speed %.1g m/s, of a gap %.1g m",
@@ -140,7 +153,9 @@ def drive_in_sumo(
     """
     require_sumo()
     by_id = _fitting(pairs, road)
-    chosen = _choose([drive for drive in evaluation.drives if drive.pair_id in by_id], evaluation.table, count)
+    chosen = _choose(
+        [drive for drive in evaluation.drives if drive.pair_id in by_id], evaluation.table, count
+    )
     networks = _networks(evaluation, policy)
     header: dict[str, Any] = {
         "dt": policy.dt,
@@ -154,13 +169,29 @@ def drive_in_sumo(
     for number, drive in enumerate(chosen):
         pair = by_id[drive.pair_id]
         base = _base(evaluation, pair.pair_id, known) if policy.base is not None else None
-        request = _request(number, pair, drive, road) | {"network": networks[pair.pair_id], "base": base}
-        traits = _traits(pair, request["first"], policy, known)
-        header["pairs"].append(request | {"traits": traits, "renew": _renewed(request["first"], policy, known)})
-        arrays[f"{number}/leader"] = np.stack([pair.leader_position, pair.leader_speed, pair.leader_acceleration])
-        arrays[f"{number}/follower"] = np.stack([pair.follower_position, pair.follower_speed, pair.follower_acceleration])
+        request = _request(number, pair, drive, road) | {
+            "network": networks[pair.pair_id],
+            "base": base,
+        }
+        driver_features = _driver_features(pair, request["first"], policy, known)
+        header["pairs"].append(
+            request
+            | {
+                "driver_features": driver_features,
+                "renew": _renewed(request["first"], policy, known),
+            }
+        )
+        arrays[f"{number}/leader"] = np.stack(
+            [pair.leader_position, pair.leader_speed, pair.leader_acceleration]
+        )
+        arrays[f"{number}/follower"] = np.stack(
+            [pair.follower_position, pair.follower_speed, pair.follower_acceleration]
+        )
     found = _ask(Message(header, arrays)).arrays
-    return [_shown(number, drive, by_id[drive.pair_id], header["pairs"][number], found) for number, drive in enumerate(chosen)]
+    return [
+        _shown(number, drive, by_id[drive.pair_id], header["pairs"][number], found)
+        for number, drive in enumerate(chosen)
+    ]
 
 
 def _fitting(pairs: PairSet, road: Motorway) -> dict[str, Pair]:
@@ -177,16 +208,23 @@ def _fitting(pairs: PairSet, road: Motorway) -> dict[str, Pair]:
             " extract with a longer road, or leave demo.osm out"
         )
     if len(found) < len(pairs):
-        log.info("SUMO: %d pairs are not shown, as the motorway is too short for them", len(pairs) - len(found))
+        log.info(
+            "SUMO: %d pairs are not shown, as the motorway is too short for them",
+            len(pairs) - len(found),
+        )
     return found
 
 
 def _choose(drives: Sequence[Drive], table: pd.DataFrame, count: int) -> list[Drive]:
     """Returns drives spread evenly from the best to the worst improvement; those without one come last."""
     policy = table[table["method"] == "policy"]
-    improvement = dict(zip(policy["pair_id"], policy["improvement"].astype(float).fillna(-np.inf), strict=True))
+    improvement = dict(
+        zip(policy["pair_id"], policy["improvement"].astype(float).fillna(-np.inf), strict=True)
+    )
     ranked = sorted(drives, key=lambda drive: -improvement[drive.pair_id])
-    places = sorted({round(place) for place in np.linspace(0, len(ranked) - 1, min(count, len(ranked)))})
+    places = sorted(
+        {round(place) for place in np.linspace(0, len(ranked) - 1, min(count, len(ranked)))}
+    )
     return [ranked[place] for place in places]
 
 
@@ -206,7 +244,11 @@ def _base(evaluation: Evaluation, pair_id: str, known: Known) -> dict[str, float
     """Returns the parameters that the policy's offsets started from for a pair."""
     table = evaluation.table
     row = table[(table["pair_id"] == pair_id) & (table["method"] == known.base)]
-    return {name: float(row[f"parameter_{name}"].iloc[0]) for name in evaluation.names} if len(row) else None
+    return (
+        {name: float(row[f"parameter_{name}"].iloc[0]) for name in evaluation.names}
+        if len(row)
+        else None
+    )
 
 
 def _since(first: int, policy: TrainedPolicy, known: Known) -> int:
@@ -214,13 +256,17 @@ def _since(first: int, policy: TrainedPolicy, known: Known) -> int:
     return 0 if known.history is None else max(0, first - round(known.history / policy.dt))
 
 
-def _traits(pair: Pair, first: int, policy: TrainedPolicy, known: Known) -> dict[str, float] | None:
-    """Returns the traits that the policy was told of a pair's driver."""
+def _driver_features(
+    pair: Pair, first: int, policy: TrainedPolicy, known: Known
+) -> dict[str, float] | None:
+    """Returns the driver features that the policy was told of a pair's driver."""
     until, since = (torch.tensor([frame]) for frame in (first, _since(first, policy, known)))
-    traits = policy.traits_of(PairBatch.of(PairSet((pair,), pair.recording)), until, since)
-    if traits is None or bool(traits.isnan().any()):
+    driver_features = policy.driver_features_of(
+        PairBatch.of(PairSet((pair,), pair.recording)), until, since
+    )
+    if driver_features is None or bool(driver_features.isnan().any()):
         return None
-    return dict(zip(policy.policy.traits, traits[0].tolist(), strict=True))
+    return dict(zip(policy.policy.driver_features, driver_features[0].tolist(), strict=True))
 
 
 def _renewed(first: int, policy: TrainedPolicy, known: Known) -> int:
@@ -245,7 +291,9 @@ def _request(number: int, pair: Pair, drive: Drive, road: Motorway) -> dict[str,
 
 def _travelled(pair: Pair) -> float:
     """Returns how much road a pair takes from the follower's begin, m."""
-    return float(max(pair.leader_position.max(), pair.follower_position.max()) - pair.follower_position[0])
+    return float(
+        max(pair.leader_position.max(), pair.follower_position.max()) - pair.follower_position[0]
+    )
 
 
 def _places(pair: Pair, road: Motorway, track: int) -> list[tuple[int, float]] | None:
@@ -286,13 +334,21 @@ def _ask(request: Message) -> Message:
         )
     if "error" in answer.header:
         if answer.header["bug"]:
-            raise RuntimeError(f"{answer.header['bug']} in the SUMO process: {answer.header['error']}")
-        printed = [line.removeprefix("Error:").strip() for line in said if line.startswith("Error:")]
-        raise SumoError(" ".join(": ".join(dict.fromkeys([answer.header["error"], *printed])).split()))
+            raise RuntimeError(
+                f"{answer.header['bug']} in the SUMO process: {answer.header['error']}"
+            )
+        printed = [
+            line.removeprefix("Error:").strip() for line in said if line.startswith("Error:")
+        ]
+        raise SumoError(
+            " ".join(": ".join(dict.fromkeys([answer.header["error"], *printed])).split())
+        )
     return answer
 
 
-def _shown(number: int, drive: Drive, pair: Pair, request: dict[str, Any], found: dict[str, Array]) -> Shown:
+def _shown(
+    number: int, drive: Drive, pair: Pair, request: dict[str, Any], found: dict[str, Array]
+) -> Shown:
     first = int(request["first"])
     speed = {kind: found[f"{number}/{kind}/motion"][:, 0] for kind in FOLLOWERS}
     gap = {kind: found[f"{number}/{kind}/motion"][:, 1] for kind in FOLLOWERS}
@@ -302,9 +358,18 @@ def _shown(number: int, drive: Drive, pair: Pair, request: dict[str, Any], found
         in_memory = drive.speed[method][1:], drive.gap[method][1:]
         in_sumo = speed[method][tested], gap[method][tested]
         real = pair.follower_speed[tested], pair.gap[tested]
-        row: dict[str, Any] = {"pair_id": pair.pair_id, "method": method, "frames": len(in_memory[0])}
-        for name, memory, sumo, measured in zip(("speed", "gap"), in_memory, in_sumo, real, strict=True):
-            row |= {f"rmse_{name}_memory": _rmse(memory - measured), f"rmse_{name}_sumo": _rmse(sumo - measured)}
+        row: dict[str, Any] = {
+            "pair_id": pair.pair_id,
+            "method": method,
+            "frames": len(in_memory[0]),
+        }
+        for name, memory, sumo, measured in zip(
+            ("speed", "gap"), in_memory, in_sumo, real, strict=True
+        ):
+            row |= {
+                f"rmse_{name}_memory": _rmse(memory - measured),
+                f"rmse_{name}_sumo": _rmse(sumo - measured),
+            }
             row[f"difference_{name}"] = float(np.abs(sumo - memory).max())
         row["collisions_sumo"] = int((in_sumo[1] < 0).any())
         rows.append(row)

@@ -14,7 +14,7 @@ import numpy as np
 
 from cfx.evaluation.result import Evaluation
 from cfx.figures.look import COLOURS, LABELS
-from cfx.files import whole
+from cfx.files import atomic_write
 from cfx.policies.trained import TrainedPolicy
 from cfx.report.drive_plots import drive
 from cfx.report.figure import Plot
@@ -27,7 +27,12 @@ _ASSETS = resources.files("cfx.sumo") / "assets"
 
 
 def write_page(
-    path: Path, road: Motorway, shown: Sequence[Shown], evaluation: Evaluation, policy: TrainedPolicy, source: str
+    path: Path,
+    road: Motorway,
+    shown: Sequence[Shown],
+    evaluation: Evaluation,
+    policy: TrainedPolicy,
+    source: str,
 ) -> Path:
     """Writes the page; returns its path.
 
@@ -43,19 +48,29 @@ def write_page(
         OSError: the page cannot be written.
     """
     page = render(road, shown, evaluation, policy, source)
-    with whole(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_text(page, encoding="utf-8")
     return path
 
 
-def render(road: Motorway, shown: Sequence[Shown], evaluation: Evaluation, policy: TrainedPolicy, source: str) -> str:
+def render(
+    road: Motorway,
+    shown: Sequence[Shown],
+    evaluation: Evaluation,
+    policy: TrainedPolicy,
+    source: str,
+) -> str:
     """Returns the page as HTML."""
     import jinja2
     from plotly.offline import get_plotlyjs
 
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
     # An end tag inside a string of a script would end its element.
-    scripts = [source.replace("</script", "<\\/script") for source in (get_plotlyjs(), _asset("demo.js"))]
+    scripts = [
+        source.replace("</script", "<\\/script") for source in (get_plotlyjs(), _asset("demo.js"))
+    ]
     return environment.from_string(_asset("demo.html.j2")).render(
         security=_security(scripts),
         scripts=scripts,
@@ -90,7 +105,10 @@ def _json(value: Any) -> str:
 
 def _security(scripts: Sequence[str]) -> str:
     """Returns the Content-Security-Policy: only these very scripts run, and nothing is ever asked from a network."""
-    allowed = " ".join(f"'sha256-{base64.b64encode(hashlib.sha256(one.encode()).digest()).decode()}'" for one in scripts)
+    allowed = " ".join(
+        f"'sha256-{base64.b64encode(hashlib.sha256(one.encode()).digest()).decode()}'"
+        for one in scripts
+    )
     return (
         f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none';"
         " form-action 'none'"
@@ -106,13 +124,15 @@ def _content(road: Motorway, shown: Sequence[Shown], evaluation: Evaluation) -> 
         data={
             "parameters": [
                 {"name": name, "unit": unit, "low": float(low), "high": float(high)}
-                for name, unit, low, high in zip(evaluation.names, evaluation.units, *evaluation.bounds, strict=True)
+                for name, unit, low, high in zip(
+                    evaluation.names, evaluation.units, *evaluation.bounds, strict=True
+                )
             ]
         },
         metrics={},
         pairs=evaluation.table,
         style=None,
-        drives=evaluation.drives_table(),
+        drives=evaluation.trajectories_table(),
         curves=None,
     )
     return {
@@ -121,9 +141,16 @@ def _content(road: Motorway, shown: Sequence[Shown], evaluation: Evaluation) -> 
         "followers": FOLLOWERS,
         "carLength": CAR_LENGTH,
         "lanes": [
-            {"width": lane.width, "inner": lane.inner, "shape": _rounded(100 * (lane.shape - corner))} for lane in road.lanes
+            {
+                "width": lane.width,
+                "inner": lane.inner,
+                "shape": _rounded(100 * (lane.shape - corner)),
+            }
+            for lane in road.lanes
         ],
-        "pairs": [_pair(one, corner) | {"plot": _plot(drive(job, one.pair.pair_id))} for one in shown],
+        "pairs": [
+            _pair(one, corner) | {"plot": _plot(drive(job, one.pair.pair_id))} for one in shown
+        ],
     }
 
 
@@ -137,7 +164,12 @@ def _pair(one: Shown, corner: Array) -> dict[str, Any]:
         "speed": {kind: _rounded(100 * one.speed[kind]) for kind in FOLLOWERS},
         "gap": {kind: _rounded(100 * one.gap[kind]) for kind in FOLLOWERS},
         "place": {
-            kind: _rounded(np.concatenate([100 * (one.place[kind][..., :2] - corner), 10 * one.place[kind][..., 2:]], axis=-1))
+            kind: _rounded(
+                np.concatenate(
+                    [100 * (one.place[kind][..., :2] - corner), 10 * one.place[kind][..., 2:]],
+                    axis=-1,
+                )
+            )
             for kind in FOLLOWERS
         },
     }
@@ -145,7 +177,12 @@ def _pair(one: Shown, corner: Array) -> dict[str, Any]:
 
 def _plot(plot: Plot) -> dict[str, Any]:
     (view,) = plot.views.values()
-    return {"data": view["data"], "layout": view["layout"], "height": plot.height, "label": plot.label}
+    return {
+        "data": view["data"],
+        "layout": view["layout"],
+        "height": plot.height,
+        "label": plot.label,
+    }
 
 
 def _rounded(values: Array) -> list[Any]:

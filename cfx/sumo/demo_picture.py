@@ -27,7 +27,9 @@ _CAR_WIDTH = 1.9  # m
 _MOMENTS = 3
 
 
-def write_pictures(folder: Path, road: Motorway, shown: Sequence[Shown], evaluation: Evaluation) -> list[Path]:
+def write_pictures(
+    folder: Path, road: Motorway, shown: Sequence[Shown], evaluation: Evaluation
+) -> list[Path]:
     """Writes `demo.png` and `demo_drives.png`.
 
     Args:
@@ -43,7 +45,9 @@ def write_pictures(folder: Path, road: Motorway, shown: Sequence[Shown], evaluat
     together = [one for one in shown if one.scene == middle.scene]
     return [
         write_figure(snapshots(road, middle, together), folder / "demo.png"),
-        write_figure(drives(evaluation, [one.pair.pair_id for one in shown]), folder / "demo_drives.png"),
+        write_figure(
+            drives(evaluation, [one.pair.pair_id for one in shown]), folder / "demo_drives.png"
+        ),
     ]
 
 
@@ -66,7 +70,10 @@ def snapshots(road: Motorway, main: Shown, together: Sequence[Shown]) -> Figure:
         for one in together:
             _draw_pair(axes, one, int(frame), view, named=one is main)
         seconds = (frame - main.first) * main.pair.dt
-        axes.set_title(f"{seconds:.0f} s after the drivers took over" if seconds else "the drivers take over", fontsize=10.5)
+        axes.set_title(
+            f"{seconds:.0f} s after the drivers took over" if seconds else "the drivers take over",
+            fontsize=10.5,
+        )
         axes.set(xlim=(-view.width / 2, view.width / 2), ylim=(-span / 2, span / 2), aspect="equal")
         axes.set_xticks([])
         axes.set_yticks([])
@@ -105,7 +112,13 @@ class _View:
         leader = vehicles[:, 0].mean(axis=0)
         last = vehicles[np.argmax([one.gap[kind][frame] for kind in FOLLOWERS]), 1]
         along = cls((leader[:2] + last[:2]) / 2, float(leader[2]), width)
-        beside = np.stack([other.place[kind][min(frame, len(other.pair) - 1), 0, :2] for other in together for kind in FOLLOWERS])
+        beside = np.stack(
+            [
+                other.place[kind][min(frame, len(other.pair) - 1), 0, :2]
+                for other in together
+                for kind in FOLLOWERS
+            ]
+        )
         along._centre = along._centre + along._axes[0] * along(beside)[:, 0].mean()
         return along
 
@@ -119,17 +132,28 @@ def _draw_road(axes: Axes, road: Motorway, view: _View) -> None:
     axes.set_facecolor(_GRASS)
     for grow, colour in ((0.5, _PAINT), (0.05, _ASPHALT)):
         for lane in road.lanes:
-            left, right = (_aside(view(lane.shape), side * (lane.width + grow) / 2) for side in (1, -1))
+            left, right = (
+                _aside(view(lane.shape), side * (lane.width + grow) / 2) for side in (1, -1)
+            )
             axes.fill(*np.concatenate([left, right[::-1]]).T, color=colour, linewidth=0, zorder=1)
     for lane in road.lanes:
         if lane.inner:
-            axes.plot(*_aside(view(lane.shape), lane.width / 2).T, color=_PAINT, linewidth=1.0, dashes=(6, 8), zorder=2)
+            axes.plot(
+                *_aside(view(lane.shape), lane.width / 2).T,
+                color=_PAINT,
+                linewidth=1.0,
+                dashes=(6, 8),
+                zorder=2,
+            )
 
 
 def _aside(line: Array, distance: float) -> Array:
     """Returns a line shifted to its left, m."""
     along = np.gradient(line, axis=0)
-    normal = np.stack([-along[:, 1], along[:, 0]], 1) / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
+    normal = (
+        np.stack([-along[:, 1], along[:, 0]], 1)
+        / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
+    )
     return np.asarray(line + distance * normal)
 
 
@@ -142,7 +166,14 @@ def _draw_pair(axes: Axes, one: Shown, frame: int, view: _View, *, named: bool) 
         _car(axes, leader, one.pair.leader_length, COLOURS["leader"], view, shade)
         _car(axes, follower, CAR_LENGTH, COLOURS[kind], view, shade)
         front, rear = view(follower[:2]), view(leader[:2]) - [0, one.pair.leader_length]
-        axes.plot([front[0], rear[0]], [front[1], rear[1]], color="white", linewidth=1.2, alpha=shade, zorder=3)
+        axes.plot(
+            [front[0], rear[0]],
+            [front[1], rear[1]],
+            color="white",
+            linewidth=1.2,
+            alpha=shade,
+            zorder=3,
+        )
         if named:
             label = f"{one.gap[kind][frame]:.1f} m".replace("-", "\N{MINUS SIGN}")
             axes.text(

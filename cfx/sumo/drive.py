@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from cfx.errors import ConfigError, DataError, OutputError, SumoError, nearest
-from cfx.files import whole
+from cfx.files import atomic_write
 from cfx.progress import Task
 from cfx.sumo.fleet import Fleet
 from cfx.sumo.installed import require_sumo
@@ -99,14 +99,18 @@ def drive(
 
     Raises:
         SumoError: SUMO is missing, refuses the scenario or stops; a vType is not in it or never on the road; the steps differ.
-        DataError: a run has no policy that drives strangers, or the scenario is not there.
+        DataError: a run has no policy that drives unseen drivers, or the scenario is not there.
         OutputError: the output cannot be written.
     """
     require_sumo()
     if not scenario.is_file():
-        raise DataError(f"{scenario} is not there; name SUMO's configuration of the scenario (.sumocfg)")
+        raise DataError(
+            f"{scenario} is not there; name SUMO's configuration of the scenario (.sumocfg)"
+        )
     fleet = Fleet.load(runs, look_ahead=look_ahead, speed_mode=speed_mode)
-    os.environ.setdefault("LIBSUMO_AS_TRACI", "quiet")  # no word about pyarrow, which is not loaded here
+    os.environ.setdefault(
+        "LIBSUMO_AS_TRACI", "quiet"
+    )  # no word about pyarrow, which is not loaded here
     import libsumo
 
     command = ["sumo", "-c", str(scenario)]
@@ -124,7 +128,9 @@ def drive(
     except libsumo.TraCIException as error:
         raise SumoError(f"SUMO stopped {scenario}: {_reason(error)}") from error
     except OSError as error:
-        raise OutputError(f"{output} cannot be written ({error.strerror or error}); name another --output") from error
+        raise OutputError(
+            f"{output} cannot be written ({error.strerror or error}); name another --output"
+        ) from error
     finally:
         libsumo.close()
 
@@ -163,12 +169,16 @@ class _Run:
         simulation = self._sumo.simulation
         dt, start = simulation.getDeltaT(), simulation.getTime()
         given = simulation.getEndTime()
-        last = min([one for one in (end, given if given >= 0 else None) if one is not None], default=None)
+        last = min(
+            [one for one in (end, given if given >= 0 else None) if one is not None], default=None
+        )
         total = max(0, round((last - start) / dt)) if last is not None else 0
         steps = others = most = 0
         began = time.perf_counter()
         with Task(f"Driving {self._scenario.name}", total) as task:
-            while simulation.getMinExpectedNumber() > 0 and (last is None or simulation.getTime() < last - 1e-9):
+            while simulation.getMinExpectedNumber() > 0 and (
+                last is None or simulation.getTime() < last - 1e-9
+            ):
                 self._sumo.simulationStep()
                 self._fleet.step(self._sumo)
                 steps += 1
@@ -217,7 +227,18 @@ class _Run:
 class _Rows:
     """The output: a row for each vehicle of the fleet and step, SI units."""
 
-    _COLUMNS = ("time_s", "vehicle", "type", "edge", "lane", "position_m", "x_m", "y_m", "speed_mps", "acceleration_mps2")
+    _COLUMNS = (
+        "time_s",
+        "vehicle",
+        "type",
+        "edge",
+        "lane",
+        "position_m",
+        "x_m",
+        "y_m",
+        "speed_mps",
+        "acceleration_mps2",
+    )
 
     def __init__(self, file: TextIO, parameters: Sequence[str]) -> None:
         self._writer = csv.writer(file)
@@ -231,11 +252,15 @@ class _Rows:
             raise OutputError(f"{path} is a folder; name a file in --output")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            partial = stack.enter_context(whole(path))
+            partial = stack.enter_context(atomic_write(path))
             file = stack.enter_context(partial.open("w", newline="", encoding="utf-8"))
         except OSError as error:
-            raise OutputError(f"{path} cannot be written ({error.strerror}); name another --output") from error
-        names = dict.fromkeys(name for driver in fleet.drivers.values() for name in driver.policy.space.names)
+            raise OutputError(
+                f"{path} cannot be written ({error.strerror}); name another --output"
+            ) from error
+        names = dict.fromkeys(
+            name for driver in fleet.drivers.values() for name in driver.policy.space.names
+        )
         return cls(file, list(names))
 
     def write(self, sumo: Any, fleet: Fleet) -> None:
@@ -244,7 +269,13 @@ class _Rows:
         for name, kind in fleet.vehicles.items():
             x, y = vehicle.getPosition(name)
             chosen = fleet.drivers[kind].parameters(name)
-            signals = (vehicle.getLanePosition(name), x, y, vehicle.getSpeed(name), vehicle.getAcceleration(name))
+            signals = (
+                vehicle.getLanePosition(name),
+                x,
+                y,
+                vehicle.getSpeed(name),
+                vehicle.getAcceleration(name),
+            )
             self._writer.writerow(
                 [
                     *(now, name, kind, vehicle.getRoadID(name), vehicle.getLaneIndex(name)),
@@ -264,7 +295,9 @@ def parse_drivers(given: Sequence[str]) -> dict[str, str]:
     for one in given:
         name, equals, run = one.partition("=")
         if not (name and equals and run):
-            raise ConfigError(f"--drivers {one}: write TYPE=RUN, a vType of the scenario and a job's output folder")
+            raise ConfigError(
+                f"--drivers {one}: write TYPE=RUN, a vType of the scenario and a job's output folder"
+            )
         if name in runs:
             raise ConfigError(f"--drivers: vType '{name}' stands twice")
         runs[name] = run
@@ -275,14 +308,25 @@ def report(driven: Driven) -> None:
     """Prints what happened: one table, and one line about speed."""
     from cfx.console import blank_table, put
 
-    columns = ("vType", "vehicles", "model drove", "mean speed [m/s]", "lane changes", "hard brakings", "collisions", "teleports")
+    columns = (
+        "vType",
+        "vehicles",
+        "model drove",
+        "mean speed [m/s]",
+        "lane changes",
+        "hard brakings",
+        "collisions",
+        "teleports",
+    )
     table = blank_table(*columns)
     for column in table.columns[1:]:
         column.justify = "right"
     for name, tally in driven.tallies.items():
         share, speed = tally.driven / tally.steps, tally.metres / (tally.steps * driven.dt)
         counts = (tally.lane_changes, tally.hard_brakings, tally.collisions, tally.teleports)
-        table.add_row(name, str(len(tally.vehicles)), f"{share:.0%}", f"{speed:.2f}", *map(str, counts))
+        table.add_row(
+            name, str(len(tally.vehicles)), f"{share:.0%}", f"{speed:.2f}", *map(str, counts)
+        )
     put(table)
     print(
         f"{driven.steps} steps of {driven.dt:g} s in {driven.seconds:.1f} s, {driven.real_time:.1f} times real time; at most"

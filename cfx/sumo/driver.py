@@ -4,7 +4,7 @@ W99's parameters cannot be changed in SUMO while a vehicle drives. So cfx comput
 which is SUMO's model, and tells SUMO that speed: what SUMO then drives is exact. All vehicles of a step are one batch, through
 one call of the policy and one call of the model.
 
-Letters: D vehicles, n tuned parameters, m width of the model's memory, s width of the policy's state, L frames of a token.
+Shapes: D vehicles, n tuned parameters, m width of the model's memory, s width of the policy's state, L frames of a token.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class Driver:
         self._network = None if network is None else self._number(network)
         self._assigned: dict[str, int] = {}
         self._bases: dict[str, list[float]] = {}
-        self._traits: dict[str, list[float]] = {}
+        self._driver_features: dict[str, list[float]] = {}
         self._speed_modes: dict[str, int] = {}
         self._slots: dict[str, int] = {}
         self._free: list[int] = []
@@ -144,8 +144,12 @@ class Driver:
         policy = _trained(run)
         name = policy.model_node["name"]
         if model is not None and name != model:
-            raise DataError(f"{run} was trained for model={name}, not for model={model}; name a run with model={model}")
-        return cls(policy, network=network, look_ahead=look_ahead, speed_mode=speed_mode, source=str(run))
+            raise DataError(
+                f"{run} was trained for model={name}, not for model={model}; name a run with model={model}"
+            )
+        return cls(
+            policy, network=network, look_ahead=look_ahead, speed_mode=speed_mode, source=str(run)
+        )
 
     @classmethod
     def constant(
@@ -173,7 +177,9 @@ class Driver:
         values = space.defaults()
         for name, value in (parameters or {}).items():
             if name not in space.names:
-                raise ParameterError(f"'{name}' is no tuned parameter of this model; it has {', '.join(space.names)}")
+                raise ParameterError(
+                    f"'{name}' is no tuned parameter of this model; it has {', '.join(space.names)}"
+                )
             values[space.names.index(name)] = value
         unit = space.to_unit(values)[None]
         policy = TrainedPolicy(
@@ -187,7 +193,13 @@ class Driver:
             dt=dt,
             names=(ALL,),
         )
-        return cls(policy, look_ahead=look_ahead, speed_mode=speed_mode, model=model, source="the constant driver")
+        return cls(
+            policy,
+            look_ahead=look_ahead,
+            speed_mode=speed_mode,
+            model=model,
+            source="the constant driver",
+        )
 
     @property
     def vehicles(self) -> tuple[str, ...]:
@@ -200,7 +212,7 @@ class Driver:
         network: str | None = None,
         *,
         base: Mapping[str, float] | None = None,
-        traits: Mapping[str, float] | None = None,
+        driver_features: Mapping[str, float] | None = None,
     ) -> None:
         """Says how a vehicle is driven from when it begins.
 
@@ -208,30 +220,38 @@ class Driver:
             vehicle: its id.
             network: which of the policy's networks drives it; None for this driver's.
             base: a driver's own parameters, name -> SI value, that a policy of offsets (`learner=rollout`) starts from, drawn
-                towards the default as in training; None: what it has for strangers. Policies that answer parameters themselves
+                towards the default as in training; None: what it has for unseen drivers. Policies that answer parameters themselves
                 have no use for it.
-            traits: a driver's traits, name -> value, where the policy was trained to know some (`policy.traits`;
-                `TrainedPolicy.traits_of` measures them); None: those of a stranger. What a vehicle does while it is watched
+            driver features: a driver's driver features, name -> value, where the policy was trained to know some (`policy.driver_features`;
+                `TrainedPolicy.traits_of` measures them); None: those of an unseen driver. What a vehicle does while it is watched
                 changes nothing of them.
 
         Raises:
             DataError: the policy has no such network.
-            ParameterError: `base` is not a value for each tuned parameter, or `traits` not one for each trait of the policy.
+            ParameterError: `base` is not a value for each tuned parameter, or `driver features` not one for each driver feature of the policy.
         """
         if network is not None:
             self._assigned[vehicle] = self._number(network)
         if base is not None:
             if set(base) != set(self.policy.space.names):
-                raise ParameterError(f"base: give a value for each of {', '.join(self.policy.space.names)}, and nothing else")
-            own = torch.tensor([[base[name] for name in self.policy.space.names]], dtype=torch.float64)
+                raise ParameterError(
+                    f"base: give a value for each of {', '.join(self.policy.space.names)}, and nothing else"
+                )
+            own = torch.tensor(
+                [[base[name] for name in self.policy.space.names]], dtype=torch.float64
+            )
             self._bases[vehicle] = self.policy.base_of(own)[0].tolist()
-        if traits is not None:
-            known = self.policy.policy.traits
+        if driver_features is not None:
+            known = self.policy.policy.driver_features
             if not known:
-                raise ParameterError("traits: there are none that this policy was trained to know; leave them out")
-            if set(traits) != set(known):
-                raise ParameterError(f"traits: give a value for each of {', '.join(known)}, and nothing else")
-            self._traits[vehicle] = [traits[name] for name in known]
+                raise ParameterError(
+                    "driver features: there are none that this policy was trained to know; leave them out"
+                )
+            if set(driver_features) != set(known):
+                raise ParameterError(
+                    f"driver features: give a value for each of {', '.join(known)}, and nothing else"
+                )
+            self._driver_features[vehicle] = [driver_features[name] for name in known]
 
     def renew(self, vehicle: str) -> None:
         """Lets the policy's memory of a vehicle begin anew; the frames of its last window stay."""
@@ -247,11 +267,19 @@ class Driver:
     def parameters(self, vehicle: str) -> dict[str, float]:
         """Returns the parameters with which a vehicle drives now, SI units; empty if no leader is ahead of it."""
         slot = self._slots.get(vehicle)
-        return {} if slot is None else dict(zip(self.policy.space.names, self._store.parameters[slot].tolist(), strict=True))
+        return (
+            {}
+            if slot is None
+            else dict(
+                zip(self.policy.space.names, self._store.parameters[slot].tolist(), strict=True)
+            )
+        )
 
     @torch.no_grad()
     @one_thread()
-    def step(self, connection: Connection, vehicles: str | Iterable[str], *, drive: bool = True) -> None:
+    def step(
+        self, connection: Connection, vehicles: str | Iterable[str], *, drive: bool = True
+    ) -> None:
         """Sets the speeds that vehicles will drive in the next `simulationStep`; call it after each.
 
         Args:
@@ -267,18 +295,24 @@ class Driver:
         self._check_step(connection)
         self._forget_gone(connection, names, now)
         times = self._store.time.tolist()
-        names = [name for name in names if name not in self._slots or times[self._slots[name]] != now]  # once an instant
+        names = [
+            name for name in names if name not in self._slots or times[self._slots[name]] != now
+        ]  # once an instant
         following, seen = self._look(connection, names)
         if not following:
             return
         slots = torch.tensor([self._slot(name) for name in following])
         store = self._store
-        for index in self._remember(slots, following, seen, now, drive=drive).nonzero().flatten().tolist():
+        for index in (
+            self._remember(slots, following, seen, now, drive=drive).nonzero().flatten().tolist()
+        ):
             self._take_over(connection, following[index], int(slots[index]))
         self._choose(slots[store.steps[slots] % self.policy.windows.stride == 0])
         store.steps[slots] += 1
         if drive:
-            for name, speed in zip(following, self._speeds(connection, following, slots, seen).tolist(), strict=True):
+            for name, speed in zip(
+                following, self._speeds(connection, following, slots, seen).tolist(), strict=True
+            ):
                 connection.vehicle.setSpeed(name, speed)
 
     def forget(self, vehicle: str) -> None:
@@ -303,7 +337,7 @@ class Driver:
             return 0
         if network == ALL:
             raise DataError(
-                f"{self.source} has {len(names)} networks, each for one driver ({names[0]}, ...), and none for strangers; train"
+                f"{self.source} has {len(names)} networks, each for one driver ({names[0]}, ...), and none for unseen drivers; train"
                 " with protocol.networks=all or protocol=across_drivers, or name one of them: Driver.load(..., network=...)"
             )
         raise DataError(
@@ -335,13 +369,15 @@ class Driver:
                 self.forget(gone)
                 self._assigned.pop(gone, None)
                 self._bases.pop(gone, None)
-                self._traits.pop(gone, None)
+                self._driver_features.pop(gone, None)
 
     def _look(self, connection: Connection, names: list[str]) -> tuple[list[str], Seen]:
         """Reads vehicles and leaders; one without a leader goes back to SUMO."""
         vehicle = connection.vehicle
         following, rows = [], []
-        motions: dict[str, tuple[float, float]] = {}  # a follower is the next one's leader, and TraCI is slow
+        motions: dict[
+            str, tuple[float, float]
+        ] = {}  # a follower is the next one's leader, and TraCI is slow
 
         def motion(one: str) -> tuple[float, float]:
             if one not in motions:
@@ -355,15 +391,27 @@ class Driver:
                 continue
             ahead, gap = leader
             following.append(name)
-            rows.append((*motion(name), gap, *motion(ahead), vehicle.getLength(ahead), vehicle.getAllowedSpeed(name)))
-        return following, Seen(*torch.tensor(rows, dtype=torch.float64).reshape(-1, len(Seen._fields)).unbind(1))
+            rows.append(
+                (
+                    *motion(name),
+                    gap,
+                    *motion(ahead),
+                    vehicle.getLength(ahead),
+                    vehicle.getAllowedSpeed(name),
+                )
+            )
+        return following, Seen(
+            *torch.tensor(rows, dtype=torch.float64).reshape(-1, len(Seen._fields)).unbind(1)
+        )
 
     def _leader(self, connection: Connection, name: str) -> tuple[str, float] | None:
         """Returns who is ahead of a vehicle and the gap from bumper to bumper, m; None if nobody is within `look_ahead`."""
         try:
             leader = connection.vehicle.getLeader(name, self.look_ahead)
         except Exception as error:
-            if type(error).__name__ != "TraCIException":  # libsumo's and traci's are two classes of this name
+            if (
+                type(error).__name__ != "TraCIException"
+            ):  # libsumo's and traci's are two classes of this name
                 raise
             raise SumoError(
                 f"vehicle '{name}' cannot be driven ({error}); step only vehicles of connection.vehicle.getIDList()"
@@ -384,7 +432,9 @@ class Driver:
             self._store.time[slot] = torch.nan  # it has no frame yet
         return self._slots[name]
 
-    def _remember(self, slots: Tensor, names: list[str], seen: Seen, now: float, *, drive: bool) -> Tensor:
+    def _remember(
+        self, slots: Tensor, names: list[str], seen: Seen, now: float, *, drive: bool
+    ) -> Tensor:
         """Puts this instant into the vehicles' histories and begins those that were not there one step ago.
 
         Returns:
@@ -392,14 +442,22 @@ class Driver:
         """
         store = self._store
         frame = torch.stack(
-            [getattr(seen, name) for name in ("leader_speed", "leader_acceleration", "speed", "acceleration", "gap")], 1
+            [
+                getattr(seen, name)
+                for name in ("leader_speed", "leader_acceleration", "speed", "acceleration", "gap")
+            ],
+            1,
         )
         going = (now - store.time[slots] - self.policy.dt).abs() < 0.5 * self.policy.dt
-        store.history[slots[going]] = torch.cat([store.history[slots[going], :, 1:], frame[going, :, None]], -1)
+        store.history[slots[going]] = torch.cat(
+            [store.history[slots[going], :, 1:], frame[going, :, None]], -1
+        )
         store.time[slots] = now
         if not bool(going.all()):
             self._begin(
-                slots[~going], [name for name, goes in zip(names, going.tolist(), strict=True) if not goes], frame[~going]
+                slots[~going],
+                [name for name, goes in zip(names, going.tolist(), strict=True) if not goes],
+                frame[~going],
             )
         return ~store.driven[slots] & drive
 
@@ -412,9 +470,12 @@ class Driver:
         store.network[slots] = torch.tensor([self._drives(name) for name in names])
         if self.policy.base is not None:
             store.base[slots] = self.policy.base[store.network[slots]].to(store.base)
-        store.traits[slots] = torch.nan
+        store.driver_features[slots] = torch.nan
         for slot, name in zip(slots.tolist(), names, strict=True):
-            for column, assigned in ((store.base, self._bases), (store.traits, self._traits)):
+            for column, assigned in (
+                (store.base, self._bases),
+                (store.driver_features, self._driver_features),
+            ):
                 if name in assigned:
                     column[slot] = torch.tensor(assigned[name], dtype=column.dtype)
         begun = self._begun(slots)
@@ -423,14 +484,18 @@ class Driver:
     def _begun(self, slots: Tensor) -> PolicyState:
         """Returns the state of vehicles before their first window."""
         base = None if self.policy.base is None else self._store.base[slots]
-        return self.policy.begin(self._store.network[slots], base, self._store.traits[slots])
+        return self.policy.begin(
+            self._store.network[slots], base, self._store.driver_features[slots]
+        )
 
     def _take_over(self, connection: Connection, name: str, slot: int) -> None:
         """From here on this vehicle is driven: with a new window and a new memory, however long it was watched."""
         store = self._store
         store.driven[slot] = True
         store.steps[slot] = 0
-        store.memory[slot] = self.model.initial_memory(store.history[slot, History._fields.index("follower_speed"), -1])
+        store.memory[slot] = self.model.initial_memory(
+            store.history[slot, History._fields.index("follower_speed"), -1]
+        )
         self._speed_modes.setdefault(name, connection.vehicle.getSpeedMode(name))
         connection.vehicle.setSpeedMode(name, self.speed_mode)
 
@@ -442,21 +507,36 @@ class Driver:
         begun = self._begun(slots)
         state = begun.state.clone()
         state[begun.network, begun.place] = store.state[slots]
-        chosen, after = self.policy.act(History(*store.history[slots].unbind(1)), begun._replace(state=state))
+        chosen, after = self.policy.act(
+            History(*store.history[slots].unbind(1)), begun._replace(state=state)
+        )
         store.parameters[slots] = chosen
         store.state[slots] = after.state[after.network, after.place]
 
-    def _speeds(self, connection: Connection, names: list[str], slots: Tensor, seen: Seen) -> Tensor:
+    def _speeds(
+        self, connection: Connection, names: list[str], slots: Tensor, seen: Seen
+    ) -> Tensor:
         """Returns the next speeds `(D,)` by the model, within the limits that SUMO puts around every model."""
         store, dt = self._store, self.policy.dt
-        follower = Follower(torch.zeros_like(seen.speed), seen.speed, seen.acceleration, store.memory[slots])
-        leader = Leader(seen.gap + seen.leader_length, seen.leader_speed, seen.leader_acceleration, seen.leader_length)
+        follower = Follower(
+            torch.zeros_like(seen.speed), seen.speed, seen.acceleration, store.memory[slots]
+        )
+        leader = Leader(
+            seen.gap + seen.leader_length,
+            seen.leader_speed,
+            seen.leader_acceleration,
+            seen.leader_length,
+        )
         p = self.policy.space.unpack(store.parameters[slots])
         speed = self.model.next_speed(follower, leader, p, dt)
         store.memory[slots] = self.model.next_memory(follower, leader, p, dt, speed)
         limit = seen.allowed.clone()
-        for index in (seen.speed > seen.allowed).nonzero().flatten().tolist():  # nobody brakes harder than `decel` for a limit
-            limit[index] = max(limit[index], seen.speed[index] - connection.vehicle.getDecel(names[index]) * dt)
+        for index in (
+            (seen.speed > seen.allowed).nonzero().flatten().tolist()
+        ):  # nobody brakes harder than `decel` for a limit
+            limit[index] = max(
+                limit[index], seen.speed[index] - connection.vehicle.getDecel(names[index]) * dt
+            )
         return torch.minimum(speed, limit)
 
 
@@ -471,7 +551,7 @@ class _Store:
         state: `(C, s)`, the policy's.
         network: `(C,)` int64, which of the policy's networks drives.
         base: `(C, n)`, SI units, what a policy of offsets starts from.
-        traits: `(C, k)`, of the drivers; NaN for strangers.
+        driver features: `(C, k)`, of the drivers; NaN for unseen drivers.
         steps: `(C,)` int64, since the vehicle's first window.
         time: `(C,)` s, of the last frame; NaN before the first.
         driven: `(C,)` bool; the others are watched.
@@ -483,7 +563,7 @@ class _Store:
     state: Tensor
     network: Tensor
     base: Tensor
-    traits: Tensor
+    driver_features: Tensor
     steps: Tensor
     time: Tensor
     driven: Tensor
@@ -494,13 +574,17 @@ class _Store:
         state = policy.begin(torch.zeros(1, dtype=torch.int64)).state
         real = torch.float64
         return cls(
-            history=torch.full((count, len(History._fields), policy.windows.length), torch.nan, dtype=real),
+            history=torch.full(
+                (count, len(History._fields), policy.windows.length), torch.nan, dtype=real
+            ),
             parameters=torch.full((count, len(policy.space)), torch.nan, dtype=real),
             memory=torch.zeros((count, model.memory_size), dtype=real),
             state=state.new_zeros((count, state.shape[-1])),
             network=torch.zeros(count, dtype=torch.int64),
             base=torch.full((count, len(policy.space)), torch.nan, dtype=real),
-            traits=torch.full((count, len(policy.policy.traits)), torch.nan, dtype=real),
+            driver_features=torch.full(
+                (count, len(policy.policy.driver_features)), torch.nan, dtype=real
+            ),
             steps=torch.zeros(count, dtype=torch.int64),
             time=torch.full((count,), torch.nan, dtype=real),
             driven=torch.zeros(count, dtype=torch.bool),
@@ -508,7 +592,12 @@ class _Store:
 
     def grown(self, more: _Store) -> _Store:
         """Returns both."""
-        return _Store(**{one.name: torch.cat([getattr(self, one.name), getattr(more, one.name)]) for one in fields(self)})
+        return _Store(
+            **{
+                one.name: torch.cat([getattr(self, one.name), getattr(more, one.name)])
+                for one in fields(self)
+            }
+        )
 
 
 def _trained(run: str | Path) -> TrainedPolicy:

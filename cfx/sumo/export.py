@@ -15,7 +15,7 @@ from torch import Tensor
 
 from cfx import registry
 from cfx.errors import ConfigError, DataError, OutputError
-from cfx.files import whole
+from cfx.files import atomic_write
 from cfx.models.base import DrivingModel
 from cfx.models.vtype import InSumo, VType
 from cfx.tracking.store import folder_of
@@ -44,12 +44,16 @@ def export(run: str | Path, output: str | Path | None = None) -> list[str]:
     path = Path(output).expanduser() if output else home / NAME
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with whole(path) as partial:
+        with atomic_write(path) as partial:
             partial.write_text(_xml(table, kind, notes), encoding="utf-8")
     except OSError as error:
-        raise OutputError(f"{path} cannot be written ({error.strerror or error}); name another --output") from error
+        raise OutputError(
+            f"{path} cannot be written ({error.strerror or error}); name another --output"
+        ) from error
     first = quoteattr(str(table["cluster"].iloc[0]))
-    counts = ", ".join(f"{name} {count}" for name, count in table.groupby("cluster", sort=False).size().items())
+    counts = ", ".join(
+        f"{name} {count}" for name, count in table.groupby("cluster", sort=False).size().items()
+    )
     return [
         f"vTypes of SUMO's {kind.car_follow_model}, in one vTypeDistribution for each cluster: {counts}",
         *(f"Note: {note}" for note in notes),
@@ -72,7 +76,9 @@ def vtypes(node: Mapping[str, Any], table: pd.DataFrame) -> tuple[VType, list[st
     columns = [f"parameter_{name}" for name in model.space.names]
     missing = [column for column in columns if column not in table]
     if missing:
-        raise DataError(f"pairs.csv has no column {missing[0]}, which model={node['name']} here needs; run the job again")
+        raise DataError(
+            f"pairs.csv has no column {missing[0]}, which model={node['name']} here needs; run the job again"
+        )
     p: dict[str, Tensor] = model.space.unpack(torch.tensor(table[columns].to_numpy(dtype=float)))
     notes: list[str] = []
     if node["name"] == "krauss":
@@ -94,10 +100,14 @@ def _krauss(node: Mapping[str, Any], p: Mapping[str, Tensor]) -> tuple[DrivingMo
             " braking begins a little later"
         )
     if node.get("leader_deceleration") is not None:
-        notes.append("SUMO's KraussOrig1 expects of the leader the follower's own decel, not leader_deceleration")
+        notes.append(
+            "SUMO's KraussOrig1 expects of the leader the follower's own decel, not leader_deceleration"
+        )
     parameters = dict(node.get("parameters") or {})
     parameters["t_i"] = {"default": 0.0, "tuned": False}
-    return cast(DrivingModel, registry.create("model", {**node, **_WITHOUT_LAG, "parameters": parameters})), notes
+    return cast(
+        DrivingModel, registry.create("model", {**node, **_WITHOUT_LAG, "parameters": parameters})
+    ), notes
 
 
 def _folder(run: str | Path) -> tuple[Path, Path]:
@@ -112,25 +122,40 @@ def _read(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
         node = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))["model"]
         table = pd.read_csv(folder / "pairs.csv", dtype={"pair_id": str})
         fixed = table[table["method"] == "fixed"]
-        fixed = fixed[np.isfinite(fixed.filter(like="parameter_").to_numpy(dtype=float)).all(axis=1)]
+        fixed = fixed[
+            np.isfinite(fixed.filter(like="parameter_").to_numpy(dtype=float)).all(axis=1)
+        ]
         fixed = fixed.sort_values("style_score", kind="stable").reset_index(drop=True)
     except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError) as error:
-        raise DataError(f"{folder} holds no finished job ({error}); give the output folder that a job printed") from error
+        raise DataError(
+            f"{folder} holds no finished job ({error}); give the output folder that a job printed"
+        ) from error
     if fixed.empty:
-        raise DataError(f"{folder}/pairs.csv holds no driver with fixed parameters; give a job that calibrated some")
+        raise DataError(
+            f"{folder}/pairs.csv holds no driver with fixed parameters; give a job that calibrated some"
+        )
     return node, fixed
 
 
 def _xml(table: pd.DataFrame, kind: VType, notes: list[str]) -> str:
-    columns = {name: _texts(value, len(table)) for name, value in {"sigma": "0", **kind.attributes}.items()}
-    lines = ['<?xml version="1.0" encoding="UTF-8"?>', "<!-- Fixed parameters of recorded drivers, calibrated by cfx."]
+    columns = {
+        name: _texts(value, len(table)) for name, value in {"sigma": "0", **kind.attributes}.items()
+    }
+    lines = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        "<!-- Fixed parameters of recorded drivers, calibrated by cfx.",
+    ]
     lines += [*(f"     {note}." for note in notes), "-->", "<additional>"]
     for cluster, rows in table.groupby("cluster", sort=False):
         lines.append(f"    <vTypeDistribution id={quoteattr(str(cluster))}>")
         for place, row in enumerate(rows.index):
-            attributes = " ".join(f"{name}={quoteattr(values[row])}" for name, values in columns.items())
+            attributes = " ".join(
+                f"{name}={quoteattr(values[row])}" for name, values in columns.items()
+            )
             name = quoteattr(f"{cluster}_{place}")
-            lines.append(f'        <vType id={name} carFollowModel="{kind.car_follow_model}" speedDev="0" {attributes}>')
+            lines.append(
+                f'        <vType id={name} carFollowModel="{kind.car_follow_model}" speedDev="0" {attributes}>'
+            )
             lines.append(f'            <param key="pair" value={quoteattr(rows["pair_id"][row])}/>')
             lines.append("        </vType>")
         lines.append("    </vTypeDistribution>")
@@ -138,4 +163,8 @@ def _xml(table: pd.DataFrame, kind: VType, notes: list[str]) -> str:
 
 
 def _texts(value: Tensor | str, count: int) -> list[str]:
-    return [value] * count if isinstance(value, str) else [repr(float(one)) for one in value.expand(count)]
+    return (
+        [value] * count
+        if isinstance(value, str)
+        else [repr(float(one)) for one in value.expand(count)]
+    )

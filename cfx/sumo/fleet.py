@@ -32,12 +32,21 @@ class Fleet:
         steps = {name: driver.policy.dt for name, driver in drivers.items()}
         if max(steps.values()) - min(steps.values()) > 1e-6:
             listed = ", ".join(f"{name} {dt:g} s" for name, dt in steps.items())
-            raise DataError(f"the policies were trained at different time steps ({listed}); a simulation has one")
+            raise DataError(
+                f"the policies were trained at different time steps ({listed}); a simulation has one"
+            )
         self.drivers = dict(drivers)
         self._type_of: dict[str, str] = {}
 
     @classmethod
-    def load(cls, runs: Mapping[str, str | Path], *, network: str = ALL, look_ahead: float = 200.0, speed_mode: int = 0) -> Fleet:
+    def load(
+        cls,
+        runs: Mapping[str, str | Path],
+        *,
+        network: str = ALL,
+        look_ahead: float = 200.0,
+        speed_mode: int = 0,
+    ) -> Fleet:
         """Reads the policy of a run for each vType; types with the same run share a driver. See `Driver.load`."""
         loaded = {
             run: Driver.load(run, network=network, look_ahead=look_ahead, speed_mode=speed_mode)
@@ -58,7 +67,9 @@ class Fleet:
         """
         present = connection.vehicle.getIDList()
         kind = connection.vehicle.getTypeID
-        self._type_of = {one: self._type_of.get(one) or kind(one).partition("@")[0] for one in present}
+        self._type_of = {
+            one: self._type_of.get(one) or kind(one).partition("@")[0] for one in present
+        }
         members: dict[int, list[str]] = {id(driver): [] for driver in self.drivers.values()}
         for vehicle, name in self._type_of.items():
             if name in self.drivers:

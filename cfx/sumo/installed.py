@@ -21,7 +21,9 @@ def require_sumo() -> str:
     try:
         version = importlib.metadata.version("libsumo")
     except importlib.metadata.PackageNotFoundError:
-        raise SumoError(f'SUMO is not installed; {wanted}, comes with: pip install "cfx-driving[sumo]"') from None
+        raise SumoError(
+            f'SUMO is not installed; {wanted}, comes with: pip install "cfx-driving[sumo]"'
+        ) from None
     number = re.match(r"(\d+)\.(\d+)", version)
     if number is None or not OLDEST <= (int(number[1]), int(number[2])) < BELOW:
         raise SumoError(

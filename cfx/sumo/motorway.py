@@ -109,7 +109,9 @@ def find_netconvert() -> str | None:
         import sumo  # of the wheel eclipse-sumo, which the extra leaves out for its size
     except ImportError:
         return shutil.which("netconvert")
-    return shutil.which("netconvert", path=str(Path(sumo.__file__).parent / "bin")) or shutil.which("netconvert")
+    return shutil.which("netconvert", path=str(Path(sumo.__file__).parent / "bin")) or shutil.which(
+        "netconvert"
+    )
 
 
 def _kind(source: Path) -> str:
@@ -140,7 +142,11 @@ def _convert(source: Path, net: Path) -> Path:
     command = [program, "--osm-files", str(source.absolute()), "--output-file", str(net), *_FLAGS]
     done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own command, no shell
     if done.returncode or not net.is_file():
-        said = [line.removeprefix("Error:").strip() for line in done.stderr.splitlines() if line.startswith("Error:")]
+        said = [
+            line.removeprefix("Error:").strip()
+            for line in done.stderr.splitlines()
+            if line.startswith("Error:")
+        ]
         raise DataError(
             f"demo.osm={source} is no OpenStreetMap extract that netconvert can read: {(said or ['no reason given'])[0]}"
         )
@@ -153,7 +159,9 @@ def _stretch(net: Path, name: str) -> Motorway:
     try:
         network = readNet(str(net), withInternal=True)
     except Exception as error:  # sumolib raises whatever its XML parser and its own code do
-        raise DataError(f"{name} is no network that SUMO can read ({type(error).__name__}: {error})") from error
+        raise DataError(
+            f"{name} is no network that SUMO can read ({type(error).__name__}: {error})"
+        ) from error
     best = max(_chains(network), key=lambda chain: _length(network, chain), default=None)
     if best is None:
         raise DataError(
@@ -161,7 +169,12 @@ def _stretch(net: Path, name: str) -> Motorway:
         )
     tracks = tuple(zip(*(lanes for _, lanes in best), strict=True))
     starts, ends = np.array([_extent(network, best, k) for k in range(len(tracks))]).swapaxes(0, 1)
-    drawn = [lane for edge in network.getEdges(withInternal=True) for lane in edge.getLanes() if lane.allows("passenger")]
+    drawn = [
+        lane
+        for edge in network.getEdges(withInternal=True)
+        for lane in edge.getLanes()
+        if lane.allows("passenger")
+    ]
     return Motorway(
         net=net.absolute(),
         edges=tuple(edge.getID() for edge, _ in best),
@@ -191,7 +204,9 @@ def _chains(network: Any) -> Iterator[_Chain]:
             chain, seen = [(first, lanes)], {first.getID()}
             while (onward := _onward(*chain[-1])) is not None and onward[2].getID() not in seen:
                 kept, numbers, edge = onward
-                chain = [(one, tuple(earlier[k] for k in kept)) for one, earlier in chain] + [(edge, numbers)]
+                chain = [(one, tuple(earlier[k] for k in kept)) for one, earlier in chain] + [
+                    (edge, numbers)
+                ]
                 seen.add(edge.getID())
             yield chain
 
@@ -202,8 +217,16 @@ def _onward(edge: Any, lanes: tuple[int, ...]) -> tuple[list[int], tuple[int, ..
     for target in edge.getOutgoing():
         found: dict[int, int] = {}
         for place, number in enumerate(lanes):
-            leads = [link.getToLane().getIndex() for link in edge.getLane(number).getOutgoing() if link.getTo() == target]
-            free = [index for index in leads if index not in found.values() and target.getLane(index).allows("passenger")]
+            leads = [
+                link.getToLane().getIndex()
+                for link in edge.getLane(number).getOutgoing()
+                if link.getTo() == target
+            ]
+            free = [
+                index
+                for index in leads
+                if index not in found.values() and target.getLane(index).allows("passenger")
+            ]
             if free:
                 found[place] = min(free)
         if len(found) >= ABREAST and (best is None or len(found) > len(best[0])):
@@ -222,10 +245,14 @@ def _extent(network: Any, chain: _Chain, track: int) -> tuple[list[float], list[
         if k + 1 < len(chain):
             onward, numbers = chain[k + 1]
             target = onward.getLane(numbers[track])
-            inside = next(link.getViaLaneID() for link in lane.getOutgoing() if link.getToLane() == target)
+            inside = next(
+                link.getViaLaneID() for link in lane.getOutgoing() if link.getToLane() == target
+            )
             while inside:  # a junction may hold several lanes in a row
                 at += network.getLane(inside).getLength()
-                inside = next((link.getViaLaneID() for link in network.getLane(inside).getOutgoing()), "")
+                inside = next(
+                    (link.getViaLaneID() for link in network.getLane(inside).getOutgoing()), ""
+                )
     return starts, ends
 
 

@@ -26,15 +26,23 @@ def network(roads: int) -> str:
     """Returns a network file (`.net.xml`) of parallel roads."""
     box = f"0,0,{ROAD},{_APART * roads}"
     lines = ['<net version="1.20">']
-    lines.append(f'<location netOffset="0,0" convBoundary="{box}" origBoundary="0,0,1,1" projParameter="!"/>')
+    lines.append(
+        f'<location netOffset="0,0" convBoundary="{box}" origBoundary="0,0,1,1" projParameter="!"/>'
+    )
     for i in range(roads):
         y = _APART * i
-        lines.append(f'<edge id="road{i}" from="from{i}" to="to{i}" priority="1"><lane id="{LANE.format(i)}" index="0"')
+        lines.append(
+            f'<edge id="road{i}" from="from{i}" to="to{i}" priority="1"><lane id="{LANE.format(i)}" index="0"'
+        )
         lines.append(f' speed="{LANE_SPEED}" length="{ROAD}" shape="0,{y} {ROAD},{y}"/></edge>')
     for i in range(roads):
         y = _APART * i
-        lines.append(f'<junction id="from{i}" type="dead_end" x="0" y="{y}" incLanes="" intLanes="" shape="0,{y}"/>')
-        lines.append(f'<junction id="to{i}" type="dead_end" x="{ROAD}" y="{y}" incLanes="{LANE.format(i)}" intLanes=""')
+        lines.append(
+            f'<junction id="from{i}" type="dead_end" x="0" y="{y}" incLanes="" intLanes="" shape="0,{y}"/>'
+        )
+        lines.append(
+            f'<junction id="to{i}" type="dead_end" x="{ROAD}" y="{y}" incLanes="{LANE.format(i)}" intLanes=""'
+        )
         lines.append(f' shape="{ROAD},{y}"/>')
     return "\n".join([*lines, "</net>"])
 
@@ -50,7 +58,9 @@ class Placed:
     def lines(self, name: str, road: int) -> tuple[str, str]:
         """Returns the elements of its type and of itself. SUMO refuses to insert above what type and lane allow."""
         limit = min(LANE_SPEED, float(self.attributes.get("maxSpeed", LANE_SPEED)))
-        given = " ".join(f"{key}={quoteattr(_text(value))}" for key, value in self.attributes.items())
+        given = " ".join(
+            f"{key}={quoteattr(_text(value))}" for key, value in self.attributes.items()
+        )
         return (
             f'<vType id="type_{name}" speedDev="0" {given}/>',
             f'<vehicle id="{name}" type="type_{name}" route="route{road}" depart="0" insertionChecks="none"'

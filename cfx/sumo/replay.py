@@ -5,7 +5,7 @@ input and ends. `cfx.sumo.demo` asks.
 
 Request: header `dt`, `net`, `edges`, `tracks` (as in `Motorway`), `policy` (a folder), and `pairs`, each with its `scene`,
 `length` (of the leader, m), `first` (frame at which the drivers take over), `network`, `base` (parameters that offsets start
-from, or null), `traits` (of the driver, or null), `renew` (frame at which the policy's memory begins), and for each of
+from, or null), `driver features` (of the driver, or null), `renew` (frame at which the policy's memory begins), and for each of
 `FOLLOWERS` its `track` and `places` (edge and position on it of leader and follower at frame 0); arrays `I/leader` and
 `I/follower` `(3, T)` of pair I: position, speed, acceleration. Pairs of one scene are on the road together.
 
@@ -66,14 +66,19 @@ class Recorded:
 
     def aim(self, sumo: Any, frame: int) -> None:
         """Says before a step where to be after it."""
-        sumo.vehicle.setSpeed(self.name, max(0.0, (self.position[frame] - self.now(sumo)) / sumo.simulation.getDeltaT()))
+        sumo.vehicle.setSpeed(
+            self.name,
+            max(0.0, (self.position[frame] - self.now(sumo)) / sumo.simulation.getDeltaT()),
+        )
 
     def settle(self, sumo: Any, frame: int) -> None:
         """Puts speed and acceleration right after a step."""
         back = self.position[frame] - self.now(sumo)
         if back < -1e-9:
             sumo.vehicle.moveTo(
-                self.name, sumo.vehicle.getLaneID(self.name), max(0.0, sumo.vehicle.getLanePosition(self.name) + back)
+                self.name,
+                sumo.vehicle.getLaneID(self.name),
+                max(0.0, sumo.vehicle.getLanePosition(self.name) + back),
             )
             self._jumps += back
         sumo.vehicle.setPreviousSpeed(self.name, self.speed[frame], self.acceleration[frame])
@@ -82,7 +87,9 @@ class Recorded:
 class Behind:
     """One follower of one pair behind its copy of the leader."""
 
-    def __init__(self, number: int, kind: str, pair: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
+    def __init__(
+        self, number: int, kind: str, pair: Mapping[str, Any], arrays: Mapping[str, Array]
+    ) -> None:
         self.number, self.kind, self.pair = number, kind, pair
         self.leader = Recorded(f"{number}/leader/{kind}", arrays[f"{number}/leader"])
         self.follower = Recorded(f"{number}/{kind}", arrays[f"{number}/follower"])
@@ -100,9 +107,15 @@ class Behind:
         if self.replayed(frame):
             self.follower.settle(sumo, frame)
         speed = sumo.vehicle.getSpeed(self.follower.name)
-        self.motion[frame] = speed, self.leader.now(sumo) - self.pair["length"] - self.follower.now(sumo)
+        self.motion[frame] = (
+            speed,
+            self.leader.now(sumo) - self.pair["length"] - self.follower.now(sumo),
+        )
         for k, vehicle in enumerate((self.leader.name, self.follower.name)):
-            self.place[frame, k] = *sumo.vehicle.getPosition(vehicle), sumo.vehicle.getAngle(vehicle)
+            self.place[frame, k] = (
+                *sumo.vehicle.getPosition(vehicle),
+                sumo.vehicle.getAngle(vehicle),
+            )
 
     def aim(self, sumo: Any, frame: int) -> None:
         """Before a step: says where those who are replayed shall be at `frame`."""
@@ -128,24 +141,51 @@ def drive(request: Message) -> dict[str, Array]:
 
 
 def _scene(
-    sumo: Any, header: Mapping[str, Any], pairs: Sequence[tuple[int, Any]], arrays: Mapping[str, Array]
+    sumo: Any,
+    header: Mapping[str, Any],
+    pairs: Sequence[tuple[int, Any]],
+    arrays: Mapping[str, Array],
 ) -> dict[str, Array]:
     from cfx.sumo.driver import Driver
 
     policy = Driver.load(header["policy"], network=None, look_ahead=LOOK_AHEAD)
-    drivers = {"policy": policy, "default": Driver.constant(policy.model, dt=header["dt"], look_ahead=LOOK_AHEAD)}
+    drivers = {
+        "policy": policy,
+        "default": Driver.constant(policy.model, dt=header["dt"], look_ahead=LOOK_AHEAD),
+    }
     roads = [Behind(i, kind, pair, arrays) for i, pair in pairs for kind in FOLLOWERS]
-    chosen = {i: np.full((len(arrays[f"{i}/leader"][0]), len(policy.policy.space)), np.nan) for i, _ in pairs}
+    chosen = {
+        i: np.full((len(arrays[f"{i}/leader"][0]), len(policy.policy.space)), np.nan)
+        for i, _ in pairs
+    }
     for i, pair in pairs:
-        policy.assign(f"{i}/policy", pair["network"], base=pair["base"], traits=pair["traits"])
+        policy.assign(
+            f"{i}/policy",
+            pair["network"],
+            base=pair["base"],
+            driver_features=pair["driver_features"],
+        )
     with tempfile.TemporaryDirectory(prefix="cfx-sumo-") as folder:
         routes = Path(folder, "scene.rou.xml")
         routes.write_text(_routes(header, roads), encoding="utf-8")
-        sumo.start(["sumo", "-n", header["net"], "-r", str(routes), "--step-length", repr(header["dt"]), *_OPTIONS])
+        sumo.start(
+            [
+                "sumo",
+                "-n",
+                header["net"],
+                "-r",
+                str(routes),
+                "--step-length",
+                repr(header["dt"]),
+                *_OPTIONS,
+            ]
+        )
         try:
             for frame in range(max(road.frames for road in roads)):
                 sumo.simulationStep()
-                _frame(sumo, [road for road in roads if frame < road.frames], frame, drivers, chosen)
+                _frame(
+                    sumo, [road for road in roads if frame < road.frames], frame, drivers, chosen
+                )
         finally:
             sumo.close()
     found: dict[str, Array] = {f"{road.number}/{road.kind}/motion": road.motion for road in roads}
@@ -153,7 +193,13 @@ def _scene(
     return found | {f"{i}/parameters": parameters for i, parameters in chosen.items()}
 
 
-def _frame(sumo: Any, roads: Sequence[Behind], frame: int, drivers: Mapping[str, Any], chosen: Mapping[int, Array]) -> None:
+def _frame(
+    sumo: Any,
+    roads: Sequence[Behind],
+    frame: int,
+    drivers: Mapping[str, Any],
+    chosen: Mapping[int, Array],
+) -> None:
     """One instant: notes what is, and says what shall be at the next frame."""
     for road in roads:
         if frame == 0:
@@ -166,11 +212,15 @@ def _frame(sumo: Any, roads: Sequence[Behind], frame: int, drivers: Mapping[str,
         for road in own:
             if frame == road.pair["renew"] > 0:
                 driver.renew(road.follower.name)
-        driver.step(sumo, [road.follower.name for road in own if frame < road.pair["first"]], drive=False)
+        driver.step(
+            sumo, [road.follower.name for road in own if frame < road.pair["first"]], drive=False
+        )
         driver.step(sumo, [road.follower.name for road in own if frame >= road.pair["first"]])
     for road in roads:
         if road.kind == "policy" and frame >= road.pair["first"]:
-            chosen[road.number][frame] = list(drivers["policy"].parameters(road.follower.name).values()) or np.nan
+            chosen[road.number][frame] = (
+                list(drivers["policy"].parameters(road.follower.name).values()) or np.nan
+            )
         if frame + 1 < road.frames:
             road.aim(sumo, frame + 1)
         else:
@@ -186,7 +236,10 @@ def _routes(header: Mapping[str, Any], roads: Sequence[Behind]) -> str:
     for road in roads:
         lanes = header["tracks"][road.pair["track"][road.kind]]
         for vehicle, length, (edge, at) in zip(
-            (road.leader, road.follower), (road.pair["length"], CAR_LENGTH), road.pair["places"][road.kind], strict=True
+            (road.leader, road.follower),
+            (road.pair["length"], CAR_LENGTH),
+            road.pair["places"][road.kind],
+            strict=True,
         ):
             lines.append(f'<vType id="type/{vehicle.name}" length="{length!r}" {free}/>')
             lines.append(
@@ -208,7 +261,13 @@ def main() -> None:
     except Exception as error:  # whatever it is, the job tells it
         lost = type(error).__module__.partition(".")[0] in {"libsumo", "traci"}
         kind = type(error).__name__ if not isinstance(error, CfxError) and not lost else ""
-        send(answers, {"error": f"SUMO lost a vehicle or refuses one ({error})" if lost else str(error), "bug": kind})
+        send(
+            answers,
+            {
+                "error": f"SUMO lost a vehicle or refuses one ({error})" if lost else str(error),
+                "bug": kind,
+            },
+        )
     else:
         send(answers, {}, found)
 

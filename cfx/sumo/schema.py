@@ -17,7 +17,16 @@ _XS = "{http://www.w3.org/2001/XMLSchema}"
 _ELEMENT = "carFollowing-"
 
 _OF_ALL = (
-    *("minGap", "maxSpeed", "desiredMaxSpeed", "speedFactor", "tau", "decel", "emergencyDecel", "apparentDecel"),
+    *(
+        "minGap",
+        "maxSpeed",
+        "desiredMaxSpeed",
+        "speedFactor",
+        "tau",
+        "decel",
+        "emergencyDecel",
+        "apparentDecel",
+    ),
     *("collisionMinGapFactor", "actionStepLength", "hasDriverState", "startupDelay"),
 )
 """Attributes that matter to a follower whatever its model; the schema lists them among all that a vehicle has."""
@@ -57,15 +66,20 @@ def car_following() -> dict[str, frozenset[str]]:
         path = Path(folder, "data", "xsd", "types", "route.xsd")
         if path.is_file():
             return _read(path)
-    raise SumoError('SUMO\'s schema (the package sumo-data) is not there: pip install "cfx-driving[sumo]"')
+    raise SumoError(
+        'SUMO\'s schema (the package sumo-data) is not there: pip install "cfx-driving[sumo]"'
+    )
 
 
 def _read(path: Path) -> dict[str, frozenset[str]]:
-    types = {one.get("name", ""): one for one in ElementTree.parse(path).getroot().iter(f"{_XS}complexType")}  # noqa: S314 - SUMO's
+    root = ElementTree.parse(path).getroot()  # noqa: S314 - SUMO's own file
+    types = {one.get("name", ""): one for one in root.iter(f"{_XS}complexType")}
 
     def attributes(name: str) -> set[str]:
         own = {one.get("name", "") for one in types[name].iter(f"{_XS}attribute")}
-        return own.union(*(attributes(one.get("base", "")) for one in types[name].iter(f"{_XS}extension")))
+        return own.union(
+            *(attributes(one.get("base", "")) for one in types[name].iter(f"{_XS}extension"))
+        )
 
     models = {}
     for element in types["vTypeBaseType"].iter(f"{_XS}element"):

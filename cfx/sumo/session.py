@@ -125,7 +125,9 @@ class _Worker:
         except OSError:
             found = None
         if found is None:
-            raise SumoError(f"a SUMO process ended by itself ({self._end()}); run again: what was calibrated so far is cached")
+            raise SumoError(
+                f"a SUMO process ended by itself ({self._end()}); run again: what was calibrated so far is cached"
+            )
         if "error" in found.header:
             raise SumoError(_in_words(found.header["error"], self._log()))
         return found
@@ -150,7 +152,11 @@ class _Worker:
         except subprocess.TimeoutExpired:
             return "it no longer answers"
         how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-        said = [line for line in self._log().splitlines() if line.strip() and not line.startswith("Warning")]
+        said = [
+            line
+            for line in self._log().splitlines()
+            if line.strip() and not line.startswith("Warning")
+        ]
         return f"{how}: {said[-1].strip()}" if said else how
 
     def _log(self) -> str:

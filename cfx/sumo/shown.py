@@ -48,7 +48,9 @@ def evaluation_in_sumo(evaluation: Evaluation, shown: Sequence[Shown]) -> Evalua
     """Returns a job's evaluation of the pairs that were shown, as they drove in SUMO instead of in memory."""
     methods = FOLLOWERS[1:]
     ids = [one.pair.pair_id for one in shown]
-    table = evaluation.table[evaluation.table["pair_id"].isin(ids) & evaluation.table["method"].isin(methods)].copy()
+    table = evaluation.table[
+        evaluation.table["pair_id"].isin(ids) & evaluation.table["method"].isin(methods)
+    ].copy()
     found = pd.concat([one.table for one in shown]).set_index(["pair_id", "method"])
     places = pd.MultiIndex.from_frame(table[["pair_id", "method"]])
     for column in ("rmse_speed", "rmse_gap"):

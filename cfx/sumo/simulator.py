@@ -56,12 +56,16 @@ class SumoSimulator(BaseSimulator):
         SumoError: SUMO is not installed, or another version.
     """
 
-    def __init__(self, model: DrivingModel, dt: float, settings: SumoSettings | None = None) -> None:
+    def __init__(
+        self, model: DrivingModel, dt: float, settings: SumoSettings | None = None
+    ) -> None:
         super().__init__(model, dt)
         self._model = require_in_sumo(model)
         self._settings = settings or SumoSettings()
         if round(dt * 1000) < 1 or abs(dt - round(dt * 1000) / 1000) > 1e-9:
-            raise ConfigError(f"simulator=sumo: SUMO counts in milliseconds, so it cannot take the recording's steps of {dt:g} s")
+            raise ConfigError(
+                f"simulator=sumo: SUMO counts in milliseconds, so it cannot take the recording's steps of {dt:g} s"
+            )
         self._session = Session(self._settings.workers or _cores())
 
     def identity(self) -> str:
@@ -71,9 +75,15 @@ class SumoSimulator(BaseSimulator):
     def close(self) -> None:
         self._session.close()
 
-    def advance(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor]) -> tuple[Follower, Tensor, Tensor]:
-        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (*follower, *leader, *p.values())):
-            raise SumoError("SUMO gives no gradients: learn with learner=imitation, or drive with simulator=memory")
+    def advance(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor]
+    ) -> tuple[Follower, Tensor, Tensor]:
+        if torch.is_grad_enabled() and any(
+            tensor.requires_grad for tensor in (*follower, *leader, *p.values())
+        ):
+            raise SumoError(
+                "SUMO gives no gradients: learn with learner=imitation, or drive with simulator=memory"
+            )
         steps, batch = len(leader.position), follower.speed.shape
         if steps * follower.speed.numel() == 0:
             nothing = follower.speed.new_empty((steps, *batch))
@@ -82,7 +92,9 @@ class SumoSimulator(BaseSimulator):
         drive = _Drive.of(follower, leader, kind)
         if kind.remembers and isinstance(follower, _Driven):
             drive = follower.drive.then(drive)
-        position, speed = (found.to(follower.speed).view(steps, *batch) for found in self._last(drive, kind, steps))
+        position, speed = (
+            found.to(follower.speed).view(steps, *batch) for found in self._last(drive, kind, steps)
+        )
         before = speed[-2] if steps > 1 else follower.speed
         end = _Driven(position[-1], speed[-1], (speed[-1] - before) / self.dt, follower.memory)
         end.drive = drive
@@ -96,11 +108,14 @@ class SumoSimulator(BaseSimulator):
         answers = self._session.drive(self._request(drive, kind, slice(a, b)) for a, b in cuts)
         rows = frames - drive.entry + torch.arange(-steps, 0)[:, None]
 
-        def whole(name: str) -> Tensor:
+        def joined(name: str) -> Tensor:
             parts = (torch.from_numpy(answer.arrays[name]) for answer in answers)
-            return torch.cat([part.gather(0, rows[:, a:b]) for part, (a, b) in zip(parts, cuts, strict=True)], dim=1)
+            return torch.cat(
+                [part.gather(0, rows[:, a:b]) for part, (a, b) in zip(parts, cuts, strict=True)],
+                dim=1,
+            )
 
-        return whole("position"), whole("speed")
+        return joined("position"), joined("speed")
 
     def _request(self, drive: _Drive, kind: VType, own: slice) -> Message:
         """Returns the request for some followers, each from his entry on; for who enters late the last frame is repeated."""
@@ -159,11 +174,16 @@ class _Drive:
 
         def frames(signal: Tensor) -> Tensor:
             missing = (1,) * (len(batch) - signal.dim() + 1)
-            whole = signal.detach().reshape(steps, *missing, *signal.shape[1:]).expand(steps, *batch)
+            whole = (
+                signal.detach().reshape(steps, *missing, *signal.shape[1:]).expand(steps, *batch)
+            )
             return whole.reshape(steps, -1).to("cpu", torch.float64)
 
         def flat(values: Mapping[str, Tensor | str]) -> _Values:
-            return {name: value if isinstance(value, str) else _flat(value, batch) for name, value in values.items()}
+            return {
+                name: value if isinstance(value, str) else _flat(value, batch)
+                for name, value in values.items()
+            }
 
         return cls(
             leader_position=frames(leader.position),
@@ -177,7 +197,10 @@ class _Drive:
 
     def then(self, following: _Drive) -> _Drive:
         """Returns this drive continued, where parameters stay the same, and the following one alone where they change."""
-        if len(self.entry) != len(following.entry) or self.attributes.keys() != following.attributes.keys():
+        if (
+            len(self.entry) != len(following.entry)
+            or self.attributes.keys() != following.attributes.keys()
+        ):
             return following
         same = torch.ones_like(self.entry, dtype=torch.bool)
         for name, value in following.attributes.items():
@@ -213,11 +236,17 @@ def require_in_sumo(model: DrivingModel) -> InSumo:
     return model
 
 
-def _columns(values: Mapping[str, Tensor | str], own: slice) -> tuple[dict[str, str], list[str], Array]:
+def _columns(
+    values: Mapping[str, Tensor | str], own: slice
+) -> tuple[dict[str, str], list[str], Array]:
     """Splits attributes into those that are one text for all, and the names and columns `(n, names)` of the others."""
     constants = {name: value for name, value in values.items() if isinstance(value, str)}
     columns = {name: value[own] for name, value in values.items() if isinstance(value, Tensor)}
-    table = torch.stack(list(columns.values()), dim=1) if columns else torch.empty((own.stop - own.start, 0), dtype=torch.float64)
+    table = (
+        torch.stack(list(columns.values()), dim=1)
+        if columns
+        else torch.empty((own.stop - own.start, 0), dtype=torch.float64)
+    )
     return constants, list(columns), table.numpy()
 
 

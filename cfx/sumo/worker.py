@@ -72,7 +72,11 @@ class Roads:
         position, speed, _ = arrays["start"]
         first, fast = arrays["leader_position"][0] - origin, arrays["leader_speed"][0]
         types = list(_attributes(header["constants"], header["names"], arrays["attributes"]))
-        ahead = list(_attributes(header["leader_constants"], header["leader_names"], arrays["leader_attributes"]))
+        ahead = list(
+            _attributes(
+                header["leader_constants"], header["leader_names"], arrays["leader_attributes"]
+            )
+        )
         for one in types:
             one["carFollowModel"] = header["car_follow_model"]
         count = len(types)
@@ -83,18 +87,36 @@ class Roads:
         route_file.write_text(
             routes(
                 [Placed(ahead[i], first[i].item(), fast[i].item()) for i in range(count)],
-                [Placed(types[i], (position - origin)[i].item(), speed[i].item()) for i in range(count)],
+                [
+                    Placed(types[i], (position - origin)[i].item(), speed[i].item())
+                    for i in range(count)
+                ],
             )
         )
-        options = ["-n", str(net), "-r", str(route_file), "--step-length", repr(header["dt"]), "--seed", str(header["seed"])]
-        options += ["--thread-rngs", str(count), *_OPTIONS]  # each road draws from numbers of its own
+        options = [
+            "-n",
+            str(net),
+            "-r",
+            str(route_file),
+            "--step-length",
+            repr(header["dt"]),
+            "--seed",
+            str(header["seed"]),
+        ]
+        options += [
+            "--thread-rngs",
+            str(count),
+            *_OPTIONS,
+        ]  # each road draws from numbers of its own
         if self._running:
             self._sumo.load(options)
         else:
             self._sumo.start(["sumo", *options])
             self._running = True
 
-    def _steps(self, arrays: Mapping[str, Array], leader_position: Array, dt: float) -> tuple[Array, Array]:
+    def _steps(
+        self, arrays: Mapping[str, Array], leader_position: Array, dt: float
+    ) -> tuple[Array, Array]:
         """Takes all steps; returns positions on the road and speeds `(K, n)`.
 
         The leader's speed moves it to its next position; then its speed and acceleration are put right, as recorded positions are
@@ -105,7 +127,8 @@ class Roads:
         leaders, followers = ([name.format(i) for i in range(count)] for name in (LEADER, FOLLOWER))
         move = (np.diff(leader_position, axis=0) / dt).tolist()
         place, fast, gain = (
-            signal.tolist() for signal in (leader_position, arrays["leader_speed"], arrays["leader_acceleration"])
+            signal.tolist()
+            for signal in (leader_position, arrays["leader_speed"], arrays["leader_acceleration"])
         )
         step()
         for i, (leader, follower) in enumerate(zip(leaders, followers, strict=True)):
@@ -131,14 +154,18 @@ class Roads:
         return position, speed
 
 
-def _attributes(constants: Mapping[str, str], names: list[str], values: Array) -> Iterator[dict[str, float | str]]:
+def _attributes(
+    constants: Mapping[str, str], names: list[str], values: Array
+) -> Iterator[dict[str, float | str]]:
     for row in values.tolist():
         yield {**constants, **dict(zip(names, row, strict=True))}
 
 
 def main(folder: Path) -> None:
     """Answers requests from standard input until it ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the job, which then lets go of this
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # Ctrl-C is for the job, which then lets go of this
     # SUMO prints to both standard outputs, and the answers must stay clean.
     answers = os.fdopen(os.dup(1), "wb")
     log = os.open(folder / LOG, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o600)
@@ -150,8 +177,17 @@ def main(folder: Path) -> None:
             os.ftruncate(log, 0)
             try:
                 done = roads.drive(request)
-            except Exception as error:  # libsumo's errors have no common base; whatever it is, the job tells it
-                send(answers, {"error": f"{type(error).__name__}: {error}" if not _is_sumos(error) else str(error)})
+            except (
+                Exception
+            ) as error:  # libsumo's errors have no common base; whatever it is, the job tells it
+                send(
+                    answers,
+                    {
+                        "error": f"{type(error).__name__}: {error}"
+                        if not _is_sumos(error)
+                        else str(error)
+                    },
+                )
             else:
                 send(answers, {}, done)
     except BrokenPipeError:

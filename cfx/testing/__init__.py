@@ -65,7 +65,9 @@ def contract_for(kind: str) -> Contract:
         PluginError: there is no such kind.
     """
     if kind not in _CHECKS:
-        raise PluginError(f"there is no contract for '{kind}'.{nearest(kind, _CHECKS)} Known: {', '.join(_CHECKS)}.")
+        raise PluginError(
+            f"there is no contract for '{kind}'.{nearest(kind, _CHECKS)} Known: {', '.join(_CHECKS)}."
+        )
     found: Contract = import_module(_CHECKS[kind]).CONTRACT
     return found
 

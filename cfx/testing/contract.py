@@ -44,12 +44,20 @@ def contract_of(module: str, kind: str, *, slow: Iterable[Check] = ()) -> Contra
     functions = [
         function
         for name, function in vars(sys.modules[module]).items()
-        if inspect.isfunction(function) and function.__module__ == module and not name.startswith("_")
+        if inspect.isfunction(function)
+        and function.__module__ == module
+        and not name.startswith("_")
     ]
-    return Contract(kind, tuple(f for f in functions if next(iter(inspect.signature(f).parameters), "") == kind), frozenset(slow))
+    return Contract(
+        kind,
+        tuple(f for f in functions if next(iter(inspect.signature(f).parameters), "") == kind),
+        frozenset(slow),
+    )
 
 
-def violations(contract: Contract, component: Any, *, quick: bool = True) -> Iterator[tuple[str, str]]:
+def violations(
+    contract: Contract, component: Any, *, quick: bool = True
+) -> Iterator[tuple[str, str]]:
     """Checks a component without pytest.
 
     Yields:
@@ -60,7 +68,9 @@ def violations(contract: Contract, component: Any, *, quick: bool = True) -> Ite
         RuntimeError: Python was started with -O, which removes the assertions that checks are made of.
     """
     if not __debug__:
-        raise RuntimeError("contract checks are made of assertions, which python -O removes; start python without -O")
+        raise RuntimeError(
+            "contract checks are made of assertions, which python -O removes; start python without -O"
+        )
     for check in contract.quick if quick else contract.checks:
         try:
             check(component)
@@ -69,4 +79,7 @@ def violations(contract: Contract, component: Any, *, quick: bool = True) -> Ite
         except (AssertionError, PluginError) as broken:
             yield check.__name__, str(broken)
         except Exception as error:  # a plugin may raise anything
-            yield check.__name__, f"the component raised {type(error).__name__}: {error}".rstrip(": ")
+            yield (
+                check.__name__,
+                f"the component raised {type(error).__name__}: {error}".rstrip(": "),
+            )

@@ -16,7 +16,9 @@ class DatasetContract:
     @pytest.fixture
     def dataset(self) -> Dataset:
         """Returns the dataset under test, with settings that find at least two pairs."""
-        raise NotImplementedError("the subclass of DatasetContract must define the fixture `dataset`")
+        raise NotImplementedError(
+            "the subclass of DatasetContract must define the fixture `dataset`"
+        )
 
     @statements(CONTRACT)
     def test_contract(self, check: Check, dataset: Dataset) -> None:

@@ -16,7 +16,9 @@ class LearnerContract:
     @pytest.fixture
     def learner(self) -> Learner:
         """Returns the learner under test; choose short trainings; a module-level instance saves time."""
-        raise NotImplementedError("the subclass of LearnerContract must define the fixture `learner`")
+        raise NotImplementedError(
+            "the subclass of LearnerContract must define the fixture `learner`"
+        )
 
     @statements(CONTRACT)
     def test_contract(self, check: Check, learner: Learner) -> None:

@@ -40,6 +40,10 @@ class ModelContract:
 
     @statements(CONTRACT)
     def test_contract(
-        self, check: Check, model: DrivingModel, equilibrium: Equilibrium | None, leader_deceleration: float
+        self,
+        check: Check,
+        model: DrivingModel,
+        equilibrium: Equilibrium | None,
+        leader_deceleration: float,
     ) -> None:
         hold(check, model, equilibrium=equilibrium, leader_deceleration=leader_deceleration)

@@ -26,7 +26,9 @@ class OptimizerContract:
     @pytest.fixture
     def optimizer(self) -> Optimizer:
         """Returns the optimizer under test; choose few evaluations, for it runs some fifty times."""
-        raise NotImplementedError("the subclass of OptimizerContract must define the fixture `optimizer`")
+        raise NotImplementedError(
+            "the subclass of OptimizerContract must define the fixture `optimizer`"
+        )
 
     @statements(CONTRACT)
     def test_contract(self, check: Check, optimizer: Optimizer) -> None:

@@ -16,7 +16,9 @@ class ProtocolContract:
     @pytest.fixture
     def protocol(self) -> Protocol:
         """Returns the protocol under test; it gets six drivers, each behind a leader of his own."""
-        raise NotImplementedError("the subclass of ProtocolContract must define the fixture `protocol`")
+        raise NotImplementedError(
+            "the subclass of ProtocolContract must define the fixture `protocol`"
+        )
 
     @statements(CONTRACT)
     def test_contract(self, check: Check, protocol: Protocol) -> None:

@@ -15,10 +15,10 @@ def statements(contract: Contract) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("check", contract.checks, ids=lambda check: check.__name__)
 
 
-def hold(check: Check, component: object, **material: Any) -> None:
+def hold(check: Check, component: object, **dataset: Any) -> None:
     """Checks one statement, with what it needs of `material`."""
     wanted = inspect.signature(check).parameters
     try:
-        check(component, **{name: value for name, value in material.items() if name in wanted})
+        check(component, **{name: value for name, value in dataset.items() if name in wanted})
     except NotApplicable as reason:
         pytest.skip(str(reason))

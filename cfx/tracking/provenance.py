@@ -38,7 +38,9 @@ def _git(folder: Path, *arguments: str) -> str | None:
     command = ["git", "-C", str(folder), *arguments]
     try:
         # `git` is the user's own, found on their PATH; no shell sees the arguments.
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_GIT_SECONDS, check=False)  # noqa: S603
+        done = subprocess.run(  # noqa: S603 - git, found on the user's own PATH; no shell
+            command, capture_output=True, text=True, timeout=_GIT_SECONDS, check=False
+        )
     except (OSError, subprocess.TimeoutExpired):
         return None
     return done.stdout.strip() if done.returncode == 0 else None
@@ -47,7 +49,9 @@ def _git(folder: Path, *arguments: str) -> str | None:
 def plugin_tags(distributions: Mapping[str, str]) -> dict[str, str]:
     """Returns a tag per plugin distribution, and all of them in one, by which runs can be grouped."""
     listed = ", ".join(f"{name} {found}" for name, found in sorted(distributions.items()))
-    return {"cfx.plugins": listed or "none"} | {f"cfx.plugin.{name}": found for name, found in sorted(distributions.items())}
+    return {"cfx.plugins": listed or "none"} | {
+        f"cfx.plugin.{name}": found for name, found in sorted(distributions.items())
+    }
 
 
 def distributions(values: Mapping[str, Any]) -> dict[str, str]:
@@ -74,7 +78,10 @@ def distributions(values: Mapping[str, Any]) -> dict[str, str]:
 def process_tags() -> dict[str, str]:
     """Returns tags that tell later whether the process that made a run is still there."""
     process = psutil.Process()
-    return {"cfx.host": socket.gethostname(), "cfx.process": f"{process.pid}@{process.create_time():.0f}"}
+    return {
+        "cfx.host": socket.gethostname(),
+        "cfx.process": f"{process.pid}@{process.create_time():.0f}",
+    }
 
 
 def is_alive(tags: Mapping[str, str]) -> bool:
@@ -84,7 +91,9 @@ def is_alive(tags: Mapping[str, str]) -> bool:
     pid, started = tags["cfx.process"].split("@")
     try:
         process = psutil.Process(int(pid))
-        if process.status() == psutil.STATUS_ZOMBIE:  # killed, and its parent has not asked how it ended
+        if (
+            process.status() == psutil.STATUS_ZOMBIE
+        ):  # killed, and its parent has not asked how it ended
             return False
         return bool(abs(process.create_time() - float(started)) < 2.0)
     except psutil.NoSuchProcess:
@@ -105,7 +114,13 @@ def flatten(config: Mapping[str, Any]) -> dict[str, str]:
     """Flattens a nested configuration: `{"model": {"name": "w99"}}` -> `{"model.name": "w99"}`; empty ones are kept."""
     flat: dict[str, str] = {}
     for path, value in _leaves(config, ""):
-        flat[path] = "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+        flat[path] = (
+            "null"
+            if value is None
+            else str(value).lower()
+            if isinstance(value, bool)
+            else str(value)
+        )
     return flat
 
 
@@ -113,7 +128,9 @@ def _leaves(value: Any, path: str) -> Iterable[tuple[str, Any]]:
     items: Iterable[tuple[Any, Any]]
     if isinstance(value, Mapping) and value:
         items = value.items()
-    elif isinstance(value, list | tuple) and any(isinstance(part, Mapping | list | tuple) for part in value):
+    elif isinstance(value, list | tuple) and any(
+        isinstance(part, Mapping | list | tuple) for part in value
+    ):
         items = enumerate(value)
     else:
         yield path, value

@@ -18,7 +18,10 @@ class ServedPolicy(PythonModel):
         self._policy = TrainedPolicy.load(context.artifacts["policy"])
 
     def predict(
-        self, context: PythonModelContext | None, model_input: pd.DataFrame, params: dict[str, Any] | None = None
+        self,
+        context: PythonModelContext | None,
+        model_input: pd.DataFrame,
+        params: dict[str, Any] | None = None,
     ) -> pd.DataFrame:
         return self._policy.predict_frame(model_input)
 

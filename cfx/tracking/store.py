@@ -77,7 +77,12 @@ def tracking_uri(configured: str | None, default: Path | None = None) -> str:
         TrackingError: it is neither a database nor a server.
     """
     said_by = "MLFLOW_TRACKING_URI" if os.environ.get("MLFLOW_TRACKING_URI") else "tracking.uri"
-    return absolute_uri(os.environ.get("MLFLOW_TRACKING_URI") or configured or f"sqlite:///{default or default_store()}", said_by)
+    return absolute_uri(
+        os.environ.get("MLFLOW_TRACKING_URI")
+        or configured
+        or f"sqlite:///{default or default_store()}",
+        said_by,
+    )
 
 
 def absolute_uri(uri: str, said_by: str) -> str:
@@ -96,7 +101,9 @@ def absolute_uri(uri: str, said_by: str) -> str:
             raise TrackingError(f"{said_by}={uri}: an SQLite store is a file; write sqlite:///FILE")
         return f"sqlite:///{Path(name).expanduser().absolute()}"
     if scheme not in _DATABASES + _SERVERS:
-        raise TrackingError(f"{said_by}={uri}: MLflow needs a database or a server; write sqlite:///FILE or http://HOST:PORT")
+        raise TrackingError(
+            f"{said_by}={uri}: MLflow needs a database or a server; write sqlite:///FILE or http://HOST:PORT"
+        )
     return uri
 
 
@@ -116,7 +123,9 @@ def open_store(uri: str, experiment: str, default: Path | None = None) -> Store:
     try:
         home.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise TrackingError(f"{home}: the folder of the MLflow store cannot be made ({error.strerror}); {_HOW}") from error
+        raise TrackingError(
+            f"{home}: the folder of the MLflow store cannot be made ({error.strerror}); {_HOW}"
+        ) from error
     if not os.access(home, os.W_OK | os.X_OK):
         raise TrackingError(f"{home}: the folder of the MLflow store cannot be written; {_HOW}")
     lock = FileLock(home / f"{file.name if file else 'mlflow'}.lock", timeout=4 * LOCK_SECONDS)
@@ -128,11 +137,16 @@ def open_store(uri: str, experiment: str, default: Path | None = None) -> Store:
                 check_database(file, uri)
         else:
             _answers(uri)
-        with told(f"open {uri}"):
+        with translate_errors(f"open {uri}"):
             from mlflow import MlflowClient
 
             client = MlflowClient(tracking_uri=f"{uri}?timeout={_PATIENCE_S}" if file else uri)
-            experiment_id = _experiment(client, uri, experiment, None if uri.split("://", maxsplit=1)[0] in _SERVERS else home)
+            experiment_id = _experiment(
+                client,
+                uri,
+                experiment,
+                None if uri.split("://", maxsplit=1)[0] in _SERVERS else home,
+            )
     return Store(uri, client, experiment_id, lock)
 
 
@@ -156,7 +170,11 @@ def quiet() -> Iterator[None]:
         os.environ[_BAR] = "false"
         loggers = [logging.getLogger(name) for name in ("mlflow", "alembic")]
         root = logging.getLogger()
-        levels, handlers, root_level = [logger.level for logger in loggers], root.handlers[:], root.level
+        levels, handlers, root_level = (
+            [logger.level for logger in loggers],
+            root.handlers[:],
+            root.level,
+        )
         for logger in loggers:
             logger.setLevel(logging.CRITICAL)
         try:
@@ -172,7 +190,7 @@ def quiet() -> Iterator[None]:
 
 
 @contextmanager
-def told(doing: str) -> Iterator[None]:
+def translate_errors(doing: str) -> Iterator[None]:
     """Runs MLflow quietly; what goes wrong becomes one sentence that says what it was doing.
 
     Raises:
@@ -185,9 +203,14 @@ def told(doing: str) -> Iterator[None]:
         try:
             yield
         except (MlflowException, SQLAlchemyError, sqlite3.Error, OSError) as error:
-            reason = next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
+            reason = next(
+                (line.strip() for line in str(error).splitlines() if line.strip()),
+                type(error).__name__,
+            )
             if "database is locked" in str(error):
-                reason = "the database is locked by another process; close what holds it and run again"
+                reason = (
+                    "the database is locked by another process; close what holds it and run again"
+                )
             raise TrackingError(f"MLflow could not {doing}: {reason[:300]}") from error
 
 
@@ -209,13 +232,15 @@ def download_run(run_id: str, uri: str | None = None) -> Path:
     address = tracking_uri(uri)
     file = sqlite_file(address)
     if file is not None and not file.is_file():
-        raise TrackingError(f"'{run_id}' is no folder, and there is no MLflow database at {file} in which it could be a run")
+        raise TrackingError(
+            f"'{run_id}' is no folder, and there is no MLflow database at {file} in which it could be a run"
+        )
     if not is_run_id(run_id):
         raise TrackingError(
             f"'{run_id}' is neither a job's output folder nor the id of an MLflow run (32 digits and letters a to f)"
         )
     store = open_store(address, "cfx")
-    with told(f"read run {run_id} from {address}"):
+    with translate_errors(f"read run {run_id} from {address}"):
         return Path(store.client.download_artifacts(run_id, ""))
 
 
@@ -245,7 +270,9 @@ def _held(lock: FileLock) -> Iterator[None]:
     try:
         lock.acquire()
     except Timeout as error:
-        raise TrackingError(f"{lock.lock_file}: another process holds the lock of the MLflow store; end it, or {_HOW}") from error
+        raise TrackingError(
+            f"{lock.lock_file}: another process holds the lock of the MLflow store; end it, or {_HOW}"
+        ) from error
     except OSError as error:
         raise TrackingError(
             f"{lock.lock_file}: the lock of the MLflow store cannot be made ({error.strerror}); {_HOW}"
@@ -267,7 +294,7 @@ def _create(file: Path, home: Path) -> None:
     partial = file.with_name(f".{file.name}.{os.getpid()}.part")
     partial.unlink(missing_ok=True)
     try:
-        with told(f"make the database {file}"), _unsynchronised():
+        with translate_errors(f"make the database {file}"), _unsynchronised():
             from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
 
             store = SqlAlchemyStore(f"sqlite:///{partial}", artifact_folder(home).as_uri())  # type: ignore[no-untyped-call]  # MLflow's
@@ -302,12 +329,21 @@ def check_database(file: Path, uri: str) -> None:
     """Looks at an existing SQLite file before MLflow does: is it free, and is it a database of this MLflow?"""
     try:
         # Autocommit mode: the transaction is this function's own.
-        connection = sqlite3.connect(file.as_uri() + "?mode=rw", uri=True, timeout=LOCK_SECONDS, isolation_level=None)
+        connection = sqlite3.connect(
+            file.as_uri() + "?mode=rw", uri=True, timeout=LOCK_SECONDS, isolation_level=None
+        )
         try:
             connection.execute("BEGIN IMMEDIATE")
-            tables = {row[0] for row in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+            tables = {
+                row[0]
+                for row in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
+            }
             ours = {"alembic_version", "experiments", "runs"} <= tables
-            versions = [row[0] for row in connection.execute("SELECT version_num FROM alembic_version")] if ours else []
+            versions = (
+                [row[0] for row in connection.execute("SELECT version_num FROM alembic_version")]
+                if ours
+                else []
+            )
             connection.execute("ROLLBACK")
         finally:
             connection.close()
@@ -316,7 +352,9 @@ def check_database(file: Path, uri: str) -> None:
             raise TrackingError(
                 f"{file}: the MLflow database is locked by another process; close what holds it and run again, or {_HOW}"
             ) from error
-        raise TrackingError(f"{file}: the MLflow database cannot be opened for writing ({error}); {_HOW}") from error
+        raise TrackingError(
+            f"{file}: the MLflow database cannot be opened for writing ({error}); {_HOW}"
+        ) from error
     except sqlite3.DatabaseError as error:
         raise TrackingError(f"{file} is not an SQLite database ({error}); {_HOW}") from error
     if not ours:
@@ -344,7 +382,9 @@ def _answers(uri: str) -> None:
         pass  # it answers; whether it lets us in shows at the first call
     except (OSError, ValueError) as error:
         reason = getattr(error, "reason", error)
-        raise TrackingError(f"no MLflow server answers at {uri} ({reason}); start it, or {_HOW}") from error
+        raise TrackingError(
+            f"no MLflow server answers at {uri} ({reason}); start it, or {_HOW}"
+        ) from error
 
 
 def _experiment(client: MlflowClient, uri: str, name: str, home: Path | None) -> str:

@@ -23,7 +23,7 @@ from cfx.errors import TrackingError
 from cfx.evaluation.result import Evaluation
 from cfx.learners.curves import over_networks
 from cfx.tracking import provenance
-from cfx.tracking.store import Store, open_store, told, tracking_uri
+from cfx.tracking.store import Store, open_store, tracking_uri, translate_errors
 
 if TYPE_CHECKING:
     from cfx.config import JobConfig
@@ -64,9 +64,15 @@ class Tracker:
             return
         values = config.model_dump(mode="json")
         names = {
-            kind: str(values[kind].get("name", "")) for kind in ("data", "model", "policy", "optimizer", "learner", "protocol")
+            kind: str(values[kind].get("name", ""))
+            for kind in ("data", "model", "policy", "optimizer", "learner", "protocol")
         }
-        tags = {**names, "style.cluster": config.style.cluster, "seed": str(config.seed), "cfx.folder": str(folder.absolute())}
+        tags = {
+            **names,
+            "style.cluster": config.style.cluster,
+            "seed": str(config.seed),
+            "cfx.folder": str(folder.absolute()),
+        }
         with MlflowTracker.run(
             tracking_uri(config.tracking.uri),
             experiment=config.tracking.experiment,
@@ -125,12 +131,20 @@ class MlflowTracker(Tracker):
     """
 
     def __init__(
-        self, store: Store, run_id: str, name: str, sweep: str | None, parent_id: str | None, plugins: Mapping[str, str]
+        self,
+        store: Store,
+        run_id: str,
+        name: str,
+        sweep: str | None,
+        parent_id: str | None,
+        plugins: Mapping[str, str],
     ) -> None:
         self.store = store
         self.run_id = run_id
         self.model_uri = ""
-        self.link = f"#/experiments/{store.experiment_id}/runs/{run_id}?workflowType=machine_learning"
+        self.link = (
+            f"#/experiments/{store.experiment_id}/runs/{run_id}?workflowType=machine_learning"
+        )
         self._sweep = sweep
         self._parent_id = parent_id
         self._plugins = plugins
@@ -175,7 +189,7 @@ class MlflowTracker(Tracker):
             "mlflow.user": provenance.user(),
             **(tags or {}),
         }
-        with store.locked(), told("begin the run"):
+        with store.locked(), translate_errors("begin the run"):
             close_abandoned(store)
             parent_id = None
             if sweep is not None:
@@ -193,7 +207,7 @@ class MlflowTracker(Tracker):
         tracker._end("FINISHED")
 
     def set_tags(self, tags: Mapping[str, str]) -> None:
-        with told("log tags"):
+        with translate_errors("log tags"):
             self.store.client.log_batch(self.run_id, tags=_tags(tags))
 
     def log_metrics(self, metrics: Mapping[str, float]) -> None:
@@ -207,7 +221,9 @@ class MlflowTracker(Tracker):
         points = []
         for column in ("train_loss", "validation_loss") if len(curves) else ():
             means = over_networks(curves, column).mean(axis=1)
-            kept = np.unique(np.linspace(0, len(means) - 1, min(CURVE_POINTS, len(means))).round().astype(int))
+            kept = np.unique(
+                np.linspace(0, len(means) - 1, min(CURVE_POINTS, len(means))).round().astype(int)
+            )
             points += [(column, float(means.iloc[k]), int(means.index[k])) for k in kept]
         self._log_metrics(points)
 
@@ -217,9 +233,11 @@ class MlflowTracker(Tracker):
         entry = {"path": name, "type": "table"}
         if entry not in self._tables:
             self._tables.append(entry)
-        with told(f"log the table {name}"):
+        with translate_errors(f"log the table {name}"):
             self.store.client.log_text(self.run_id, text, name)
-            self.store.client.set_tag(self.run_id, "mlflow.loggedArtifacts", json.dumps(self._tables))
+            self.store.client.set_tag(
+                self.run_id, "mlflow.loggedArtifacts", json.dumps(self._tables)
+            )
 
     def log_figures(self, paths: Sequence[Path]) -> None:
         self._log_artifacts(paths, "figures")
@@ -231,14 +249,20 @@ class MlflowTracker(Tracker):
         if not folder.is_dir():
             raise TrackingError(f"{folder} holds no policy to log")
         self._log_artifacts(sorted(folder.iterdir()), "policy")
-        with told("log the policy as a model"), tempfile.TemporaryDirectory() as temporary:
+        with (
+            translate_errors("log the policy as a model"),
+            tempfile.TemporaryDirectory() as temporary,
+        ):
             import mlflow
             from mlflow.entities import LoggedModelOutput
             from mlflow.models import Model
 
             client = self.store.client
             model = client.create_logged_model(
-                self.store.experiment_id, name=self._model_name, source_run_id=self.run_id, model_type="cfx policy"
+                self.store.experiment_id,
+                name=self._model_name,
+                source_run_id=self.run_id,
+                model_type="cfx policy",
             )
             path = Path(temporary) / "model"
             mlflow.pyfunc.save_model(
@@ -250,7 +274,10 @@ class MlflowTracker(Tracker):
                     *(f"{name}=={found}" for name, found in self._plugins.items()),
                 ],
                 mlflow_model=Model(
-                    artifact_path=model.artifact_location, run_id=self.run_id, model_uuid=model.model_id, model_id=model.model_id
+                    artifact_path=model.artifact_location,
+                    run_id=self.run_id,
+                    model_uuid=model.model_id,
+                    model_id=model.model_id,
                 ),
             )
             client.log_model_artifacts(model.model_id, str(path))
@@ -262,7 +289,9 @@ class MlflowTracker(Tracker):
         address, first = _address(self.store.uri)
         lines = [*first, f"MLflow: {address}/{self.link}"]
         if self._sweep is not None:
-            lines.append(f"All jobs of this sweep: {address}/{sweep_link(self.store.experiment_id, self._sweep)}")
+            lines.append(
+                f"All jobs of this sweep: {address}/{sweep_link(self.store.experiment_id, self._sweep)}"
+            )
         return tuple(lines)
 
     def _log_metrics(self, points: Sequence[tuple[str, float, int]]) -> None:
@@ -270,13 +299,13 @@ class MlflowTracker(Tracker):
 
         now = round(1000 * time.time())
         metrics = [Metric(name, value, now, step) for name, value, step in points]
-        with told("log metrics"):
+        with translate_errors("log metrics"):
             for first in range(0, len(metrics), 1000):  # MLflow's limit for a batch
                 self.store.client.log_batch(self.run_id, metrics=metrics[first : first + 1000])
 
     def _log_artifacts(self, paths: Sequence[Path], place: str | None) -> None:
         for path in paths:
-            with told(f"log {path}"):
+            with translate_errors(f"log {path}"):
                 self.store.client.log_artifact(self.run_id, str(path), place)
 
     def _end_badly(self, error: BaseException) -> None:
@@ -289,7 +318,7 @@ class MlflowTracker(Tracker):
             log.warning("%s", second)
 
     def _end(self, status: str, reason: str = "") -> None:
-        with told("close the run"):
+        with translate_errors("close the run"):
             if reason:
                 self.store.client.log_batch(self.run_id, tags=_tags({"cfx.failure": reason}))
             self.store.client.set_terminated(self.run_id, status)
@@ -325,9 +354,11 @@ def end_sweep(uri: str, experiment: str, sweep: str) -> tuple[str, ...]:
         TrackingError: the store cannot be used.
     """
     store = open_store(uri, experiment)
-    with store.locked(), told("close the sweep"):
+    with store.locked(), translate_errors("close the sweep"):
         close_abandoned(store)
-        parents = store.client.search_runs([store.experiment_id], f"tags.`cfx.sweep_parent` = '{_safe(sweep)}'", max_results=1)
+        parents = store.client.search_runs(
+            [store.experiment_id], f"tags.`cfx.sweep_parent` = '{_safe(sweep)}'", max_results=1
+        )
         if not parents:
             return ()
         _settle(store, str(parents[0].info.run_id), _safe(sweep))
@@ -341,7 +372,11 @@ def _begin(store: Store, name: str, parameters: Mapping[str, str], tags: Mapping
 
     client = store.client
     same = f"tags.`cfx.job` = '{tags['cfx.job']}' and attributes.status != 'FINISHED'"
-    left = [run for run in client.search_runs([store.experiment_id], same, max_results=10) if not _is_running(run)]
+    left = [
+        run
+        for run in client.search_runs([store.experiment_id], same, max_results=10)
+        if not _is_running(run)
+    ]
     if left:
         run, known = left[0], left[0].data.params
         client.update_run(run.info.run_id, status="RUNNING", name=name)
@@ -390,7 +425,9 @@ def close_abandoned(store: Store) -> None:
     mine = f"attributes.status = 'RUNNING' and tags.`cfx.host` = '{_safe(provenance.process_tags()['cfx.host'])}'"
     for run in store.client.search_runs([store.experiment_id], mine, max_results=1000):
         if not provenance.is_alive(run.data.tags):
-            store.client.set_tag(run.info.run_id, "cfx.failure", "the process ended without closing the run")
+            store.client.set_tag(
+                run.info.run_id, "cfx.failure", "the process ended without closing the run"
+            )
             store.client.set_terminated(run.info.run_id, "KILLED")
             if "mlflow.parentRunId" in run.data.tags and "cfx.sweep" in run.data.tags:
                 _settle(store, run.data.tags["mlflow.parentRunId"], run.data.tags["cfx.sweep"])
@@ -400,13 +437,22 @@ def _sweep_parent(store: Store, sweep: str) -> str:
     """Returns the id of the sweep's parent run, made by whichever job comes first; call under the lock."""
     client, name = store.client, _safe(sweep)
     # The parent has not the children's tag: a table filtered by `cfx.sweep` shows the jobs alone, flat, and so do its charts.
-    found = client.search_runs([store.experiment_id], f"tags.`cfx.sweep_parent` = '{name}'", max_results=1)
+    found = client.search_runs(
+        [store.experiment_id], f"tags.`cfx.sweep_parent` = '{name}'", max_results=1
+    )
     if found:
         client.update_run(found[0].info.run_id, status="RUNNING")
         return str(found[0].info.run_id)
     note = f"[All jobs of this sweep]({sweep_link(store.experiment_id, sweep)})"
-    tags = {"cfx.sweep_parent": name, "mlflow.note.content": note, "mlflow.source.name": "cfx", "mlflow.user": provenance.user()}
-    return str(client.create_run(store.experiment_id, run_name=f"sweep {name}", tags=tags).info.run_id)
+    tags = {
+        "cfx.sweep_parent": name,
+        "mlflow.note.content": note,
+        "mlflow.source.name": "cfx",
+        "mlflow.user": provenance.user(),
+    }
+    return str(
+        client.create_run(store.experiment_id, run_name=f"sweep {name}", tags=tags).info.run_id
+    )
 
 
 def _settle(store: Store, parent_id: str, sweep: str) -> None:
@@ -426,7 +472,9 @@ def _clean_parameters(parameters: Mapping[str, str]) -> dict[str, str]:
     clean = {}
     for key, value in parameters.items():
         name = re.sub(r"[^\w\-. :/]", "_", key)[:_KEY_LENGTH]
-        clean[name] = value if len(value) <= _PARAMETER_LENGTH else value[: _PARAMETER_LENGTH - 1] + "…"
+        clean[name] = (
+            value if len(value) <= _PARAMETER_LENGTH else value[: _PARAMETER_LENGTH - 1] + "…"
+        )
     return clean
 
 
@@ -434,7 +482,10 @@ def _tags(tags: Mapping[str, str]) -> list[Any]:
     from mlflow.entities import RunTag
 
     return [
-        RunTag(key[:_KEY_LENGTH], value if len(value) <= _TAG_LENGTH else value[: _TAG_LENGTH - 1] + "…")
+        RunTag(
+            key[:_KEY_LENGTH],
+            value if len(value) <= _TAG_LENGTH else value[: _TAG_LENGTH - 1] + "…",
+        )
         for key, value in tags.items()
     ]
 

@@ -37,14 +37,20 @@ def windows(model: DrivingModel) -> DriveObjective:
         return low + (high - low) * torch.rand(WINDOWS, generator=draw, dtype=torch.float64)
 
     speed, acceleration, gap = uniform(3.0, 18.0), uniform(-1.5, 1.5), uniform(5.0, 40.0)
-    leader_speed = (speed + uniform(-1.5, 1.5) + acceleration * DT * torch.arange(STEPS)[:, None]).clamp(min=0.0)
-    leader_position = gap + 4.5 + torch.cat([torch.zeros(1, WINDOWS), leader_speed[1:] * DT]).cumsum(0)
+    leader_speed = (
+        speed + uniform(-1.5, 1.5) + acceleration * DT * torch.arange(STEPS)[:, None]
+    ).clamp(min=0.0)
+    leader_position = (
+        gap + 4.5 + torch.cat([torch.zeros(1, WINDOWS), leader_speed[1:] * DT]).cumsum(0)
+    )
     length = torch.full((WINDOWS,), 4.5, dtype=torch.float64)
     leader = Leader(leader_position, leader_speed, acceleration.expand(STEPS, -1), length)
     start = Start(torch.zeros_like(speed), speed, uniform(-1.0, 1.0))
     simulator = Simulator(model, DT, compile="never")
     truth = torch.rand(WINDOWS, len(model.space), generator=draw, dtype=torch.float64)
-    _, _, observed = simulator.advance(simulator.begin(start), leader, model.space.unpack(model.space.from_unit(truth)))
+    _, _, observed = simulator.advance(
+        simulator.begin(start), leader, model.space.unpack(model.space.from_unit(truth))
+    )
     observed = observed + 0.02 * torch.randn(observed.shape, generator=draw, dtype=torch.float64)
     return DriveObjective(simulator, *leader, *start, observed, torch.ones_like(observed))
 
@@ -53,7 +59,9 @@ def plain_loop(objective: DriveObjective, guess: Tensor, *, initial: int, iterat
     """Returns the loss that BoTorch's tutorial reaches in one window."""
     n = guess.shape[-1]
     bounds = torch.tensor([[0.0], [1.0]], dtype=torch.float64).expand(2, n)
-    points = torch.quasirandom.SobolEngine(n, scramble=True, seed=0).draw(initial - 1, dtype=torch.float64)
+    points = torch.quasirandom.SobolEngine(n, scramble=True, seed=0).draw(
+        initial - 1, dtype=torch.float64
+    )
     tried = torch.cat([guess, points])
     values = -objective(tried[None])[0][:, None]
     for _ in range(iterations):
@@ -61,7 +69,10 @@ def plain_loop(objective: DriveObjective, guess: Tensor, *, initial: int, iterat
         fit_gpytorch_mll(ExactMarginalLogLikelihood(process.likelihood, process))
         improvement = LogExpectedImprovement(process, best_f=values.max())
         candidate, _ = optimize_acqf(improvement, bounds, q=1, num_restarts=10, raw_samples=512)
-        tried, values = torch.cat([tried, candidate]), torch.cat([values, -objective(candidate[None])[0][:, None]])
+        tried, values = (
+            torch.cat([tried, candidate]),
+            torch.cat([values, -objective(candidate[None])[0][:, None]]),
+        )
     return -values.max().item()
 
 
@@ -71,7 +82,9 @@ def test_labels_per_second(benchmark: Any, model: DrivingModel) -> None:
     objective = windows(model)
     guesses = model.space.to_unit(model.space.defaults()).expand(WINDOWS, 1, -1)
 
-    found = benchmark.pedantic(BotorchOptimizer().minimize, args=(objective, guesses), kwargs={"seed": 0})
+    found = benchmark.pedantic(
+        BotorchOptimizer().minimize, args=(objective, guesses), kwargs={"seed": 0}
+    )
     began = time.perf_counter()
     searched = RandomSearch().minimize(objective, guesses, seed=0)
     random_seconds = (time.perf_counter() - began) / WINDOWS
@@ -80,7 +93,10 @@ def test_labels_per_second(benchmark: Any, model: DrivingModel) -> None:
     with warnings.catch_warnings():
         # The plain loop warns of fits and climbs that did not converge: part of what is compared.
         warnings.simplefilter("ignore")
-        plain = [plain_loop(objective.select(i, i + 1), guesses[i], initial=10, iterations=30) for i in range(LOOPED)]
+        plain = [
+            plain_loop(objective.select(i, i + 1), guesses[i], initial=10, iterations=30)
+            for i in range(LOOPED)
+        ]
     plain_seconds = (time.perf_counter() - began) / LOOPED
     seconds = benchmark.stats.stats.mean / WINDOWS
     benchmark.extra_info |= {

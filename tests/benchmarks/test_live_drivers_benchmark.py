@@ -40,7 +40,9 @@ def test_three_hundred_live_drivers(benchmark, tmp_path: Path) -> None:
         for lane in range(LANES):
             kind = "head" if row == 0 else "calm" if (row + lane) % 2 else "hasty"
             place = f'departPos="{5000 - 30 * row}" departSpeed="10" insertionChecks="none"'
-            lines.append(f'<vehicle id="{lane}/{row}" type="{kind}" route="lane{lane}" depart="0" {place}/>')
+            lines.append(
+                f'<vehicle id="{lane}/{row}" type="{kind}" route="lane{lane}" depart="0" {place}/>'
+            )
     (tmp_path / "demand.rou.xml").write_text(f"<routes>{''.join(lines)}</routes>")
     (tmp_path / "motorway.sumocfg").write_text(
         '<configuration><input><net-file value="road.net.xml"/><route-files value="demand.rou.xml"/></input>'

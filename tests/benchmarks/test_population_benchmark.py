@@ -49,13 +49,23 @@ def test_population(benchmark: Any, model: DrivingModel) -> None:
     compiled = drives(model)
     eager = replace(compiled, simulator=Simulator(model, DT, compile="never"))
     fold = torch.arange(DRIVES) % FOLDS
-    members = (fold != torch.arange(FOLDS + 1)[:, None]) | (torch.arange(FOLDS + 1)[:, None] == FOLDS)
-    points = torch.quasirandom.SobolEngine(len(model.space), scramble=True, seed=0).draw(CANDIDATES, dtype=torch.float64)
+    members = (fold != torch.arange(FOLDS + 1)[:, None]) | (
+        torch.arange(FOLDS + 1)[:, None] == FOLDS
+    )
+    points = torch.quasirandom.SobolEngine(len(model.space), scramble=True, seed=0).draw(
+        CANDIDATES, dtype=torch.float64
+    )
     candidates = points.expand(FOLDS + 1, -1, -1)
-    losses = benchmark.pedantic(JointObjective(compiled, members, MEMORY), args=(candidates,), rounds=3, warmup_rounds=1)
+    losses = benchmark.pedantic(
+        JointObjective(compiled, members, MEMORY), args=(candidates,), rounds=3, warmup_rounds=1
+    )
     one_by_one = JointObjective(eager, members, MEMORY)
     began = time.perf_counter()
-    expected = torch.cat([one_by_one.select(k, k + 1)(candidates[k : k + 1]) for k in range(FOLDS + 1)])
+    expected = torch.cat(
+        [one_by_one.select(k, k + 1)(candidates[k : k + 1]) for k in range(FOLDS + 1)]
+    )
     seconds = time.perf_counter() - began
     torch.testing.assert_close(losses, expected, rtol=1e-6, atol=1e-9)
-    benchmark.extra_info["times faster than fold by fold in eager PyTorch"] = seconds / benchmark.stats["median"]
+    benchmark.extra_info["times faster than fold by fold in eager PyTorch"] = (
+        seconds / benchmark.stats["median"]
+    )

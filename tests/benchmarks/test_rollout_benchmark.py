@@ -61,14 +61,17 @@ def w99_kernel(lead: Array, v0: Array, p: Array, c: Array, x_out: Array, v_out: 
                 dx, dv = lead[k, row, 0] - lead[k, row, 3] - x, v_l - v
                 near = q[0] + (q[1] * v if v_l > 0 else 0)
                 far = near + q[2]
-                spread = q[6] * dx * dx * 1e-4
-                closing = q[4] - spread if v > 0 else 0
-                opening = spread + q[5] if v_l > q[5] else spread
+                sensitivity = q[6] * dx * dx * 1e-4
+                closing = q[4] - sensitivity if v > 0 else 0
+                opening = sensitivity + q[5] if v_l > q[5] else sensitivity
                 if dv < opening and dx <= near:
                     acc = -b_max if dx < v * dt + 0.1 * q[0] else 0.0
                     if v_l > 0:
                         if dv < 0:
-                            acc = min(a_l + (dv * dv / (q[0] - dx) if dx > q[0] else (dv - opening) / 2), 0)
+                            acc = min(
+                                a_l + (dv * dv / (q[0] - dx) if dx > q[0] else (dv - opening) / 2),
+                                0,
+                            )
                         acc = -q[7] if acc > -q[7] else max(acc, math.sqrt(v) / 2 - 10)
                 elif dv < closing and dx < far + q[3] * (dv - q[4]):
                     acc = dv * dv / (2 * (near - dx - 0.1))
@@ -110,9 +113,13 @@ class Case:
         steps = torch.arange(STEPS, dtype=dtype)[:, None, None]
         position = 8 + 30 * uniform(PROBLEMS, 1) + steps * speed * DT
         acceleration = uniform(STEPS, PROBLEMS, 1) - 0.5
-        self.leader = Leader(position, speed.expand_as(position), acceleration, torch.full_like(speed, 5.0))
+        self.leader = Leader(
+            position, speed.expand_as(position), acceleration, torch.full_like(speed, 5.0)
+        )
         self.values = model.space.from_unit(uniform(PROBLEMS, CANDIDATES, len(model.space)))
-        self.p = {name: value.contiguous() for name, value in model.space.unpack(self.values).items()}
+        self.p = {
+            name: value.contiguous() for name, value in model.space.unpack(self.values).items()
+        }
         zero = torch.zeros((PROBLEMS, CANDIDATES), dtype=dtype)
         self.start = Start(zero, zero + 9 + uniform(PROBLEMS, 1), zero)
 
@@ -123,7 +130,9 @@ class Case:
 
     def numba(self) -> Callable[[], Array]:
         kernel, names = KERNELS[type(self.model)]
-        lead = np.stack([np.broadcast_to(x[..., 0].numpy(), (STEPS, PROBLEMS)) for x in self.leader], axis=-1)
+        lead = np.stack(
+            [np.broadcast_to(x[..., 0].numpy(), (STEPS, PROBLEMS)) for x in self.leader], axis=-1
+        )
         constants = np.array([*(self.p[name].item() for name in names), DT], dtype=lead.dtype)
         speed, values = self.start.speed.numpy(), self.values.numpy()
 
@@ -169,6 +178,8 @@ def test_rollout(benchmark: Any, model: DrivingModel, mode: Compile, dtype: torc
     for threads in {1, min(2, available)}:
         numba.set_num_threads(threads)
         kernel_steps = WORK / best_time(run) / 1e6
-        benchmark.extra_info[f"numba_{threads}_threads_million_vehicle_steps_per_s"] = round(kernel_steps)
+        benchmark.extra_info[f"numba_{threads}_threads_million_vehicle_steps_per_s"] = round(
+            kernel_steps
+        )
         benchmark.extra_info[f"times_numba_{threads}_threads"] = round(steps / kernel_steps, 2)
     numba.set_num_threads(available)

@@ -1,6 +1,6 @@
 """A gradient step of learning by rollout, beside the same step in plain eager PyTorch in the same run.
 
-The case has I-80's size: six networks (five folds and one for everybody), or committees of four, of 57 drivers, two drives of
+The case has I-80's size: six networks (five folds and one for everybody), or ensembles of four, of 57 drivers, two drives of
 15 s for each, the policy having read 20 s of history. All ways run the same code: through `torch.compile`, as cfx does;
 eagerly, all networks in one batch; and eagerly a network at a time, as a training loop without batched networks would have to.
 `extra_info` holds the ratios of their times; nothing passes or fails by the clock.
@@ -16,8 +16,8 @@ import pytest
 import torch
 
 from cfx.calibration.windows import Split, WindowSettings
-from cfx.learners.base import Lesson
-from cfx.learners.material import Material
+from cfx.learners.base import TrainingData
+from cfx.learners.dataset import RolloutDataset
 from cfx.learners.rollout import RolloutModule, RolloutSettings
 from cfx.models.base import DrivingModel
 from cfx.models.krauss import Krauss
@@ -30,10 +30,12 @@ from cfx.simulation.threads import one_thread
 from tests.drives import wavy_pairs
 
 NETWORKS, DRIVERS, FRAMES = 6, 57, 700
-POLICY = GruPolicy(inputs=("leader_speed", "relative_speed", "gap", "follower_acceleration", "leader_acceleration"))
+POLICY = GruPolicy(
+    inputs=("leader_speed", "relative_speed", "gap", "follower_acceleration", "leader_acceleration")
+)
 
 
-def _lesson(model: DrivingModel, networks: int) -> Lesson:
+def _lesson(model: DrivingModel, networks: int) -> TrainingData:
     driven = Krauss()
     unit = torch.rand((DRIVERS, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     pairs = wavy_pairs(driven, driven.space.from_unit(0.1 + 0.2 * unit), frames=FRAMES)
@@ -42,19 +44,40 @@ def _lesson(model: DrivingModel, networks: int) -> Lesson:
     fixed = model.space.defaults().expand(len(index), -1)
     names, windows = tuple(f"fold {k}" for k in range(networks)), WindowSettings()
     batch, split = PairBatch.of(pairs)[index], Split.none(pairs, windows)[index]
-    return Lesson(Simulator(model, 0.1), batch, split, windows, fixed, None, network, names, seed=0, base=fixed)
+    return TrainingData(
+        Simulator(model, 0.1),
+        batch,
+        split,
+        windows,
+        fixed,
+        None,
+        network,
+        names,
+        seed=0,
+        base=fixed,
+    )
 
 
 class Step:
     """What `RolloutModule.training_step` computes, with the optimizer that it uses and without Lightning around it."""
 
-    def __init__(self, model: DrivingModel, settings: RolloutSettings, networks: int = NETWORKS) -> None:
-        lesson = _lesson(model, networks)
-        material = Material.of(lesson, POLICY, settings.validation, torch.Generator().manual_seed(0), settings.members)
-        blank = torch.full((len(material.pair), len(model.space)), NONE)
-        width = material.scaler.mean.shape[-1]
+    def __init__(
+        self, model: DrivingModel, settings: RolloutSettings, networks: int = NETWORKS
+    ) -> None:
+        training_data = _lesson(model, networks)
+        dataset = RolloutDataset.of(
+            training_data,
+            POLICY,
+            settings.validation,
+            torch.Generator().manual_seed(0),
+            settings.ensemble_size,
+        )
+        blank = torch.full((len(dataset.pair), len(model.space)), NONE)
+        width = dataset.scaler.mean.shape[-1]
         network = POLICY.build(width, blank[0], blank, torch.Generator().manual_seed(0))
-        self.module = RolloutModule(network, material, POLICY, replace(lesson, workspace=None), settings)
+        self.module = RolloutModule(
+            network, dataset, POLICY, replace(training_data, workspace=None), settings
+        )
         self.optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3)
         self.number = 0
 
@@ -69,11 +92,14 @@ class Step:
 
 @pytest.mark.benchmark(group="training")
 @pytest.mark.parametrize("model", [Krauss(), W99()], ids=["krauss", "w99"])
-@pytest.mark.parametrize("members", [1, 4])
+@pytest.mark.parametrize("ensemble_size", [1, 4])
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf:UserWarning")
-def test_a_gradient_step(benchmark: Any, model: DrivingModel, members: int) -> None:
-    compiled, eager = (Step(model, RolloutSettings(compile=how, members=members)) for how in ("always", "never"))
-    alone = Step(model, RolloutSettings(compile="never", members=1), networks=1)
+def test_a_gradient_step(benchmark: Any, model: DrivingModel, ensemble_size: int) -> None:
+    compiled, eager = (
+        Step(model, RolloutSettings(compile=how, ensemble_size=ensemble_size))
+        for how in ("always", "never")
+    )
+    alone = Step(model, RolloutSettings(compile="never", ensemble_size=1), networks=1)
     began = time.perf_counter()
     compiled()
     benchmark.extra_info["seconds to compile"] = time.perf_counter() - began
@@ -84,7 +110,9 @@ def test_a_gradient_step(benchmark: Any, model: DrivingModel, members: int) -> N
     benchmark.pedantic(compiled, rounds=5)
     took = benchmark.stats.stats.median
     benchmark.extra_info["times faster than eager"] = _seconds(eager) / took
-    benchmark.extra_info["times faster than eager, a network at a time"] = NETWORKS * members * _seconds(alone) / took
+    benchmark.extra_info["times faster than eager, a network at a time"] = (
+        NETWORKS * ensemble_size * _seconds(alone) / took
+    )
 
 
 def _seconds(step: Step) -> float:

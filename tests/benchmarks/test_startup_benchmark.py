@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["plugins"], ["modle=w99"]], ids=["help", "plugins", "mistake"])
+@pytest.mark.parametrize(
+    "arguments", [["--help"], ["plugins"], ["modle=w99"]], ids=["help", "plugins", "mistake"]
+)
 def test_startup(benchmark, arguments: list[str], tmp_path: Path) -> None:
     command = [sys.executable, "-m", "cfx", *arguments]
 

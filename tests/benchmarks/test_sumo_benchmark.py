@@ -28,7 +28,8 @@ from cfx.simulation.rollout import Start
 from cfx.simulation.settings import SumoSettings
 
 pytestmark = pytest.mark.skipif(
-    importlib.util.find_spec("libsumo") is None, reason="SUMO is not here; pip install 'cfx-driving[sumo]'"
+    importlib.util.find_spec("libsumo") is None,
+    reason="SUMO is not here; pip install 'cfx-driving[sumo]'",
 )
 
 RUNS, STEPS, DT = 400, 650, 0.1
@@ -50,14 +51,20 @@ class Case:
         speed = 9 + 6 * torch.sin(6.28 * time / uniform(12, 25, RUNS) + uniform(0, 6, RUNS))
         acceleration = torch.cat([torch.zeros(1, RUNS), speed.diff(dim=0) / DT])
         moved = torch.cat([torch.zeros(1, RUNS), (speed[1:] * DT).cumsum(0)])
-        self.leader = Leader(200.0 + moved, speed, acceleration, torch.full((RUNS,), 5.0, dtype=torch.float64))
+        self.leader = Leader(
+            200.0 + moved, speed, acceleration, torch.full((RUNS,), 5.0, dtype=torch.float64)
+        )
         zero = torch.zeros(RUNS, dtype=torch.float64)
         self.start = Start(195.0 - uniform(10, 40, RUNS), zero + 9.0, zero)
-        self.p = self.model.space.unpack(self.model.space.from_unit(uniform(0, 1, RUNS, len(self.model.space))))
+        self.p = self.model.space.unpack(
+            self.model.space.from_unit(uniform(0, 1, RUNS, len(self.model.space)))
+        )
 
     def request(self, i: int) -> str:
         """Returns run i for a process of its own."""
-        kind = self.model.sumo_vtype({name: value if value.dim() == 0 else value[i] for name, value in self.p.items()})
+        kind = self.model.sumo_vtype(
+            {name: value if value.dim() == 0 else value[i] for name, value in self.p.items()}
+        )
         run = {
             "model": kind.car_follow_model,
             "parameters": {name: float(value) for name, value in kind.attributes.items()},
@@ -75,7 +82,9 @@ class Case:
 
 def alone(request: str) -> list[float]:
     """Drives one pair in a process of its own."""
-    done = subprocess.run([sys.executable, str(REFERENCE)], input=request, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, str(REFERENCE)], input=request, capture_output=True, text=True, check=True
+    )
     speed: list[float] = json.loads(done.stdout)["runs"][0]["speed"]
     return speed
 

@@ -11,7 +11,7 @@ from torch import nn
 
 from cfx.calibration.calibrator import Labels
 from cfx.calibration.windows import Split, Windows, WindowSettings
-from cfx.learners.base import Lesson
+from cfx.learners.base import TrainingData
 from cfx.learners.imitation import ImitationLearner
 from cfx.models.krauss import Krauss
 from cfx.pairs import PairBatch
@@ -23,17 +23,35 @@ from tests.drives import straight_pairs
 PAIRS, FRAMES, EPOCHS, BATCH = 94, 700, 5, 16
 
 
-def _lesson() -> Lesson:
+def _lesson() -> TrainingData:
     model, settings = Krauss(), WindowSettings()
     pairs = straight_pairs([FRAMES] * PAIRS)
     split = Split.of(pairs, settings, 0.8)
     windows = Windows.of(split.windows, settings)
-    unit = torch.rand((len(windows), 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    unit = torch.rand(
+        (len(windows), 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     even = torch.ones(len(windows), dtype=torch.float64)
-    labels = Labels(windows, model.space.from_unit(unit), even, even, torch.zeros(len(windows), dtype=torch.int64))
+    labels = Labels(
+        windows,
+        model.space.from_unit(unit),
+        even,
+        even,
+        torch.zeros(len(windows), dtype=torch.int64),
+    )
     fixed = model.space.defaults().expand(PAIRS, 2)
     names = tuple(f"p{i}" for i in range(PAIRS))
-    return Lesson(Simulator(model, 0.1), PairBatch.of(pairs), split, settings, fixed, labels, torch.arange(PAIRS), names, 0)
+    return TrainingData(
+        Simulator(model, 0.1),
+        PairBatch.of(pairs),
+        split,
+        settings,
+        fixed,
+        labels,
+        torch.arange(PAIRS),
+        names,
+        0,
+    )
 
 
 @one_thread()
@@ -58,10 +76,12 @@ def _one_by_one(networks: int) -> float:
 
 @pytest.mark.benchmark(group="training")
 def test_epoch_of_94_networks(benchmark: Any) -> None:
-    lesson = _lesson()
+    training_data = _lesson()
     learner = ImitationLearner(epochs=EPOCHS, batch_size=BATCH, patience=None)
-    learner.fit(GruPolicy(), lesson)  # imports and first-call costs
-    benchmark.pedantic(learner.fit, args=(GruPolicy(), lesson), rounds=3)
+    learner.fit(GruPolicy(), training_data)  # imports and first-call costs
+    benchmark.pedantic(learner.fit, args=(GruPolicy(), training_data), rounds=3)
     per_epoch = benchmark.stats.stats.min / EPOCHS
     benchmark.extra_info["milliseconds per epoch"] = 1e3 * per_epoch
-    benchmark.extra_info["times faster than one network after the other"] = _one_by_one(PAIRS) / per_epoch
+    benchmark.extra_info["times faster than one network after the other"] = (
+        _one_by_one(PAIRS) / per_epoch
+    )

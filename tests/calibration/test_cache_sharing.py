@@ -63,7 +63,9 @@ def start(here: Path, seconds: float) -> subprocess.Popen[str]:
     script.write_text(WORKER)
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, str(script), str(here), str(seconds)]
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
 
 
 def release(here: Path, *workers: subprocess.Popen[str]) -> None:
@@ -108,7 +110,9 @@ def test_a_process_that_is_killed_with_its_claims_blocks_nobody(tmp_path: Path) 
     release(tmp_path, stuck)
     until(lambda: bool(solved(tmp_path)), stuck)
     other = start(tmp_path, 0)
-    until(lambda: sum(solved(tmp_path).values()) == PAIRS, stuck, other)  # all but what the first has claimed, and that
+    until(
+        lambda: sum(solved(tmp_path).values()) == PAIRS, stuck, other
+    )  # all but what the first has claimed, and that
     assert other.poll() is None  # it waits for the claimed ones, and does not compute them again
     stuck.kill()
     stuck.communicate()
@@ -154,7 +158,9 @@ def test_the_locks_stay_few_however_many_calibrations_there_are(tmp_path: Path) 
     assert len(names) <= 4096
 
 
-def test_without_a_cache_nothing_is_claimed_or_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_cache_nothing_is_claimed_or_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     shares = Cache(None).shares(keys(200), "labels")
     assert [sorted(positions) for positions in shares.values()] == [list(range(200))]
@@ -166,7 +172,9 @@ def test_without_a_cache_nothing_is_claimed_or_written(tmp_path: Path, monkeypat
 def test_a_cache_that_cannot_be_written_is_said_before_the_work(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with (
-        pytest.raises(OutputError, match=r"cannot write the calibration cache.*cache\.enabled=false"),
+        pytest.raises(
+            OutputError, match=r"cannot write the calibration cache.*cache\.enabled=false"
+        ),
         Cache(tmp_path / "file").claim({"a": 1}, 1),
     ):
         pass

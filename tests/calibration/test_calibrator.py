@@ -45,7 +45,10 @@ class Counting(RandomSearch):
 
 
 def calibrator(
-    optimizer: RandomSearch, folder: Path | None = None, model: DrivingModel | None = None, **changes: object
+    optimizer: RandomSearch,
+    folder: Path | None = None,
+    model: DrivingModel | None = None,
+    **changes: object,
 ) -> Calibrator:
     arguments = {"seed": 0, "cache": Cache(folder), "memory": 1 << 28, "progress": Task} | changes
     return Calibrator(Simulator(model or Krauss(), 0.1), optimizer, **arguments)  # type: ignore[arg-type]  # the test's own mix
@@ -70,23 +73,32 @@ def everything(tool: Calibrator, pairs: PairSet) -> tuple[Tensor, Tensor]:
     ],
     ids=["krauss", "w99"],
 )  # fmt: skip
-def test_constant_true_parameters_are_recovered(model: DrivingModel, true: Tensor, tolerance: dict[str, float]) -> None:
+def test_constant_true_parameters_are_recovered(
+    model: DrivingModel, true: Tensor, tolerance: dict[str, float]
+) -> None:
     pairs = wavy_pairs(model, true, frames=400)
     tool = calibrator(RandomSearch(samples=4096), model=model)
     fixed = tool.fixed(pairs, PairBatch.of(pairs), torch.full((len(pairs),), 320))
     low, high = model.space.bounds()
-    error = dict(zip(model.space.names, ((fixed - true).abs() / (high - low)).amax(0).tolist(), strict=True))
+    error = dict(
+        zip(model.space.names, ((fixed - true).abs() / (high - low)).amax(0).tolist(), strict=True)
+    )
     assert all(error[name] < limit for name, limit in tolerance.items()), error
 
 
 def test_labels_of_a_driver_who_changes_follow_him() -> None:
     model = Krauss()
-    first, second = (wavy_pairs(model, torch.tensor([[t_r, 0.1]], dtype=torch.float64), seed=3) for t_r in (1.0, 2.5))
+    first, second = (
+        wavy_pairs(model, torch.tensor([[t_r, 0.1]], dtype=torch.float64), seed=3)
+        for t_r in (1.0, 2.5)
+    )
     pairs = PairSet((first[0], replace(second[0], pair_id="p1")), "test")
     batch = PairBatch.of(pairs)
     windows = Windows.of(torch.tensor([40, 40]), SETTINGS)
-    labels = calibrator(RandomSearch(samples=1024)).labels(pairs, batch, windows, torch.tensor([[1.7, 0.1], [1.7, 0.1]]).double())
-    told = labels.spread > labels.spread.median()
+    labels = calibrator(RandomSearch(samples=1024)).labels(
+        pairs, batch, windows, torch.tensor([[1.7, 0.1], [1.7, 0.1]]).double()
+    )
+    told = labels.sensitivity > labels.sensitivity.median()
     medians = [float(labels.parameters[(windows.pair == p) & told, 0].median()) for p in (0, 1)]
     assert medians[0] == pytest.approx(1.0, abs=0.3)
     assert medians[1] == pytest.approx(2.5, abs=0.3)
@@ -101,9 +113,11 @@ def test_windows_that_determine_nothing_get_the_fixed_parameters() -> None:
     pairs = PairSet((far,), "test")
     fixed = torch.tensor([[2.345, 0.678]], dtype=torch.float64)
     windows = Windows.of(torch.tensor([10]), SETTINGS)
-    labels = calibrator(RandomSearch(samples=256), model=model).labels(pairs, PairBatch.of(pairs), windows, fixed)
+    labels = calibrator(RandomSearch(samples=256), model=model).labels(
+        pairs, PairBatch.of(pairs), windows, fixed
+    )
     torch.testing.assert_close(labels.parameters, fixed.expand(10, 2))
-    assert float(labels.spread.max()) == 0
+    assert float(labels.sensitivity.max()) == 0
 
 
 def test_the_second_time_nothing_is_calibrated_again(tmp_path: Path) -> None:
@@ -148,7 +162,9 @@ def test_other_data_is_not_mistaken(tmp_path: Path) -> None:
     assert again.solved == 1 + 40
 
 
-def test_an_interrupted_calibration_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_calibration_goes_on_where_it_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("cfx.calibration.calibrator._GROUP", 40)
     pairs = wavy_pairs(Krauss(), TRUE)
     whole = everything(calibrator(Counting()), pairs)
@@ -178,7 +194,9 @@ def test_a_damaged_entry_is_computed_again(tmp_path: Path) -> None:
 
 def test_a_cache_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match=r"cannot write the calibration cache.*cache\.enabled=false"):
+    with pytest.raises(
+        OutputError, match=r"cannot write the calibration cache.*cache\.enabled=false"
+    ):
         everything(calibrator(Counting(), tmp_path / "file"), wavy_pairs(Krauss(), TRUE))
 
 
@@ -191,20 +209,34 @@ def test_the_objective_is_the_rmse_of_the_rollout() -> None:
     batch = PairBatch.of(pairs)
     pair, first, steps = torch.tensor([0, 2]), torch.tensor([10, 50]), torch.tensor([7, 20])
     objective = DriveObjective.of_segments(Simulator(model, 0.1), batch, pair, first, steps)
-    candidates = torch.rand((2, 5, 2), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    candidates = torch.rand(
+        (2, 5, 2), dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+    )
     losses = objective(candidates)
     for i in range(2):
         frames = slice(int(first[i]), int(first[i] + steps[i]) + 1)
         leader = Leader(
-            *(x[pair[i], frames] for x in (batch.leader_position, batch.leader_speed, batch.leader_acceleration)),
+            *(
+                x[pair[i], frames]
+                for x in (batch.leader_position, batch.leader_speed, batch.leader_acceleration)
+            ),
             batch.leader_length[pair[i]],
         )
         begin = Start(
-            *(x[pair[i], first[i]] for x in (batch.follower_position, batch.follower_speed, batch.follower_acceleration))
+            *(
+                x[pair[i], first[i]]
+                for x in (
+                    batch.follower_position,
+                    batch.follower_speed,
+                    batch.follower_acceleration,
+                )
+            )
         )
         for j in range(5):
             drive = simulate(model, model.space.from_unit(candidates[i, j]), leader, begin, 0.1)
-            expected = (drive.speed[1:] - batch.follower_speed[pair[i], frames][1:]).square().mean().sqrt()
+            expected = (
+                (drive.speed[1:] - batch.follower_speed[pair[i], frames][1:]).square().mean().sqrt()
+            )
             torch.testing.assert_close(losses[i, j], expected)
     torch.testing.assert_close(objective.select(1, 2)(candidates[1:]), losses[1:])
 
@@ -213,8 +245,12 @@ def test_constant_drivers_of_the_synthetic_dataset_are_recovered() -> None:
     pairs = SyntheticDataset(variation=0.0, pairs=6, frames=500, seed=3).load()
     tool = calibrator(BotorchOptimizer(screening=256))
     fixed = tool.fixed(pairs, PairBatch.of(pairs), torch.full((len(pairs),), 400))
-    true = torch.tensor([[pair.truth[name][0] for name in tool.space.names] for pair in pairs], dtype=torch.float64)
+    true = torch.tensor(
+        [[pair.truth[name][0] for name in tool.space.names] for pair in pairs], dtype=torch.float64
+    )
     low, high = tool.space.bounds()
-    error = dict(zip(tool.space.names, ((fixed - true).abs() / (high - low)).amax(0).tolist(), strict=True))
+    error = dict(
+        zip(tool.space.names, ((fixed - true).abs() / (high - low)).amax(0).tolist(), strict=True)
+    )
     assert error["t_r"] < 0.01, error
     assert error["t_i"] < 0.15, error

@@ -24,8 +24,14 @@ def test_windows_fit_and_none_is_missing(frames: int, length: int, stride: int) 
     assert last_frame_of[count] > frames - 1
 
 
-@given(frames=st.lists(st.integers(60, 300), min_size=1, max_size=5), stride=st.integers(1, 6), share=st.floats(0.5, 0.9))
-def test_training_windows_stay_before_the_test_part(frames: list[int], stride: int, share: float) -> None:
+@given(
+    frames=st.lists(st.integers(60, 300), min_size=1, max_size=5),
+    stride=st.integers(1, 6),
+    share=st.floats(0.5, 0.9),
+)
+def test_training_windows_stay_before_the_test_part(
+    frames: list[int], stride: int, share: float
+) -> None:
     settings = WindowSettings(length=stride + 2, stride=stride)
     split = Split.of(straight_pairs(frames), settings, share)
     windows = Windows.of(split.windows, settings)

@@ -16,7 +16,13 @@ from cfx.errors import DataError
 
 def test_describes_real_tidy_pairs(shared_data: Path) -> None:
     text = describe(shared_data / "i80_reconstructed_pairs.parquet")
-    for words in ("147,521", "i80-0400 (113 pairs), i80-0500 (116 pairs)", "229 of 221 drivers", "0.1 s", "Left out: nothing"):
+    for words in (
+        "147,521",
+        "i80-0400 (113 pairs), i80-0500 (116 pairs)",
+        "229 of 221 drivers",
+        "0.1 s",
+        "Left out: nothing",
+    ):
         assert words in text
     line = next(line for line in text.splitlines() if "at least 700" in line)
     assert line.split()[-1] == "71"
@@ -24,7 +30,14 @@ def test_describes_real_tidy_pairs(shared_data: Path) -> None:
 
 def test_describes_a_real_raw_recording(shared_data: Path) -> None:
     text = describe(shared_data / "i80_0400_raw_sample.csv.gz")
-    for words in ("NGSIM (feet)", "110,905", "222", "145 of 142 drivers", "42,566 rows: no vehicle ahead", "data=ngsim"):
+    for words in (
+        "NGSIM (feet)",
+        "110,905",
+        "222",
+        "145 of 142 drivers",
+        "42,566 rows: no vehicle ahead",
+        "data=ngsim",
+    ):
         assert words in text
 
 

@@ -26,13 +26,27 @@ STARTS = {"0400": 1_113_433_200_000, "0500": 1_113_436_800_000, "0515": 1_113_43
 Row = dict[str, str]
 
 
-def vehicle(number: int, leader: int, frames: range, recording: str, ahead: float, place: str = "i-80") -> list[Row]:
+def vehicle(
+    number: int, leader: int, frames: range, recording: str, ahead: float, place: str = "i-80"
+) -> list[Row]:
     """A vehicle at a steady 30 ft/s; frame 0 of a recording lies half a minute before its nominal beginning."""
-    known = {"Vehicle_ID": number, "Total_Frames": len(frames), "v_Length": 15, "v_Vel": 30, "Lane_ID": 2, "Preceding": leader}
+    known = {
+        "Vehicle_ID": number,
+        "Total_Frames": len(frames),
+        "v_Length": 15,
+        "v_Vel": 30,
+        "Lane_ID": 2,
+        "Preceding": leader,
+    }
     clock = STARTS[recording] - 30_000
     return [
         {name: str(known.get(name, 0)) for name in COLUMNS}
-        | {"Frame_ID": str(k), "Global_Time": str(clock + 100 * k), "Local_Y": f"{ahead + 3 * k:.3f}", "Location": place}
+        | {
+            "Frame_ID": str(k),
+            "Global_Time": str(clock + 100 * k),
+            "Local_Y": f"{ahead + 3 * k:.3f}",
+            "Location": place,
+        }
         for k in frames
     ]
 
@@ -90,7 +104,11 @@ class Soda:
         if fault in {"429", "503", "202"}:
             send(handler, int(fault), "busy", **{"Retry-After": "0"})
         elif fault == "400":
-            send(handler, 400, json.dumps({"message": "Query coordinator error: query.soql.no-such-column"}))
+            send(
+                handler,
+                400,
+                json.dumps({"message": "Query coordinator error: query.soql.no-such-column"}),
+            )
         elif fault == "a log-in page":
             send(handler, 200, "<!DOCTYPE html>\n<title>Please log in</title>\n")
         elif fault == "a broken connection":
@@ -101,7 +119,9 @@ class Soda:
 
 def where(soql: str) -> Callable[[Row], bool]:
     """Understands the little of SoQL that is used."""
-    found = re.fullmatch(r"location='([\w-]+)'(?: AND global_time >= (\d+) AND global_time <= (\d+))?", soql)
+    found = re.fullmatch(
+        r"location='([\w-]+)'(?: AND global_time >= (\d+) AND global_time <= (\d+))?", soql
+    )
     assert found, soql
     place, first, last = found[1], int(found[2] or 0), int(found[3] or 10**15)
     return lambda row: row["Location"] == place and first <= int(row["Global_Time"]) <= last
@@ -109,7 +129,9 @@ def where(soql: str) -> Callable[[Row], bool]:
 
 def send(handler: BaseHTTPRequestHandler, status: int, text: str, **headers: str) -> None:
     handler.send_response(status)
-    for name, value in ({"Content-Type": "text/csv", "Content-Length": str(len(text))} | headers).items():
+    for name, value in (
+        {"Content-Type": "text/csv", "Content-Length": str(len(text))} | headers
+    ).items():
         handler.send_header(name, value)
     handler.end_headers()
     handler.wfile.write(text.encode())
@@ -143,7 +165,11 @@ def fetch(soda: Soda, tmp_path: Path) -> Callable[..., Path]:
     """Fetches in small pages, without waiting."""
 
     def run(recording: str = "0400", **options: Any) -> Path:
-        return fetch_ngsim_i80(tmp_path / "data", recording, **({"url": soda.url, "page_rows": 25, "wait_s": 0.0} | options))
+        return fetch_ngsim_i80(
+            tmp_path / "data",
+            recording,
+            **({"url": soda.url, "page_rows": 25, "wait_s": 0.0} | options),
+        )
 
     return run
 
@@ -157,12 +183,17 @@ def names_in(folder: Path) -> list[str]:
     return sorted(one.name for one in folder.iterdir())
 
 
-def test_the_command_downloads_a_file_that_jobs_read_as_it_is(soda: Soda, tmp_path: Path, monkeypatch, capsys) -> None:
+def test_the_command_downloads_a_file_that_jobs_read_as_it_is(
+    soda: Soda, tmp_path: Path, monkeypatch, capsys
+) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SOCRATA_APP_TOKEN", "a token")
     assert cli.main(["data", "fetch", "ngsim-i80", "--url", soda.url]) == 0
     said = capsys.readouterr()
-    assert said.out.splitlines()[-1] == "Use it: python -m cfx data=ngsim data.path=data/ngsim-i80-0400.csv"
+    assert (
+        said.out.splitlines()[-1]
+        == "Use it: python -m cfx data=ngsim data.path=data/ngsim-i80-0400.csv"
+    )
     assert "60 rows in 1 page" in said.out
     assert said.err == ""
     assert set(soda.tokens) == {"a token"}
@@ -172,7 +203,9 @@ def test_the_command_downloads_a_file_that_jobs_read_as_it_is(soda: Soda, tmp_pa
     assert "Use it: data=ngsim data.path=data/ngsim-i80-0400.csv" in capsys.readouterr().out
 
 
-def test_pages_are_joined_in_order_and_whole(soda: Soda, fetch: Callable[..., Path], tmp_path: Path) -> None:
+def test_pages_are_joined_in_order_and_whole(
+    soda: Soda, fetch: Callable[..., Path], tmp_path: Path
+) -> None:
     path = fetch()
     assert rows_in(path) == [row for row in soda.rows if row["Location"] == "i-80"][:60]
     assert path.read_text().splitlines()[0] == ",".join(COLUMNS)
@@ -181,7 +214,9 @@ def test_pages_are_joined_in_order_and_whole(soda: Soda, fetch: Callable[..., Pa
     assert names_in(tmp_path / "data") == ["ngsim-i80-0400.csv"]
 
 
-def test_recordings_that_overlap_in_time_are_told_apart(soda: Soda, fetch: Callable[..., Path]) -> None:
+def test_recordings_that_overlap_in_time_are_told_apart(
+    soda: Soda, fetch: Callable[..., Path]
+) -> None:
     rows = [row for row in soda.rows if row["Location"] == "i-80"]
     assert rows_in(fetch("0500")) == rows[60:100]
     assert rows_in(fetch("0515")) == rows[100:]
@@ -189,14 +224,20 @@ def test_recordings_that_overlap_in_time_are_told_apart(soda: Soda, fetch: Calla
     assert read_ngsim(fetch("all")).recordings == ("i-80-1", "i-80-2", "i-80-3")
 
 
-def test_a_recording_that_would_be_cut_is_refused(soda: Soda, fetch: Callable[..., Path], tmp_path: Path) -> None:
+def test_a_recording_that_would_be_cut_is_refused(
+    soda: Soda, fetch: Callable[..., Path], tmp_path: Path
+) -> None:
     soda.rows += vehicle(3, 0, range(300, 16_000), "0400", 0)
-    with pytest.raises(DataError, match="recording 0400 is longer than known and would be cut; use --recording all"):
+    with pytest.raises(
+        DataError, match="recording 0400 is longer than known and would be cut; use --recording all"
+    ):
         fetch(page_rows=10_000)
     assert "ngsim-i80-0400.csv" not in names_in(tmp_path / "data")
 
 
-def test_a_busy_service_and_a_broken_connection_are_asked_again(soda: Soda, fetch: Callable[..., Path]) -> None:
+def test_a_busy_service_and_a_broken_connection_are_asked_again(
+    soda: Soda, fetch: Callable[..., Path]
+) -> None:
     soda.faults = ["429", "503", "202", None, "a broken connection", None, "a row too few"]
     assert len(rows_in(fetch())) == 60
     assert soda.pages == [0, 0, 0, 0, 25, 25, 50, 50]
@@ -225,7 +266,9 @@ def test_a_download_that_is_broken_off_goes_on_where_it_was(
     assert soda.pages == [25, 50]
 
 
-def test_a_page_that_was_damaged_meanwhile_is_fetched_again(soda: Soda, fetch: Callable[..., Path], tmp_path: Path) -> None:
+def test_a_page_that_was_damaged_meanwhile_is_fetched_again(
+    soda: Soda, fetch: Callable[..., Path], tmp_path: Path
+) -> None:
     soda.faults = [None, None, "400"]
     with pytest.raises(DataError):
         fetch()
@@ -240,7 +283,10 @@ def test_data_that_changes_during_the_download_is_refused_and_fetched_anew(
     soda: Soda, fetch: Callable[..., Path], tmp_path: Path
 ) -> None:
     soda.counts = [60, 90]
-    with pytest.raises(DataError, match="had 60 rows when the download began and has 90 now; run the same command again"):
+    with pytest.raises(
+        DataError,
+        match="had 60 rows when the download began and has 90 now; run the same command again",
+    ):
         fetch()
     assert names_in(tmp_path / "data") == ["ngsim-i80-0400.pages"]
     soda.rows[60:60] = vehicle(3, 2, range(10, 40), "0400", 0)
@@ -249,7 +295,9 @@ def test_data_that_changes_during_the_download_is_refused_and_fetched_anew(
     assert soda.pages == [0, 25, 50, 75]
 
 
-def test_a_finished_file_is_replaced_only_when_told(soda: Soda, fetch: Callable[..., Path], tmp_path: Path) -> None:
+def test_a_finished_file_is_replaced_only_when_told(
+    soda: Soda, fetch: Callable[..., Path], tmp_path: Path
+) -> None:
     path = tmp_path / "data" / "ngsim-i80-0400.csv"
     path.parent.mkdir()
     path.write_text("mine")
@@ -262,17 +310,22 @@ def test_a_finished_file_is_replaced_only_when_told(soda: Soda, fetch: Callable[
     assert len(rows_in(fetch(force=True))) == 60
 
 
-def test_without_a_connection_one_sentence_says_what_to_do(tmp_path: Path, monkeypatch, capsys) -> None:
+def test_without_a_connection_one_sentence_says_what_to_do(
+    tmp_path: Path, monkeypatch, capsys
+) -> None:
     monkeypatch.chdir(tmp_path)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    with socket.socket() as smoke_check:
+        smoke_check.bind(("127.0.0.1", 0))
+        port = smoke_check.getsockname()[1]
     assert cli.main(["data", "fetch", "ngsim-i80", "--url", f"http://127.0.0.1:{port}/x.csv"]) == 2
     said = capsys.readouterr()
     assert said.out == ""
     (line,) = said.err.splitlines()
     assert line.startswith(f"127.0.0.1:{port} cannot be reached: ")
-    assert "download https://data.transportation.gov/api/views/8ect-6jqj/rows.csv?accessType=DOWNLOAD by hand" in line
+    assert (
+        "download https://data.transportation.gov/api/views/8ect-6jqj/rows.csv?accessType=DOWNLOAD by hand"
+        in line
+    )
     assert "data=ngsim data.path=FILE" in line
     assert names_in(tmp_path) == []
 
@@ -284,7 +337,9 @@ def test_without_a_connection_one_sentence_says_what_to_do(tmp_path: Path, monke
         ({"url": "8ect-6jqj"}, ConfigError, "--url 8ect-6jqj is no address"),
     ],
 )
-def test_wrong_options_say_so(fetch: Callable[..., Path], options: dict[str, str], error: type[CfxError], message: str) -> None:
+def test_wrong_options_say_so(
+    fetch: Callable[..., Path], options: dict[str, str], error: type[CfxError], message: str
+) -> None:
     with pytest.raises(error, match=message):
         fetch(**options)
 
@@ -300,7 +355,9 @@ def test_a_service_without_the_recording_and_a_folder_that_is_a_file_say_so(
         fetch()
 
 
-def test_real_rows_come_through_unchanged(soda: Soda, fetch: Callable[..., Path], shared_data: Path) -> None:
+def test_real_rows_come_through_unchanged(
+    soda: Soda, fetch: Callable[..., Path], shared_data: Path
+) -> None:
     sample = shared_data / "i80_0400_raw_sample.csv.gz"
     with gzip.open(sample, "rt", newline="") as file:
         soda.rows = [row | {"Location": "i-80"} for row in csv.DictReader(file)]

@@ -31,14 +31,37 @@ COLUMNS = [
         "v_Length",
         "v_Width",
     ),
-    *("v_Class", "v_Vel", "v_Acc", "Lane_ID", "Preceding", "Following", "Space_Headway", "Time_Headway"),
+    *(
+        "v_Class",
+        "v_Vel",
+        "v_Acc",
+        "Lane_ID",
+        "Preceding",
+        "Following",
+        "Space_Headway",
+        "Time_Headway",
+    ),
 ]
-ARTERIAL = [*COLUMNS[:14], "O_Zone", "D_Zone", "Int_ID", "Section_ID", "Direction", "Movement", *COLUMNS[14:]]
+ARTERIAL = [
+    *COLUMNS[:14],
+    "O_Zone",
+    "D_Zone",
+    "Int_ID",
+    "Section_ID",
+    "Direction",
+    "Movement",
+    *COLUMNS[14:],
+]
 CLOCK = 1_113_433_136_300
 
 
 def vehicle(
-    number: int, leader: int, at: float, frames: range = range(10, 60), lane: int = 2, clock: int = CLOCK
+    number: int,
+    leader: int,
+    at: float,
+    frames: range = range(10, 60),
+    lane: int = 2,
+    clock: int = CLOCK,
 ) -> pd.DataFrame:
     """A vehicle at a steady 30 ft/s; `at` is its position at frame 0, ft."""
     k = np.array(frames)
@@ -49,20 +72,35 @@ def vehicle(
         "Global_Time": clock + 100 * k,
         "Local_Y": at + 3.0 * k,
     }
-    values |= {"v_Length": 15.0, "v_Width": 6.0, "v_Class": 2, "v_Vel": 30.0, "v_Acc": 0.5, "Lane_ID": lane, "Preceding": leader}
+    values |= {
+        "v_Length": 15.0,
+        "v_Width": 6.0,
+        "v_Class": 2,
+        "v_Vel": 30.0,
+        "v_Acc": 0.5,
+        "Lane_ID": lane,
+        "Preceding": leader,
+    }
     return pd.DataFrame({name: values.get(name, 0.0) for name in COLUMNS}, index=k)
 
 
 def traffic(clock: int = CLOCK) -> pd.DataFrame:
     """Vehicle 2 behind 1, and 3 behind 2."""
-    rows = [vehicle(1, 0, 200.0, clock=clock), vehicle(2, 1, 120.0, clock=clock), vehicle(3, 2, 60.0, clock=clock)]
+    rows = [
+        vehicle(1, 0, 200.0, clock=clock),
+        vehicle(2, 1, 120.0, clock=clock),
+        vehicle(3, 2, 60.0, clock=clock),
+    ]
     return pd.concat(rows, ignore_index=True)
 
 
 def save(rows: pd.DataFrame, path: Path, layout: str = "csv") -> Path:
     if layout == "text":
         lines = [
-            " ".join(f"{value:>12g}" if name != "Global_Time" else f"{value:>14.0f}" for name, value in row.items())
+            " ".join(
+                f"{value:>12g}" if name != "Global_Time" else f"{value:>14.0f}"
+                for name, value in row.items()
+            )
             for _, row in rows.iterrows()
         ]
         path.write_text("  " + "\n".join(lines) + " \n")
@@ -92,9 +130,17 @@ def test_feet_become_metres(rows: pd.DataFrame, tmp_path: Path, layout: str) -> 
     first, second = read_ngsim(save(rows, tmp_path / "site.any", layout)).pairs()
     assert (first.pair_id, first.follower_id, first.leader_id) == ("site-2-1", "2", "1")
     assert second.pair_id == "site-3-2"
-    assert (first.first_frame, len(first), first.dt, first.lane, first.recording) == (10, 50, 0.1, 2, "site")
+    assert (first.first_frame, len(first), first.dt, first.lane, first.recording) == (
+        10,
+        50,
+        0.1,
+        2,
+        "site",
+    )
     np.testing.assert_allclose(first.gap, (80 - 15) * 0.3048, rtol=1e-12)
-    np.testing.assert_allclose(first.follower_position, (120 + 3 * np.arange(10, 60)) * 0.3048, rtol=1e-12)
+    np.testing.assert_allclose(
+        first.follower_position, (120 + 3 * np.arange(10, 60)) * 0.3048, rtol=1e-12
+    )
     np.testing.assert_allclose(first.leader_speed, 30 * 0.3048)
     np.testing.assert_allclose(first.follower_acceleration, 0.5 * 0.3048)
     assert first.leader_length == pytest.approx(15 * 0.3048)
@@ -107,7 +153,9 @@ def test_all_ways_of_writing_give_the_same_pairs(rows: pd.DataFrame, tmp_path: P
     (tmp_path / "f.txt.gz").write_bytes(gzip.compress((tmp_path / "f.txt").read_bytes()))
     assert found(tmp_path / "f.txt.gz") == wanted
     assert found(save(rows.sample(frac=1, random_state=0), tmp_path / "f.csv")) == wanted
-    (tmp_path / "f.txt").write_bytes((tmp_path / "f.txt").read_bytes().replace(b"\n", b"\r\n").replace(b"  ", b"\t"))
+    (tmp_path / "f.txt").write_bytes(
+        (tmp_path / "f.txt").read_bytes().replace(b"\n", b"\r\n").replace(b"  ", b"\t")
+    )
     assert found(tmp_path / "f.txt") == wanted
     headless = rows.to_csv(index=False, header=False)
     (tmp_path / "f.csv").write_text(headless)
@@ -123,7 +171,9 @@ def test_all_ways_of_writing_give_the_same_pairs(rows: pd.DataFrame, tmp_path: P
 
 
 def test_arterial_text_has_six_columns_more(rows: pd.DataFrame, tmp_path: Path) -> None:
-    assert found(save(rows.reindex(columns=ARTERIAL, fill_value=7), tmp_path / "f.txt", "text")) == [
+    assert found(
+        save(rows.reindex(columns=ARTERIAL, fill_value=7), tmp_path / "f.txt", "text")
+    ) == [
         ("f-2-1", 10, 50),
         ("f-3-2", 10, 50),
     ]
@@ -154,10 +204,21 @@ def test_recordings_are_told_apart_by_place_and_clock(tmp_path: Path) -> None:
     path = save(pd.concat(parts).sample(frac=1, random_state=2), tmp_path / "all.csv")
     pairs = read_ngsim(path).pairs()
     assert [pair.pair_id for pair in pairs] == [
-        *("i-80-1-2-1", "i-80-1-3-2", "i-80-2-2-1", "i-80-2-3-2", "i-80-3-2-1", "i-80-3-3-2", "us-101-2-1", "us-101-3-2"),
+        *(
+            "i-80-1-2-1",
+            "i-80-1-3-2",
+            "i-80-2-2-1",
+            "i-80-2-3-2",
+            "i-80-3-2-1",
+            "i-80-3-3-2",
+            "us-101-2-1",
+            "us-101-3-2",
+        ),
     ]
     assert {len(pair) for pair in pairs} == {50}
-    assert len({pair.driver for pair in pairs}) == 8, "vehicle 2 of one recording is not vehicle 2 of another"
+    assert len({pair.driver for pair in pairs}) == 8, (
+        "vehicle 2 of one recording is not vehicle 2 of another"
+    )
     chosen = NgsimDataset(path=path, location="US-101", min_frames=2).load()
     assert [pair.pair_id for pair in chosen] == ["us-101-2-1", "us-101-3-2"]
     assert counts(chosen)["other locations than 'US-101'"] == 450
@@ -170,14 +231,24 @@ def test_recordings_that_overlap_in_time_are_told_apart(tmp_path: Path) -> None:
     """The second recording's clock starts two minutes after the first's, while that still runs."""
     long = pd.concat([vehicle(1, 0, 200.0, range(2000)), vehicle(2, 1, 120.0, range(2000))])
     late = pd.concat(
-        [vehicle(1, 0, 200.0, range(2000), clock=CLOCK + 120_000), vehicle(2, 1, 120.0, range(2000), clock=CLOCK + 120_000)]
+        [
+            vehicle(1, 0, 200.0, range(2000), clock=CLOCK + 120_000),
+            vehicle(2, 1, 120.0, range(2000), clock=CLOCK + 120_000),
+        ]
     )
-    assert found(save(pd.concat([long, late]), tmp_path / "f.csv")) == [("f-1-2-1", 0, 2000), ("f-2-2-1", 0, 2000)]
+    assert found(save(pd.concat([long, late]), tmp_path / "f.csv")) == [
+        ("f-1-2-1", 0, 2000),
+        ("f-2-2-1", 0, 2000),
+    ]
 
 
 @pytest.mark.parametrize("clock", ["none", "rounded"])
-def test_without_a_usable_clock_there_is_one_recording(rows: pd.DataFrame, tmp_path: Path, clock: str) -> None:
-    rows = rows.drop(columns="Global_Time") if clock == "none" else rows.assign(Global_Time=1.11343e12)
+def test_without_a_usable_clock_there_is_one_recording(
+    rows: pd.DataFrame, tmp_path: Path, clock: str
+) -> None:
+    rows = (
+        rows.drop(columns="Global_Time") if clock == "none" else rows.assign(Global_Time=1.11343e12)
+    )
     assert len(found(save(rows, tmp_path / "f.csv"))) == 2
     with pytest.raises(DataError, match="give it Global_Time in milliseconds"):
         found(save(pd.concat([rows, rows.assign(Local_Y=rows["Local_Y"] + 9)]), tmp_path / "f.csv"))
@@ -194,7 +265,11 @@ def reference(rows: pd.DataFrame) -> dict[tuple[int, int, int], int]:
     first = 0
     for r in sorted(rows.itertuples(), key=lambda r: (r.Vehicle_ID, r.Frame_ID)):
         leader = at.get((r.Preceding, r.Frame_ID)) if r.Preceding else None
-        if leader is None or leader.Lane_ID != r.Lane_ID or leader.Local_Y - leader.v_Length <= r.Local_Y:
+        if (
+            leader is None
+            or leader.Lane_ID != r.Lane_ID
+            or leader.Local_Y - leader.v_Length <= r.Local_Y
+        ):
             before = ()
             continue
         if before != (r.Vehicle_ID, r.Preceding, r.Lane_ID, r.Frame_ID - 1):
@@ -206,21 +281,29 @@ def reference(rows: pd.DataFrame) -> dict[tuple[int, int, int], int]:
 
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 10**6))
-def test_pairs_are_those_of_the_definition(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
+def test_pairs_are_those_of_the_definition(
+    tmp_path_factory: pytest.TempPathFactory, seed: int
+) -> None:
     rng = np.random.default_rng(seed)
     parts = []
     for number in range(1, 6):
         rows = vehicle(number, number - 1, 400.0 - 60 * number, range(40))
-        rows["Preceding"] = np.where(rng.random(40) < 0.1, rng.integers(0, 7, 40), rows["Preceding"])
+        rows["Preceding"] = np.where(
+            rng.random(40) < 0.1, rng.integers(0, 7, 40), rows["Preceding"]
+        )
         rows["Lane_ID"] = np.where(np.arange(40) >= rng.integers(20, 60), 3, 2)
         rows["Local_Y"] += rng.choice([0, 70], 40, p=[0.97, 0.03])
         parts.append(rows[rng.random(40) > 0.05])
     rows = pd.concat(parts, ignore_index=True)
     path = save(rows.sample(frac=1, random_state=seed), tmp_path_factory.mktemp("ngsim") / "f.csv")
     pairs = read_ngsim(path).pairs()
-    assert {(int(p.follower_id), int(p.leader_id), p.first_frame): len(p) for p in pairs} == reference(rows)
+    assert {
+        (int(p.follower_id), int(p.leader_id), p.first_frame): len(p) for p in pairs
+    } == reference(rows)
     rows_in_pairs = sum(len(pair) for pair in pairs)
-    assert rows_in_pairs + sum(d.count for d in pairs.dropped if d.unit == "rows") == len(rows), "every row is used or counted"
+    assert rows_in_pairs + sum(d.count for d in pairs.dropped if d.unit == "rows") == len(rows), (
+        "every row is used or counted"
+    )
 
 
 def test_everything_left_out_is_counted_with_its_reason(tmp_path: Path) -> None:
@@ -240,22 +323,40 @@ def test_everything_left_out_is_counted_with_its_reason(tmp_path: Path) -> None:
         "a single frame makes no pair": 1,
     }
     assert [(pair.pair_id, pair.first_frame, len(pair)) for pair in pairs] == [
-        *(("f-2-1", 10, 10), ("f-2-1-run2", 21, 19), ("f-2-1-run3", 41, 19), ("f-3-2", 10, 20), ("f-3-2-run2", 32, 28)),
+        *(
+            ("f-2-1", 10, 10),
+            ("f-2-1-run2", 21, 19),
+            ("f-2-1-run3", 41, 19),
+            ("f-3-2", 10, 20),
+            ("f-3-2-run2", 32, 28),
+        ),
     ]
 
 
 def test_both_ends_of_every_vehicle_are_left_out_if_wanted(tmp_path: Path) -> None:
-    rows = pd.concat([traffic(), vehicle(4, 3, 0.0, range(10, 25))], ignore_index=True)  # the last one is too short to be left
+    rows = pd.concat(
+        [traffic(), vehicle(4, 3, 0.0, range(10, 25))], ignore_index=True
+    )  # the last one is too short to be left
     path = save(rows, tmp_path / "f.csv")
     whole, pairs = (NgsimDataset(path=path, min_frames=2, trim=trim).load() for trim in (0.0, 1.0))
-    assert [(pair.pair_id, pair.first_frame, len(pair)) for pair in pairs] == [("f-2-1", 20, 30), ("f-3-2", 20, 30)]
+    assert [(pair.pair_id, pair.first_frame, len(pair)) for pair in pairs] == [
+        ("f-2-1", 20, 30),
+        ("f-3-2", 20, 30),
+    ]
     np.testing.assert_array_equal(pairs[0].follower_position, whole[0].follower_position[10:40])
     assert counts(pairs)["within 1 s of their vehicle's first or last row"] == 3 * 20 + 15
-    assert sum(map(len, pairs)) + sum(d.count for d in pairs.dropped if d.unit == "rows") == len(rows)
+    assert sum(map(len, pairs)) + sum(d.count for d in pairs.dropped if d.unit == "rows") == len(
+        rows
+    )
 
 
-def test_bent_ends_are_said_until_they_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    rows = pd.concat([vehicle(1, 0, 200.0, range(10, 200)), vehicle(2, 1, 120.0, range(10, 200))], ignore_index=True)
+def test_bent_ends_are_said_until_they_are_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    rows = pd.concat(
+        [vehicle(1, 0, 200.0, range(10, 200)), vehicle(2, 1, 120.0, range(10, 200))],
+        ignore_index=True,
+    )
     straight = save(rows, tmp_path / "straight.csv")
     rows.loc[rows.Frame_ID < 40, "v_Acc"] = 4.5
     bent = save(rows, tmp_path / "bent.csv")
@@ -293,11 +394,21 @@ def test_raw_speeds_are_bent_for_three_seconds(shared_data: Path) -> None:
 
 
 def test_raw_pairs_agree_with_their_reconstruction(raw: PairSet, shared_data: Path) -> None:
-    reconstructed = TidyDataset(path=shared_data / "i80_reconstructed_pairs.parquet", recording="i80-0400", min_frames=2).load()
+    reconstructed = TidyDataset(
+        path=shared_data / "i80_reconstructed_pairs.parquet", recording="i80-0400", min_frames=2
+    ).load()
     by_ids = {(pair.follower_id, pair.leader_id): pair for pair in reconstructed}
-    both = [(pair, by_ids[pair.follower_id, pair.leader_id]) for pair in raw if (pair.follower_id, pair.leader_id) in by_ids]
+    both = [
+        (pair, by_ids[pair.follower_id, pair.leader_id])
+        for pair in raw
+        if (pair.follower_id, pair.leader_id) in by_ids
+    ]
     assert len(both) == 10
-    errors: dict[str, list[np.ndarray]] = {"follower_position": [], "leader_position": [], "follower_speed": []}
+    errors: dict[str, list[np.ndarray]] = {
+        "follower_position": [],
+        "leader_position": [],
+        "follower_speed": [],
+    }
     for one, other in both:
         assert one.leader_length == pytest.approx(other.leader_length, abs=1e-9)
         first = max(one.first_frame, other.first_frame)
@@ -307,7 +418,9 @@ def test_raw_pairs_agree_with_their_reconstruction(raw: PairSet, shared_data: Pa
             a = getattr(one, name)[first - one.first_frame : last - one.first_frame]
             b = getattr(other, name)[first - other.first_frame : last - other.first_frame]
             found.append(a - b)
-    median = {name: float(np.median(np.abs(np.concatenate(found)))) for name, found in errors.items()}
+    median = {
+        name: float(np.median(np.abs(np.concatenate(found)))) for name, found in errors.items()
+    }
     assert median["follower_position"] < 0.6
     assert median["leader_position"] < 0.6
     assert median["follower_speed"] < 0.3
@@ -329,8 +442,14 @@ def put(column: str, value: object, row: int = 3) -> Change:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda r: r.rename(columns={"v_Vel": "v_Speed"}), ["column v_Vel is missing", "Columns found"]),
-        (lambda r: r.rename(columns={"Preceding": "Precedes"}), ["Preceding is missing", "Did you mean 'Precedes'?"]),
+        (
+            lambda r: r.rename(columns={"v_Vel": "v_Speed"}),
+            ["column v_Vel is missing", "Columns found"],
+        ),
+        (
+            lambda r: r.rename(columns={"Preceding": "Precedes"}),
+            ["Preceding is missing", "Did you mean 'Precedes'?"],
+        ),
         (lambda r: r.iloc[:0], ["no rows"]),
         (put("v_Vel", "fast"), ["row 5", "column v_Vel", "'fast' is not a number"]),
         (put("v_Vel", np.nan), ["row 5", "column v_Vel", "empty or NaN", "1 such"]),
@@ -345,11 +464,19 @@ def put(column: str, value: object, row: int = 3) -> Change:
         ),
         (lambda r: r.assign(v_Vel=r["v_Vel"] * 0.3048), ["Local_Y and v_Vel", "3.28 times"]),
         (lambda r: r.assign(v_Vel=r["v_Vel"] / 1.4667), ["1.47 times"]),
-        (lambda r: r.assign(Location=["x"] * 3 + [""] + ["x"] * 146), ["row 5", "Location", "empty"]),
-        (lambda r: r.rename(columns={"Vehicle_ID": "pair_id"}), ["Vehicle_ID is missing", "use data=tidy"]),
+        (
+            lambda r: r.assign(Location=["x"] * 3 + [""] + ["x"] * 146),
+            ["row 5", "Location", "empty"],
+        ),
+        (
+            lambda r: r.rename(columns={"Vehicle_ID": "pair_id"}),
+            ["Vehicle_ID is missing", "use data=tidy"],
+        ),
     ],
 )
-def test_refuses_what_no_recording_can_hold(rows: pd.DataFrame, tmp_path: Path, change: Change, said: list[str]) -> None:
+def test_refuses_what_no_recording_can_hold(
+    rows: pd.DataFrame, tmp_path: Path, change: Change, said: list[str]
+) -> None:
     changed = change(rows)
     with pytest.raises(DataError) as error:
         read_ngsim(save(rows if changed is None else changed, tmp_path / "f.csv"))
@@ -381,10 +508,22 @@ def test_files_that_cannot_be_read(rows: pd.DataFrame, tmp_path: Path) -> None:
     says(file("narrow.txt", narrow), "has 17 columns; NGSIM's files without a header have 18")
     ragged = b"\n".join([*lines[:5], lines[5] + b" 1 2", *lines[6:]])
     says(file("ragged.txt", ragged), "row 6: 20 columns instead of 18")
-    says(file("cut.txt", text[: text.rfind(b" 30 ")]), r"row \d+: \d+ columns instead of 18; is the file cut off")
-    says(file("word.txt", text.replace(b" 30 ", b" -- ", 1)), "row 1, column v_Vel: '--' is not a number")
-    says(file("semicolons.csv", rows.to_csv(index=False, sep=";").encode()), "separated by semicolons")
-    says(file("headless.csv", rows.to_csv(index=False, sep=";", header=False).encode()), "separated by semicolons")
+    says(
+        file("cut.txt", text[: text.rfind(b" 30 ")]),
+        r"row \d+: \d+ columns instead of 18; is the file cut off",
+    )
+    says(
+        file("word.txt", text.replace(b" 30 ", b" -- ", 1)),
+        "row 1, column v_Vel: '--' is not a number",
+    )
+    says(
+        file("semicolons.csv", rows.to_csv(index=False, sep=";").encode()),
+        "separated by semicolons",
+    )
+    says(
+        file("headless.csv", rows.to_csv(index=False, sep=";", header=False).encode()),
+        "separated by semicolons",
+    )
     packed = gzip.compress(text)
     says(file("cut.txt.gz", packed[: len(packed) // 2]), "gzip file is cut off")
     rows.to_parquet(tmp_path / "f.parquet")

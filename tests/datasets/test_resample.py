@@ -21,7 +21,11 @@ def swinging(frames: int, dt: float, name: str = "a") -> Pair:
     time, turn = np.arange(frames) * dt, 2 * np.pi / 12
 
     def drive(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return 10 * t - 2 / turn * np.cos(turn * t), 10 + 2 * np.sin(turn * t), 2 * turn * np.cos(turn * t)
+        return (
+            10 * t - 2 / turn * np.cos(turn * t),
+            10 + 2 * np.sin(turn * t),
+            2 * turn * np.cos(turn * t),
+        )
 
     leader, follower = drive(time), drive(time - 1.2)
     return Pair(name, "r", "1", name, 0, dt, 5.0, leader[0] + 8, *leader[1:], *follower, lane=3)
@@ -31,7 +35,9 @@ def of(*pairs: Pair) -> PairSet:
     return PairSet(pairs, "made up")
 
 
-@pytest.mark.parametrize(("recorded", "wanted"), [(0.04, 0.1), (0.1, 0.04), (0.1, 0.2), (1 / 30, 0.1), (0.12, 0.1)])
+@pytest.mark.parametrize(
+    ("recorded", "wanted"), [(0.04, 0.1), (0.1, 0.04), (0.1, 0.2), (1 / 30, 0.1), (0.12, 0.1)]
+)
 def test_drives_stay_what_they_are(recorded: float, wanted: float) -> None:
     (pair,) = resampled(of(swinging(1000, recorded)), wanted)
     expected = swinging(len(pair), wanted)
@@ -39,7 +45,11 @@ def test_drives_stay_what_they_are(recorded: float, wanted: float) -> None:
     assert (len(pair) - 1) * wanted == pytest.approx(999 * recorded, abs=wanted)
     for name in SIGNALS:
         # A monotone cubic flattens a peak: by half its curvature times the square of half a step at most, and little elsewhere.
-        np.testing.assert_allclose(getattr(pair, name), getattr(expected, name), atol=2 * (2 * np.pi / 12) ** 2 * recorded**2 / 8)
+        np.testing.assert_allclose(
+            getattr(pair, name),
+            getattr(expected, name),
+            atol=2 * (2 * np.pi / 12) ** 2 * recorded**2 / 8,
+        )
     assert (pair.driver, pair.lane, pair.leader_length) == ("r/a", 3, 5.0)
 
 
@@ -62,11 +72,15 @@ def test_pairs_that_have_the_step_are_left_alone() -> None:
     recorded=st.floats(0.02, 0.5),
     wanted=st.floats(0.02, 0.5),
 )
-def test_nobody_reverses_or_is_faster_than_recorded(speeds: list[float], recorded: float, wanted: float) -> None:
+def test_nobody_reverses_or_is_faster_than_recorded(
+    speeds: list[float], recorded: float, wanted: float
+) -> None:
     speed = np.array(speeds)
     position = np.concatenate([[0.0], np.cumsum(speed[1:] * recorded)])
     zero = np.zeros(len(speed))
-    pair = Pair("a", "r", "1", "2", 0, recorded, 5.0, position + 30, speed, zero, position, speed, zero)
+    pair = Pair(
+        "a", "r", "1", "2", 0, recorded, 5.0, position + 30, speed, zero, position, speed, zero
+    )
     for one in resampled(of(pair), wanted):
         assert one.follower_speed.min() >= speed.min() - 1e-9
         assert one.follower_speed.max() <= speed.max() + 1e-9
@@ -75,7 +89,11 @@ def test_nobody_reverses_or_is_faster_than_recorded(speeds: list[float], recorde
 
 
 def test_true_parameters_are_those_of_the_last_frame_before() -> None:
-    pair = replace(swinging(6, 0.1), truth={"t_r": np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])}, truth_model="krauss")
+    pair = replace(
+        swinging(6, 0.1),
+        truth={"t_r": np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])},
+        truth_model="krauss",
+    )
     (fine,) = resampled(of(pair), 0.05)
     assert fine.truth["t_r"].tolist() == [1.0] * 6 + [2.0] * 5
     (coarse,) = resampled(of(pair), 0.2)

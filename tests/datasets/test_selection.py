@@ -18,11 +18,31 @@ from cfx.pairs import Dropped, Pair, PairSet
 def a_pair(name: str, frames: int, recording: str = "r", lane: int | None = None) -> Pair:
     drive = np.arange(frames) * 1.0
     same = np.full(frames, 10.0)
-    return Pair(name, recording, "1", name, 0, 0.1, 5.0, drive + 30, same, 0 * same, drive, same, 0 * same, lane=lane)
+    return Pair(
+        name,
+        recording,
+        "1",
+        name,
+        0,
+        0.1,
+        5.0,
+        drive + 30,
+        same,
+        0 * same,
+        drive,
+        same,
+        0 * same,
+        lane=lane,
+    )
 
 
 PAIRS = PairSet(
-    (a_pair("a", 10), a_pair("b", 30, lane=2), a_pair("c", 40, lane=3), a_pair("d", 50, "other", lane=3)),
+    (
+        a_pair("a", 10),
+        a_pair("b", 30, lane=2),
+        a_pair("c", 40, lane=3),
+        a_pair("d", 50, "other", lane=3),
+    ),
     "made up",
     (Dropped("of no use", 7, "rows"),),
 )
@@ -72,12 +92,24 @@ def test_every_pair_is_kept_or_counted() -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"min_frames": 60}, "none of its 4 pairs has at least 60 frames, the longest has 50; lower data.min_frames"),
-        ({"min_frames": 30, "max_pairs": 5}, "asked for 5 pairs but only 3 have at least 30 frames; lower data.max_pairs"),
-        ({"min_frames": 2, "recording": "othr"}, "no such recording. Did you mean 'other'? Known: r, other."),
+        (
+            {"min_frames": 60},
+            "none of its 4 pairs has at least 60 frames, the longest has 50; lower data.min_frames",
+        ),
+        (
+            {"min_frames": 30, "max_pairs": 5},
+            "asked for 5 pairs but only 3 have at least 30 frames; lower data.max_pairs",
+        ),
+        (
+            {"min_frames": 2, "recording": "othr"},
+            "no such recording. Did you mean 'other'? Known: r, other.",
+        ),
         ({"min_frames": 2, "lanes": [9]}, "pairs in lanes 2, 3 only"),
         ({"min_frames": 2, "lanes": []}, "pairs in lanes 2, 3 only"),
-        ({"min_frames": 2, "pair_ids": ["bb"]}, "there is no pair 'bb'. Did you mean 'b'? Known: a, b, c, d."),
+        (
+            {"min_frames": 2, "pair_ids": ["bb"]},
+            "there is no pair 'bb'. Did you mean 'b'? Known: a, b, c, d.",
+        ),
         ({"min_frames": 2, "pair_ids": []}, "the list is empty. Known: a, b, c, d."),
     ],
 )
@@ -99,11 +131,16 @@ def test_no_pair_at_all_is_an_error_that_says_why() -> None:
     class Empty(Ready):
         pairs = PairSet((), "made up", (Dropped("no vehicle ahead", 7, "rows"),))
 
-    with pytest.raises(DataError, match=r"made up: no leader-follower pair found \(left out: 7 rows: no vehicle ahead\)"):
+    with pytest.raises(
+        DataError,
+        match=r"made up: no leader-follower pair found \(left out: 7 rows: no vehicle ahead\)",
+    ):
         Empty().load()
 
 
-@pytest.mark.parametrize("options", [{"min_frames": 1}, {"max_pairs": 0}, {"min_frames": float("nan")}, {"frames": 3}])
+@pytest.mark.parametrize(
+    "options", [{"min_frames": 1}, {"max_pairs": 0}, {"min_frames": float("nan")}, {"frames": 3}]
+)
 def test_refuses_settings_that_make_no_sense(options: dict[str, object]) -> None:
     with pytest.raises(ConfigError):
         Ready(**options)
@@ -115,7 +152,9 @@ def test_a_missing_path_is_said_in_plain_words(options: dict[str, object]) -> No
         TidyDataset(**options)
 
 
-def test_paths_know_home_and_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paths_know_home_and_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     assert FileDatasetSettings(path=Path("~/a.csv")).path == tmp_path / "a.csv"

@@ -24,12 +24,22 @@ def made(**options: object) -> PairSet:
 def driven_again(pair: Pair) -> Trajectory:
     model = MODELS[pair.truth_model]()
     hold = round(0.5 / pair.dt)
-    parameters = torch.tensor(np.stack([pair.truth[name][::hold] for name in model.space.names], -1))
+    parameters = torch.tensor(
+        np.stack([pair.truth[name][::hold] for name in model.space.names], -1)
+    )
     leader = Leader(
-        *(torch.tensor(x) for x in (pair.leader_position, pair.leader_speed, pair.leader_acceleration)),
+        *(
+            torch.tensor(x)
+            for x in (pair.leader_position, pair.leader_speed, pair.leader_acceleration)
+        ),
         torch.tensor(pair.leader_length, dtype=torch.float64),
     )
-    start = Start(*(torch.tensor(x[0]) for x in (pair.follower_position, pair.follower_speed, pair.follower_acceleration)))
+    start = Start(
+        *(
+            torch.tensor(x[0])
+            for x in (pair.follower_position, pair.follower_speed, pair.follower_acceleration)
+        )
+    )
     return simulate(model, parameters, leader, start, pair.dt, window=hold)
 
 
@@ -38,7 +48,9 @@ def driven_again(pair: Pair) -> Trajectory:
 def test_true_parameters_give_the_recorded_drive_again(model: str, dt: float) -> None:
     for pair in made(model=model, dt=dt):
         again = driven_again(pair)
-        np.testing.assert_allclose(again.position.numpy(), pair.follower_position, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(
+            again.position.numpy(), pair.follower_position, rtol=0, atol=1e-9
+        )
         np.testing.assert_allclose(again.speed.numpy(), pair.follower_speed, rtol=0, atol=1e-9)
 
 
@@ -46,7 +58,9 @@ def test_true_parameters_give_the_recorded_drive_again(model: str, dt: float) ->
 def test_positions_speeds_and_accelerations_belong_together(model: str) -> None:
     for pair in made(model=model):
         for who in ("leader", "follower"):
-            position, speed, acceleration = (getattr(pair, f"{who}_{name}") for name in ("position", "speed", "acceleration"))
+            position, speed, acceleration = (
+                getattr(pair, f"{who}_{name}") for name in ("position", "speed", "acceleration")
+            )
             np.testing.assert_allclose(np.diff(position), speed[1:] * pair.dt, atol=1e-9)
             np.testing.assert_allclose(np.diff(speed) / pair.dt, acceleration[1:], atol=1e-9)
 
@@ -72,12 +86,16 @@ def test_traffic_is_plausible(model: str, seed: int) -> None:
     assert speed.max() < 25
     assert np.abs(acceleration).max() < 5
     assert min(pair.gap.min() for pair in pairs) > 0
-    assert np.median([pair.follower_speed.std() for pair in pairs]) > 1.0, "stop and go, not a steady flow"
+    assert np.median([pair.follower_speed.std() for pair in pairs]) > 1.0, (
+        "stop and go, not a steady flow"
+    )
 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_the_most_diverse_drivers_do_not_collide(model: str) -> None:
-    pairs = made(model=model, seed=5, pairs=12, platoon_size=4, frames=400, heterogeneity=1.0, variation=1.0)
+    pairs = made(
+        model=model, seed=5, pairs=12, platoon_size=4, frames=400, heterogeneity=1.0, variation=1.0
+    )
     assert min(pair.gap.min() for pair in pairs) > 0
     assert max(np.abs(pair.follower_acceleration).max() for pair in pairs) < 9 + 1e-6
 
@@ -109,7 +127,9 @@ def test_true_parameters_vary_as_asked_and_stay_in_bounds(model: str) -> None:
             assert values.shape == (300,)
             assert values.min() >= space[name].low
             assert values.max() <= space[name].high
-            assert (np.diff(values).reshape(-1)[np.arange(299) % 5 != 4] == 0).all(), "held for half a second"
+            assert (np.diff(values).reshape(-1)[np.arange(299) % 5 != 4] == 0).all(), (
+                "held for half a second"
+            )
             assert values.std() > 0
     for pair in made(model=model, variation=0.0):
         assert all(np.ptp(values) == 0 for values in pair.truth.values())
@@ -127,9 +147,13 @@ def test_the_seed_decides() -> None:
 def test_noise_belongs_to_the_vehicle_and_leaves_the_truth_alone() -> None:
     clean, noisy = made(frames=600), made(frames=600, noise_position_m=0.2, noise_speed_mps=0.1)
     for one, other in zip(clean, noisy, strict=True):
-        assert (other.follower_position - one.follower_position).std() == pytest.approx(0.2, rel=0.15)
+        assert (other.follower_position - one.follower_position).std() == pytest.approx(
+            0.2, rel=0.15
+        )
         assert (other.follower_speed - one.follower_speed).std() == pytest.approx(0.1, rel=0.15)
-        np.testing.assert_allclose(np.diff(other.follower_speed) / 0.1, other.follower_acceleration[1:], atol=1e-9)
+        np.testing.assert_allclose(
+            np.diff(other.follower_speed) / 0.1, other.follower_acceleration[1:], atol=1e-9
+        )
         for name in one.truth:
             np.testing.assert_array_equal(one.truth[name], other.truth[name])
     np.testing.assert_array_equal(noisy[0].follower_position, noisy[1].leader_position)
@@ -143,7 +167,9 @@ def test_pairs_that_noise_turns_around_are_counted() -> None:
     assert "noise" in dropped.reason
 
 
-@pytest.mark.parametrize("options", [{"model": "idm"}, {"variation": 1.5}, {"pairs": 0}, {"dt": 0.0}, {"seed": -1}])
+@pytest.mark.parametrize(
+    "options", [{"model": "idm"}, {"variation": 1.5}, {"pairs": 0}, {"dt": 0.0}, {"seed": -1}]
+)
 def test_refuses_settings_that_make_no_sense(options: dict[str, object]) -> None:
     with pytest.raises(ConfigError):
         SyntheticDataset(**options)

@@ -76,7 +76,10 @@ def read(frame: pd.DataFrame, folder: Path, name: str = "t.csv") -> PairSet:
 @pytest.mark.parametrize("name", ["t.csv", "t.csv.gz", "t.parquet", "t.txt"])
 def test_reads_parquet_and_csv(good: pd.DataFrame, tmp_path: Path, name: str) -> None:
     pairs = read(good, tmp_path, name)
-    assert [(pair.pair_id, len(pair), pair.first_frame) for pair in pairs] == [("p", 30, 5), ("q", 20, 0)]
+    assert [(pair.pair_id, len(pair), pair.first_frame) for pair in pairs] == [
+        ("p", 30, 5),
+        ("q", 20, 0),
+    ]
     assert pairs[0].leader_id == "1"
     assert pairs[0].dt == 0.1
     assert pairs[0].lane is None
@@ -93,7 +96,12 @@ def test_text_ids_lanes_and_truth_are_understood(good: pd.DataFrame, tmp_path: P
     good["leader_id"], good["lane"] = "car x", 2
     good["true_model"], good["true_t_r"] = "krauss", np.linspace(1, 2, len(good))
     pair = read(good, tmp_path)[0]
-    assert (pair.leader_id, pair.lane, pair.truth_model, list(pair.truth)) == ("car x", 2, "krauss", ["t_r"])
+    assert (pair.leader_id, pair.lane, pair.truth_model, list(pair.truth)) == (
+        "car x",
+        2,
+        "krauss",
+        ["t_r"],
+    )
 
 
 def test_other_columns_are_ignored_and_counted(good: pd.DataFrame, tmp_path: Path) -> None:
@@ -112,7 +120,10 @@ def test_real_pairs(shared_data: Path) -> None:
     assert len(TidyDataset(path=path, min_frames=2).load()) == 229
     assert len(TidyDataset(path=path).load()) == 71
     assert len(TidyDataset(path=path, recording="i80-0400").load()) == 26
-    with pytest.raises(DataError, match="asked for 50 pairs but only 26 have at least 700 frames in the selected recording"):
+    with pytest.raises(
+        DataError,
+        match="asked for 50 pairs but only 26 have at least 700 frames in the selected recording",
+    ):
         TidyDataset(path=path, recording="i80-0400", max_pairs=50).load()
 
 
@@ -120,14 +131,18 @@ def test_real_pairs(shared_data: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["t.parquet", "t.csv", "t.csv.gz"])
-def test_writing_and_reading_real_pairs_changes_nothing(shared_data: Path, tmp_path: Path, name: str) -> None:
+def test_writing_and_reading_real_pairs_changes_nothing(
+    shared_data: Path, tmp_path: Path, name: str
+) -> None:
     pairs = TidyDataset(path=shared_data / "i80_reconstructed_pairs.parquet", max_pairs=5).load()
     write_tidy(pairs, tmp_path / name)
     same(pairs, read_tidy(tmp_path / name))
     assert [path.name for path in tmp_path.iterdir()] == [name], "no temporary file is left"
 
 
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(
     seed=st.integers(0, 10_000),
     dt=st.sampled_from([0.1, 0.04, 1 / 30, 0.2, 1001 / 30000, 0.123]),
@@ -153,7 +168,14 @@ def test_round_trip_is_exact(
             truth_model="krauss" if truth else "",
         )
 
-    pairs = PairSet((a_pair(0, {}), a_pair(1, {"t_r": rng.uniform(1, 2, 12)}), a_pair(2, {"t_i": rng.uniform(0, 1, 12)})), "x")
+    pairs = PairSet(
+        (
+            a_pair(0, {}),
+            a_pair(1, {"t_r": rng.uniform(1, 2, 12)}),
+            a_pair(2, {"t_i": rng.uniform(0, 1, 12)}),
+        ),
+        "x",
+    )
     write_tidy(pairs, tmp_path / name)
     same(pairs, read_tidy(tmp_path / name))
 
@@ -166,7 +188,9 @@ def test_synthetic_pairs_survive_with_their_truth(tmp_path: Path) -> None:
     assert again.fingerprint == pairs.fingerprint
 
 
-def test_writing_says_what_is_wrong_and_leaves_what_was_there(good: pd.DataFrame, tmp_path: Path) -> None:
+def test_writing_says_what_is_wrong_and_leaves_what_was_there(
+    good: pd.DataFrame, tmp_path: Path
+) -> None:
     pairs = pairs_from_frame(good)
     with pytest.raises(OutputError, match=r"named \.parquet, \.csv or \.csv\.gz"):
         write_tidy(pairs, tmp_path / "t.xlsx")
@@ -212,8 +236,14 @@ SPEEDS = ("leader_speed_mps", "follower_speed_mps")
             ["leader_speed_mps is missing", "Did you mean 'leader_speed'?"],
         ),
         (lambda f: f.iloc[:0], ["no rows"]),
-        (put("follower_speed_mps", "fast"), ["row 5", "follower_speed_mps", "'fast' is not a number"]),
-        (put("follower_speed_mps", np.nan), ["row 5", "pair 'p', frame 8", "empty or NaN", "1 such"]),
+        (
+            put("follower_speed_mps", "fast"),
+            ["row 5", "follower_speed_mps", "'fast' is not a number"],
+        ),
+        (
+            put("follower_speed_mps", np.nan),
+            ["row 5", "pair 'p', frame 8", "empty or NaN", "1 such"],
+        ),
         (put("leader_position_m", np.inf), ["row 5", "leader_position_m", "infinite"]),
         (put("pair_id", None), ["row 5", "column pair_id", "empty"]),
         (put("frame", 8.5), ["row 5", "column frame", "no whole number"]),
@@ -224,7 +254,10 @@ SPEEDS = ("leader_speed_mps", "follower_speed_mps")
         (put("time_s", 0.5), ["row 5", "time does not advance"]),
         (put("follower_speed_mps", -0.5), ["row 5", "follower_speed_mps", "-0.5 is negative"]),
         (put("leader_length_m", 0.0), ["row 5", "leader_length_m", "no vehicle length"]),
-        (put("leader_length_m", 4.6), ["row 5", "leader_length_m", "differs from the pair's first row"]),
+        (
+            put("leader_length_m", 4.6),
+            ["row 5", "leader_length_m", "differs from the pair's first row"],
+        ),
         (put("leader_id", 7), ["row 5", "leader_id", "differs from the pair's first row"]),
         (put("recording", "x"), ["row 5", "recording", "differs"]),
         (put("leader_position_m", 0.0), ["row 5", "leader is behind its follower", "the gap is -"]),
@@ -237,11 +270,19 @@ SPEEDS = ("leader_speed_mps", "follower_speed_mps")
         (scale(1.7, *SPEEDS), ["0.588 times", "positions must be in m"]),
         (scale(-1, *POSITIONS[:2]), ["positions must grow"]),
         (lambda f: f.assign(lane=[1] * 10 + [2] * 40), ["row 12", "column lane", "differs"]),
-        (lambda f: f.assign(true_a=[1.0] * 10 + [np.nan] * 40), ["row 12", "true_a", "part of the pair"]),
-        (lambda f: f.rename(columns={"pair_id": "Vehicle_ID"}), ["pair_id is missing", "use data=ngsim"]),
+        (
+            lambda f: f.assign(true_a=[1.0] * 10 + [np.nan] * 40),
+            ["row 12", "true_a", "part of the pair"],
+        ),
+        (
+            lambda f: f.rename(columns={"pair_id": "Vehicle_ID"}),
+            ["pair_id is missing", "use data=ngsim"],
+        ),
     ],
 )
-def test_refuses_what_no_recording_can_hold(good: pd.DataFrame, tmp_path: Path, change: Change, said: list[str]) -> None:
+def test_refuses_what_no_recording_can_hold(
+    good: pd.DataFrame, tmp_path: Path, change: Change, said: list[str]
+) -> None:
     changed = change(good)
     with pytest.raises(DataError) as error:
         read(good if changed is None else changed, tmp_path)
@@ -254,9 +295,13 @@ def test_refuses_what_no_recording_can_hold(good: pd.DataFrame, tmp_path: Path, 
 
 def test_parquet_and_tables_are_checked_the_same_way(good: pd.DataFrame, tmp_path: Path) -> None:
     broken = good.assign(follower_speed_mps=["fast", *good["follower_speed_mps"].astype(str)[1:]])
-    with pytest.raises(DataError, match=r"row 1, column follower_speed_mps: 'fast' is not a number"):
+    with pytest.raises(
+        DataError, match=r"row 1, column follower_speed_mps: 'fast' is not a number"
+    ):
         read(broken, tmp_path, "t.parquet")
-    with pytest.raises(DataError, match=r"table, row 1, column follower_speed_mps: 'fast' is not a number"):
+    with pytest.raises(
+        DataError, match=r"table, row 1, column follower_speed_mps: 'fast' is not a number"
+    ):
         pairs_from_frame(broken)
     with pytest.raises(DataError, match=r"row 3,.*infinite"):
         read(good.assign(time_s=[0, 0.1, np.inf, *good["time_s"][3:]]), tmp_path, "t.parquet")
@@ -291,11 +336,18 @@ def test_files_that_cannot_be_read(good: pd.DataFrame, tmp_path: Path) -> None:
     says(file("spaces.csv", text.replace(",", " ").encode()), "separated by spaces")
     says(file("colons.csv", text.replace(",", ":").encode()), "is missing")
     says(
-        file("headless.csv", text.split("\n", 1)[1].replace("rec,p,", "1,2,").replace("rec,q,", "1,3,").encode()), "column names"
+        file(
+            "headless.csv",
+            text.split("\n", 1)[1].replace("rec,p,", "1,2,").replace("rec,q,", "1,3,").encode(),
+        ),
+        "column names",
     )
     says(file("twice.csv", text.replace("follower_id", "leader_id").encode()), "more than once")
     cut = text.encode()[: len(text) // 2]
-    says(file("cut.csv", cut[: cut.rfind(b",")]), r"row \d+: \d+ columns instead of 13; is the file cut off")
+    says(
+        file("cut.csv", cut[: cut.rfind(b",")]),
+        r"row \d+: \d+ columns instead of 13; is the file cut off",
+    )
     packed = gzip.compress(text.encode())
     says(file("cut.csv.gz", packed[: len(packed) // 2]), "gzip file is cut off")
     damaged = bytearray(packed)
@@ -306,7 +358,11 @@ def test_files_that_cannot_be_read(good: pd.DataFrame, tmp_path: Path) -> None:
     says(file("cut.parquet", whole[: len(whole) // 2]), "parquet file is cut off or damaged")
 
 
-def test_bom_blank_lines_and_windows_line_ends_do_no_harm(good: pd.DataFrame, tmp_path: Path) -> None:
+def test_bom_blank_lines_and_windows_line_ends_do_no_harm(
+    good: pd.DataFrame, tmp_path: Path
+) -> None:
     text = good.to_csv(index=False)
-    (tmp_path / "w.csv").write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode() + b"\r\n\r\n")
+    (tmp_path / "w.csv").write_bytes(
+        b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode() + b"\r\n\r\n"
+    )
     same(read_tidy(tmp_path / "w.csv"), read(good, tmp_path))

@@ -50,7 +50,15 @@ def adaptive(model: DrivingModel, policy: Policy, networks: int, features: int) 
     scaler = Scaler(torch.full((networks, features), 8.0), torch.full((networks, features), 3.0))
     names = tuple(f"p{i}" for i in range(networks))
     return TrainedPolicy(
-        policy, network.eval(), scaler, {"name": "krauss"}, {"name": "gru"}, model.space, WindowSettings(), 0.1, names
+        policy,
+        network.eval(),
+        scaler,
+        {"name": "krauss"},
+        {"name": "gru"},
+        model.space,
+        WindowSettings(),
+        0.1,
+        names,
     )
 
 
@@ -61,7 +69,13 @@ def test_true_parameters_drive_exactly_like_the_driver(model: DrivingModel) -> N
     true = true.clamp(low, high)
     pairs = wavy_pairs(model, true)
     batch = PairBatch.of(pairs)
-    loop = drive(Simulator(model, 0.1), constant(model, true), batch, torch.tensor([200, 215, 100]), torch.arange(3))
+    loop = drive(
+        Simulator(model, 0.1),
+        constant(model, true),
+        batch,
+        torch.tensor([200, 215, 100]),
+        torch.arange(3),
+    )
     for i, first in enumerate((200, 215, 100)):
         counted = int(loop.counted[i].sum())
         assert counted == 299 - first
@@ -72,13 +86,22 @@ def test_true_parameters_drive_exactly_like_the_driver(model: DrivingModel) -> N
 def test_constant_parameters_are_the_plain_rollout() -> None:
     model = Krauss()
     parameters = torch.tensor([[2.0, 0.3], [1.0, 0.0]], dtype=torch.float64)
-    batch = PairBatch.of(wavy_pairs(model, torch.tensor([[1.5, 0.1], [3.0, 0.5]], dtype=torch.float64)))
+    batch = PairBatch.of(
+        wavy_pairs(model, torch.tensor([[1.5, 0.1], [3.0, 0.5]], dtype=torch.float64))
+    )
     first = torch.tensor([150, 150])
     loop = drive(Simulator(model, 0.1), constant(model, parameters), batch, first, torch.arange(2))
     leader = Leader(
-        batch.leader_position[:, 150:], batch.leader_speed[:, 150:], batch.leader_acceleration[:, 150:], batch.leader_length
+        batch.leader_position[:, 150:],
+        batch.leader_speed[:, 150:],
+        batch.leader_acceleration[:, 150:],
+        batch.leader_length,
     )
-    start = Start(batch.follower_position[:, 150], batch.follower_speed[:, 150], batch.follower_acceleration[:, 150])
+    start = Start(
+        batch.follower_position[:, 150],
+        batch.follower_speed[:, 150],
+        batch.follower_acceleration[:, 150],
+    )
     plain = simulate(model, parameters, leader, start, 0.1)
     torch.testing.assert_close(loop.speed, plain.speed)
     torch.testing.assert_close(loop.gap, plain.gap)
@@ -86,13 +109,20 @@ def test_constant_parameters_are_the_plain_rollout() -> None:
 
 
 def closed_loop_of(batch: PairBatch, model: DrivingModel, first: Tensor) -> ClosedLoop:
-    policy = adaptive(model, GruPolicy(start="middle", inputs=("leader_speed", "follower_speed", "gap")), len(batch), 15)
+    policy = adaptive(
+        model,
+        GruPolicy(start="middle", inputs=("leader_speed", "follower_speed", "gap")),
+        len(batch),
+        15,
+    )
     return drive(Simulator(model, 0.1), policy, batch, first, torch.arange(len(batch)))
 
 
 def test_the_policy_never_sees_the_measured_follower_of_the_test_part() -> None:
     model = Krauss()
-    batch = PairBatch.of(wavy_pairs(model, torch.tensor([[1.5, 0.1], [3.0, 0.5]], dtype=torch.float64)))
+    batch = PairBatch.of(
+        wavy_pairs(model, torch.tensor([[1.5, 0.1], [3.0, 0.5]], dtype=torch.float64))
+    )
     first = torch.tensor([150, 200])
     before = closed_loop_of(batch, model, first)
     frame = torch.arange(batch.mask.shape[1])
@@ -110,10 +140,17 @@ def test_the_policy_never_sees_the_measured_follower_of_the_test_part() -> None:
 
 def test_the_policy_reads_the_history_first() -> None:
     model = Krauss()
-    batch = PairBatch.of(wavy_pairs(model, torch.tensor([[1.5, 0.1], [3.0, 0.5]], dtype=torch.float64)))
+    batch = PairBatch.of(
+        wavy_pairs(model, torch.tensor([[1.5, 0.1], [3.0, 0.5]], dtype=torch.float64))
+    )
     first = torch.tensor([150, 200])
     before = closed_loop_of(batch, model, first)
-    changed = replace(batch, follower_speed=torch.where(torch.arange(300) < 100, batch.follower_speed + 1, batch.follower_speed))
+    changed = replace(
+        batch,
+        follower_speed=torch.where(
+            torch.arange(300) < 100, batch.follower_speed + 1, batch.follower_speed
+        ),
+    )
     after = closed_loop_of(changed, model, first)
     assert not torch.equal(before.parameters, after.parameters)
 
@@ -123,7 +160,9 @@ def test_a_pair_drives_the_same_whatever_drives_beside_it() -> None:
     true = torch.tensor([[1.5, 0.1], [3.0, 0.5], [2.0, 0.0]], dtype=torch.float64)
     batch = PairBatch.of(wavy_pairs(model, true))
     policy = adaptive(model, GruPolicy(start="middle"), 3, 10)
-    together = drive(Simulator(model, 0.1), policy, batch, torch.tensor([150, 200, 100]), torch.arange(3))
+    together = drive(
+        Simulator(model, 0.1), policy, batch, torch.tensor([150, 200, 100]), torch.arange(3)
+    )
     alone = drive(Simulator(model, 0.1), policy, batch[1:2], torch.tensor([200]), torch.tensor([1]))
     steps = alone.speed.shape[1]
     torch.testing.assert_close(together.speed[1:2, :steps], alone.speed, atol=1e-5, rtol=1e-5)
@@ -131,10 +170,16 @@ def test_a_pair_drives_the_same_whatever_drives_beside_it() -> None:
 
 def test_several_drivers_share_one_network() -> None:
     model = Krauss()
-    batch = PairBatch.of(wavy_pairs(model, torch.tensor([[1.5, 0.1], [3.0, 0.5]], dtype=torch.float64)))
+    batch = PairBatch.of(
+        wavy_pairs(model, torch.tensor([[1.5, 0.1], [3.0, 0.5]], dtype=torch.float64))
+    )
     shared = adaptive(model, GruPolicy(start="middle"), 1, 10)
-    both = drive(Simulator(model, 0.1), shared, batch, torch.tensor([150, 150]), torch.tensor([0, 0]))
-    second = drive(Simulator(model, 0.1), shared, batch[1:2], torch.tensor([150]), torch.tensor([0]))
+    both = drive(
+        Simulator(model, 0.1), shared, batch, torch.tensor([150, 150]), torch.tensor([0, 0])
+    )
+    second = drive(
+        Simulator(model, 0.1), shared, batch[1:2], torch.tensor([150]), torch.tensor([0])
+    )
     torch.testing.assert_close(both.parameters[1:2], second.parameters, atol=1e-5, rtol=1e-5)
 
 
@@ -146,14 +191,26 @@ def test_the_table_says_what_the_loops_did() -> None:
     first = torch.tensor([150, 200])
     simulator = Simulator(model, 0.1)
     loops = {
-        "default": drive(simulator, constant(model, model.space.defaults().expand(2, 2)), batch, first, torch.arange(2)),
+        "default": drive(
+            simulator,
+            constant(model, model.space.defaults().expand(2, 2)),
+            batch,
+            first,
+            torch.arange(2),
+        ),
         "fixed": drive(
-            simulator, constant(model, torch.tensor([[4.0, 0.1], [4.0, 0.1]]).double()), batch, first, torch.arange(2)
+            simulator,
+            constant(model, torch.tensor([[4.0, 0.1], [4.0, 0.1]]).double()),
+            batch,
+            first,
+            torch.arange(2),
         ),
         "policy": drive(simulator, constant(model, true), batch, first, torch.arange(2)),
     }
     style = StyleResult(
-        pd.DataFrame({"driver": [p.driver for p in pairs], "score": [0.2, 0.8], "cluster": [0, 2]}), {}, (0.3, 0.7)
+        pd.DataFrame({"driver": [p.driver for p in pairs], "score": [0.2, 0.8], "cluster": [0, 2]}),
+        {},
+        (0.3, 0.7),
     )
     result = evaluate(pairs, batch, first, loops, model.space, style, seed=0)
     table = result.table.set_index(["pair_id", "method"])
@@ -165,7 +222,9 @@ def test_the_table_says_what_the_loops_did() -> None:
     expected = math.sqrt(((real - simulated) ** 2).mean())
     assert table.loc[("p0", "fixed"), "rmse_speed"] == pytest.approx(expected)
     metrics = result.metrics()
-    assert metrics["rmse_speed/fixed"] == pytest.approx(result.table.query("method == 'fixed'").rmse_speed.mean())
+    assert metrics["rmse_speed/fixed"] == pytest.approx(
+        result.table.query("method == 'fixed'").rmse_speed.mean()
+    )
     assert metrics["collisions/policy"] == 0
 
 
@@ -174,9 +233,25 @@ def test_a_collision_is_counted() -> None:
     pairs = wavy_pairs(model, torch.tensor([[1.5, 0.1]], dtype=torch.float64))
     batch = PairBatch.of(pairs)
     first = torch.tensor([150])
-    loop = drive(Simulator(model, 0.1), constant(model, torch.tensor([[1.5, 0.1]]).double()), batch, first, torch.arange(1))
+    loop = drive(
+        Simulator(model, 0.1),
+        constant(model, torch.tensor([[1.5, 0.1]]).double()),
+        batch,
+        first,
+        torch.arange(1),
+    )
     crashed = loop._replace(gap=torch.where(torch.arange(loop.gap.shape[1]) == 7, -0.1, loop.gap))
-    style = StyleResult(pd.DataFrame({"driver": ["test/0"], "score": [0.2], "cluster": [0]}), {}, (0.3, 0.7))
-    result = evaluate(pairs, batch, first, {"default": loop, "fixed": loop, "policy": crashed}, model.space, style, seed=0)
+    style = StyleResult(
+        pd.DataFrame({"driver": ["test/0"], "score": [0.2], "cluster": [0]}), {}, (0.3, 0.7)
+    )
+    result = evaluate(
+        pairs,
+        batch,
+        first,
+        {"default": loop, "fixed": loop, "policy": crashed},
+        model.space,
+        style,
+        seed=0,
+    )
     assert result.metrics()["collisions/policy"] == 1
     assert result.metrics()["collisions/fixed"] == 0

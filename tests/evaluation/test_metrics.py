@@ -40,11 +40,19 @@ def test_the_interval_is_scipys_and_holds_the_mean() -> None:
 
 def test_no_difference_is_no_evidence() -> None:
     result = improvement_statistics(np.ones(10), np.ones(10), seed=0)
-    assert (result.mean, result.win_rate, result.p_value, result.ci95_low, result.ci95_high) == (0, 0, 1, 0, 0)
+    assert (result.mean, result.win_rate, result.p_value, result.ci95_low, result.ci95_high) == (
+        0,
+        0,
+        1,
+        0,
+        0,
+    )
 
 
 def test_undefined_pairs_are_counted() -> None:
-    result = improvement_statistics(np.array([1.0, 0.0, np.nan, 2.0]), np.array([0.5, 0.1, 1.0, np.inf]), seed=0)
+    result = improvement_statistics(
+        np.array([1.0, 0.0, np.nan, 2.0]), np.array([0.5, 0.1, 1.0, np.inf]), seed=0
+    )
     assert (result.pairs, result.undefined, result.mean) == (1, 3, 0.5)
 
 
@@ -60,7 +68,9 @@ def test_pairs_of_one_driver_are_drawn_together() -> None:
     assert (copied.pairs, copied.drivers) == (120, 12)
     assert copied.mean == pytest.approx(alone.mean)
     assert copied.p_value == pytest.approx(alone.p_value)
-    assert (copied.ci95_low, copied.ci95_high) == pytest.approx((alone.ci95_low, alone.ci95_high), abs=0.01)  # other draws
+    assert (copied.ci95_low, copied.ci95_high) == pytest.approx(
+        (alone.ci95_low, alone.ci95_high), abs=0.01
+    )  # other draws
     assert naive.ci95_high - naive.ci95_low < 0.5 * (copied.ci95_high - copied.ci95_low)
 
 
@@ -88,22 +98,32 @@ def test_what_comes_after_the_start_is_measured_on_its_own() -> None:
     counted = (first[:, None] + frames < batch.lengths[:, None]) & (frames > 0)
     parameters = Krauss().space.from_unit(torch.full((2, 91, 2), 0.5).double())
 
-    def loop(later: float) -> ClosedLoop:
-        speed = 10 + torch.where(frames <= 50, 1.0, later).double().expand(2, -1)
+    def loop(steady: float) -> ClosedLoop:
+        speed = 10 + torch.where(frames <= 50, 1.0, steady).double().expand(2, -1)
         return ClosedLoop(speed, speed + 10, parameters, counted)
 
     style = StyleResult(
-        pd.DataFrame({"driver": [p.driver for p in pairs], "score": [0.2, 0.8], "cluster": [0, 2]}), {}, (0.3, 0.7)
+        pd.DataFrame({"driver": [p.driver for p in pairs], "score": [0.2, 0.8], "cluster": [0, 2]}),
+        {},
+        (0.3, 0.7),
     )
     loops = {"fixed": loop(0.5), "policy": loop(0.2)}
     found = evaluate(pairs, batch, first, loops, Krauss().space, style, seed=0)
-    table = found.table.set_index(["pair_id", "method"])["later_rmse_speed"]
+    table = found.table.set_index(["pair_id", "method"])["steady_rmse_speed"]
     assert table["p0"].to_dict() == pytest.approx({"fixed": 0.5, "policy": 0.2})
     assert table["p1"].isna().all()
     metrics = found.metrics()
-    assert metrics["later/rmse_speed/policy"] == pytest.approx(0.2)
-    assert metrics["later/rmse_improvement/fixed/mean"] == pytest.approx(0.6)
-    assert found.later_improvements["fixed"].undefined == 1
+    assert metrics["steady/rmse_speed/policy"] == pytest.approx(0.2)
+    assert metrics["steady/rmse_improvement/fixed/mean"] == pytest.approx(0.6)
+    assert found.steady_improvements["fixed"].undefined == 1
     alone = {method: ClosedLoop(*(values[1:] for values in one)) for method, one in loops.items()}
-    short = evaluate(pairs.select([False, True], "long"), batch[1:], first[1:], alone, Krauss().space, style, seed=0)
-    assert not [name for name in short.metrics() if name.startswith("later")]
+    short = evaluate(
+        pairs.select([False, True], "long"),
+        batch[1:],
+        first[1:],
+        alone,
+        Krauss().space,
+        style,
+        seed=0,
+    )
+    assert not [name for name in short.metrics() if name.startswith("steady")]

@@ -10,7 +10,14 @@ import torch
 from torch import Tensor
 
 from cfx.evaluation.closed_loop import drive
-from cfx.evaluation.platoon import LENGTH, VEHICLES, Manoeuvre, drive_platoons, measure_platoons, slowing
+from cfx.evaluation.platoon import (
+    LENGTH,
+    VEHICLES,
+    Manoeuvre,
+    drive_platoons,
+    measure_platoons,
+    slowing,
+)
 from cfx.evaluation.result import Platoon
 from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
 from cfx.models.krauss import Krauss
@@ -35,9 +42,13 @@ class Linear(DrivingModel):
         Parameter("k_speed", "1/s", 0.0, 2.0, 0.6, "answer to the speed difference"),
     )
 
-    def next_speed(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float) -> Tensor:
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
         gap = bumper_gap(follower, leader)
-        answer = p["k_gap"] * (gap - p["h"] * follower.speed) + p["k_speed"] * (leader.speed - follower.speed)
+        answer = p["k_gap"] * (gap - p["h"] * follower.speed) + p["k_speed"] * (
+            leader.speed - follower.speed
+        )
         return (follower.speed + answer * dt).clamp(min=0.0)
 
 
@@ -46,7 +57,9 @@ STABLE, UNSTABLE = (2.0, 0.5, 0.8), (1.0, 0.4, 0.5)  # 5.2 and 1.4
 
 def measured(model: DrivingModel, *parameters: tuple[float, ...]) -> Platoon:
     values = torch.tensor(parameters).double()
-    found = measure_platoons(model, {"fixed": (constant(model, values), [f"set {k}" for k in range(len(values))])})
+    found = measure_platoons(
+        model, {"fixed": (constant(model, values), [f"set {k}" for k in range(len(values))])}
+    )
     assert found is not None
     return found
 
@@ -97,7 +110,9 @@ def test_who_does_not_follow_amplifies_nothing() -> None:
 
 def test_each_vehicle_drives_as_it_would_alone_behind_the_one_before() -> None:
     model, short = Krauss(), Manoeuvre(settle=5, after=5, hold=2)
-    policy = adaptive(model, GruPolicy(start="middle", inputs=("leader_speed", "follower_speed", "gap")), 2, 15)
+    policy = adaptive(
+        model, GruPolicy(start="middle", inputs=("leader_speed", "follower_speed", "gap")), 2, 15
+    )
     ((speed, gap),) = drive_platoons(model, [policy], short)
     frames = speed.shape[-1]
     for vehicle in (1, 7, VEHICLES):
@@ -133,7 +148,9 @@ def test_platoons_of_several_methods_do_not_touch_each_other() -> None:
 
 
 def test_what_a_vehicle_overshoots_on_the_way_back_is_no_slowing() -> None:
-    speed = torch.tensor([[15.0, 14.0, 9.0, 12.0, 17.0, 15.0], [15.0, 16.0, 14.5, 15.5, 18.0, 15.0]])
+    speed = torch.tensor(
+        [[15.0, 14.0, 9.0, 12.0, 17.0, 15.0], [15.0, 16.0, 14.5, 15.5, 18.0, 15.0]]
+    )
     assert slowing(speed).tolist() == [6.0, 1.5]
 
 

@@ -28,7 +28,9 @@ from cfx.learners.curves import over_networks
 from cfx.parameters import Parameter, ParameterSpace
 from tests.made_up import GAINS, MadeUp, make_history, make_platoon, make_results
 
-TEN = ParameterSpace.of(*(Parameter(f"p{k}", "m/s2", -2.0, 3.0 + k, 1.0, "made up") for k in range(10)))
+TEN = ParameterSpace.of(
+    *(Parameter(f"p{k}", "m/s2", -2.0, 3.0 + k, 1.0, "made up") for k in range(10))
+)
 
 
 def texts(figure: Figure) -> str:
@@ -56,7 +58,15 @@ def with_improvement(results: MadeUp, values: dict[int, float]) -> Evaluation:
         ({"pairs": 3, "networks": 0}, 6),
         ({"pairs": 3, "methods": ("default", "population", "fixed", "policy")}, 7),
     ],
-    ids=["krauss", "ten parameters", "one pair", "94 pairs", "one frame", "nothing learned", "four methods"],
+    ids=[
+        "krauss",
+        "ten parameters",
+        "one pair",
+        "94 pairs",
+        "one frame",
+        "nothing learned",
+        "four methods",
+    ],
 )
 def test_every_size_of_job_is_drawn(tmp_path: Path, options: dict[str, Any], files: int) -> None:
     results = make_results(**options)
@@ -71,7 +81,12 @@ def test_every_size_of_job_is_drawn(tmp_path: Path, options: dict[str, Any], fil
 def test_errors_over_time_are_those_of_the_pairs_that_still_drive() -> None:
     drives = make_results(pairs=4, frames=30).evaluation.drives
     short = [
-        dataclasses.replace(d, time=d.time[:11], real_speed=d.real_speed[:11], speed={"policy": d.speed["policy"][:11]})
+        dataclasses.replace(
+            d,
+            time=d.time[:11],
+            real_speed=d.real_speed[:11],
+            speed={"policy": d.speed["policy"][:11]},
+        )
         for d in drives[:1]
     ]
     seconds, error = errors_over_time(drives, "policy", "speed")
@@ -79,9 +94,13 @@ def test_errors_over_time_are_those_of_the_pairs_that_still_drive() -> None:
     np.testing.assert_allclose(error, expected)
     assert seconds[0] == 0
     assert error[0] == 0
-    seconds, _ = errors_over_time([short[0], *drives[1:]], "policy", "speed")  # three of four are not nearly all
+    seconds, _ = errors_over_time(
+        [short[0], *drives[1:]], "policy", "speed"
+    )  # three of four are not nearly all
     assert len(seconds) == 11
-    assert "time since the test part began" in texts(error_over_time(make_results(pairs=3).evaluation))
+    assert "time since the test part began" in texts(
+        error_over_time(make_results(pairs=3).evaluation)
+    )
 
 
 @pytest.mark.parametrize("count", range(1, 11))
@@ -112,7 +131,10 @@ def test_an_outlier_is_labelled_and_does_not_shrink_the_others() -> None:
     results = make_results(pairs=20, frames=20)
     tame = with_improvement(results, {k: 0.3 - 0.02 * k for k in range(20)})
     figure = improvement_per_driver(
-        dataclasses.replace(tame, table=with_improvement(dataclasses.replace(results, evaluation=tame), {19: -7.0}).table)
+        dataclasses.replace(
+            tame,
+            table=with_improvement(dataclasses.replace(results, evaluation=tame), {19: -7.0}).table,
+        )
     )
     assert "\N{MINUS SIGN}700 %" in texts(figure)
     assert figure.axes[0].get_ylim()[0] > -2.0
@@ -127,7 +149,9 @@ def test_drives_shows_best_median_and_worst() -> None:
         assert f"{rank} pair, {ids[k]}:  {percent(0.1 * k)}" in written
     one = drives(evaluation, pair_id=ids[2])
     assert len(one.axes) == 2
-    rows = evaluation.table[(evaluation.table["pair_id"] == ids[2]) & (evaluation.table["method"] == "fixed")]
+    rows = evaluation.table[
+        (evaluation.table["pair_id"] == ids[2]) & (evaluation.table["method"] == "fixed")
+    ]
     assert f"fixed {float(rows['rmse_speed'].iloc[0]):.2f}" in texts(one)
     colours = {line.get_color() for line in one.axes[0].lines}
     assert colours == {COLOURS[signal] for signal in ("real", "leader", *evaluation.methods)}
@@ -135,14 +159,18 @@ def test_drives_shows_best_median_and_worst() -> None:
 
 def test_an_unknown_pair_is_named_with_the_nearest() -> None:
     evaluation = make_results(pairs=3, frames=20).evaluation
-    with pytest.raises(ConfigError, match=r"pair 'i80-0400-1000-99' is not .* Did you mean 'i80-0400-1000-990'"):
+    with pytest.raises(
+        ConfigError, match=r"pair 'i80-0400-1000-99' is not .* Did you mean 'i80-0400-1000-990'"
+    ):
         drives(evaluation, pair_id="i80-0400-1000-99")
 
 
 def test_a_default_driver_far_away_does_not_shrink_the_others() -> None:
     evaluation = make_results(pairs=1, frames=50).evaluation
     drive = evaluation.drives[0]
-    far = dataclasses.replace(drive, gap={**drive.gap, "default": drive.real_gap + np.linspace(0, 500, 51)})
+    far = dataclasses.replace(
+        drive, gap={**drive.gap, "default": drive.real_gap + np.linspace(0, 500, 51)}
+    )
     figure = drives(dataclasses.replace(evaluation, drives=(far,)))
     assert figure.axes[1].get_ylim()[1] < 120
     assert "default up to" in texts(figure)
@@ -153,7 +181,11 @@ def test_a_collision_is_marked_and_a_diverged_drive_is_survived() -> None:
     drive = evaluation.drives[0]
     bad = dataclasses.replace(
         drive,
-        gap={**drive.gap, "policy": drive.real_gap - np.linspace(0, 20, 51), "fixed": np.full(51, np.inf)},
+        gap={
+            **drive.gap,
+            "policy": drive.real_gap - np.linspace(0, 20, 51),
+            "fixed": np.full(51, np.inf),
+        },
         speed={**drive.speed, "fixed": np.full(51, np.nan)},
     )
     figure = drives(dataclasses.replace(evaluation, drives=(bad,)))
@@ -166,7 +198,9 @@ def test_names_are_text_and_never_formulas(tmp_path: Path) -> None:
     name = "50$ \\frac{1}{0} $ 跟车 " + "x" * 80
     table = results.evaluation.table.assign(pair_id=name)
     evaluation = dataclasses.replace(
-        results.evaluation, table=table, drives=(dataclasses.replace(results.evaluation.drives[0], pair_id=name),)
+        results.evaluation,
+        table=table,
+        drives=(dataclasses.replace(results.evaluation.drives[0], pair_id=name),),
     )
     assert len(write_figures(tmp_path, evaluation, results.style, results.curves)) == 7
 
@@ -200,7 +234,12 @@ def test_a_network_that_stopped_early_keeps_its_last_loss() -> None:
 def test_a_loss_that_no_logarithm_takes_is_drawn(loss: float) -> None:
     epochs = np.arange(5)
     curves = pd.DataFrame(
-        {"network": "a", "epoch": epochs, "train_loss": np.where(epochs == 2, loss, 10.0**-epochs), "validation_loss": np.nan}
+        {
+            "network": "a",
+            "epoch": epochs,
+            "train_loss": np.where(epochs == 2, loss, 10.0**-epochs),
+            "validation_loss": np.nan,
+        }
     )
     learning_curve(curves).canvas.draw()
 
@@ -215,8 +254,12 @@ def test_figures_leave_the_readers_matplotlib_alone(tmp_path: Path) -> None:
 def test_a_path_that_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     results = make_results(pairs=1, frames=10)
-    with pytest.raises(OutputError, match=r"improvement_per_driver\.png: this figure cannot be written"):
-        write_figures(tmp_path / "file" / "figures", results.evaluation, results.style, results.curves)
+    with pytest.raises(
+        OutputError, match=r"improvement_per_driver\.png: this figure cannot be written"
+    ):
+        write_figures(
+            tmp_path / "file" / "figures", results.evaluation, results.style, results.curves
+        )
 
 
 def test_labels() -> None:
@@ -227,7 +270,9 @@ def test_labels() -> None:
 
 
 def test_each_method_has_its_own_speed_plot() -> None:
-    evaluation = make_results(pairs=3, methods=("default", "population", "fixed", "policy")).evaluation
+    evaluation = make_results(
+        pairs=3, methods=("default", "population", "fixed", "policy")
+    ).evaluation
     figure = speeds(evaluation)
     assert len(figure.axes) == 4
     row = evaluation.table[evaluation.table["method"] == "population"].sort_values("improvement")
@@ -256,7 +301,9 @@ def test_history_is_drawn_from_least_to_most_with_its_intervals() -> None:
     history = make_history(make_results(pairs=6, frames=20).evaluation.drives, GAINS)
     assert amounts_of(history) == ["0 s", "10 s", "80 %"]
     # A drive may be shorter than the longest amount in seconds.
-    short = history.assign(history_s=history["history_s"].where(~history["amount"].str.endswith("%"), 8.0))
+    short = history.assign(
+        history_s=history["history_s"].where(~history["amount"].str.endswith("%"), 8.0)
+    )
     assert amounts_of(short) == ["0 s", "10 s", "80 %"]
     (axes,) = history_gain(history).axes
     own, population = axes.containers
@@ -269,7 +316,9 @@ def test_history_is_drawn_from_least_to_most_with_its_intervals() -> None:
 def test_platoon_and_history_are_written_where_a_protocol_delivered_them(tmp_path: Path) -> None:
     results = make_results(pairs=3, frames=20)
     history = make_history(results.evaluation.drives, GAINS)
-    further = dataclasses.replace(results.evaluation, platoon=make_platoon({"policy": 2}), history=history)
+    further = dataclasses.replace(
+        results.evaluation, platoon=make_platoon({"policy": 2}), history=history
+    )
     names = {path.name for path in write_figures(tmp_path, further, results.style, results.curves)}
     assert {"platoon.png", "history.png"} <= names
     assert len(names) == 9

@@ -13,7 +13,11 @@ from cfx.testing import LearnerContract
 IMITATION = ImitationLearner(epochs=30, learning_rate=0.03)
 ROLLOUT = {
     name: RolloutLearner(**{**RolloutLearner.trial, **options})
-    for name, options in {"one": {"members": 1}, "committee": {"members": 2}, "taught": {"members": 1, "taught": 2}}.items()
+    for name, options in {
+        "one": {"ensemble_size": 1},
+        "ensemble": {"ensemble_size": 2},
+        "distillation_epochs": {"ensemble_size": 1, "distillation_epochs": 2},
+    }.items()
 }
 
 

@@ -32,8 +32,27 @@ def main() -> None:
         net, routes = Path(folder, "net.net.xml"), Path(folder, "routes.rou.xml")
         net.write_text(_network(job["runs"]))
         routes.write_text(_routes(job["runs"]))
-        command = ["sumo", "-n", str(net), "-r", str(routes), "--step-length", repr(job["dt"]), "--collision.action", "none"]
-        command += ["--time-to-teleport", "-1", "--no-step-log", "true", "--no-warnings", "true", "--seed", "1"]
+        command = [
+            "sumo",
+            "-n",
+            str(net),
+            "-r",
+            str(routes),
+            "--step-length",
+            repr(job["dt"]),
+            "--collision.action",
+            "none",
+        ]
+        command += [
+            "--time-to-teleport",
+            "-1",
+            "--no-step-log",
+            "true",
+            "--no-warnings",
+            "true",
+            "--seed",
+            "1",
+        ]
         libsumo.start(command)
         answer = _drive(libsumo, job["runs"])
         libsumo.close()
@@ -50,7 +69,13 @@ def _drive(sumo: Any, runs: list[Job]) -> list[Job]:
         sumo.vehicle.setSpeedMode(leader, 0)  # drives what it is told, whatever its limits
         sumo.vehicle.setPreviousSpeed(leader, run["leader_speed"][0], run["leader_acceleration"])
         sumo.vehicle.setPreviousSpeed(follower, run["speed"], run["acceleration"])
-        answer.append({"speed": [run["speed"]], "position": [run["position"]], "leader_position": [run["leader_position"]]})
+        answer.append(
+            {
+                "speed": [run["speed"]],
+                "position": [run["position"]],
+                "leader_position": [run["leader_position"]],
+            }
+        )
     for frame in range(1, max(len(run["leader_speed"]) for run in runs)):
         driving = [i for i, run in enumerate(runs) if frame < len(run["leader_speed"])]
         for i in driving:
@@ -65,18 +90,24 @@ def _drive(sumo: Any, runs: list[Job]) -> list[Job]:
 
 def _network(runs: list[Job]) -> str:
     """One straight road for each run, long enough for both vehicles; written by hand, as it needs no netconvert."""
-    length = 2000.0 + max(run["leader_position"] + len(run["leader_speed"]) * max(run["leader_speed"]) for run in runs)
+    length = 2000.0 + max(
+        run["leader_position"] + len(run["leader_speed"]) * max(run["leader_speed"]) for run in runs
+    )
     lines = [
         '<net version="1.20">',
         f'<location netOffset="0,0" convBoundary="0,0,{length},{100 * len(runs)}" origBoundary="0,0,1,1" projParameter="!"/>',
     ]
     for i in range(len(runs)):
         y = 100 * i
-        lines.append(f'<edge id="road{i}" from="from{i}" to="to{i}" priority="1"><lane id="road{i}_0" index="0" speed="{_FAST}"')
+        lines.append(
+            f'<edge id="road{i}" from="from{i}" to="to{i}" priority="1"><lane id="road{i}_0" index="0" speed="{_FAST}"'
+        )
         lines.append(f' length="{length}" shape="0,{y} {length},{y}"/></edge>')
     for i in range(len(runs)):
         y = 100 * i
-        lines.append(f'<junction id="from{i}" type="dead_end" x="0" y="{y}" incLanes="" intLanes="" shape="0,{y}"/>')
+        lines.append(
+            f'<junction id="from{i}" type="dead_end" x="0" y="{y}" incLanes="" intLanes="" shape="0,{y}"/>'
+        )
         lines.append(
             f'<junction id="to{i}" type="dead_end" x="{length}" y="{y}" incLanes="road{i}_0" intLanes="" shape="{length},{y}"/>'
         )
@@ -88,16 +119,22 @@ def _routes(runs: list[Job]) -> str:
     for i, run in enumerate(runs):
         given = " ".join(f'{name}="{value!r}"' for name, value in run["parameters"].items())
         ahead = " ".join(f'{name}="{value!r}"' for name, value in run["leader"].items())
-        lines.append(f'<vType id="lead{i}" maxSpeed="{_FAST}" sigma="0" speedFactor="1" speedDev="0" {ahead}')
+        lines.append(
+            f'<vType id="lead{i}" maxSpeed="{_FAST}" sigma="0" speedFactor="1" speedDev="0" {ahead}'
+        )
         lines.append(f' length="{run["leader_length"]!r}"/>')
-        lines.append(f'<vType id="drive{i}" carFollowModel="{run["model"]}" sigma="0" speedFactor="1" speedDev="0" {given}/>')
+        lines.append(
+            f'<vType id="drive{i}" carFollowModel="{run["model"]}" sigma="0" speedFactor="1" speedDev="0" {given}/>'
+        )
         lines.append(f'<route id="route{i}" edges="road{i}"/>')
     for i, run in enumerate(runs):
         for name, kind, position, speed in (
             ("leader", "lead", run["leader_position"], run["leader_speed"][0]),
             ("follower", "drive", run["position"], run["speed"]),
         ):
-            lines.append(f'<vehicle id="{name}{i}" type="{kind}{i}" route="route{i}" depart="0" insertionChecks="none"')
+            lines.append(
+                f'<vehicle id="{name}{i}" type="{kind}{i}" route="route{i}" depart="0" insertionChecks="none"'
+            )
             lines.append(f' departPos="{position!r}" departSpeed="{speed!r}"/>')
     return "\n".join([*lines, "</routes>"])
 

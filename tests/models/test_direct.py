@@ -20,9 +20,16 @@ def drive(acceleration: float, seconds: float, leader_speed: float = 12.0) -> li
     """Returns the speed each second, from 10 m/s."""
     frames = round(seconds * 10) + 1
     constant = torch.full((1, frames), leader_speed).double()
-    leader = Leader(30 + constant.cumsum(1) * 0.1, constant, torch.zeros_like(constant), torch.tensor([5.0]).double())
+    leader = Leader(
+        30 + constant.cumsum(1) * 0.1,
+        constant,
+        torch.zeros_like(constant),
+        torch.tensor([5.0]).double(),
+    )
     zero = torch.zeros(1).double()
-    found = simulate(Direct(), torch.tensor([[acceleration]]).double(), leader, Start(zero, zero + 10, zero), 0.1)
+    found = simulate(
+        Direct(), torch.tensor([[acceleration]]).double(), leader, Start(zero, zero + 10, zero), 0.1
+    )
     return [float(v) for v in found.speed[0, ::10]]
 
 
@@ -37,5 +44,5 @@ def test_no_leader_matters_to_it() -> None:
 
 def test_it_is_a_model_like_any_other_and_says_that_its_fixed_parameters_are_no_baseline() -> None:
     assert cfx.get("model", "direct") is Direct
-    assert not Direct.follows
+    assert not Direct.has_constant_baseline
     assert Direct().space.names == ("acceleration",)

@@ -51,15 +51,23 @@ class TestCautious(ModelContract):
 
 
 @given(v=st.floats(0.1, 40), t_r=st.floats(0.1, 10), t_i=st.floats(0, 2), b=st.floats(1, 9))
-def test_at_equal_speeds_the_gap_is_v_times_t_r_whatever_t_i(v: float, t_r: float, t_i: float, b: float) -> None:
-    assert next_speed(Krauss(), gap=v * t_r, v=v, v_l=v, t_r=t_r, t_i=t_i, b=b) == pytest.approx(v, abs=1e-9)
+def test_at_equal_speeds_the_gap_is_v_times_t_r_whatever_t_i(
+    v: float, t_r: float, t_i: float, b: float
+) -> None:
+    assert next_speed(Krauss(), gap=v * t_r, v=v, v_l=v, t_r=t_r, t_i=t_i, b=b) == pytest.approx(
+        v, abs=1e-9
+    )
 
 
 @given(v_l=st.floats(0, 40), gap=st.floats(0, 100), tau=st.floats(0.1, 3), b=st.floats(1, 9))
-def test_without_build_up_time_it_is_krauss_1998(v_l: float, gap: float, tau: float, b: float) -> None:
+def test_without_build_up_time_it_is_krauss_1998(
+    v_l: float, gap: float, tau: float, b: float
+) -> None:
     # Krauss (1998), eq. for v_safe with both stopping at b: v_l^2 / 2b + g = v tau + v^2 / 2b.
     safe = -b * tau + math.sqrt(b * b * tau * tau + v_l * v_l + 2 * b * gap)
-    assert next_speed(Krauss(), gap=gap, v=50.0, v_l=v_l, t_r=tau, t_i=0.0, b=b) == pytest.approx(safe if safe < 50.26 else 50.26)
+    assert next_speed(Krauss(), gap=gap, v=50.0, v_l=v_l, t_r=tau, t_i=0.0, b=b) == pytest.approx(
+        safe if safe < 50.26 else 50.26
+    )
 
 
 @given(
@@ -82,4 +90,6 @@ def test_the_safe_speed_stops_within_the_gap_and_the_leaders_stopping_distance(
 def test_an_overlapping_leader_makes_it_stop() -> None:
     assert next_speed(Krauss(), gap=-30.0, v=10.0, v_l=0.0) == 0.0
     # SUMO itself would get NaN here and ignore the leader; we brake as hard as the brakes go.
-    assert next_speed(Krauss(variant="sumo"), gap=-30.0, v=10.0, v_l=0.5) == pytest.approx(10.0 - 0.9)
+    assert next_speed(Krauss(variant="sumo"), gap=-30.0, v=10.0, v_l=0.5) == pytest.approx(
+        10.0 - 0.9
+    )

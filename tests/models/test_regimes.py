@@ -18,16 +18,24 @@ numbers = st.floats(-50.0, 50.0)
 def test_without_softness_the_choice_is_exact(value: float, threshold: float) -> None:
     yes, no = torch.tensor([1.0, 2.0], dtype=torch.float64)
     v, t = torch.tensor([value, threshold], dtype=torch.float64)
-    assert float(below(v, t, yes, no, scale=1.0, softness=0.0)) == (1.0 if value < threshold else 2.0)
-    assert float(up_to(v, t, yes, no, scale=1.0, softness=0.0)) == (1.0 if value <= threshold else 2.0)
+    assert float(below(v, t, yes, no, scale=1.0, temperature=0.0)) == (
+        1.0 if value < threshold else 2.0
+    )
+    assert float(up_to(v, t, yes, no, scale=1.0, temperature=0.0)) == (
+        1.0 if value <= threshold else 2.0
+    )
 
 
 @given(numbers, numbers, st.floats(0.05, 3.0))
-def test_a_soft_choice_is_the_logistic_mixture(value: float, threshold: float, softness: float) -> None:
+def test_a_soft_choice_is_the_logistic_mixture(
+    value: float, threshold: float, temperature: float
+) -> None:
     yes, no = torch.tensor([1.0, 2.0], dtype=torch.float64)
     v, t = torch.tensor([value, threshold], dtype=torch.float64)
-    weight = torch.sigmoid((t - v) / (2.0 * softness))
-    torch.testing.assert_close(below(v, t, yes, no, scale=2.0, softness=softness), 2.0 - weight)
+    weight = torch.sigmoid((t - v) / (2.0 * temperature))
+    torch.testing.assert_close(
+        below(v, t, yes, no, scale=2.0, temperature=temperature), 2.0 - weight
+    )
 
 
 def states(count: int = 400) -> tuple[Follower, Leader]:
@@ -37,28 +45,40 @@ def states(count: int = 400) -> tuple[Follower, Leader]:
         return low + (high - low) * torch.rand(count, generator=draw, dtype=torch.float64)
 
     speed, leader_speed = uniform(2, 20), uniform(2, 20)
-    leader = Leader(uniform(100, 100.1), leader_speed, uniform(-1, 1), torch.full((count,), 5.0).double())
-    follower = Follower(leader.position - 5 - uniform(1, 60), speed, uniform(-1, 1), speed.new_zeros((count, 0)))
+    leader = Leader(
+        uniform(100, 100.1), leader_speed, uniform(-1, 1), torch.full((count,), 5.0).double()
+    )
+    follower = Follower(
+        leader.position - 5 - uniform(1, 60), speed, uniform(-1, 1), speed.new_zeros((count, 0))
+    )
     return follower, leader
 
 
 @pytest.mark.parametrize("model", [W99(), W74()], ids=["w99", "w74"])
 def test_a_smoothed_model_tends_to_the_exact_one(model: DrivingModel) -> None:
-    """All but the states that lie on a threshold give the same speed as softness goes to 0."""
+    """All but the states that lie on a threshold give the same speed as temperature goes to 0."""
     follower, leader = states()
     p = model.space.unpack(model.space.defaults())
     exact = model.next_speed(follower, leader, p, 0.1)
-    gaps = [(model.smoothed(s).next_speed(follower, leader, p, 0.1) - exact).abs() for s in (1.0, 0.1, 1e-4)]
+    gaps = [
+        (model.at_temperature(s).next_speed(follower, leader, p, 0.1) - exact).abs()
+        for s in (1.0, 0.1, 1e-4)
+    ]
     assert float(gaps[0].mean()) > float(gaps[1].mean()) > float(gaps[2].mean())
     assert float((gaps[2] < 1e-9).double().mean()) > 0.99
-    assert model.softness == 0
+    assert model.temperature == 0
 
 
-@pytest.mark.parametrize(("model", "names"), [(W99(), ("cc1", "cc2", "cc4", "cc5")), (W74(), ("bx_add", "sdx_mult", "cx"))])
-def test_thresholds_have_a_gradient_only_in_the_smoothed_model(model: DrivingModel, names: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(
+    ("model", "names"),
+    [(W99(), ("cc1", "cc2", "cc4", "cc5")), (W74(), ("bx_add", "sdx_mult", "cx"))],
+)
+def test_thresholds_have_a_gradient_only_in_the_smoothed_model(
+    model: DrivingModel, names: tuple[str, ...]
+) -> None:
     follower, leader = states()
     shares = []
-    for used in (model, model.smoothed(torch.tensor(1.0))):
+    for used in (model, model.at_temperature(torch.tensor(1.0))):
         values = model.space.defaults().expand(400, -1).clone().requires_grad_()
         used.next_speed(follower, leader, model.space.unpack(values), 0.1).sum().backward()
         assert values.grad is not None
@@ -72,4 +92,7 @@ def test_a_model_without_regimes_stays_as_it_is() -> None:
     follower, leader = states()
     model = Krauss()
     p = model.space.unpack(model.space.defaults())
-    assert torch.equal(model.smoothed(1.0).next_speed(follower, leader, p, 0.1), model.next_speed(follower, leader, p, 0.1))
+    assert torch.equal(
+        model.at_temperature(1.0).next_speed(follower, leader, p, 0.1),
+        model.next_speed(follower, leader, p, 0.1),
+    )

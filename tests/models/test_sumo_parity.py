@@ -31,7 +31,8 @@ from cfx.models.w99 import W99
 from cfx.simulation.rollout import Start, Trajectory, simulate
 
 pytestmark = pytest.mark.skipif(
-    importlib.util.find_spec("libsumo") is None, reason="SUMO is not here; pip install 'cfx-driving[sumo]'"
+    importlib.util.find_spec("libsumo") is None,
+    reason="SUMO is not here; pip install 'cfx-driving[sumo]'",
 )
 
 DT = 0.1
@@ -47,9 +48,14 @@ LARGEST: dict[str, dict[str, float]] = {}
 def table() -> Iterator[None]:
     yield
     cases = list(dict.fromkeys(case for row in LARGEST.values() for case in row))
-    print(f"\n\nLargest difference to SUMO, m/s\n{'':32}" + "".join(f"{case:>18}" for case in cases))
+    print(
+        f"\n\nLargest difference to SUMO, m/s\n{'':32}" + "".join(f"{case:>18}" for case in cases)
+    )
     for model, row in LARGEST.items():
-        print(f"{model:32}" + "".join(f"{row[case]:18.1e}" if case in row else f"{'':18}" for case in cases))
+        print(
+            f"{model:32}"
+            + "".join(f"{row[case]:18.1e}" if case in row else f"{'':18}" for case in cases)
+        )
 
 
 @dataclass(frozen=True)
@@ -82,7 +88,9 @@ class Twin:
     model: DrivingModel
     draw: Callable[[np.random.Generator, int], list[Values]]
     draws: bool = False
-    same: Callable[[Follower, Leader, Mapping[str, Tensor]], Tensor] = lambda follower, *_: follower.speed >= 0
+    same: Callable[[Follower, Leader, Mapping[str, Tensor]], Tensor] = lambda follower, *_: (
+        follower.speed >= 0
+    )
     vtype: Callable[[Mapping[str, Tensor]], VType] | None = None
 
     def in_sumo(self, p: Values) -> VType:
@@ -93,21 +101,33 @@ class Twin:
         return self.model.sumo_vtype(values)
 
 
-def anywhere(model: DrivingModel, **constants: float) -> Callable[[np.random.Generator, int], list[Values]]:
+def anywhere(
+    model: DrivingModel, **constants: float
+) -> Callable[[np.random.Generator, int], list[Values]]:
     """Draws every parameter within its bounds; the first set is the defaults."""
 
     def draw(rng: np.random.Generator, count: int) -> list[Values]:
         rows = [{p.name: p.default for p in model.space} | constants]
-        return rows + [{p.name: float(rng.uniform(p.low, p.high)) for p in model.space} | constants for _ in range(count - 1)]
+        return rows + [
+            {p.name: float(rng.uniform(p.low, p.high)) for p in model.space} | constants
+            for _ in range(count - 1)
+        ]
 
     return draw
 
 
 def krauss_parameters(rng: np.random.Generator, count: int) -> list[Values]:
-    rows = [{"t_r": 1.0, "t_i": 0.0, "a": 2.6, "b": 4.5, "v_max": 55.0, "min_gap": gap, "b_max": 9.0} for gap in (0.0, 2.5)]
+    rows = [
+        {"t_r": 1.0, "t_i": 0.0, "a": 2.6, "b": 4.5, "v_max": 55.0, "min_gap": gap, "b_max": 9.0}
+        for gap in (0.0, 2.5)
+    ]
     while len(rows) < count:
         b = float(rng.uniform(1.5, 7))
-        own = {"t_r": float(rng.uniform(0.3, 4)), "a": float(rng.uniform(0.5, 5)), "v_max": float(rng.uniform(10, 55))}
+        own = {
+            "t_r": float(rng.uniform(0.3, 4)),
+            "a": float(rng.uniform(0.5, 5)),
+            "v_max": float(rng.uniform(10, 55)),
+        }
         own["min_gap"] = float(rng.choice([0.0, 2.5, rng.uniform(0, 5)]))
         rows.append({**own, "t_i": 0.0, "b": b, "b_max": b + float(rng.uniform(0, 6))})
     return rows
@@ -130,10 +150,21 @@ def plugins_idm() -> Twin | None:
         return None
     from cfx_idm.idm import IDM
 
-    names = {"v0": "maxSpeed", "T": "tau", "s0": "minGap", "a": "accel", "b": "decel", "delta": "delta"}
+    names = {
+        "v0": "maxSpeed",
+        "T": "tau",
+        "s0": "minGap",
+        "a": "accel",
+        "b": "decel",
+        "delta": "delta",
+    }
 
     def vtype(p: Mapping[str, Tensor]) -> VType:
-        return VType("IDM", {names[ours]: value for ours, value in p.items()} | {"emergencyDecel": torch.tensor(1e9)})
+        return VType(
+            "IDM",
+            {names[ours]: value for ours, value in p.items()}
+            | {"emergencyDecel": torch.tensor(1e9)},
+        )
 
     def same(follower: Follower, leader: Leader, p: Mapping[str, Tensor]) -> Tensor:
         return bumper_gap(follower, leader) >= 0.1
@@ -174,7 +205,11 @@ def sumo(twin: Twin, drives: list[Drive]) -> list[dict[str, list[float]]]:
         )
     script = Path(__file__).with_name("sumo_reference.py")
     done = subprocess.run(
-        [sys.executable, str(script)], input=json.dumps({"dt": DT, "runs": runs}), capture_output=True, text=True, check=False
+        [sys.executable, str(script)],
+        input=json.dumps({"dt": DT, "runs": runs}),
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)["runs"]  # type: ignore[no-any-return]  # our own script's answer
@@ -184,12 +219,16 @@ def column(values: Iterable[float]) -> Tensor:
     return torch.tensor(list(values), dtype=torch.float64)
 
 
-def ours(model: DrivingModel, cases: list[Drive], reference: list[dict[str, list[float]]]) -> tuple[Trajectory, Leader]:
+def ours(
+    model: DrivingModel, cases: list[Drive], reference: list[dict[str, list[float]]]
+) -> tuple[Trajectory, Leader]:
     """Drives our model behind the leaders whom SUMO drove, at the very same positions; all at once, `(drives, time)`."""
     frames = max(len(drive.leader_speed) for drive in cases)
 
     def longest(rows: Iterable[Iterable[float]]) -> Tensor:
-        return torch.tensor([[*row, *[math.nan] * frames][:frames] for row in rows], dtype=torch.float64)
+        return torch.tensor(
+            [[*row, *[math.nan] * frames][:frames] for row in rows], dtype=torch.float64
+        )
 
     speed = longest(drive.leader_speed for drive in cases)
     first = column(drive.leader_acceleration for drive in cases)[:, None]
@@ -218,11 +257,22 @@ def undrawn(drive: Trajectory, leader: Leader) -> Tensor:
     return (draws.cumsum(dim=1) - draws.long()) == 0
 
 
-def chaotic(model: DrivingModel, cases: list[Drive], reference: list[dict[str, list[float]]], mine: Trajectory) -> Tensor:
+def chaotic(
+    model: DrivingModel,
+    cases: list[Drive],
+    reference: list[dict[str, list[float]]],
+    mine: Trajectory,
+) -> Tensor:
     """Frames from which on a thousandth of a nanometre matters: rounding decides there, which nobody can restate."""
     rng = np.random.default_rng(0)
-    places = ([x + 1e-12 * float(rng.uniform(-1, 1)) for x in run["leader_position"]] for run in reference)
-    other, _ = ours(model, cases, [run | {"leader_position": moved} for run, moved in zip(reference, places, strict=True)])
+    places = (
+        [x + 1e-12 * float(rng.uniform(-1, 1)) for x in run["leader_position"]] for run in reference
+    )
+    other, _ = ours(
+        model,
+        cases,
+        [run | {"leader_position": moved} for run, moved in zip(reference, places, strict=True)],
+    )
     return ((other.speed - mine.speed).abs() > 0.1 * TOLERANCE).cumsum(dim=1) > 0
 
 
@@ -247,11 +297,15 @@ def compare(twin: Twin, case: str, cases: list[Drive]) -> float:
         counted &= undrawn(mine, leader)
     for drive, own, run, valid in zip(cases, mine.speed, reference, counted, strict=True):
         theirs = torch.tensor(run["speed"], dtype=torch.float64)
-        rounded = (theirs == 0) & (own[: len(theirs)] > 0)  # SUMO's 1e-5 m/s, which not everybody knows
+        rounded = (theirs == 0) & (
+            own[: len(theirs)] > 0
+        )  # SUMO's 1e-5 m/s, which not everybody knows
         difference = (own[: len(theirs)] - theirs).abs()
         difference = difference[valid[: len(theirs)] & (rounded.cumsum(dim=0) == 0)]
         first = int((difference > TOLERANCE).long().argmax())
-        assert difference.max() < TOLERANCE, f"{drive.parameters} differs from SUMO at frame {first} of {len(difference)}"
+        assert difference.max() < TOLERANCE, (
+            f"{drive.parameters} differs from SUMO at frame {first} of {len(difference)}"
+        )
         note(twin.name, case, difference.max().item())
     return (counted.sum() / there.sum()).item()
 
@@ -276,14 +330,24 @@ def synthetic(rng: np.random.Generator, count: int, gentle: float) -> Iterable[A
         yield np.array(v)
 
 
-def drives(leaders: Iterable[Array], rows: Iterable[Values], rng: np.random.Generator) -> list[Drive]:
+def drives(
+    leaders: Iterable[Array], rows: Iterable[Values], rng: np.random.Generator
+) -> list[Drive]:
     made = []
     for speed, p in zip(leaders, rows, strict=True):
         fastest = next((p[name] for name in ("v_max", "maxSpeed", "v0") if name in p), 99.0)
         v = min(max(0.0, speed[0] + float(rng.uniform(-2, 2))), fastest)
         gap = float(rng.uniform(5, 20) + 1.5 * v)
         made.append(
-            Drive(speed, float(rng.uniform(-0.9, 0.9)), float(rng.uniform(3.5, 12)), gap, v, float(rng.uniform(-1, 1)), p)
+            Drive(
+                speed,
+                float(rng.uniform(-0.9, 0.9)),
+                float(rng.uniform(3.5, 12)),
+                gap,
+                v,
+                float(rng.uniform(-1, 1)),
+                p,
+            )
         )
     return made
 
@@ -291,7 +355,9 @@ def drives(leaders: Iterable[Array], rows: Iterable[Values], rng: np.random.Gene
 @pytest.fixture(scope="module")
 def real_leaders(shared_data: Path) -> list[Array]:
     """The speeds of 20 recorded leaders, by position so that a replay is exact."""
-    table = pd.read_parquet(shared_data / "i80_reconstructed_pairs.parquet", columns=["pair_id", "leader_position_m"])
+    table = pd.read_parquet(
+        shared_data / "i80_reconstructed_pairs.parquet", columns=["pair_id", "leader_position_m"]
+    )
     groups = list(table.groupby("pair_id")["leader_position_m"])[::10][:20]
     speeds = [np.clip(np.diff(position.to_numpy()) / DT, 0, None) for _, position in groups]
     return [speed[:500] for speed in speeds]
@@ -323,9 +389,9 @@ def test_single_steps_from_random_states(twin: Twin) -> None:
         v = float(rng.choice([0.0, rng.uniform(0, 2), max(0.0, v_l + 2 * rng.normal())]))
         fastest = next((p[name] for name in ("v_max", "maxSpeed", "v0") if name in p), 99.0)
         gap = float(rng.choice([rng.uniform(-0.5, 3), rng.uniform(0, 1), rng.uniform(0, 60)]))
-        later = max(0.0, v_l + float(rng.uniform(-0.3, 0.09)))
+        steady = max(0.0, v_l + float(rng.uniform(-0.3, 0.09)))
         state = (5.0, gap, min(v, fastest), float(rng.uniform(-2, 2)))
-        cases.append(Drive(np.array([v_l, later]), float(rng.uniform(-4, 0.9)), *state, p))
+        cases.append(Drive(np.array([v_l, steady]), float(rng.uniform(-4, 0.9)), *state, p))
     assert one_step(twin, cases) > 0.35
 
 
@@ -334,10 +400,14 @@ def one_step(twin: Twin, cases: list[Drive]) -> float:
     reference = sumo(twin, cases)
     mine, leader = ours(twin.model, cases, reference)
     theirs = column(run["speed"][1] for run in reference)
-    same = same_so_far(twin, cases, mine, leader)[:, 1] & ~((theirs == 0) & (mine.speed[:, 1] < 1e-5))
+    same = same_so_far(twin, cases, mine, leader)[:, 1] & ~(
+        (theirs == 0) & (mine.speed[:, 1] < 1e-5)
+    )
     difference = (mine.speed[:, 1] - theirs).abs()[same]
     worst = int(((mine.speed[:, 1] - theirs).abs() * same).argmax())
-    assert difference.max() < TOLERANCE, f"{cases[worst]} differs: {mine.speed[worst, 1].item()} and {theirs[worst].item()}"
+    assert difference.max() < TOLERANCE, (
+        f"{cases[worst]} differs: {mine.speed[worst, 1].item()} and {theirs[worst].item()}"
+    )
     note(twin.name, "one step", difference.max().item())
     return same.double().mean().item()
 
@@ -347,7 +417,12 @@ def sumos_wiedemann(p: Mapping[str, Tensor]) -> VType:
     security = 0.5 * (p["ax_add"] - 1.0)
     estimation = p["cx"] / 25.0 - 1.0 - security
     accel = 5.0 * p["b_null"]
-    own = {"security": security, "estimation": estimation, "accel": accel, "minGap": torch.tensor(0.0)}
+    own = {
+        "security": security,
+        "estimation": estimation,
+        "accel": accel,
+        "minGap": torch.tensor(0.0),
+    }
     # While approaching SUMO brakes by at most the mean of the two.
     return VType("Wiedemann", own | {"decel": -p["b_min"], "emergencyDecel": -p["b_min"]})
 
@@ -365,7 +440,9 @@ def wiedemanns_case(follower: Follower, leader: Leader, p: Mapping[str, Tensor])
     patience = 2.0 - (p["cx"] / 25.0 - 1.0 - 0.5 * (p["ax_add"] - 1.0))  # Wiedemann's EX
     within = spacing < p["sdx_mult"] * abx
     following = within & (closing >= 0) & (closing <= perceived)
-    approaching = (spacing < 150.0) & (closing > torch.where(within, perceived * patience.square(), perceived))
+    approaching = (spacing < 150.0) & (
+        closing > torch.where(within, perceived * patience.square(), perceived)
+    )
     return (spacing > abx) & (v >= v_l) & (following | approaching)
 
 
@@ -377,12 +454,31 @@ def test_w74_takes_the_steps_of_sumos_wiedemann_where_both_follow_or_approach() 
         v_l = float(rng.uniform(1, 20))
         v = v_l + float(rng.choice([rng.uniform(0, 0.3), rng.uniform(0, 6)]))
         ax, patience = 1.0 + 2.0 * security, 2.0 - estimation
-        bx = (1.0 + 7.0 * security) * math.sqrt(v)  # SUMO takes the follower's speed, w74 the slower one's
+        bx = (1.0 + 7.0 * security) * math.sqrt(
+            v
+        )  # SUMO takes the follower's speed, w74 the slower one's
         abx = 5.0 + ax + bx
         sdx = 5.0 + ax + patience * bx  # in w74 a multiple of ABX
-        p = {"ax_add": ax, "bx_add": bx / math.sqrt(v_l), "sdx_mult": sdx / abx, "cx": 25.0 * (1 + security + estimation)}
-        p |= {"opdv_add": 1.5, "b_max": 2.6, "v_desired": 50.0, "b_null": float(rng.uniform(0.1, 1)), "b_min": -9.0}
+        p = {
+            "ax_add": ax,
+            "bx_add": bx / math.sqrt(v_l),
+            "sdx_mult": sdx / abx,
+            "cx": 25.0 * (1 + security + estimation),
+        }
+        p |= {
+            "opdv_add": 1.5,
+            "b_max": 2.6,
+            "v_desired": 50.0,
+            "b_null": float(rng.uniform(0.1, 1)),
+            "b_min": -9.0,
+        }
         gap = abx - 5.0 + float(rng.choice([rng.uniform(0.5, 5), rng.uniform(0, 60)]))
         cases.append(Drive(np.array([v_l, v_l]), 0.0, 5.0, gap, v, 0.5, p))
-    twin = Twin("w74 / Wiedemann, two cases", W74(), lambda *_: [], same=wiedemanns_case, vtype=sumos_wiedemann)
+    twin = Twin(
+        "w74 / Wiedemann, two cases",
+        W74(),
+        lambda *_: [],
+        same=wiedemanns_case,
+        vtype=sumos_wiedemann,
+    )
     assert one_step(twin, cases) > 0.5

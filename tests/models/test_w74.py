@@ -18,7 +18,15 @@ def number(value: float) -> Tensor:
     return torch.tensor(value, dtype=torch.float64)
 
 
-def acceleration(spacing: float, *, v: float = V, v_l: float = V, a: float = 0.0, a_l: float = 0.0, **parameters: float) -> float:
+def acceleration(
+    spacing: float,
+    *,
+    v: float = V,
+    v_l: float = V,
+    a: float = 0.0,
+    a_l: float = 0.0,
+    **parameters: float,
+) -> float:
     model = W74()
     p = {p.name: number(parameters.get(p.name, p.default)) for p in model.space}
     follower = Follower(number(0.0), number(v), number(a), torch.zeros(0))
@@ -54,7 +62,9 @@ def test_closing_in_is_noticed_above_sdv_and_braked_for_to_reach_abx(spacing: fl
 
 def test_a_braking_leader_is_braked_for_when_approaching() -> None:
     spacing = ABX + 5.0
-    assert acceleration(spacing, v=V + 2, a_l=-3.0) - acceleration(spacing, v=V + 2) == pytest.approx(-3.0)
+    assert acceleration(spacing, v=V + 2, a_l=-3.0) - acceleration(
+        spacing, v=V + 2
+    ) == pytest.approx(-3.0)
 
 
 def test_opening_is_noticed_below_opdv() -> None:

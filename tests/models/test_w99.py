@@ -22,7 +22,9 @@ class TestVissim(ModelContract):
 
 def free_acceleration(model: W99, speed: float) -> float:
     p = model.space.unpack(model.space.defaults())
-    follower = Follower(*(torch.tensor(x, dtype=torch.float64) for x in (0.0, speed, 0.0)), torch.zeros(0))
+    follower = Follower(
+        *(torch.tensor(x, dtype=torch.float64) for x in (0.0, speed, 0.0)), torch.zeros(0)
+    )
     leader = Leader(*(torch.tensor(x, dtype=torch.float64) for x in (1000.0, 40.0, 0.0, 5.0)))
     return (model.next_speed(follower, leader, p, 0.1).item() - speed) / 0.1
 
@@ -39,5 +41,7 @@ def test_it_does_not_creep_into_a_standing_leader() -> None:
     p = W99().space.unpack(W99().space.defaults())
     leader = Leader(*(torch.tensor(x, dtype=torch.float64) for x in (5.3, 0.0, 0.0, 5.0)))
     for speed, wanted in ((0.3, 0.3), (0.6, 0.0)):
-        follower = Follower(*(torch.tensor(x, dtype=torch.float64) for x in (0.0, speed, 0.0)), torch.zeros(0))
+        follower = Follower(
+            *(torch.tensor(x, dtype=torch.float64) for x in (0.0, speed, 0.0)), torch.zeros(0)
+        )
         assert W99().next_speed(follower, leader, p, 0.1).item() == pytest.approx(wanted)

@@ -17,7 +17,13 @@ class TestBotorchOptimizer(OptimizerContract):
     @pytest.fixture
     def optimizer(self) -> BotorchOptimizer:
         return BotorchOptimizer(
-            initial=6, iterations=7, first_fit_steps=15, fit_steps=4, raw_samples=128, restarts=2, climb_steps=3
+            initial=6,
+            iterations=7,
+            first_fit_steps=15,
+            fit_steps=4,
+            raw_samples=128,
+            restarts=2,
+            climb_steps=3,
         )
 
 
@@ -27,7 +33,13 @@ class TestBotorchOptimizerWithScreening(OptimizerContract):
     @pytest.fixture
     def optimizer(self) -> BotorchOptimizer:
         return BotorchOptimizer(
-            initial=4, iterations=2, screening=200, first_fit_steps=5, raw_samples=64, restarts=2, climb_steps=3
+            initial=4,
+            iterations=2,
+            screening=200,
+            first_fit_steps=5,
+            raw_samples=64,
+            restarts=2,
+            climb_steps=3,
         )
 
 
@@ -45,23 +57,41 @@ def test_forty_evaluations_beat_four_thousand_random_ones(function: Function) ->
 
 def test_marginals_are_those_of_botorchs_posterior() -> None:
     draw = torch.Generator().manual_seed(1)
-    seen, query = (torch.rand(3, count, 4, generator=draw, dtype=torch.float64) for count in (12, 50))
+    seen, query = (
+        torch.rand(3, count, 4, generator=draw, dtype=torch.float64) for count in (12, 50)
+    )
     values = torch.randn(3, 12, 1, generator=draw, dtype=torch.float64)
-    kernel, mean = botorch._kernel(4, torch.Size([3])).double(), botorch.ConstantMean(batch_shape=torch.Size([3])).double()
+    kernel, mean = (
+        botorch._kernel(4, torch.Size([3])).double(),
+        botorch.ConstantMean(batch_shape=torch.Size([3])).double(),
+    )
     process = botorch._MarginalGP(seen, values, mean, kernel)
     joint = SingleTaskGP(
-        seen, values, torch.full_like(values, botorch._NOISE), mean_module=mean, covar_module=kernel, outcome_transform=None
+        seen,
+        values,
+        torch.full_like(values, botorch._NOISE),
+        mean_module=mean,
+        covar_module=kernel,
+        outcome_transform=None,
     )
     with torch.no_grad():
         marginal = botorch._Marginals(process).posterior(query.transpose(0, 1)[..., None, :])
         expected = joint.posterior(query)
     torch.testing.assert_close(marginal.mean[:, :, 0].transpose(0, 1), expected.mean)
-    torch.testing.assert_close(marginal.variance[:, :, 0].transpose(0, 1), expected.variance, rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(
+        marginal.variance[:, :, 0].transpose(0, 1), expected.variance, rtol=1e-6, atol=1e-9
+    )
 
 
 def test_modelled_values_keep_the_order_of_losses_and_are_finite() -> None:
     losses = torch.tensor(
-        [[0.0, 1e-9, 0.1, 3.0], [-2.0, -1.0, 0.0, 5.0], [1e-300, 1.0, 1e308, torch.inf], [torch.inf] * 4, [0.0] * 4],
+        [
+            [0.0, 1e-9, 0.1, 3.0],
+            [-2.0, -1.0, 0.0, 5.0],
+            [1e-300, 1.0, 1e308, torch.inf],
+            [torch.inf] * 4,
+            [0.0] * 4,
+        ],
         dtype=torch.float64,
     )
     values = botorch._values(losses)

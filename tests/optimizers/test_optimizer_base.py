@@ -39,7 +39,9 @@ class Miscounting(Listed):
 
 
 def minimize(function: object, guess: float = 0.5, optimizer: Optimizer | None = None) -> object:
-    return (optimizer or Listed()).minimize(Problems(function, torch.zeros(1, 1)), torch.full((1, 1, 1), guess), seed=0)
+    return (optimizer or Listed()).minimize(
+        Problems(function, torch.zeros(1, 1)), torch.full((1, 1, 1), guess), seed=0
+    )
 
 
 def test_the_tie_nearest_to_the_first_guess_wins() -> None:
@@ -58,7 +60,7 @@ def test_a_difference_within_the_tolerance_is_a_tie_and_one_above_is_not() -> No
 def test_the_spread_is_measured_on_space_filling_candidates_without_the_guess() -> None:
     found = minimize(lambda x, _: x[..., 0], guess=0.05)
     assert found.filling.tolist() == [[0.2, 0.4, 0.9]]
-    assert found.spread.item() == pytest.approx(0.4 - 0.05)
+    assert found.sensitivity.item() == pytest.approx(0.4 - 0.05)
 
 
 def test_diverged_candidates_are_counted_and_left_out_of_the_spread() -> None:
@@ -74,7 +76,9 @@ def test_a_candidate_outside_the_bounds_is_the_plugins_mistake(optimizer: Optimi
 
 
 def test_a_wrong_number_of_evaluations_is_the_plugins_mistake() -> None:
-    with pytest.raises(PluginError, match=r"optimizer Miscounting: solve must return candidates \(1, 5, 1\)"):
+    with pytest.raises(
+        PluginError, match=r"optimizer Miscounting: solve must return candidates \(1, 5, 1\)"
+    ):
         minimize(distance, optimizer=Miscounting())
 
 

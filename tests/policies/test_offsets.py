@@ -26,14 +26,19 @@ def test_no_answer_leaves_the_bounds(base: float, answer: float) -> None:
 def test_a_larger_answer_gives_a_larger_parameter(base: float, one: float, other: float) -> None:
     low, high = sorted((one, other))
     value = torch.tensor(base).double()
-    assert float(moved(value, torch.tensor(low).double())) <= float(moved(value, torch.tensor(high).double())) + 1e-12
+    assert (
+        float(moved(value, torch.tensor(low).double()))
+        <= float(moved(value, torch.tensor(high).double())) + 1e-12
+    )
 
 
 @given(st.floats(0.01, 0.99), st.floats(0.01, 0.99))
 def test_offsets_add_up_on_logits(base: float, answer: float) -> None:
     """Inside the bounds the squashed space is the logit: the closed form."""
     b, a = torch.tensor(base).double(), torch.tensor(answer).double()
-    torch.testing.assert_close(moved(b, a), torch.sigmoid(torch.logit(b) + 3.0 * torch.logit(a)), rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        moved(b, a), torch.sigmoid(torch.logit(b) + 3.0 * torch.logit(a)), rtol=0, atol=1e-12
+    )
 
 
 SPACE = Krauss().space
@@ -44,7 +49,9 @@ def krauss(unit: float) -> torch.Tensor:
 
 
 @given(unit)
-def test_a_set_that_is_not_drawn_stays_exactly_and_one_drawn_fully_is_the_default(own: float) -> None:
+def test_a_set_that_is_not_drawn_stays_exactly_and_one_drawn_fully_is_the_default(
+    own: float,
+) -> None:
     values = krauss(own)
     assert torch.equal(drawn(SPACE, values, 0.0), values)
     torch.testing.assert_close(drawn(SPACE, values, 1.0)[0], SPACE.defaults(), rtol=0, atol=1e-9)

@@ -37,13 +37,24 @@ class TestGru(PolicyContract):
 class TestLstm(PolicyContract):
     @pytest.fixture(params=[1, 2])
     def policy(self, request: pytest.FixtureRequest) -> Policy:
-        return LstmPolicy(layers=request.param, hidden_size=8, inputs=("gap", "relative_speed"), summary="mean_std")
+        return LstmPolicy(
+            layers=request.param,
+            hidden_size=8,
+            inputs=("gap", "relative_speed"),
+            summary="mean_std",
+        )
 
 
-@pytest.mark.parametrize(("component", "reference"), [(GruPolicy, torch.nn.GRU), (LstmPolicy, torch.nn.LSTM)])
-def test_recurrent_networks_are_torchs(component: type[Policy], reference: type[torch.nn.RNNBase]) -> None:
+@pytest.mark.parametrize(
+    ("component", "reference"), [(GruPolicy, torch.nn.GRU), (LstmPolicy, torch.nn.LSTM)]
+)
+def test_recurrent_networks_are_torchs(
+    component: type[Policy], reference: type[torch.nn.RNNBase]
+) -> None:
     policy = component(layers=2, hidden_size=6, start="middle")
-    network = policy.build(5, torch.zeros(3), torch.zeros((2, 3)), torch.Generator().manual_seed(0)).double()
+    network = policy.build(
+        5, torch.zeros(3), torch.zeros((2, 3)), torch.Generator().manual_seed(0)
+    ).double()
     assert isinstance(network, RecurrentNetwork)
     x = torch.randn((2, 3, 9, 5), dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     ours, _ = network(x, network.initial_state(2, 3))
@@ -70,14 +81,20 @@ def test_tokens_have_the_declared_width_and_are_finite_at_standstill() -> None:
 
 @pytest.mark.parametrize(
     ("inputs", "message"),
-    [(("leader_sped",), "Did you mean 'leader_speed'"), ((), "give at least one"), (("gap", "gap"), "stands twice")],
+    [
+        (("leader_sped",), "Did you mean 'leader_speed'"),
+        ((), "give at least one"),
+        (("gap", "gap"), "stands twice"),
+    ],
 )
 def test_wrong_inputs_are_named(inputs: tuple[str, ...], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         GruPolicy(inputs=inputs)
 
 
-@pytest.mark.parametrize(("name", "message"), [("situatoin", "Did you mean 'situation'"), ("gap", r"Write \[gap\]")])
+@pytest.mark.parametrize(
+    ("name", "message"), [("situatoin", "Did you mean 'situation'"), ("gap", r"Write \[gap\]")]
+)
 def test_a_set_of_inputs_goes_by_its_name(name: str, message: str) -> None:
     listed = GruPolicy(inputs=INPUT_SETS["situation"])
     assert GruPolicy(inputs="situation").identity() == listed.identity()

@@ -24,7 +24,7 @@ from cfx.errors import DataError
 from cfx.models.krauss import Krauss
 from cfx.optimizers.random import RandomSearch
 from cfx.pairs import SIGNALS, PairBatch, PairSet
-from cfx.policies.committee import Committee
+from cfx.policies.ensemble import Ensemble
 from cfx.policies.features import History
 from cfx.progress import Task
 from cfx.protocols.across_drivers import AcrossDrivers
@@ -45,17 +45,24 @@ def chained(*followed: tuple[str, str]) -> PairSet:
     """Pairs of (leader, follower)."""
     pairs = straight_pairs([100] * len(followed))
     return PairSet(
-        tuple(replace(pair, leader_id=leader, follower_id=own) for pair, (leader, own) in zip(pairs, followed, strict=True)),
+        tuple(
+            replace(pair, leader_id=leader, follower_id=own)
+            for pair, (leader, own) in zip(pairs, followed, strict=True)
+        ),
         "test",
     )
 
 
 def test_no_driver_is_on_both_sides() -> None:
     # Driver 3 follows three leaders.
-    pairs = chained(("1", "2"), ("2", "3"), ("8", "3"), ("9", "3"), ("3", "4"), ("4", "5"), ("5", "6"))
+    pairs = chained(
+        ("1", "2"), ("2", "3"), ("8", "3"), ("9", "3"), ("3", "4"), ("4", "5"), ("5", "6")
+    )
     fold = AcrossDrivers(folds=3).folds(pairs, seed=0)
     assert set(fold.tolist()) == {0, 1, 2}
-    assert len({int(k) for k, pair in zip(fold, pairs, strict=True) if pair.follower_id == "3"}) == 1
+    assert (
+        len({int(k) for k, pair in zip(fold, pairs, strict=True) if pair.follower_id == "3"}) == 1
+    )
 
 
 def test_a_platoon_stays_together_if_wanted() -> None:
@@ -89,7 +96,10 @@ def test_recordings_stay_whole_if_wanted() -> None:
 
 def test_short_pairs_of_a_tested_recording_teach_nobody_there_and_others_everybody() -> None:
     long, short = in_recordings("a", "b", "a", "b"), in_recordings("a", "c", frames=50)
-    shorter = [replace(pair, pair_id=f"short {k}", follower_id=f"short {k}") for k, pair in enumerate(short)]
+    shorter = [
+        replace(pair, pair_id=f"short {k}", follower_id=f"short {k}")
+        for k, pair in enumerate(short)
+    ]
     fold = (
         AcrossDrivers(folds=2, together="recording", min_test_frames=100)
         .folds(PairSet((*long, *shorter), "test"), seed=0)
@@ -113,13 +123,21 @@ def test_too_few_drivers_are_told() -> None:
         AcrossDrivers().folds(chained(("1", "2"), ("2", "3"), ("3", "4"), ("9", "4")), seed=0)
     with pytest.raises(DataError, match="only 1 platoon here"):
         AcrossDrivers(folds=2, together="platoon").folds(chained(("1", "2"), ("2", "3")), seed=0)
-    with pytest.raises(DataError, match=r"only 2 recordings here; lower protocol.folds \(2 at least\) or use more recordings"):
+    with pytest.raises(
+        DataError,
+        match=r"only 2 recordings here; lower protocol.folds \(2 at least\) or use more recordings",
+    ):
         AcrossDrivers(folds=5, together="recording").folds(in_recordings("a", "b", "a"), seed=0)
 
 
 def calibrator(memory: int = 1 << 28, samples: int = 256) -> Calibrator:
     return Calibrator(
-        Simulator(Krauss(), 0.1), RandomSearch(samples=samples), seed=0, cache=Cache(None), memory=memory, progress=Task
+        Simulator(Krauss(), 0.1),
+        RandomSearch(samples=samples),
+        seed=0,
+        cache=Cache(None),
+        memory=memory,
+        progress=Task,
     )
 
 
@@ -129,35 +147,50 @@ def test_a_joint_objective_is_the_mean_of_its_drives() -> None:
     simulator = Simulator(Krauss(), 0.1)
     index, steps = torch.arange(3), torch.full((3,), 150)
     drives = DriveObjective.of_segments(simulator, batch, index, torch.zeros_like(index), steps)
-    members = torch.tensor([[True, True, False], [True, True, True]])
-    candidates = torch.rand((2, 7, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    for asked in (candidates, candidates[:1].expand(2, -1, -1)):  # also where a drive of both problems is simulated once
-        joint = JointObjective(drives, members, memory=1 << 30)
+    ensemble_size = torch.tensor([[True, True, False], [True, True, True]])
+    candidates = torch.rand(
+        (2, 7, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    for asked in (
+        candidates,
+        candidates[:1].expand(2, -1, -1),
+    ):  # also where a drive of both problems is simulated once
+        joint = JointObjective(drives, ensemble_size, memory=1 << 30)
         first, second = (drives(asked[[k, k, k]]) for k in range(2))
         expected = torch.stack([first[:2].mean(0), second.mean(0)])
         torch.testing.assert_close(joint(asked), expected)
         torch.testing.assert_close(joint.select(1, 2)(asked[1:]), expected[1:])
         # One candidate at a time gives the same.
-        torch.testing.assert_close(JointObjective(drives, members, memory=1)(asked), expected)
+        torch.testing.assert_close(JointObjective(drives, ensemble_size, memory=1)(asked), expected)
 
 
 def test_a_drive_that_diverges_spoils_only_its_own_problems() -> None:
     pairs = wavy_pairs(Krauss(), torch.tensor([[1.0, 0.1], [2.0, 0.4]], dtype=torch.float64))
     batch = PairBatch.of(pairs)
     index = torch.arange(2)
-    drives = DriveObjective.of_segments(Simulator(Krauss(), 0.1), batch, index, torch.zeros_like(index), torch.full((2,), 150))
+    drives = DriveObjective.of_segments(
+        Simulator(Krauss(), 0.1), batch, index, torch.zeros_like(index), torch.full((2,), 150)
+    )
     drives.observed[10, 1] = torch.nan
     same = torch.full((2, 3, 2), 0.5, dtype=torch.float64)
-    losses = JointObjective(drives, torch.tensor([[True, False], [True, True]]), memory=1 << 30)(same)
+    losses = JointObjective(drives, torch.tensor([[True, False], [True, True]]), memory=1 << 30)(
+        same
+    )
     assert losses.isnan().tolist() == [[False] * 3, [True] * 3]
 
 
-def test_joint_losses_are_the_same_where_their_work_is_worth_compiling_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_joint_losses_are_the_same_where_their_work_is_worth_compiling_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     pairs = wavy_pairs(Krauss(), torch.tensor([[1.0, 0.1], [2.0, 0.4]], dtype=torch.float64))
     index = torch.arange(2)
     simulator = Simulator(Krauss(), 0.1)
-    drives = DriveObjective.of_segments(simulator, PairBatch.of(pairs), index, torch.zeros_like(index), torch.full((2,), 23))
-    candidates = torch.rand((1, 9, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    drives = DriveObjective.of_segments(
+        simulator, PairBatch.of(pairs), index, torch.zeros_like(index), torch.full((2,), 23)
+    )
+    candidates = torch.rand(
+        (1, 9, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     joint = JointObjective(drives, torch.tensor([[True, True]]), memory=1)
     expected = joint(candidates)
     # 2 drives, 9 candidates and 23 steps are worth it together; a turn of one candidate is not.
@@ -171,9 +204,9 @@ def test_the_populations_parameters_fit_all_their_drivers() -> None:
     """Drivers who are all alike are found as one."""
     truth = torch.tensor([[1.7, 0.3]] * 4 + [[4.0, 0.3]], dtype=torch.float64)
     pairs = wavy_pairs(Krauss(), truth)
-    members = torch.tensor([[True] * 4 + [False], [False, False, False, False, True]])
+    ensemble_size = torch.tensor([[True] * 4 + [False], [False, False, False, False, True]])
     last = torch.full((5,), 250)
-    found = calibrator(samples=2048).population(pairs, PairBatch.of(pairs), last, members)
+    found = calibrator(samples=2048).population(pairs, PairBatch.of(pairs), last, ensemble_size)
     assert found[:, 0].tolist() == pytest.approx([1.7, 4.0], abs=0.1)
 
 
@@ -206,19 +239,26 @@ def test_all_methods_drive_the_same_frames(result: cfx.JobResult) -> None:
 
 def test_every_baseline_has_its_improvement(result: cfx.JobResult) -> None:
     policy = result.pairs[result.pairs.method == "policy"].set_index("pair_id")
-    for baseline, key in (("fixed", "rmse_improvement"), ("population", "rmse_improvement/population")):
+    for baseline, key in (
+        ("fixed", "rmse_improvement"),
+        ("population", "rmse_improvement/population"),
+    ):
         before = result.pairs[result.pairs.method == baseline].set_index("pair_id")
         gain = (before.rmse_speed - policy.rmse_speed) / before.rmse_speed
         assert result.metrics[f"{key}/mean"] == pytest.approx(gain.mean())
         column = "improvement" if baseline == "fixed" else f"improvement_over_{baseline}"
         assert policy[column].to_numpy() == pytest.approx(gain.to_numpy())
-        whole = (before.whole_rmse_speed - policy.whole_rmse_speed) / before.whole_rmse_speed
+        whole = (
+            before.full_trajectory_rmse_speed - policy.full_trajectory_rmse_speed
+        ) / before.full_trajectory_rmse_speed
         if baseline == "population":
-            assert result.metrics["whole/rmse_improvement/population/mean"] == pytest.approx(whole.mean())
+            assert result.metrics[
+                "full_trajectory/rmse_improvement/population/mean"
+            ] == pytest.approx(whole.mean())
         else:
             assert whole.isna().all(), "his own parameters have seen the first part of the drive"
-    assert result.metrics["whole/rmse_gap/default"] > 0
-    assert "whole/rmse_speed/fixed" not in result.metrics
+    assert result.metrics["full_trajectory/rmse_gap/default"] > 0
+    assert "full_trajectory/rmse_speed/fixed" not in result.metrics
 
 
 def test_the_design_is_told(result: cfx.JobResult) -> None:
@@ -228,27 +268,41 @@ def test_the_design_is_told(result: cfx.JobResult) -> None:
 
 
 def test_drives_and_curves_are_kept(result: cfx.JobResult) -> None:
-    drives = pd.read_parquet(result.folder / "drives.parquet")
+    drives = pd.read_parquet(result.folder / "trajectories.parquet")
     row = result.pairs[(result.pairs.method == "population")].iloc[0]
     own = drives[drives.pair_id == row.pair_id].iloc[1:]
     assert len(own) == row.frames
-    assert math.sqrt(((own.speed_population - own.real_speed) ** 2).mean()) == pytest.approx(row.rmse_speed)
-    assert {"t_r_policy", "t_i_fixed", "gap_default", "leader_speed", "real_gap"} <= set(own.columns)
+    assert math.sqrt(((own.speed_population - own.real_speed) ** 2).mean()) == pytest.approx(
+        row.rmse_speed
+    )
+    assert {"t_r_policy", "t_i_fixed", "gap_default", "leader_speed", "real_gap"} <= set(
+        own.columns
+    )
     curves = pd.read_parquet(result.folder / "curves.parquet")
     assert set(curves.network) == {"fold 0", "fold 1", "fold 2", "all"}
-    assert result.metrics["validation_loss/best"] == pytest.approx(curves.groupby("network").validation_loss.min().mean())
+    assert result.metrics["validation_loss/best"] == pytest.approx(
+        curves.groupby("network").validation_loss.min().mean()
+    )
 
 
 def test_the_saved_policy_drives_strangers(result: cfx.JobResult) -> None:
     policy = cfx.load(result.folder).policy
-    strangers = SyntheticDataset(pairs=2, frames=100, seed=9).load()
-    assert policy.networks_for(strangers).tolist() == [3, 3]
+    cold_start_fraction = SyntheticDataset(pairs=2, frames=100, seed=9).load()
+    assert policy.networks_for(cold_start_fraction).tolist() == [3, 3]
 
 
-def test_what_a_test_driver_does_changes_nothing_that_is_learned_for_him(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_what_a_test_driver_does_changes_nothing_that_is_learned_for_him(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """Another drive of one driver changes the networks of other folds, and never that of his own."""
     monkeypatch.chdir(tmp_path)
-    overrides = [*QUICK, "protocol=across_drivers", "protocol.folds=3", "policy.hidden_size=4", "cache.enabled=false"]
+    overrides = [
+        *QUICK,
+        "protocol=across_drivers",
+        "protocol.folds=3",
+        "policy.hidden_size=4",
+        "cache.enabled=false",
+    ]
     before = cfx.run(overrides)
     load = SyntheticDataset.load
 
@@ -273,9 +327,13 @@ def test_what_a_test_driver_does_changes_nothing_that_is_learned_for_him(monkeyp
 
 
 @pytest.mark.parametrize("policy", ["fixed", "default"])
-def test_a_baseline_as_policy_equals_itself(policy: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_baseline_as_policy_equals_itself(
+    policy: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.chdir(tmp_path)
-    metrics = cfx.run([*QUICK, "protocol=across_drivers", "protocol.folds=2", f"policy={policy}"]).metrics
+    metrics = cfx.run(
+        [*QUICK, "protocol=across_drivers", "protocol.folds=2", f"policy={policy}"]
+    ).metrics
     same = {"fixed": "population", "default": "default"}[policy]
     assert metrics["rmse_speed/policy"] == metrics[f"rmse_speed/{same}"]
     assert metrics[f"rmse_improvement/{same}/mean"] == 0
@@ -306,7 +364,7 @@ def test_too_few_long_pairs_are_told() -> None:
 def rollout(folder: Path, *changes: str) -> cfx.JobResult:
     small = [
         "learner=rollout",
-        "learner.members=2",
+        "learner.ensemble_size=2",
         "learner.epochs=2",
         "learner.steps=4",
         "learner.horizon=8",
@@ -320,24 +378,33 @@ def test_a_job_learns_by_rollout_and_tells_how_much_history_matters(tmp_path: Pa
     history = pd.read_parquet(tmp_path / "one" / "history.parquet")
     assert set(history["base"]) == {"own", "population"}
     assert list(dict.fromkeys(history["amount"])) == ["0 s", "5 s", "80 %"]
-    whole = history[(history["base"] == "own") & (history["amount"] == "80 %")].set_index("pair_id")["rmse_speed"]
+    whole = history[(history["base"] == "own") & (history["amount"] == "80 %")].set_index(
+        "pair_id"
+    )["rmse_speed"]
     policy = result.pairs[result.pairs["method"] == "policy"].set_index("pair_id")["rmse_speed"]
     pd.testing.assert_series_equal(whole, policy, check_names=False, rtol=1e-9)
     again = cfx.load(tmp_path / "one").policy
     assert again.base is not None
     assert torch.equal(again.base, result.policy.base)  # type: ignore[arg-type]  # it has one
     assert again.shrinkage == result.policy.shrinkage == 0.7
-    assert isinstance(again.network, Committee)
+    assert isinstance(again.network, Ensemble)
     assert again.network.size == 2
     kept = result.policy.network.state_dict()
     assert all(torch.equal(value, kept[key]) for key, value in again.network.state_dict().items())
-    assert {"hard_braking/policy", "jerk/policy", "at_bounds/policy", "platoon/collisions/policy"} <= result.metrics.keys()
+    assert {
+        "hard_braking/policy",
+        "jerk/policy",
+        "at_bounds/policy",
+        "platoon/collisions/policy",
+    } <= result.metrics.keys()
 
 
 def test_less_history_is_what_the_plot_says(tmp_path: Path) -> None:
     one, other = rollout(tmp_path / "one"), rollout(tmp_path / "other", "protocol.history=0")
     history = pd.read_parquet(tmp_path / "one" / "history.parquet")
-    none = history[(history["base"] == "own") & (history["amount"] == "0 s")]["rmse_speed"].to_numpy()
+    none = history[(history["base"] == "own") & (history["amount"] == "0 s")][
+        "rmse_speed"
+    ].to_numpy()
     policy = other.pairs[other.pairs["method"] == "policy"]["rmse_speed"].to_numpy()
     np.testing.assert_allclose(none, policy, rtol=1e-9)
     assert not np.allclose(one.pairs[one.pairs["method"] == "policy"]["rmse_speed"], policy)
@@ -347,20 +414,27 @@ def test_less_history_is_what_the_plot_says(tmp_path: Path) -> None:
     ("base", "shrinkage", "method"),
     [
         ("own", 0, "fixed"),
-        ("own", 0.7, "base"),
+        ("own", 0.7, "shrunk"),
         ("own", 1, "default"),
         ("population", 0.7, "population"),
         ("default", 0.7, "default"),
     ],
 )
-def test_without_learning_the_policy_is_its_base(tmp_path: Path, base: str, shrinkage: float, method: str) -> None:
-    still = ["learner.epochs=1", "learner.steps=1", "learner.learning_rate=1e-12", "learner.weight_decay=0"]
+def test_without_learning_the_policy_is_its_base(
+    tmp_path: Path, base: str, shrinkage: float, method: str
+) -> None:
+    still = [
+        "learner.epochs=1",
+        "learner.steps=1",
+        "learner.learning_rate=1e-12",
+        "learner.weight_decay=0",
+    ]
     start = [f"protocol.base={base}", f"protocol.shrinkage={shrinkage}"]
     result = rollout(tmp_path, *start, "protocol.histories=[]", *still)
     rmse = result.pairs.set_index(["method", "pair_id"])["rmse_speed"]
     np.testing.assert_allclose(rmse["policy"], rmse[method], rtol=1e-5)
     # What drawing does on its own is shown where it was done.
-    assert ("base" in rmse.index.get_level_values(0)) == (base == "own" and shrinkage > 0)
+    assert ("shrunk" in rmse.index.get_level_values(0)) == (base == "own" and shrinkage > 0)
     assert ("rmse_improvement/base/mean" in result.metrics) == (base == "own" and shrinkage > 0)
     assert not (tmp_path / "history.parquet").exists()
 
@@ -374,7 +448,12 @@ def test_a_policy_reaches_farther_than_constant_parameters(tmp_path: Path) -> No
         "learner.weight_decay=0",
         "protocol.histories=[]",
     ]
-    result = rollout(tmp_path / "one", "model.reach={t_r: [0.05, 60]}", "protocol.base=population", *still)
+    result = rollout(
+        tmp_path / "one",
+        "model.adaptation_bounds={t_r: [0.05, 60]}",
+        "protocol.base=population",
+        *still,
+    )
     rmse = result.pairs.set_index(["method", "pair_id"])["rmse_speed"]
     np.testing.assert_allclose(rmse["policy"], rmse["population"], rtol=1e-5)
     for policy in (result.policy, cfx.load(tmp_path / "one").policy):
@@ -382,70 +461,119 @@ def test_a_policy_reaches_farther_than_constant_parameters(tmp_path: Path) -> No
         assert policy.space["t_r"].high == 60 > largest
         for weights in policy.network.parameters():
             weights.data.fill_(0.0)
-        policy.network.get_parameter("members.b_out").data.fill_(20.0)  # as large an answer as there is
-        silence = History(*(torch.zeros((1, policy.windows.length), dtype=torch.float64) for _ in range(5)))
+        policy.network.get_parameter("members.b_out").data.fill_(
+            20.0
+        )  # as large an answer as there is
+        silence = History(
+            *(torch.zeros((1, policy.windows.length), dtype=torch.float64) for _ in range(5))
+        )
         answer, _ = policy.act(silence, policy.begin(torch.zeros(1, dtype=torch.long)))
         assert float(policy.space.unpack(answer)["t_r"]) == pytest.approx(60, rel=1e-3)
 
 
-def test_a_reach_without_offsets_is_said_to_change_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    short = ["protocol=across_drivers", "protocol.folds=2", "learner.epochs=1", f"hydra.run.dir={tmp_path / 'one'}"]
-    result = cfx.run([*QUICK, *short, "model.reach={t_r: [0.05, 60]}"])
-    assert "model.reach changes nothing here" in caplog.text
+def test_a_reach_without_offsets_is_said_to_change_nothing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    short = [
+        "protocol=across_drivers",
+        "protocol.folds=2",
+        "learner.epochs=1",
+        f"hydra.run.dir={tmp_path / 'one'}",
+    ]
+    result = cfx.run([*QUICK, *short, "model.adaptation_bounds={t_r: [0.05, 60]}"])
+    assert "model.adaptation_bounds changes nothing here" in caplog.text
     assert result.policy.space == Krauss().space
 
 
 @pytest.mark.parametrize(
     ("options", "warned"),
     [
-        (["learner.strangers=1"], True),
-        (["learner.strangers=1", "protocol.history=0"], True),  # and 10 and 30 s, for comparison
-        (["learner.strangers=1", "protocol.history=0", "protocol.histories=[]"], False),
-        (["learner.strangers=0.9"], False),
+        (["learner.cold_start_fraction=1"], True),
+        (
+            ["learner.cold_start_fraction=1", "protocol.history=0"],
+            True,
+        ),  # and 10 and 30 s, for comparison
+        (["learner.cold_start_fraction=1", "protocol.history=0", "protocol.histories=[]"], False),
+        (["learner.cold_start_fraction=0.9"], False),
     ],
 )
 def test_reading_what_was_never_learned_to_read_is_warned_of(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, options: list[str], warned: bool
 ) -> None:
-    short = ["protocol=across_drivers", "protocol.folds=2", "learner=rollout", "learner.epochs=1", "learner.steps=1"]
+    short = [
+        "protocol=across_drivers",
+        "protocol.folds=2",
+        "learner=rollout",
+        "learner.epochs=1",
+        "learner.steps=1",
+    ]
     cfx.run([*QUICK, *short, *options, f"hydra.run.dir={tmp_path / 'job'}"])
     assert ("with history before it" in caplog.text) == warned
 
 
 @pytest.mark.parametrize(
     ("options", "warned"),
-    [(["protocol.history=0"], True), (["learner.strangers=1", "protocol.histories=[]"], True), ([], False)],
+    [
+        (["protocol.history=0"], True),
+        (["learner.cold_start_fraction=1", "protocol.histories=[]"], True),
+        ([], False),
+    ],
 )
 def test_traits_of_which_nothing_is_known_are_warned_of(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, options: list[str], warned: bool
 ) -> None:
-    short = ["protocol=across_drivers", "protocol.folds=2", "learner=rollout", "learner.epochs=1", "learner.steps=1"]
-    result = cfx.run([*QUICK, *short, "policy.traits=all", *options, f"hydra.run.dir={tmp_path / 'job'}"])
-    assert ("policy.traits are measured from a driver's history" in caplog.text) == warned
-    assert len(cfx.load(result.folder).policy.policy.traits) == 6
+    short = [
+        "protocol=across_drivers",
+        "protocol.folds=2",
+        "learner=rollout",
+        "learner.epochs=1",
+        "learner.steps=1",
+    ]
+    result = cfx.run(
+        [
+            *QUICK,
+            *short,
+            "policy.driver_features=all",
+            *options,
+            f"hydra.run.dir={tmp_path / 'job'}",
+        ]
+    )
+    assert ("policy.driver_features are measured from a driver's history" in caplog.text) == warned
+    assert len(cfx.load(result.folder).policy.policy.driver_features) == 6
 
 
 def test_drives_that_are_too_short_to_test_change_what_is_learned(tmp_path: Path) -> None:
     """All pairs are calibrated and learned from, the long ones alone stand in the results."""
     frames = [160, 200, 200, 200, 200]
-    pairs = wavy_pairs(Krauss(), torch.tensor([[1.0, 0.1], [1.5, 0.1], [2.0, 0.1], [2.5, 0.1], [3.0, 0.1]]).double(), frames=200)
+    pairs = wavy_pairs(
+        Krauss(),
+        torch.tensor([[1.0, 0.1], [1.5, 0.1], [2.0, 0.1], [2.5, 0.1], [3.0, 0.1]]).double(),
+        frames=200,
+    )
     cut = []
     for pair, count in zip(pairs, frames, strict=True):
         signals: dict[str, Any] = {name: getattr(pair, name)[:count] for name in SIGNALS}
         cut.append(replace(pair, **signals))
     write_tidy(PairSet(tuple(cut), "test"), tmp_path / "pairs.csv")
-    options = ["data=tidy", f"data.path={tmp_path / 'pairs.csv'}", "protocol.min_test_frames=180", "data.min_frames=100"]
+    options = [
+        "data=tidy",
+        f"data.path={tmp_path / 'pairs.csv'}",
+        "protocol.min_test_frames=180",
+        "data.min_frames=100",
+    ]
     options.append("data.max_pairs=null")
     data = [option for option in QUICK if not option.startswith("data.")]
     small = [
         "learner=rollout",
-        "learner.members=1",
+        "learner.ensemble_size=1",
         "learner.epochs=1",
         "learner.steps=2",
         "learner.horizon=8",
         "protocol.folds=2",
     ]
-    result = cfx.run([*data, "protocol=across_drivers", *small, *options, f"hydra.run.dir={tmp_path / 'job'}"])
+    result = cfx.run(
+        [*data, "protocol=across_drivers", *small, *options, f"hydra.run.dir={tmp_path / 'job'}"]
+    )
     assert set(result.pairs["pair_id"]) == {"p1", "p2", "p3", "p4"}
     notes = json.loads((tmp_path / "job" / "data.json").read_text())["protocol"]
     assert notes["pairs_only_learned_from"] == 1

@@ -23,22 +23,42 @@ from cfx.protocols.transfer import Transfer
 from cfx.simulation.rollout import Simulator
 from cfx.testing import ProtocolContract
 
-QUICK = ["debug=quick", "data.max_pairs=null", "data.frames=200", "figures.enabled=false", "tracking.enabled=false"]
+QUICK = [
+    "debug=quick",
+    "data.max_pairs=null",
+    "data.frames=200",
+    "figures.enabled=false",
+    "tracking.enabled=false",
+]
 TRAINED = [*QUICK, "data.pairs=6", "data.seed=5"]
 HERE = [*QUICK, "data.pairs=3", "data.seed=9", "protocol=transfer"]
-ACROSS = ["protocol=across_drivers", "protocol.folds=2", "protocol.histories=[]", "policy.inputs=situation", "learner=rollout"]
-ROLLOUT = [*ACROSS, "learner.epochs=1", "learner.steps=3", "learner.horizon=4", "learner.members=2"]
+ACROSS = [
+    "protocol=across_drivers",
+    "protocol.folds=2",
+    "protocol.histories=[]",
+    "policy.inputs=situation",
+    "learner=rollout",
+]
+ROLLOUT = [
+    *ACROSS,
+    "learner.epochs=1",
+    "learner.steps=3",
+    "learner.horizon=4",
+    "learner.ensemble_size=2",
+]
 
 
 def trained(folder: Path, *overrides: str) -> Path:
-    return cfx.run([*TRAINED, f"hydra.run.dir={folder}", f"cache.folder={folder.parent / 'cache'}", *overrides]).folder
+    return cfx.run(
+        [*TRAINED, f"hydra.run.dir={folder}", f"cache.folder={folder.parent / 'cache'}", *overrides]
+    ).folder
 
 
 @pytest.fixture(scope="module")
-def strangers(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def cold_start_fraction(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A job whose policy knows nothing of its drivers."""
-    nothing = ["protocol.base=population", "protocol.history=0", "learner.strangers=1"]
-    return trained(tmp_path_factory.mktemp("jobs") / "strangers", *ROLLOUT, *nothing)
+    nothing = ["protocol.base=population", "protocol.history=0", "learner.cold_start_fraction=1"]
+    return trained(tmp_path_factory.mktemp("jobs") / "cold_start_fraction", *ROLLOUT, *nothing)
 
 
 @pytest.fixture(scope="module")
@@ -54,8 +74,8 @@ def one_for_all(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def saved(strangers: Path) -> Transfer:
-    return Transfer(run=strangers)
+def saved(cold_start_fraction: Path) -> Transfer:
+    return Transfer(run=cold_start_fraction)
 
 
 class TestTransfer(ProtocolContract):
@@ -72,96 +92,176 @@ def transferred(run: Path, tmp_path: Path, *overrides: str) -> cfx.JobResult:
     return cfx.run([*HERE, f"protocol.run={run}", f"hydra.run.dir={tmp_path / 'job'}", *overrides])
 
 
-def test_it_drives_with_the_network_of_all_from_the_populations_parameters(strangers: Path, tmp_path: Path) -> None:
-    result = transferred(strangers, tmp_path)
-    policy = TrainedPolicy.load(strangers / "policy")
+def test_it_drives_with_the_network_of_all_from_the_populations_parameters(
+    cold_start_fraction: Path, tmp_path: Path
+) -> None:
+    result = transferred(cold_start_fraction, tmp_path)
+    policy = TrainedPolicy.load(cold_start_fraction / "policy")
     batch = PairBatch.of(elsewhere())
     number = torch.full((3,), policy.names.index(ALL))
     model = cfx.get("model", "krauss")()
     loop = drive(Simulator(model, 0.1), policy, batch, torch.zeros(3, dtype=torch.int64), number)
     error = loop.speed - batch.follower_speed[:, : loop.speed.shape[1]]
     rows = result.pairs[result.pairs.method == "policy"]
-    torch.testing.assert_close(torch.tensor(rows["whole_rmse_speed"].to_numpy()), error[:, 1:].square().mean(1).sqrt())
+    torch.testing.assert_close(
+        torch.tensor(rows["full_trajectory_rmse_speed"].to_numpy()),
+        error[:, 1:].square().mean(1).sqrt(),
+    )
     assert policy.population is not None
-    population = result.pairs[result.pairs.method == "population"][["parameter_t_r", "parameter_t_i"]].to_numpy()
+    population = result.pairs[result.pairs.method == "population"][
+        ["parameter_t_r", "parameter_t_i"]
+    ].to_numpy()
     torch.testing.assert_close(torch.tensor(population), policy.population[number])
 
 
-def test_it_starts_from_drivers_own_parameters_where_it_learned_so(known: Path, strangers: Path, tmp_path: Path) -> None:
-    assert "rmse_speed/base" in transferred(known, tmp_path / "known").metrics  # own sets, drawn by 0.4, held
-    assert "rmse_speed/base" not in transferred(strangers, tmp_path / "strangers").metrics
+def test_it_starts_from_drivers_own_parameters_where_it_learned_so(
+    known: Path, cold_start_fraction: Path, tmp_path: Path
+) -> None:
+    assert (
+        "rmse_speed/base" in transferred(known, tmp_path / "known").metrics
+    )  # own sets, drawn by 0.4, held
+    assert (
+        "rmse_speed/base"
+        not in transferred(cold_start_fraction, tmp_path / "cold_start_fraction").metrics
+    )
 
 
-def test_model_policy_and_windows_are_those_it_was_trained_with(strangers: Path, tmp_path: Path) -> None:
-    result = transferred(strangers, tmp_path, "model=w99", "policy=lstm", "windows.length=7")
+def test_model_policy_and_windows_are_those_it_was_trained_with(
+    cold_start_fraction: Path, tmp_path: Path
+) -> None:
+    result = transferred(
+        cold_start_fraction, tmp_path, "model=w99", "policy=lstm", "windows.length=7"
+    )
     config = yaml.safe_load((result.folder / "config.yaml").read_text())
-    assert (config["model"]["name"], config["policy"]["name"], config["windows"]["length"]) == ("krauss", "gru", 5)
+    assert (config["model"]["name"], config["policy"]["name"], config["windows"]["length"]) == (
+        "krauss",
+        "gru",
+        5,
+    )
     assert config["policy"]["inputs"] == "situation"
-    assert json.loads((result.folder / "data.json").read_text())["protocol"]["pairs_learned_from"] == 6
+    assert (
+        json.loads((result.folder / "data.json").read_text())["protocol"]["pairs_learned_from"] == 6
+    )
 
 
 def test_the_job_may_be_named_by_its_mlflow_run(tmp_path: Path) -> None:
     tracked = ["tracking.enabled=true", f"tracking.uri=sqlite:///{tmp_path / 'jobs.db'}"]
-    first = cfx.run([*TRAINED, "protocol.networks=all", f"hydra.run.dir={tmp_path / 'first'}", *tracked])
+    first = cfx.run(
+        [*TRAINED, "protocol.networks=all", f"hydra.run.dir={tmp_path / 'first'}", *tracked]
+    )
     there = transferred(first.folder, tmp_path / "by folder")
-    named = cfx.run([*HERE, f"protocol.run={first.run_id}", f"hydra.run.dir={tmp_path / 'by id'}", *tracked])
+    named = cfx.run(
+        [*HERE, f"protocol.run={first.run_id}", f"hydra.run.dir={tmp_path / 'by id'}", *tracked]
+    )
     pd.testing.assert_frame_equal(named.pairs, there.pairs)
-    assert yaml.safe_load((named.folder / "config.yaml").read_text())["protocol"]["run"] == first.run_id
+    assert (
+        yaml.safe_load((named.folder / "config.yaml").read_text())["protocol"]["run"]
+        == first.run_id
+    )
     with pytest.raises(TrackingError, match=r"could not read run f{32}"):
-        cfx.run([*HERE, f"protocol.run={'f' * 32}", f"hydra.run.dir={tmp_path / 'nothing'}", *tracked])
+        cfx.run(
+            [*HERE, f"protocol.run={'f' * 32}", f"hydra.run.dir={tmp_path / 'nothing'}", *tracked]
+        )
 
 
-def test_without_a_population_the_default_is_the_only_baseline_of_strangers(one_for_all: Path, tmp_path: Path) -> None:
+def test_without_a_population_the_default_is_the_only_baseline_of_strangers(
+    one_for_all: Path, tmp_path: Path
+) -> None:
     result = transferred(one_for_all, tmp_path)
     assert set(result.pairs.method) == {"default", "fixed", "policy"}
-    assert result.pairs[result.pairs.method == "policy"]["whole_rmse_speed"].notna().all()
+    assert result.pairs[result.pairs.method == "policy"]["full_trajectory_rmse_speed"].notna().all()
 
 
-def test_what_it_has_learned_from_is_refused_whatever_it_is_called(strangers: Path, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"has learned from 3 of the 3 pairs in .*, the first of them 'synthetic-"):
-        transferred(strangers, tmp_path, "data.seed=5", "data.pairs=6", "data.max_pairs=3")
-    learned = SyntheticDataset(pairs=6, frames=200, seed=5).load()
-    renamed = tuple(replace(pair, recording="other", pair_id=f"x{pair.pair_id}", truth={}) for pair in learned[:4])
+def test_what_it_has_learned_from_is_refused_whatever_it_is_called(
+    cold_start_fraction: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(
+        DataError, match=r"has learned from 3 of the 3 pairs in .*, the first of them 'synthetic-"
+    ):
+        transferred(
+            cold_start_fraction, tmp_path, "data.seed=5", "data.pairs=6", "data.max_pairs=3"
+        )
+    training_result = SyntheticDataset(pairs=6, frames=200, seed=5).load()
+    renamed = tuple(
+        replace(pair, recording="other", pair_id=f"x{pair.pair_id}", truth={})
+        for pair in training_result[:4]
+    )
     write_tidy(PairSet((*renamed, *elsewhere()), "both"), tmp_path / "renamed.csv")
-    tidy = [*QUICK[1:2], *QUICK[3:], "data=tidy", "data.min_frames=100", "protocol=transfer", f"protocol.run={strangers}"]
+    tidy = [
+        *QUICK[1:2],
+        *QUICK[3:],
+        "data=tidy",
+        "data.min_frames=100",
+        "protocol=transfer",
+        f"protocol.run={cold_start_fraction}",
+    ]
     with pytest.raises(DataError, match="has learned from 4 of the 7 pairs"):
-        cfx.run([*tidy, f"data.path={tmp_path / 'renamed.csv'}", f"hydra.run.dir={tmp_path / 'again'}"])
+        cfx.run(
+            [*tidy, f"data.path={tmp_path / 'renamed.csv'}", f"hydra.run.dir={tmp_path / 'again'}"]
+        )
 
 
 def test_constant_parameters_are_not_tested_on_whom_they_were_calibrated_on(tmp_path: Path) -> None:
-    constant = trained(tmp_path / "constant", "policy=fixed", "protocol=across_drivers", "protocol.folds=2")
+    constant = trained(
+        tmp_path / "constant", "policy=fixed", "protocol=across_drivers", "protocol.folds=2"
+    )
     with pytest.raises(DataError, match="has learned from 3 of the 3 pairs"):
         transferred(constant, tmp_path, "data.seed=5", "data.pairs=6", "data.max_pairs=3")
     there = transferred(constant, tmp_path)
-    gain = there.metrics["whole/rmse_improvement/population/mean"]
+    gain = there.metrics["full_trajectory/rmse_improvement/population/mean"]
     assert gain == pytest.approx(0, abs=1e-9)
 
 
-def test_drivers_of_the_same_names_are_said(strangers: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_drivers_of_the_same_names_are_said(
+    cold_start_fraction: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     with caplog.at_level("WARNING"):
-        result = transferred(strangers, tmp_path)  # all synthetic recordings are called synthetic
-    assert any("3 drivers are called, recording and all, as some" in message for message in caplog.messages)
-    assert json.loads((result.folder / "data.json").read_text())["protocol"]["drivers_named_as_some_learned_from"] == 3
+        result = transferred(
+            cold_start_fraction, tmp_path
+        )  # all synthetic recordings are called synthetic
+    assert any(
+        "3 drivers are called, recording and all, as some" in message for message in caplog.messages
+    )
+    assert (
+        json.loads((result.folder / "data.json").read_text())["protocol"][
+            "drivers_named_as_some_learned_from"
+        ]
+        == 3
+    )
 
 
-def test_other_time_steps_are_refused(strangers: Path, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"drives in steps of 0.1 s, .* has 0.05 s; set data.time_step=0.1"):
-        transferred(strangers, tmp_path, "data.dt=0.05")
-    assert transferred(strangers, tmp_path, "data.dt=0.05", "data.frames=400", "data.time_step=0.1").metrics
+def test_other_time_steps_are_refused(cold_start_fraction: Path, tmp_path: Path) -> None:
+    with pytest.raises(
+        DataError, match=r"drives in steps of 0.1 s, .* has 0.05 s; set data.time_step=0.1"
+    ):
+        transferred(cold_start_fraction, tmp_path, "data.dt=0.05")
+    assert transferred(
+        cold_start_fraction, tmp_path, "data.dt=0.05", "data.frames=400", "data.time_step=0.1"
+    ).metrics
 
 
 def test_runs_that_have_no_policy_for_others_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"protocol\.run=.*nowhere: .*nowhere/policy holds no policy"):
+    with pytest.raises(
+        DataError, match=r"protocol\.run=.*nowhere: .*nowhere/policy holds no policy"
+    ):
         transferred(tmp_path / "nowhere", tmp_path)
     per_pair = trained(tmp_path / "pairs", "data.pairs=2")
-    with pytest.raises(DataError, match=r"protocol\.run=.*pairs: the policy has 2 networks, one for each of its own pairs"):
+    with pytest.raises(
+        DataError,
+        match=r"protocol\.run=.*pairs: the policy has 2 networks, one for each of its own pairs",
+    ):
         transferred(per_pair, tmp_path)
     with pytest.raises(CfxError, match=r"protocol\.run: a value is required"):
         cfx.run([*HERE, f"hydra.run.dir={tmp_path / 'job'}"])
 
 
-def test_a_job_that_drives_a_saved_policy_hands_it_on(strangers: Path, tmp_path: Path) -> None:
-    once = transferred(strangers, tmp_path / "once")
+def test_a_job_that_drives_a_saved_policy_hands_it_on(
+    cold_start_fraction: Path, tmp_path: Path
+) -> None:
+    once = transferred(cold_start_fraction, tmp_path / "once")
     twice = transferred(once.folder, tmp_path / "twice")
     pd.testing.assert_frame_equal(twice.pairs, once.pairs)
-    assert TrainedPolicy.load(twice.folder / "policy").learned_from == TrainedPolicy.load(strangers / "policy").learned_from
+    assert (
+        TrainedPolicy.load(twice.folder / "policy").learned_from
+        == TrainedPolicy.load(cold_start_fraction / "policy").learned_from
+    )

@@ -37,11 +37,13 @@ def write_job(
     space: ParameterSpace = TWO,
     source: str = "recording.parquet",
     settings: Mapping[str, Any] | None = None,
-    follows: bool = True,
+    has_constant_baseline: bool = True,
     further: bool = False,
 ) -> dict[str, float | None]:
     """Writes a job's folder; returns what its metrics.json holds. `further`: with safety, platoons and history."""
-    made = make_results(pairs=pairs, frames=frames, space=space, seed=seed, epochs=12, methods=tuple(methods))
+    made = make_results(
+        pairs=pairs, frames=frames, space=space, seed=seed, epochs=12, methods=tuple(methods)
+    )
     evaluation = _completed(made.evaluation, methods, cluster)
     folder.mkdir(parents=True)
     if further:
@@ -53,11 +55,16 @@ def write_job(
     config = {
         "preset": experiment or None,
         "data": {"name": "tidy", "path": source},
-        "model": {"name": model, "parameters": {p.name: {"low": p.low, "high": p.high} for p in space.tuned}},
+        "model": {
+            "name": model,
+            "parameters": {p.name: {"low": p.low, "high": p.high} for p in space.tuned},
+        },
         "policy": {"name": "gru"},
         "optimizer": {"name": "random"},
         "learner": {"name": "imitation", "epochs": 12, "batch_size": 16},
-        "protocol": {"name": "across_drivers", "folds": 5} if "population" in methods else {"name": "within_driver"},
+        "protocol": {"name": "across_drivers", "folds": 5}
+        if "population" in methods
+        else {"name": "within_driver"},
         "seed": 0,
         "split": 0.8,
         "style": {"cluster": cluster, "percentiles": [25.0, 75.0]},
@@ -67,7 +74,7 @@ def write_job(
     (folder / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False), encoding="utf-8")
     evaluation.table.to_csv(folder / "pairs.csv", index=False)
     made.style.table.to_csv(folder / "style.csv", index=False)
-    evaluation.drives_table().to_parquet(folder / "drives.parquet", index=False)
+    evaluation.trajectories_table().to_parquet(folder / "trajectories.parquet", index=False)
     made.curves.astype({"network": str}).to_parquet(folder / "curves.parquet", index=False)
     dropped = [{"reason": "fewer than 700 frames", "count": 12, "unit": "pairs"}]
     units = [{"name": p.name, "unit": p.unit, "low": p.low, "high": p.high} for p in space.tuned]
@@ -77,24 +84,33 @@ def write_job(
         "pairs": pairs,
         "dropped": dropped,
         "parameters": units,
-        "follows": follows,
+        "has_constant_baseline": has_constant_baseline,
     }
     (folder / "data.json").write_text(json.dumps(data), encoding="utf-8")
     (folder / ".hydra").mkdir()
-    (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(list(overrides)), encoding="utf-8")
-    (folder / "cfx.log").write_text("2026-11-21 15:28:37,316 INFO begin\n2026-11-21 15:29:42,000 INFO end\n", encoding="utf-8")
-    metrics = {name: value if math.isfinite(value) else None for name, value in evaluation.metrics().items()}
+    (folder / ".hydra" / "overrides.yaml").write_text(
+        yaml.safe_dump(list(overrides)), encoding="utf-8"
+    )
+    (folder / "cfx.log").write_text(
+        "2026-11-21 15:28:37,316 INFO begin\n2026-11-21 15:29:42,000 INFO end\n", encoding="utf-8"
+    )
+    metrics = {
+        name: value if math.isfinite(value) else None
+        for name, value in evaluation.metrics().items()
+    }
     (folder / "metrics.json").write_text(json.dumps(metrics), encoding="utf-8")
     return metrics
 
 
 def _with_further_results(evaluation: Evaluation) -> Evaluation:
     table = evaluation.table.assign(hard_braking=1, rms_jerk=2.5, real_rms_jerk=0.4, at_bounds=0.25)
-    if evaluation.whole_improvements:
-        table = table.assign(whole_collisions=0.0, whole_hard_braking=2.0)
+    if evaluation.full_trajectory_improvements:
+        table = table.assign(full_trajectory_collisions=0.0, full_trajectory_hard_braking=2.0)
     methods = [method for method in evaluation.methods if method != "fixed"]
     platoon = make_platoon(dict.fromkeys(methods, 2))
-    return dataclasses.replace(evaluation, table=table, platoon=platoon, history=make_history(evaluation.drives, GAINS))
+    return dataclasses.replace(
+        evaluation, table=table, platoon=platoon, history=make_history(evaluation.drives, GAINS)
+    )
 
 
 def _completed(evaluation: Evaluation, methods: Sequence[str], cluster: str) -> Evaluation:
@@ -110,10 +126,19 @@ def _completed(evaluation: Evaluation, methods: Sequence[str], cluster: str) -> 
         if baseline != "fixed":
             before = rmse(speeds[baseline]).astype(float)
             table[f"improvement_over_{baseline}"] = (before - table["rmse_speed"]) / before
-            improvements_whole[baseline] = _statistics(1.3 * speeds[baseline], 1.1 * speeds["policy"])
+            improvements_whole[baseline] = _statistics(
+                1.3 * speeds[baseline], 1.1 * speeds["policy"]
+            )
     if whole:
-        factor = table["method"].map({"default": 1.3, "population": 1.3, "policy": 1.1, "fixed": np.nan}).astype(float)
-        table["whole_rmse_speed"], table["whole_rmse_gap"] = factor * table["rmse_speed"], factor * table["rmse_gap"]
+        factor = (
+            table["method"]
+            .map({"default": 1.3, "population": 1.3, "policy": 1.1, "fixed": np.nan})
+            .astype(float)
+        )
+        table["full_trajectory_rmse_speed"], table["full_trajectory_rmse_gap"] = (
+            factor * table["rmse_speed"],
+            factor * table["rmse_gap"],
+        )
     return Evaluation(
         table,
         improvements,

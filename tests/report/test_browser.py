@@ -10,7 +10,9 @@ from tests.browser import Browser
 from tests.report.folders import write_job
 
 
-def test_plots_are_drawn_headings_sort_and_nothing_is_asked_for(tmp_path: Path, browser: Browser) -> None:
+def test_plots_are_drawn_headings_sort_and_nothing_is_asked_for(
+    tmp_path: Path, browser: Browser
+) -> None:
     write_job(tmp_path / "0", pairs=8)
     write_job(tmp_path / "1", model="w99", pairs=8, seed=1)
     path = write_report(read_runs([str(tmp_path)]), tmp_path / "report.html")

@@ -25,7 +25,14 @@ def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two models that follow, and one that is set its acceleration."""
     folder = tmp_path_factory.mktemp("sweep")
     for seed, model in enumerate(("krauss", "w99", "direct")):
-        write_job(folder / model, model=model, methods=ACROSS, seed=seed, follows=model != "direct", further=True)
+        write_job(
+            folder / model,
+            model=model,
+            methods=ACROSS,
+            seed=seed,
+            has_constant_baseline=model != "direct",
+            further=True,
+        )
     return folder
 
 
@@ -48,8 +55,10 @@ def test_errors_of_all_jobs_stand_in_one_table_in_metres(sweep: Path) -> None:
             for where in ("", "whole/")
         ]
         assert row["policy"] == expected
-        if job.follows:
-            assert row["own fixed"] == [f"{job.metrics['rmse_speed/fixed']:.3f} {job.metrics['rmse_gap/fixed']:.2f}"]
+        if job.has_constant_baseline:
+            assert row["own fixed"] == [
+                f"{job.metrics['rmse_speed/fixed']:.3f} {job.metrics['rmse_gap/fixed']:.2f}"
+            ]
             assert row["over own fixed"][0].startswith(
                 f"{100 * job.metrics['rmse_improvement/mean']:+.1f} %".replace("-", "\u2212")
             )
@@ -58,12 +67,17 @@ def test_errors_of_all_jobs_stand_in_one_table_in_metres(sweep: Path) -> None:
 
 def test_jobs_with_and_without_a_baseline_stand_in_one_report(tmp_path: Path) -> None:
     """A drawn base is a baseline of jobs that learn by rollout; those that imitate beside them have none."""
-    write_job(tmp_path / "rollout", model="krauss", methods=(*ACROSS, "base"), seed=0)
+    write_job(tmp_path / "rollout", model="krauss", methods=(*ACROSS, "shrunk"), seed=0)
     write_job(tmp_path / "imitation", model="w99", methods=ACROSS, seed=1)
     runs = read_runs([str(tmp_path)])
     sheet, page = closeness(runs.jobs), render(runs)
-    with_base, without = (next(job for job in runs.jobs if ("base" in job.methods) is there) for there in (True, False))
-    assert cells(sheet, with_base.name)["own, drawn"][0].startswith(f"{with_base.metrics['rmse_speed/base']:.3f}")
+    with_base, without = (
+        next(job for job in runs.jobs if ("shrunk" in job.methods) is there)
+        for there in (True, False)
+    )
+    assert cells(sheet, with_base.name)["own, drawn"][0].startswith(
+        f"{with_base.metrics['rmse_speed/base']:.3f}"
+    )
     assert set(cells(sheet, without.name)["own, drawn"]) == {"\N{EN DASH}"}
     assert "drawn towards the default" in page
 
@@ -79,11 +93,15 @@ def test_the_best_is_marked_where_the_pairs_are_the_same(sweep: Path, tmp_path: 
     assert not [cell for row in others.rows for cell in row if cell.best]
 
 
-def test_constant_parameters_of_a_model_that_does_not_follow_are_compared_with_nowhere(sweep: Path) -> None:
+def test_constant_parameters_of_a_model_that_does_not_follow_are_compared_with_nowhere(
+    sweep: Path,
+) -> None:
     jobs = read_runs([str(sweep)]).jobs
     (direct,) = (job for job in jobs if job.component("model") == "direct")
     row = cells(closeness(jobs), direct.name)
-    assert {*row["default"], *row["population"], *row["own fixed"], *row["over own fixed"]} == {"\u2013"}
+    assert {*row["default"], *row["population"], *row["own fixed"], *row["over own fixed"]} == {
+        "\u2013"
+    }
     assert direct.baselines() == ()
     said = " ".join(summary(jobs))
     assert "direct: the policy sets the acceleration itself. RMSE of speed" in said
@@ -91,8 +109,17 @@ def test_constant_parameters_of_a_model_that_does_not_follow_are_compared_with_n
     assert {row[1].text for row in safety_of_methods([direct]).rows} == {"real", "policy"}
 
 
-def test_a_report_of_such_a_job_alone_has_no_comparison_with_fixed_parameters(tmp_path: Path) -> None:
-    write_job(tmp_path / "job", model="direct", pairs=4, methods=ACROSS, follows=False, further=True)
+def test_a_report_of_such_a_job_alone_has_no_comparison_with_fixed_parameters(
+    tmp_path: Path,
+) -> None:
+    write_job(
+        tmp_path / "job",
+        model="direct",
+        pairs=4,
+        methods=ACROSS,
+        has_constant_baseline=False,
+        further=True,
+    )
     page = page_of(tmp_path)
     assert {"comparison", "safety", "history", "drives"} <= set(page.having("id"))
     assert not {"drivers", "clusters"} & set(page.having("id"))
@@ -111,7 +138,9 @@ def test_safety_is_told_of_the_policy_and_below_it_of_a_baseline(sweep: Path) ->
     assert cells(safety(jobs), "direct")["Hard braking"] == ["8"]
 
 
-def test_jobs_of_an_older_version_have_a_page_without_what_they_did_not_measure(tmp_path: Path) -> None:
+def test_jobs_of_an_older_version_have_a_page_without_what_they_did_not_measure(
+    tmp_path: Path,
+) -> None:
     write_job(tmp_path / "job", pairs=4)
     jobs = read_runs([str(tmp_path)]).jobs
     assert [column.heading for column in safety(jobs).columns] == ["Job", "Collisions"]
@@ -141,13 +170,17 @@ def test_history_has_a_plot_and_a_table(sweep: Path) -> None:
     assert amounts.count(["0 s", "10 s", "80 %"]) == 3
 
 
-def test_the_comparison_fits_a_laptop_and_sorts(sweep: Path, tmp_path: Path, browser: Browser) -> None:
+def test_the_comparison_fits_a_laptop_and_sorts(
+    sweep: Path, tmp_path: Path, browser: Browser
+) -> None:
     path = tmp_path / "report.html"
     path.write_text(render(read_runs([str(sweep)])), encoding="utf-8")
     page = browser.page
     page.set_viewport_size({"width": 1366, "height": 900})
     page.goto(path.as_uri())
-    widths = page.evaluate("[...document.querySelectorAll('#comparison .scroll')].map(s => s.scrollWidth - s.clientWidth)")
+    widths = page.evaluate(
+        "[...document.querySelectorAll('#comparison .scroll')].map(s => s.scrollWidth - s.clientWidth)"
+    )
     assert widths == [0, 0]
     names = page.locator("#comparison .compact").first.locator("tbody td:first-child")
     heading = page.locator("#comparison .compact").first.locator("thead tr:nth-child(2) th").nth(4)

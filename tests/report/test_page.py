@@ -15,14 +15,26 @@ import pytest
 
 from cfx.report import paper
 from cfx.report.comparison import absolute
-from cfx.report.drive_plots import chosen_drives, drive
+from cfx.report.drive_plots import chosen_trajectories, drive
 from cfx.report.improvement_plots import overview, per_driver
 from cfx.report.page import cluster_series, duration, render, summary
 from cfx.report.runs import read_runs
 from tests.report.folders import ACROSS, write_job
 
 HOSTILE = "</script><img src=x onerror=alert(1)>&\"'"
-SECTIONS = ("summary", "comparison", "run", "results", "safety", "drivers", "clusters", "style", "drives", "learning", "configs")
+SECTIONS = (
+    "summary",
+    "comparison",
+    "run",
+    "results",
+    "safety",
+    "drivers",
+    "clusters",
+    "style",
+    "drives",
+    "learning",
+    "configs",
+)
 
 
 class Page(HTMLParser):
@@ -67,7 +79,9 @@ class Page(HTMLParser):
                 self.tables[-1][-1][-1] += data
 
     def having(self, attribute: str) -> list[str]:
-        return [str(attributes[attribute]) for _, attributes in self.elements if attribute in attributes]
+        return [
+            str(attributes[attribute]) for _, attributes in self.elements if attribute in attributes
+        ]
 
 
 Clusters = tuple[Path, dict[str, dict[str, float | None]], Page]
@@ -100,7 +114,10 @@ def test_the_page_has_every_section(clusters: Clusters) -> None:
     ids = page.having("id")
     assert set(SECTIONS) | {"paper"} <= set(ids)
     assert len(ids) == len(set(ids))
-    assert {link.removeprefix("#") for link in page.having("href") if link != "data:,"} == {*SECTIONS, "paper"}
+    assert {link.removeprefix("#") for link in page.having("href") if link != "data:,"} == {
+        *SECTIONS,
+        "paper",
+    }
     assert len(page.contents) == sum("plot" in (a.get("class") or "") for _, a in page.elements)
     assert "12 pairs (fewer than 700 frames)" in page.words
     assert "secret" not in page.words
@@ -111,9 +128,16 @@ def test_the_page_asks_for_nothing_and_runs_only_its_own_scripts(
 ) -> None:
     _, _, page = clusters
     for attribute in ("src", "href", "action", "srcset", "data", "poster"):
-        assert not [value for value in page.having(attribute) if not value.startswith(("#", "data:"))]
-    (policy,) = (a["content"] for tag, a in page.elements if a.get("http-equiv") == "Content-Security-Policy")
-    hashes = {f"'sha256-{base64.b64encode(hashlib.sha256(one.encode()).digest()).decode()}'" for one in page.scripts}
+        assert not [
+            value for value in page.having(attribute) if not value.startswith(("#", "data:"))
+        ]
+    (policy,) = (
+        a["content"] for tag, a in page.elements if a.get("http-equiv") == "Content-Security-Policy"
+    )
+    hashes = {
+        f"'sha256-{base64.b64encode(hashlib.sha256(one.encode()).digest()).decode()}'"
+        for one in page.scripts
+    }
     assert set(re.findall(r"'sha256-[^']+'", str(policy))) == hashes
     assert len(page.scripts) == 4
     assert str(policy).startswith("default-src 'none';")
@@ -122,27 +146,45 @@ def test_the_page_asks_for_nothing_and_runs_only_its_own_scripts(
 
 def test_the_tables_hold_the_numbers_of_metrics_json(clusters: Clusters) -> None:
     _, metrics, page = clusters
-    gains, errors = (next(table for table in page.tables if heading in table[0]) for heading in ("Policy against", "Method"))
+    gains, errors = (
+        next(table for table in page.tables if heading in table[0])
+        for heading in ("Policy against", "Method")
+    )
     assert len(errors) == 1 + 4 * 4
     assert len(gains) == 1 + 4 * (3 + 2)
     for name, values in metrics.items():
-        for method, shown in (("default", "default"), ("population", "population"), ("fixed", "own fixed"), ("policy", "policy")):
+        for method, shown in (
+            ("default", "default"),
+            ("population", "population"),
+            ("fixed", "own fixed"),
+            ("policy", "policy"),
+        ):
             (row,) = (row for row in errors if row[:2] == [name, shown])
-            expected = [values[f"{column}/{method}"] for column in ("rmse_speed", "rmse_gap", "collisions")]
+            expected = [
+                values[f"{column}/{method}"] for column in ("rmse_speed", "rmse_gap", "collisions")
+            ]
             assert [float(cell) for cell in row[3:6]] == expected
-            whole = values.get(f"whole/rmse_speed/{method}")
+            whole = values.get(f"full_trajectory/rmse_speed/{method}")
             assert row[6] == ("" if whole is None else repr(whole))
         for prefix, shown, frames in (
             ("rmse_improvement", "own fixed", "test part"),
             ("rmse_improvement/default", "default", "test part"),
             ("rmse_improvement/population", "population", "test part"),
-            ("whole/rmse_improvement/default", "default", "whole drive"),
-            ("whole/rmse_improvement/population", "population", "whole drive"),
+            ("full_trajectory/rmse_improvement/default", "default", "whole drive"),
+            ("full_trajectory/rmse_improvement/population", "population", "whole drive"),
         ):
-            (row,) = (row for row in gains if row[:3] == [name, shown, frames.replace(" ", "\N{NO-BREAK SPACE}")])
+            (row,) = (
+                row
+                for row in gains
+                if row[:3] == [name, shown, frames.replace(" ", "\N{NO-BREAK SPACE}")]
+            )
             names = ("mean", "ci95_low", "trimmed_mean", "median", "win_rate", "p_value")
-            assert [float(cell) for cell in row[3:9]] == [values[f"{prefix}/{one}"] for one in names]
-            low, high = (100 * (values[f"{prefix}/{end}"] or 0.0) for end in ("ci95_low", "ci95_high"))
+            assert [float(cell) for cell in row[3:9]] == [
+                values[f"{prefix}/{one}"] for one in names
+            ]
+            low, high = (
+                100 * (values[f"{prefix}/{end}"] or 0.0) for end in ("ci95_low", "ci95_high")
+            )
             assert f"{low:+.1f} % to {high:+.1f} %".replace("-", "\N{MINUS SIGN}") in page.words
 
 
@@ -154,15 +196,19 @@ def test_names_from_data_are_text_and_nothing_else(tmp_path: Path) -> None:
         if "pair_id" in table:
             table["pair_id"] = table["pair_id"].astype(str) + HOSTILE
         table.to_csv(tmp_path / "job" / file, index=False)
-    drives = pd.read_parquet(tmp_path / "job" / "drives.parquet")
+    drives = pd.read_parquet(tmp_path / "job" / "trajectories.parquet")
     drives["pair_id"] = drives["pair_id"].astype(str) + HOSTILE
-    drives.to_parquet(tmp_path / "job" / "drives.parquet")
+    drives.to_parquet(tmp_path / "job" / "trajectories.parquet")
     page = page_of(tmp_path)
     assert "img" not in {tag for tag, _ in page.elements}
     assert HOSTILE in page.words
     assert len(page.scripts) == 4
     shown = json.dumps(
-        [[view["data"], view["layout"]] for content in page.contents.values() for view in content["views"].values()]
+        [
+            [view["data"], view["layout"]]
+            for content in page.contents.values()
+            for view in content["views"].values()
+        ]
     )
     assert "&lt;img" in shown
     assert "<img" not in shown
@@ -191,7 +237,9 @@ def test_the_pairs_can_be_ordered_by_driver_and_by_each_job(tmp_path: Path) -> N
     orders = per_driver(runs.jobs).orders
     for job in runs.jobs:
         gain = job.by_pair.set_index("pair_id")["improvement/fixed"]
-        assert orders[f"improvement over fixed, {job.name}"] == list(gain.sort_values(ascending=False).index)
+        assert orders[f"improvement over fixed, {job.name}"] == list(
+            gain.sort_values(ascending=False).index
+        )
     assert orders["driver"] == sorted(runs.jobs[0].by_pair["pair_id"])
 
 
@@ -211,44 +259,58 @@ def test_best_median_and_worst_drives_alone_are_shown(tmp_path: Path) -> None:
     write_job(tmp_path / "job", pairs=9)
     (job,) = read_runs([str(tmp_path)]).jobs
     gain = job.by_pair.set_index("pair_id")["improvement/fixed"].sort_values(ascending=False)
-    chosen = chosen_drives(job)
+    chosen = chosen_trajectories(job)
     assert [(one.rank, one.pair_id) for one in chosen] == [
         ("best", gain.index[0]),
         ("median", gain.index[4]),
         ("worst", gain.index[8]),
     ]
     view = drive(job, chosen[0].pair_id).views[""]
-    assert [note["text"] for note in view["layout"]["annotations"][:2]] == ["<b>t_r (s)</b>", "<b>t_i (s)</b>"]
+    assert [note["text"] for note in view["layout"]["annotations"][:2]] == [
+        "<b>t_r (s)</b>",
+        "<b>t_i (s)</b>",
+    ]
     bottom, top = view["layout"]["yaxis3"]["range"]
     assert top - bottom >= 0.2 * (10.0 - 0.1)
     assert len(view["data"]) == 2 + 3 + 1 + 3 + 2 * 3
     shown = page_of(tmp_path).contents.values()
-    assert sum("yaxis3" in view["layout"] for content in shown for view in content["views"].values()) == 3
+    assert (
+        sum("yaxis3" in view["layout"] for content in shown for view in content["views"].values())
+        == 3
+    )
 
 
 @pytest.mark.parametrize("pairs", [1, 2])
-def test_a_job_of_very_few_pairs_and_of_a_model_that_is_not_installed_has_a_page(tmp_path: Path, pairs: int) -> None:
+def test_a_job_of_very_few_pairs_and_of_a_model_that_is_not_installed_has_a_page(
+    tmp_path: Path, pairs: int
+) -> None:
     write_job(tmp_path / "job", model="not-installed-here", pairs=pairs)
     assert set(SECTIONS) <= set(page_of(tmp_path).having("id"))
 
 
 def test_a_job_of_an_older_version_has_a_page_that_says_what_is_missing(tmp_path: Path) -> None:
     write_job(tmp_path / "job", pairs=3)
-    for name in ("drives.parquet", "curves.parquet", "style.csv"):
+    for name in ("trajectories.parquet", "curves.parquet", "style.csv"):
         (tmp_path / "job" / name).unlink()
     words = page_of(tmp_path).words
-    for name in ("drives.parquet", "curves.parquet", "style.csv"):
+    for name in ("trajectories.parquet", "curves.parquet", "style.csv"):
         assert f"this job has no {name}" in words
 
 
 def test_what_is_gained_after_the_start_has_a_view_of_its_own(tmp_path: Path) -> None:
     write_job(tmp_path / "a")
     metrics = json.loads((tmp_path / "a" / "metrics.json").read_text())
-    views = [overview(read_runs([tmp_path / "a"]).jobs).views, absolute(read_runs([tmp_path / "a"]).jobs).views]
+    views = [
+        overview(read_runs([tmp_path / "a"]).jobs).views,
+        absolute(read_runs([tmp_path / "a"]).jobs).views,
+    ]
     assert not any("5 s" in name for view in views for name in view)  # test parts may be no longer
-    later = {f"later/rmse_improvement/fixed/{name}": 0.1 for name in ("mean", "ci95_low", "ci95_high", "trimmed_mean", "median")}
-    errors = {f"later/rmse_speed/{method}": 0.5 for method in ("default", "fixed", "policy")}
-    (tmp_path / "a" / "metrics.json").write_text(json.dumps(metrics | later | errors))
+    steady = {
+        f"steady/rmse_improvement/fixed/{name}": 0.1
+        for name in ("mean", "ci95_low", "ci95_high", "trimmed_mean", "median")
+    }
+    errors = {f"steady/rmse_speed/{method}": 0.5 for method in ("default", "fixed", "policy")}
+    (tmp_path / "a" / "metrics.json").write_text(json.dumps(metrics | steady | errors))
     jobs = read_runs([tmp_path / "a"]).jobs
     assert "against own fixed parameters, beyond the first 5 s" in overview(jobs).views
     assert "speed, test part beyond the first 5 s" in absolute(jobs).views
@@ -256,10 +318,16 @@ def test_what_is_gained_after_the_start_has_a_view_of_its_own(tmp_path: Path) ->
 
 def test_the_page_says_who_was_trained_on_whom(tmp_path: Path) -> None:
     write_job(
-        tmp_path / "a", methods=ACROSS, settings={"protocol": {"name": "across_drivers", "folds": 2, "together": "recording"}}
+        tmp_path / "a",
+        methods=ACROSS,
+        settings={"protocol": {"name": "across_drivers", "folds": 2, "together": "recording"}},
     )
     assert "2 folds of whole recordings; the driver's own" in page_of(tmp_path / "a").words
-    write_job(tmp_path / "b", methods=ACROSS, settings={"protocol": {"name": "transfer", "run": "/runs/motorway"}})
+    write_job(
+        tmp_path / "b",
+        methods=ACROSS,
+        settings={"protocol": {"name": "transfer", "run": "/runs/motorway"}},
+    )
     words = page_of(tmp_path / "b").words
     assert "gru, as it was learned in /runs/motorway" in words
     assert "nothing is trained" in words
@@ -281,14 +349,22 @@ def test_the_summary_answers_by_the_interval(tmp_path: Path) -> None:
     path = tmp_path / "job" / "metrics.json"
     metrics = json.loads(path.read_text(encoding="utf-8"))
     for low, high, answer in ((0.1, 0.3, "yes"), (-0.3, -0.1, "no"), (-0.1, 0.1, "undecided")):
-        changed = {"rmse_improvement/mean": 0.123, "rmse_improvement/ci95_low": low, "rmse_improvement/ci95_high": high}
+        changed = {
+            "rmse_improvement/mean": 0.123,
+            "rmse_improvement/ci95_low": low,
+            "rmse_improvement/ci95_high": high,
+        }
         path.write_text(json.dumps(metrics | changed), encoding="utf-8")
         question, said = summary(read_runs([str(tmp_path)]).jobs)
         assert question.startswith("8 pairs of leader and follower from recording.parquet")
-        assert said.startswith(f"krauss: {answer}. Improvement of the RMSE of speed: +12.3 % on average")
+        assert said.startswith(
+            f"krauss: {answer}. Improvement of the RMSE of speed: +12.3 % on average"
+        )
 
 
-def test_the_papers_figures_stand_beside_those_of_its_experiments(tmp_path: Path, clusters: Clusters) -> None:
+def test_the_papers_figures_stand_beside_those_of_its_experiments(
+    tmp_path: Path, clusters: Clusters
+) -> None:
     write_job(tmp_path / "pair", pairs=1, experiment="paper/pair")
     write_job(tmp_path / "pairs", pairs=5, experiment="paper/pairs")
     write_job(tmp_path / "own", pairs=5)
@@ -301,9 +377,15 @@ def test_the_papers_figures_stand_beside_those_of_its_experiments(tmp_path: Path
     assert "the number of pairs (here 5 in a job; there 94 in all)" in pairs.explanation
     assert "the search (here random; there Bayesian optimization)" in pairs.explanation
     _, metrics, page = clusters
-    low, high = (metrics[f"w99 · {c}"]["rmse_improvement/population/mean"] or 0.0 for c in ("conservative", "aggressive"))
+    low, high = (
+        metrics[f"w99 · {c}"]["rmse_improvement/population/mean"] or 0.0
+        for c in ("conservative", "aggressive")
+    )
     does = "fares better" if high > low else "fares no better"
-    assert f"w99: the policy {does} with aggressive than conservative drivers here; better in the paper." in page.words
+    assert (
+        f"w99: the policy {does} with aggressive than conservative drivers here; better in the paper."
+        in page.words
+    )
 
 
 def test_the_best_of_a_grid_search_is_chosen_by_the_validation_loss(tmp_path: Path) -> None:
@@ -311,7 +393,9 @@ def test_the_best_of_a_grid_search_is_chosen_by_the_validation_loss(tmp_path: Pa
         folder = tmp_path / str(epochs)
         learner = {"name": "imitation", "epochs": epochs, "batch_size": 1}
         metrics = write_job(folder, pairs=3, experiment="paper/grid", settings={"learner": learner})
-        (folder / "metrics.json").write_text(json.dumps(metrics | {"validation_loss/best": loss}), encoding="utf-8")
+        (folder / "metrics.json").write_text(
+            json.dumps(metrics | {"validation_loss/best": loss}), encoding="utf-8"
+        )
     (grid,) = paper.comparisons(read_runs([str(tmp_path)]).jobs)
     assert [row[1].text for row in grid.sheet.rows] == ["500", "500", "100"]
     assert grid.verdicts == ("The smallest validation loss here: krauss · epochs=500.",)

@@ -20,7 +20,9 @@ def test_a_sweep_gives_its_finished_jobs_and_names_the_others(tmp_path: Path) ->
         write_job(tmp_path / f"{number}-krauss", settings={"seed": number})
     failed, running = tmp_path / "3-krauss", tmp_path / "4-krauss"
     failed.mkdir()
-    (failed / "outcome.json").write_text(json.dumps({"code": 2, "message": "seed: must be positive"}), encoding="utf-8")
+    (failed / "outcome.json").write_text(
+        json.dumps({"code": 2, "message": "seed: must be positive"}), encoding="utf-8"
+    )
     (running / ".hydra").mkdir(parents=True)
     found = read_runs([str(tmp_path)])
     assert [job.name for job in found.jobs] == ["krauss · seed 2", "krauss · seed 10"]
@@ -46,32 +48,53 @@ def test_settings_outside_of_groups_keep_their_names(tmp_path: Path) -> None:
 
 
 def test_jobs_are_named_by_what_differs(tmp_path: Path) -> None:
-    write_job(tmp_path / "a", model="krauss", settings={"learner": {"name": "imitation", "epochs": 20}})
-    write_job(tmp_path / "b", model="krauss", settings={"learner": {"name": "imitation", "epochs": 500}})
-    write_job(tmp_path / "c", model="theirs", settings={"learner": {"name": "imitation", "epochs": 500}})
-    write_job(tmp_path / "d", model="theirs", settings={"learner": {"name": "imitation", "epochs": 500}, "threads": 3})
+    write_job(
+        tmp_path / "a", model="krauss", settings={"learner": {"name": "imitation", "epochs": 20}}
+    )
+    write_job(
+        tmp_path / "b", model="krauss", settings={"learner": {"name": "imitation", "epochs": 500}}
+    )
+    write_job(
+        tmp_path / "c", model="theirs", settings={"learner": {"name": "imitation", "epochs": 500}}
+    )
+    write_job(
+        tmp_path / "d",
+        model="theirs",
+        settings={"learner": {"name": "imitation", "epochs": 500}, "threads": 3},
+    )
     names = [job.name for job in read_runs([str(tmp_path)]).jobs]
-    assert names == ["krauss · epochs=20", "krauss · epochs=500", "theirs · epochs=500 (1)", "theirs · epochs=500 (2)"]
+    assert names == [
+        "krauss · epochs=20",
+        "krauss · epochs=500",
+        "theirs · epochs=500 (1)",
+        "theirs · epochs=500 (2)",
+    ]
 
 
 def test_what_a_job_says_of_itself(tmp_path: Path) -> None:
-    metrics = write_job(tmp_path / "job", methods=ACROSS, experiment="paper/clusters", overrides=["model=krauss"])
+    metrics = write_job(
+        tmp_path / "job", methods=ACROSS, experiment="paper/clusters", overrides=["model=krauss"]
+    )
     (job,) = read_runs([str(tmp_path / "job")]).jobs
     assert job.methods == ACROSS
     assert job.baselines() == ("fixed", "default", "population")
     assert job.baselines("whole/") == ("default", "population")
-    assert (job.experiment, job.overrides, job.seconds) == ("paper/clusters", ("model=krauss",), 65.0)
+    assert (job.experiment, job.overrides, job.seconds) == (
+        "paper/clusters",
+        ("model=krauss",),
+        65.0,
+    )
     assert dict(job.metrics) == metrics
     assert job.setting("tracking.uri") == "postgresql://someone:***@host/db"
 
 
 def test_a_job_of_an_older_version_lacks_files_and_is_still_read(tmp_path: Path) -> None:
     write_job(tmp_path / "job")
-    for name in ("drives.parquet", "curves.parquet", "style.csv", "data.json", "cfx.log"):
+    for name in ("trajectories.parquet", "curves.parquet", "style.csv", "data.json", "cfx.log"):
         (tmp_path / "job" / name).unlink()
     shutil.rmtree(tmp_path / "job" / ".hydra")
     (job,) = read_runs([str(tmp_path / "job")]).jobs
-    assert set(job.missing) == {"drives.parquet", "curves.parquet", "style.csv"}
+    assert set(job.missing) == {"trajectories.parquet", "curves.parquet", "style.csv"}
     assert (job.experiment, job.overrides, job.started) == ("", None, None)
 
 
@@ -95,7 +118,7 @@ def test_the_preset_is_found_where_only_hydra_noted_it(tmp_path: Path) -> None:
         ("config.yaml", "a: [", "cannot be read"),
         ("pairs.csv", "pair_id,driver\n1,2\n", "no column 'cluster'"),
         ("pairs.csv", "", "cannot be read"),
-        ("drives.parquet", "no parquet", "cannot be read"),
+        ("trajectories.parquet", "no parquet", "cannot be read"),
         ("curves.parquet", "", "cannot be read"),
         ("style.csv", "driver,score,cluster\nd,high,0\n", "column 'score'"),
         ("data.json", "\x00", "cannot be read"),
@@ -132,8 +155,12 @@ def test_the_command_says_in_one_sentence_what_it_cannot_do(
     assert list((tmp_path / "empty").iterdir()) == []
 
 
-def test_the_command_writes_beside_the_jobs_and_says_where(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_writes_beside_the_jobs_and_says_where(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_job(tmp_path / "sweep" / "0", pairs=3)
     assert main(["report", str(tmp_path / "sweep"), "--title", "My title"]) == 0
     assert capsys.readouterr().out == f"Report of 1 job: {tmp_path / 'sweep' / 'report.html'}\n"
-    assert "<title>My title</title>" in (tmp_path / "sweep" / "report.html").read_text(encoding="utf-8")
+    assert "<title>My title</title>" in (tmp_path / "sweep" / "report.html").read_text(
+        encoding="utf-8"
+    )

@@ -17,7 +17,9 @@ def broken_off(uri: str) -> None:
         raise KeyboardInterrupt
 
 
-def test_a_run_is_read_by_its_id_and_a_sweep_by_its_parents(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_is_read_by_its_id_and_a_sweep_by_its_parents(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MLFLOW_TRACKING_URI", uri := f"sqlite:///{tmp_path}/mlflow.db")
     ids = {}
@@ -25,14 +27,17 @@ def test_a_run_is_read_by_its_id_and_a_sweep_by_its_parents(tmp_path: Path, monk
         folder = tmp_path / model
         metrics = write_job(folder, model=model, pairs=3, overrides=[f"model={model}"])
         tags = {"cfx.folder": str(folder)}
-        with MlflowTracker.run(uri, run_name=model, parameters={"model.name": model}, tags=tags, sweep="my sweep") as tracker:
+        with MlflowTracker.run(
+            uri, run_name=model, parameters={"model.name": model}, tags=tags, sweep="my sweep"
+        ) as tracker:
             tracker.log_files([path for path in folder.iterdir() if path.is_file()])
             store, ids[model] = tracker.store, tracker.run_id
     with pytest.raises(KeyboardInterrupt):
         broken_off(uri)
-    (broken,) = {run.info.run_id for run in store.client.search_runs([store.experiment_id], "attributes.status = 'KILLED'")} - {
-        store.client.get_run(ids["w99"]).data.tags["mlflow.parentRunId"]
-    }
+    (broken,) = {
+        run.info.run_id
+        for run in store.client.search_runs([store.experiment_id], "attributes.status = 'KILLED'")
+    } - {store.client.get_run(ids["w99"]).data.tags["mlflow.parentRunId"]}
 
     (job,) = read_runs([ids["w99"]]).jobs
     assert (job.name, job.place, dict(job.metrics)) == ("w99", f"MLflow run {ids['w99']}", metrics)
@@ -43,7 +48,9 @@ def test_a_run_is_read_by_its_id_and_a_sweep_by_its_parents(tmp_path: Path, monk
     parent = store.client.get_run(ids["w99"]).data.tags["mlflow.parentRunId"]
     found = read_runs([parent])
     assert [one.name for one in found.jobs] == ["krauss", "w99"]
-    assert [(one.place, one.reason) for one in found.unfinished] == [(f"MLflow run {broken}", "KeyboardInterrupt")]
+    assert [(one.place, one.reason) for one in found.unfinished] == [
+        (f"MLflow run {broken}", "KeyboardInterrupt")
+    ]
 
     with pytest.raises(DataError, match=f"run {broken} holds no finished job; .*KeyboardInterrupt"):
         read_runs([broken])

@@ -22,7 +22,9 @@ MODELS = [Krauss(), W99(), W74()]
 each_model = pytest.mark.parametrize("model", MODELS, ids=lambda model: type(model).__name__)
 
 
-def wavy_leader(pairs: int, frames: int, dtype: torch.dtype = torch.float64, device: str = "cpu") -> Leader:
+def wavy_leader(
+    pairs: int, frames: int, dtype: torch.dtype = torch.float64, device: str = "cpu"
+) -> Leader:
     time = torch.arange(frames, dtype=torch.float64) * DT
     phase = torch.arange(pairs, dtype=torch.float64)[:, None]
     speed = (8 + 7 * torch.sin(0.4 * time + phase)).clamp(min=0.0)
@@ -33,13 +35,21 @@ def wavy_leader(pairs: int, frames: int, dtype: torch.dtype = torch.float64, dev
     return Leader(*(x.to(device=device, dtype=dtype) for x in tensors))
 
 
-def start_of(batch: tuple[int, ...], dtype: torch.dtype = torch.float64, device: str = "cpu") -> Start:
+def start_of(
+    batch: tuple[int, ...], dtype: torch.dtype = torch.float64, device: str = "cpu"
+) -> Start:
     zero = torch.zeros(batch, dtype=dtype, device=device)
     return Start(zero, zero + 8.0, zero)
 
 
-def candidates(model: DrivingModel, *batch: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
-    unit = torch.rand((*batch, len(model.space)), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+def candidates(
+    model: DrivingModel, *batch: int, seed: int = 0, dtype: torch.dtype = torch.float64
+) -> Tensor:
+    unit = torch.rand(
+        (*batch, len(model.space)),
+        generator=torch.Generator().manual_seed(seed),
+        dtype=torch.float64,
+    )
     return model.space.from_unit(unit).to(dtype)
 
 
@@ -76,7 +86,9 @@ def test_leading_dimensions_broadcast(model: DrivingModel) -> None:
     leader = wavy_leader(1, 30)
     out = simulate(model, p, Leader(*(x[0] for x in leader)), start_of(()), DT)
     assert out.speed.shape == (4, 30)
-    full = simulate(model, p, Leader(*(x.expand(4, *x.shape[1:]) for x in leader)), start_of((4,)), DT)
+    full = simulate(
+        model, p, Leader(*(x.expand(4, *x.shape[1:]) for x in leader)), start_of((4,)), DT
+    )
     assert_same(out, full)
 
 
@@ -89,11 +101,16 @@ def test_parameters_per_window(model: DrivingModel) -> None:
     follower, speeds = simulator.begin(start_of((2,))), []
     for k in range(23):  # the last window's parameters are kept for the rest
         at = Leader(*(x.T[k : k + 1] for x in leader[:3]), leader.length)
-        follower, _, speed = simulator.advance(follower, at, model.space.unpack(p[:, min(k // 5, windows - 1)]))
+        follower, _, speed = simulator.advance(
+            follower, at, model.space.unpack(p[:, min(k // 5, windows - 1)])
+        )
         speeds.append(speed)
     torch.testing.assert_close(out.speed[:, 1:], torch.cat(speeds).T)
     same = p[:, :1].expand(2, windows, -1)
-    assert_same(simulate(model, same, leader, start_of((2,)), DT, window=5), simulate(model, p[:, 0], leader, start_of((2,)), DT))
+    assert_same(
+        simulate(model, same, leader, start_of((2,)), DT, window=5),
+        simulate(model, p[:, 0], leader, start_of((2,)), DT),
+    )
 
 
 def test_parameters_by_name_leave_the_others_at_their_defaults() -> None:
@@ -101,7 +118,9 @@ def test_parameters_by_name_leave_the_others_at_their_defaults() -> None:
     defaults = simulate(model, None, leader, start_of((2,)), DT)
     assert_same(simulate(model, {"t_r": 1.5}, leader, start_of((2,)), DT), defaults)
     assert_same(simulate(model, model.space.defaults(), leader, start_of((2,)), DT), defaults)
-    each = simulate(model, {"t_r": torch.tensor([1.5, 3.0], dtype=torch.float64)}, leader, start_of((2,)), DT)
+    each = simulate(
+        model, {"t_r": torch.tensor([1.5, 3.0], dtype=torch.float64)}, leader, start_of((2,)), DT
+    )
     torch.testing.assert_close(each.speed[0], defaults.speed[0])
     assert (each.speed[1] - defaults.speed[1]).abs().max() > 0.1
 
@@ -125,7 +144,21 @@ def ragged(lengths: tuple[int, ...]) -> PairSet:
         position, speed, acceleration = (x[i, :count].numpy() for x in leader[:3])
         zero = np.zeros(count)
         pairs.append(
-            Pair(f"p{i}", "r", "1", str(i), 0, DT, 5.0, 1e5 + position, speed, acceleration, zero + 1e5, zero + 8.0, zero)
+            Pair(
+                f"p{i}",
+                "r",
+                "1",
+                str(i),
+                0,
+                DT,
+                5.0,
+                1e5 + position,
+                speed,
+                acceleration,
+                zero + 1e5,
+                zero + 8.0,
+                zero,
+            )
         )
     return PairSet(tuple(pairs), "made up")
 
@@ -142,8 +175,14 @@ def test_ragged_pairs_drive_as_if_alone_within_the_mask(model: DrivingModel) -> 
 
 
 def drive(model: DrivingModel, batch: PairBatch) -> Trajectory:
-    leader = Leader(batch.leader_position, batch.leader_speed, batch.leader_acceleration, batch.leader_length)
-    first = (batch.follower_position[:, 0], batch.follower_speed[:, 0], batch.follower_acceleration[:, 0])
+    leader = Leader(
+        batch.leader_position, batch.leader_speed, batch.leader_acceleration, batch.leader_length
+    )
+    first = (
+        batch.follower_position[:, 0],
+        batch.follower_speed[:, 0],
+        batch.follower_acceleration[:, 0],
+    )
     return simulate(model, None, leader, Start(*first), batch.dt)
 
 
@@ -164,7 +203,8 @@ def test_single_precision_stays_near_double(model: DrivingModel) -> None:
 
 def test_collisions_are_reported_and_the_drive_goes_on() -> None:
     leader = Leader(
-        *(torch.tensor([x], dtype=torch.float64).expand(1, 30) for x in (12.0, 0.0, 0.0)), torch.tensor([5.0]).double()
+        *(torch.tensor([x], dtype=torch.float64).expand(1, 30) for x in (12.0, 0.0, 0.0)),
+        torch.tensor([5.0]).double(),
     )
     zero = torch.zeros(1, dtype=torch.float64)
     out = simulate(W74(), None, leader, Start(zero, zero + 20.0, zero), DT)
@@ -197,7 +237,12 @@ def test_gradients_flow_through_the_drive() -> None:
     def final(p: Tensor) -> Tensor:
         return simulate(model, p, leader, near, DT, window=4).speed
 
-    p = torch.tensor([[0.8, 0.2], [1.2, 0.1], [2.0, 0.4]], dtype=torch.float64).expand(2, 3, 2).clone().requires_grad_()
+    p = (
+        torch.tensor([[0.8, 0.2], [1.2, 0.1], [2.0, 0.4]], dtype=torch.float64)
+        .expand(2, 3, 2)
+        .clone()
+        .requires_grad_()
+    )
     assert torch.autograd.gradcheck(final, (p,))
     assert torch.autograd.grad(final(p).sum(), p)[0].abs().sum() > 0
 
@@ -207,7 +252,9 @@ def test_gradients_stay_finite_through_standstill_and_contact(model: DrivingMode
     leader = Leader(*(x[:, None] for x in wavy_leader(3, 50)))
     zero = torch.zeros((3, 4), dtype=torch.float64)
     gaps = torch.tensor([-2.0, 0.0, 0.5, 20.0], dtype=torch.float64)
-    start = Start(leader.position[..., 0] - 5.0 - gaps, zero + torch.tensor([0.0, 0.0, 3.0, 12.0]), zero)
+    start = Start(
+        leader.position[..., 0] - 5.0 - gaps, zero + torch.tensor([0.0, 0.0, 3.0, 12.0]), zero
+    )
     p = candidates(model, 3, 4).requires_grad_()
     speed = simulate(model, p, leader, start, DT).speed
     assert torch.autograd.grad(speed.square().sum(), p)[0].isfinite().all()
@@ -215,11 +262,14 @@ def test_gradients_stay_finite_through_standstill_and_contact(model: DrivingMode
 
 @each_model
 @pytest.mark.parametrize("batch", [(7,), (1, 5), (5, 1), (3, 11), (2, 3, 4), ()], ids=str)
-def test_tiles_change_nothing(model: DrivingModel, batch: tuple[int, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tiles_change_nothing(
+    model: DrivingModel, batch: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
     leader = wavy_leader(batch[0] if batch else 1, 13)
-    spread = (..., *[None] * (len(batch) - 1), slice(None))
+    sensitivity = (..., *[None] * (len(batch) - 1), slice(None))
     leader = Leader(
-        *(x[spread] if batch else x[0] for x in leader[:3]), leader.length[spread[:-1]] if batch else leader.length[0]
+        *(x[sensitivity] if batch else x[0] for x in leader[:3]),
+        leader.length[sensitivity[:-1]] if batch else leader.length[0],
     )
     p = candidates(model, *batch)
     whole = simulate(model, p, leader, start_of(batch), DT)
@@ -243,7 +293,10 @@ def test_memory_is_carried_through_tiles(monkeypatch: pytest.MonkeyPatch) -> Non
     in_time = Leader(*(x.T[:, :, None] for x in leader[:3]), leader.length[:, None])
     p = Krauss().space.unpack(candidates(Krauss(), 3, 5))
     end, _, speed = simulator.advance(simulator.begin(start_of((3, 5))), in_time, p)
-    torch.testing.assert_close(end.memory, torch.stack([torch.full((3, 5), 8.0, dtype=torch.float64), speed.sum(0)], dim=-1))
+    torch.testing.assert_close(
+        end.memory,
+        torch.stack([torch.full((3, 5), 8.0, dtype=torch.float64), speed.sum(0)], dim=-1),
+    )
 
 
 @pytest.fixture
@@ -265,14 +318,24 @@ def test_compiled_equals_eager_and_shapes_do_not_recompile(monkeypatch: pytest.M
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         # The shapes of a job: windows of many candidates, one candidate for each window, last chunks, whole drives.
-        for batch, frames in (((16, 128), 6), ((300, 1), 6), ((7, 128), 6), ((1, 99), 6), ((300,), 8), ((3, 40), 24), ((1,), 6)):
+        for batch, frames in (
+            ((16, 128), 6),
+            ((300, 1), 6),
+            ((7, 128), 6),
+            ((1, 99), 6),
+            ((300,), 8),
+            ((3, 40), 24),
+            ((1,), 6),
+        ):
             leader, p = wavy_leader(batch[0], frames), candidates(model, *batch)
             if len(batch) == 2:
                 leader = Leader(*(x[:, None] for x in leader))
             eager = simulate(model, p, leader, start_of(batch), DT, compile="never")
             compiled = simulate(Krauss(), p, leader, start_of(batch), DT, compile="always")
             assert_same(eager, compiled)
-    assert len(rollout._COMPILED) == 2, "one function for a block of five steps, one for the steps left over"
+    assert len(rollout._COMPILED) == 2, (
+        "one function for a block of five steps, one for the steps left over"
+    )
     counters = torch._dynamo.utils.counters
     assert counters["stats"]["unique_graphs"] == 2, "a job's shapes must share their compiled code"
 
@@ -288,7 +351,9 @@ def test_without_a_compiler_it_runs_eagerly(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(rollout.shutil, "which", lambda name: None)
     assert not can_compile(torch.device("cpu"))
     out = simulate(Krauss(), None, wavy_leader(2, 8), start_of((2,)), DT, compile="always")
-    assert_same(out, simulate(Krauss(), None, wavy_leader(2, 8), start_of((2,)), DT, compile="never"))
+    assert_same(
+        out, simulate(Krauss(), None, wavy_leader(2, 8), start_of((2,)), DT, compile="never")
+    )
     assert not rollout._COMPILED
 
 
@@ -297,6 +362,8 @@ def test_without_a_compiler_it_runs_eagerly(monkeypatch: pytest.MonkeyPatch) -> 
 def test_cuda_agrees_with_the_cpu(model: DrivingModel) -> None:
     leader, p = wavy_leader(3, 60), candidates(model, 3)
     cpu = simulate(model, p, leader, start_of((3,)), DT)
-    cuda = simulate(model, p.cuda(), wavy_leader(3, 60, device="cuda"), start_of((3,), device="cuda"), DT)
+    cuda = simulate(
+        model, p.cuda(), wavy_leader(3, 60, device="cuda"), start_of((3,), device="cuda"), DT
+    )
     assert cuda.speed.device.type == "cuda"
     torch.testing.assert_close(cuda.speed.cpu(), cpu.speed, rtol=0, atol=1e-6)

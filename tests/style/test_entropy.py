@@ -16,25 +16,56 @@ from cfx.component import validate
 from cfx.datasets.tidy import TidyDataset
 from cfx.errors import ConfigError, DataError
 from cfx.pairs import Pair, PairSet
-from cfx.style.entropy import INDICATORS, entropies, entropy_weights, indicators, measure_style, normalise, select_cluster
+from cfx.style.entropy import (
+    INDICATORS,
+    entropies,
+    entropy_weights,
+    indicators,
+    measure_style,
+    normalise,
+    select_cluster,
+)
 from cfx.style.settings import StyleSettings
 
 # Whole numbers keep columns either constant or clearly spread: rounding itself is tested apart.
-MATRICES = st.integers(1, 20).flatmap(lambda m: arrays(np.float64, (m, 6), elements=st.integers(-50, 50).map(float)))
+MATRICES = st.integers(1, 20).flatmap(
+    lambda m: arrays(np.float64, (m, 6), elements=st.integers(-50, 50).map(float))
+)
 
 
-def a_pair(name: str, speed: object, headway: object = 20.0, driver: str = "", acceleration: object = 0.0) -> Pair:
+def a_pair(
+    name: str, speed: object, headway: object = 20.0, driver: str = "", acceleration: object = 0.0
+) -> Pair:
     speed = np.asarray(speed, dtype=float)
     position = np.cumsum(speed) * 0.1
     wave = np.broadcast_to(np.asarray(acceleration, dtype=float), speed.shape)
-    return Pair(name, "r", "1", driver or name, 0, 0.1, 5.0, position + headway, speed, wave, position, speed, wave)
+    return Pair(
+        name,
+        "r",
+        "1",
+        driver or name,
+        0,
+        0.1,
+        5.0,
+        position + headway,
+        speed,
+        wave,
+        position,
+        speed,
+        wave,
+    )
 
 
 def some_pairs(count: int, seed: int = 0) -> PairSet:
     rng = np.random.default_rng(seed)
     return PairSet(
         tuple(
-            a_pair(f"d{i}", rng.uniform(1, 20, 30), rng.uniform(8, 40), acceleration=rng.normal(0, rng.uniform(0.1, 2), 30))
+            a_pair(
+                f"d{i}",
+                rng.uniform(1, 20, 30),
+                rng.uniform(8, 40),
+                acceleration=rng.normal(0, rng.uniform(0.1, 2), 30),
+            )
             for i in range(count)
         ),
         "made up",
@@ -62,11 +93,19 @@ def test_weights_and_scores_keep_to_their_ranges(raw: np.ndarray, direction: str
 def test_the_order_of_drivers_does_not_matter(raw: np.ndarray, random: object) -> None:
     order = np.array(sorted(range(len(raw)), key=lambda _: random.random()))  # type: ignore[attr-defined] # hypothesis' Random
     one, other = normalise(raw), normalise(raw[order])
-    np.testing.assert_allclose(one[order] @ entropy_weights(one), other @ entropy_weights(other), atol=1e-9)
+    np.testing.assert_allclose(
+        one[order] @ entropy_weights(one), other @ entropy_weights(other), atol=1e-9
+    )
 
 
-@given(MATRICES, arrays(np.float64, 6, elements=st.floats(0.01, 100)), arrays(np.float64, 6, elements=st.floats(-1000, 1000)))
-def test_units_and_origins_do_not_matter(raw: np.ndarray, factor: np.ndarray, offset: np.ndarray) -> None:
+@given(
+    MATRICES,
+    arrays(np.float64, 6, elements=st.floats(0.01, 100)),
+    arrays(np.float64, 6, elements=st.floats(-1000, 1000)),
+)
+def test_units_and_origins_do_not_matter(
+    raw: np.ndarray, factor: np.ndarray, offset: np.ndarray
+) -> None:
     one, other = normalise(raw), normalise(raw * factor + offset)
     np.testing.assert_allclose(one, other, atol=1e-6)
     np.testing.assert_allclose(entropy_weights(one), entropy_weights(other), atol=1e-4)
@@ -76,7 +115,9 @@ def test_units_and_origins_do_not_matter(raw: np.ndarray, factor: np.ndarray, of
 def test_entropy_is_shannons(raw: np.ndarray) -> None:
     assume(len(raw) > 1)
     normalised = normalise(raw)
-    expected = [1.0 if not column.any() else entropy(column) / np.log(len(raw)) for column in normalised.T]
+    expected = [
+        1.0 if not column.any() else entropy(column) / np.log(len(raw)) for column in normalised.T
+    ]
     np.testing.assert_allclose(entropies(normalised), expected, atol=1e-9)
 
 
@@ -109,14 +150,18 @@ def test_a_spread_that_is_only_rounding_counts_as_none() -> None:
 
 
 def test_indicators_by_hand() -> None:
-    one = a_pair("a", [0.0, 2.0, 4.0], headway=np.array([6.0, 8.0, 12.0]), acceleration=[1.0, 2.0, 3.0])
+    one = a_pair(
+        "a", [0.0, 2.0, 4.0], headway=np.array([6.0, 8.0, 12.0]), acceleration=[1.0, 2.0, 3.0]
+    )
     row = indicators(PairSet((one,), "x")).iloc[0]
     assert row["mean_speed"] == pytest.approx(2.0)
     assert row["variance_speed"] == pytest.approx(8 / 3)
     assert row["mean_acceleration"] == pytest.approx(2.0)
     assert row["variance_acceleration"] == pytest.approx(2 / 3)
     assert row["mean_space_headway"] == pytest.approx(26 / 3)
-    assert row["mean_time_headway"] == pytest.approx((8 / 2 + 12 / 4) / 2), "the standing frame does not count"
+    assert row["mean_time_headway"] == pytest.approx((8 / 2 + 12 / 4) / 2), (
+        "the standing frame does not count"
+    )
     assert (row["frames"], row["standing_frames"]) == (3, 1)
 
 
@@ -124,7 +169,14 @@ def test_pairs_of_one_driver_count_together() -> None:
     rng = np.random.default_rng(0)
     speed = rng.uniform(2, 9, 50)
     whole = PairSet((a_pair("a", speed), a_pair("b", speed[::2] + 1)), "x")
-    cut = PairSet((a_pair("a1", speed[:20], driver="a"), a_pair("b", speed[::2] + 1), a_pair("a2", speed[20:], driver="a")), "x")
+    cut = PairSet(
+        (
+            a_pair("a1", speed[:20], driver="a"),
+            a_pair("b", speed[::2] + 1),
+            a_pair("a2", speed[20:], driver="a"),
+        ),
+        "x",
+    )
     one, other = indicators(whole), indicators(cut)
     assert list(one["driver"]) == list(other["driver"]) == ["r/a", "r/b"]
     np.testing.assert_allclose(one.drop(columns="driver"), other.drop(columns="driver"))
@@ -168,8 +220,13 @@ def test_one_driver_is_normal() -> None:
 
 
 def test_faster_and_closer_is_more_aggressive() -> None:
-    calm, keen = a_pair("calm", np.linspace(5, 6, 30), 40.0), a_pair("keen", np.linspace(5, 25, 30), 10.0)
-    score = measure_style(PairSet((calm, keen), "x"), StyleSettings()).table.set_index("driver")["score"]
+    calm, keen = (
+        a_pair("calm", np.linspace(5, 6, 30), 40.0),
+        a_pair("keen", np.linspace(5, 25, 30), 10.0),
+    )
+    score = measure_style(PairSet((calm, keen), "x"), StyleSettings()).table.set_index("driver")[
+        "score"
+    ]
     assert score["r/keen"] > score["r/calm"]
 
 
@@ -177,7 +234,9 @@ def test_selecting_a_cluster_keeps_its_drivers_and_counts_the_others() -> None:
     pairs = some_pairs(20)
     style = measure_style(pairs, StyleSettings())
     kept = [select_cluster(pairs, style, name) for name in ("conservative", "normal", "aggressive")]
-    assert sorted(pair.pair_id for part in kept for pair in part) == sorted(pair.pair_id for pair in pairs)
+    assert sorted(pair.pair_id for part in kept for pair in part) == sorted(
+        pair.pair_id for pair in pairs
+    )
     for part in kept:
         assert len(part) + part.dropped[-1].count == 20
     assert select_cluster(pairs, style, "all") is pairs
@@ -186,7 +245,8 @@ def test_selecting_a_cluster_keeps_its_drivers_and_counts_the_others() -> None:
 def test_an_empty_cluster_says_so() -> None:
     pairs = some_pairs(1)
     with pytest.raises(
-        DataError, match=r"style.cluster=aggressive: none of the 1 drivers .*0 conservative, 1 normal, 0 aggressive"
+        DataError,
+        match=r"style.cluster=aggressive: none of the 1 drivers .*0 conservative, 1 normal, 0 aggressive",
     ):
         select_cluster(pairs, measure_style(pairs, StyleSettings()), "aggressive")
     with pytest.raises(DataError, match="no pairs"):
@@ -194,7 +254,13 @@ def test_an_empty_cluster_says_so() -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{"cluster": "angry"}, {"percentiles": [75, 25]}, {"percentiles": [0, 50]}, {"direction": "up"}]
+    "options",
+    [
+        {"cluster": "angry"},
+        {"percentiles": [75, 25]},
+        {"percentiles": [0, 50]},
+        {"direction": "up"},
+    ],
 )
 def test_refuses_settings_that_make_no_sense(options: dict[str, object]) -> None:
     with pytest.raises(ConfigError, match="style"):
@@ -210,4 +276,6 @@ def test_real_drivers(shared_data: Path, direction: str) -> None:
     assert [int((table["cluster"] == k).sum()) for k in range(3)] == [55, 111, 55]
     assert np.isfinite(table[["score", *(i.name for i in INDICATORS)]].to_numpy(dtype=float)).all()
     means = table.groupby("cluster")["mean_time_headway"].mean()
-    assert (means[0] > means[2]) == (direction == "signed"), "the printed rule counts a long headway as aggressive"
+    assert (means[0] > means[2]) == (direction == "signed"), (
+        "the printed rule counts a long headway as aggressive"
+    )

@@ -23,7 +23,7 @@ def adaptive(
     dt: float = 0.1,
     length: int = 5,
     offsets: bool = False,
-    traits: tuple[str, ...] = (),
+    driver_features: tuple[str, ...] = (),
 ) -> TrainedPolicy:
     """Returns a GRU for each name; what it chooses depends on all it sees.
 
@@ -31,24 +31,38 @@ def adaptive(
     """
     model = registry.create("model", dict(node))
     assert isinstance(model, DrivingModel)
-    policy = GruPolicy(inputs=INPUTS, traits=traits, start="middle")
+    policy = GruPolicy(inputs=INPUTS, driver_features=driver_features, start="middle")
     networks = len(names)
-    features = length * len(INPUTS) + (len(model.space) if offsets else 0) + len(traits)
+    features = length * len(INPUTS) + (len(model.space) if offsets else 0) + len(driver_features)
     unit = model.space.to_unit(model.space.defaults())
-    network = policy.build(features, unit, unit.expand(networks, -1), torch.Generator().manual_seed(3)).double().eval()
+    network = (
+        policy.build(features, unit, unit.expand(networks, -1), torch.Generator().manual_seed(3))
+        .double()
+        .eval()
+    )
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.mul_(1.5)  # so that the chosen parameters vary enough to tell drivers apart
-    scaler = Scaler(torch.full((networks, features), 6.0).double(), torch.full((networks, features), 4.0).double())
+    scaler = Scaler(
+        torch.full((networks, features), 6.0).double(),
+        torch.full((networks, features), 4.0).double(),
+    )
     return TrainedPolicy(
         policy=policy,
         network=network,
         scaler=scaler,
         model_node=dict(node),
-        policy_node={"name": "gru", "inputs": list(INPUTS), "traits": list(traits), "start": "middle"},
+        policy_node={
+            "name": "gru",
+            "inputs": list(INPUTS),
+            "driver_features": list(driver_features),
+            "start": "middle",
+        },
         space=model.space,
         windows=WindowSettings(length=length, stride=5),
         dt=dt,
         names=names,
-        base=model.space.from_unit(torch.full((networks, len(model.space)), 0.5).double()) if offsets else None,
+        base=model.space.from_unit(torch.full((networks, len(model.space)), 0.5).double())
+        if offsets
+        else None,
     )

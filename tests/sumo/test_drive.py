@@ -54,14 +54,30 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def python(script: str, folder: Path) -> Any:
     """Runs a script in a process of its own, as libsumo wants it; returns the JSON of its last line."""
     done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(script)], cwd=folder, capture_output=True, text=True, check=False, timeout=200
+        [sys.executable, "-c", textwrap.dedent(script)],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=200,
     )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
 
 
 def test_the_command_drives_a_scenario_and_says_what_happened(scenario: Path) -> None:
-    command = [sys.executable, "-m", "cfx", "drive", "motorway.sumocfg", "--drivers", "calm=calm", "hasty=hasty", "--seed", "7"]
+    command = [
+        sys.executable,
+        "-m",
+        "cfx",
+        "drive",
+        "motorway.sumocfg",
+        "--drivers",
+        "calm=calm",
+        "hasty=hasty",
+        "--seed",
+        "7",
+    ]
     done = subprocess.run(
         [*command, "--output", "out/drives.csv", "--", "--collision.action", "warn"],
         cwd=scenario,
@@ -70,7 +86,11 @@ def test_the_command_drives_a_scenario_and_says_what_happened(scenario: Path) ->
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    table = {line.split()[0]: line.split() for line in done.stdout.splitlines() if line.strip().startswith(("calm", "hasty"))}
+    table = {
+        line.split()[0]: line.split()
+        for line in done.stdout.splitlines()
+        if line.strip().startswith(("calm", "hasty"))
+    }
     assert int(table["calm"][1]) > 15
     assert int(table["hasty"][1]) > 12
     assert "300 steps of 0.1 s in" in done.stdout
@@ -111,9 +131,16 @@ def test_what_cannot_be_driven_is_one_sentence_and_leaves_no_file(scenario: Path
     )
     (unknown, never, step, edge, torn), steps, pyarrow = said
     assert "has no vType 'clam'. Did you mean 'calm'? It has: calm, ghost, hasty, other" in unknown
-    assert never.startswith("no vehicle of vType 'ghost' was ever on the road in motorway.sumocfg (2 s)")
-    assert "steps by 0.5 s, the policy of calm was trained at 0.1 s; start SUMO with --step-length 0.1" in step
-    assert edge.startswith("SUMO refuses lost.sumocfg: The edge '9999' within the route 'whole' is not known")
+    assert never.startswith(
+        "no vehicle of vType 'ghost' was ever on the road in motorway.sumocfg (2 s)"
+    )
+    assert (
+        "steps by 0.5 s, the policy of calm was trained at 0.1 s; start SUMO with --step-length 0.1"
+        in step
+    )
+    assert edge.startswith(
+        "SUMO refuses lost.sumocfg: The edge '9999' within the route 'whole' is not known"
+    )
     assert torn.startswith("SUMO refuses torn.sumocfg: ")
     assert not any("\n" in one for one in said[0])
     assert steps == 20
@@ -125,7 +152,9 @@ def test_mistakes_are_told_before_sumo_starts(
     scenario: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(scenario)
-    monkeypatch.setitem(sys.modules, "pyarrow", sys.modules.get("pyarrow"))  # the command does without it, later tests do not
+    monkeypatch.setitem(
+        sys.modules, "pyarrow", sys.modules.get("pyarrow")
+    )  # the command does without it, later tests do not
     with pytest.raises(ConfigError, match=r"--drivers calm: write TYPE=RUN"):
         parse_drivers(["calm"])
     with pytest.raises(ConfigError, match="'calm' stands twice"):
@@ -137,7 +166,9 @@ def test_mistakes_are_told_before_sumo_starts(
         without.setattr("importlib.metadata.version", _not_found)
         assert cli.main(["drive", "motorway.sumocfg", "--drivers", "calm=calm"]) == 2
     assert 'pip install "cfx-driving[sumo]"' in capsys.readouterr().err
-    assert not any(isinstance(handler, ConsoleHandler) for handler in logging.getLogger("cfx").handlers)  # nothing is left behind
+    assert not any(
+        isinstance(handler, ConsoleHandler) for handler in logging.getLogger("cfx").handlers
+    )  # nothing is left behind
 
 
 def _not_found(name: str) -> str:
@@ -146,7 +177,9 @@ def _not_found(name: str) -> str:
     raise PackageNotFoundError(name)
 
 
-def test_a_vehicle_that_collides_teleports_or_changes_lanes_is_counted_and_ends_nothing(scenario: Path) -> None:
+def test_a_vehicle_that_collides_teleports_or_changes_lanes_is_counted_and_ends_nothing(
+    scenario: Path,
+) -> None:
     """One drives into a car that stands, one is told to change lanes."""
     counts = python(
         """
@@ -196,8 +229,29 @@ def test_a_vehicle_that_collides_teleports_or_changes_lanes_is_counted_and_ends_
 
 
 def test_the_table_says_it_all(capsys: pytest.CaptureFixture[str]) -> None:
-    tally = Tally({"a", "b"}, steps=200, driven=150, metres=240.0, lane_changes=3, hard_brakings=2, collisions=1, teleports=4)
+    tally = Tally(
+        {"a", "b"},
+        steps=200,
+        driven=150,
+        metres=240.0,
+        lane_changes=3,
+        hard_brakings=2,
+        collisions=1,
+        teleports=4,
+    )
     report(Driven({"calm": tally}, steps=100, dt=0.1, seconds=2.0, others=5, most=2))
     out = capsys.readouterr().out
-    assert next(line for line in out.splitlines() if "calm" in line).split() == ["calm", "2", "75%", "12.00", "3", "2", "1", "4"]
-    assert "100 steps of 0.1 s in 2.0 s, 5.0 times real time; at most 2 of these vehicles at once, 5 others" in out
+    assert next(line for line in out.splitlines() if "calm" in line).split() == [
+        "calm",
+        "2",
+        "75%",
+        "12.00",
+        "3",
+        "2",
+        "1",
+        "4",
+    ]
+    assert (
+        "100 steps of 0.1 s in 2.0 s, 5.0 times real time; at most 2 of these vehicles at once, 5 others"
+        in out
+    )

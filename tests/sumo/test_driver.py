@@ -92,14 +92,23 @@ class Road:
         self.cars[name].mode = mode
 
     def __getattr__(self, name: str) -> Any:
-        fields = {"Speed": "speed", "Acceleration": "acceleration", "Length": "length", "AllowedSpeed": "allowed"}
+        fields = {
+            "Speed": "speed",
+            "Acceleration": "acceleration",
+            "Length": "length",
+            "AllowedSpeed": "allowed",
+        }
         fields |= {"TypeID": "kind", "SpeedMode": "mode"}
         return lambda vehicle: getattr(self.cars[vehicle], fields[name.removeprefix("get")])
 
 
 def platoon(count: int, **settings: Any) -> Road:
     return Road(
-        lead=Car(), **{f"v{i}": Car(speed=8.0 + i % 9, gap=15.0 + 3 * (i % 50), leader="lead", **settings) for i in range(count)}
+        lead=Car(),
+        **{
+            f"v{i}": Car(speed=8.0 + i % 9, gap=15.0 + 3 * (i % 50), leader="lead", **settings)
+            for i in range(count)
+        },
     )
 
 
@@ -116,21 +125,32 @@ def counted(policy: TrainedPolicy, monkeypatch: pytest.MonkeyPatch) -> list[int]
     return calls
 
 
-def test_all_vehicles_are_one_call_of_the_policy_and_windows_are_each_vehicles_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_vehicles_are_one_call_of_the_policy_and_windows_are_each_vehicles_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     road = platoon(300)
     late = [f"v{i}" for i in range(200, 300)]
     driver = Driver(adaptive({"name": "w99"}))
     calls = counted(driver.policy, monkeypatch)
     for k in range(11):
-        driver.step(road, [name for name in road.cars if name != "lead" and (k >= 2 or name not in late)])
+        driver.step(
+            road, [name for name in road.cars if name != "lead" and (k >= 2 or name not in late)]
+        )
         road.advance()
     assert calls == [200, 100, 200, 100, 200], "at steps 0, 2, 5, 7, 10"
-    assert all(len(road.cars[name].told) == (9 if name in late else 11) for name in road.cars if name != "lead")
+    assert all(
+        len(road.cars[name].told) == (9 if name in late else 11)
+        for name in road.cars
+        if name != "lead"
+    )
 
 
 def test_many_at_once_drive_as_one_by_one() -> None:
     together, alone = platoon(7), platoon(7)
-    for road, groups in ((together, [[f"v{i}" for i in range(7)]]), (alone, [f"v{i}" for i in range(7)])):
+    for road, groups in (
+        (together, [[f"v{i}" for i in range(7)]]),
+        (alone, [f"v{i}" for i in range(7)]),
+    ):
         driver = Driver(adaptive({"name": "krauss"}))
         for _ in range(12):
             for group in groups:
@@ -209,17 +229,23 @@ def test_stepping_twice_at_one_instant_is_stepping_once() -> None:
     for _ in range(6):
         other.step(once, ["v0", "v1", "v2"])
         once.advance()
-    assert [road.cars[v].told for v in ("v0", "v1", "v2")] == [once.cars[v].told for v in ("v0", "v1", "v2")]
+    assert [road.cars[v].told for v in ("v0", "v1", "v2")] == [
+        once.cars[v].told for v in ("v0", "v1", "v2")
+    ]
 
 
 def test_the_speed_limit_holds_as_around_sumos_own_models() -> None:
     road = Road(
-        lead=Car(speed=30), v0=Car(speed=20, gap=90, leader="lead", allowed=20.1), v1=Car(speed=20, gap=90, leader="lead")
+        lead=Car(speed=30),
+        v0=Car(speed=20, gap=90, leader="lead", allowed=20.1),
+        v1=Car(speed=20, gap=90, leader="lead"),
     )
     road.cars["v2"] = Car(speed=20, gap=90, leader="lead", allowed=10)
     Driver(adaptive({"name": "krauss"})).step(road, ["v0", "v1", "v2"])
     told = [road.cars[name].told[0] for name in ("v0", "v1", "v2")]
-    assert told == pytest.approx([20.1, 20.26, 20 - 0.45]), "the limit; the model; not harder than decel for a limit"
+    assert told == pytest.approx([20.1, 20.26, 20 - 0.45]), (
+        "the limit; the model; not harder than decel for a limit"
+    )
 
 
 def test_a_constant_driver_takes_parameters_by_name() -> None:
@@ -236,23 +262,32 @@ def test_a_constant_driver_takes_parameters_by_name() -> None:
 
 def test_traits_are_told_by_name_to_a_policy_that_knows_them() -> None:
     found = []
-    for traits in (None, {"time_gap": 0.5, "acceleration": -1.0}):
-        driver = Driver(adaptive({"name": "krauss"}, traits=("acceleration", "time_gap")))
-        driver.assign("v0", traits=traits)
+    for driver_features in (None, {"time_gap": 0.5, "acceleration": -1.0}):
+        driver = Driver(adaptive({"name": "krauss"}, driver_features=("acceleration", "time_gap")))
+        driver.assign("v0", driver_features=driver_features)
         driver.step(platoon(1), "v0")
         found.append(driver.parameters("v0")["t_r"])
     assert found[0] != pytest.approx(found[1], rel=1e-3)
-    with pytest.raises(ParameterError, match="traits: give a value for each of acceleration, time_gap, and nothing else"):
-        driver.assign("v0", traits={"time_gap": 0.5})
-    with pytest.raises(ParameterError, match="traits: there are none that this policy was trained to know"):
-        Driver(adaptive({"name": "krauss"})).assign("v0", traits={"time_gap": 0.5})
+    with pytest.raises(
+        ParameterError,
+        match="driver features: give a value for each of acceleration, time_gap, and nothing else",
+    ):
+        driver.assign("v0", driver_features={"time_gap": 0.5})
+    with pytest.raises(
+        ParameterError, match="driver features: there are none that this policy was trained to know"
+    ):
+        Driver(adaptive({"name": "krauss"})).assign("v0", driver_features={"time_gap": 0.5})
 
 
 def test_a_drivers_own_parameters_are_drawn_towards_the_default_as_in_training() -> None:
     plain = adaptive({"name": "krauss"}, offsets=True)
     own, found = torch.tensor([[4.0, 1.0]], dtype=torch.float64), []
     middle = drawn(plain.space, own, 0.5)[0].tolist()
-    for policy, values in ((replace(plain, shrinkage=0.5), own[0].tolist()), (plain, middle), (plain, own[0].tolist())):
+    for policy, values in (
+        (replace(plain, shrinkage=0.5), own[0].tolist()),
+        (plain, middle),
+        (plain, own[0].tolist()),
+    ):
         driver = Driver(policy)
         driver.assign("v0", base=dict(zip(plain.space.names, values, strict=True)))
         driver.step(platoon(1), "v0")
@@ -264,45 +299,74 @@ def test_a_drivers_own_parameters_are_drawn_towards_the_default_as_in_training()
 def test_what_cannot_be_driven_is_one_sentence(tmp_path: Path) -> None:
     policy = adaptive({"name": "krauss"})
     driver = Driver(policy, source="outputs/job")
-    with pytest.raises(SumoError, match=r"steps by 1 s, the policy of outputs/job was trained at 0.1 s; start SUMO with"):
+    with pytest.raises(
+        SumoError,
+        match=r"steps by 1 s, the policy of outputs/job was trained at 0.1 s; start SUMO with",
+    ):
         driver.step(Road(dt=1.0), [])
-    with pytest.raises(SumoError, match=r"vehicle 'gone' cannot be driven \(Vehicle 'gone' is not known"):
+    with pytest.raises(
+        SumoError, match=r"vehicle 'gone' cannot be driven \(Vehicle 'gone' is not known"
+    ):
         driver.step(platoon(1), ["gone"])
-    with pytest.raises(DataError, match=r"no network of this policy was assigned to vehicle 'v0'; call assign"):
+    with pytest.raises(
+        DataError, match=r"no network of this policy was assigned to vehicle 'v0'; call assign"
+    ):
         Driver(policy, network=None).step(platoon(1), "v0")
-    node = {"name": "sumo_vtype", "car_follow_model": "EIDM", "parameters": {"tau": {"low": 0.5, "high": 3, "default": 1}}}
+    node = {
+        "name": "sumo_vtype",
+        "car_follow_model": "EIDM",
+        "parameters": {"tau": {"low": 0.5, "high": 3, "default": 1}},
+    }
     untold = adaptive(node)
     with pytest.raises(DataError, match="SUMO alone drives"):
         Driver(untold)
     adaptive({"name": "krauss"}, ("p1", "p2")).save(tmp_path / "policy")
-    with pytest.raises(DataError, match=r"has 2 networks, each for one driver \(p1, \.\.\.\), and none for strangers"):
+    with pytest.raises(
+        DataError,
+        match=r"has 2 networks, each for one driver \(p1, \.\.\.\), and none for unseen drivers",
+    ):
         Driver.load(tmp_path)
     with pytest.raises(DataError, match=r"has no network 'p3'; it has p1, p2"):
         Driver.load(tmp_path, network="p3")
     with pytest.raises(DataError, match=r"was trained for model=krauss, not for model=w99"):
         Driver.load(tmp_path, network="p1", model="w99")
     description = json.loads((tmp_path / "policy" / "policy.json").read_text())
-    (tmp_path / "policy" / "policy.json").write_text(json.dumps(description | {"parameters": ["t_r", "other"]}))
-    with pytest.raises(DataError, match=r"with the parameters t_r, other, but model=krauss here has t_r, t_i"):
+    (tmp_path / "policy" / "policy.json").write_text(
+        json.dumps(description | {"parameters": ["t_r", "other"]})
+    )
+    with pytest.raises(
+        DataError, match=r"with the parameters t_r, other, but model=krauss here has t_r, t_i"
+    ):
         Driver.load(tmp_path, network="p1")
     (tmp_path / "policy" / "policy.pt").unlink()
     with pytest.raises(DataError, match="holds no policy"):
         Driver.load(tmp_path, network="p1")
 
 
-def test_a_fleet_drives_each_type_by_its_own_and_finds_who_comes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fleet_drives_each_type_by_its_own_and_finds_who_comes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name, model in (("calm", "krauss"), ("hasty", "w99")):
         adaptive({"name": model}).save(tmp_path / name / "policy")
-    fleet = Fleet.load({"calm": tmp_path / "calm", "normal": tmp_path / "calm", "hasty": tmp_path / "hasty"})
+    fleet = Fleet.load(
+        {"calm": tmp_path / "calm", "normal": tmp_path / "calm", "hasty": tmp_path / "hasty"}
+    )
     assert fleet.drivers["calm"] is fleet.drivers["normal"], "types of one run are one batch"
     road = platoon(9)
     road.cars["lead"].kind = "other"
-    for i, kind in enumerate(["calm", "normal", "hasty", "calm@v3", "other", "hasty", "normal", "calm", "calm"]):
+    for i, kind in enumerate(
+        ["calm", "normal", "hasty", "calm@v3", "other", "hasty", "normal", "calm", "calm"]
+    ):
         road.cars[f"v{i}"].kind = kind
     calls = counted(fleet.drivers["calm"].policy, monkeypatch)
     fleet.step(road)
     assert sorted(calls) == [2, 6]
-    assert {name for name, kind in fleet.vehicles.items() if kind == "calm"} == {"v0", "v3", "v7", "v8"}
+    assert {name for name, kind in fleet.vehicles.items() if kind == "calm"} == {
+        "v0",
+        "v3",
+        "v7",
+        "v8",
+    }
     assert {name for name, kind in fleet.vehicles.items() if kind == "hasty"} == {"v2", "v5"}
     assert len(fleet.vehicles) == 8
     assert set(fleet.driver("v2").parameters("v2")) == set(W99().space.names)
@@ -314,7 +378,12 @@ def test_a_fleet_drives_each_type_by_its_own_and_finds_who_comes(tmp_path: Path,
     assert fleet.drivers["hasty"].drives("new")
     assert road.cars["v4"].told == road.cars["lead"].told == []
     with pytest.raises(DataError, match=r"different time steps \(a 0.1 s, b 0.2 s\)"):
-        Fleet({"a": Driver(adaptive({"name": "krauss"})), "b": Driver(adaptive({"name": "krauss"}, dt=0.2))})
+        Fleet(
+            {
+                "a": Driver(adaptive({"name": "krauss"})),
+                "b": Driver(adaptive({"name": "krauss"}, dt=0.2)),
+            }
+        )
 
 
 def test_the_package_gives_the_driver_and_imports_no_sumo() -> None:
@@ -346,24 +415,41 @@ def style_of(pairs: Sequence[Any]) -> StyleResult:
 
 
 @pytest.mark.parametrize(
-    ("node", "length", "frames", "history", "traits"),
+    ("node", "length", "frames", "history", "driver_features"),
     [
         ({"name": "krauss"}, 5, 250, 5.3, ()),
         ({"name": "krauss"}, 5, 250, 17.3, ("acceleration", "time_gap")),
         ({"name": "w99"}, 8, 1000, None, ("time_headway",)),
     ],
-    ids=["offsets from own parameters, after 5 s", "with traits, after 17 s", "parameters and traits, after all there is"],
+    ids=[
+        "offsets from own parameters, after 5 s",
+        "with driver features, after 17 s",
+        "parameters and driver features, after all there is",
+    ],
 )
 def test_in_sumo_a_policy_drives_as_in_memory(
-    node: dict[str, Any], length: int, frames: int, history: float | None, traits: tuple[str, ...], tmp_path: Path
+    node: dict[str, Any],
+    length: int,
+    frames: int,
+    history: float | None,
+    driver_features: tuple[str, ...],
+    tmp_path: Path,
 ) -> None:
     """Behind replayed leaders in libsumo, across edges and junctions of a road, after it has watched the first part: to 1e-9."""
     model = {"krauss": Krauss, "w99": W99}[node["name"]]()
     low, high = model.space.bounds()
-    true = (model.space.defaults() + 0.1 * (high - low) * torch.linspace(-1, 1, 4).double()[:, None]).clamp(low, high)
+    true = (
+        model.space.defaults() + 0.1 * (high - low) * torch.linspace(-1, 1, 4).double()[:, None]
+    ).clamp(low, high)
     pairs = wavy_pairs(model, true, frames=frames)
     batch = PairBatch.of(pairs)
-    policy = adaptive(node, tuple(pair.pair_id for pair in pairs), length=length, offsets=history is not None, traits=traits)
+    policy = adaptive(
+        node,
+        tuple(pair.pair_id for pair in pairs),
+        length=length,
+        offsets=history is not None,
+        driver_features=driver_features,
+    )
     policy.save(tmp_path / "policy")
     first, own = torch.tensor([0, 215, 100, frames - 100]), torch.arange(4)
     simulator, base = Simulator(model, 0.1), model.space.defaults().expand(4, -1)
@@ -374,8 +460,18 @@ def test_in_sumo_a_policy_drives_as_in_memory(
     }
     evaluation = evaluate(pairs, batch, first, loops, model.space, style_of(pairs), seed=0)
     known = Known("fixed", history)
-    shown = drive_in_sumo(tmp_path / "policy", pairs, policy, evaluation, read_motorway(None, tmp_path), 4, known=known)
-    assert {one.pair.pair_id: one.first for one in shown} == {f"p{i}": int(first[i]) for i in range(4)}
+    shown = drive_in_sumo(
+        tmp_path / "policy",
+        pairs,
+        policy,
+        evaluation,
+        read_motorway(None, tmp_path),
+        4,
+        known=known,
+    )
+    assert {one.pair.pair_id: one.first for one in shown} == {
+        f"p{i}": int(first[i]) for i in range(4)
+    }
     for one in shown:
         assert one.table["difference_speed"].max() < 1e-9
         assert one.table["difference_gap"].max() < 1e-9

@@ -31,8 +31,19 @@ def job(folder: Path, node: dict[str, Any], shift: float = 0.1) -> Path:
     for k, cluster in enumerate(CLUSTERS):
         for method in ("default", "fixed", "policy"):
             share = shift * (k + 1) if method == "fixed" else 0.9
-            values = {f"parameter_{n}": a + share * (b - a) for n, a, b in zip(model.space.names, low, high, strict=True)}
-            rows.append({"pair_id": f"p<{k}>", "cluster": cluster, "style_score": 0.2 * k, "method": method, **values})
+            values = {
+                f"parameter_{n}": a + share * (b - a)
+                for n, a, b in zip(model.space.names, low, high, strict=True)
+            }
+            rows.append(
+                {
+                    "pair_id": f"p<{k}>",
+                    "cluster": cluster,
+                    "style_score": 0.2 * k,
+                    "method": method,
+                    **values,
+                }
+            )
     pd.DataFrame(rows[::-1]).to_csv(folder / "pairs.csv", index=False)
     return folder
 
@@ -50,8 +61,17 @@ def test_each_cluster_is_a_distribution_of_its_drivers_own_fixed_parameters(tmp_
     lines = export(folder)
     assert lines[0].endswith("conservative 1, normal 2, aggressive 1")
     found = types(folder / "drivers.add.xml")
-    assert {cluster: len(kinds) for cluster, kinds in found.items()} == {"conservative": 1, "normal": 2, "aggressive": 1}
-    table = pd.read_csv(folder / "pairs.csv").query("method == 'fixed'").sort_values("style_score").reset_index()
+    assert {cluster: len(kinds) for cluster, kinds in found.items()} == {
+        "conservative": 1,
+        "normal": 2,
+        "aggressive": 1,
+    }
+    table = (
+        pd.read_csv(folder / "pairs.csv")
+        .query("method == 'fixed'")
+        .sort_values("style_score")
+        .reset_index()
+    )
     for row, kind in enumerate(one for kinds in found.values() for one in kinds.values()):
         assert kind["carFollowModel"] == "W99"
         assert float(kind["cc1"]) == table["parameter_cc1"][row]
@@ -63,27 +83,45 @@ def test_each_cluster_is_a_distribution_of_its_drivers_own_fixed_parameters(tmp_
 def test_krauss_loses_its_brake_build_up_time_and_says_so(tmp_path: Path) -> None:
     folder = job(tmp_path / "krauss", {"name": "krauss"})
     lines = export(folder, tmp_path / "here.add.xml")
-    assert any(line.startswith("Note: SUMO's KraussOrig1 has no brake build-up time t_i; tau is t_r") for line in lines)
+    assert any(
+        line.startswith("Note: SUMO's KraussOrig1 has no brake build-up time t_i; tau is t_r")
+        for line in lines
+    )
     fixed = pd.read_csv(folder / "pairs.csv").query("method == 'fixed' and cluster == 'aggressive'")
     (kind,) = types(tmp_path / "here.add.xml")["aggressive"].values()
-    assert (kind["carFollowModel"], float(kind["tau"])) == ("KraussOrig1", fixed["parameter_t_r"].item())
+    assert (kind["carFollowModel"], float(kind["tau"])) == (
+        "KraussOrig1",
+        fixed["parameter_t_r"].item(),
+    )
     assert not (folder / "drivers.add.xml").exists()
     same = job(
-        tmp_path / "without", {"name": "krauss", "variant": "sumo", "parameters": {"t_i": {"default": 0.0, "tuned": False}}}
+        tmp_path / "without",
+        {
+            "name": "krauss",
+            "variant": "sumo",
+            "parameters": {"t_i": {"default": 0.0, "tuned": False}},
+        },
     )
     assert len(export(same)) == 2
 
 
 def test_sumo_loads_it_as_it_is_and_one_vehicle_of_each_type_drives(tmp_path: Path) -> None:
     pytest.importorskip("traci", reason="needs the extra sumo")
-    nodes: list[dict[str, Any]] = [{"name": name} for name in ("krauss", "w99", "krauss_sumo", "idm_sumo")]
+    nodes: list[dict[str, Any]] = [
+        {"name": name} for name in ("krauss", "w99", "krauss_sumo", "idm_sumo")
+    ]
     for number, node in enumerate(nodes):
         folder = job(tmp_path / str(number), node)
         export(folder)
         every = [kind for kinds in types(folder / "drivers.add.xml").values() for kind in kinds]
-        vehicles = [f'<vehicle id="{kind}" type="{kind}" route="m" depart="{i}"/>' for i, kind in enumerate(every)]
+        vehicles = [
+            f'<vehicle id="{kind}" type="{kind}" route="m" depart="{i}"/>'
+            for i, kind in enumerate(every)
+        ]
         vehicles.append('<vehicle id="any" type="normal" route="m" depart="9"/>')
-        (folder / "demand.rou.xml").write_text(f'<routes><route id="m" edges="1001"/>{"".join(vehicles)}</routes>')
+        (folder / "demand.rou.xml").write_text(
+            f'<routes><route id="m" edges="1001"/>{"".join(vehicles)}</routes>'
+        )
     script = """
 import json, os, sys
 os.environ["LIBSUMO_AS_TRACI"] = "quiet"
@@ -102,7 +140,12 @@ for k in range(4):
 print(json.dumps(answers))
 """
     done = subprocess.run(
-        [sys.executable, "-c", script, str(SHIPPED)], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=100
+        [sys.executable, "-c", script, str(SHIPPED)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=100,
     )
     assert done.returncode == 0, done.stderr
     assert "Warning" not in done.stderr, done.stderr
@@ -117,9 +160,12 @@ print(json.dumps(answers))
         assert all(fastest > 5 for _, fastest in seen.values())
 
 
-def test_what_cannot_be_exported_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_exported_is_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(
-        ConfigError, match="SUMO has no car-following model that drives as model=w74; export jobs with model=krauss"
+        ConfigError,
+        match="SUMO has no car-following model that drives as model=w74; export jobs with model=krauss",
     ):
         export(job(tmp_path / "w74", {"name": "w74"}))
     with pytest.raises(ConfigError, match="variant=sumo only"):
@@ -141,7 +187,10 @@ def test_what_cannot_be_exported_is_one_sentence(tmp_path: Path, capsys: pytest.
 
 def test_the_command_says_how_to_use_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = job(tmp_path / "job", {"name": "w99"})
-    assert cli.main(["export", str(folder), "--to", "sumo", "--output", str(tmp_path / "x.add.xml")]) == 0
+    assert (
+        cli.main(["export", str(folder), "--to", "sumo", "--output", str(tmp_path / "x.add.xml")])
+        == 0
+    )
     assert (
         f'sumo --additional-files {tmp_path / "x.add.xml"}; then in a flow or vehicle: type="conservative"'
         in capsys.readouterr().out

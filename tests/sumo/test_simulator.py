@@ -21,7 +21,8 @@ from cfx.simulation.rollout import Simulator, Start
 from cfx.simulation.settings import SumoSettings
 
 pytestmark = pytest.mark.skipif(
-    importlib.util.find_spec("libsumo") is None, reason="SUMO is not here; pip install 'cfx-driving[sumo]'"
+    importlib.util.find_spec("libsumo") is None,
+    reason="SUMO is not here; pip install 'cfx-driving[sumo]'",
 )
 
 STEPS, PAIRS, DT = 60, 9, 0.1
@@ -39,7 +40,12 @@ class Case:
         acceleration = (self.uniform(-1, 1, STEPS, PAIRS).cumsum(0) * 0.2).clamp(-2.0, 0.9)
         speed = (first + acceleration.cumsum(0) * DT).clamp(min=0.0)
         position = 50.0 + (speed * DT).cumsum(0) + self.uniform(-0.2, 0.2, STEPS, PAIRS)
-        self.leader = Leader(position, speed, acceleration + self.uniform(-0.05, 0.05, STEPS, PAIRS), self.uniform(4, 9, PAIRS))
+        self.leader = Leader(
+            position,
+            speed,
+            acceleration + self.uniform(-0.05, 0.05, STEPS, PAIRS),
+            self.uniform(4, 9, PAIRS),
+        )
         own = (first + self.uniform(-2, 2, PAIRS)).clamp(min=0.0)
         behind = position[0] - self.leader.length - 3.0 - self.uniform(0.5, 2, PAIRS) * own
         self.start = Start(behind, own, self.uniform(-1, 1, PAIRS))
@@ -48,7 +54,9 @@ class Case:
         return low + (high - low) * torch.rand(shape, generator=self.draw, dtype=torch.float64)
 
     def parameters(self, model: DrivingModel) -> dict[str, Tensor]:
-        return model.space.unpack(model.space.from_unit(self.uniform(0, 1, PAIRS, len(model.space))))
+        return model.space.unpack(
+            model.space.from_unit(self.uniform(0, 1, PAIRS, len(model.space)))
+        )
 
     def part(self, first: int, last: int) -> Leader:
         return Leader(*(signal[first:last] for signal in self.leader[:3]), self.leader.length)
@@ -72,13 +80,17 @@ def eidm() -> Iterator[object]:
     yield from in_sumo(EIDM)
 
 
-@pytest.mark.parametrize("model", [KRAUSS, KraussSumo(), IdmSumo(), W99()], ids=lambda model: type(model).__name__)
+@pytest.mark.parametrize(
+    "model", [KRAUSS, KraussSumo(), IdmSumo(), W99()], ids=lambda model: type(model).__name__
+)
 def test_drives_in_sumo_are_drives_in_memory(model: DrivingModel, case: Case) -> None:
     memory, p = Simulator(model, DT), case.parameters(model)
     for sumo in in_sumo(model, workers=2, followers=4):
         expected = memory.advance(memory.begin(case.start), case.leader, p)
         found = sumo.advance(sumo.begin(case.start), case.leader, p)
-        for theirs, ours in zip([*found[0], *found[1:]], [*expected[0], *expected[1:]], strict=True):
+        for theirs, ours in zip(
+            [*found[0], *found[1:]], [*expected[0], *expected[1:]], strict=True
+        ):
             torch.testing.assert_close(theirs, ours, rtol=0.0, atol=1e-9)
 
 
@@ -87,10 +99,16 @@ def test_drives_in_sumo_are_drives_in_memory(model: DrivingModel, case: Case) ->
 def test_longer_time_steps_are_sumos_too(model: DrivingModel, dt: float, case: Case) -> None:
     from cfx.sumo.simulator import SumoSimulator
 
-    p, memory, sumo = case.parameters(model), Simulator(model, dt), SumoSimulator(model, dt, SumoSettings(workers=1))
+    p, memory, sumo = (
+        case.parameters(model),
+        Simulator(model, dt),
+        SumoSimulator(model, dt, SumoSettings(workers=1)),
+    )
     far = Start(case.start.position - 20.0, case.start.speed, case.start.acceleration)
     expected = memory.advance(memory.begin(far), case.part(0, 12), p)[2]
-    torch.testing.assert_close(sumo.advance(sumo.begin(far), case.part(0, 12), p)[2], expected, rtol=0.0, atol=1e-9)
+    torch.testing.assert_close(
+        sumo.advance(sumo.begin(far), case.part(0, 12), p)[2], expected, rtol=0.0, atol=1e-9
+    )
     sumo.close()
 
 
@@ -122,17 +140,19 @@ def test_what_a_model_remembers_is_kept_while_its_parameters_are(case: Case) -> 
     assert (torch.cat(forgetful) - whole).abs().max() > 1e-3  # else the model would not need it
 
 
-def test_a_follower_whose_parameters_change_begins_anew_and_the_others_do_not(eidm: object, case: Case) -> None:
+def test_a_follower_whose_parameters_change_begins_anew_and_the_others_do_not(
+    eidm: object, case: Case
+) -> None:
     before = {"tau": torch.full((PAIRS,), 1.5, dtype=torch.float64)}
     after = {"tau": before["tau"].clone().index_fill_(0, torch.tensor([2]), 0.8)}
     follower, *_ = eidm.advance(eidm.begin(case.start), case.part(0, 30), before)
-    later, _, speed = eidm.advance(follower, case.part(30, 60), after)
+    steady, _, speed = eidm.advance(follower, case.part(30, 60), after)
     whole = eidm.advance(eidm.begin(case.start), case.leader, before)[2][30:]
     fresh = eidm.advance(Follower(*follower), case.part(30, 60), after)[2]
     others = torch.arange(PAIRS) != 2
     torch.testing.assert_close(speed[:, others], whole[:, others], rtol=0.0, atol=1e-12)
     torch.testing.assert_close(speed[:, 2], fresh[:, 2], rtol=0.0, atol=1e-12)
-    last = eidm.advance(later, case.part(0, 5), after)[2]
+    last = eidm.advance(steady, case.part(0, 5), after)[2]
     assert bool(last.isfinite().all())
 
 
@@ -141,7 +161,12 @@ def test_leaders_and_parameters_broadcast_and_single_precision_stays(case: Case)
     memory = Simulator(model, DT)
     leader = Leader(*(x.float()[..., None] for x in case.leader))
     start = Start(*(x.float()[:, None].expand(PAIRS, 3) for x in case.start))
-    p = {name: value.float() for name, value in model.space.unpack(model.space.from_unit(case.uniform(0, 1, 3, 5))).items()}
+    p = {
+        name: value.float()
+        for name, value in model.space.unpack(
+            model.space.from_unit(case.uniform(0, 1, 3, 5))
+        ).items()
+    }
     for sumo in in_sumo(model, followers=10):
         expected = memory.advance(memory.begin(start), leader, p)
         found = sumo.advance(sumo.begin(start), leader, p)
@@ -153,9 +178,16 @@ def test_a_follower_who_collides_stays_and_has_a_negative_gap() -> None:
     steps = 30
     position = 50.0 + torch.arange(steps, dtype=torch.float64)[:, None].repeat(1, 3)
     position[10:, 0] -= 45.0  # it jumps behind its follower
-    leader = Leader(position, torch.full_like(position, 10.0), torch.zeros_like(position), torch.full((3,), 5.0).double())
+    leader = Leader(
+        position,
+        torch.full_like(position, 10.0),
+        torch.zeros_like(position),
+        torch.full((3,), 5.0).double(),
+    )
     zero = torch.zeros(3, dtype=torch.float64)
-    start = Start(torch.tensor([30.0, 47.0, 70.0], dtype=torch.float64), zero + 10.0, zero)  # 2 m too near; ahead of its leader
+    start = Start(
+        torch.tensor([30.0, 47.0, 70.0], dtype=torch.float64), zero + 10.0, zero
+    )  # 2 m too near; ahead of its leader
     model = KraussSumo()
     p = model.space.unpack(model.space.defaults().expand(3, -1))
     for sumo in in_sumo(model):
@@ -184,14 +216,21 @@ def test_settings_that_change_drives_are_part_of_what_caches_see(eidm: object) -
     from cfx.sumo.simulator import SumoSimulator
 
     assert SumoSimulator(EIDM, DT, SumoSettings(workers=3)).identity() == eidm.identity()
-    assert SumoSimulator(EIDM, DT, SumoSettings(seed=1)).identity() != eidm.identity() != Simulator(EIDM, DT).identity()
+    assert (
+        SumoSimulator(EIDM, DT, SumoSettings(seed=1)).identity()
+        != eidm.identity()
+        != Simulator(EIDM, DT).identity()
+    )
 
 
 def test_gradients_are_refused(eidm: object, case: Case) -> None:
     assert not eidm.differentiable
     assert Simulator(KraussSumo(), DT).differentiable
     p = {"tau": torch.tensor(1.0, dtype=torch.float64, requires_grad=True)}
-    with pytest.raises(SumoError, match="SUMO gives no gradients: learn with learner=imitation, or drive with simulator=memory"):
+    with pytest.raises(
+        SumoError,
+        match="SUMO gives no gradients: learn with learner=imitation, or drive with simulator=memory",
+    ):
         eidm.advance(eidm.begin(case.start), case.leader, p)
 
 
@@ -205,16 +244,38 @@ def test_nobody_or_no_time_is_no_drive(eidm: object, case: Case) -> None:
 @pytest.mark.parametrize(
     ("model", "dt", "sentence"),
     [
-        (W74(), DT, "SUMO has no car-following model W74; choose model=krauss_sumo, idm_sumo, w99, krauss or sumo_vtype"),
+        (
+            W74(),
+            DT,
+            "SUMO has no car-following model W74; choose model=krauss_sumo, idm_sumo, w99, krauss or sumo_vtype",
+        ),
         (Krauss(), DT, "only without a brake build-up time; add model.variant=sumo"),
-        (IdmSumo(), 1 / 30, "SUMO counts in milliseconds, so it cannot take the recording's steps of 0.0333333 s"),
-        (SumoVType(car_follow_model="EIDN", parameters={"tau": TAU}), DT, "no such car-following model. Did you mean 'EIDM'"),
-        (SumoVType(parameters={"tua": TAU}), DT, "SUMO's EIDM reads no attribute 'tua'. Did you mean 'tau'"),
+        (
+            IdmSumo(),
+            1 / 30,
+            "SUMO counts in milliseconds, so it cannot take the recording's steps of 0.0333333 s",
+        ),
+        (
+            SumoVType(car_follow_model="EIDN", parameters={"tau": TAU}),
+            DT,
+            "no such car-following model. Did you mean 'EIDM'",
+        ),
+        (
+            SumoVType(parameters={"tua": TAU}),
+            DT,
+            "SUMO's EIDM reads no attribute 'tua'. Did you mean 'tau'",
+        ),
         (SumoVType(parameters={"cc1": TAU}), DT, "SUMO's EIDM reads no attribute 'cc1'"),
-        (SumoVType(parameters={"tau": TAU}, attributes={"nonsense": 1}), DT, "SUMO's EIDM reads no attribute 'nonsense'"),
+        (
+            SumoVType(parameters={"tau": TAU}, attributes={"nonsense": 1}),
+            DT,
+            "SUMO's EIDM reads no attribute 'nonsense'",
+        ),
     ],
 )
-def test_what_sumo_cannot_drive_is_refused_before_any_work(model: DrivingModel, dt: float, sentence: str) -> None:
+def test_what_sumo_cannot_drive_is_refused_before_any_work(
+    model: DrivingModel, dt: float, sentence: str
+) -> None:
     from cfx.sumo.simulator import SumoSimulator
 
     with pytest.raises(ConfigError) as error:
@@ -225,5 +286,11 @@ def test_what_sumo_cannot_drive_is_refused_before_any_work(model: DrivingModel, 
 def test_a_value_that_sumo_refuses_is_told_in_its_own_words(case: Case) -> None:
     model = SumoVType(parameters={"tau": {"low": -1.0, "high": 3.0, "default": 1.0}})
     for sumo in in_sumo(model):
-        with pytest.raises(SumoError, match=r"^SUMO refuses the vehicles: .*tau\. Must be greater than 0$"):
-            sumo.advance(sumo.begin(case.start), case.leader, {"tau": torch.tensor(-1.0, dtype=torch.float64)})
+        with pytest.raises(
+            SumoError, match=r"^SUMO refuses the vehicles: .*tau\. Must be greater than 0$"
+        ):
+            sumo.advance(
+                sumo.begin(case.start),
+                case.leader,
+                {"tau": torch.tensor(-1.0, dtype=torch.float64)},
+            )

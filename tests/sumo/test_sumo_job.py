@@ -20,7 +20,8 @@ from cfx.simulation.settings import SIMULATORS
 from cfx.sumo import installed
 
 needs_sumo = pytest.mark.skipif(
-    importlib.util.find_spec("libsumo") is None, reason="SUMO is not here; pip install 'cfx-driving[sumo]'"
+    importlib.util.find_spec("libsumo") is None,
+    reason="SUMO is not here; pip install 'cfx-driving[sumo]'",
 )
 
 QUICK = [
@@ -44,13 +45,21 @@ def test_the_table_is_the_same_with_sumo_in_the_loop(tmp_path: Path) -> None:
     memory = job(tmp_path / "memory", "model=krauss_sumo")
     sumo = job(tmp_path / "sumo", "model=krauss_sumo", "simulator=sumo", "simulator.followers=8")
     pd.testing.assert_frame_equal(sumo.pairs, memory.pairs, rtol=0, atol=1e-9)
-    assert len(list((tmp_path / "cache").rglob("*.npz"))) == 2 * 3, "each simulator has its own results in the cache"
+    assert len(list((tmp_path / "cache").rglob("*.npz"))) == 2 * 3, (
+        "each simulator has its own results in the cache"
+    )
 
 
 @needs_sumo
 def test_any_model_of_sumo_is_calibrated_by_its_name(tmp_path: Path) -> None:
     own = "model.parameters={tau: {low: 0.5, high: 3, default: 1}, accel: {low: 0.5, high: 4, default: 2}}"
-    result = job(tmp_path / "eidm", "model=sumo_vtype", own, "model.attributes={treaction: 0.6}", "simulator=sumo")
+    result = job(
+        tmp_path / "eidm",
+        "model=sumo_vtype",
+        own,
+        "model.attributes={treaction: 0.6}",
+        "simulator=sumo",
+    )
     fixed = result.pairs[result.pairs["method"] == "fixed"]
     assert fixed["rmse_speed"].between(0.0, 5.0).all()
     assert fixed["parameter_tau"].between(0.5, 3.0).all()
@@ -58,7 +67,9 @@ def test_any_model_of_sumo_is_calibrated_by_its_name(tmp_path: Path) -> None:
 
 @needs_sumo
 def test_the_preset_of_eidm_is_what_sumo_knows(tmp_path: Path) -> None:
-    result = job(tmp_path / "eidm", "model=eidm", "simulator=sumo", "data.max_pairs=1", "optimizer.samples=2")
+    result = job(
+        tmp_path / "eidm", "model=eidm", "simulator=sumo", "data.max_pairs=1", "optimizer.samples=2"
+    )
     assert {"parameter_treaction", "parameter_jerkmax"} <= set(result.pairs.columns)
 
 
@@ -76,13 +87,23 @@ def test_a_policy_that_learned_drives_w99_in_sumo(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("overrides", "sentence"),
     [
-        (["model=sumo_vtype", "model.parameters={tau: {low: 0.5, high: 3, default: 1}}"], "add simulator=sumo"),
-        pytest.param(["model=w74", "simulator=sumo"], "SUMO has no car-following model W74", marks=needs_sumo),
-        (["simulator=sumo", "simulator.workers=0"], "simulator.workers=0: should be greater than or equal to 1"),
+        (
+            ["model=sumo_vtype", "model.parameters={tau: {low: 0.5, high: 3, default: 1}}"],
+            "add simulator=sumo",
+        ),
+        pytest.param(
+            ["model=w74", "simulator=sumo"], "SUMO has no car-following model W74", marks=needs_sumo
+        ),
+        (
+            ["simulator=sumo", "simulator.workers=0"],
+            "simulator.workers=0: should be greater than or equal to 1",
+        ),
         (["simulator.name=somu"], "there is no simulator 'somu'. Did you mean 'sumo'?"),
     ],
 )
-def test_a_combination_that_cannot_be_leaves_nothing(overrides: list[str], sentence: str, tmp_path: Path) -> None:
+def test_a_combination_that_cannot_be_leaves_nothing(
+    overrides: list[str], sentence: str, tmp_path: Path
+) -> None:
     with pytest.raises(ConfigError) as error:
         job(tmp_path / "job", *overrides)
     assert sentence in str(error.value)
@@ -104,5 +125,13 @@ def test_the_option_in_conf_says_what_its_settings_do(name: str) -> None:
 
 def test_a_learner_that_needs_gradients_is_refused_before_any_work(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="needs gradients, and the simulator has none"):
-        cfx.run(["simulator=sumo", "model=krauss_sumo", "learner=rollout", "tracking.enabled=false", f"hydra.run.dir={tmp_path}"])
+        cfx.run(
+            [
+                "simulator=sumo",
+                "model=krauss_sumo",
+                "learner=rollout",
+                "tracking.enabled=false",
+                f"hydra.run.dir={tmp_path}",
+            ]
+        )
     assert not (tmp_path / "config.yaml").exists()

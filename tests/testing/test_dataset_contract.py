@@ -71,7 +71,11 @@ class Silent(Straight):
 
 
 def two_time_steps(pair: Pair) -> Pair:
-    return replace(pair, dt=0.1 if pair.pair_id == "p0" else 0.2, leader_speed=pair.leader_speed / (1 + (pair.pair_id == "p1")))
+    return replace(
+        pair,
+        dt=0.1 if pair.pair_id == "p0" else 0.2,
+        leader_speed=pair.leader_speed / (1 + (pair.pair_id == "p1")),
+    )
 
 
 AHEAD = checks.leaders_are_ahead_and_nobody_reverses

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.learners.base import CURVE_COLUMNS, Learned, Learner, Lesson
+from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import tokens
 from cfx.policies.trained import Scaler, measured_history
@@ -24,26 +24,37 @@ class Plain(Learner):
 
     needs_labels = True
 
-    def fit(self, policy: Policy, lesson: Lesson) -> Learned:
-        torch_seed = torch.Generator().manual_seed(self.seed(lesson))
-        windows = lesson.labels.windows
-        history = measured_history(lesson.batch, windows.pair, windows.first + self.ahead, lesson.windows.length)
-        seen, mask = windows.to_grid(tokens(history, policy.inputs, policy.summary).float(), len(lesson.batch))
-        space = lesson.simulator.model.space
-        wanted, _ = windows.to_grid(space.to_unit(lesson.labels.parameters).float(), len(lesson.batch))
-        network_of, names = lesson.network, lesson.names
+    def fit(self, policy: Policy, training_data: TrainingData) -> TrainingResult:
+        torch_seed = torch.Generator().manual_seed(self.seed(training_data))
+        windows = training_data.labels.windows
+        history = measured_history(
+            training_data.batch,
+            windows.pair,
+            windows.first + self.ahead,
+            training_data.windows.length,
+        )
+        seen, mask = windows.to_grid(
+            tokens(history, policy.inputs, policy.summary).float(), len(training_data.batch)
+        )
+        space = training_data.simulator.model.space
+        wanted, _ = windows.to_grid(
+            space.to_unit(training_data.labels.parameters).float(), len(training_data.batch)
+        )
+        network_of, names = training_data.network, training_data.names
         grid, mask, wanted = (self.arrange(x, network_of, len(names)) for x in (seen, mask, wanted))
         scaler = self.scaler(grid, mask)
-        start = space.to_unit(lesson.fixed).float()
+        start = space.to_unit(training_data.fixed).float()
         first = torch.stack([start[network_of == k].mean(0) for k in range(len(names))])
         network = policy.build(grid.shape[-1], first[0], first, torch_seed)
         rows = self.train(network, scaler(grid), wanted, mask)
-        return self.finish(Learned(network.eval(), scaler, self.curves(rows, names)), lesson)
+        return self.finish(
+            TrainingResult(network.eval(), scaler, self.curves(rows, names)), training_data
+        )
 
     ahead = 0
 
-    def seed(self, lesson: Lesson) -> int:
-        return lesson.seed
+    def seed(self, training_data: TrainingData) -> int:
+        return training_data.seed
 
     @staticmethod
     def arrange(values: Tensor, network: Tensor, networks: int) -> Tensor:
@@ -52,7 +63,9 @@ class Plain(Learner):
     def scaler(self, grid: Tensor, mask: Tensor) -> Scaler:
         return Scaler.of(grid, mask)
 
-    def train(self, network: PolicyNetwork, seen: Tensor, wanted: Tensor, mask: Tensor) -> list[Tensor]:
+    def train(
+        self, network: PolicyNetwork, seen: Tensor, wanted: Tensor, mask: Tensor
+    ) -> list[Tensor]:
         adam = torch.optim.Adam(network.parameters(), lr=0.1)
         rows = []
         for _ in range(EPOCHS):
@@ -65,11 +78,17 @@ class Plain(Learner):
         return rows
 
     def curves(self, rows: list[Tensor], names: tuple[str, ...]) -> pd.DataFrame:
-        table = [(name, epoch, float(row[k]), float("nan")) for epoch, row in enumerate(rows) for k, name in enumerate(names)]
+        table = [
+            (name, epoch, float(row[k]), float("nan"))
+            for epoch, row in enumerate(rows)
+            for k, name in enumerate(names)
+        ]
         return pd.DataFrame(table, columns=CURVE_COLUMNS)
 
-    def finish(self, learned: Learned, lesson: Lesson) -> Learned:
-        return learned
+    def finish(
+        self, training_result: TrainingResult, training_data: TrainingData
+    ) -> TrainingResult:
+        return training_result
 
 
 class Lazy(Plain):
@@ -78,19 +97,19 @@ class Lazy(Plain):
 
 
 class Seedless(Plain):
-    def seed(self, lesson: Lesson) -> int:
+    def seed(self, training_data: TrainingData) -> int:
         return 0
 
 
 class Global(Plain):
-    def seed(self, lesson: Lesson) -> int:
+    def seed(self, training_data: TrainingData) -> int:
         return int(torch.randint(0, 1000, ()))
 
 
 class Seeding(Plain):
-    def seed(self, lesson: Lesson) -> int:
-        torch.manual_seed(lesson.seed)
-        return lesson.seed
+    def seed(self, training_data: TrainingData) -> int:
+        torch.manual_seed(training_data.seed)
+        return training_data.seed
 
 
 class Ahead(Plain):
@@ -108,39 +127,55 @@ class Together(Plain):
 
 
 class Training(Plain):
-    def finish(self, learned: Learned, lesson: Lesson) -> Learned:
-        learned.network.train()
-        return learned
+    def finish(
+        self, training_result: TrainingResult, training_data: TrainingData
+    ) -> TrainingResult:
+        training_result.network.train()
+        return training_result
 
 
 class Undone(Plain):
-    def finish(self, learned: Learned, lesson: Lesson) -> Learned:
-        for value in learned.network.parameters():
+    def finish(
+        self, training_result: TrainingResult, training_data: TrainingData
+    ) -> TrainingResult:
+        for value in training_result.network.parameters():
             value.data.fill_(torch.nan)
-        return learned
+        return training_result
 
 
 class Separate(Plain):
-    """Makes a network for each pair, whatever the lesson wants."""
+    """Makes a network for each pair, whatever the training data wants."""
 
-    def fit(self, policy: Policy, lesson: Lesson) -> Learned:
-        return super().fit(policy, replace(lesson, network=torch.arange(3), names=("a", "b", "c")))
+    def fit(self, policy: Policy, training_data: TrainingData) -> TrainingResult:
+        return super().fit(
+            policy, replace(training_data, network=torch.arange(3), names=("a", "b", "c"))
+        )
 
 
 class Meddling(Plain):
-    def finish(self, learned: Learned, lesson: Lesson) -> Learned:
-        lesson.fixed.mul_(1.01)
-        return learned
+    def finish(
+        self, training_result: TrainingResult, training_data: TrainingData
+    ) -> TrainingResult:
+        training_data.fixed.mul_(1.01)
+        return training_result
 
 
 class Renaming(Plain):
-    def finish(self, learned: Learned, lesson: Lesson) -> Learned:
-        return replace(learned, curves=learned.curves.rename(columns={"train_loss": "loss"}))
+    def finish(
+        self, training_result: TrainingResult, training_data: TrainingData
+    ) -> TrainingResult:
+        return replace(
+            training_result, curves=training_result.curves.rename(columns={"train_loss": "loss"})
+        )
 
 
 class Skipping(Plain):
-    def finish(self, learned: Learned, lesson: Lesson) -> Learned:
-        return replace(learned, curves=learned.curves[learned.curves.epoch % 2 == 0])
+    def finish(
+        self, training_result: TrainingResult, training_data: TrainingData
+    ) -> TrainingResult:
+        return replace(
+            training_result, curves=training_result.curves[training_result.curves.epoch % 2 == 0]
+        )
 
 
 READY = checks.delivers_networks_that_are_ready_to_drive
@@ -149,9 +184,17 @@ BROKEN: dict[str, tuple[Learner, Any, str]] = {
     "training": (Training(), READY, "evaluation mode"),
     "undone": (Undone(), READY, "nothing outside the model's bounds"),
     "lazy": (Lazy(), checks.learns_something, "at least 30 % nearer"),
-    "global": (Global(), checks.the_same_seed_gives_the_same_networks, "left as it was|from `lesson.seed` alone"),
+    "global": (
+        Global(),
+        checks.the_same_seed_gives_the_same_networks,
+        "left as it was|from `training data.seed` alone",
+    ),
     "seeding": (Seeding(), checks.the_same_seed_gives_the_same_networks, "left as it was"),
-    "seedless": (Seedless(), checks.another_seed_gives_other_networks, "must reach the initial weights"),
+    "seedless": (
+        Seedless(),
+        checks.another_seed_gives_other_networks,
+        "must reach the initial weights",
+    ),
     "ahead": (Ahead(), checks.reads_no_frame_after_the_training_part, "proves nothing"),
     "together": (Together(), checks.networks_are_independent, "drivers of another network"),
     "meddling": (Meddling(), checks.the_lesson_stays_as_it_is, "not be changed in place"),

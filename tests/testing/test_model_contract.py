@@ -54,12 +54,17 @@ class Stubborn(Krauss):
 
 
 class Undocumented(Krauss):
-    parameters = ParameterSpace.of(*(Parameter(p.name, p.unit, p.low, p.high, p.default, p.meaning) for p in Krauss.parameters))
+    parameters = ParameterSpace.of(
+        *(Parameter(p.name, p.unit, p.low, p.high, p.default, p.meaning) for p in Krauss.parameters)
+    )
 
 
 class Dimensionless(Krauss):
     parameters = ParameterSpace.of(
-        *(Parameter(p.name, "", p.low, p.high, p.default, p.meaning, p.source) for p in Krauss.parameters)
+        *(
+            Parameter(p.name, "", p.low, p.high, p.default, p.meaning, p.source)
+            for p in Krauss.parameters
+        )
     )
 
 
@@ -91,20 +96,60 @@ BROKEN = {
     "memory": (Forgetting(), SHAPE, "memory_size"),
     "state": (Remembering(), checks.is_pure, "keeps no state"),
     "in place": (Meddling(), checks.is_pure, "in place"),
-    "mean": (model(lambda v, f, *_: v + 0.1 * f.speed.mean()), checks.a_batch_equals_the_loop_over_it, "differently alone"),
-    "sum": (model(lambda v, f, _, p: v + 0 * p["t_r"].sum()), checks.a_bad_neighbour_does_no_harm, "not reach the others"),
-    "first": (model(lambda v, *_: v[..., :1].expand(v.shape)), checks.leaders_and_parameters_broadcast, "changes the numbers"),
-    "cancels": (model(lambda v, *_: (v + 1e7) - 1e7), checks.single_precision_agrees_with_double, "cancels"),
-    "gradient": (model(lambda v, *_: v.detach() + 0 * v), checks.gradients_are_right, "gradients differ"),
+    "mean": (
+        model(lambda v, f, *_: v + 0.1 * f.speed.mean()),
+        checks.a_batch_equals_the_loop_over_it,
+        "differently alone",
+    ),
+    "sum": (
+        model(lambda v, f, _, p: v + 0 * p["t_r"].sum()),
+        checks.a_bad_neighbour_does_no_harm,
+        "not reach the others",
+    ),
+    "first": (
+        model(lambda v, *_: v[..., :1].expand(v.shape)),
+        checks.leaders_and_parameters_broadcast,
+        "changes the numbers",
+    ),
+    "cancels": (
+        model(lambda v, *_: (v + 1e7) - 1e7),
+        checks.single_precision_agrees_with_double,
+        "cancels",
+    ),
+    "gradient": (
+        model(lambda v, *_: v.detach() + 0 * v),
+        checks.gradients_are_right,
+        "gradients differ",
+    ),
     "root": (model(root_of_gap), checks.gradients_are_finite_at_every_extreme, "not finite"),
-    "explodes": (Exploding(), checks.no_rollout_leaves_what_is_finite, "infinity or NaN|absurd speeds"),
-    "blind": (model(lambda v, f, *_: f.speed, collision_free=True), checks.collision_free_as_claimed, "hits a leader"),
-    "ignores": (model(lambda v, f, *_: f.speed), checks.follows_its_leader_as_claimed, "set `follows = False`"),
-    "stubborn": (Stubborn(), checks.constants_can_be_tuned_and_tuned_parameters_fixed, "must turn a constant"),
+    "explodes": (
+        Exploding(),
+        checks.no_rollout_leaves_what_is_finite,
+        "infinity or NaN|absurd speeds",
+    ),
+    "blind": (
+        model(lambda v, f, *_: f.speed, collision_free=True),
+        checks.collision_free_as_claimed,
+        "hits a leader",
+    ),
+    "ignores": (
+        model(lambda v, f, *_: f.speed),
+        checks.has_a_constant_baseline_as_claimed,
+        "set `has_constant_baseline = False`",
+    ),
+    "stubborn": (
+        Stubborn(),
+        checks.constants_can_be_tuned_and_tuned_parameters_fixed,
+        "must turn a constant",
+    ),
     "no source": (Undocumented(), checks.every_parameter_says_what_it_is, "has no source"),
     "no unit": (Dimensionless(), checks.every_parameter_says_what_it_is, "has no unit"),
     "no reference": (Anonymous(), checks.every_parameter_says_what_it_is, "set `reference`"),
-    "branch": (model(lambda v, *_: v if v.sum() > 0 else 2 * v), checks.can_be_compiled_as_one_graph, "instead of if"),
+    "branch": (
+        model(lambda v, *_: v if v.sum() > 0 else 2 * v),
+        checks.can_be_compiled_as_one_graph,
+        "instead of if",
+    ),
 }
 
 

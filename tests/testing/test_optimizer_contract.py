@@ -25,7 +25,9 @@ class Small(RandomSearch):
         super().__init__(samples=60)
 
     def draw(self, problems: int, count: int, n: int, seed: int) -> Tensor:
-        return torch.rand((count, n), generator=torch.Generator().manual_seed(seed), dtype=torch.float64).expand(problems, -1, -1)
+        return torch.rand(
+            (count, n), generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+        ).expand(problems, -1, -1)
 
     def solve(self, objective: Objective, guesses: Tensor, *, seed: int) -> tuple[Tensor, Tensor]:
         problems, g, n = guesses.shape
@@ -132,18 +134,38 @@ class Twice(Small):
 BROKEN: dict[str, tuple[Optimizer, Any, str]] = {
     "coarse": (Small(), checks.recovers_a_known_optimum, "was missed by"),
     "straying": (Straying(), checks.never_leaves_the_bounds, "outside"),
-    "no number": (Centring(), checks.survives_whatever_the_losses_are, "losses that are numbers or infinity"),
+    "no number": (
+        Centring(),
+        checks.survives_whatever_the_losses_are,
+        "losses that are numbers or infinity",
+    ),
     "shaking": (Shaking(), checks.survives_duplicate_guesses, "it must be returned"),
     "half": (Half(), checks.finds_a_corner, "bounds must be within reach"),
-    "hiding": (Hiding(), checks.a_problem_alone_and_all_diverged, "the loss is infinity|the first guess stands"),
+    "hiding": (
+        Hiding(),
+        checks.a_problem_alone_and_all_diverged,
+        "the loss is infinity|the first guess stands",
+    ),
     "global": (Global(), checks.the_same_seed_gives_the_same_result, "two results"),
-    "seeding numpy": (SeedingNumpy(), checks.the_same_seed_gives_the_same_result, "global random state of numpy"),
+    "seeding numpy": (
+        SeedingNumpy(),
+        checks.the_same_seed_gives_the_same_result,
+        "global random state of numpy",
+    ),
     "seedless": (Seedless(), checks.another_seed_searches_elsewhere, "must reach the search"),
-    "gossiping": (Gossiping(), checks.problems_are_independent, "must not depend on the problems beside it"),
+    "gossiping": (
+        Gossiping(),
+        checks.problems_are_independent,
+        "must not depend on the problems beside it",
+    ),
     "numbering": (Numbering(), checks.chunks_change_nothing, "never on the result"),
     "deaf": (Deaf(), checks.evaluates_exactly_what_it_says, "every guess is evaluated"),
     "twice": (Twice(), checks.evaluates_exactly_what_it_says, "not one more"),
-    "overfilled": (Overfilled(), checks.says_how_many_evaluations_fill_the_space, "measured over the first of them"),
+    "overfilled": (
+        Overfilled(),
+        checks.says_how_many_evaluations_fill_the_space,
+        "measured over the first of them",
+    ),
     "deaf to ties": (Deaf(), checks.ties_go_to_the_first_guess, "keeps the first guess"),
     "lying": (Lying(), checks.returns_the_loss_of_what_it_returns, "loss of `best`"),
 }

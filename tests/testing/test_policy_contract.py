@@ -19,7 +19,9 @@ Change = Callable[[nn.Module, Tensor], Tensor]
 class Network(PolicyNetwork):
     """Answers from the present token, and lets itself be spoiled."""
 
-    def __init__(self, features: int, fixed: Tensor, draw: Callable[..., Tensor], change: Change | None) -> None:
+    def __init__(
+        self, features: int, fixed: Tensor, draw: Callable[..., Tensor], change: Change | None
+    ) -> None:
         super().__init__()
         self.weight = nn.Parameter(draw((len(fixed), features, fixed.shape[1])))
         self.change = change
@@ -29,13 +31,17 @@ class Network(PolicyNetwork):
 
     def forward(self, tokens: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         logits = torch.einsum("nbwf,nfp->nbwp", tokens, self.weight)
-        return (logits.sigmoid() if self.change is None else self.change(self, logits)), state + tokens.shape[2]
+        return (
+            logits.sigmoid() if self.change is None else self.change(self, logits)
+        ), state + tokens.shape[2]
 
 
 class Simple(Policy):
     change: ClassVar[Any] = None
 
-    def build(self, features: int, default: Tensor, fixed: Tensor, generator: torch.Generator) -> PolicyNetwork:
+    def build(
+        self, features: int, default: Tensor, fixed: Tensor, generator: torch.Generator
+    ) -> PolicyNetwork:
         def draw(shape: tuple[int, ...]) -> Tensor:
             return torch.randn(shape, generator=generator)
 

@@ -10,11 +10,11 @@ import torch
 
 from cfx.calibration.windows import Split
 from cfx.evaluation.result import Drive, Evaluation
-from cfx.learners.base import Learned, Lesson
+from cfx.learners.base import TrainingData, TrainingResult
 from cfx.learners.imitation import ImitationLearner
 from cfx.policies.base import Policy
 from cfx.policies.fixed import FixedPolicy
-from cfx.protocols.base import Outcome, Protocol, Study
+from cfx.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.protocols.within_driver import WithinDriver
 from cfx.testing.checks import protocols as checks
 
@@ -22,9 +22,9 @@ from cfx.testing.checks import protocols as checks
 class Retelling(WithinDriver):
     """Changes what came out."""
 
-    def run(self, study: Study) -> Outcome:
-        outcome = super().run(study)
-        return replace(outcome, evaluation=self.retell(outcome.evaluation))
+    def run(self, context: ProtocolContext) -> ProtocolResult:
+        protocol_result = super().run(context)
+        return replace(protocol_result, evaluation=self.retell(protocol_result.evaluation))
 
     def retell(self, evaluation: Evaluation) -> Evaluation:
         return replace(evaluation, drives=tuple(self.redrive(drive) for drive in evaluation.drives))
@@ -77,50 +77,53 @@ class _Whole:
 
 
 class Peeking(WithinDriver):
-    def run(self, study: Study) -> Outcome:
-        return super().run(replace(study, calibrator=_Whole(study.calibrator)))
+    def run(self, context: ProtocolContext) -> ProtocolResult:
+        return super().run(replace(context, calibrator=_Whole(context.calibrator)))
 
 
 class _Telling(ImitationLearner):
     """Is given the whole drives to learn from."""
 
-    def __init__(self, learner: Any, study: Study) -> None:
+    def __init__(self, learner: Any, context: ProtocolContext) -> None:
         super().__init__(epochs=1)
-        self._learner, self._study = learner, study
+        self._learner, self._context = learner, context
 
-    def fit(self, policy: Policy, lesson: Lesson) -> Learned:
-        whole = Split.none(self._study.pairs, self._study.windows)
-        return self._learner.fit(policy, replace(lesson, labels=self._study.labels(whole.windows, lesson.fixed)))
+    def fit(self, policy: Policy, training_data: TrainingData) -> TrainingResult:
+        whole = Split.none(self._context.pairs, self._context.windows)
+        return self._learner.fit(
+            policy,
+            replace(training_data, labels=self._context.labels(whole.windows, training_data.fixed)),
+        )
 
 
 class Telling(WithinDriver):
-    def run(self, study: Study) -> Outcome:
-        if not study.policy.trainable:
-            return super().run(study)
-        return super().run(replace(study, learner=_Telling(study.learner, study)))
+    def run(self, context: ProtocolContext) -> ProtocolResult:
+        if not context.policy.trainable:
+            return super().run(context)
+        return super().run(replace(context, learner=_Telling(context.learner, context)))
 
 
 class Drawing(WithinDriver):
-    def run(self, study: Study) -> Outcome:
-        return super().run(replace(study, seed=int(torch.randint(0, 1000, ()))))
+    def run(self, context: ProtocolContext) -> ProtocolResult:
+        return super().run(replace(context, seed=int(torch.randint(0, 1000, ()))))
 
 
 class Eager(WithinDriver):
     """Trains whatever it is given."""
 
-    def run(self, study: Study) -> Outcome:
-        if not study.policy.trainable:
-            study.learner.fit(study.policy, None)  # type: ignore[arg-type]  # the mistake to be found
-        return super().run(study)
+    def run(self, context: ProtocolContext) -> ProtocolResult:
+        if not context.policy.trainable:
+            context.learner.fit(context.policy, None)  # type: ignore[arg-type]  # the mistake to be found
+        return super().run(context)
 
 
 class Labelling(WithinDriver):
-    def run(self, study: Study) -> Outcome:
-        outcome = super().run(study)
-        counts = Split.of(study.pairs, study.windows, study.split).windows
-        learned = replace(study, policy=FixedPolicy())
-        assert learned.labels(counts, torch.zeros(0)) is None
-        return replace(outcome, labels=outcome.labels or object())  # type: ignore[arg-type]  # the mistake to be found
+    def run(self, context: ProtocolContext) -> ProtocolResult:
+        protocol_result = super().run(context)
+        counts = Split.of(context.pairs, context.windows, context.split).windows
+        training_result = replace(context, policy=FixedPolicy())
+        assert training_result.labels(counts, torch.zeros(0)) is None
+        return replace(protocol_result, labels=protocol_result.labels or object())  # type: ignore[arg-type]  # the mistake to be found
 
 
 FRAMES = checks.all_methods_drive_the_same_frames
@@ -131,9 +134,21 @@ BROKEN: dict[str, tuple[Protocol, Any, str]] = {
     "narrow": (Narrow(), TABLE, "read these columns of the table: rmse_gap"),
     "double": (Double(), TABLE, "would count it twice"),
     "mute": (Mute(), TABLE, "over every baseline"),
-    "copying": (Copying(), checks.no_method_sees_the_measured_follower_of_the_test_part, "speeds of method 'policy'"),
-    "peeking": (Peeking(), checks.nothing_is_found_or_learned_from_the_test_part, "method 'fixed' begins"),
-    "telling": (Telling(), checks.nothing_is_found_or_learned_from_the_test_part, "method 'policy' begins"),
+    "copying": (
+        Copying(),
+        checks.no_method_sees_the_measured_follower_of_the_test_part,
+        "speeds of method 'policy'",
+    ),
+    "peeking": (
+        Peeking(),
+        checks.nothing_is_found_or_learned_from_the_test_part,
+        "method 'fixed' begins",
+    ),
+    "telling": (
+        Telling(),
+        checks.nothing_is_found_or_learned_from_the_test_part,
+        "method 'policy' begins",
+    ),
     "told": (Telling(), checks.learners_get_only_what_they_may_use, "end within the training part"),
     "drawing": (Drawing(), checks.the_same_seed_gives_the_same_outcome, "from `study.seed` alone"),
     "eager": (Eager(), checks.a_policy_without_training_is_not_trained, "nothing to train"),

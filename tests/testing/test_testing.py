@@ -82,5 +82,7 @@ except ModuleNotFoundError as error:
 
 def test_checks_refuse_to_run_where_assertions_are_removed() -> None:
     code = "import cfx.testing as t; next(t.violations(t.Contract('model', ()), None))"
-    done = subprocess.run([sys.executable, "-O", "-c", code], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-O", "-c", code], capture_output=True, text=True, check=False
+    )
     assert "start python without -O" in done.stderr

@@ -73,7 +73,10 @@ def test_a_database_of_another_mlflow(database: Path) -> None:
     with closing(sqlite3.connect(database)) as other:
         other.execute("UPDATE alembic_version SET version_num = 'abc123'")
         other.commit()
-    refused(database, r"another version of MLflow \(schema abc123, MLflow .* needs .*\); make a copy and run `mlflow db upgrade")
+    refused(
+        database,
+        r"another version of MLflow \(schema abc123, MLflow .* needs .*\); make a copy and run `mlflow db upgrade",
+    )
 
 
 def test_an_older_database_is_not_upgraded_behind_the_users_back(database: Path) -> None:
@@ -91,14 +94,19 @@ def test_a_folder_in_the_place_of_the_file(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(TrackingError, match="file/store: the folder of the MLflow store cannot be made"):
+    with pytest.raises(
+        TrackingError, match="file/store: the folder of the MLflow store cannot be made"
+    ):
         open_store(f"sqlite:///{tmp_path}/file/store/mlflow.db", "cfx")
 
 
 def test_a_folder_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Tests may run as root, whom no permission stops.
     monkeypatch.setattr(store.os, "access", lambda *_: False)
-    with pytest.raises(TrackingError, match=f"{re.escape(str(tmp_path))}: the folder of the MLflow store cannot be written"):
+    with pytest.raises(
+        TrackingError,
+        match=f"{re.escape(str(tmp_path))}: the folder of the MLflow store cannot be written",
+    ):
         open_store(f"sqlite:///{tmp_path}/mlflow.db", "cfx")
 
 
@@ -126,7 +134,9 @@ def test_a_server_that_does_not_answer() -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    with pytest.raises(TrackingError, match=f"no MLflow server answers at http://127.0.0.1:{port} "):
+    with pytest.raises(
+        TrackingError, match=f"no MLflow server answers at http://127.0.0.1:{port} "
+    ):
         open_store(f"http://127.0.0.1:{port}", "cfx")
 
 
@@ -143,7 +153,16 @@ def test_the_address_is_the_environments_then_the_configs_then_beside_the_output
 
 
 @pytest.mark.parametrize(
-    "uri", ["mlruns", "file:///tmp/mlruns", "outputs/mlflow.db", "ftp://host", "sqlite:///", "sqlite:///:memory:", "sqlite://"]
+    "uri",
+    [
+        "mlruns",
+        "file:///tmp/mlruns",
+        "outputs/mlflow.db",
+        "ftp://host",
+        "sqlite:///",
+        "sqlite:///:memory:",
+        "sqlite://",
+    ],
 )
 def test_an_address_that_is_none(uri: str) -> None:
     with pytest.raises(TrackingError, match=r"^tracking.uri=.*write sqlite:///FILE"):

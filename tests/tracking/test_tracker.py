@@ -26,7 +26,7 @@ from cfx.policies.features import token_width
 from cfx.policies.gru import GruPolicy
 from cfx.policies.trained import Scaler, TrainedPolicy
 from cfx.tracking import provenance
-from cfx.tracking.store import download_run, quiet, told
+from cfx.tracking.store import download_run, quiet, translate_errors
 from cfx.tracking.tracker import CURVE_POINTS, MlflowTracker, Tracker, sweep_link
 from tests.drives import wavy_pairs
 from tests.made_up import make_curves, make_results
@@ -52,7 +52,9 @@ def _own_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An empty MLflow database; making one takes a second."""
     folder = tmp_path_factory.mktemp("template")
-    with MlflowTracker.run(f"sqlite:///{folder}/mlflow.db", experiment="other", run_name="x", parameters={}):
+    with MlflowTracker.run(
+        f"sqlite:///{folder}/mlflow.db", experiment="other", run_name="x", parameters={}
+    ):
         pass
     return folder / "mlflow.db"
 
@@ -73,7 +75,11 @@ def client(uri: str) -> Iterator[Any]:
 
 
 def begin(uri: str, **changes: Any) -> Any:
-    options: dict[str, Any] = {"run_name": "krauss-gru", "parameters": {"seed": "0"}, "tags": {"model": "krauss"}}
+    options: dict[str, Any] = {
+        "run_name": "krauss-gru",
+        "parameters": {"seed": "0"},
+        "tags": {"model": "krauss"},
+    }
     return MlflowTracker.run(uri, **(options | changes))
 
 
@@ -91,7 +97,9 @@ def config_of(uri: str | None, **tracking: Any) -> JobConfig:
     return JobConfig.of({**nodes, "tracking": {"uri": uri, **tracking}})
 
 
-def test_a_job_is_kept_under_the_names_of_the_contract(uri: str, client: Any, tmp_path: Path) -> None:
+def test_a_job_is_kept_under_the_names_of_the_contract(
+    uri: str, client: Any, tmp_path: Path
+) -> None:
     results = make_results(pairs=4, frames=20)
     (tmp_path / "metrics.json").write_text("{}")
     (tmp_path / "drives.png").write_bytes(b"png")
@@ -119,10 +127,16 @@ def test_a_job_is_kept_under_the_names_of_the_contract(uri: str, client: Any, tm
     assert tags["cfx.plugins"] == "none"
     assert tags["dataset.fingerprint"] == "f" * 64
     assert "cfx.sweep" not in tags
-    assert {file.path for file in client.list_artifacts(run.run_id)} == {"figures", "metrics.json", "pairs.json"}
+    assert {file.path for file in client.list_artifacts(run.run_id)} == {
+        "figures",
+        "metrics.json",
+        "pairs.json",
+    }
     table = table_of(client, run.run_id)
     assert len(table) == 12
-    assert table["rmse_speed"].to_numpy() == pytest.approx(results.evaluation.table["rmse_speed"].to_numpy())
+    assert table["rmse_speed"].to_numpy() == pytest.approx(
+        results.evaluation.table["rmse_speed"].to_numpy()
+    )
     assert json.loads(tags["mlflow.loggedArtifacts"]) == [{"path": "pairs.json", "type": "table"}]
 
 
@@ -142,7 +156,10 @@ def test_a_store_is_made_beside_the_outputs(tmp_path: Path) -> None:
     assert names_in(tmp_path / "outputs") == ["mlartifacts", "mlflow.db", "mlflow.db.lock"]
     first, second = run.how_to_open()
     assert first == "To see it in MLflow: python -m cfx ui"
-    assert second == f"MLflow: http://127.0.0.1:5000/#/experiments/1/runs/{run.run_id}?workflowType=machine_learning"
+    assert (
+        second
+        == f"MLflow: http://127.0.0.1:5000/#/experiments/1/runs/{run.run_id}?workflowType=machine_learning"
+    )
 
 
 def test_tracking_can_be_off(tmp_path: Path) -> None:
@@ -166,7 +183,9 @@ def test_tracking_can_be_off(tmp_path: Path) -> None:
         (SystemExit(143), "KILLED", "SystemExit: 143"),
     ],
 )
-def test_a_broken_job_says_how_it_ended(uri: str, client: Any, error: BaseException, status: str, reason: str) -> None:
+def test_a_broken_job_says_how_it_ended(
+    uri: str, client: Any, error: BaseException, status: str, reason: str
+) -> None:
     with pytest.raises(type(error)), begin(uri) as run:
         raise error
     kept = client.get_run(run.run_id)
@@ -220,12 +239,20 @@ def test_a_job_that_starts_again_goes_on_in_its_run(uri: str, client: Any, tmp_p
 
 def test_a_run_whose_process_is_gone_is_closed(uri: str, client: Any) -> None:
     with begin(uri, sweep="s") as gone, begin(uri, parameters={"seed": "1"}) as alive:
-        dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True, check=True)
+        dead = subprocess.run(
+            [sys.executable, "-c", "import os; print(os.getpid())"],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
         client.set_tag(gone.run_id, "cfx.process", f"{dead.stdout.strip()}@1000000000")
         with begin(uri, parameters={"seed": "2"}):
             assert client.get_run(alive.run_id).info.status == "RUNNING"
             kept = client.get_run(gone.run_id)
-            assert (kept.info.status, kept.data.tags["cfx.failure"]) == ("KILLED", "the process ended without closing the run")
+            assert (kept.info.status, kept.data.tags["cfx.failure"]) == (
+                "KILLED",
+                "the process ended without closing the run",
+            )
             assert client.get_run(kept.data.tags["mlflow.parentRunId"]).info.status == "KILLED"
 
 
@@ -243,7 +270,10 @@ def test_many_processes_begin_a_sweep_at_once(tmp_path: Path) -> None:
     uri = f"sqlite:///{tmp_path}/new/deeper/mlflow.db"
     jobs = [
         subprocess.Popen(
-            [sys.executable, "-W", "error", "-c", JOB, uri, str(k)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+            [sys.executable, "-W", "error", "-c", JOB, uri, str(k)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
         )
         for k in range(4)
     ]
@@ -270,7 +300,10 @@ def test_a_sweep_has_the_status_of_its_jobs(uri: str, client: Any) -> None:
 
     with begin(uri, sweep="s") as one:
         assert parent() == "RUNNING"
-        with pytest.raises(RuntimeError), begin(uri, sweep="s", parameters={"seed": "1"}, tags={"cfx.folder": "b"}):
+        with (
+            pytest.raises(RuntimeError),
+            begin(uri, sweep="s", parameters={"seed": "1"}, tags={"cfx.folder": "b"}),
+        ):
             raise RuntimeError
         assert parent() == "RUNNING"
     assert parent() == "FAILED"
@@ -285,14 +318,25 @@ def test_a_sweep_has_the_status_of_its_jobs(uri: str, client: Any) -> None:
 
 
 def test_long_values_and_odd_keys_are_kept(uri: str, client: Any) -> None:
-    odd = {"data.path": "x" * 9000, "model.parameters.k(ü)[0]": "1", "empty": "", "unicode": "50 ‰"} | {
-        f"p{k}": "v" for k in range(250)
-    }
+    odd = {
+        "data.path": "x" * 9000,
+        "model.parameters.k(ü)[0]": "1",
+        "empty": "",
+        "unicode": "50 ‰",
+    } | {f"p{k}": "v" for k in range(250)}
     with begin(uri, parameters=odd, tags={"note": "y" * 9000, "empty": ""}) as run:
         pass
     kept = client.get_run(run.run_id).data
     assert kept.params["data.path"] == "x" * 5999 + "…"
-    assert kept.params["model.parameters.k(ü)[0]".replace("(", "_").replace(")", "_").replace("[", "_").replace("]", "_")] == "1"
+    assert (
+        kept.params[
+            "model.parameters.k(ü)[0]".replace("(", "_")
+            .replace(")", "_")
+            .replace("[", "_")
+            .replace("]", "_")
+        ]
+        == "1"
+    )
     assert (kept.params["empty"], kept.params["unicode"]) == ("", "50 ‰")
     assert len(kept.params) == len(odd)
     assert kept.tags["note"].endswith("y…")
@@ -332,7 +376,11 @@ def saved_policy(tmp_path: Path) -> SimpleNamespace:
     trained.save(tmp_path / "policy")
     pairs = wavy_pairs(model, torch.tensor([[1.5, 0.1], [2.0, 0.3]]).double(), frames=60)
     write_tidy(pairs, tmp_path / "pairs.parquet")
-    return SimpleNamespace(policy=trained, folder=tmp_path / "policy", frame=pd.read_parquet(tmp_path / "pairs.parquet"))
+    return SimpleNamespace(
+        policy=trained,
+        folder=tmp_path / "policy",
+        frame=pd.read_parquet(tmp_path / "pairs.parquet"),
+    )
 
 
 def test_a_logged_policy_loads_again_and_predicts_the_same(
@@ -360,7 +408,9 @@ def test_a_logged_policy_loads_again_and_predicts_the_same(
     assert f"cfx-driving=={provenance.version()}" in requirements.read_text().split()
 
 
-def test_a_job_comes_back_from_its_run(uri: str, saved_policy: SimpleNamespace, tmp_path: Path) -> None:
+def test_a_job_comes_back_from_its_run(
+    uri: str, saved_policy: SimpleNamespace, tmp_path: Path
+) -> None:
     (tmp_path / "metrics.json").write_text("{}")
     with begin(uri) as run:
         run.log_policy(saved_policy.folder)
@@ -368,8 +418,13 @@ def test_a_job_comes_back_from_its_run(uri: str, saved_policy: SimpleNamespace, 
     folder = download_run(run.run_id, uri)
     assert (folder / "metrics.json").read_text() == "{}"
     expected = saved_policy.policy.predict_frame(saved_policy.frame)
-    pd.testing.assert_frame_equal(TrainedPolicy.load(folder / "policy").predict_frame(saved_policy.frame), expected)
-    for wrong, message in (("nothing", "neither a job's output folder nor the id"), ("0" * 32, "could not read run 000")):
+    pd.testing.assert_frame_equal(
+        TrainedPolicy.load(folder / "policy").predict_frame(saved_policy.frame), expected
+    )
+    for wrong, message in (
+        ("nothing", "neither a job's output folder nor the id"),
+        ("0" * 32, "could not read run 000"),
+    ):
         with pytest.raises(TrackingError, match=message):
             download_run(wrong, uri)
 
@@ -394,30 +449,45 @@ def test_nothing_is_printed_and_nothing_global_changes(
 
 
 def test_what_mlflow_refuses_is_one_sentence(uri: str) -> None:
-    with pytest.raises(TrackingError, match=r"^MLflow could not log .*missing\.png: .*$") as caught, begin(uri) as run:
+    with (
+        pytest.raises(TrackingError, match=r"^MLflow could not log .*missing\.png: .*$") as caught,
+        begin(uri) as run,
+    ):
         run.log_figures([Path("missing.png")])
     assert "\n" not in str(caught.value)
     with pytest.raises(TrackingError, match="holds no policy"), begin(uri) as run:
         run.log_policy(Path("missing"))
-    with pytest.raises(TrackingError, match="could not dance: Permission denied"), told("dance"):
+    with (
+        pytest.raises(TrackingError, match="could not dance: Permission denied"),
+        translate_errors("dance"),
+    ):
         raise PermissionError("Permission denied")
 
 
-def test_artifacts_that_cannot_be_written_are_found_at_the_start(uri: str, client: Any, tmp_path: Path) -> None:
+def test_artifacts_that_cannot_be_written_are_found_at_the_start(
+    uri: str, client: Any, tmp_path: Path
+) -> None:
     (tmp_path / "file").write_text("in the way")
     client.create_experiment("cfx", artifact_location=(tmp_path / "file" / "artifacts").as_uri())
-    with pytest.raises(TrackingError, match=r"could not begin the run: .*Not a directory"), begin(uri):
+    with (
+        pytest.raises(TrackingError, match=r"could not begin the run: .*Not a directory"),
+        begin(uri),
+    ):
         pytest.fail("the job must not start")
     (run,) = client.search_runs([client.get_experiment_by_name("cfx").experiment_id])
     assert run.info.status == "FAILED"
 
 
-def test_plugins_are_named_with_their_versions(uri: str, client: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_plugins_are_named_with_their_versions(
+    uri: str, client: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     from cfx import registry
 
     def entry(kind: str, name: str) -> SimpleNamespace:
         plugin = kind == "model"
-        return SimpleNamespace(distribution="cfx-idm" if plugin else "cfx-driving", version="0.3" if plugin else "0.1")
+        return SimpleNamespace(
+            distribution="cfx-idm" if plugin else "cfx-driving", version="0.3" if plugin else "0.1"
+        )
 
     monkeypatch.setattr(registry, "entry", entry)
     with Tracker.open(config_of(uri), tmp_path) as run:
@@ -429,9 +499,18 @@ def test_plugins_are_named_with_their_versions(uri: str, client: Any, monkeypatc
 
 def test_the_commit_of_the_users_checkout(tmp_path: Path) -> None:
     def git(*arguments: str) -> str:
-        who = {"GIT_AUTHOR_NAME": "a", "GIT_AUTHOR_EMAIL": "a@b", "GIT_COMMITTER_NAME": "a", "GIT_COMMITTER_EMAIL": "a@b"}
+        who = {
+            "GIT_AUTHOR_NAME": "a",
+            "GIT_AUTHOR_EMAIL": "a@b",
+            "GIT_COMMITTER_NAME": "a",
+            "GIT_COMMITTER_EMAIL": "a@b",
+        }
         done = subprocess.run(
-            ["git", "-C", str(tmp_path), *arguments], capture_output=True, text=True, check=True, env=os.environ | who
+            ["git", "-C", str(tmp_path), *arguments],
+            capture_output=True,
+            text=True,
+            check=True,
+            env=os.environ | who,
         )
         return done.stdout.strip()
 

@@ -28,7 +28,9 @@ def leaders_are_ahead_and_nobody_reverses(dataset: Dataset) -> None:
             f"pair {pair.pair_id}: the gap is bumper to bumper, in m, and positive: nobody drives through another"
         )
         lowest = min(float(pair.leader_speed.min()), float(pair.follower_speed.min()))
-        assert lowest >= 0, f"pair {pair.pair_id}: speeds are in m/s and not negative: no model reverses"
+        assert lowest >= 0, (
+            f"pair {pair.pair_id}: speeds are in m/s and not negative: no model reverses"
+        )
 
 
 def units_are_si(dataset: Dataset) -> None:
@@ -53,9 +55,13 @@ def pairs_stack(dataset: Dataset) -> None:
     try:
         batch = PairBatch.of(pairs)
     except CfxError as error:
-        raise AssertionError(f"all pairs of a dataset are simulated in one batch: {error}") from error
+        raise AssertionError(
+            f"all pairs of a dataset are simulated in one batch: {error}"
+        ) from error
     frames = sum(len(pair) for pair in pairs)
-    assert int(batch.mask.sum()) == frames, f"the batch holds {int(batch.mask.sum())} frames of {frames}: every frame counts once"
+    assert int(batch.mask.sum()) == frames, (
+        f"the batch holds {int(batch.mask.sum())} frames of {frames}: every frame counts once"
+    )
 
 
 def max_pairs_keeps_the_first_and_counts_the_rest(dataset: Dataset) -> None:
@@ -77,8 +83,12 @@ def asking_for_too_much_is_an_error(dataset: Dataset) -> None:
         _with(dataset, min_frames=longest + 1).load()
     except DataError as error:
         said = str(error)
-    assert said is not None, "where no pair is left `load` must raise DataError: no job can go on without pairs"
-    assert "min_frames" in said, f"where no pair is long enough the DataError must name min_frames, for users to change: {said}"
+    assert said is not None, (
+        "where no pair is left `load` must raise DataError: no job can go on without pairs"
+    )
+    assert "min_frames" in said, (
+        f"where no pair is long enough the DataError must name min_frames, for users to change: {said}"
+    )
 
 
 def _with(dataset: Dataset, **changes: object) -> Dataset:

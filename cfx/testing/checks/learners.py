@@ -1,6 +1,6 @@
 """The contract of a learner, statement by statement. Letters as in `cfx.learners.base`.
 
-The lesson: three simulated drivers whose parameters are known and constant. Their networks start far from these, so that whoever
+The training data: three simulated drivers whose parameters are known and constant. Their networks start far from these, so that whoever
 learns from the recorded drives, or from the window labels (which are the truth), drives nearer to them afterwards.
 """
 
@@ -18,10 +18,10 @@ from cfx.calibration.calibrator import Labels
 from cfx.calibration.windows import Split, Windows, WindowSettings
 from cfx.datasets.synthetic import SyntheticDataset
 from cfx.evaluation.closed_loop import drive
-from cfx.learners.base import CURVE_COLUMNS, Learned, Learner, Lesson
+from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.models.krauss import Krauss
 from cfx.pairs import SIGNALS, PairBatch, PairSet
-from cfx.policies.committee import Committee
+from cfx.policies.ensemble import Ensemble
 from cfx.policies.features import token_width
 from cfx.policies.gru import GruPolicy
 from cfx.policies.offsets import NONE
@@ -36,27 +36,33 @@ _POLICY = GruPolicy(hidden_size=8)
 
 @cache
 def _recording() -> PairSet:
-    return SyntheticDataset(pairs=PAIRS, platoon_size=1, frames=FRAMES, variation=0.0, heterogeneity=1.0, seed=3).load()
+    return SyntheticDataset(
+        pairs=PAIRS, platoon_size=1, frames=FRAMES, variation=0.0, heterogeneity=1.0, seed=3
+    ).load()
 
 
-def lesson(*, needs_labels: bool = True, together: bool = False, seed: int = 0) -> Lesson:
-    """Returns the lesson, with window labels if they are needed: a network for each driver, or one for all of them together."""
+def training_data(
+    *, needs_labels: bool = True, together: bool = False, seed: int = 0
+) -> TrainingData:
+    """Returns the training data, with window labels if they are needed: a network for each driver, or one for all of them together."""
     model = Krauss()
     pairs = _recording()
     batch = PairBatch.of(pairs)
     split = Split.of(pairs, WINDOWS, 0.8)
     windows = Windows.of(split.windows, WINDOWS)
-    truth = torch.tensor([[pair.truth[name][0] for name in model.space.names] for pair in pairs], dtype=torch.float64)
+    truth = torch.tensor(
+        [[pair.truth[name][0] for name in model.space.names] for pair in pairs], dtype=torch.float64
+    )
     unit = model.space.to_unit(truth)
     count = len(windows)
     labels = Labels(
         windows=windows,
         parameters=truth[windows.pair],
         loss=torch.zeros(count, dtype=torch.float64),
-        spread=torch.ones(count, dtype=torch.float64),
+        sensitivity=torch.ones(count, dtype=torch.float64),
         diverged=torch.zeros(count, dtype=torch.int64),
     )
-    return Lesson(
+    return TrainingData(
         simulator=Simulator(model, pairs.dt),
         batch=batch,
         split=split,
@@ -71,44 +77,58 @@ def lesson(*, needs_labels: bool = True, together: bool = False, seed: int = 0) 
 
 def delivers_networks_that_are_ready_to_drive(learner: Learner) -> None:
     for together in (False, True):
-        material = lesson(needs_labels=learner.needs_labels, together=together)
-        learned = _fitted(learner, material)
-        assert isinstance(learned, Learned), f"`fit` must return a cfx.Learned, not a {type(learned).__name__}"
-        networks, width = len(material.names), _width(learned, material)
-        members = learned.network.size if isinstance(learned.network, Committee) else 1
+        dataset = training_data(needs_labels=learner.needs_labels, together=together)
+        training_result = _fitted(learner, dataset)
+        assert isinstance(training_result, TrainingResult), (
+            f"`fit` must return a cfx.TrainingResult, not a {type(training_result).__name__}"
+        )
+        networks, width = len(dataset.names), _width(training_result, dataset)
+        members = (
+            training_result.network.size if isinstance(training_result.network, Ensemble) else 1
+        )
         wanted = f"{networks} of {members} members" if members > 1 else str(networks)
-        for name, value in [*learned.network.named_parameters(), *learned.network.named_buffers()]:
+        for name, value in [
+            *training_result.network.named_parameters(),
+            *training_result.network.named_buffers(),
+        ]:
             assert value.shape[0] == networks * members, (
-                f"{name} is for {value.shape[0]} networks, but the lesson names {wanted}: `network` and `names` of the"
-                " lesson say how many there are and who learns in which"
+                f"{name} is for {value.shape[0]} networks, but the training data names {wanted}: `network` and `names` of the"
+                " training data say how many there are and who learns in which"
             )
-        assert learned.scaler.mean.shape == learned.scaler.scale.shape == (networks, width), (
+        assert (
+            training_result.scaler.mean.shape
+            == training_result.scaler.scale.shape
+            == (networks, width)
+        ), (
             f"the scaler must hold {(networks, width)} means and scales: each network's tokens are normalised on their own, with"
             " the base beside them where answers are offsets"
         )
-        assert not learned.network.training, (
+        assert not training_result.network.training, (
             "the networks must be in evaluation mode (`network.eval()`): dropout would make a driver's parameters random"
         )
-        answers = _answers(learned, material)
+        answers = _answers(training_result, dataset)
         assert bool(((answers >= 0) & (answers <= 1)).all()), (
             "a trained policy answers in unit space, finite and within [0, 1]: nothing outside the model's bounds ever drives"
         )
 
 
 def learns_something(learner: Learner) -> None:
-    material = lesson(needs_labels=learner.needs_labels)
-    learned = _fitted(learner, material)
-    space = material.simulator.model.space
-    unit = space.to_unit(material.fixed).float()
+    dataset = training_data(needs_labels=learner.needs_labels)
+    training_result = _fitted(learner, dataset)
+    space = dataset.simulator.model.space
+    unit = space.to_unit(dataset.fixed).float()
     untrained = _POLICY.build(
-        _width(learned, material),
+        _width(training_result, dataset),
         space.to_unit(space.defaults()).float(),
-        unit if learned.base is None else torch.full_like(unit, NONE),
+        unit if training_result.base is None else torch.full_like(unit, NONE),
         torch.Generator().manual_seed(0),
     ).eval()
-    before, after = _rmse(replace(learned, network=untrained), material), _rmse(learned, material)
+    before, after = (
+        _rmse(replace(training_result, network=untrained), dataset),
+        _rmse(training_result, dataset),
+    )
     assert after < 0.7 * before, (
-        "drivers with constant parameters are the easiest lesson there is: in closed loop over the frames that were learned from,"
+        "drivers with constant parameters are the easiest training data there is: in closed loop over the frames that were learned from,"
         " trained networks must be at least 30 % nearer to them than untrained ones; RMSE of speed was"
         f" {before:.3g} m/s before and is {after:.3g} m/s after"
     )
@@ -120,31 +140,41 @@ def the_same_seed_gives_the_same_networks(learner: Learner) -> None:
         for attempt in (1, 2):
             torch.manual_seed(attempt)
             state = torch.get_rng_state()
-            material = lesson(needs_labels=learner.needs_labels)
-            states.append(_state(learner.fit(_POLICY, material) if attempt == 2 else _fitted(learner, material)))
+            dataset = training_data(needs_labels=learner.needs_labels)
+            states.append(
+                _state(learner.fit(_POLICY, dataset) if attempt == 2 else _fitted(learner, dataset))
+            )
             assert torch.equal(torch.get_rng_state(), state), (
                 "the global random state must be left as it was (torch.random.fork_rng): others draw from it"
             )
-    assert _equal(*states), "the same lesson twice gave two results: randomness must come from `lesson.seed` alone"
+    assert _equal(*states), (
+        "the same training data twice gave two results: randomness must come from `training data.seed` alone"
+    )
 
 
 def another_seed_gives_other_networks(learner: Learner) -> None:
-    one, two = (_state(_fitted(learner, lesson(needs_labels=learner.needs_labels, seed=seed))) for seed in (0, 1))
+    one, two = (
+        _state(_fitted(learner, training_data(needs_labels=learner.needs_labels, seed=seed)))
+        for seed in (0, 1)
+    )
     assert not _equal(one, two), (
-        "seeds 0 and 1 gave the same networks: `lesson.seed` must reach the initial weights, or repeating a study with other"
+        "seeds 0 and 1 gave the same networks: `training data.seed` must reach the initial weights, or repeating a study with other"
         " seeds shows a spread that is not there"
     )
 
 
 def reads_no_frame_after_the_training_part(learner: Learner) -> None:
-    material = lesson(needs_labels=learner.needs_labels)
-    frames = torch.arange(material.batch.mask.shape[1])
-    secret = frames > material.split.frame[:, None]
+    dataset = training_data(needs_labels=learner.needs_labels)
+    frames = torch.arange(dataset.batch.mask.shape[1])
+    secret = frames > dataset.split.frame[:, None]
     changed: dict[str, Any] = {
-        name: torch.where(secret, 3.0 + 0.5 * getattr(material.batch, name), getattr(material.batch, name)) for name in SIGNALS
+        name: torch.where(
+            secret, 3.0 + 0.5 * getattr(dataset.batch, name), getattr(dataset.batch, name)
+        )
+        for name in SIGNALS
     }
-    poisoned = replace(material, batch=replace(material.batch, **changed))
-    one, two = _state(_fitted(learner, material)), _state(learner.fit(_POLICY, poisoned))
+    poisoned = replace(dataset, batch=replace(dataset.batch, **changed))
+    one, two = _state(_fitted(learner, dataset)), _state(learner.fit(_POLICY, poisoned))
     assert _equal(one, two), (
         "frames after `split.frame` were changed, and the networks or their scaler changed with them: that is the test part, and"
         " whoever learns from it proves nothing"
@@ -152,108 +182,145 @@ def reads_no_frame_after_the_training_part(learner: Learner) -> None:
 
 
 def networks_are_independent(learner: Learner) -> None:
-    material = lesson(needs_labels=learner.needs_labels)
-    batch, first = material.batch, torch.arange(PAIRS)[:, None] == 0
+    dataset = training_data(needs_labels=learner.needs_labels)
+    batch, first = dataset.batch, torch.arange(PAIRS)[:, None] == 0
     changed: dict[str, Any] = {
         name: torch.where(first, 1.0 + 0.8 * getattr(batch, name), getattr(batch, name))
-        for name in ("leader_speed", "follower_speed", "leader_acceleration", "follower_acceleration")
+        for name in (
+            "leader_speed",
+            "follower_speed",
+            "leader_acceleration",
+            "follower_acceleration",
+        )
     }
-    labels = material.labels
+    labels = dataset.labels
     if labels is not None:
         own = (labels.windows.pair == 0)[:, None]
-        labels = replace(labels, parameters=torch.where(own, material.simulator.model.space.defaults(), labels.parameters))
-    other = replace(material, batch=replace(batch, **changed), labels=labels)
-    one, two = _state(_fitted(learner, material)), _state(learner.fit(_POLICY, other))
+        labels = replace(
+            labels,
+            parameters=torch.where(
+                own, dataset.simulator.model.space.defaults(), labels.parameters
+            ),
+        )
+    other = replace(dataset, batch=replace(batch, **changed), labels=labels)
+    one, two = _state(_fitted(learner, dataset)), _state(learner.fit(_POLICY, other))
     message = "what a network learns must not depend on the drivers of another network: change one driver, and only his changes"
     for key in one:
-        his = len(one[key]) // PAIRS  # rows of one network, more than one in a committee
-        torch.testing.assert_close(one[key][his:], two[key][his:], rtol=1e-4, atol=1e-5, msg=f"{message} ({key})")
+        his = len(one[key]) // PAIRS  # rows of one network, more than one in an ensemble
+        torch.testing.assert_close(
+            one[key][his:], two[key][his:], rtol=1e-4, atol=1e-5, msg=f"{message} ({key})"
+        )
 
 
 def the_lesson_stays_as_it_is(learner: Learner) -> None:
-    material, untouched = lesson(needs_labels=learner.needs_labels), lesson(needs_labels=learner.needs_labels)
-    learner.fit(_POLICY, material)
+    dataset, untouched = (
+        training_data(needs_labels=learner.needs_labels),
+        training_data(needs_labels=learner.needs_labels),
+    )
+    learner.fit(_POLICY, dataset)
     message = "must not be changed in place: the protocol still needs it for the evaluation"
     for name in (*SIGNALS, "gap"):
         torch.testing.assert_close(
-            getattr(material.batch, name), getattr(untouched.batch, name), rtol=0, atol=0, msg=f"lesson.batch.{name} {message}"
+            getattr(dataset.batch, name),
+            getattr(untouched.batch, name),
+            rtol=0,
+            atol=0,
+            msg=f"training data.batch.{name} {message}",
         )
     for name in ("fixed", "network"):
-        assert torch.equal(getattr(material, name), getattr(untouched, name)), f"lesson.{name} {message}"
-    if material.labels is not None and untouched.labels is not None:
-        assert torch.equal(material.labels.parameters, untouched.labels.parameters), f"lesson.labels {message}"
+        assert torch.equal(getattr(dataset, name), getattr(untouched, name)), (
+            f"training data.{name} {message}"
+        )
+    if dataset.labels is not None and untouched.labels is not None:
+        assert torch.equal(dataset.labels.parameters, untouched.labels.parameters), (
+            f"training data.labels {message}"
+        )
 
 
 def curves_tell_how_it_went(learner: Learner) -> None:
-    material = lesson(needs_labels=learner.needs_labels)
-    curves = _fitted(learner, material).curves
+    dataset = training_data(needs_labels=learner.needs_labels)
+    curves = _fitted(learner, dataset).curves
     assert list(curves.columns) == CURVE_COLUMNS, (
         f"curves have the columns {', '.join(CURVE_COLUMNS)}, for figures and MLflow read them; not {', '.join(curves.columns)}"
     )
-    assert set(curves["network"]) == set(material.names), "every network has its curve, under its name in the lesson"
+    assert set(curves["network"]) == set(dataset.names), (
+        "every network has its curve, under its name in the training data"
+    )
     for name, own in curves.groupby("network"):
-        assert own["epoch"].tolist() == list(range(len(own))), f"epochs of network {name} are counted 0, 1, 2, ..., a row each"
-    assert bool(curves["train_loss"].notna().all()), "the training loss is measured in every epoch; NaN is for validation alone"
+        assert own["epoch"].tolist() == list(range(len(own))), (
+            f"epochs of network {name} are counted 0, 1, 2, ..., a row each"
+        )
+    assert bool(curves["train_loss"].notna().all()), (
+        "the training loss is measured in every epoch; NaN is for validation alone"
+    )
 
 
-_fits: WeakKeyDictionary[Learner, dict[tuple[int, int], Learned]] = WeakKeyDictionary()
+_fits: WeakKeyDictionary[Learner, dict[tuple[int, int], TrainingResult]] = WeakKeyDictionary()
 
 
-def _fitted(learner: Learner, material: Lesson) -> Learned:
-    """Fits the lesson of that seed and number of networks once for all checks of one learner: training takes the time."""
+def _fitted(learner: Learner, dataset: TrainingData) -> TrainingResult:
+    """Fits the training data of that seed and number of networks once for all checks of one learner: training takes the time."""
     known = _fits.setdefault(learner, {})
-    key = (len(material.names), material.seed)
+    key = (len(dataset.names), dataset.seed)
     if key not in known:
-        known[key] = learner.fit(_POLICY, material)
+        known[key] = learner.fit(_POLICY, dataset)
     return known[key]
 
 
-def _answers(learned: Learned, material: Lesson) -> Tensor:
+def _answers(training_result: TrainingResult, dataset: TrainingData) -> Tensor:
     """Returns what the networks answer on the measured training parts, `(P, W, n)` in unit space."""
-    policy = _ready(learned, material)
-    state = policy.begin(material.network)
-    space, answers = material.simulator.model.space, []
-    for first in range(0, int(material.split.frame.min()), WINDOWS.stride):
-        seen = measured_history(material.batch, torch.arange(PAIRS), torch.full((PAIRS,), first), WINDOWS.length)
+    policy = _ready(training_result, dataset)
+    state = policy.begin(dataset.network)
+    space, answers = dataset.simulator.model.space, []
+    for first in range(0, int(dataset.split.frame.min()), WINDOWS.stride):
+        seen = measured_history(
+            dataset.batch, torch.arange(PAIRS), torch.full((PAIRS,), first), WINDOWS.length
+        )
         chosen, state = policy.act(seen, state)
         answers.append(space.to_unit(chosen))
     return torch.stack(answers, dim=1)
 
 
-def _rmse(learned: Learned, material: Lesson) -> float:
+def _rmse(training_result: TrainingResult, dataset: TrainingData) -> float:
     """Returns the RMSE of speed in closed loop over the training parts, m/s."""
     loop = drive(
-        material.simulator, _ready(learned, material), material.batch, torch.zeros(PAIRS, dtype=torch.int64), material.network
+        dataset.simulator,
+        _ready(training_result, dataset),
+        dataset.batch,
+        torch.zeros(PAIRS, dtype=torch.int64),
+        dataset.network,
     )
     frames = torch.arange(loop.speed.shape[1])
-    counted = (frames > 0) & (frames <= material.split.frame[:, None])
-    error = (loop.speed - material.batch.follower_speed[:, : loop.speed.shape[1]])[counted]
+    counted = (frames > 0) & (frames <= dataset.split.frame[:, None])
+    error = (loop.speed - dataset.batch.follower_speed[:, : loop.speed.shape[1]])[counted]
     return float(error.square().mean().sqrt())
 
 
-def _ready(learned: Learned, material: Lesson) -> TrainedPolicy:
+def _ready(training_result: TrainingResult, dataset: TrainingData) -> TrainedPolicy:
     return TrainedPolicy(
         policy=_POLICY,
-        network=learned.network,
-        scaler=learned.scaler,
+        network=training_result.network,
+        scaler=training_result.scaler,
         model_node={},
         policy_node={},
-        space=material.simulator.model.space,
+        space=dataset.simulator.model.space,
         windows=WINDOWS,
-        dt=material.simulator.dt,
-        names=material.names,
-        base=learned.base,
+        dt=dataset.simulator.dt,
+        names=dataset.names,
+        base=training_result.base,
     )
 
 
-def _width(learned: Learned, material: Lesson) -> int:
+def _width(training_result: TrainingResult, dataset: TrainingData) -> int:
     """Returns f; where answers are offsets, the networks read the base too."""
     width = token_width(_POLICY.inputs, _POLICY.summary, WINDOWS.length)
-    return width if learned.base is None else width + len(material.simulator.model.space)
+    return width if training_result.base is None else width + len(dataset.simulator.model.space)
 
 
-def _state(learned: Learned) -> dict[str, Tensor]:
-    values = learned.network.state_dict() | {f"scaler.{key}": value for key, value in learned.scaler.state_dict().items()}
+def _state(training_result: TrainingResult) -> dict[str, Tensor]:
+    values = training_result.network.state_dict() | {
+        f"scaler.{key}": value for key, value in training_result.scaler.state_dict().items()
+    }
     return {key: value.detach().clone() for key, value in values.items()}
 
 
@@ -262,5 +329,7 @@ def _equal(one: dict[str, Tensor], two: dict[str, Tensor]) -> bool:
 
 
 CONTRACT = contract_of(
-    __name__, "learner", slow=[another_seed_gives_other_networks, networks_are_independent, the_lesson_stays_as_it_is]
+    __name__,
+    "learner",
+    slow=[another_seed_gives_other_networks, networks_are_independent, the_lesson_stays_as_it_is],
 )

@@ -34,11 +34,19 @@ def _extreme(model: DrivingModel) -> _Step:
     gap, v, v_l, a_l, a = (
         torch.tensor(rows, dtype=torch.float64)
         for rows in zip(
-            *itertools.product((-20, -0.1, 0, 0.01, 1, 30, 1e3), (0, 1e-3, 5, 60), (0, 1e-3, 15, 60), (-9, 0, 5), (-9, 0, 3)),
+            *itertools.product(
+                (-20, -0.1, 0, 0.01, 1, 30, 1e3),
+                (0, 1e-3, 5, 60),
+                (0, 1e-3, 15, 60),
+                (-9, 0, 5),
+                (-9, 0, 3),
+            ),
             strict=True,
         )
     )
-    corner = torch.randint(0, 2, (200, 1, len(model.space.parameters)), generator=torch.Generator().manual_seed(1)).bool()
+    corner = torch.randint(
+        0, 2, (200, 1, len(model.space.parameters)), generator=torch.Generator().manual_seed(1)
+    ).bool()
     p = {
         parameter.name: torch.where(corner[..., i], parameter.high, parameter.low).double()
         for i, parameter in enumerate(model.space)
@@ -54,7 +62,9 @@ def every_parameter_says_what_it_is(model: DrivingModel) -> None:
             assert getattr(parameter, field), (
                 f"parameter {parameter.name} has no {field}: the documentation, the config's comments and the figures show it"
             )
-    assert model.reference, "a model says where its equations come from (set `reference`): who reads a result must find them"
+    assert model.reference, (
+        "a model says where its equations come from (set `reference`): who reads a result must find them"
+    )
 
 
 def constants_can_be_tuned_and_tuned_parameters_fixed(model: DrivingModel) -> None:
@@ -65,7 +75,9 @@ def constants_can_be_tuned_and_tuned_parameters_fixed(model: DrivingModel) -> No
     )
     for name in constants:
         value = model.space.unpack(model.space.defaults()[None])[name]
-        assert value.dim() == 0, f"constant {name} must reach the step as one number for all followers, for it costs no memory so"
+        assert value.dim() == 0, (
+            f"constant {name} must reach the step as one number for all followers, for it costs no memory so"
+        )
 
 
 def keeps_shape_dtype_and_device(model: DrivingModel) -> None:
@@ -74,8 +86,12 @@ def keeps_shape_dtype_and_device(model: DrivingModel) -> None:
         follower, leader, p = _to(ordinary, dtype)
         speed = model.next_speed(follower, leader, p, DT)
         memory = model.next_memory(follower, leader, p, DT, speed)
-        assert speed.shape == (DRIVES,), f"next_speed must give (*batch,), got {tuple(speed.shape)}: one speed for each follower"
-        assert speed.dtype == dtype, f"{dtype} states must give {dtype} speeds, got {speed.dtype}: a step is no place to convert"
+        assert speed.shape == (DRIVES,), (
+            f"next_speed must give (*batch,), got {tuple(speed.shape)}: one speed for each follower"
+        )
+        assert speed.dtype == dtype, (
+            f"{dtype} states must give {dtype} speeds, got {speed.dtype}: a step is no place to convert"
+        )
         assert speed.device == follower.speed.device, (
             "the speed must stay on the device of the states: a step on a GPU must not wait for a copy"
         )
@@ -156,7 +172,10 @@ def speeds_are_finite_and_not_negative_at_every_extreme(model: DrivingModel) -> 
 def a_bad_neighbour_does_no_harm(model: DrivingModel) -> None:
     follower, leader, p = _ordinary(model)
     clean = model.next_speed(follower, leader, p, DT)
-    broken = {name: value.index_fill(0, torch.tensor([0]), torch.nan) if value.dim() else value for name, value in p.items()}
+    broken = {
+        name: value.index_fill(0, torch.tensor([0]), torch.nan) if value.dim() else value
+        for name, value in p.items()
+    }
     speed = model.next_speed(follower, leader, broken, DT)
     assert torch.equal(speed[1:], clean[1:]), (
         "NaN parameters of one follower must not reach the others: one diverged candidate would spoil all"
@@ -196,9 +215,14 @@ def gradients_are_finite_at_every_extreme(model: DrivingModel) -> None:
     extreme = _extreme(model)
     follower, leader, p = extreme
     position, speed, acceleration = (x.clone().requires_grad_() for x in follower[:3])
-    values = {name: value.expand(follower.speed.shape).clone().requires_grad_() for name, value in p.items()}
+    values = {
+        name: value.expand(follower.speed.shape).clone().requires_grad_()
+        for name, value in p.items()
+    }
     inputs = {"position": position, "speed": speed, "acceleration": acceleration, **values}
-    out = model.next_speed(Follower(position, speed, acceleration, follower.memory), leader, values, DT)
+    out = model.next_speed(
+        Follower(position, speed, acceleration, follower.memory), leader, values, DT
+    )
     gradients = torch.autograd.grad(out.sum(), list(inputs.values()), materialize_grads=True)
     for name, gradient in zip(inputs, gradients, strict=True):
         wrong = ~gradient.isfinite()
@@ -208,16 +232,18 @@ def gradients_are_finite_at_every_extreme(model: DrivingModel) -> None:
         )
 
 
-def follows_its_leader_as_claimed(model: DrivingModel) -> None:
-    if not model.follows:
+def has_a_constant_baseline_as_claimed(model: DrivingModel) -> None:
+    if not model.has_constant_baseline:
         raise NotApplicable("the model does not claim to follow with constant parameters")
     follower, leader, p = _ordinary(model)
     near = model.next_speed(follower, leader, p, DT)
-    far = model.next_speed(follower, leader._replace(position=leader.position + 1e3, speed=leader.speed + 20.0), p, DT)
+    far = model.next_speed(
+        follower, leader._replace(position=leader.position + 1e3, speed=leader.speed + 20.0), p, DT
+    )
     reacts = (near - far).abs().gt(1e-6).double().mean().item()
     assert reacts >= 0.1, (
-        f"the model claims `follows`, but takes notice of its leader in {reacts:.0%} of ordinary states: fixed parameters would"
-        " be no baseline (set `follows = False` for a model whose parameters are the control itself)"
+        f"the model claims `has_constant_baseline`, but takes notice of its leader in {reacts:.0%} of ordinary states: fixed parameters would"
+        " be no baseline (set `has_constant_baseline = False` for a model whose parameters are the control itself)"
     )
 
 
@@ -242,11 +268,15 @@ def keeps_its_equilibrium(model: DrivingModel, equilibrium: Equilibrium | None =
         raise NotApplicable("the model gives no closed form of its equilibrium gap")
     follower, leader, p = ordinary
     gap = equilibrium(leader.speed, p)
-    calm = follower._replace(position=leader.position - leader.length - gap, speed=leader.speed.clone())
+    calm = follower._replace(
+        position=leader.position - leader.length - gap, speed=leader.speed.clone()
+    )
     calm = calm._replace(acceleration=torch.zeros_like(gap))
     ahead = leader._replace(acceleration=torch.zeros_like(gap))
     torch.testing.assert_close(
-        model.next_speed(calm, ahead, p, DT), leader.speed, msg="at the equilibrium gap and equal speeds the speed must stay"
+        model.next_speed(calm, ahead, p, DT),
+        leader.speed,
+        msg="at the equilibrium gap and equal speeds the speed must stay",
     )
 
 
@@ -284,7 +314,11 @@ def can_be_compiled_as_one_graph(model: DrivingModel) -> None:
                 f" torch.where instead of if); the compiler says: {str(error).strip().partition(chr(10))[0]}"
             ) from error
         eager = model.next_speed(follower, leader, p, DT)
-    torch.testing.assert_close(compiled, eager, msg="compiling the step changes its numbers: calibrations would find others")
+    torch.testing.assert_close(
+        compiled,
+        eager,
+        msg="compiling the step changes its numbers: calibrations would find others",
+    )
 
 
 def _with_tuned(model: DrivingModel, tuned: Mapping[str, bool]) -> DrivingModel:
@@ -294,7 +328,9 @@ def _with_tuned(model: DrivingModel, tuned: Mapping[str, bool]) -> DrivingModel:
     return type(model)(**options)
 
 
-def _follower(model: DrivingModel, position: Tensor, speed: Tensor, acceleration: Tensor) -> Follower:
+def _follower(
+    model: DrivingModel, position: Tensor, speed: Tensor, acceleration: Tensor
+) -> Follower:
     return Follower(position, speed, acceleration, model.initial_memory(speed))
 
 
@@ -315,9 +351,15 @@ def _stop_and_go(speed: Tensor, deceleration: float) -> Leader:
     top = speed[..., None]
     braking = (top - deceleration * (period - 3.0)).clamp(min=0.0)
     v = torch.where(
-        period < 3.0, top, torch.where(period < 20.0, torch.minimum(braking, top), torch.minimum(1.5 * (period - 20.0), top))
+        period < 3.0,
+        top,
+        torch.where(
+            period < 20.0, torch.minimum(braking, top), torch.minimum(1.5 * (period - 20.0), top)
+        ),
     )
-    position = torch.cat([torch.zeros_like(v[..., :1]), torch.cumsum(v[..., 1:] * DT, dim=-1)], dim=-1)
+    position = torch.cat(
+        [torch.zeros_like(v[..., :1]), torch.cumsum(v[..., 1:] * DT, dim=-1)], dim=-1
+    )
     acceleration = torch.diff(v, dim=-1, prepend=v[..., :1]) / DT
     return Leader(position, v, acceleration, torch.full(speed.shape, LENGTH, dtype=torch.float64))
 

@@ -25,24 +25,28 @@ TOLERANCE = 0.05
 class Problems:
     """P functions as an objective, which remembers what it was asked."""
 
-    def __init__(self, function: Function, traits: Tensor, asked: list[Tensor] | None = None) -> None:
+    def __init__(
+        self, function: Function, driver_features: Tensor, asked: list[Tensor] | None = None
+    ) -> None:
         self._function = function
-        self._traits = traits
+        self._driver_features = driver_features
         self.asked = [] if asked is None else asked
 
     @property
     def problems(self) -> int:
         """P."""
-        return len(self._traits)
+        return len(self._driver_features)
 
     def __call__(self, candidates: Tensor) -> Tensor:
-        assert candidates.shape[0] == self.problems, "an objective is asked about all its problems at once"
+        assert candidates.shape[0] == self.problems, (
+            "an objective is asked about all its problems at once"
+        )
         self.asked.append(candidates.detach().clone())
-        return self._function(candidates, self._traits[:, None])
+        return self._function(candidates, self._driver_features[:, None])
 
     def select(self, first: int, last: int) -> Problems:
         """Returns problems `first` to `last - 1`; what they are asked is remembered here."""
-        return Problems(self._function, self._traits[first:last], self.asked)
+        return Problems(self._function, self._driver_features[first:last], self.asked)
 
 
 def distance(candidates: Tensor, optimum: Tensor) -> Tensor:
@@ -119,10 +123,14 @@ def never_leaves_the_bounds(optimizer: Optimizer) -> None:
         try:
             found = _solve(optimizer, problems, n=n, guesses=guesses, seed=seed)
         except PluginError as error:
-            raise AssertionError(f"{error}: a model would drive with parameters outside its bounds") from error
+            raise AssertionError(
+                f"{error}: a model would drive with parameters outside its bounds"
+            ) from error
         for asked in [*problems.asked, found.best]:
             inside = bool(((asked >= 0) & (asked <= 1)).all())
-            assert inside, "a candidate lies outside [0, 1]: a model would drive with parameters outside its bounds"
+            assert inside, (
+                "a candidate lies outside [0, 1]: a model would drive with parameters outside its bounds"
+            )
 
 
 def survives_whatever_the_losses_are(optimizer: Optimizer) -> None:
@@ -130,7 +138,9 @@ def survives_whatever_the_losses_are(optimizer: Optimizer) -> None:
         for n in (1, 3):
             found = _solve(optimizer, Problems(function, _random(2, n, seed=5)), n=n)
             what = f" ('{function.__name__}' of {n} parameters)"
-            assert bool(found.best.isfinite().all()), f"the parameters of a window must be numbers whatever its losses are{what}"
+            assert bool(found.best.isfinite().all()), (
+                f"the parameters of a window must be numbers whatever its losses are{what}"
+            )
             assert not bool(found.loss.isnan().any()), (
                 f"a loss is a number, or infinity where every candidate diverged, for means are taken over losses{what}"
             )
@@ -162,30 +172,34 @@ def a_problem_alone_and_all_diverged(optimizer: Optimizer) -> None:
     assert torch.equal(found.best, guess[:, 0]), (
         "where every candidate diverges, the first guess stands: a window needs some parameters"
     )
-    assert bool(found.loss.isinf().all()), "where every candidate diverges, the loss is infinity: nobody may take it for a result"
+    assert bool(found.loss.isinf().all()), (
+        "where every candidate diverges, the loss is infinity: nobody may take it for a result"
+    )
     assert found.diverged.tolist() == [optimizer.evaluations()], (
         "every diverged candidate is counted: users are told of models that fail within their bounds"
     )
-    assert found.spread.tolist() == [0.0], (
+    assert found.sensitivity.tolist() == [0.0], (
         "where every candidate diverges, nothing tells candidates apart: such a window must weigh nothing"
     )
 
 
 def the_same_seed_gives_the_same_result(optimizer: Optimizer) -> None:
-    traits = _random(3, 2, seed=5)
+    driver_features = _random(3, 2, seed=5)
     for seed in (0, 7):
         with _kept_random_states():
             _set_random_states(1)
-            one = _solve(optimizer, Problems(rugged, traits), n=2, seed=seed)
+            one = _solve(optimizer, Problems(rugged, driver_features), n=2, seed=seed)
             _set_random_states(2)
             before = _random_states()
-            two = _solve(optimizer, Problems(rugged, traits), n=2, seed=seed)
+            two = _solve(optimizer, Problems(rugged, driver_features), n=2, seed=seed)
             after = _random_states()
         assert torch.equal(one.best, two.best), (
             f"seed={seed} twice gave two results: randomness must come from `seed` alone, or no result can be repeated"
         )
         for name, state in before.items():
-            assert state == after[name], f"the global random state of {name} must be left alone: others draw from it"
+            assert state == after[name], (
+                f"the global random state of {name} must be left alone: others draw from it"
+            )
 
 
 def another_seed_searches_elsewhere(optimizer: Optimizer) -> None:
@@ -203,20 +217,26 @@ def another_seed_searches_elsewhere(optimizer: Optimizer) -> None:
 
 
 def problems_are_independent(optimizer: Optimizer) -> None:
-    traits, guesses = _random(10, 3, seed=5), _random(10, 2, 3, seed=6)
+    driver_features, guesses = _random(10, 3, seed=5), _random(10, 2, 3, seed=6)
     message = "a problem's result must not depend on the problems beside it: caches and chunks would change results"
     for function in (distance, bowl, some_nan):
-        together = optimizer.minimize(Problems(function, traits), guesses, seed=1)
-        alone = optimizer.minimize(Problems(function, traits[3:7]), guesses[3:7], seed=1)
-        torch.testing.assert_close(alone.loss, together.loss[3:7], rtol=1e-3, atol=1e-6, msg=message)
-        torch.testing.assert_close(alone.best, together.best[3:7], rtol=1e-3, atol=1e-4, msg=message)
+        together = optimizer.minimize(Problems(function, driver_features), guesses, seed=1)
+        alone = optimizer.minimize(Problems(function, driver_features[3:7]), guesses[3:7], seed=1)
+        torch.testing.assert_close(
+            alone.loss, together.loss[3:7], rtol=1e-3, atol=1e-6, msg=message
+        )
+        torch.testing.assert_close(
+            alone.best, together.best[3:7], rtol=1e-3, atol=1e-4, msg=message
+        )
 
 
 def chunks_change_nothing(optimizer: Optimizer) -> None:
     problems, guesses = Problems(distance, _random(3, 2, seed=5)), _random(3, 1, 2, seed=6)
     whole = optimizer.minimize(problems, guesses, seed=1)
     pieces = optimizer.minimize(problems, guesses, seed=1, memory=1)
-    message = "the memory bound decides on how many problems are solved at once, never on the result"
+    message = (
+        "the memory bound decides on how many problems are solved at once, never on the result"
+    )
     torch.testing.assert_close(pieces.best, whole.best, rtol=1e-3, atol=1e-4, msg=message)
     torch.testing.assert_close(pieces.filling, whole.filling, msg=message)
 
@@ -226,8 +246,12 @@ def evaluates_exactly_what_it_says(optimizer: Optimizer) -> None:
     done: list[int] = []
     optimizer.minimize(problems, guesses, seed=1, progress=done.append)
     asked = torch.cat(problems.asked, dim=1)
-    assert asked.shape[1] == optimizer.evaluations(), "evaluations() is the budget of comparisons: not one more, not one less"
-    assert sum(done) == 3 * optimizer.evaluations(), "progress must sum to problems times evaluations: users wait by it"
+    assert asked.shape[1] == optimizer.evaluations(), (
+        "evaluations() is the budget of comparisons: not one more, not one less"
+    )
+    assert sum(done) == 3 * optimizer.evaluations(), (
+        "progress must sum to problems times evaluations: users wait by it"
+    )
     for k in range(2):
         tried = (asked == guesses[:, k : k + 1]).all(dim=-1).any(dim=1)
         assert bool(tried.all()), (
@@ -241,16 +265,24 @@ def says_how_many_evaluations_fill_the_space(optimizer: Optimizer) -> None:
     )
     found = _solve(optimizer, Problems(distance, _random(3, 2, seed=5)), n=2, guesses=1)
     low, median, high = found.filling.unbind(1)
-    assert bool((low <= median).all() and (median <= high).all()), "filling holds the lowest, median and highest loss"
-    assert bool((found.spread > 0).all()), "where the choice of parameters matters, the spread is positive"
+    assert bool((low <= median).all() and (median <= high).all()), (
+        "filling holds the lowest, median and highest loss"
+    )
+    assert bool((found.sensitivity > 0).all()), (
+        "where the choice of parameters matters, the spread is positive"
+    )
 
 
 def ties_go_to_the_first_guess(optimizer: Optimizer) -> None:
     guesses = _random(3, 2, 2, seed=6)
     for function in (flat, zero):
         found = optimizer.minimize(Problems(function, guesses[:, 0]), guesses, seed=1)
-        assert torch.equal(found.best, guesses[:, 0]), "a window that says nothing about the parameters keeps the first guess"
-        assert found.spread.tolist() == [0.0] * 3, "a window that says nothing about the parameters has no spread"
+        assert torch.equal(found.best, guesses[:, 0]), (
+            "a window that says nothing about the parameters keeps the first guess"
+        )
+        assert found.sensitivity.tolist() == [0.0] * 3, (
+            "a window that says nothing about the parameters has no spread"
+        )
 
 
 def returns_the_loss_of_what_it_returns(optimizer: Optimizer) -> None:
@@ -266,7 +298,9 @@ def returns_the_loss_of_what_it_returns(optimizer: Optimizer) -> None:
     )
 
 
-def _solve(optimizer: Optimizer, problems: Objective, *, n: int, guesses: int = 1, seed: int = 1) -> Solution:
+def _solve(
+    optimizer: Optimizer, problems: Objective, *, n: int, guesses: int = 1, seed: int = 1
+) -> Solution:
     return optimizer.minimize(problems, _random(problems.problems, guesses, n, seed=99), seed=seed)
 
 
@@ -277,7 +311,11 @@ def _random(*shape: int, seed: int) -> Tensor:
 
 def _random_states() -> dict[str, object]:
     name, keys, *rest = np.random.get_state(legacy=True)  # noqa: NPY002 - it is the global state that is looked at
-    return {"torch": torch.get_rng_state().tolist(), "numpy": (name, list(keys), *rest), "random": random.getstate()}
+    return {
+        "torch": torch.get_rng_state().tolist(),
+        "numpy": (name, list(keys), *rest),
+        "random": random.getstate(),
+    }
 
 
 def _set_random_states(seed: int) -> None:

@@ -25,7 +25,9 @@ def _network(policy: Policy) -> PolicyNetwork:
 def _tokens(policy: Policy) -> Tensor:
     """Returns random tokens."""
     return 3 * torch.randn(
-        (NETWORKS, DRIVERS, WINDOWS, _features(policy)), generator=torch.Generator().manual_seed(2), dtype=torch.float64
+        (NETWORKS, DRIVERS, WINDOWS, _features(policy)),
+        generator=torch.Generator().manual_seed(2),
+        dtype=torch.float64,
     )
 
 
@@ -36,7 +38,9 @@ def outputs_lie_within_the_bounds(policy: Policy) -> None:
     assert out.shape == (NETWORKS, DRIVERS, WINDOWS, PARAMETERS), (
         "a policy answers one parameter vector per network, driver and window"
     )
-    assert bool(((out >= 0) & (out <= 1)).all()), "a policy answers in unit space: nothing outside the model's bounds ever drives"
+    assert bool(((out >= 0) & (out <= 1)).all()), (
+        "a policy answers in unit space: nothing outside the model's bounds ever drives"
+    )
 
 
 def streaming_equals_the_whole_sequence(policy: Policy) -> None:
@@ -74,7 +78,9 @@ def networks_are_independent(policy: Policy) -> None:
     before, _ = network(tokens, network.initial_state(NETWORKS, DRIVERS))
     after, _ = network(changed, network.initial_state(NETWORKS, DRIVERS))
     torch.testing.assert_close(
-        before[1:], after[1:], msg="network i must read only slice i of its tokens: drivers would learn from one another"
+        before[1:],
+        after[1:],
+        msg="network i must read only slice i of its tokens: drivers would learn from one another",
     )
     for name, value in [*network.named_parameters(), *network.named_buffers()]:
         assert value.shape[0] == NETWORKS, (
@@ -94,7 +100,10 @@ def state_is_passed_not_kept(policy: Policy) -> None:
 
 def the_same_generator_gives_the_same_weights(policy: Policy) -> None:
     features = _features(policy)
-    one, two = _build(policy, features, seed=3).state_dict(), _build(policy, features, seed=3).state_dict()
+    one, two = (
+        _build(policy, features, seed=3).state_dict(),
+        _build(policy, features, seed=3).state_dict(),
+    )
     assert all(torch.equal(one[key], two[key]) for key in one), (
         "initial weights must come from the generator alone, or no training can be repeated"
     )

@@ -19,7 +19,7 @@ from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.windows import WindowSettings
 from cfx.datasets.synthetic import SyntheticDataset
 from cfx.evaluation.result import METHODS, Drive
-from cfx.learners.base import CURVE_COLUMNS, Learned, Learner, Lesson
+from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.learners.imitation import ImitationLearner
 from cfx.models.krauss import Krauss
 from cfx.optimizers.random import RandomSearch
@@ -28,7 +28,7 @@ from cfx.policies.base import Policy
 from cfx.policies.fixed import FixedPolicy
 from cfx.policies.gru import GruPolicy
 from cfx.progress import Task
-from cfx.protocols.base import Outcome, Protocol, Study
+from cfx.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.simulation.rollout import Simulator
 from cfx.style.entropy import measure_style
 from cfx.style.settings import StyleSettings
@@ -48,19 +48,28 @@ def recording() -> PairSet:
     return SyntheticDataset(pairs=PAIRS, platoon_size=1, frames=FRAMES, heterogeneity=1.0).load()
 
 
-def study(pairs: PairSet, *, policy: Policy | None = None, learner: Learner | None = None, seed: int = 0) -> Study:
+def context(
+    pairs: PairSet, *, policy: Policy | None = None, learner: Learner | None = None, seed: int = 0
+) -> ProtocolContext:
     """Returns a study of some drives; its policy is a small recurrent network unless given."""
     model = Krauss()
     batch = PairBatch.of(pairs)
     simulator = Simulator(model, pairs.dt)
-    return Study(
+    return ProtocolContext(
         pairs=pairs,
         batch=batch,
         style=measure_style(pairs, StyleSettings()),
         simulator=simulator,
         model_node={"name": "krauss"},
         policy_node={"name": "gru"},
-        calibrator=Calibrator(simulator, RandomSearch(samples=512), seed=seed, cache=Cache(None), memory=1 << 28, progress=Task),
+        calibrator=Calibrator(
+            simulator,
+            RandomSearch(samples=512),
+            seed=seed,
+            cache=Cache(None),
+            memory=1 << 28,
+            progress=Task,
+        ),
         policy=policy or GruPolicy(hidden_size=4),
         learner=learner or ImitationLearner(epochs=3, learning_rate=0.02),
         windows=WindowSettings(),
@@ -70,11 +79,13 @@ def study(pairs: PairSet, *, policy: Policy | None = None, learner: Learner | No
 
 
 def all_methods_drive_the_same_frames(protocol: Protocol) -> None:
-    outcome = _outcome(protocol)
-    assert isinstance(outcome, Outcome), f"`run` must return a cfx.Outcome, not a {type(outcome).__name__}"
-    for drive in outcome.evaluation.drives:
+    protocol_result = _protocol_result(protocol)
+    assert isinstance(protocol_result, ProtocolResult), (
+        f"`run` must return a cfx.ProtocolResult, not a {type(protocol_result).__name__}"
+    )
+    for drive in protocol_result.evaluation.drives:
         where = f"(pair {drive.pair_id})"
-        for method in outcome.evaluation.methods:
+        for method in protocol_result.evaluation.methods:
             speed, gap = drive.speed[method], drive.gap[method]
             assert len(speed) == len(gap) == len(drive.time) == len(drive.real_speed), (
                 f"every method drives the same frames, or their errors cannot be compared; {method} drives {len(speed)} of"
@@ -83,26 +94,42 @@ def all_methods_drive_the_same_frames(protocol: Protocol) -> None:
             assert speed[0] == drive.real_speed[0] and gap[0] == drive.real_gap[0], (  # noqa: PT018 - one statement
                 f"every method starts from the last measured state; {method} does not {where}"
             )
-            assert bool(np.isfinite(speed).all()), f"every frame of the test part is driven; {method} leaves some out {where}"
-    frames = outcome.evaluation.table.groupby("pair_id")["frames"].nunique()
-    assert bool((frames == 1).all()), "every method of a pair is measured over the same number of frames"
+            assert bool(np.isfinite(speed).all()), (
+                f"every frame of the test part is driven; {method} leaves some out {where}"
+            )
+    frames = protocol_result.evaluation.table.groupby("pair_id")["frames"].nunique()
+    assert bool((frames == 1).all()), (
+        "every method of a pair is measured over the same number of frames"
+    )
 
 
 def the_table_has_a_row_for_each_pair_and_method(protocol: Protocol) -> None:
-    evaluation = _outcome(protocol).evaluation
-    missing = [name for name in (*_COLUMNS, *(f"parameter_{name}" for name in evaluation.names)) if name not in evaluation.table]
-    assert not missing, f"reports, figures and `cfx show` read these columns of the table: {', '.join(missing)}"
+    evaluation = _protocol_result(protocol).evaluation
+    missing = [
+        name
+        for name in (*_COLUMNS, *(f"parameter_{name}" for name in evaluation.names))
+        if name not in evaluation.table
+    ]
+    assert not missing, (
+        f"reports, figures and `cfx show` read these columns of the table: {', '.join(missing)}"
+    )
     assert {"default", "fixed", "policy"} <= set(evaluation.methods), (
         f"the policy is compared with the model's defaults and with the driver's own fixed parameters; there are only"
         f" {', '.join(evaluation.methods)}"
     )
-    assert set(evaluation.table["method"]) <= set(METHODS), f"methods are named {', '.join(METHODS)}"
+    assert set(evaluation.table["method"]) <= set(METHODS), (
+        f"methods are named {', '.join(METHODS)}"
+    )
     assert set(evaluation.improvements) == set(evaluation.methods) - {"policy"}, (
         "the improvement of the policy is told over every baseline that drove"
     )
     counts = evaluation.table.groupby(["pair_id", "method"]).size()
-    assert bool((counts == 1).all()), "a pair is tested once by each method; twice would count it twice in every mean"
-    assert len(counts) == len(evaluation.methods) * evaluation.table["pair_id"].nunique(), "every method is tested on every pair"
+    assert bool((counts == 1).all()), (
+        "a pair is tested once by each method; twice would count it twice in every mean"
+    )
+    assert len(counts) == len(evaluation.methods) * evaluation.table["pair_id"].nunique(), (
+        "every method is tested on every pair"
+    )
     assert {drive.pair_id for drive in evaluation.drives} == set(evaluation.table["pair_id"]), (
         "the drives are those that the table measures"
     )
@@ -111,9 +138,9 @@ def the_table_has_a_row_for_each_pair_and_method(protocol: Protocol) -> None:
 def no_method_sees_the_measured_follower_of_the_test_part(protocol: Protocol) -> None:
     """The follower alone is changed: every method must drive exactly as before."""
     pairs = recording()
-    before = _drives(_outcome(protocol))
+    before = _drives(_protocol_result(protocol))
     tested = next(iter(before.values()))
-    after = _drives(protocol.run(study(_poisoned(pairs, tested, leader=False))))[tested.pair_id]
+    after = _drives(protocol.run(context(_poisoned(pairs, tested, leader=False))))[tested.pair_id]
     for method in tested.speed:
         for what, one, two in (
             ("parameters", tested.parameters[method], after.parameters[method]),
@@ -128,9 +155,9 @@ def no_method_sees_the_measured_follower_of_the_test_part(protocol: Protocol) ->
 def nothing_is_found_or_learned_from_the_test_part(protocol: Protocol) -> None:
     """Leader and follower are changed: what holds at the first test frame must be as before."""
     pairs = recording()
-    before = _drives(_outcome(protocol))
+    before = _drives(_protocol_result(protocol))
     tested = list(before.values())[-1]
-    after = _drives(protocol.run(study(_poisoned(pairs, tested, leader=True))))[tested.pair_id]
+    after = _drives(protocol.run(context(_poisoned(pairs, tested, leader=True))))[tested.pair_id]
     for method in tested.parameters:
         assert np.array_equal(tested.parameters[method][0], after.parameters[method][0]), (
             f"a driver's test part was changed, and with it the parameters that method '{method}' begins it with: frames that"
@@ -143,48 +170,65 @@ def the_same_seed_gives_the_same_outcome(protocol: Protocol) -> None:
         tables = []
         for attempt in (1, 2):
             torch.manual_seed(attempt)
-            outcome = protocol.run(study(recording())) if attempt == 2 else _outcome(protocol)
-            tables.append(outcome.evaluation.table)
-    assert tables[0].equals(tables[1]), "the same study twice gave two results: randomness must come from `study.seed` alone"
+            protocol_result = (
+                protocol.run(context(recording())) if attempt == 2 else _protocol_result(protocol)
+            )
+            tables.append(protocol_result.evaluation.table)
+    assert tables[0].equals(tables[1]), (
+        "the same study twice gave two results: randomness must come from `study.seed` alone"
+    )
 
 
 def learners_get_only_what_they_may_use(protocol: Protocol) -> None:
     if not protocol.trains:
         raise NotApplicable("this protocol trains nothing")
     watched = _Watched(ImitationLearner(epochs=1))
-    protocol.run(study(recording(), learner=watched))
-    assert watched.lessons, "a trainable policy must be trained by the study's learner"
-    for lesson in watched.lessons:
-        pairs = len(lesson.batch)
-        assert len(lesson.split.frame) == len(lesson.network) == len(lesson.fixed) == pairs, (
-            "split, network and fixed of a lesson have an entry for each of its pairs"
+    protocol.run(context(recording(), learner=watched))
+    assert watched.training_data_seen, "a trainable policy must be trained by the study's learner"
+    for training_data in watched.training_data_seen:
+        pairs = len(training_data.batch)
+        assert (
+            len(training_data.split.frame)
+            == len(training_data.network)
+            == len(training_data.fixed)
+            == pairs
+        ), "split, network and fixed of training data have an entry for each of its pairs"
+        assert bool((training_data.split.frame < training_data.batch.lengths).all()), (
+            "`split.frame` is a frame of the pair"
         )
-        assert bool((lesson.split.frame < lesson.batch.lengths).all()), "`split.frame` is a frame of the pair"
-        assert set(lesson.network.tolist()) == set(range(len(lesson.names))), (
-            "every network of a lesson has a name and learns from at least one pair"
+        assert set(training_data.network.tolist()) == set(range(len(training_data.names))), (
+            "every network of training data has a name and learns from at least one pair"
         )
-        assert lesson.labels is not None, "the learner needs window labels: find them with `study.labels`"
-        windows = lesson.labels.windows
+        assert training_data.labels is not None, (
+            "the learner needs window labels: find them with `study.labels`"
+        )
+        windows = training_data.labels.windows
         ends = windows.first + windows.settings.length
-        assert bool((ends <= lesson.split.frame[windows.pair]).all()), (
+        assert bool((ends <= training_data.split.frame[windows.pair]).all()), (
             "a label's window must end within the training part: a label is a measurement like any other"
         )
 
 
 def a_policy_without_training_is_not_trained(protocol: Protocol) -> None:
-    outcome = protocol.run(study(recording(), policy=FixedPolicy(), learner=_Refusing(epochs=1)))
-    assert outcome.labels is None, "labels cost most of a job's time: without a learner to read them, find none"
-    assert len(outcome.curves) == 0, "where nothing was learned the curves are empty"
-    assert list(outcome.curves.columns) == CURVE_COLUMNS, f"empty curves still have the columns {', '.join(CURVE_COLUMNS)}"
+    protocol_result = protocol.run(
+        context(recording(), policy=FixedPolicy(), learner=_Refusing(epochs=1))
+    )
+    assert protocol_result.labels is None, (
+        "labels cost most of a job's time: without a learner to read them, find none"
+    )
+    assert len(protocol_result.curves) == 0, "where nothing was learned the curves are empty"
+    assert list(protocol_result.curves.columns) == CURVE_COLUMNS, (
+        f"empty curves still have the columns {', '.join(CURVE_COLUMNS)}"
+    )
 
 
-_outcomes: WeakKeyDictionary[Protocol, Outcome] = WeakKeyDictionary()
+_outcomes: WeakKeyDictionary[Protocol, ProtocolResult] = WeakKeyDictionary()
 
 
-def _outcome(protocol: Protocol) -> Outcome:
+def _protocol_result(protocol: Protocol) -> ProtocolResult:
     """Runs the study as it is once for all checks of one protocol."""
     if protocol not in _outcomes:
-        _outcomes[protocol] = protocol.run(study(recording()))
+        _outcomes[protocol] = protocol.run(context(recording()))
     return _outcomes[protocol]
 
 
@@ -197,48 +241,59 @@ class _Watched(Learner):
     def __init__(self, learner: ImitationLearner) -> None:
         super().__init__(learner.settings)
         self._learner = learner
-        self.lessons: list[Lesson] = []
+        self.training_data_seen: list[TrainingData] = []
 
-    def fit(self, policy: Policy, lesson: Lesson) -> Learned:
-        self.lessons.append(lesson)
-        return self._learner.fit(policy, lesson)
+    def fit(self, policy: Policy, training_data: TrainingData) -> TrainingResult:
+        self.training_data_seen.append(training_data)
+        return self._learner.fit(policy, training_data)
 
 
 class _Refusing(ImitationLearner):
-    def fit(self, policy: Policy, lesson: Lesson) -> Learned:
-        raise AssertionError("a policy that is not `trainable` must not be handed to a learner: there is nothing to train")
+    def fit(self, policy: Policy, training_data: TrainingData) -> TrainingResult:
+        raise AssertionError(
+            "a policy that is not `trainable` must not be handed to a learner: there is nothing to train"
+        )
 
 
-def _drives(outcome: Outcome) -> dict[str, Drive]:
-    return {drive.pair_id: drive for drive in outcome.evaluation.drives}
+def _drives(protocol_result: ProtocolResult) -> dict[str, Drive]:
+    return {drive.pair_id: drive for drive in protocol_result.evaluation.drives}
 
 
 def _poisoned(pairs: PairSet, tested: Drive, *, leader: bool) -> PairSet:
     """Changes one driver's frames after the last measured state that his test part starts from."""
     return PairSet(
-        tuple(_changed(pair, tested, leader) if pair.pair_id == tested.pair_id else pair for pair in pairs), pairs.source
+        tuple(
+            _changed(pair, tested, leader) if pair.pair_id == tested.pair_id else pair
+            for pair in pairs
+        ),
+        pairs.source,
     )
 
 
 def _changed(pair: Pair, tested: Drive, leader: bool) -> Pair:
     first = len(pair) - (len(tested.time) - 1)
-    later = np.arange(len(pair)) >= first
-    ramp = np.where(later, np.arange(len(pair)) - first + 1.0, 0.0)
+    steady = np.arange(len(pair)) >= first
+    ramp = np.where(steady, np.arange(len(pair)) - first + 1.0, 0.0)
     # The follower falls far back and the leader pulls away: whoever calibrates on this finds another driver.
     values: dict[str, Any] = {
         "follower_position": pair.follower_position - ramp,
-        "follower_speed": np.where(later, 0.3 * pair.follower_speed, pair.follower_speed),
-        "follower_acceleration": np.where(later, -1.0, pair.follower_acceleration),
+        "follower_speed": np.where(steady, 0.3 * pair.follower_speed, pair.follower_speed),
+        "follower_acceleration": np.where(steady, -1.0, pair.follower_acceleration),
     }
     if leader:
         values |= {
             "leader_position": pair.leader_position + ramp,
-            "leader_speed": np.where(later, 2.0 * pair.leader_speed + 3.0, pair.leader_speed),
-            "leader_acceleration": np.where(later, 1.0, pair.leader_acceleration),
+            "leader_speed": np.where(steady, 2.0 * pair.leader_speed + 3.0, pair.leader_speed),
+            "leader_acceleration": np.where(steady, 1.0, pair.leader_acceleration),
         }
     return replace(pair, **values)
 
 
 CONTRACT = contract_of(
-    __name__, "protocol", slow=[the_same_seed_gives_the_same_outcome, no_method_sees_the_measured_follower_of_the_test_part]
+    __name__,
+    "protocol",
+    slow=[
+        the_same_seed_gives_the_same_outcome,
+        no_method_sees_the_measured_follower_of_the_test_part,
+    ],
 )

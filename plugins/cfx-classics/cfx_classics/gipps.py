@@ -44,20 +44,40 @@ class Gipps(DrivingModel):
     parameters = ParameterSpace.of(
         Parameter("tau", "s", 0.3, 5.0, 2 / 3, "apparent reaction time", _PAPER),
         Parameter("V", "m/s", 1.0, 70.0, 20.0, "desired speed on a free road", _PAPER),
-        Parameter("a", "m/s2", 0.1, 6.0, 1.7, "greatest acceleration that the driver wishes", _PAPER),
+        Parameter(
+            "a", "m/s2", 0.1, 6.0, 1.7, "greatest acceleration that the driver wishes", _PAPER
+        ),
         Parameter("b", "m/s2", 0.5, 9.0, 3.4, "hardest braking that the driver wishes", _PAPER),
-        Parameter("b_hat", "m/s2", 0.5, 9.0, 3.2, "braking that the driver expects of the leader", _PAPER),
-        Parameter("s0", "m", 0.0, 8.0, 2.0, "gap at standstill", "default: size of 6.5 m in Gipps (1981) less a 4.5 m car"),
+        Parameter(
+            "b_hat", "m/s2", 0.5, 9.0, 3.2, "braking that the driver expects of the leader", _PAPER
+        ),
+        Parameter(
+            "s0",
+            "m",
+            0.0,
+            8.0,
+            2.0,
+            "gap at standstill",
+            "default: size of 6.5 m in Gipps (1981) less a 4.5 m car",
+        ),
     )
 
-    def next_speed(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float) -> Tensor:
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
         v, tau, b = follower.speed, p["tau"], p["b"]
         ratio = v / p["V"]
         free = v + 2.5 * p["a"] * tau * (1.0 - ratio) * torch.sqrt(0.025 + ratio)
-        room = 2.0 * (bumper_gap(follower, leader) - p["s0"]) - v * tau + leader.speed * leader.speed / p["b_hat"]
+        room = (
+            2.0 * (bumper_gap(follower, leader) - p["s0"])
+            - v * tau
+            + leader.speed * leader.speed / p["b_hat"]
+        )
         radicand = b * b * tau * tau + b * room
         # The root of 1 stands in for that of a negative number, whose gradient is no number.
         possible = radicand > 0.0
-        safe = torch.where(possible, torch.sqrt(torch.where(possible, radicand, 1.0)), 0.0) - b * tau
+        safe = (
+            torch.where(possible, torch.sqrt(torch.where(possible, radicand, 1.0)), 0.0) - b * tau
+        )
         share = (dt / tau).clamp(max=1.0)
         return (v + (torch.minimum(free, safe) - v) * share).clamp(min=0.0)

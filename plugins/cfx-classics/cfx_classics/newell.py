@@ -40,11 +40,29 @@ class Newell(DrivingModel):
     collision_free = True
     parameters = ParameterSpace.of(
         Parameter("tau", "s", 0.3, 10.0, 1.4, "time by which the path is shifted", _SOURCE),
-        Parameter("d", "m", 0.0, 20.0, 2.5, "distance by which the path is shifted: gap at standstill", _SOURCE),
-        Parameter("v_f", "m/s", 1.0, 70.0, 120 / 3.6, "speed on a free road", "Newell (2002); default: as cfx-idm's v0"),
+        Parameter(
+            "d",
+            "m",
+            0.0,
+            20.0,
+            2.5,
+            "distance by which the path is shifted: gap at standstill",
+            _SOURCE,
+        ),
+        Parameter(
+            "v_f",
+            "m/s",
+            1.0,
+            70.0,
+            120 / 3.6,
+            "speed on a free road",
+            "Newell (2002); default: as cfx-idm's v0",
+        ),
     )
 
-    def next_speed(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float) -> Tensor:
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
         # In less than a step the follower would drive past the end of the leader's path.
         following = (bumper_gap(follower, leader) - p["d"]) / p["tau"].clamp(min=dt)
         return torch.minimum(following, p["v_f"]).clamp(min=0.0)

@@ -13,12 +13,24 @@ _BOOK = "default: Treiber and Kesting (2013), section 10.6, motorway; bounds: ab
 
 OPTIMAL_VELOCITY = (
     Parameter("v0", "m/s", 1.0, 70.0, 120 / 3.6, "desired speed on a free road", _BOOK),
-    Parameter("width", "m", 1.0, 100.0, 15.0, "interaction length: gap over which the speed rises", _BOOK),
-    Parameter("beta", "1", 0.1, 5.0, 1.5, "form factor: where the speed rises fastest, in interaction lengths", _BOOK),
+    Parameter(
+        "width", "m", 1.0, 100.0, 15.0, "interaction length: gap over which the speed rises", _BOOK
+    ),
+    Parameter(
+        "beta",
+        "1",
+        0.1,
+        5.0,
+        1.5,
+        "form factor: where the speed rises fastest, in interaction lengths",
+        _BOOK,
+    ),
 )
 
 
 def optimal_velocity(gap: Tensor, p: Mapping[str, Tensor]) -> Tensor:
     """Returns V, m/s: `v0 (tanh(gap / width - beta) + tanh(beta)) / (1 + tanh(beta))`, 0 where the gap is gone; gaps in m."""
     shift = torch.tanh(p["beta"])
-    return p["v0"] * (torch.tanh(gap.clamp(min=0.0) / p["width"] - p["beta"]) + shift) / (1.0 + shift)
+    return (
+        p["v0"] * (torch.tanh(gap.clamp(min=0.0) / p["width"] - p["beta"]) + shift) / (1.0 + shift)
+    )

@@ -49,6 +49,8 @@ class OVM(DrivingModel):
         ),
     )
 
-    def next_speed(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float) -> Tensor:
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
         wanted = optimal_velocity(bumper_gap(follower, leader), p)
         return (follower.speed + (wanted - follower.speed) * (dt / p["tau"])).clamp(min=0.0)

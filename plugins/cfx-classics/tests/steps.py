@@ -17,14 +17,24 @@ def number(value: float) -> Tensor:
     return torch.tensor(value, dtype=torch.float64)
 
 
-def next_speed(model: DrivingModel, *, gap: float, v: float, v_l: float, dt: float = 0.1, **changes: float) -> float:
+def next_speed(
+    model: DrivingModel, *, gap: float, v: float, v_l: float, dt: float = 0.1, **changes: float
+) -> float:
     p = {p.name: number(changes.get(p.name, p.default)) for p in model.space}
     follower = Follower(number(-LENGTH - gap), number(v), number(0.0), torch.zeros(0))
     leader = Leader(number(0.0), number(v_l), number(0.0), number(LENGTH))
     return model.next_speed(follower, leader, p, dt).item()
 
 
-def gain(model: DrivingModel, p: Mapping[str, Tensor], *, gap: Tensor, speed: Tensor, pace: float, dt: float = 0.02) -> Tensor:
+def gain(
+    model: DrivingModel,
+    p: Mapping[str, Tensor],
+    *,
+    gap: Tensor,
+    speed: Tensor,
+    pace: float,
+    dt: float = 0.02,
+) -> Tensor:
     """Returns by how much each follower amplifies a swing of its leader's speed, of angular frequency `pace` in 1/s; `(n,)`.
 
     The leaders drive at `speed` plus a swing of 1 cm/s, the followers start at the equilibrium `gap`, both `(n,)`. The last of

@@ -53,18 +53,30 @@ def papers_step(gap: float, v: float, v_l: float) -> float:
     return min(free, safe)
 
 
-@pytest.mark.parametrize(("gap", "v", "v_l"), [(100.0, 5.0, 5.0), (100.0, 0.0, 0.0), (15.0, 12.0, 10.0), (8.0, 9.0, 9.0)])
+@pytest.mark.parametrize(
+    ("gap", "v", "v_l"), [(100.0, 5.0, 5.0), (100.0, 0.0, 0.0), (15.0, 12.0, 10.0), (8.0, 9.0, 9.0)]
+)
 def test_a_step_of_tau_is_the_papers(gap: float, v: float, v_l: float) -> None:
-    assert next_speed(Gipps(), gap=gap, v=v, v_l=v_l, dt=TAU) == pytest.approx(papers_step(gap, v, v_l))
+    assert next_speed(Gipps(), gap=gap, v=v, v_l=v_l, dt=TAU) == pytest.approx(
+        papers_step(gap, v, v_l)
+    )
     # A shorter step goes its share of the way.
     share = 0.1 / TAU
-    assert next_speed(Gipps(), gap=gap, v=v, v_l=v_l) == pytest.approx(v + share * (papers_step(gap, v, v_l) - v))
+    assert next_speed(Gipps(), gap=gap, v=v, v_l=v_l) == pytest.approx(
+        v + share * (papers_step(gap, v, v_l) - v)
+    )
     # A longer one stops there.
-    assert next_speed(Gipps(), gap=gap, v=v, v_l=v_l, dt=1.0) == pytest.approx(papers_step(gap, v, v_l))
+    assert next_speed(Gipps(), gap=gap, v=v, v_l=v_l, dt=1.0) == pytest.approx(
+        papers_step(gap, v, v_l)
+    )
 
 
-@pytest.mark.parametrize(("v", "v_l", "gap"), [(10.0, 0.0, 60.0), (15.0, 12.0, 30.0), (5.0, 5.0, 10.0)])
-def test_the_safe_speed_is_the_root_of_the_papers_condition(v: float, v_l: float, gap: float) -> None:
+@pytest.mark.parametrize(
+    ("v", "v_l", "gap"), [(10.0, 0.0, 60.0), (15.0, 12.0, 30.0), (5.0, 5.0, 10.0)]
+)
+def test_the_safe_speed_is_the_root_of_the_papers_condition(
+    v: float, v_l: float, gap: float
+) -> None:
     # The paper's condition: stopped by b after tau and tau / 2 more, the driver stands s0 behind the leader, who braked by b_hat.
     def clearance(speed: float) -> float:
         own = (v + speed) * TAU / 2 + speed * TAU / 2 + speed**2 / (2 * 3.4)
@@ -76,7 +88,9 @@ def test_the_safe_speed_is_the_root_of_the_papers_condition(v: float, v_l: float
 
 def test_the_greatest_acceleration_on_a_free_road_is_about_a() -> None:
     # 2.5 (1 - r) sqrt(0.025 + r) peaks at r = (1 - 2 * 0.025) / 3 with 0.996: the constants make `a` the greatest acceleration.
-    found = max((next_speed(Gipps(), gap=1e6, v=v / 10, v_l=20.0) - v / 10) / 0.1 for v in range(200))
+    found = max(
+        (next_speed(Gipps(), gap=1e6, v=v / 10, v_l=20.0) - v / 10) / 0.1 for v in range(200)
+    )
     ratio = (1 - 2 * 0.025) / 3
     assert found == pytest.approx(1.7 * 2.5 * (1 - ratio) * math.sqrt(0.025 + ratio), rel=1e-3)
 
@@ -84,10 +98,19 @@ def test_the_greatest_acceleration_on_a_free_road_is_about_a() -> None:
 def test_a_follower_settles_at_the_closed_form_of_the_gap() -> None:
     frames = 2000
     t = torch.arange(frames, dtype=torch.float64) * 0.1
-    leader = Leader(12.0 * t[None], torch.full((1, frames), 12.0).double(), torch.zeros(1, frames).double(), number(5.0)[None])
-    out = simulate(Gipps(), None, leader, Start(number(-60.0)[None], number(5.0)[None], number(0.0)[None]), 0.1)
+    leader = Leader(
+        12.0 * t[None],
+        torch.full((1, frames), 12.0).double(),
+        torch.zeros(1, frames).double(),
+        number(5.0)[None],
+    )
+    out = simulate(
+        Gipps(), None, leader, Start(number(-60.0)[None], number(5.0)[None], number(0.0)[None]), 0.1
+    )
     assert out.speed[0, -1].item() == pytest.approx(12.0, abs=1e-6)
-    assert out.gap[0, -1].item() == pytest.approx(2.0 + 1.5 * 12.0 * TAU + 144.0 * (1 / 3.4 - 1 / 3.2) / 2, abs=1e-4)
+    assert out.gap[0, -1].item() == pytest.approx(
+        2.0 + 1.5 * 12.0 * TAU + 144.0 * (1 / 3.4 - 1 / 3.2) / 2, abs=1e-4
+    )
 
 
 def test_without_any_gap_it_brakes_to_a_stop() -> None:

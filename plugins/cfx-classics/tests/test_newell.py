@@ -58,11 +58,21 @@ def test_with_steps_of_tau_it_is_the_papers_translated_path() -> None:
     torch.testing.assert_close(out.position[:, 1:], leader.position[:, :-1] - LENGTH - D)
 
 
-def test_behind_an_accelerating_leader_the_gap_is_smaller_than_the_papers_by_half_a_tau_squared() -> None:
+def test_behind_an_accelerating_leader_the_gap_is_smaller_than_the_papers_by_half_a_tau_squared() -> (
+    None
+):
     a, dt = 0.5, 0.01
     t = torch.arange(3_000, dtype=torch.float64) * dt
-    leader = Leader((a * t * t / 2)[None], (a * t)[None], torch.full_like(t, a)[None], number(LENGTH)[None])
-    out = simulate(Newell(), None, leader, Start(number(-LENGTH - D)[None], number(0.0)[None], number(0.0)[None]), dt)
+    leader = Leader(
+        (a * t * t / 2)[None], (a * t)[None], torch.full_like(t, a)[None], number(LENGTH)[None]
+    )
+    out = simulate(
+        Newell(),
+        None,
+        leader,
+        Start(number(-LENGTH - D)[None], number(0.0)[None], number(0.0)[None]),
+        dt,
+    )
     papers = a * (t[-1] - TAU) ** 2 / 2 - LENGTH - D
     assert (out.position[0, -1] - papers).item() == pytest.approx(a * TAU**2 / 2, rel=2e-2)
 
@@ -70,8 +80,12 @@ def test_behind_an_accelerating_leader_the_gap_is_smaller_than_the_papers_by_hal
 def test_swings_fade_as_in_a_low_pass() -> None:
     pace, taus = 0.3, (0.5, 1.4, 4.0)
     p = {"tau": torch.tensor(taus).double(), "d": number(D), "v_f": number(40.0)}
-    found = gain(Newell(), p, gap=D + 10.0 * p["tau"], speed=torch.full((3,), 10.0).double(), pace=pace)
-    assert found.tolist() == pytest.approx([1 / math.hypot(1.0, pace * tau) for tau in taus], rel=1e-2)
+    found = gain(
+        Newell(), p, gap=D + 10.0 * p["tau"], speed=torch.full((3,), 10.0).double(), pace=pace
+    )
+    assert found.tolist() == pytest.approx(
+        [1 / math.hypot(1.0, pace * tau) for tau in taus], rel=1e-2
+    )
 
 
 def test_on_a_free_road_it_drives_at_v_f_and_without_a_gap_it_stands() -> None:

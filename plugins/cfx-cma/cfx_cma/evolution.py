@@ -39,8 +39,12 @@ class CmaSettings(Settings):
         description="first evaluations, guesses and space-filling points; the search starts at the best of them, and their losses"
         " tell how much the choice of parameters matters",
     )
-    population: int | None = Field(None, ge=4, description="candidates in a generation; null: 4 + 3 ln n, as cma has it")
-    sigma: float = Field(0.25, gt=0, le=1, description="first standard deviation of a search, in unit space")
+    population: int | None = Field(
+        None, ge=4, description="candidates in a generation; null: 4 + 3 ln n, as cma has it"
+    )
+    sigma: float = Field(
+        0.25, gt=0, le=1, description="first standard deviation of a search, in unit space"
+    )
 
 
 class CmaOptimizer(Optimizer):
@@ -79,7 +83,11 @@ class CmaOptimizer(Optimizer):
         points = _sobol(self._initial - g, n, seed=seed).to(guesses.device)
         candidates = [torch.cat([guesses, points.expand(problems, -1, -1)], dim=1)]
         losses = [objective(candidates[0])]
-        best = candidates[0].gather(1, losses[0].argmin(dim=1)[:, None, None].expand(-1, 1, n)).squeeze(1)
+        best = (
+            candidates[0]
+            .gather(1, losses[0].argmin(dim=1)[:, None, None].expand(-1, 1, n))
+            .squeeze(1)
+        )
         size = self.settings.population or 4 + int(3 * math.log(n))
         searches = [_Search(start, size, self.settings.sigma, seed) for start in best.cpu().numpy()]
         while (left := self.settings.samples - sum(part.shape[1] for part in losses)) > 0:

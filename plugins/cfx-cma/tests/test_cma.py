@@ -36,7 +36,10 @@ def valley(candidates: torch.Tensor, optimum: torch.Tensor) -> torch.Tensor:
 
 
 def test_it_learns_the_shape_of_the_problem() -> None:
-    problems, guesses = Problems(valley, 0.2 + 0.6 * random(6, 4)), torch.full((6, 1, 4), 0.5, dtype=torch.float64)
+    problems, guesses = (
+        Problems(valley, 0.2 + 0.6 * random(6, 4)),
+        torch.full((6, 1, 4), 0.5, dtype=torch.float64),
+    )
     found = CmaOptimizer(samples=1500).minimize(problems, guesses, seed=0)
     searched = cfx.get("optimizer", "random")(samples=1500).minimize(problems, guesses, seed=0)
     assert found.loss.median() < 0.001 * searched.loss.median()
@@ -50,8 +53,12 @@ def test_a_search_that_ends_starts_again_somewhere_else() -> None:
         return torch.minimum(shallow, 3 * deep - 1)
 
     guess = torch.full((1, 1, 2), 0.85, dtype=torch.float64)
-    once = CmaOptimizer(samples=100, initial=1, sigma=0.05).minimize(Problems(holes, guess[:, 0]), guess, seed=0)
-    often = CmaOptimizer(samples=1500, initial=1, sigma=0.05).minimize(Problems(holes, guess[:, 0]), guess, seed=0)
+    once = CmaOptimizer(samples=100, initial=1, sigma=0.05).minimize(
+        Problems(holes, guess[:, 0]), guess, seed=0
+    )
+    often = CmaOptimizer(samples=1500, initial=1, sigma=0.05).minimize(
+        Problems(holes, guess[:, 0]), guess, seed=0
+    )
     assert once.loss.item() == pytest.approx(0, abs=1e-6)
     assert often.loss.item() == pytest.approx(-1, abs=1e-6)
 
@@ -75,11 +82,21 @@ def test_more_guesses_than_first_evaluations_is_told() -> None:
         CmaOptimizer(initial=2).minimize(Problems(valley, random(1, 2)), random(1, 3, 2), seed=0)
 
 
-def test_cfx_recovers_known_drivers_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cfx_recovers_known_drivers_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Drivers whose parameters are constant and known, calibrated by a whole job."""
     monkeypatch.chdir(tmp_path)
     options = ["data.pairs=3", "data.platoon_size=1", "data.variation=0", "data.frames=400"]
-    result = cfx.run(["optimizer=cma", "policy=fixed", *options, "tracking.enabled=false", "figures.enabled=false"])
+    result = cfx.run(
+        [
+            "optimizer=cma",
+            "policy=fixed",
+            *options,
+            "tracking.enabled=false",
+            "figures.enabled=false",
+        ]
+    )
     truth = cfx.get("dataset", "synthetic")(pairs=3, platoon_size=1, variation=0, frames=400).load()
     found = result.pairs[result.pairs.method == "fixed"].set_index("pair_id").parameter_t_r
     for pair in truth:

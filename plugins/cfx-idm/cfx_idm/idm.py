@@ -24,7 +24,16 @@ IDM_PARAMETERS = ParameterSpace.of(
     Parameter("s0", "m", 0.1, 8.0, 2.0, "gap at standstill", _PAPER),
     Parameter("a", "m/s2", 0.1, 6.0, 0.73, "maximum acceleration", _PAPER),
     Parameter("b", "m/s2", 0.1, 6.0, 1.67, "comfortable deceleration", _PAPER),
-    Parameter("delta", "1", 1.0, 8.0, 4.0, "acceleration exponent", "Treiber et al. (2000), table I", tuned=False),
+    Parameter(
+        "delta",
+        "1",
+        1.0,
+        8.0,
+        4.0,
+        "acceleration exponent",
+        "Treiber et al. (2000), table I",
+        tuned=False,
+    ),
 )
 
 
@@ -59,7 +68,9 @@ class IDM(DrivingModel):
     collision_free = True
     parameters = IDM_PARAMETERS
 
-    def next_speed(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float) -> Tensor:
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
         v = follower.speed
         crowding = desired_gap(v, leader.speed, p) / bumper_gap(follower, leader).clamp(min=CLOSEST)
         acceleration = p["a"] * (1.0 - torch.pow(v / p["v0"], p["delta"]) - crowding * crowding)

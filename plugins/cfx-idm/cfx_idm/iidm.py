@@ -13,7 +13,9 @@ from torch import Tensor
 from cfx import DrivingModel, Follower, Leader, bumper_gap
 from cfx_idm.idm import CLOSEST, IDM_PARAMETERS, desired_gap
 
-_NEARLY_ZERO = 1e-6  # m/s2: a smaller free acceleration is 0 in all but the exponent that it divides
+_NEARLY_ZERO = (
+    1e-6  # m/s2: a smaller free acceleration is 0 in all but the exponent that it divides
+)
 
 
 class IIDM(DrivingModel):
@@ -44,7 +46,9 @@ class IIDM(DrivingModel):
     collision_free = True
     parameters = IDM_PARAMETERS
 
-    def next_speed(self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float) -> Tensor:
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
         v, a, b, delta = follower.speed, p["a"], p["b"], p["delta"]
         z = desired_gap(v, leader.speed, p) / bumper_gap(follower, leader).clamp(min=CLOSEST)
         ratio = v / p["v0"]

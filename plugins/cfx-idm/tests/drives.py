@@ -26,29 +26,52 @@ def leader_speed(t: float | np.ndarray) -> float | np.ndarray:
     return MEAN + SWING * np.sin(PACE * t)
 
 
-def stepped(model: DrivingModel, p: Mapping[str, float], gap: float, speed: float, dt: float) -> np.ndarray:
+def stepped(
+    model: DrivingModel, p: Mapping[str, float], gap: float, speed: float, dt: float
+) -> np.ndarray:
     """Returns the follower's speeds at every step until END."""
     t = np.arange(round(END / dt) + 1) * dt
     ahead = (leader_position(t), leader_speed(t), SWING * PACE * np.cos(PACE * t))
-    leader = Leader(*(torch.from_numpy(values)[None] for values in ahead), torch.tensor([LENGTH], dtype=torch.float64))
-    begin = Start(*(torch.tensor([value], dtype=torch.float64) for value in (-LENGTH - gap, speed, 0.0)))
+    leader = Leader(
+        *(torch.from_numpy(values)[None] for values in ahead),
+        torch.tensor([LENGTH], dtype=torch.float64),
+    )
+    begin = Start(
+        *(torch.tensor([value], dtype=torch.float64) for value in (-LENGTH - gap, speed, 0.0))
+    )
     values = {name: torch.tensor(value, dtype=torch.float64) for name, value in p.items()}
     return simulate(model, values, leader, begin, dt).speed[0].numpy()
 
 
-def integrated(acceleration: Acceleration, p: Mapping[str, float], gap: float, speed: float, times: np.ndarray) -> np.ndarray:
+def integrated(
+    acceleration: Acceleration, p: Mapping[str, float], gap: float, speed: float, times: np.ndarray
+) -> np.ndarray:
     """Returns the speeds of the continuous model, by a Runge-Kutta method of order 8 to ten digits."""
 
     def slope(t: float, state: np.ndarray) -> tuple[float, float]:
         x, v = state
         return v, acceleration(float(leader_position(t)) - LENGTH - x, v, float(leader_speed(t)), p)
 
-    found = solve_ivp(slope, (0.0, END), (-LENGTH - gap, speed), method="DOP853", t_eval=times, rtol=1e-10, atol=1e-10)
+    found = solve_ivp(
+        slope,
+        (0.0, END),
+        (-LENGTH - gap, speed),
+        method="DOP853",
+        t_eval=times,
+        rtol=1e-10,
+        atol=1e-10,
+    )
     assert found.success, found.message
     return found.y[1]
 
 
-def order(model: DrivingModel, acceleration: Acceleration, p: Mapping[str, float], gap: float, speed: float) -> float:
+def order(
+    model: DrivingModel,
+    acceleration: Acceleration,
+    p: Mapping[str, float],
+    gap: float,
+    speed: float,
+) -> float:
     """Returns how the largest deviation from the continuous model falls with the step: 1 where halving it halves the error."""
     errors = []
     for dt in (0.1, 0.05, 0.025):

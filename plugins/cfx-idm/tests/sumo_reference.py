@@ -20,15 +20,23 @@ START = 300.0  # m: front of every leader
 def network(count: int) -> str:
     length = 6000.0
     lines = ['<net version="1.20">']
-    lines.append(f'<location netOffset="0,0" convBoundary="0,0,{length},{count}" origBoundary="0,0,1,1" projParameter="!"/>')
+    lines.append(
+        f'<location netOffset="0,0" convBoundary="0,0,{length},{count}" origBoundary="0,0,1,1" projParameter="!"/>'
+    )
     for i in range(count):
         y = 100 * i
         lines.append(f'<edge id="r{i}" from="a{i}" to="b{i}" priority="1">')
-        lines.append(f'<lane id="r{i}_0" index="0" speed="{LIMIT}" length="{length}" shape="0,{y} {length},{y}"/></edge>')
+        lines.append(
+            f'<lane id="r{i}_0" index="0" speed="{LIMIT}" length="{length}" shape="0,{y} {length},{y}"/></edge>'
+        )
     for i in range(count):
         y = 100 * i
-        lines.append(f'<junction id="a{i}" type="dead_end" x="0" y="{y}" incLanes="" intLanes="" shape="0,{y}"/>')
-        lines.append(f'<junction id="b{i}" type="dead_end" x="{length}" y="{y}" incLanes="r{i}_0" intLanes="" shape="0,{y}"/>')
+        lines.append(
+            f'<junction id="a{i}" type="dead_end" x="0" y="{y}" incLanes="" intLanes="" shape="0,{y}"/>'
+        )
+        lines.append(
+            f'<junction id="b{i}" type="dead_end" x="{length}" y="{y}" incLanes="r{i}_0" intLanes="" shape="0,{y}"/>'
+        )
     return "\n".join([*lines, "</net>"])
 
 
@@ -37,12 +45,16 @@ def routes(runs: list[dict[str, Any]]) -> str:
     types, cars = [f'<vType id="lead" maxSpeed="{LIMIT}" {same}/>'], []
     for i, run in enumerate(runs):
         given = " ".join(f'{name}="{value!r}"' for name, value in run["parameters"].items())
-        types.append(f'<vType id="t{i}" carFollowModel="IDM" {same} {given}/><route id="r{i}" edges="r{i}"/>')
+        types.append(
+            f'<vType id="t{i}" carFollowModel="IDM" {same} {given}/><route id="r{i}" edges="r{i}"/>'
+        )
         for name, kind, position, speed in (
             ("leader", "lead", START, run["leader_speed"][0]),
             ("follower", f"t{i}", START - 5.0 - run["gap"], run["speed"]),
         ):
-            cars.append(f'<vehicle id="{name}{i}" type="{kind}" route="r{i}" depart="0" insertionChecks="none"')
+            cars.append(
+                f'<vehicle id="{name}{i}" type="{kind}" route="r{i}" depart="0" insertionChecks="none"'
+            )
             cars.append(f' departPos="{position!r}" departSpeed="{speed!r}"/>')
     return "\n".join(["<routes>", *types, *cars, "</routes>"])
 
@@ -74,7 +86,16 @@ def main() -> None:
         net, cars = Path(folder, "net.net.xml"), Path(folder, "cars.rou.xml")
         net.write_text(network(len(runs)))
         cars.write_text(routes(runs))
-        options = ["--step-length", "0.1", "--collision.action", "none", "--time-to-teleport", "-1", "--no-step-log", "true"]
+        options = [
+            "--step-length",
+            "0.1",
+            "--collision.action",
+            "none",
+            "--time-to-teleport",
+            "-1",
+            "--no-step-log",
+            "true",
+        ]
         libsumo.start(["sumo", "-n", str(net), "-r", str(cars), "--no-warnings", "true", *options])
         answer = drive(libsumo, runs)
         libsumo.close()

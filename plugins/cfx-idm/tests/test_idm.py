@@ -30,7 +30,9 @@ def number(value: float) -> Tensor:
     return torch.tensor(value, dtype=torch.float64)
 
 
-def acceleration(model: cfx.DrivingModel, *, gap: float, v: float, v_l: float, **changes: float) -> float:
+def acceleration(
+    model: cfx.DrivingModel, *, gap: float, v: float, v_l: float, **changes: float
+) -> float:
     """Returns dv/dt as a very short step shows it."""
     p = {name: number(value) for name, value in (PAPER | changes).items()}
     follower = Follower(number(-5.0 - gap), number(v), number(0.0), torch.zeros(0))
@@ -92,7 +94,9 @@ def test_limits_that_the_paper_states(model: cfx.DrivingModel) -> None:
 
 
 @pytest.mark.parametrize("needed", [0.5, 1.67, 4.0])
-def test_braking_for_a_standing_obstacle_squares_the_deceleration_that_is_needed(needed: float) -> None:
+def test_braking_for_a_standing_obstacle_squares_the_deceleration_that_is_needed(
+    needed: float,
+) -> None:
     # The paper's braking strategy: where v^2 / (2 s) is needed to stop in time, the model brakes by its square over b.
     v = 20.0
     found = acceleration(IDM(), gap=v * v / (2 * needed), v=v, v_l=0.0, T=0.0, s0=0.0, v0=1e6)
@@ -101,24 +105,32 @@ def test_braking_for_a_standing_obstacle_squares_the_deceleration_that_is_needed
 
 def test_at_standstill_behind_a_leader_iidm_is_idm() -> None:
     for gap in (1.0, 2.0, 5.0, 50.0):
-        assert acceleration(IIDM(), gap=gap, v=0.0, v_l=0.0) == pytest.approx(acceleration(IDM(), gap=gap, v=0.0, v_l=0.0))
+        assert acceleration(IIDM(), gap=gap, v=0.0, v_l=0.0) == pytest.approx(
+            acceleration(IDM(), gap=gap, v=0.0, v_l=0.0)
+        )
 
 
 def test_above_the_desired_speed_iidm_brakes_by_b_at_most_and_idm_by_far_more() -> None:
     for v in (20.0, 30.0, 60.0):
         assert -1.67 <= acceleration(IIDM(), gap=1e6, v=v, v_l=v, v0=15.0) < 0.0
-    assert acceleration(IDM(), gap=1e6, v=30.0, v_l=30.0, v0=15.0) == pytest.approx(0.73 * (1 - 2**4), rel=1e-3)
+    assert acceleration(IDM(), gap=1e6, v=30.0, v_l=30.0, v0=15.0) == pytest.approx(
+        0.73 * (1 - 2**4), rel=1e-3
+    )
 
 
 def test_iidm_is_continuous_where_its_cases_meet() -> None:
     # Around v = v0, and around z = 1 on either side of v0.
     v0, tiny = 15.0, 1e-7
     for gap in (2.0 + 1.6 * v0 - 5.0, 200.0):
-        below, above = (acceleration(IIDM(), gap=gap, v=v0 + side * tiny, v_l=v0, v0=v0) for side in (-1, 1))
+        below, above = (
+            acceleration(IIDM(), gap=gap, v=v0 + side * tiny, v_l=v0, v0=v0) for side in (-1, 1)
+        )
         assert below == pytest.approx(above, abs=1e-5)
     for v in (10.0, 20.0):
         desired = 2.0 + 1.6 * v
-        near, far = (acceleration(IIDM(), gap=desired + side * tiny, v=v, v_l=v, v0=v0) for side in (-1, 1))
+        near, far = (
+            acceleration(IIDM(), gap=desired + side * tiny, v=v, v_l=v, v0=v0) for side in (-1, 1)
+        )
         assert near == pytest.approx(far, abs=1e-5)
 
 
@@ -144,7 +156,10 @@ def test_steps_converge_to_the_differential_equation_with_order_one(model, book,
     assert order(model, book, PAPER | changes, gap=30.0, speed=12.0) == pytest.approx(1.0, abs=0.15)
 
 
-@pytest.mark.skipif(importlib.util.find_spec("libsumo") is None, reason="SUMO is not here; pip install 'cfx-idm[test]'")
+@pytest.mark.skipif(
+    importlib.util.find_spec("libsumo") is None,
+    reason="SUMO is not here; pip install 'cfx-idm[test]'",
+)
 def test_idm_is_sumos() -> None:
     rng = np.random.default_rng(3)
     runs = []
@@ -154,23 +169,53 @@ def test_idm_is_sumos() -> None:
         while len(v_l) < 400:
             target = float(rng.choice([0.0, rng.uniform(0, 20)])) if rng.random() < 0.02 else target
             v_l.append(max(0.0, v_l[-1] + float(np.clip(target - v_l[-1], -0.25, 0.2))))
-        p = {"v0": rng.uniform(21, 40), "T": rng.uniform(0.5, 4), "s0": rng.uniform(1, 5), "a": rng.uniform(0.4, 4)}
-        p = {name: float(value) for name, value in p.items()} | {"b": float(rng.uniform(0.5, 5)), "delta": 4.0}
-        runs.append({"p": p, "leader_speed": v_l, "gap": float(rng.uniform(20, 60)), "speed": v_l[0]})
-    names = {"v0": "maxSpeed", "T": "tau", "s0": "minGap", "a": "accel", "b": "decel", "delta": "delta"}
+        p = {
+            "v0": rng.uniform(21, 40),
+            "T": rng.uniform(0.5, 4),
+            "s0": rng.uniform(1, 5),
+            "a": rng.uniform(0.4, 4),
+        }
+        p = {name: float(value) for name, value in p.items()} | {
+            "b": float(rng.uniform(0.5, 5)),
+            "delta": 4.0,
+        }
+        runs.append(
+            {"p": p, "leader_speed": v_l, "gap": float(rng.uniform(20, 60)), "speed": v_l[0]}
+        )
+    names = {
+        "v0": "maxSpeed",
+        "T": "tau",
+        "s0": "minGap",
+        "a": "accel",
+        "b": "decel",
+        "delta": "delta",
+    }
     # SUMO's own brake cap and rounding lie around every model; the cap is lifted here.
-    job = [run | {"parameters": {names[k]: v for k, v in run["p"].items()} | {"emergencyDecel": 1000.0}} for run in runs]
+    job = [
+        run
+        | {"parameters": {names[k]: v for k, v in run["p"].items()} | {"emergencyDecel": 1000.0}}
+        for run in runs
+    ]
     script = Path(__file__).with_name("sumo_reference.py")
     done = subprocess.run(
-        [sys.executable, str(script)], input=json.dumps({"runs": job}), capture_output=True, text=True, check=False
+        [sys.executable, str(script)],
+        input=json.dumps({"runs": job}),
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
-    ahead, _, speed = (torch.tensor(rows, dtype=torch.float64) for rows in zip(*json.loads(done.stdout), strict=True))
+    ahead, _, speed = (
+        torch.tensor(rows, dtype=torch.float64)
+        for rows in zip(*json.loads(done.stdout), strict=True)
+    )
     v_l = torch.tensor([run["leader_speed"] for run in runs], dtype=torch.float64)
     column = {k: torch.tensor([run["p"][k] for run in runs], dtype=torch.float64) for k in PAPER}
     gap = torch.tensor([run["gap"] for run in runs], dtype=torch.float64)
     leader = Leader(ahead, v_l, torch.zeros_like(v_l), torch.full_like(gap, 5.0))
-    mine = simulate(IDM(), column, leader, Start(ahead[:, 0] - 5.0 - gap, v_l[:, 0], torch.zeros_like(gap)), 0.1)
+    mine = simulate(
+        IDM(), column, leader, Start(ahead[:, 0] - 5.0 - gap, v_l[:, 0], torch.zeros_like(gap)), 0.1
+    )
     assert not bool(mine.collided.any())
     assert (mine.speed.diff(dim=1) < -0.3).any(), "the leaders must make it brake"
     difference = (mine.speed - speed).abs()
@@ -182,6 +227,14 @@ def test_idm_is_sumos() -> None:
 
 def test_a_job_runs_with_the_preset_for_city_traffic(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    overrides = ["model=idm_city", "data.pairs=2", "data.frames=200", "optimizer=random", "optimizer.samples=64"]
-    result = cfx.run([*overrides, "policy=fixed", "tracking.enabled=false", "figures.enabled=false"])
+    overrides = [
+        "model=idm_city",
+        "data.pairs=2",
+        "data.frames=200",
+        "optimizer=random",
+        "optimizer.samples=64",
+    ]
+    result = cfx.run(
+        [*overrides, "policy=fixed", "tracking.enabled=false", "figures.enabled=false"]
+    )
     assert math.isfinite(result.metrics["rmse_speed/fixed"])

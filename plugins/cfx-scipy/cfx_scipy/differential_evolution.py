@@ -31,15 +31,30 @@ _LARGEST = 1e100
 class DifferentialEvolutionSettings(Settings):
     """Settings of `DifferentialEvolution`; names and defaults are SciPy's where it has them."""
 
-    population: int = Field(20, ge=5, description="candidates in a generation; the first are guesses and space-filling points")
-    generations: int = Field(14, ge=0, description="generations after the first; evaluations = population * (generations + 1)")
+    population: int = Field(
+        20,
+        ge=5,
+        description="candidates in a generation; the first are guesses and space-filling points",
+    )
+    generations: int = Field(
+        14,
+        ge=0,
+        description="generations after the first; evaluations = population * (generations + 1)",
+    )
     strategy: Literal[
         "best1bin", "best1exp", "rand1bin", "rand1exp", "rand2bin", "rand2exp", "randtobest1bin", "randtobest1exp",
         "currenttobest1bin", "currenttobest1exp", "best2exp", "best2bin",
     ] = Field("best1bin", description="how a candidate is made from others, in SciPy's names")  # fmt: skip
     mutation_low: float = Field(0.5, ge=0, lt=2, description="least weight of a difference")
-    mutation_high: float = Field(1.0, gt=0, lt=2, description="greatest weight of a difference; drawn anew in each generation")
-    recombination: float = Field(0.7, ge=0, le=1, description="probability with which a parameter is taken from the mutant")
+    mutation_high: float = Field(
+        1.0,
+        gt=0,
+        lt=2,
+        description="greatest weight of a difference; drawn anew in each generation",
+    )
+    recombination: float = Field(
+        0.7, ge=0, le=1, description="probability with which a parameter is taken from the mutant"
+    )
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
@@ -82,14 +97,18 @@ class DifferentialEvolution(Optimizer):
         problems, g, n = guesses.shape
         size = self.settings.population
         if g > size:
-            raise ConfigError(f"optimizer.population={size}: there are {g} first guesses; set optimizer.population >= {g}")
+            raise ConfigError(
+                f"optimizer.population={size}: there are {g} first guesses; set optimizer.population >= {g}"
+            )
         points = _sobol(size - g, n, seed=seed).to(guesses.device)
         candidates = [torch.cat([guesses, points.expand(problems, -1, -1)], dim=1)]
         losses = [objective(candidates[0])]
         searches = [_Search(start, self.settings, seed) for start in candidates[0].cpu().numpy()]
         for _ in range(self.settings.generations):
             told = losses[-1].cpu().numpy()
-            asked = np.stack([search.tell(loss) for search, loss in zip(searches, told, strict=True)])
+            asked = np.stack(
+                [search.tell(loss) for search, loss in zip(searches, told, strict=True)]
+            )
             candidates.append(torch.from_numpy(asked).to(guesses.device))
             losses.append(objective(candidates[-1]))
         return torch.cat(candidates, dim=1), torch.cat(losses, dim=1)

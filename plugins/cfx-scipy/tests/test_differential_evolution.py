@@ -24,7 +24,9 @@ class TestAnotherStrategy(OptimizerContract):
 
     @pytest.fixture
     def optimizer(self) -> DifferentialEvolution:
-        return DifferentialEvolution(population=10, generations=10, strategy="randtobest1exp", recombination=0.9)
+        return DifferentialEvolution(
+            population=10, generations=10, strategy="randtobest1exp", recombination=0.9
+        )
 
 
 def random(*shape: int) -> torch.Tensor:
@@ -62,7 +64,9 @@ def test_every_problem_is_solved_as_scipy_solves_it_alone() -> None:
 def test_it_gets_out_of_local_minima() -> None:
     optima = 0.2 + 0.6 * random(8, 3)
     optimizer = DifferentialEvolution(population=30, generations=60)
-    found = optimizer.minimize(Problems(bumpy, optima), torch.full((8, 1, 3), 0.5, dtype=torch.float64), seed=0)
+    found = optimizer.minimize(
+        Problems(bumpy, optima), torch.full((8, 1, 3), 0.5, dtype=torch.float64), seed=0
+    )
     assert float((found.best - optima).abs().max()) < 0.01
 
 
@@ -82,14 +86,18 @@ def test_an_interrupted_search_leaves_nothing_behind() -> None:
         return bumpy(candidates, optimum)
 
     with pytest.raises(KeyboardInterrupt):
-        DifferentialEvolution().minimize(Problems(interrupted, random(4, 2)), random(4, 1, 2), seed=0)
+        DifferentialEvolution().minimize(
+            Problems(interrupted, random(4, 2)), random(4, 1, 2), seed=0
+        )
     again = DifferentialEvolution().minimize(Problems(bumpy, random(4, 2)), random(4, 1, 2), seed=0)
     assert bool(again.loss.isfinite().all())
 
 
 def test_more_guesses_than_the_population_is_told() -> None:
     with pytest.raises(ConfigError, match=r"optimizer\.population=5: there are 6 first guesses"):
-        DifferentialEvolution(population=5).minimize(Problems(bumpy, random(1, 2)), random(1, 6, 2), seed=0)
+        DifferentialEvolution(population=5).minimize(
+            Problems(bumpy, random(1, 2)), random(1, 6, 2), seed=0
+        )
 
 
 def test_the_mutation_weights_must_be_in_order() -> None:
@@ -97,12 +105,20 @@ def test_the_mutation_weights_must_be_in_order() -> None:
         DifferentialEvolution(mutation_low=1.2, mutation_high=0.5)
 
 
-def test_cfx_recovers_known_drivers_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cfx_recovers_known_drivers_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Drivers whose parameters are constant and known, calibrated by a whole job."""
     monkeypatch.chdir(tmp_path)
     options = ["data.pairs=3", "data.platoon_size=1", "data.variation=0", "data.frames=400"]
     result = cfx.run(
-        ["optimizer=differential_evolution", "policy=fixed", *options, "tracking.enabled=false", "figures.enabled=false"]
+        [
+            "optimizer=differential_evolution",
+            "policy=fixed",
+            *options,
+            "tracking.enabled=false",
+            "figures.enabled=false",
+        ]
     )
     truth = cfx.get("dataset", "synthetic")(pairs=3, platoon_size=1, variation=0, frames=400).load()
     found = result.pairs[result.pairs.method == "fixed"].set_index("pair_id").parameter_t_r

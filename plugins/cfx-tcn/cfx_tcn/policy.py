@@ -25,15 +25,20 @@ class TcnSettings(PolicySettings):
     """Settings of `TcnPolicy`."""
 
     channels: int = Field(32, ge=1, description="channels of each convolution")
-    levels: int = Field(3, ge=1, description="residual blocks; the dilation is 1, 2, 4, ... windows")
+    levels: int = Field(
+        3, ge=1, description="residual blocks; the dilation is 1, 2, 4, ... windows"
+    )
     kernel: int = Field(
         3,
         ge=2,
         description="taps of each convolution; the network sees 1 + 2 (kernel - 1) (2^levels - 1) windows back, its own too",
     )
-    dropout: float = Field(0.0, ge=0, lt=1, description="dropout after each convolution while training")
+    dropout: float = Field(
+        0.0, ge=0, lt=1, description="dropout after each convolution while training"
+    )
     start: Literal["fixed", "middle"] = Field(
-        "fixed", description="what an untrained network answers: the fixed parameters, or about the middle of the bounds"
+        "fixed",
+        description="what an untrained network answers: the fixed parameters, or about the middle of the bounds",
     )
 
     @property
@@ -51,7 +56,15 @@ def _uniform(shape: tuple[int, ...], fan_in: int, generator: torch.Generator) ->
 class CausalConvolution(nn.Module):
     """One dilated causal convolution of N networks, as one batched matrix product over its taps."""
 
-    def __init__(self, networks: int, inputs: int, outputs: int, kernel: int, dilation: int, generator: torch.Generator) -> None:
+    def __init__(
+        self,
+        networks: int,
+        inputs: int,
+        outputs: int,
+        kernel: int,
+        dilation: int,
+        generator: torch.Generator,
+    ) -> None:
         super().__init__()
         self.inputs = inputs
         self.kernel = kernel
@@ -72,7 +85,13 @@ class CausalConvolution(nn.Module):
         """
         windows = x.shape[2]
         whole = torch.cat([past, x], dim=2)
-        taps = torch.cat([whole[:, :, j * self.dilation : j * self.dilation + windows] for j in range(self.kernel)], dim=-1)
+        taps = torch.cat(
+            [
+                whole[:, :, j * self.dilation : j * self.dilation + windows]
+                for j in range(self.kernel)
+            ],
+            dim=-1,
+        )
         out = torch.baddbmm(self.bias, taps.flatten(1, 2), self.weight)
         return out.view(*x.shape[:3], -1), whole[:, :, whole.shape[2] - self.memory :]
 
@@ -81,12 +100,23 @@ class ResidualBlock(nn.Module):
     """Two convolutions with dropout and a way around them."""
 
     def __init__(
-        self, networks: int, inputs: int, channels: int, kernel: int, dilation: int, dropout: float, generator: torch.Generator
+        self,
+        networks: int,
+        inputs: int,
+        channels: int,
+        kernel: int,
+        dilation: int,
+        dropout: float,
+        generator: torch.Generator,
     ) -> None:
         super().__init__()
         self.first = CausalConvolution(networks, inputs, channels, kernel, dilation, generator)
         self.second = CausalConvolution(networks, channels, channels, kernel, dilation, generator)
-        self.around = CausalConvolution(networks, inputs, channels, 1, 1, generator) if inputs != channels else None
+        self.around = (
+            CausalConvolution(networks, inputs, channels, 1, 1, generator)
+            if inputs != channels
+            else None
+        )
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, x: Tensor, past: list[Tensor]) -> tuple[Tensor, list[Tensor]]:
@@ -104,7 +134,9 @@ class TcnNetwork(PolicyNetwork):
     they are 0: the zero padding of the paper.
     """
 
-    def __init__(self, features: int, fixed: Tensor, settings: TcnSettings, generator: torch.Generator) -> None:
+    def __init__(
+        self, features: int, fixed: Tensor, settings: TcnSettings, generator: torch.Generator
+    ) -> None:
         """Takes the networks' fixed parameters in unit space, `(N, n)`."""
         super().__init__()
         networks, parameters = fixed.shape
@@ -124,21 +156,31 @@ class TcnNetwork(PolicyNetwork):
 
     @property
     def _convolutions(self) -> list[CausalConvolution]:
-        return [c for block in self.blocks if isinstance(block, ResidualBlock) for c in (block.first, block.second)]
+        return [
+            c
+            for block in self.blocks
+            if isinstance(block, ResidualBlock)
+            for c in (block.first, block.second)
+        ]
 
     def initial_state(self, networks: int, drivers: int) -> Tensor:
-        return self.w_out.new_zeros((networks, drivers, sum(c.memory * c.inputs for c in self._convolutions)))
+        return self.w_out.new_zeros(
+            (networks, drivers, sum(c.memory * c.inputs for c in self._convolutions))
+        )
 
     def forward(self, tokens: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         convolutions = self._convolutions
         pieces = torch.split(state, [c.memory * c.inputs for c in convolutions], dim=-1)
-        past = [piece.view(*state.shape[:2], c.memory, c.inputs) for c, piece in zip(convolutions, pieces, strict=True)]
-        x, later = tokens, []
+        past = [
+            piece.view(*state.shape[:2], c.memory, c.inputs)
+            for c, piece in zip(convolutions, pieces, strict=True)
+        ]
+        x, steady = tokens, []
         for level, block in enumerate(self.blocks):
             x, read = block(x, past[2 * level : 2 * level + 2])
-            later += read
+            steady += read
         logits = torch.baddbmm(self.b_out, x.flatten(1, 2), self.w_out).view(*x.shape[:3], -1)
-        return logits.sigmoid(), torch.cat([piece.flatten(2) for piece in later], dim=-1)
+        return logits.sigmoid(), torch.cat([piece.flatten(2) for piece in steady], dim=-1)
 
 
 class TcnPolicy(Policy):
@@ -152,5 +194,7 @@ class TcnPolicy(Policy):
     schema: ClassVar[type[Settings]] = TcnSettings
     settings: TcnSettings
 
-    def build(self, features: int, default: Tensor, fixed: Tensor, generator: torch.Generator) -> PolicyNetwork:
+    def build(
+        self, features: int, default: Tensor, fixed: Tensor, generator: torch.Generator
+    ) -> PolicyNetwork:
         return TcnNetwork(features, fixed, self.settings, generator)

@@ -13,7 +13,13 @@ from cfx_tcn.policy import TcnNetwork, TcnPolicy, TcnSettings
 
 
 class TestTcn(PolicyContract):
-    @pytest.fixture(params=[{}, {"levels": 1, "kernel": 4}, {"channels": 10, "levels": 2, "kernel": 2, "start": "middle"}])
+    @pytest.fixture(
+        params=[
+            {},
+            {"levels": 1, "kernel": 4},
+            {"channels": 10, "levels": 2, "kernel": 2, "start": "middle"},
+        ]
+    )
     def policy(self, request: pytest.FixtureRequest) -> TcnPolicy:
         return TcnPolicy(**{"channels": 6, **request.param})
 
@@ -23,12 +29,17 @@ class TestTcnWhoseTokensAreAsWideAsItsChannels(PolicyContract):
 
     @pytest.fixture
     def policy(self) -> TcnPolicy:
-        return TcnPolicy(channels=4, inputs=("gap", "relative_speed"), summary="mean_std", dropout=0.2)
+        return TcnPolicy(
+            channels=4, inputs=("gap", "relative_speed"), summary="mean_std", dropout=0.2
+        )
 
 
 def build(seed: int = 0, networks: int = 2, **options: object) -> TcnNetwork:
     network = TcnPolicy(**options).build(
-        5, torch.full((3,), 0.5), torch.full((networks, 3), 0.25), torch.Generator().manual_seed(seed)
+        5,
+        torch.full((3,), 0.5),
+        torch.full((networks, 3), 0.25),
+        torch.Generator().manual_seed(seed),
     )
     assert isinstance(network, TcnNetwork)
     return network.double().eval()
@@ -44,7 +55,10 @@ def torch_block(block: nn.Module, network: int, x: Tensor) -> Tensor:
     def convolve(layer: nn.Module, x: Tensor) -> Tensor:
         weight = layer.weight[network].unflatten(0, (layer.kernel, layer.inputs)).permute(2, 1, 0)
         return nn.functional.conv1d(
-            nn.functional.pad(x, (layer.memory, 0)), weight, layer.bias[network, 0], dilation=layer.dilation
+            nn.functional.pad(x, (layer.memory, 0)),
+            weight,
+            layer.bias[network, 0],
+            dilation=layer.dilation,
         )
 
     y = convolve(block.second, convolve(block.first, x).relu()).relu()
@@ -98,14 +112,25 @@ def test_it_learns_what_happened_some_windows_ago() -> None:
     assert float(loss.detach().max()) < 0.1 * float(answer.var())
 
 
-def test_a_job_trains_it_and_what_is_saved_drives_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_job_trains_it_and_what_is_saved_drives_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
-    quick = ["debug=quick", "data.frames=300", "learner.epochs=15", "tracking.enabled=false", "figures.enabled=false"]
+    quick = [
+        "debug=quick",
+        "data.frames=300",
+        "learner.epochs=15",
+        "tracking.enabled=false",
+        "figures.enabled=false",
+    ]
     result = cfx.run(["policy=tcn", "policy.channels=8", "policy.levels=2", *quick])
     assert isinstance(result.policy.network, TcnNetwork)
     curves = pd.read_parquet(result.folder / "curves.parquet").groupby("epoch").train_loss.mean()
     assert curves.iloc[-1] < curves.iloc[0]
     again = cfx.load(result.folder).policy.network
     tokens = noise(4, 1, 9, 10).float()
-    mine, theirs = (network(tokens, network.initial_state(4, 1))[0] for network in (result.policy.network, again))
+    mine, theirs = (
+        network(tokens, network.initial_state(4, 1))[0]
+        for network in (result.policy.network, again)
+    )
     assert torch.equal(mine, theirs)

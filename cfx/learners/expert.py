@@ -5,7 +5,7 @@ next, wherever the pupil has got to: so the pupil drives, and learns from each w
 later windows' switches (S. Ross, G. Gordon and D. Bagnell, 2011, *A reduction of imitation learning and structured prediction to
 no-regret online learning*, AISTATS).
 
-Letters: N networks, D drives of each, S steps of a window, n parameters, s width of the policy's state, m of the model's memory.
+Shapes: N networks, D drives of each, S steps of a window, n parameters, s width of the policy's state, m of the model's memory.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from cfx.learners.material import Drives, Material
+from cfx.learners.dataset import Drives, RolloutDataset
 from cfx.learners.window_step import Ahead, Recent, WindowStep
 
 
 @dataclass(frozen=True)
-class Teacher:
+class Expert:
     """N networks that know the pupils' drives.
 
     Attributes:
@@ -29,13 +29,15 @@ class Teacher:
     """
 
     step: WindowStep
-    material: Material
+    dataset: RolloutDataset
 
     @torch.no_grad()
     def watch(self, drives: Drives, leader_length: Tensor, most: int | None) -> Watching:
         """Begins to watch drives, having read what the pupil has; arguments as of `Material.read`, lengths `(N, D)` in m."""
-        _, base, told = self.material.of_drives(drives)
-        return Watching(self.step, base, told, leader_length, None, self.material.read(self.step, drives, most))
+        _, base, told = self.dataset.of_drives(drives)
+        return Watching(
+            self.step, base, told, leader_length, None, self.dataset.read(self.step, drives, most)
+        )
 
 
 @dataclass
@@ -45,7 +47,7 @@ class Watching:
     Attributes:
         step: drives one window.
         base: in unit space, `(N, D, n)`.
-        told: the same in the squashed space, and the drivers' traits, `(N, D, n + k)`.
+        told: the same in the squashed space, and the drivers' driver features, `(N, D, n + k)`.
         leader_length: `(N, D)`, m.
         memory: of the teacher's model, `(N, D, m)`; None before the first window.
         state: of the teacher's networks, `(N, D, s)`.
@@ -62,7 +64,9 @@ class Watching:
     def would_drive(self, recent: Recent, ahead: Ahead) -> Tensor:
         """Returns the speeds at which the teacher would drive the next window from where the pupil stands, `(N, D, S)` in m/s."""
         position, speed, acceleration = (value.detach() for value in recent[:3])
-        memory = self.step.model.initial_memory(speed[..., -1]) if self.memory is None else self.memory
+        memory = (
+            self.step.model.initial_memory(speed[..., -1]) if self.memory is None else self.memory
+        )
         stands = Recent(position, speed, acceleration, memory, self.state)
         after, wanted, _ = self.step.drive(stands, ahead, self.leader_length, self.base, self.told)
         self.memory, self.state = after.memory, after.state
@@ -71,5 +75,7 @@ class Watching:
 
 def apart(recent: Recent) -> Recent:
     """Returns the same state, through which gradients reach only what the policy remembers, not how the vehicle got there."""
-    position, speed, acceleration, memory = (value.detach().requires_grad_() for value in recent[:4])
+    position, speed, acceleration, memory = (
+        value.detach().requires_grad_() for value in recent[:4]
+    )
     return Recent(position, speed, acceleration, memory, recent.state)

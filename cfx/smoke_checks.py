@@ -28,7 +28,7 @@ NETWORKS, DRIVERS, WINDOWS, PARAMETERS, LENGTH = 3, 2, 4, 5, 5
 
 
 @torch.no_grad()
-def probe_model(model: DrivingModel) -> None:
+def smoke_check_model(model: DrivingModel) -> None:
     """Takes one step from ordinary states, in double and in single precision, with parameters as the class declares them.
 
     Raises:
@@ -50,7 +50,9 @@ def probe_model(model: DrivingModel) -> None:
                 " not negative"
             )
         memory = model.next_memory(follower, leader, p, DT, speed)
-        _require_tensor(memory, "next_memory", (STATES, model.memory_size), dtype, "(*batch, memory_size)")
+        _require_tensor(
+            memory, "next_memory", (STATES, model.memory_size), dtype, "(*batch, memory_size)"
+        )
         if not bool(memory.isfinite().all()):
             raise PluginError("next_memory gives a number that is not finite in an ordinary state")
         _require_all_read(model, p)
@@ -61,7 +63,9 @@ def _states(model: DrivingModel, dtype: torch.dtype) -> tuple[Follower, Leader]:
     draw = torch.Generator().manual_seed(0)
 
     def uniform(low: float, high: float) -> Tensor:
-        return low + (high - low) * torch.rand(STATES, generator=draw, dtype=torch.float64).to(dtype)
+        return low + (high - low) * torch.rand(STATES, generator=draw, dtype=torch.float64).to(
+            dtype
+        )
 
     speed, leader_speed = uniform(0.0, 25.0), uniform(0.0, 25.0)
     speed[:2] = 0.0
@@ -69,14 +73,18 @@ def _states(model: DrivingModel, dtype: torch.dtype) -> tuple[Follower, Leader]:
     length = uniform(4.0, 6.0)
     leader = Leader(uniform(100.0, 200.0), leader_speed, uniform(-1.0, 1.0), length)
     memory = model.initial_memory(speed)
-    _require_tensor(memory, "initial_memory", (STATES, model.memory_size), dtype, "(*batch, memory_size)")
+    _require_tensor(
+        memory, "initial_memory", (STATES, model.memory_size), dtype, "(*batch, memory_size)"
+    )
     position = leader.position - length - 2.0 - 1.5 * speed - uniform(0.0, 30.0)
     return Follower(position, speed, uniform(-1.0, 1.0), memory), leader
 
 
 def _values(space: ParameterSpace, dtype: torch.dtype) -> dict[str, Tensor]:
     """Returns the defaults for the first half of the states, and values within the declared bounds for the others."""
-    unit = torch.rand((STATES, len(space)), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    unit = torch.rand(
+        (STATES, len(space)), generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
     unit[: STATES // 2] = space.to_unit(space.defaults())
     return space.unpack(space.from_unit(unit).to(dtype))
 
@@ -93,7 +101,9 @@ class _Noted(dict[str, Tensor]):
         return super().__getitem__(name)
 
     def __missing__(self, name: str) -> NoReturn:
-        raise PluginError(f"next_speed reads the parameter '{name}', which is not in its `parameters` ({', '.join(self)})")
+        raise PluginError(
+            f"next_speed reads the parameter '{name}', which is not in its `parameters` ({', '.join(self)})"
+        )
 
     def get(self, name: str, default: Any = None) -> Any:
         self.read.add(name)
@@ -126,7 +136,10 @@ def _require_all_read(model: DrivingModel, p: _Noted) -> None:
         name
         for name, field in model.schema.model_fields.items()
         if name != "parameters"
-        and (field.is_required() or model.settings.__dict__[name] != field.get_default(call_default_factory=True))
+        and (
+            field.is_required()
+            or model.settings.__dict__[name] != field.get_default(call_default_factory=True)
+        )
     ]
     if changed:  # a variant of a model may leave some out
         return
@@ -139,7 +152,7 @@ def _require_all_read(model: DrivingModel, p: _Noted) -> None:
 
 
 @torch.no_grad()
-def probe_policy(policy: Policy) -> None:
+def smoke_check_policy(policy: Policy) -> None:
     """Builds a few networks and asks them about a few windows, in the precision in which a job uses them.
 
     Raises:
@@ -158,15 +171,25 @@ def probe_policy(policy: Policy) -> None:
         state = network.initial_state(NETWORKS, DRIVERS)
         answer, after = network.eval()(tokens, state)
     if not isinstance(state, Tensor) or state.dim() != 3 or state.shape[:2] != (NETWORKS, DRIVERS):
-        raise PluginError(f"initial_state gives {_shown(state)}; it must give (networks, drivers, s)")
-    _require_tensor(after, "the state after the last window", tuple(state.shape), state.dtype, "(networks, drivers, s)")
+        raise PluginError(
+            f"initial_state gives {_shown(state)}; it must give (networks, drivers, s)"
+        )
+    _require_tensor(
+        after,
+        "the state after the last window",
+        tuple(state.shape),
+        state.dtype,
+        "(networks, drivers, s)",
+    )
     expected = (NETWORKS, DRIVERS, WINDOWS, PARAMETERS)
     _require_tensor(answer, "forward", expected, dtype, "(networks, drivers, windows, parameters)")
     if not bool(((answer >= 0) & (answer <= 1)).all()):  # written so that NaN fails too
-        raise PluginError("forward answers NaN or a number outside [0, 1]; parameters are chosen in unit space")
+        raise PluginError(
+            "forward answers NaN or a number outside [0, 1]; parameters are chosen in unit space"
+        )
 
 
-def probe_optimizer(optimizer: Optimizer) -> None:
+def smoke_check_optimizer(optimizer: Optimizer) -> None:
     """Asks an optimizer for its numbers; what it finds is checked by `Optimizer.minimize`.
 
     Raises:
@@ -176,7 +199,9 @@ def probe_optimizer(optimizer: Optimizer) -> None:
     _whole(optimizer.evaluations_at_once(), "evaluations_at_once()", least=1)
     _whole(optimizer.bytes_per_problem(PARAMETERS), "bytes_per_problem(n)", least=0)
     if _whole(optimizer.space_filling(), "space_filling()", least=1) > evaluations:
-        raise PluginError(f"space_filling() gives more than the {evaluations} evaluations that evaluations() gives")
+        raise PluginError(
+            f"space_filling() gives more than the {evaluations} evaluations that evaluations() gives"
+        )
 
 
 def _whole(value: object, name: str, *, least: int) -> int:
@@ -185,12 +210,20 @@ def _whole(value: object, name: str, *, least: int) -> int:
     return value
 
 
-def _require_tensor(value: object, name: str, shape: tuple[int, ...], dtype: torch.dtype, letters: str) -> None:
+def _require_tensor(
+    value: object, name: str, shape: tuple[int, ...], dtype: torch.dtype, letters: str
+) -> None:
     if not isinstance(value, Tensor) or value.shape != shape:
         raise PluginError(f"{name} gives {_shown(value)}; it must give {letters}, here {shape}")
     if value.dtype != dtype:
-        raise PluginError(f"{name} gives {value.dtype} for {dtype}; a component computes in the dtype of what it is given")
+        raise PluginError(
+            f"{name} gives {value.dtype} for {dtype}; a component computes in the dtype of what it is given"
+        )
 
 
 def _shown(value: object) -> str:
-    return f"the shape {tuple(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
+    return (
+        f"the shape {tuple(value.shape)}"
+        if isinstance(value, Tensor)
+        else f"a {type(value).__name__}"
+    )

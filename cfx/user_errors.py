@@ -18,14 +18,16 @@ from cfx.errors import CfxError, nearest
 SUBCOMMANDS = ("plugins", "data", "ui")
 
 
-def is_mistake(error: BaseException) -> bool:
+def is_user_error(error: BaseException) -> bool:
     """Says whether an error raised outside the job itself is the user's to mend."""
-    if isinstance(error, CfxError | HydraException | OmegaConfBaseException | yaml.YAMLError | OSError):
+    if isinstance(
+        error, CfxError | HydraException | OmegaConfBaseException | yaml.YAMLError | OSError
+    ):
         return True
     # Hydra raises plain errors for contradictory flags and for options of the wrong type.
-    return isinstance(error, ValueError | AssertionError | RuntimeError | ImportError) and _raised_in(error).startswith(
-        ("hydra.", "hydra_plugins.", "omegaconf.")
-    )
+    return isinstance(
+        error, ValueError | AssertionError | RuntimeError | ImportError
+    ) and _raised_in(error).startswith(("hydra.", "hydra_plugins.", "omegaconf."))
 
 
 def explain(error: BaseException, overrides: Sequence[str]) -> str:
@@ -38,7 +40,11 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
             f"{file_error.filename}: {file_error.strerror}; choose an output folder that can be written with"
             " hydra.run.dir=FOLDER (multiruns: hydra.sweep.dir=FOLDER)"
         )
-    if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options is not None:
+    if (
+        isinstance(error, MissingConfigException)
+        and error.missing_cfg_file
+        and error.options is not None
+    ):
         return _unknown_option(error.missing_cfg_file, error.options)
     if isinstance(error, OverrideParseException):
         return _unreadable(error)
@@ -50,9 +56,13 @@ def _reworded(error: BaseException, overrides: Sequence[str]) -> str:
     unknown = re.search(r"Could not override '([^']+)'", text)
     if unknown:
         return _unknown_key(unknown[1], overrides)
-    several = re.search(r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?:\n| requires)", text)
+    several = re.search(
+        r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?:\n| requires)", text
+    )
     if several:
-        return f"{several[1]}: several values need a multirun; add -m (or write key=[a,b] for a list)"
+        return (
+            f"{several[1]}: several values need a multirun; add -m (or write key=[a,b] for a list)"
+        )
     if text.startswith("Config group override must be"):
         return f"{text}; choose an option by its name, such as model=w99"
     return _plain(error)
@@ -68,7 +78,11 @@ def _unreadable(error: OverrideParseException) -> str:
     word = error.override
     if "=" not in word:
         return f"{word}: neither key=value nor a sub-command.{nearest(word, SUBCOMMANDS)} See cfx --help."
-    words = [line for line in error.message.splitlines() if not line.startswith(("Error parsing", "See "))]
+    words = [
+        line
+        for line in error.message.splitlines()
+        if not line.startswith(("Error parsing", "See "))
+    ]
     detail = re.sub(r" expecting \{.*\}", "", words[0]) if words else "syntax"
     return f"{word}: cannot be read as key=value ({detail}); quote a value that holds special characters: key=\\'value\\'"
 
@@ -108,11 +122,17 @@ def _plain(error: BaseException) -> str:
         kept = [
             line
             for line in lines
-            if line and not line.startswith(("object_type=", "See https://", "Config search path", "provider="))
+            if line
+            and not line.startswith(
+                ("object_type=", "See https://", "Config search path", "provider=")
+            )
         ]
         if kept:
             parts.append(" ".join(kept))
-    return ": ".join(dict.fromkeys(parts)) or f"{type(error).__name__} while composing the configuration"
+    return (
+        ": ".join(dict.fromkeys(parts))
+        or f"{type(error).__name__} while composing the configuration"
+    )
 
 
 def _chain(error: BaseException) -> Iterator[BaseException]:
@@ -123,7 +143,11 @@ def _chain(error: BaseException) -> Iterator[BaseException]:
 
 
 def _is_about_a_file(error: BaseException) -> bool:
-    return isinstance(error, OSError) and not isinstance(error, HydraException) and bool(error.filename and error.strerror)
+    return (
+        isinstance(error, OSError)
+        and not isinstance(error, HydraException)
+        and bool(error.filename and error.strerror)
+    )
 
 
 def _raised_in(error: BaseException) -> str:

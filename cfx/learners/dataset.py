@@ -1,7 +1,7 @@
 """What is learned from when a policy learns by driving: drivers placed in networks, and drives drawn from their recordings.
 
-Letters: P pairs of the lesson, N networks (each member of a committee counts), B drivers of the largest, D drives, H windows of a
-drive, W windows of the longest pair, L frames that a token holds, S steps of a window, f features, n tuned parameters, k traits,
+Shapes: P pairs of the training data, N networks (each member of an ensemble counts), B drivers of the largest, D drives, H windows of a
+drive, W windows of the longest pair, L frames that a token holds, S steps of a window, f features, n tuned parameters, k driver features,
 s width of a policy's state, m of a model's memory.
 """
 
@@ -13,16 +13,16 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from cfx.learners.base import Lesson
+from cfx.learners.base import TrainingData
 from cfx.learners.batched import Grid
 from cfx.learners.window_step import Ahead, Recent, WindowStep
 from cfx.models.base import Leader
 from cfx.pairs import PairBatch
 from cfx.policies.base import Policy
+from cfx.policies.driver_features import measure
 from cfx.policies.features import tokens
 from cfx.policies.offsets import coordinates
 from cfx.policies.trained import Scaler, measured_history
-from cfx.policies.traits import measure
 from cfx.simulation.rollout import Start
 
 _FEW_DRIVERS = 5
@@ -38,7 +38,7 @@ class Drives(NamedTuple):
     Attributes:
         place: which of the network's drivers, `(N, D)`.
         start: window at whose beginning the policy takes over, `(N, D)`.
-        stranger: whether it has read nothing and begins from the population's parameters, bool `(N, D)`.
+        unseen driver: whether it has read nothing and begins from the population's parameters, bool `(N, D)`.
         last: the last frame that counts, `(N, D)`.
         weight: `(N, D)`; 0 leaves a drive out.
         scale: factor on all distances, speeds and accelerations of the drive, `(N, D)`; None: 1. A made-up recording of another
@@ -47,7 +47,7 @@ class Drives(NamedTuple):
 
     place: Tensor
     start: Tensor
-    stranger: Tensor
+    cold_start: Tensor
     last: Tensor
     weight: Tensor
     scale: Tensor | None = None
@@ -61,13 +61,15 @@ class Drives(NamedTuple):
         """Returns the drives that have weight, in order; others fill up a network that has fewer of them than another."""
         has_weight = self.weight > 0
         most = int(has_weight.sum(1).max())
-        kept = has_weight.long().argsort(dim=1, descending=True, stable=True)[:, :most].sort(1).values
+        kept = (
+            has_weight.long().argsort(dim=1, descending=True, stable=True)[:, :most].sort(1).values
+        )
         return Drives._make(value if value is None else value.gather(1, kept) for value in self)
 
 
 @dataclass
-class Material:
-    """The lesson, placed as N networks by B drivers, in single precision.
+class RolloutDataset:
+    """The training data, placed as N networks by B drivers, in single precision.
 
     Attributes:
         batch: the P pairs.
@@ -78,10 +80,10 @@ class Material:
         base: each driver's base in unit space, `(N, B, n)`.
         start: the population's, `(N, n)`: of those who bring no base of their own.
         tokens: what was measured, `(P, W, f)`.
-        traits: of drivers, from their whole training parts, `(P, k)`; NaN where too little was measured.
-        scaler: normalises tokens, the base in the squashed space, and traits, f + n + k features; alike for all members of a
-            committee.
-        members: networks of a committee, which stand behind one another.
+        driver features: of drivers, from their whole training parts, `(P, k)`; NaN where too little was measured.
+        scaler: normalises tokens, the base in the squashed space, and driver features, f + n + k features; alike for all members of a
+            ensemble.
+        members: networks of an ensemble, which stand behind one another.
     """
 
     batch: PairBatch
@@ -93,47 +95,69 @@ class Material:
     base: Tensor
     start: Tensor
     tokens: Tensor
-    traits: Tensor
+    driver_features: Tensor
     scaler: Scaler
-    members: int = 1
+    ensemble_size: int = 1
 
     @classmethod
-    def of(cls, lesson: Lesson, policy: Policy, share: float, generator: torch.Generator, members: int = 1) -> Material:
-        """Places a lesson.
+    def of(
+        cls,
+        training_data: TrainingData,
+        policy: Policy,
+        share: float,
+        generator: torch.Generator,
+        ensemble_size: int = 1,
+    ) -> RolloutDataset:
+        """Places training data.
 
         Args:
-            lesson: what may be learned from.
+            training data: what may be learned from.
             policy: what is read.
             share: of the drivers (of each drive's end, where drivers are few), kept for validation.
-            generator: chooses them, for each member of a committee anew.
-            members: networks of a committee.
+            generator: chooses them, for each member of an ensemble anew.
+            members: networks of an ensemble.
         """
-        batch = _single(lesson.batch)
+        batch = _single(training_data.batch)
         device = batch.lengths.device
-        space, stride = lesson.simulator.model.reach, lesson.windows.stride
-        grid = Grid(lesson.network.to(device), len(lesson.names))
+        space, stride = training_data.simulator.model.adaptation_space, training_data.windows.stride
+        grid = Grid(training_data.network.to(device), len(training_data.names))
         pairs = torch.arange(len(batch), device=device)
-        population = grid.mean(space.to_unit(lesson.fixed)).float()
+        population = grid.mean(space.to_unit(training_data.fixed)).float()
         placed = (grid.scatter(pairs), grid.scatter(torch.ones_like(pairs)).bool(), population)
-        pair, real, start = (values.repeat_interleave(members, 0) for values in placed)
-        last = lesson.split.frame.to(device)[pair]
-        held, few = _held_out(lesson, pair.cpu(), real.cpu(), share, generator)
+        pair, real, start = (values.repeat_interleave(ensemble_size, 0) for values in placed)
+        last = training_data.split.frame.to(device)[pair]
+        held, few = _held_out(training_data, pair.cpu(), real.cpu(), share, generator)
         held, few = held.to(device), few.to(device)[:, None]
         cut = (last * (1.0 - share)).long()
-        own = space.to_unit(lesson.fixed if lesson.base is None else lesson.base).float()
-        windows = torch.arange(0, int(lesson.split.frame.max()) + 1, stride, device=device)
-        seen = tokens(measured_history(batch, pairs[:, None], windows, lesson.windows.length), policy.inputs, policy.summary)
+        own = space.to_unit(
+            training_data.fixed if training_data.base is None else training_data.base
+        ).float()
+        windows = torch.arange(0, int(training_data.split.frame.max()) + 1, stride, device=device)
+        seen = tokens(
+            measured_history(batch, pairs[:, None], windows, training_data.windows.length),
+            policy.inputs,
+            policy.summary,
+        )
         trains = real & (few | ~held)
         until = torch.where(few, cut, last)
-        traits = _traits(lesson, policy, batch)
-        features = torch.cat([seen, coordinates(own)[:, None].expand(-1, len(windows), -1)], -1)[pair[::members]]
-        seen_by_any = trains.view(-1, members, trains.shape[1]).any(1)
-        there = seen_by_any[..., None] & (windows <= until[::members, :, None])
-        known = traits.isnan().logical_not().all(-1)[pair[::members]]
-        told = traits.nan_to_num()[pair[::members], None].expand(-1, -1, len(windows), -1)
+        driver_features = _driver_features(training_data, policy, batch)
+        features = torch.cat([seen, coordinates(own)[:, None].expand(-1, len(windows), -1)], -1)[
+            pair[::ensemble_size]
+        ]
+        seen_by_any = trains.view(-1, ensemble_size, trains.shape[1]).any(1)
+        there = seen_by_any[..., None] & (windows <= until[::ensemble_size, :, None])
+        known = driver_features.isnan().logical_not().all(-1)[pair[::ensemble_size]]
+        told = driver_features.nan_to_num()[pair[::ensemble_size], None].expand(
+            -1, -1, len(windows), -1
+        )
         scalers = Scaler.of(features, there), Scaler.of(told, there & known[..., None])
-        mean, scale = (torch.cat(values, -1) for values in zip(*((one.mean, one.scale) for one in scalers), strict=True))
-        scaler = Scaler(mean.repeat_interleave(members, 0), scale.repeat_interleave(members, 0))
+        mean, scale = (
+            torch.cat(values, -1)
+            for values in zip(*((one.mean, one.scale) for one in scalers), strict=True)
+        )
+        scaler = Scaler(
+            mean.repeat_interleave(ensemble_size, 0), scale.repeat_interleave(ensemble_size, 0)
+        )
         return cls(
             batch=batch,
             pair=pair,
@@ -144,21 +168,30 @@ class Material:
             base=own[pair],
             start=start,
             tokens=seen,
-            traits=traits,
+            driver_features=driver_features,
             scaler=scaler,
-            members=members,
+            ensemble_size=ensemble_size,
         )
 
-    def driven_from(self, base: Tensor) -> Material:
+    def driven_from(self, base: Tensor) -> RolloutDataset:
         """Returns the same drivers, all driven from one base of another model, `(n,)` in its unit space."""
-        (networks, drivers), tokens, traits = self.pair.shape, self.tokens.shape[-1], self.tokens.shape[-1] + self.base.shape[-1]
+        (networks, drivers), tokens, driver_features = (
+            self.pair.shape,
+            self.tokens.shape[-1],
+            self.tokens.shape[-1] + self.base.shape[-1],
+        )
         told = coordinates(base).expand(networks, -1)
         mean, scale = self.scaler.mean, self.scaler.scale
         scaler = Scaler(
-            torch.cat([mean[:, :tokens], told, mean[:, traits:]], -1),
-            torch.cat([scale[:, :tokens], torch.ones_like(told), scale[:, traits:]], -1),
+            torch.cat([mean[:, :tokens], told, mean[:, driver_features:]], -1),
+            torch.cat([scale[:, :tokens], torch.ones_like(told), scale[:, driver_features:]], -1),
         )
-        return replace(self, base=base.expand(networks, drivers, -1), start=base.expand(networks, -1), scaler=scaler)
+        return replace(
+            self,
+            base=base.expand(networks, drivers, -1),
+            start=base.expand(networks, -1),
+            scaler=scaler,
+        )
 
     def driving(self, most: int | None, generator: torch.Generator) -> Tensor:
         """Returns places of the drivers for whom drives are drawn in one gradient step, as many of each network, `(N, D)`.
@@ -184,18 +217,28 @@ class Material:
 
         Returns:
             Which pair each is of, `(N, D)`; the base that its driver is driven from, `(N, D, n)`; and what networks are told of
-            him in every window: that base in the squashed space, and his traits, `(N, D, n + k)`.
+            him in every window: that base in the squashed space, and his driver features, `(N, D, n + k)`.
         """
-        pair, stranger = self.pair.gather(1, drives.place), drives.stranger[..., None]
-        base = torch.where(stranger, self.start[:, None], self.base[drives.row, drives.place])
+        pair, cold_start = self.pair.gather(1, drives.place), drives.cold_start[..., None]
+        base = torch.where(cold_start, self.start[:, None], self.base[drives.row, drives.place])
         told = coordinates(base)
-        if (k := self.traits.shape[-1]) > 0:
-            traits = self.traits[pair]
-            told = torch.cat([told, torch.where(stranger | traits.isnan(), self.scaler.mean[:, None, -k:], traits)], -1)
+        if (k := self.driver_features.shape[-1]) > 0:
+            driver_features = self.driver_features[pair]
+            told = torch.cat(
+                [
+                    told,
+                    torch.where(
+                        cold_start | driver_features.isnan(),
+                        self.scaler.mean[:, None, -k:],
+                        driver_features,
+                    ),
+                ],
+                -1,
+            )
         return pair, base, told
 
     def read(self, step: WindowStep, drives: Drives, most: int | None = None) -> Tensor:
-        """Lets the policy read what was measured before each drive; nothing, for a stranger.
+        """Lets the policy read what was measured before each drive; nothing, for an unseen driver.
 
         Args:
             step: reads one window.
@@ -206,13 +249,15 @@ class Material:
             The policy's state as each drive begins, `(N, D, s)`.
         """
         pair, _, told = self.of_drives(drives)
-        start = torch.where(drives.stranger, 0, drives.start)
+        start = torch.where(drives.cold_start, 0, drives.start)
         count = int(start.max()) if most is None else min(int(start.max()), most)
         windows = start - count + torch.arange(count, device=start.device)[:, None, None]
         seen = self.tokens[pair, windows.clamp(min=0)]
         state = step.network.initial_state(*pair.shape)
         if state.is_floating_point() and torch.is_grad_enabled():
-            state = state.detach().requires_grad_()  # as all later ones, so that one compiled function serves all
+            state = (
+                state.detach().requires_grad_()
+            )  # as all later ones, so that one compiled function serves all
         for k in range(count):
             state = step.read(seen[k], told, state, windows[k] >= 0)
         return state
@@ -251,7 +296,9 @@ class Scene:
     measured: Real
 
     @classmethod
-    def of(cls, batch: PairBatch, pair: Tensor, drives: Drives, step: WindowStep, windows: int) -> Scene:
+    def of(
+        cls, batch: PairBatch, pair: Tensor, drives: Drives, step: WindowStep, windows: int
+    ) -> Scene:
         length, stride = step.length, step.stride
         now, end = (drives.start * stride)[..., None], batch.mask.shape[1] - 1
         device = pair.device
@@ -262,12 +309,22 @@ class Scene:
         origin = at(batch.follower_position, now)
         past = now + torch.arange(1 - length, 1, device=device)
         follower = torch.stack(
-            [at(batch.follower_position, past) - origin, at(batch.follower_speed, past), at(batch.follower_acceleration, past)]
+            [
+                at(batch.follower_position, past) - origin,
+                at(batch.follower_speed, past),
+                at(batch.follower_acceleration, past),
+            ]
         )
-        offsets = torch.arange(windows, device=device)[:, None] * stride + torch.arange(1 - length, stride + 1, device=device)
+        offsets = torch.arange(windows, device=device)[:, None] * stride + torch.arange(
+            1 - length, stride + 1, device=device
+        )
         around = now + offsets[:, None, None]
         leader = torch.stack(
-            [at(batch.leader_position, around) - origin, at(batch.leader_speed, around), at(batch.leader_acceleration, around)]
+            [
+                at(batch.leader_position, around) - origin,
+                at(batch.leader_speed, around),
+                at(batch.leader_acceleration, around),
+            ]
         )
         simulated = now + torch.arange(1, windows * stride + 1, device=device)
         length_of = batch.leader_length[pair]
@@ -296,7 +353,9 @@ class Scene:
         if not torch.is_grad_enabled():
             return begin
         # Gradients flow through all later states; if they did not through the first, it would be compiled for once more.
-        return Recent(*(value if value.requires_grad else value.clone().requires_grad_() for value in begin))
+        return Recent(
+            *(value if value.requires_grad else value.clone().requires_grad_() for value in begin)
+        )
 
     def real(self, frames: slice) -> Real:
         """Returns what was measured at some of the simulated frames."""
@@ -322,20 +381,27 @@ class BaseErrors:
     whole: Tensor
 
     @classmethod
-    def of(cls, lesson: Lesson, material: Material, horizon: int) -> BaseErrors:
+    def of(cls, training_data: TrainingData, dataset: RolloutDataset, horizon: int) -> BaseErrors:
         """Simulates them; `horizon` in windows."""
-        stride, (networks, drivers) = lesson.windows.stride, material.pair.shape
-        windows = torch.arange(material.tokens.shape[1], device=material.pair.device) * stride
-        near, far = (_Constant(lesson, material.batch, steps) for steps in (horizon * stride, int(material.last.max())))
-        first = slice(None, None, material.members)  # what drives is the same for all members
-        pairs, own = material.pair[first].flatten(), material.base[first].flatten(0, 1)
-        start = material.start[first].repeat_interleave(drivers, 0)
+        stride, (networks, drivers) = training_data.windows.stride, dataset.pair.shape
+        windows = torch.arange(dataset.tokens.shape[1], device=dataset.pair.device) * stride
+        near, far = (
+            _Constant(training_data, dataset.batch, steps)
+            for steps in (horizon * stride, int(dataset.last.max()))
+        )
+        first = slice(None, None, dataset.ensemble_size)  # what drives is the same for all members
+        pairs, own = dataset.pair[first].flatten(), dataset.base[first].flatten(0, 1)
+        start = dataset.start[first].repeat_interleave(drivers, 0)
 
         def placed(errors: Tensor) -> Tensor:
-            return errors.view(networks // material.members, drivers, -1, 2).repeat_interleave(material.members, 0)
+            return errors.view(networks // dataset.ensemble_size, drivers, -1, 2).repeat_interleave(
+                dataset.ensemble_size, 0
+            )
 
         familiar = placed(near.errors(pairs, own, windows))
-        strange = familiar if lesson.base is None else placed(near.errors(pairs, start, windows))
+        strange = (
+            familiar if training_data.base is None else placed(near.errors(pairs, start, windows))
+        )
         return cls(familiar, strange, placed(far.errors(pairs, start, windows[:1]))[:, :, 0])
 
     def over_whole(self, drives: Drives) -> Tensor:
@@ -345,7 +411,9 @@ class BaseErrors:
     def over_horizon(self, drives: Drives) -> Tensor:
         """Returns the errors over the horizon from where each drive begins, `(N, D, 2)`."""
         places = (drives.row, drives.place, drives.start)
-        errors = torch.where(drives.stranger[..., None], self.strange[places], self.familiar[places])
+        errors = torch.where(
+            drives.cold_start[..., None], self.strange[places], self.familiar[places]
+        )
         return _scaled(errors, drives)
 
 
@@ -356,11 +424,11 @@ def _scaled(errors: Tensor, drives: Drives) -> Tensor:
 class _Constant:
     """Drives with constant parameters from many frames on."""
 
-    def __init__(self, lesson: Lesson, batch: PairBatch, steps: int) -> None:
-        self.simulator = lesson.simulator
+    def __init__(self, training_data: TrainingData, batch: PairBatch, steps: int) -> None:
+        self.simulator = training_data.simulator
         self.batch = batch
         self.steps = steps
-        self.last = lesson.split.frame.to(batch.lengths.device)
+        self.last = training_data.split.frame.to(batch.lengths.device)
 
     @torch.no_grad()
     def errors(self, pair: Tensor, unit: Tensor, windows: Tensor) -> Tensor:
@@ -383,12 +451,24 @@ class _Constant:
         rows = pair[:, None].expand(shape)
         first = windows.clamp(max=end).expand(shape)
         position, speed, acceleration = (
-            signal[rows, index] for signal in (batch.leader_position, batch.leader_speed, batch.leader_acceleration)
+            signal[rows, index]
+            for signal in (batch.leader_position, batch.leader_speed, batch.leader_acceleration)
         )
         length = batch.leader_length[rows]
-        start = Start(*(s[rows, first] for s in (batch.follower_position, batch.follower_speed, batch.follower_acceleration)))
-        space = self.simulator.model.reach
-        p = {k: v[:, None] if v.dim() else v for k, v in space.unpack(space.from_unit(unit)).items()}
+        start = Start(
+            *(
+                s[rows, first]
+                for s in (
+                    batch.follower_position,
+                    batch.follower_speed,
+                    batch.follower_acceleration,
+                )
+            )
+        )
+        space = self.simulator.model.adaptation_space
+        p = {
+            k: v[:, None] if v.dim() else v for k, v in space.unpack(space.from_unit(unit)).items()
+        }
         leader = Leader(position[:-1], speed[:-1], acceleration[:-1], length)
         _, simulated, driven = self.simulator.advance(self.simulator.begin(start), leader, p)
         counted = (frames[1:] <= self.last[pair][:, None]).to(driven.dtype)
@@ -405,12 +485,14 @@ def _single(batch: PairBatch) -> PairBatch:
     return replace(batch, **changed)
 
 
-def _traits(lesson: Lesson, policy: Policy, batch: PairBatch) -> Tensor:
+def _driver_features(training_data: TrainingData, policy: Policy, batch: PairBatch) -> Tensor:
     """Returns what networks are told of the drivers, `(P, k)`."""
-    until = lesson.split.frame.to(batch.lengths.device)
-    if not policy.traits:
+    until = training_data.split.frame.to(batch.lengths.device)
+    if not policy.driver_features:
         return until.new_empty((len(batch), 0), dtype=torch.float32)
-    return measure(batch, policy.traits, lesson.simulator.dt, torch.zeros_like(until), until).float()
+    return measure(
+        batch, policy.driver_features, training_data.simulator.dt, torch.zeros_like(until), until
+    ).float()
 
 
 def _chosen(wanted: Tensor, count: int, generator: torch.Generator) -> Tensor:
@@ -419,13 +501,21 @@ def _chosen(wanted: Tensor, count: int, generator: torch.Generator) -> Tensor:
     return torch.where(wanted, lots, -1.0).topk(count, dim=1).indices.sort(1).values
 
 
-def _held_out(lesson: Lesson, pair: Tensor, real: Tensor, share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def _held_out(
+    training_data: TrainingData,
+    pair: Tensor,
+    real: Tensor,
+    share: float,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor]:
     """Chooses validation drivers for each network.
 
     Returns:
         Whether a place's driver is held out, `(N, B)`; and which networks have too few drivers for that, `(N,)`.
     """
-    drivers = lesson.drivers or tuple(str(number) for number in range(len(lesson.batch)))
+    drivers = training_data.drivers or tuple(
+        str(number) for number in range(len(training_data.batch))
+    )
     held, few = torch.zeros_like(real), torch.zeros(len(pair), dtype=torch.bool)
     for number, (places, there) in enumerate(zip(pair.tolist(), real.tolist(), strict=True)):
         who = [drivers[place] if here else None for place, here in zip(places, there, strict=True)]

@@ -20,20 +20,22 @@ from cfx.datasets.tidy import write_tidy
 from cfx.errors import ConfigError
 from cfx.models.krauss import Krauss
 from cfx.pairs import PairBatch
+from cfx.policies.driver_features import DRIVER_FEATURES, LEAST, MOVING, measure
 from cfx.policies.features import History
 from cfx.policies.gru import GruPolicy
 from cfx.policies.trained import TrainedPolicy, measured_history
-from cfx.policies.traits import LEAST, MOVING, TRAITS, measure
 from tests.drives import straight_pairs, wavy_pairs
 from tests.sumo.policies import adaptive
 
-ALL = tuple(TRAITS)
+ALL = tuple(DRIVER_FEATURES)
 PARAMETERS = torch.tensor([[1.0, 0.1], [1.8, 0.5], [3.0, 0.4]]).double()
 BATCH = PairBatch.of(wavy_pairs(Krauss(), PARAMETERS, frames=300))
 frame = st.integers(0, 299)
 
 
-def measured(batch: PairBatch, since: int, until: int, names: tuple[str, ...] = ALL) -> torch.Tensor:
+def measured(
+    batch: PairBatch, since: int, until: int, names: tuple[str, ...] = ALL
+) -> torch.Tensor:
     pairs = len(batch)
     return measure(batch, names, 0.1, torch.full((pairs,), since), torch.full((pairs,), until))
 
@@ -42,14 +44,21 @@ def by_hand(pair: int, since: int, until: int) -> dict[str, float]:
     """The same from the signals, with NumPy, and scikit-learn's ridge regression around a slope of 1.2 s."""
     speed, leader, acceleration, gap = (
         signal[pair, since:until].double().numpy()
-        for signal in (BATCH.follower_speed, BATCH.leader_speed, BATCH.follower_acceleration, BATCH.gap)
+        for signal in (
+            BATCH.follower_speed,
+            BATCH.leader_speed,
+            BATCH.follower_acceleration,
+            BATCH.gap,
+        )
     )
     moving = speed > MOVING
     if moving.sum() * 0.1 < LEAST:
         return dict.fromkeys(ALL, math.nan)
     headway = np.log(np.maximum(gap[moving], 0.5) / speed[moving])
     ridge = Ridge(alpha=2.0 * len(speed)).fit(speed[:, None], gap - 1.2 * speed)
-    rms = [math.log(np.sqrt(np.mean(signal**2)) + 0.05) for signal in (leader - speed, acceleration)]
+    rms = [
+        math.log(np.sqrt(np.mean(signal**2)) + 0.05) for signal in (leader - speed, acceleration)
+    ]
     return {
         "time_headway": float(headway.mean()),
         "time_gap": 1.2 + float(ridge.coef_[0]),
@@ -65,7 +74,9 @@ def test_any_stretch_has_the_traits_of_its_frames(one: int, other: int, pair: in
     since, until = sorted((one, other))
     found = dict(zip(ALL, measured(BATCH, since, until)[pair].tolist(), strict=True))
     expected = by_hand(pair, since, until)
-    assert {name: found[name] for name in expected} == pytest.approx(expected, rel=1e-6, abs=1e-6, nan_ok=True)
+    assert {name: found[name] for name in expected} == pytest.approx(
+        expected, rel=1e-6, abs=1e-6, nan_ok=True
+    )
 
 
 @pytest.mark.parametrize("delay", [0.0, 1.0, 2.4])
@@ -81,9 +92,15 @@ def test_who_repeats_what_his_leader_did_responds_after_as_long(delay: float) ->
 @settings(deadline=None)
 @given(frame, st.sampled_from(ALL))
 def test_what_is_still_to_come_tells_nothing(until: int, name: str) -> None:
-    later = torch.arange(BATCH.mask.shape[1]) >= until
-    signals = ("leader_speed", "leader_acceleration", "follower_speed", "follower_acceleration", "leader_position")
-    other = replace(BATCH, **{signal: getattr(BATCH, signal) + 7.0 * later for signal in signals})
+    steady = torch.arange(BATCH.mask.shape[1]) >= until
+    signals = (
+        "leader_speed",
+        "leader_acceleration",
+        "follower_speed",
+        "follower_acceleration",
+        "leader_position",
+    )
+    other = replace(BATCH, **{signal: getattr(BATCH, signal) + 7.0 * steady for signal in signals})
     one, same = (measured(batch, 0, until, (name,)) for batch in (BATCH, other))
     torch.testing.assert_close(one, same, rtol=0, atol=0, equal_nan=True)
 
@@ -99,44 +116,62 @@ def test_who_was_hardly_measured_or_stood_is_unknown() -> None:
 
 
 def one_that_knows() -> TrainedPolicy:
-    """Two networks for whom an unknown trait is 6, the mean of those they learned from."""
-    return adaptive({"name": "krauss"}, ("one", "all"), offsets=True, traits=("time_headway", "acceleration"))
+    """Two networks for whom an unknown driver feature is 6, the mean of those they learned from."""
+    return adaptive(
+        {"name": "krauss"},
+        ("one", "all"),
+        offsets=True,
+        driver_features=("time_headway", "acceleration"),
+    )
 
 
-def first_answer(policy: TrainedPolicy, traits: list[float] | None) -> list[float]:
-    now = History(*(torch.full((1, policy.windows.length), value).double() for value in (8.0, 0.1, 9.0, -0.2, 15.0)))
-    told = None if traits is None else torch.tensor([traits]).double()
-    return policy.act(now, policy.begin(torch.ones(1, dtype=torch.long), traits=told))[0][0].tolist()
+def first_answer(policy: TrainedPolicy, driver_features: list[float] | None) -> list[float]:
+    now = History(
+        *(
+            torch.full((1, policy.windows.length), value).double()
+            for value in (8.0, 0.1, 9.0, -0.2, 15.0)
+        )
+    )
+    told = None if driver_features is None else torch.tensor([driver_features]).double()
+    return policy.act(now, policy.begin(torch.ones(1, dtype=torch.long), driver_features=told))[0][
+        0
+    ].tolist()
 
 
 def test_a_stranger_is_taken_for_the_mean_of_those_who_were_learned_from() -> None:
     policy = one_that_knows()
-    stranger = first_answer(policy, None)
-    assert stranger == first_answer(policy, [6.0, 6.0]) == first_answer(policy, [math.nan, math.nan])
-    assert stranger != pytest.approx(first_answer(policy, [0.7, -0.5]), rel=1e-4)
+    cold_start = first_answer(policy, None)
+    assert (
+        cold_start == first_answer(policy, [6.0, 6.0]) == first_answer(policy, [math.nan, math.nan])
+    )
+    assert cold_start != pytest.approx(first_answer(policy, [0.7, -0.5]), rel=1e-4)
     assert first_answer(policy, [math.nan, -0.5]) == first_answer(policy, [6.0, -0.5])
 
 
 def test_a_saved_policy_knows_the_same_traits(tmp_path: Path) -> None:
     policy = one_that_knows()
     policy.save(tmp_path)
-    for again in (TrainedPolicy.load(tmp_path), TrainedPolicy.load(tmp_path).for_strangers()):
-        now = History(*(torch.full((1, 5), value).double() for value in (8.0, 0.1, 9.0, -0.2, 15.0)))
+    for again in (TrainedPolicy.load(tmp_path), TrainedPolicy.load(tmp_path).for_unseen_drivers()):
+        now = History(
+            *(torch.full((1, 5), value).double() for value in (8.0, 0.1, 9.0, -0.2, 15.0))
+        )
         network = torch.tensor([len(again.names) - 1])
-        answer, _ = again.act(now, again.begin(network, traits=torch.tensor([[0.7, -0.5]]).double()))
+        answer, _ = again.act(
+            now, again.begin(network, driver_features=torch.tensor([[0.7, -0.5]]).double())
+        )
         assert answer[0].tolist() == pytest.approx(first_answer(policy, [0.7, -0.5]), rel=1e-6)
 
 
 def test_whoever_asks_with_a_table_is_answered_with_its_drivers_traits(tmp_path: Path) -> None:
     write_tidy(wavy_pairs(Krauss(), PARAMETERS, frames=300), tmp_path / "pairs.parquet")
     table = pd.read_parquet(tmp_path / "pairs.parquet")
-    policy = adaptive({"name": "krauss"}, traits=("time_headway", "response_time"))
+    policy = adaptive({"name": "krauss"}, driver_features=("time_headway", "response_time"))
     until, network = BATCH.lengths - 1, torch.zeros(3, dtype=torch.long)
     chosen = {}
-    for traits in (policy.traits_of(BATCH, until), None):
-        state = policy.read(BATCH, until, policy.begin(network, traits=traits))
+    for driver_features in (policy.driver_features_of(BATCH, until), None):
+        state = policy.read(BATCH, until, policy.begin(network, driver_features=driver_features))
         now = measured_history(BATCH, torch.arange(3), until, policy.windows.length)
-        chosen[traits is None] = policy.act(now, state)[0][:, 0].tolist()
+        chosen[driver_features is None] = policy.act(now, state)[0][:, 0].tolist()
     found = policy.predict_frame(table)["t_r"].tolist()
     assert found == pytest.approx(chosen[False], rel=1e-6)
     assert found != pytest.approx(chosen[True], rel=1e-3)
@@ -145,26 +180,48 @@ def test_whoever_asks_with_a_table_is_answered_with_its_drivers_traits(tmp_path:
 def test_how_much_history_is_read_says_how_much_is_measured() -> None:
     policy, until = one_that_knows(), torch.tensor([290, 290, 290])
     names = ("time_headway", "acceleration")
-    torch.testing.assert_close(policy.traits_of(BATCH, until, until - 210), measured(BATCH, 80, 290, names))
-    torch.testing.assert_close(policy.traits_of(BATCH, until), measured(BATCH, 0, 290, names))
-    nothing = policy.traits_of(BATCH, until, until)
+    torch.testing.assert_close(
+        policy.driver_features_of(BATCH, until, until - 210), measured(BATCH, 80, 290, names)
+    )
+    torch.testing.assert_close(
+        policy.driver_features_of(BATCH, until), measured(BATCH, 0, 290, names)
+    )
+    nothing = policy.driver_features_of(BATCH, until, until)
     assert nothing is not None
     assert bool(nothing.isnan().all())
-    assert adaptive({"name": "krauss"}).traits_of(BATCH, until) is None
+    assert adaptive({"name": "krauss"}).driver_features_of(BATCH, until) is None
 
 
 def test_a_trait_that_is_none_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"policy.traits: unknown trait 'time_headwy'. Did you mean 'time_headway'"):
-        GruPolicy(traits=("time_headwy",))
-    with pytest.raises(ConfigError, match=r"policy.traits: a trait stands twice in time_gap, time_gap"):
-        GruPolicy(traits=("time_gap", "time_gap"))
-    with pytest.raises((ConfigError, ValidationError), match=r"not a set of traits. Write \[time_gap\]"):
-        GruPolicy(traits="time_gap")
-    assert GruPolicy(traits="all").traits == ALL
-    assert GruPolicy(traits="none").traits == ()
+    with pytest.raises(
+        ConfigError,
+        match=r"policy.driver_features: unknown driver feature 'time_headwy'. Did you mean 'time_headway'",
+    ):
+        GruPolicy(driver_features=("time_headwy",))
+    with pytest.raises(
+        ConfigError,
+        match=r"policy.driver_features: a driver feature stands twice in time_gap, time_gap",
+    ):
+        GruPolicy(driver_features=("time_gap", "time_gap"))
+    with pytest.raises(
+        (ConfigError, ValidationError), match=r"not a set of driver features. Write \[time_gap\]"
+    ):
+        GruPolicy(driver_features="time_gap")
+    assert GruPolicy(driver_features="all").driver_features == ALL
+    assert GruPolicy(driver_features="none").driver_features == ()
 
 
 def test_a_learner_that_tells_its_networks_nothing_refuses_traits(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"policy.traits=\['time_gap'\]: this learner tells its networks nothing of drivers"):
-        cfx.run(["debug=quick", "policy.traits=[time_gap]", "tracking.enabled=false", f"hydra.run.dir={tmp_path / 'job'}"])
+    with pytest.raises(
+        ConfigError,
+        match=r"policy.driver_features=\['time_gap'\]: this learner tells its networks nothing of drivers",
+    ):
+        cfx.run(
+            [
+                "debug=quick",
+                "policy.driver_features=[time_gap]",
+                "tracking.enabled=false",
+                f"hydra.run.dir={tmp_path / 'job'}",
+            ]
+        )
     assert not (tmp_path / "job" / "pairs.csv").exists()

@@ -14,8 +14,8 @@ from cfx.policies.base import PolicyNetwork
 _EDGE = 1e-6
 
 
-class Committee(PolicyNetwork):
-    """N committees of M networks. All members of a committee read the same; it answers, for each parameter, their median.
+class Ensemble(PolicyNetwork):
+    """N ensembles of M networks. All members of an ensemble read the same; it answers, for each parameter, their median.
 
     Not their mean: a member who answers far out drags it to where no member is, and a model with regimes (Wiedemann 74) then
     drives worse than each of them. Of an even number the median is the mean of the middle two in the squashed space (logits). It
@@ -23,7 +23,7 @@ class Committee(PolicyNetwork):
     """
 
     def __init__(self, members: PolicyNetwork, size: int) -> None:
-        """Takes N times M networks, those of one committee behind one another, and M."""
+        """Takes N times M networks, those of one ensemble behind one another, and M."""
         super().__init__()
         self.members = members
         self.size = size
@@ -33,11 +33,19 @@ class Committee(PolicyNetwork):
 
     def forward(self, tokens: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         networks, drivers, width = state.shape
-        apart = state.view(networks, drivers, self.size, width // self.size).transpose(1, 2).flatten(0, 1)
+        apart = (
+            state.view(networks, drivers, self.size, width // self.size)
+            .transpose(1, 2)
+            .flatten(0, 1)
+        )
         answers, after = self.members(tokens.repeat_interleave(self.size, 0), apart)
         logits = torch.logit(answers, eps=_EDGE).view(networks, self.size, *answers.shape[1:])
         return logits.quantile(0.5, dim=1).sigmoid(), self._together(after)
 
     def _together(self, states: Tensor) -> Tensor:
         """Arranges the members' states `(N M, B, s)` as `(N, B, M s)`."""
-        return states.view(len(states) // self.size, self.size, *states.shape[1:]).transpose(1, 2).flatten(2)
+        return (
+            states.view(len(states) // self.size, self.size, *states.shape[1:])
+            .transpose(1, 2)
+            .flatten(2)
+        )

@@ -1,11 +1,11 @@
-"""Traits: what a driver's measured past tells of him, in a few numbers that a policy knows from its first window on.
+"""Driver features: what a driver's measured past tells of him, in a few numbers that a policy knows from its first window on.
 
 A network that has to find out from its memory what sort of driver it imitates finds little in the end, and a driver's own fixed
 parameters tell it only as much as one minute determines them: of Wiedemann 99's ten hardly any. How far behind he keeps, how much
 his speed differs from his leader's, how hard he accelerates and how late he reacts can simply be measured. On the I-80 recordings
-his mean time headway of the first half of a drive correlates with that of the second by 0.76, the other traits by 0.4 to 0.6.
+his mean time headway of the first half of a drive correlates with that of the second by 0.76, the other driver features by 0.4 to 0.6.
 
-Letters: P pairs, T frames, k traits.
+Shapes: P pairs, T frames, k driver features.
 """
 
 from __future__ import annotations
@@ -77,13 +77,20 @@ def _time_headway(m: Measured) -> Tensor:
 
 def _time_gap(m: Measured) -> Tensor:
     """By how much the gap grows with speed, s: a ridge regression around what is usual, as speed may hardly have varied."""
-    speed, gap = (values - _mean(values, m.counted)[:, None] for values in (m.signals.follower_speed, m.signals.gap))
-    return (_mean(speed * gap, m.counted) + _FLAT * _USUAL_GAP) / (_mean(speed.square(), m.counted) + _FLAT)
+    speed, gap = (
+        values - _mean(values, m.counted)[:, None]
+        for values in (m.signals.follower_speed, m.signals.gap)
+    )
+    return (_mean(speed * gap, m.counted) + _FLAT * _USUAL_GAP) / (
+        _mean(speed.square(), m.counted) + _FLAT
+    )
 
 
 def _standstill_gap(m: Measured) -> Tensor:
     """What gap that regression leaves at standstill, m."""
-    return _mean(m.signals.gap, m.counted) - _time_gap(m) * _mean(m.signals.follower_speed, m.counted)
+    return _mean(m.signals.gap, m.counted) - _time_gap(m) * _mean(
+        m.signals.follower_speed, m.counted
+    )
 
 
 def _speed_difference(m: Measured) -> Tensor:
@@ -103,15 +110,20 @@ def _response_time(m: Measured) -> Tensor:
     variances = []
     for delay in delays:
         both = m.counted[:, delay:] & m.counted[:, : m.counted.shape[1] - delay]
-        apart = m.signals.follower_speed[:, delay:] - m.signals.leader_speed[:, : m.counted.shape[1] - delay]
+        apart = (
+            m.signals.follower_speed[:, delay:]
+            - m.signals.leader_speed[:, : m.counted.shape[1] - delay]
+        )
         variances.append(_mean((apart - _mean(apart, both)[:, None]).square(), both))
     variance = torch.stack(variances, 1)
     least = variance.min(1, keepdim=True).values
     weight = torch.softmax(-(variance - least) / (_CLEARLY[0] + _CLEARLY[1] * least), 1)
-    return weight @ torch.tensor([delay * m.dt for delay in delays], dtype=weight.dtype, device=weight.device)
+    return weight @ torch.tensor(
+        [delay * m.dt for delay in delays], dtype=weight.dtype, device=weight.device
+    )
 
 
-TRAITS: dict[str, Callable[[Measured], Tensor]] = {
+DRIVER_FEATURES: dict[str, Callable[[Measured], Tensor]] = {
     "time_headway": _time_headway,
     "time_gap": _time_gap,
     "standstill_gap": _standstill_gap,
@@ -119,29 +131,31 @@ TRAITS: dict[str, Callable[[Measured], Tensor]] = {
     "acceleration": _acceleration,
     "response_time": _response_time,
 }
-"""Traits that a policy may know, each `(P,)`. What does not hold from the first half of a drive to the second tells nothing of a
+"""Driver features that a policy may know, each `(P,)`. What does not hold from the first half of a drive to the second tells nothing of a
 driver: the spread of his headway, say, or how many times as hard as his leader he accelerates (correlations of 0.15 and 0.1)."""
 
-TRAIT_SETS: dict[str, tuple[str, ...]] = {"all": tuple(TRAITS), "none": ()}
-"""Traits that go by one name: `policy.traits=all`."""
+DRIVER_FEATURE_SETS: dict[str, tuple[str, ...]] = {"all": tuple(DRIVER_FEATURES), "none": ()}
+"""Driver features that go by one name: `policy.driver_features=all`."""
 
 
-def named_traits(value: object) -> object:
-    """As `of_set`, for traits."""
-    return of_set(value, TRAIT_SETS, TRAITS, "trait")
+def named_driver_features(value: object) -> object:
+    """As `of_set`, for driver features."""
+    return of_set(value, DRIVER_FEATURE_SETS, DRIVER_FEATURES, "driver feature")
 
 
-def check_traits(names: Sequence[str]) -> None:
-    """As `check_names`, for traits."""
-    check_names(names, TRAITS, "trait")
+def check_driver_features(names: Sequence[str]) -> None:
+    """As `check_names`, for driver features."""
+    check_names(names, DRIVER_FEATURES, "driver feature")
 
 
-def measure(batch: PairBatch, names: Sequence[str], dt: float, since: Tensor, until: Tensor) -> Tensor:
-    """Measures drivers' traits.
+def measure(
+    batch: PairBatch, names: Sequence[str], dt: float, since: Tensor, until: Tensor
+) -> Tensor:
+    """Measures drivers' driver features.
 
     Args:
         batch: P pairs.
-        names: the traits, k of `TRAITS`.
+        names: the driver features, k of `TRAITS`.
         dt: the pairs' time step, s.
         since, until: `(P,)`, the frames from which on and before which each driver is measured.
 
@@ -152,4 +166,8 @@ def measure(batch: PairBatch, names: Sequence[str], dt: float, since: Tensor, un
     counted = batch.mask & (frame >= since[:, None]) & (frame < until[:, None])
     measured = Measured(History(*(signal.double() for signal in History.of(batch))), counted, dt)
     known = measured.moving.sum(1) * dt >= LEAST
-    return torch.where(known[:, None], torch.stack([TRAITS[name](measured) for name in names], -1), torch.nan)
+    return torch.where(
+        known[:, None],
+        torch.stack([DRIVER_FEATURES[name](measured) for name in names], -1),
+        torch.nan,
+    )
