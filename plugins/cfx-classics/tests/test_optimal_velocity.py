@@ -22,7 +22,7 @@ from .steps import LENGTH, gain, next_speed, number
 BOOK = {"v0": 120 / 3.6, "width": 15.0, "beta": 1.5}
 DEFAULTS: Mapping[type[DrivingModel], Mapping[str, float]] = {
     OVM: BOOK | {"tau": 0.65},
-    FVDM: BOOK | {"tau": 5.0, "lambda": 0.6, "adaptation_bounds": 100.0},
+    FVDM: BOOK | {"tau": 5.0, "lambda": 0.6, "reach": 100.0},
 }
 
 
@@ -57,7 +57,7 @@ class TestOvmBelowItsDesiredSpeed(ModelContract):
 class TestFvdmBelowItsDesiredSpeed(TestOvmBelowItsDesiredSpeed):
     @pytest.fixture
     def model(self) -> DrivingModel:
-        return FVDM(parameters={"v0": {"low": 21.0}, "adaptation_bounds": {"tuned": True}})
+        return FVDM(parameters={"v0": {"low": 21.0}, "reach": {"tuned": True}})
 
 
 def test_with_the_papers_units_it_is_bandos_function() -> None:
@@ -73,7 +73,7 @@ def test_fvdm_without_its_term_is_ovm_and_beyond_its_reach_too() -> None:
     state = {"gap": 40.0, "v": 12.0, "v_l": 8.0, "tau": 3.0}
     plain = next_speed(OVM(), **state)
     assert next_speed(FVDM(), **state, **{"lambda": 0.0}) == pytest.approx(plain)
-    assert next_speed(FVDM(), **state, adaptation_space=39.0) == pytest.approx(plain)
+    assert next_speed(FVDM(), **state, reach=39.0) == pytest.approx(plain)
     assert next_speed(FVDM(), **state, **{"lambda": 0.6}) == pytest.approx(
         plain + 0.1 * 0.6 * (8.0 - 12.0)
     )
@@ -114,23 +114,23 @@ def test_swings_grow_exactly_where_the_linear_theory_says(model: DrivingModel) -
     # Linearised: x'' = (V' (x_l - x) - x') / tau + lambda (x_l' - x'); long waves grow unless V' <= 1 / (2 tau) + lambda.
     pace, cases = 0.15, CASES[type(model)]
     theory, stable = [], []
-    for gap, tau, gradient_decay in cases:
+    for gap, tau, sensitivity in cases:
         steep = slope(gap, BOOK)
         theory.append(
             abs(
-                (steep / tau + 1j * pace * gradient_decay)
-                / (steep / tau - pace**2 + 1j * pace * (1 / tau + gradient_decay))
+                (steep / tau + 1j * pace * sensitivity)
+                / (steep / tau - pace**2 + 1j * pace * (1 / tau + sensitivity))
             )
         )
-        stable.append(steep <= 1 / (2 * tau) + gradient_decay)
+        stable.append(steep <= 1 / (2 * tau) + sensitivity)
     assert set(stable) == {True, False}, "cases on both sides of the limit"
     assert [value <= 1 for value in theory] == stable
-    gaps, taus, dampings = (
+    gaps, taus, sensitivities = (
         torch.tensor(column, dtype=torch.float64) for column in zip(*cases, strict=True)
     )
     p = {name: number(value) for name, value in DEFAULTS[type(model)].items()} | {"tau": taus}
     if isinstance(model, FVDM):
-        p["lambda"] = dampings
+        p["lambda"] = sensitivities
     speed = torch.tensor([velocity(gap, BOOK) for gap, _, _ in cases], dtype=torch.float64)
     assert gain(model, p, gap=gaps, speed=speed, pace=pace).tolist() == pytest.approx(
         theory, rel=4e-3
