@@ -22,6 +22,7 @@ from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import History, tokens
 from cfx.policies.offsets import moved
 from cfx.policies.trained import Scaler
+from cfx.simulation.step import advance_vehicle
 
 
 class Recent(NamedTuple):
@@ -138,16 +139,9 @@ class WindowStep:
                 ahead.acceleration[..., k],
                 leader_length,
             )
-            speed = self.model.next_speed(follower, leader, p, self.dt)
-            memory = self.model.next_memory(follower, leader, p, self.dt, speed)
-            follower = Follower(
-                follower.position + speed * self.dt,
-                speed,
-                (speed - follower.speed) / self.dt,
-                memory,
-            )
+            follower = advance_vehicle(self.model, follower, leader, p, self.dt)
             positions.append(follower.position)
-            speeds.append(speed)
+            speeds.append(follower.speed)
             accelerations.append(follower.acceleration)
         position, speed, acceleration = (
             torch.stack(frames, -1) for frames in (positions, speeds, accelerations)

@@ -1,7 +1,6 @@
 """The rollout: one driving model along recorded leaders, for any number of followers at once.
 
-This is the only place that integrates. Forward Euler, as the paper prints it and SUMO does it by default:
-`v' = model(...)`, then `x' = x + v' dt`; the model sees the leader **at t**.
+Every step is `cfx.simulation.step.advance_vehicle`; the model sees the leader **at t**.
 
 Shapes: public tensors are `(*batch, time)`. Inside, time comes first, so that each step reads contiguous memory, and
 leaders broadcast: a leader `(pairs, 1)` drives ahead of followers `(pairs, candidates)` without a copy.
@@ -24,6 +23,7 @@ from cfx.component import folder_hash
 from cfx.errors import ParameterError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.simulation.base import BaseSimulator
+from cfx.simulation.step import advance_vehicle
 from cfx.simulation.threads import one_thread
 
 Compile = Literal["auto", "always", "never"]
@@ -185,16 +185,9 @@ def _stepper(model: DrivingModel, dt: float) -> _Step:
         positions, speeds = [], []
         for k in range(leader.position.shape[0]):
             now = Leader(leader.position[k], leader.speed[k], leader.acceleration[k], leader.length)
-            next_speed = model.next_speed(follower, now, p, dt)
-            next_memory = model.next_memory(follower, now, p, dt, next_speed)
-            follower = Follower(
-                follower.position + next_speed * dt,
-                next_speed,
-                (next_speed - follower.speed) / dt,
-                next_memory,
-            )
+            follower = advance_vehicle(model, follower, now, p, dt)
             positions.append(follower.position)
-            speeds.append(next_speed)
+            speeds.append(follower.speed)
         return follower, torch.stack(positions), torch.stack(speeds)
 
     return take

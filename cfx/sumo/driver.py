@@ -28,6 +28,7 @@ from cfx.policies.base import ConstantNetwork
 from cfx.policies.features import History
 from cfx.policies.fixed import FixedPolicy
 from cfx.policies.trained import ALL, PolicyState, Scaler, TrainedPolicy
+from cfx.simulation.step import advance_vehicle
 from cfx.simulation.threads import one_thread
 from cfx.tracking.store import folder_of
 
@@ -528,8 +529,8 @@ class Driver:
             seen.leader_length,
         )
         p = self.policy.space.unpack(store.parameters[slots])
-        speed = self.model.next_speed(follower, leader, p, dt)
-        store.memory[slots] = self.model.next_memory(follower, leader, p, dt, speed)
+        after = advance_vehicle(self.model, follower, leader, p, dt)
+        store.memory[slots] = after.memory
         limit = seen.allowed.clone()
         for index in (
             (seen.speed > seen.allowed).nonzero().flatten().tolist()
@@ -537,7 +538,7 @@ class Driver:
             limit[index] = max(
                 limit[index], seen.speed[index] - connection.vehicle.getDecel(names[index]) * dt
             )
-        return torch.minimum(speed, limit)
+        return torch.minimum(after.speed, limit)
 
 
 @dataclass(frozen=True)
