@@ -283,12 +283,12 @@ BROKEN = (
         "learns_nothing",
         "learners",
         "from cfx import Learner\nclass Bad(Learner):\n    def fit(self, policy, training_data):\n        return None\n",
-        r"fit must return a cfx\.Learned, but returned a NoneType",
+        r"fit must return a cfx\.TrainingResult, but returned a NoneType",
     ),
     Broken(
         "no_outcome",
         "protocols",
         "from cfx import Protocol\nclass Bad(Protocol):\n    def run(self, study):\n        return {}\n",
-        r"run must return a cfx\.Outcome, but returned a dict",
+        r"run must return a cfx\.ProtocolResult, but returned a dict",
     ),
 )

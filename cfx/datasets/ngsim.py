@@ -230,11 +230,11 @@ class Rows:
     def bent(self) -> str:
         """Says that speeds are bent at the ends of vehicles' rows, "" where they are not: see `NgsimDataset`."""
         begun, left = self._since_and_until()
-        adaptation_space = round(_EDGE_S / DT)
+        edge = round(_EDGE_S / DT)
         ends = (
-            begun < adaptation_space,
-            left < adaptation_space,
-            (begun >= adaptation_space) & (left >= adaptation_space),
+            begun < edge,
+            left < edge,
+            (begun >= edge) & (left >= edge),
         )
         if not all(end.any() for end in ends):
             return ""

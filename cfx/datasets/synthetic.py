@@ -203,12 +203,12 @@ def _true_parameters(
 ) -> Floats:
     """Returns true parameters in unit space, `(*drivers, windows, n)`."""
     default = np.array([(p.default - p.low) / (p.high - p.low) for p in space.tuned])
-    adaptation_space = 0.5 * np.minimum(default, 1.0 - default)
+    room = 0.5 * np.minimum(default, 1.0 - default)
     own = rng.uniform(-1.0, 1.0, (*drivers, 1, len(space)))
     drift = np.tanh(
         0.7 * smooth_noise((*drivers, len(space)), windows, step / _DRIFT_SCALE_S, rng)
     ).swapaxes(-1, -2)
-    unit: Floats = default + adaptation_space * (s.heterogeneity * own + s.variation * drift)
+    unit: Floats = default + room * (s.heterogeneity * own + s.variation * drift)
     return unit
 
 

@@ -36,12 +36,12 @@ def history_gain(history: pd.DataFrame) -> Figure:
             k - 0.5 * (history["base"].nunique() - 1)
         )
         mean, low, high = (gains[name].to_numpy(dtype=float) for name in ("mean", "low", "high"))
-        adaptation_space = np.nan_to_num(np.stack([mean - low, high - mean]))
+        distance = np.nan_to_num(np.stack([mean - low, high - mean]))
         colour = COLOURS.get(BASES.get(base, ""), INK)
         axes.errorbar(
             places,
             mean,
-            adaptation_space,
+            distance,
             color=colour,
             marker="o",
             linewidth=1.8,

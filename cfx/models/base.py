@@ -61,7 +61,7 @@ class ModelSettings(Settings):
         default_factory=dict,
         description="changes to the model's parameters: bounds, default, tuned or constant",
     )
-    adaptation_space: dict[str, tuple[float, float] | None] | None = Field(
+    adaptation_bounds: dict[str, tuple[float, float] | None] | None = Field(
         None,
         description="what a policy of offsets (learner=rollout) may move, where that is not what calibration may:"
         " {NAME: [low, high]}, farther; {NAME: null}, not at all",
@@ -104,13 +104,13 @@ class DrivingModel(Component):
         super().__init__(settings, **options)
         self.space = self.parameters.override(self.settings.parameters)
         self.space.for_adaptation(
-            self.settings.adaptation_space or {}
+            self.settings.adaptation_bounds or {}
         )  # says now what is wrong with it
 
     @property
     def adaptation_space(self) -> ParameterSpace:
         """The parameters in the bounds within which a policy of offsets moves them: those of `space` and beyond."""
-        return self.space.for_adaptation(self.settings.adaptation_space or {})
+        return self.space.for_adaptation(self.settings.adaptation_bounds or {})
 
     def at_temperature(self, temperature: Temperature) -> Self:
         """Returns the model with its regime switches smoothed, for training by gradients.

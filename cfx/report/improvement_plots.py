@@ -74,7 +74,7 @@ def _overview_view(jobs: Sequence[Job], baseline: str, where: str) -> dict[str, 
         "hovertemplate": "%{text}<extra></extra>",
     }
     mean, low, high, trimmed, median = values.T
-    adaptation_space = {
+    distance = {
         "type": "data",
         "symmetric": False,
         "array": high - mean,
@@ -88,7 +88,7 @@ def _overview_view(jobs: Sequence[Job], baseline: str, where: str) -> dict[str, 
         | {
             "x": mean,
             "name": "mean and its 95 % interval",
-            "error_x": adaptation_space,
+            "error_x": distance,
             "marker": dot,
         },
         common

@@ -13,14 +13,14 @@ from cfx.policies.offsets import moved
 
 
 def test_reach_moves_bounds_outwards_for_policies_alone() -> None:
-    model = Krauss(adaptation_space={"t_r": (0.001, 50.0)})
+    model = Krauss(adaptation_bounds={"t_r": (0.001, 50.0)})
     assert (model.adaptation_space["t_r"].low, model.adaptation_space["t_r"].high) == (0.001, 50.0)
     assert model.space == Krauss().space
     assert model.adaptation_space["b"] == model.space["b"]
 
 
 def test_reach_never_moves_bounds_inwards() -> None:
-    model = W99(parameters={"cc8": {"high": 9.0}}, adaptation_space={"cc8": (0.05, 5.0)})
+    model = W99(parameters={"cc8": {"high": 9.0}}, adaptation_bounds={"cc8": (0.05, 5.0)})
     assert (model.adaptation_space["cc8"].low, model.adaptation_space["cc8"].high) == (0.05, 9.0)
     assert W99().adaptation_space == W99().space
 
@@ -29,24 +29,24 @@ def test_reach_never_moves_bounds_inwards() -> None:
     ("adaptation_bounds", "message"),
     [
         ({"tr": (0.0, 1.0)}, "Did you mean 't_r'"),
-        ({"t_r": (2.0, 1.0)}, r"model\.reach\.t_r=\[2\.0, 1\.0\]: the first must be below"),
+        ({"t_r": (2.0, 1.0)}, r"model\.adaptation_bounds\.t_r=\[2\.0, 1\.0\]: the first must be below"),
         ({"t_r": None, "t_i": None}, "could move none"),
     ],
 )
 def test_a_wrong_reach_is_named(
-    adaptation_space: dict[str, tuple[float, float] | None], message: str
+    adaptation_bounds: dict[str, tuple[float, float] | None], message: str
 ) -> None:
     with pytest.raises(ParameterError, match=message):
-        Krauss(adaptation_space=adaptation_space)
+        Krauss(adaptation_bounds=adaptation_bounds)
 
 
 def test_a_reach_needs_both_ends() -> None:
-    with pytest.raises(ConfigError, match=r"model\.reach\.t_r"):
-        Krauss(adaptation_space={"t_r": (1.0,)})  # type: ignore[dict-item]  # what a user may write
+    with pytest.raises(ConfigError, match=r"model\.adaptation_bounds\.t_r"):
+        Krauss(adaptation_bounds={"t_r": (1.0,)})  # type: ignore[dict-item]  # what a user may write
 
 
 def test_what_is_held_stays_at_its_base_whatever_a_network_answers() -> None:
-    adaptation_space = Krauss(adaptation_space={"t_i": None}).adaptation_space
+    adaptation_space = Krauss(adaptation_bounds={"t_i": None}).adaptation_space
     base = adaptation_space.to_unit(torch.tensor([[1.5, 0.2], [3.0, 2.0]]).double())
     free = adaptation_space.free()
     assert free is not None
