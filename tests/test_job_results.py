@@ -12,7 +12,9 @@ import pytest
 from rich.console import Console
 
 from cfx.evaluation.result import Evaluation
-from cfx.job import JobResult, _further, _Output, report
+from cfx.job.console import report
+from cfx.job.output import Output, write_further_tables
+from cfx.job.results import JobResult
 from tests.made_up import GAINS, make_history, make_platoon, make_results
 
 
@@ -79,7 +81,7 @@ def test_platoon_and_history_are_written_and_old_ones_go(tmp_path: Path, present
         evaluation = dataclasses.replace(
             evaluation, platoon=make_platoon({"policy": 1}), history=history
         )
-    written = _further(evaluation, _Output(tmp_path))
+    written = write_further_tables(Output(tmp_path), evaluation)
     assert written == ([tmp_path / name for name in names] if present else [])
     assert sorted(path.name for path in tmp_path.iterdir()) == (sorted(names) if present else [])
     if present:

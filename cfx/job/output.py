@@ -1,0 +1,274 @@
+"""The files of a job's folder; each appears whole or not at all."""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import yaml
+
+from cfx.config import JobConfig
+from cfx.datasets.tidy import write_tidy
+from cfx.errors import OutputError
+from cfx.evaluation.result import Evaluation
+from cfx.files import atomic_write
+from cfx.pairs import PairSet
+from cfx.protocols.base import ProtocolResult
+from cfx.style.result import StyleResult
+from cfx.tracking.provenance import version
+
+TRACKED = (
+    "config.yaml",
+    "metrics.json",
+    "pairs.csv",
+    "style.csv",
+    "data.json",
+    "trajectories.parquet",
+    "curves.parquet",
+)
+"""Files of a job's folder that MLflow keeps too, besides its figures and its policy."""
+
+
+class Output:
+    """Writes a job's files.
+
+    Attributes:
+        folder: the job's output folder.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    @classmethod
+    def make(cls, folder: Path) -> Output:
+        """Makes the folder, if it is not there.
+
+        Raises:
+            OutputError: it cannot be made.
+        """
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(
+                f"cannot make the output folder {folder}: {error.strerror};"
+                " set hydra.run.dir to a place that can be written"
+            ) from error
+        return cls(folder)
+
+    def file(self, name: str, write: Callable[[Path], object]) -> None:
+        """Writes one file, whole.
+
+        Args:
+            write: is given a path to write to; the file takes its name when it returns.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+
+        def write_whole() -> None:
+            with atomic_write(self.folder / name) as temporary:
+                write(temporary)
+
+        self.run(write_whole)
+
+    def text(self, name: str, text: str) -> None:
+        """Writes a text file.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        self.file(name, lambda path: path.write_text(text, encoding="utf-8"))
+
+    def json(self, name: str, values: Mapping[str, Any]) -> None:
+        """Writes a JSON file.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        self.text(name, json.dumps(values, indent=2) + "\n")
+
+    def run(self, write: Callable[[], object]) -> None:
+        """Calls a function that writes into the folder.
+
+        Raises:
+            OutputError: it cannot write.
+        """
+        try:
+            write()
+        except OSError as error:
+            raise OutputError(
+                f"cannot write into {self.folder}: {error.strerror or error};"
+                " the calibration is cached, so run again"
+            ) from error
+
+
+def write_config(output: Output, config: JobConfig) -> None:
+    """Writes `config.yaml`.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    values = config.model_dump(mode="json")
+    output.text("config.yaml", yaml.safe_dump(values, sort_keys=False))
+
+
+def write_tables(
+    output: Output, pairs: PairSet, style: StyleResult, protocol_result: ProtocolResult
+) -> list[Path]:
+    """Writes the tables of the results.
+
+    Returns:
+        The paths of the tables that only some protocols deliver.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    evaluation = protocol_result.evaluation
+    trajectories, curves = evaluation.trajectories_table, typed_curves(protocol_result.curves)
+    output.file("pairs.csv", lambda path: evaluation.table.to_csv(path, index=False))
+    output.file("trajectories.parquet", lambda path: trajectories().to_parquet(path, index=False))
+    output.file("curves.parquet", lambda path: curves.to_parquet(path, index=False))
+    output.file("style.csv", lambda path: style.table.to_csv(path, index=False))
+    if protocol_result.labels is not None:
+        labels = protocol_result.labels.to_frame(pairs, evaluation.names)
+        output.file("labels.parquet", lambda path: labels.to_parquet(path, index=False))
+    if any(pair.truth for pair in pairs):
+        output.file("data.parquet", lambda path: write_tidy(pairs, path))
+    return write_further_tables(output, evaluation)
+
+
+def write_further_tables(output: Output, evaluation: Evaluation) -> list[Path]:
+    """Writes the tables that only some protocols deliver; returns their paths.
+
+    Those that an earlier job left in the folder go.
+    """
+    platoon = None
+    if evaluation.platoon is not None:
+        platoon = evaluation.platoon.table
+    tables = {"platoon.parquet": platoon, "history.parquet": evaluation.history}
+    paths = []
+    for name, table in tables.items():
+        path = output.folder / name
+        if table is None:
+            output.run(functools.partial(path.unlink, missing_ok=True))
+        else:
+            output.file(name, functools.partial(table.to_parquet, index=False))
+            paths.append(path)
+    return paths
+
+
+def write_figures(
+    output: Output, config: JobConfig, style: StyleResult, protocol_result: ProtocolResult
+) -> list[Path]:
+    """Writes the figures, if the configuration wants any; returns their paths.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    paths: list[Path] = []
+    if config.figures.enabled:
+        from cfx.figures import write
+
+        folder = output.folder / "figures"
+
+        def write_all() -> None:
+            paths.extend(
+                write.write_figures(
+                    folder, protocol_result.evaluation, style, protocol_result.curves
+                )
+            )
+
+        output.run(write_all)
+    return paths
+
+
+def write_demo(
+    output: Output, config: JobConfig, pairs: PairSet, protocol_result: ProtocolResult
+) -> list[Path]:
+    """Writes the demonstration in SUMO, if the configuration wants it; returns its paths.
+
+    The policy must have been saved before.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    paths: list[Path] = []
+    if config.demo.enabled:
+        from cfx.sumo import demo
+
+        def write_all() -> None:
+            paths.extend(
+                demo.write_demo(
+                    output.folder / "sumo",
+                    output.folder / "policy",
+                    pairs,
+                    protocol_result.policy,
+                    protocol_result.evaluation,
+                    config,
+                )
+            )
+
+        output.run(write_all)
+    return paths
+
+
+def write_provenance(
+    output: Output,
+    pairs: PairSet,
+    protocol_result: ProtocolResult,
+    *,
+    has_constant_baseline: bool,
+) -> None:
+    """Writes `data.json`: where the data came from, and what a report must know of the model.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    evaluation = protocol_result.evaluation
+    dropped = []
+    for drop in pairs.dropped:
+        dropped.append({"reason": drop.reason, "count": drop.count, "unit": drop.unit})
+    parameters = []
+    lows, highs = evaluation.bounds
+    for name, unit, low, high in zip(evaluation.names, evaluation.units, lows, highs, strict=True):
+        parameters.append({"name": name, "unit": unit, "low": float(low), "high": float(high)})
+    values = {
+        "source": pairs.source,
+        "fingerprint": pairs.fingerprint,
+        "pairs": len(pairs),
+        "protocol": dict(protocol_result.notes),
+        "dropped": dropped,
+        "parameters": parameters,
+        "has_constant_baseline": has_constant_baseline,
+        "cfx": version(),
+    }
+    output.json("data.json", values)
+
+
+def write_metrics(output: Output, metrics: Mapping[str, float]) -> None:
+    """Writes `metrics.json`; null stands for a metric that is not defined.
+
+    It is the last file of a job, so that a folder with a `metrics.json` is complete.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    defined: dict[str, float | None] = {}
+    for name, value in metrics.items():
+        if math.isfinite(value):
+            defined[name] = value
+        else:
+            defined[name] = None
+    output.json("metrics.json", defined)
+
+
+def typed_curves(curves: pd.DataFrame) -> pd.DataFrame:
+    """Returns learning curves with the same column types whether anything was learned or not."""
+    return curves.astype(
+        {"network": str, "epoch": "int64", "train_loss": float, "validation_loss": float}
+    )

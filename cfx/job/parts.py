@@ -1,0 +1,150 @@
+"""The components of a job, made from its configuration and checked against each other."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+
+from cfx import registry
+from cfx.config import JobConfig
+from cfx.datasets.base import Dataset
+from cfx.errors import ConfigError
+from cfx.learners.base import Learner
+from cfx.models.base import DrivingModel
+from cfx.models.vtype import SumoOnly
+from cfx.optimizers.base import Optimizer
+from cfx.policies.base import Policy
+from cfx.protocols.base import Protocol
+from cfx.simulation.base import BaseSimulator
+from cfx.simulation.rollout import Simulator
+from cfx.simulation.settings import SumoSettings
+from cfx.tracking.store import folder_of, is_run_id
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The components of a job; making them checks the whole configuration before any work begins.
+
+    The registry has checked that each is what its kind promises.
+    """
+
+    dataset: Dataset
+    model: DrivingModel
+    optimizer: Optimizer
+    policy: Policy
+    learner: Learner
+    protocol: Protocol
+
+    @classmethod
+    def of(cls, config: JobConfig, protocol: Protocol) -> Parts:
+        """Makes the components of a configuration around a protocol that is there already.
+
+        Raises:
+            ConfigError: a setting is wrong, or two components do not fit each other.
+            PluginError: a component cannot be loaded.
+            SumoError: SUMO was asked for and is not installed.
+        """
+        model = cast(DrivingModel, registry.create("model", config.model))
+        check_simulator(config, model)
+        learner = cast(Learner, registry.create("learner", config.learner))
+        policy = cast(Policy, registry.create("policy", config.policy))
+        learner.require_gradients(model, not isinstance(config.simulator, SumoSettings))
+        if "policy" not in protocol.determines():  # else the policy has been trained already
+            learner.require_no_driver_features(policy)
+        return cls(
+            dataset=cast(Dataset, registry.create("dataset", config.data)),
+            model=model,
+            optimizer=cast(Optimizer, registry.create("optimizer", config.optimizer)),
+            policy=policy,
+            learner=learner,
+            protocol=protocol,
+        )
+
+
+def make_protocol(config: JobConfig) -> Protocol:
+    """Returns the protocol, for which ids of MLflow runs have become folders.
+
+    Raises:
+        ConfigError: a setting is wrong.
+        TrackingError: there is no such run.
+    """
+    node = dict(config.protocol)
+    name = node.get("name")
+    if isinstance(name, str):
+        protocol = cast(type[Protocol], registry.get("protocol", name))
+        for setting in protocol.jobs:
+            given = str(node.get(setting))
+            if is_run_id(given):
+                node[setting] = folder_of(given, config.tracking.uri)
+    return cast(Protocol, registry.create("protocol", node))
+
+
+def complete(config: JobConfig, protocol: Protocol) -> JobConfig:
+    """Returns the configuration with the nodes that the protocol determines."""
+    determined = protocol.determines()
+    if not determined:
+        return config
+    named = []
+    for key, value in determined.items():
+        if "name" in value:
+            named.append(f"{key}={value['name']}")
+        else:
+            named.append(key)
+    log.info("The protocol determines %s", ", ".join(named))
+    return JobConfig.of({**config.model_dump(), **determined})
+
+
+def choose_device(name: str) -> torch.device:
+    """Returns the device that `device=NAME` asks for.
+
+    Raises:
+        ConfigError: the machine has no such device.
+    """
+    if name == "auto":
+        if torch.cuda.is_available():
+            return torch.device("cuda")
+        return torch.device("cpu")
+    device = torch.device(name)
+    found = torch.cuda.device_count()
+    if device.type == "cuda" and (device.index or 0) >= found:
+        raise ConfigError(
+            f"device={name}: PyTorch finds {found} CUDA devices here;"
+            " write device=cpu or device=auto"
+        )
+    return device
+
+
+def check_simulator(config: JobConfig, model: DrivingModel) -> None:
+    """Checks that the chosen simulator can run a model, before any work begins.
+
+    Raises:
+        ConfigError: it cannot; says what to choose.
+        SumoError: SUMO is not installed, or another version.
+    """
+    if isinstance(config.simulator, SumoSettings):
+        from cfx.sumo.simulator import require_in_sumo
+
+        require_in_sumo(model)
+    elif isinstance(model, SumoOnly):
+        name = config.model.get("name")
+        raise ConfigError(
+            f"model={name} has no equations in Python, SUMO alone simulates it; add simulator=sumo"
+        )
+
+
+def make_simulator(config: JobConfig, model: DrivingModel, dt: float) -> BaseSimulator:
+    """Returns the simulator that a configuration chooses.
+
+    Args:
+        dt: time step, s.
+    """
+    if isinstance(config.simulator, SumoSettings):
+        from cfx.sumo.simulator import SumoSimulator
+
+        return SumoSimulator(model, dt, config.simulator)
+    return Simulator(model, dt, compile=config.simulation.compile)

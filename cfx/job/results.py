@@ -1,0 +1,71 @@
+"""What a job leaves behind, and how it is read back."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pandas as pd
+
+from cfx import renamed
+from cfx.errors import DataError
+from cfx.evaluation.result import Evaluation
+from cfx.policies.trained import TrainedPolicy
+from cfx.style.result import StyleResult
+from cfx.tracking.store import folder_of
+
+
+@dataclass(frozen=True)
+class JobResult:
+    """What a job leaves behind; `cfx.load` reads it back from the job's folder.
+
+    Attributes:
+        metrics: under their MLflow names; NaN where a metric is not defined.
+        pairs: a row per pair and method.
+        policy: the policy of the job, ready for another trajectory.
+        figures: the figures' files.
+        folder: the job's output folder.
+        run_id: MLflow's id of the run; "" if it was not tracked.
+        evaluation: what was measured; None if the job was read back from its folder.
+        style: the driving style of each pair; None if the job was read back from its folder.
+    """
+
+    metrics: dict[str, float]
+    pairs: pd.DataFrame
+    policy: TrainedPolicy
+    figures: tuple[Path, ...]
+    folder: Path
+    run_id: str = ""
+    evaluation: Evaluation | None = field(default=None, repr=False)
+    style: StyleResult | None = field(default=None, repr=False)
+
+
+def load(folder_or_run: str | Path) -> JobResult:
+    """Reads a finished job back.
+
+    Args:
+        folder_or_run: a job's output folder, or the id of its MLflow run.
+
+    Raises:
+        DataError: there is no finished job.
+    """
+    folder = folder_of(folder_or_run)
+    try:
+        defined = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        pairs = pd.read_csv(folder / "pairs.csv", dtype={"leader_id": str, "follower_id": str})
+        pairs = renamed.results(pairs)
+    except (OSError, ValueError, KeyError) as error:
+        raise DataError(
+            f"{folder} holds no finished job ({error}); give the output folder that a job printed"
+        ) from error
+    values: dict[str, float] = {}
+    for name, value in defined.items():
+        if value is None:
+            values[name] = math.nan
+        else:
+            values[name] = float(value)
+    figures = tuple(sorted((folder / "figures").glob("*.png")))
+    policy = TrainedPolicy.load(folder / "policy")
+    return JobResult(renamed.metrics(values), pairs, policy, figures, folder)

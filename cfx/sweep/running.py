@@ -1,0 +1,202 @@
+"""A sweep that runs in this process: from the folder that it finds to the summary that it leaves."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import logging
+import shlex
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Self, cast
+
+from filelock import FileLock
+from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import OmegaConfBaseException
+
+from cfx.console import put
+from cfx.hydra_source import resolving
+from cfx.sweep.fingerprint import command_of
+from cfx.sweep.folder import LOCK, find_folder
+from cfx.sweep.record import RECORD, Record
+from cfx.sweep.status import JobStatus, worst
+from cfx.sweep.summary import SUMMARY, rows, summary_table, write_summary
+
+log = logging.getLogger(__name__)
+
+_AGAIN = "The same command again runs only the jobs that are not done."
+
+
+class Sweep:
+    """A sweep that runs in this process.
+
+    Attributes:
+        folder: of the sweep, as people see it.
+        record: what `sweep.json` says.
+        tracking: the resolved configuration of tracking.
+        resumable: the folders of its jobs are named by what the jobs are.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        lock: FileLock,
+        record: Record,
+        tracking: Mapping[str, Any],
+        *,
+        resumable: bool,
+    ) -> None:
+        self.folder = folder
+        self.record = record
+        self.tracking = tracking
+        self.resumable = resumable
+        self._lock = lock
+
+    @classmethod
+    def open(cls, config: DictConfig) -> Self:
+        """Finds or makes the folder of the multirun that `config` describes, and holds its lock until `close`.
+
+        Raises:
+            ConfigError: another sweep runs in the folder that was asked for.
+            OSError: the folder cannot be made.
+        """
+        command, digest, jobs = command_of(config)
+        raw: Any = OmegaConf.to_container(config.hydra.sweep, resolve=False)
+        wanted = Path(str(config.hydra.sweep.dir))
+        resumable = "cfx_job" in str(raw["subdir"])
+        folder, lock = find_folder(str(raw["dir"]), wanted, digest, resumable=resumable)
+        now = _now()
+        earlier = Record.read(folder)
+        record = Record(str(folder), command, digest, now, jobs)
+        if earlier is not None:
+            same = earlier.command_hash == digest
+            record = replace(record, name=earlier.name, started=earlier.started if same else now)
+            print(_continuing(folder, record, earlier), flush=True)
+        record.write(folder)
+        return cls(folder, lock, record, _tracking(config), resumable=resumable)
+
+    def lead(self, config: DictConfig) -> None:
+        """Sends Hydra into the folder: `config` itself, and the overrides that each job is composed from."""
+        path = str(self.folder)
+        given: Any = OmegaConf.to_container(config.hydra.overrides.hydra, resolve=False)
+        overrides = [one for one in given if not one.startswith("hydra.sweep.dir=")]
+        with open_dict(config.hydra):
+            config.hydra.sweep.dir = path
+            config.hydra.overrides.hydra = [
+                *overrides,
+                "hydra.sweep.dir='" + path.replace("'", "\\'") + "'",
+            ]
+
+    def close(self, multirun: str, code: int, *, interrupted: bool) -> int:
+        """Says how the sweep ended, on the terminal and in `summary.csv`, and lets go of its folder.
+
+        Args:
+            multirun: this start of the sweep.
+            code: exit code so far.
+            interrupted: a signal ended it.
+
+        Returns:
+            The exit code.
+        """
+        try:
+            statuses = self.record.statuses(self.folder, multirun)
+            lines = self._tracked() if statuses or interrupted else ()
+            if not statuses:
+                return self._nothing(code, interrupted=interrupted)
+            table = rows(statuses)
+            write_summary(self.folder / SUMMARY, table)
+            put(summary_table(table))
+            code = self._tell(statuses, code)
+            if any(status.code == 0 for status in statuses.values()):
+                for line in (
+                    *lines,
+                    f"Report of the whole sweep: python -m cfx report {shlex.quote(str(self.folder))}",
+                ):
+                    print(line)
+            if code == 0:
+                replace(self.record, completed=_now()).write(self.folder)
+            elif self.resumable:
+                print(_AGAIN)
+            return code
+        finally:
+            self._lock.release()
+
+    def _tell(self, statuses: Mapping[Path, JobStatus], code: int) -> int:
+        """Prints how many jobs are done, and which failed and why; returns the exit code."""
+        failed = {path: status for path, status in statuses.items() if status.code}
+        total = max(self.record.jobs or 0, len(statuses))
+        print(f"{len(statuses) - len(failed)} of {total} jobs done; their folders: {self.folder}")
+        for path, status in failed.items():
+            print(
+                f"failed: {' '.join(status.overrides)}: {status.message} ({path})", file=sys.stderr
+            )
+        if total > len(statuses) and not code:
+            print(
+                f"{total - len(statuses)} jobs left no outcome; see the launcher's own logs",
+                file=sys.stderr,
+            )
+            code = 1
+        return worst(code, *(status.code for status in failed.values()))
+
+    def _nothing(self, code: int, *, interrupted: bool) -> int:
+        if not code:
+            print(
+                f"no job left its outcome in {self.folder}; see the launcher's own logs",
+                file=sys.stderr,
+            )
+            return 1
+        if not interrupted and not any(path.is_dir() for path in self.folder.iterdir()):
+            # A wrong command line that no job was made of leaves no folder.
+            for name in (RECORD, "multirun.yaml", LOCK):
+                (self.folder / name).unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                self.folder.rmdir()
+        elif self.resumable:
+            print(_AGAIN)
+        return code
+
+    def _tracked(self) -> tuple[str, ...]:
+        """Closes runs that killed jobs left open; returns lines that tell where the sweep is in MLflow."""
+        from cfx.errors import TrackingError
+        from cfx.tracking.store import sqlite_file, tracking_uri
+
+        if not self.tracking.get("enabled"):
+            return ()
+        try:
+            uri = tracking_uri(self.tracking.get("uri"))
+            file = sqlite_file(uri)
+            if file is not None and not file.is_file():
+                return ()
+            from cfx.tracking.tracker import end_sweep
+
+            return end_sweep(
+                uri,
+                str(self.tracking.get("experiment")),
+                self.tracking.get("sweep") or self.record.name,
+            )
+        except TrackingError as error:
+            log.warning("%s", error)
+            return ()
+
+
+def _continuing(folder: Path, record: Record, earlier: Record) -> str:
+    done = sum(one.code == 0 for one in record.statuses(folder, "").values())
+    if earlier.command_hash == record.command_hash:
+        return f"continuing sweep {folder}: {done}{f' of {record.jobs}' if record.jobs else ''} jobs are done"
+    return f"continuing in {folder}, which holds another command's sweep: jobs that both have in common are not run again"
+
+
+def _tracking(config: DictConfig) -> dict[str, Any]:
+    """Returns the resolved configuration of tracking; nothing where only a job's own configuration can say it."""
+    try:
+        with resolving(copy.deepcopy(config)):  # it makes what it is given read-only
+            return cast("dict[str, Any]", OmegaConf.to_container(config.tracking, resolve=True))
+    except (OmegaConfBaseException, ValueError):
+        return {}
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="microseconds")
