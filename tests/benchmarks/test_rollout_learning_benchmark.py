@@ -17,8 +17,8 @@ import torch
 
 from cfx.calibration.windows import Split, WindowSettings
 from cfx.learners.base import TrainingData
-from cfx.learners.dataset import RolloutDataset
 from cfx.learners.rollout import RolloutModule, RolloutSettings
+from cfx.learners.rollout.dataset import RolloutDataset
 from cfx.models.base import DrivingModel
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99

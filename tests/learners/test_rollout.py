@@ -14,10 +14,10 @@ from cfx.calibration.windows import Split, WindowSettings
 from cfx.errors import ConfigError
 from cfx.evaluation.closed_loop import ClosedLoop, drive
 from cfx.learners.base import TrainingData, TrainingResult
-from cfx.learners.dataset import BaseErrors, Drives, RolloutDataset, Scene
-from cfx.learners.expert import Expert, apart
 from cfx.learners.rollout import RolloutLearner, RolloutModule, RolloutSettings
-from cfx.learners.window_step import WindowStep
+from cfx.learners.rollout.dataset import BaseErrors, RolloutBatch, RolloutDataset, RolloutInputs
+from cfx.learners.rollout.distillation import Expert, apart
+from cfx.learners.rollout.step import WindowStep
 from cfx.models.direct import Direct
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
@@ -173,7 +173,7 @@ def test_training_simulates_what_evaluation_simulates(
         held.driver_features = measure(
             dataset.batch, driver_features, 0.1, 0 * frame, frame
         ).float()
-    drives = Drives(
+    drives = RolloutBatch(
         place, start, torch.zeros_like(place).bool(), held.last, torch.ones_like(place).float()
     )
     with torch.no_grad():
@@ -193,7 +193,7 @@ def test_networks_are_told_how_each_of_their_drivers_drives() -> None:
     held = RolloutDataset.of(dataset, policy, 0.25, torch.Generator().manual_seed(0))
     cold_start = torch.tensor([[True, False, False, False, False, False]])
     told = held.of_drives(
-        Drives(place, 0 * place, cold_start, held.last, torch.ones_like(place).float())
+        RolloutBatch(place, 0 * place, cold_start, held.last, torch.ones_like(place).float())
     )[2]
     frame = dataset.split.frame
     expected = measure(dataset.batch, policy.driver_features, 0.1, 0 * frame, frame).float()
@@ -238,7 +238,7 @@ def test_reading_at_most_some_windows_forgets_what_was_before() -> None:
     step = RolloutModule(network, held, policy, dataset, RolloutSettings(**QUICK)).exact
     place, start = torch.arange(6)[None], torch.tensor([[2, 4, 5, 9, 12, 12]])
     cold_start = torch.tensor([[False, False, False, False, False, True]])
-    drives = Drives(place, start, cold_start, held.last, torch.ones_like(place).float())
+    drives = RolloutBatch(place, start, cold_start, held.last, torch.ones_like(place).float())
     with torch.no_grad():
         torch.testing.assert_close(
             held.read(step, drives, 100), held.read(step, drives), rtol=0, atol=0
@@ -393,7 +393,9 @@ def test_the_validation_loss_is_the_mean_over_validation_drivers(
                 )
                 share = cold_start_fraction if began == 0 else 0.0
                 for fifth in (0.2, 0.4, 0.6, 0.8):
-                    known = Drives(here, ((began + fifth * (end - began)) / 5).long(), no, end, one)
+                    known = RolloutBatch(
+                        here, ((began + fifth * (end - began)) / 5).long(), no, end, one
+                    )
                     (loss,) = module.drive(
                         module.exact,
                         held.read(module.exact, known),
@@ -402,7 +404,7 @@ def test_the_validation_loss_is_the_mean_over_validation_drivers(
                         module.errors.over_horizon(known),
                     )
                     expected[network] += (1 - share) * loss[network, 0] / (4 * count)
-                whole = Drives(here, end * 0, ~no, end, one)
+                whole = RolloutBatch(here, end * 0, ~no, end, one)
                 (loss,) = module.drive(
                     module.exact,
                     held.read(module.exact, whole),
@@ -446,7 +448,7 @@ def test_drives_without_weight_are_not_simulated() -> None:
     assert (drives.weight.sum(1) / module.settings.draws).tolist() == counts
     assert drives.scale is not None
     weight = torch.tensor([[1.0, 0.0, 1.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
-    made = Drives(
+    made = RolloutBatch(
         *(torch.arange(8.0).view(2, 4) + 10 * k for k in range(4)), weight=weight
     ).weighed()
     assert made.weight.tolist() == [[1.0, 1.0], [0.0, 1.0]]
@@ -481,7 +483,7 @@ def test_a_committee_learns_and_drives_as_one() -> None:
     assert isinstance(training_result.network, Ensemble)
     assert training_result.curves.network.tolist() == ["n0", "n1"] * 6
     assert training_result.scaler.mean.shape[0] == len(dataset.names)
-    for weights in training_result.network.ensemble_size.parameters():
+    for weights in training_result.network.members.parameters():
         assert not any(torch.equal(weights[0], weights[number]) for number in (1, 2))
     before = error(loop(untrained(dataset, policy), dataset, policy, first=100), dataset, first=100)
     assert (
@@ -630,10 +632,10 @@ def test_a_teacher_says_what_he_would_do_where_the_pupil_stands() -> None:
     step, known, place = module.expert.step, module.expert.dataset, torch.arange(6)[None]
     cold_start = torch.tensor([[False, False, False, True, True, True]])
     start = torch.where(cold_start, 0, 15)
-    drives = Drives(place, start, cold_start, known.last, torch.ones_like(place).float())
+    drives = RolloutBatch(place, start, cold_start, known.last, torch.ones_like(place).float())
     with torch.no_grad():
         pair, base, _ = known.of_drives(drives)
-        scene = Scene.of(known.batch, pair, drives, step, 8)
+        scene = RolloutInputs.of(known.batch, pair, drives, step, 8)
         own = scene.recent(known.read(step, drives))
         watching = module.expert.watch(drives, scene.leader_length, None)
         for window in range(8):
@@ -664,7 +666,7 @@ def test_who_is_taught_learns_from_each_window_alone() -> None:
     drives = distillation_epochs._draw(0)
     state = distillation_epochs.dataset.read(distillation_epochs.step, drives)
     pair, *_ = distillation_epochs.dataset.of_drives(drives)
-    recent = Scene.of(
+    recent = RolloutInputs.of(
         distillation_epochs.dataset.batch, pair, drives, distillation_epochs.step, 1
     ).recent(state)
     assert not any(value.grad_fn for value in apart(recent)[:4])

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from cfx.learners.dataset import Drives, RolloutDataset
-from cfx.learners.window_step import Ahead, Recent, WindowStep
+from cfx.learners.rollout.dataset import RolloutBatch, RolloutDataset
+from cfx.learners.rollout.step import LeaderWindow, LoopState, WindowStep
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Expert:
     dataset: RolloutDataset
 
     @torch.no_grad()
-    def watch(self, drives: Drives, leader_length: Tensor, most: int | None) -> Watching:
+    def watch(self, drives: RolloutBatch, leader_length: Tensor, most: int | None) -> Watching:
         """Begins to watch drives, having read what the pupil has; arguments as of `Material.read`, lengths `(N, D)` in m."""
         _, base, told = self.dataset.of_drives(drives)
         return Watching(
@@ -61,21 +61,21 @@ class Watching:
     state: Tensor
 
     @torch.no_grad()
-    def would_drive(self, recent: Recent, ahead: Ahead) -> Tensor:
+    def would_drive(self, recent: LoopState, ahead: LeaderWindow) -> Tensor:
         """Returns the speeds at which the teacher would drive the next window from where the pupil stands, `(N, D, S)` in m/s."""
         position, speed, acceleration = (value.detach() for value in recent[:3])
         memory = (
             self.step.model.initial_memory(speed[..., -1]) if self.memory is None else self.memory
         )
-        stands = Recent(position, speed, acceleration, memory, self.state)
+        stands = LoopState(position, speed, acceleration, memory, self.state)
         after, wanted, _ = self.step.drive(stands, ahead, self.leader_length, self.base, self.told)
         self.memory, self.state = after.memory, after.state
         return wanted
 
 
-def apart(recent: Recent) -> Recent:
+def apart(recent: LoopState) -> LoopState:
     """Returns the same state, through which gradients reach only what the policy remembers, not how the vehicle got there."""
     position, speed, acceleration, memory = (
         value.detach().requires_grad_() for value in recent[:4]
     )
-    return Recent(position, speed, acceleration, memory, recent.state)
+    return LoopState(position, speed, acceleration, memory, recent.state)

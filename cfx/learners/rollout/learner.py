@@ -29,9 +29,15 @@ from torch.utils.data import DataLoader
 from cfx.component import Settings, content_key
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.learners.batched import BatchedModule, fit
-from cfx.learners.dataset import BaseErrors, Drives, Real, RolloutDataset, Scene
-from cfx.learners.expert import Expert, apart
-from cfx.learners.window_step import Recent, WindowStep, bounded
+from cfx.learners.rollout.dataset import (
+    BaseErrors,
+    Measured,
+    RolloutBatch,
+    RolloutDataset,
+    RolloutInputs,
+)
+from cfx.learners.rollout.distillation import Expert, apart
+from cfx.learners.rollout.step import LoopState, WindowStep, bounded
 from cfx.models.direct import Direct
 from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy, PolicyNetwork
@@ -379,7 +385,7 @@ class _Steps(pl.LightningDataModule):
         return DataLoader([0], batch_size=None)  # type: ignore[arg-type]  # a list is a dataset
 
 
-class Stretch(NamedTuple):
+class Segment(NamedTuple):
     """What was simulated between two truncations, `(N, D, frames)` each.
 
     Attributes:
@@ -390,7 +396,7 @@ class Stretch(NamedTuple):
 
     speed: Tensor
     gap: Tensor
-    measured: Real
+    measured: Measured
     wanted: Tensor | None
 
 
@@ -472,7 +478,12 @@ class RolloutModule(BatchedModule):
         )
 
     def drive(
-        self, step: WindowStep, state: Tensor, drives: Drives, windows: int, scale: Tensor | None
+        self,
+        step: WindowStep,
+        state: Tensor,
+        drives: RolloutBatch,
+        windows: int,
+        scale: Tensor | None,
     ) -> Iterator[Tensor]:
         """Simulates drives in closed loop.
 
@@ -502,12 +513,12 @@ class RolloutModule(BatchedModule):
                 yield loss.detach() + (training_data - training_data.detach())
 
     def stretches(
-        self, step: WindowStep, state: Tensor, drives: Drives, windows: int
-    ) -> Iterator[Stretch]:
+        self, step: WindowStep, state: Tensor, drives: RolloutBatch, windows: int
+    ) -> Iterator[Segment]:
         """Simulates drives in closed loop, as `drive` does; yields what came of them between two truncations."""
         s, learning = self.settings, torch.is_grad_enabled()
         pair, base, told = self.dataset.of_drives(drives)
-        scene = Scene.of(self.dataset.batch, pair, drives, step, windows)
+        scene = RolloutInputs.of(self.dataset.batch, pair, drives, step, windows)
         recent = scene.recent(state)
         length = s.tbptt_windows if s.tbptt_windows and learning else windows
         distillation_epochs = (
@@ -533,15 +544,15 @@ class RolloutModule(BatchedModule):
                 speeds.append(speed)
                 gaps.append(gap)
             frames = slice(first * step.stride, (first + len(speeds)) * step.stride)
-            yield Stretch(
+            yield Segment(
                 torch.cat(speeds, -1),
                 torch.cat(gaps, -1),
                 scene.real(frames),
                 torch.cat(wanted, -1) if wanted else None,
             )
-            recent = Recent(*(value.detach().requires_grad_(learning) for value in recent))
+            recent = LoopState(*(value.detach().requires_grad_(learning) for value in recent))
 
-    def _scale(self, drives: Drives) -> Tensor | None:
+    def _scale(self, drives: RolloutBatch) -> Tensor | None:
         return self.errors.over_horizon(drives) if self.errors is not None else None
 
     def training_step(self, number: int, index: int) -> None:
@@ -580,7 +591,7 @@ class RolloutModule(BatchedModule):
     def _seed(self, step: int) -> int:
         return (self.seed * 1_000_003 + step) % 2**63
 
-    def _draw(self, step: int) -> Drives:
+    def _draw(self, step: int) -> RolloutBatch:
         """Draws the drives of one step; they follow from the seed and the step's number, whatever came before."""
         s, dataset = self.settings, self.dataset
         generator = torch.Generator().manual_seed(self._seed(step))
@@ -597,7 +608,9 @@ class RolloutModule(BatchedModule):
             drawn = torch.exp(s.scaling * torch.randn(shape, generator=generator)).to(device)
             scale = torch.where(cold_start, drawn, 1.0)
         weight = dataset.trains.gather(1, place).float()
-        return Drives(place, (share * latest).long(), cold_start, until, weight, scale).weighed()
+        return RolloutBatch(
+            place, (share * latest).long(), cold_start, until, weight, scale
+        ).weighed()
 
     @torch.no_grad()
     def validation_step(self, number: int, index: int) -> None:
@@ -635,7 +648,7 @@ class RolloutModule(BatchedModule):
             ((began + share * (last - began)) / self.exact.stride).long() for share in _VALIDATED
         ]
         places, lasts, weight = (x.repeat(1, len(starts)) for x in (place, last, self._weight()))
-        drives = Drives(
+        drives = RolloutBatch(
             places, torch.cat(starts, 1), torch.zeros_like(places, dtype=torch.bool), lasts, weight
         )
         state = dataset.read(self.exact, drives)
@@ -649,7 +662,7 @@ class RolloutModule(BatchedModule):
         dataset, place = self.dataset, self.validated
         last = dataset.last.gather(1, place)
         weight = self._weight() * (dataset.until.gather(1, place) == last)
-        drives = Drives(
+        drives = RolloutBatch(
             place, torch.zeros_like(place), torch.ones_like(place, dtype=torch.bool), last, weight
         )
         if not bool(weight.any()):

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from cfx.learners.base import TrainingData
 from cfx.learners.batched import Grid
-from cfx.learners.window_step import Ahead, Recent, WindowStep
+from cfx.learners.rollout.step import LeaderWindow, LoopState, WindowStep
 from cfx.models.base import Leader
 from cfx.pairs import PairBatch
 from cfx.policies.base import Policy
@@ -32,7 +32,7 @@ _TABLE = 4_000_000
 """Vehicle steps of one part of a table of errors, which bounds its memory to some hundred MB."""
 
 
-class Drives(NamedTuple):
+class RolloutBatch(NamedTuple):
     """Drives to simulate, D for each network.
 
     Attributes:
@@ -57,14 +57,16 @@ class Drives(NamedTuple):
         """The network of each drive, `(N, 1)`: with `place` it says where the drive's driver stands in a table of places."""
         return torch.arange(len(self.place), device=self.place.device)[:, None]
 
-    def weighed(self) -> Drives:
+    def weighed(self) -> RolloutBatch:
         """Returns the drives that have weight, in order; others fill up a network that has fewer of them than another."""
         has_weight = self.weight > 0
         most = int(has_weight.sum(1).max())
         kept = (
             has_weight.long().argsort(dim=1, descending=True, stable=True)[:, :most].sort(1).values
         )
-        return Drives._make(value if value is None else value.gather(1, kept) for value in self)
+        return RolloutBatch._make(
+            value if value is None else value.gather(1, kept) for value in self
+        )
 
 
 @dataclass
@@ -212,7 +214,7 @@ class RolloutDataset:
         count = int(self.validates.sum(1).max())
         return _chosen(self.validates, count if most is None else min(most, count), generator)
 
-    def of_drives(self, drives: Drives) -> tuple[Tensor, Tensor, Tensor]:
+    def of_drives(self, drives: RolloutBatch) -> tuple[Tensor, Tensor, Tensor]:
         """Says whose drives these are.
 
         Returns:
@@ -237,7 +239,7 @@ class RolloutDataset:
             )
         return pair, base, told
 
-    def read(self, step: WindowStep, drives: Drives, most: int | None = None) -> Tensor:
+    def read(self, step: WindowStep, drives: RolloutBatch, most: int | None = None) -> Tensor:
         """Lets the policy read what was measured before each drive; nothing, for an unseen driver.
 
         Args:
@@ -263,7 +265,7 @@ class RolloutDataset:
         return state
 
 
-class Real(NamedTuple):
+class Measured(NamedTuple):
     """What was measured at simulated frames; `(N, D, frames)` each.
 
     Attributes:
@@ -278,7 +280,7 @@ class Real(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Scene:
+class RolloutInputs:
     """What is measured around drives; H windows, time in frames from `1 - L` to `H S`.
 
     Attributes:
@@ -293,12 +295,12 @@ class Scene:
     leader_length: Tensor
     follower: Tensor
     memory: Tensor
-    measured: Real
+    measured: Measured
 
     @classmethod
     def of(
-        cls, batch: PairBatch, pair: Tensor, drives: Drives, step: WindowStep, windows: int
-    ) -> Scene:
+        cls, batch: PairBatch, pair: Tensor, drives: RolloutBatch, step: WindowStep, windows: int
+    ) -> RolloutInputs:
         length, stride = step.length, step.stride
         now, end = (drives.start * stride)[..., None], batch.mask.shape[1] - 1
         device = pair.device
@@ -339,31 +341,31 @@ class Scene:
             leader_length=length_of,
             follower=follower,
             memory=step.model.initial_memory(follower[1, ..., -1]),
-            measured=Real(
+            measured=Measured(
                 real_speed,
                 real_gap,
                 (simulated <= drives.last[..., None]).to(follower.dtype),
             ),
         )
 
-    def recent(self, state: Tensor) -> Recent:
+    def recent(self, state: Tensor) -> LoopState:
         """Returns where the drives begin."""
         position, speed, acceleration = self.follower.unbind(0)
-        begin = Recent(position, speed, acceleration, self.memory, state)
+        begin = LoopState(position, speed, acceleration, self.memory, state)
         if not torch.is_grad_enabled():
             return begin
         # Gradients flow through all later states; if they did not through the first, it would be compiled for once more.
-        return Recent(
+        return LoopState(
             *(value if value.requires_grad else value.clone().requires_grad_() for value in begin)
         )
 
-    def real(self, frames: slice) -> Real:
+    def real(self, frames: slice) -> Measured:
         """Returns what was measured at some of the simulated frames."""
-        return Real(*(signal[..., frames] for signal in self.measured))
+        return Measured(*(signal[..., frames] for signal in self.measured))
 
-    def ahead(self, window: int) -> Ahead:
+    def ahead(self, window: int) -> LeaderWindow:
         """Returns the leader around a window."""
-        return Ahead(*self.leader[:, window].unbind(0))
+        return LeaderWindow(*self.leader[:, window].unbind(0))
 
 
 @dataclass(frozen=True)
@@ -404,11 +406,11 @@ class BaseErrors:
         )
         return cls(familiar, strange, placed(far.errors(pairs, start, windows[:1]))[:, :, 0])
 
-    def over_whole(self, drives: Drives) -> Tensor:
+    def over_whole(self, drives: RolloutBatch) -> Tensor:
         """Returns the errors of the population's set over each drive from the first frame to the last, `(N, D, 2)`."""
         return _scaled(self.whole[drives.row, drives.place], drives)
 
-    def over_horizon(self, drives: Drives) -> Tensor:
+    def over_horizon(self, drives: RolloutBatch) -> Tensor:
         """Returns the errors over the horizon from where each drive begins, `(N, D, 2)`."""
         places = (drives.row, drives.place, drives.start)
         errors = torch.where(
@@ -417,7 +419,7 @@ class BaseErrors:
         return _scaled(errors, drives)
 
 
-def _scaled(errors: Tensor, drives: Drives) -> Tensor:
+def _scaled(errors: Tensor, drives: RolloutBatch) -> Tensor:
     return errors if drives.scale is None else errors * drives.scale[..., None]
 
 

@@ -25,7 +25,7 @@ from cfx.policies.trained import Scaler
 from cfx.simulation.step import advance_vehicle
 
 
-class Recent(NamedTuple):
+class LoopState(NamedTuple):
     """Where N by D drives stand: the follower's last L frames, the last being now; `(N, D, L)` each, SI units.
 
     Attributes:
@@ -40,7 +40,7 @@ class Recent(NamedTuple):
     state: Tensor
 
 
-class Ahead(NamedTuple):
+class LeaderWindow(NamedTuple):
     """The leader around one window: the last L frames up to now and the S frames after it, `(N, D, L + S)` each; SI units."""
 
     position: Tensor
@@ -100,8 +100,13 @@ class WindowStep:
         return answer[:, :, 0], after
 
     def drive(
-        self, recent: Recent, ahead: Ahead, leader_length: Tensor, base: Tensor, told: Tensor
-    ) -> tuple[Recent, Tensor, Tensor]:
+        self,
+        recent: LoopState,
+        ahead: LeaderWindow,
+        leader_length: Tensor,
+        base: Tensor,
+        told: Tensor,
+    ) -> tuple[LoopState, Tensor, Tensor]:
         """Drives one window.
 
         Args:
@@ -150,7 +155,7 @@ class WindowStep:
         carried = [
             torch.cat([before, after], -1)[..., stride:].contiguous() for before, after in frames
         ]
-        last = Recent(carried[0], carried[1], carried[2], follower.memory, state)
+        last = LoopState(carried[0], carried[1], carried[2], follower.memory, state)
         return last, speed, ahead.position[..., length:] - leader_length[..., None] - position
 
 
@@ -168,10 +173,10 @@ class _Bounded(torch.autograd.Function):
         return gradient.clamp(-ctx.bound, ctx.bound), None, None
 
 
-def bounded(recent: Recent, gradient_decay: float, bound: float) -> Recent:
+def bounded(recent: LoopState, gradient_decay: float, bound: float) -> LoopState:
     """Returns the same state; what gradients bring back through it is multiplied by `damping` and kept within `bound`.
 
     A closed loop of many windows multiplies Jacobians, and behind a regime switch these can be large: without this, W99's
     gradients overflow. A damping of g per window makes gradients forget with a time constant of -1 / ln g windows.
     """
-    return Recent(*(_Bounded.apply(value, gradient_decay, bound) for value in recent))  # type: ignore[no-untyped-call]
+    return LoopState(*(_Bounded.apply(value, gradient_decay, bound) for value in recent))  # type: ignore[no-untyped-call]
