@@ -93,7 +93,7 @@ class DrivingModel(Component):
     settings: ModelSettings
 
     parameters: ClassVar[ParameterSpace]
-    memory_size: ClassVar[int] = 0
+    memory_size: int = 0
     differentiable: ClassVar[bool] = True
     collision_free: ClassVar[bool] = False
     has_constant_baseline: ClassVar[bool] = True
