@@ -44,8 +44,11 @@ if TYPE_CHECKING:
     from cfx.protocols.base import ProtocolContext as ProtocolContext
     from cfx.protocols.base import ProtocolResult as ProtocolResult
     from cfx.registry import get as get
-    from cfx.simulation.rollout import Start as Start
+    from cfx.simulation.base import Stepper as Stepper
     from cfx.simulation.rollout import simulate as simulate
+    from cfx.simulation.trajectory import Start as Start
+    from cfx.simulators.base import Simulator as Simulator
+    from cfx.simulators.base import SimulatorSettings as SimulatorSettings
 
     __version__: str
 
@@ -65,7 +68,10 @@ _HOMES = {
     "Leader": "cfx.models.base",
     "ModelSettings": "cfx.models.base",
     "bumper_gap": "cfx.models.base",
-    "Start": "cfx.simulation.rollout",
+    "Start": "cfx.simulation.trajectory",
+    "Simulator": "cfx.simulators.base",
+    "SimulatorSettings": "cfx.simulators.base",
+    "Stepper": "cfx.simulation.base",
     "Optimizer": "cfx.optimizers.base",
     "Objective": "cfx.optimizers.base",
     "Policy": "cfx.policies.base",

@@ -9,23 +9,14 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator
 
+from cfx import renamed
 from cfx.calibration.settings import WindowSettings
 from cfx.component import Settings, validate
-from cfx.errors import ConfigError, nearest
-from cfx.simulation.settings import SIMULATORS, MemorySettings, SumoSettings
+from cfx.errors import ConfigError
 from cfx.style.settings import StyleSettings
 
 Node = dict[str, Any]
 """A component's node, `{name: ..., settings...}`: `cfx.registry.create` validates it against the component's own schema."""
-
-
-class SimulationSettings(Settings):
-    """How rollouts are computed."""
-
-    compile: Literal["auto", "always", "never"] = Field(
-        "auto", description="compile the model's step: auto: where it pays"
-    )
-    memory_mb: int = Field(1024, ge=16, description="bound for one chunk of problems, MB")
 
 
 class CacheSettings(Settings):
@@ -82,9 +73,7 @@ class JobConfig(Settings):
     optimizer: Node = Field(description="the optimizer's node")
     learner: Node = Field(description="the learner's node")
     protocol: Node = Field(description="the protocol's node")
-    simulator: MemorySettings | SumoSettings = Field(
-        MemorySettings(), description="what takes the steps"
-    )
+    simulator: Node = Field({"name": "memory"}, description="the simulator's node")
     seed: int = Field(0, ge=0, lt=2**32, description="seed of everything random")
     device: str = Field("auto", description="auto, cpu, cuda or cuda:N")
     dtype: Literal["float32", "float64"] = Field("float64", description="precision of simulations")
@@ -94,7 +83,6 @@ class JobConfig(Settings):
     )
     windows: WindowSettings = Field(WindowSettings(), description="how drives are cut")
     style: StyleSettings = Field(StyleSettings(), description="driving style")
-    simulation: SimulationSettings = Field(SimulationSettings(), description="rollouts")
     cache: CacheSettings = Field(CacheSettings(), description="cache of calibrations")
     tracking: TrackingSettings = Field(TrackingSettings(), description="MLflow")
     figures: FigureSettings = Field(FigureSettings(), description="figures")
@@ -107,18 +95,6 @@ class JobConfig(Settings):
             raise ValueError("choose auto, cpu, cuda or cuda:N")
         return device
 
-    @field_validator("simulator", mode="before")
-    @classmethod
-    def _chosen(cls, node: Any) -> Any:
-        if not isinstance(node, Mapping):
-            return node
-        name = str(node.get("name"))
-        if name not in SIMULATORS:
-            raise ValueError(
-                f"there is no simulator '{name}'.{nearest(name, SIMULATORS)} Known: {', '.join(SIMULATORS)}"
-            )
-        return validate(SIMULATORS[name], node, where="simulator")
-
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> JobConfig:
         """Validates a resolved configuration.
@@ -130,4 +106,4 @@ class JobConfig(Settings):
             raise ConfigError(
                 f"a configuration is a mapping of keys to values, not {type(values).__name__}"
             )
-        return validate(cls, values, where="")
+        return validate(cls, renamed.config(values), where="")

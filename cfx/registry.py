@@ -85,6 +85,13 @@ KINDS: dict[str, Kind] = {
             "cfx.optimizers.base:Optimizer",
             "cfx.smoke_checks:smoke_check_optimizer",
         ),
+        Kind(
+            "simulator",
+            "simulator",
+            "cfx.simulators",
+            "cfx.simulators.base:Simulator",
+            "cfx.smoke_checks:smoke_check_simulator",
+        ),
         Kind("learner", "learner", "cfx.learners", "cfx.learners.base:Learner"),
         Kind("protocol", "protocol", "cfx.protocols", "cfx.protocols.base:Protocol"),
     )
@@ -275,6 +282,14 @@ def origin(component: Component | type[Component]) -> str:
     return f"{cls.kind} {cls.__name__}"
 
 
+def name_of(component: Component) -> str:
+    """Returns the name under which configs choose a component; its class's if it is none's."""
+    for found, loaded in _loaded.items():
+        if loaded is type(component):
+            return found.name
+    return type(component).__name__
+
+
 def in_words(error: BaseException) -> str:
     """Returns an error's type and the first line of its text."""
     first = next(iter(str(error).splitlines()), "")
@@ -404,10 +419,14 @@ def _check(found: Entry, cls: Any) -> None:
             f"{found}: its settings must not have a field 'name', which chooses the component itself"
         )
     if found.kind == "model":
-        _check_model(found, cls, base)
+        _check_model(found, cls)
+    if found.kind in {"model", "simulator"} and not issubclass(schema, base.schema):
+        raise PluginError(
+            f"{found}: its schema must extend {base.schema.__module__}.{base.schema.__name__}"
+        )
 
 
-def _check_model(found: Entry, cls: Any, base: Any) -> None:
+def _check_model(found: Entry, cls: Any) -> None:
     from cfx.parameters import ParameterSpace
 
     space = getattr(cls, "parameters", None)
@@ -417,10 +436,6 @@ def _check_model(found: Entry, cls: Any, base: Any) -> None:
         )
     if not space.tuned and not space.open:
         raise PluginError(f"{found}: at least one of its parameters must be tuned")
-    if not issubclass(cls.schema, base.schema):
-        raise PluginError(
-            f"{found}: its schema must extend {base.schema.__module__}.{base.schema.__name__}"
-        )
 
 
 def _resolve(target: str) -> Any:

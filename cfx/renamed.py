@@ -31,6 +31,8 @@ SETTINGS: dict[str, str] = {
     "learner.weight_by_spread": "learner.weight_by_sensitivity",
     "model.reach": "model.adaptation_bounds",
     "policy.traits": "policy.driver_features",
+    "simulation.compile": "simulator.compile",
+    "simulation.memory_mb": "simulator.memory_mb",
 }
 """Paths in the configuration: the old one and the new one."""
 
@@ -97,6 +99,36 @@ def node(group: str, values: Mapping[str, Any]) -> dict[str, Any]:
     if isinstance(name, str) and (group, name) in OPTIONS:
         renamed["name"] = _option(group, name)
     return renamed
+
+
+def config(values: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Returns a job's configuration with today's groups; warns of each that was renamed.
+
+    Args:
+        values: the resolved configuration, such as a job's `config.yaml`.
+    """
+    earlier = values.get("simulation")
+    if not isinstance(earlier, Mapping):
+        return values
+    current = dict(values)
+    simulator = dict(current.get("simulator") or {"name": "memory"})
+    kept = dict(earlier)
+    for key in earlier:
+        new = SETTINGS.get(f"simulation.{key}")
+        if new is None:
+            continue
+        value = kept.pop(key)
+        text = "simulation.%s is now called %s; the old name goes with the next version"
+        log.warning(text, key, new)
+        if key == "compile" and simulator.get("name") != "memory":
+            continue  # compiling was always the in-memory simulator's alone
+        simulator[key] = value
+    current["simulator"] = simulator
+    if kept:
+        current["simulation"] = kept  # what is left was never there, and is refused by name
+    else:
+        del current["simulation"]
+    return current
 
 
 def metric(name: str) -> str:

@@ -14,13 +14,16 @@ from typing import Any, NoReturn
 import torch
 from torch import Tensor
 
-from cfx.errors import PluginError
+from cfx.errors import CfxError, PluginError
 from cfx.models.base import DrivingModel, Follower, Leader
-from cfx.models.vtype import SumoOnly
+from cfx.models.krauss import Krauss
 from cfx.optimizers.base import Optimizer
 from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import token_width
+from cfx.simulation.base import Stepper
+from cfx.simulation.trajectory import Start
+from cfx.simulators.base import Simulator
 
 STATES = 24
 DT = 0.1
@@ -35,7 +38,7 @@ def smoke_check_model(model: DrivingModel) -> None:
         PluginError: a speed or the memory has another shape or dtype than the states or is not finite, a speed is negative, or
             the step reads other parameters than the class declares.
     """
-    if isinstance(model, SumoOnly):  # it has no step to try
+    if model.needs_simulator:  # it has no step to try
         return
     for dtype in (torch.float64, torch.float32):
         follower, leader = _states(model, dtype)
@@ -187,6 +190,53 @@ def smoke_check_policy(policy: Policy) -> None:
         raise PluginError(
             "forward answers NaN or a number outside [0, 1]; parameters are chosen in unit space"
         )
+
+
+@torch.no_grad()
+def smoke_check_simulator(simulator: Simulator) -> None:
+    """Makes a stepper for Krauss's model; one that works in this process takes two steps.
+
+    Whether it works in this process is known by its gradients. Another one may take seconds to start,
+    so that its steps are left to `cfx plugins check`. A simulator that cannot drive this model, or
+    misses something that is not installed, says so itself when a job asks it.
+
+    Raises:
+        PluginError: what `stepper` returns is no stepper, its identity is no text, or a step gives
+            another shape or dtype than the states have, or a number that is not finite.
+    """
+    model = Krauss()
+    try:
+        simulator.require(model)
+        stepper: object = simulator.stepper(model, DT)
+    except PluginError:
+        raise
+    except CfxError:
+        return
+    if not isinstance(stepper, Stepper):
+        raise PluginError(f"stepper returns a {type(stepper).__name__} and no Stepper")
+    if not isinstance(stepper.identity(), str):
+        raise PluginError("identity() must give a text: caches carry it")
+    if simulator.differentiable:
+        _smoke_check_steps(stepper, model)
+
+
+def _smoke_check_steps(stepper: Stepper, model: DrivingModel) -> None:
+    for dtype in (torch.float64, torch.float32):
+        follower, ahead = _states(model, dtype)
+        leader = Leader(
+            ahead.position.expand(2, -1),
+            ahead.speed.expand(2, -1),
+            ahead.acceleration.expand(2, -1),
+            ahead.length,
+        )
+        start = Start(follower.position, follower.speed, follower.acceleration)
+        values = _values(model.parameters, dtype)
+        end, position, speed = stepper.advance(stepper.begin(start), leader, values)
+        _require_tensor(end.speed, "advance's follower", (STATES,), dtype, "(*batch,)")
+        for name, found in (("positions", position), ("speeds", speed)):
+            _require_tensor(found, f"advance's {name}", (2, STATES), dtype, "(K, *batch)")
+            if not bool(found.isfinite().all()):
+                raise PluginError(f"advance gives {name} that are not finite in ordinary states")
 
 
 def smoke_check_optimizer(optimizer: Optimizer) -> None:

@@ -77,7 +77,6 @@ def test_a_job_config_cannot_be_changed() -> None:
         ("+style.clster=all", r"^style\.clster: unknown key\. Did you mean 'cluster'\?"),
         ("+sede=1", r"^sede: unknown key\. Did you mean 'seed'\?"),
         ("~model", r"^model: a value is required"),
-        ("simulation.memory_mb=1", r"^simulation\.memory_mb=1: "),
     ],
 )
 def test_a_wrong_value_is_explained_with_its_full_key(override: str, message: str) -> None:

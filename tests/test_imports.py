@@ -21,6 +21,7 @@ FLOORS = (
     ("registry",),
     ("models",),
     ("simulation",),
+    ("simulators",),
     ("datasets", "style", "optimizers", "calibration"),
     ("policies", "learners"),
     ("evaluation", "smoke_checks"),

@@ -21,7 +21,6 @@ from torch import Tensor
 from cfx.evaluation.result import METHODS, Array, Platoon
 from cfx.evaluation.safety import hard_braking
 from cfx.models.base import DrivingModel, Follower, Leader
-from cfx.models.vtype import SumoOnly
 from cfx.policies.features import History
 from cfx.policies.trained import TrainedPolicy
 from cfx.simulation.rollout import Simulator, Start
@@ -158,7 +157,7 @@ def measure_platoons(
     Returns:
         None for a model without equations.
     """
-    if isinstance(model, SumoOnly):
+    if model.needs_simulator:
         return None
     chosen = {method: policies[method] for method in METHODS if method in policies}
     dt = next(iter(chosen.values()))[0].dt

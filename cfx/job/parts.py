@@ -14,13 +14,10 @@ from cfx.datasets.base import Dataset
 from cfx.errors import ConfigError
 from cfx.learners.base import Learner
 from cfx.models.base import DrivingModel
-from cfx.models.vtype import SumoOnly
 from cfx.optimizers.base import Optimizer
 from cfx.policies.base import Policy
 from cfx.protocols.base import Protocol
-from cfx.simulation.base import BaseSimulator
-from cfx.simulation.rollout import Simulator
-from cfx.simulation.settings import SumoSettings
+from cfx.simulators.base import Simulator
 from cfx.tracking.store import folder_of, is_run_id
 
 log = logging.getLogger(__name__)
@@ -35,6 +32,7 @@ class Parts:
 
     dataset: Dataset
     model: DrivingModel
+    simulator: Simulator
     optimizer: Optimizer
     policy: Policy
     learner: Learner
@@ -47,18 +45,20 @@ class Parts:
         Raises:
             ConfigError: a setting is wrong, or two components do not fit each other.
             PluginError: a component cannot be loaded.
-            SumoError: SUMO was asked for and is not installed.
+            CfxError: the simulator needs what is not installed, such as SUMO.
         """
         model = cast(DrivingModel, registry.create("model", config.model))
-        check_simulator(config, model)
+        simulator = cast(Simulator, registry.create("simulator", config.simulator))
+        simulator.require(model)
         learner = cast(Learner, registry.create("learner", config.learner))
         policy = cast(Policy, registry.create("policy", config.policy))
-        learner.require_gradients(model, not isinstance(config.simulator, SumoSettings))
+        learner.require_gradients(model, simulator.differentiable)
         if "policy" not in protocol.determines():  # else the policy has been trained already
             learner.require_no_driver_features(policy)
         return cls(
             dataset=cast(Dataset, registry.create("dataset", config.data)),
             model=model,
+            simulator=simulator,
             optimizer=cast(Optimizer, registry.create("optimizer", config.optimizer)),
             policy=policy,
             learner=learner,
@@ -117,34 +117,3 @@ def choose_device(name: str) -> torch.device:
             " write device=cpu or device=auto"
         )
     return device
-
-
-def check_simulator(config: JobConfig, model: DrivingModel) -> None:
-    """Checks that the chosen simulator can run a model, before any work begins.
-
-    Raises:
-        ConfigError: it cannot; says what to choose.
-        SumoError: SUMO is not installed, or another version.
-    """
-    if isinstance(config.simulator, SumoSettings):
-        from cfx.sumo.simulator import require_in_sumo
-
-        require_in_sumo(model)
-    elif isinstance(model, SumoOnly):
-        name = config.model.get("name")
-        raise ConfigError(
-            f"model={name} has no equations in Python, SUMO alone simulates it; add simulator=sumo"
-        )
-
-
-def make_simulator(config: JobConfig, model: DrivingModel, dt: float) -> BaseSimulator:
-    """Returns the simulator that a configuration chooses.
-
-    Args:
-        dt: time step, s.
-    """
-    if isinstance(config.simulator, SumoSettings):
-        from cfx.sumo.simulator import SumoSimulator
-
-        return SumoSimulator(model, dt, config.simulator)
-    return Simulator(model, dt, compile=config.simulation.compile)

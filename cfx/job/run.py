@@ -20,7 +20,7 @@ from cfx.errors import PluginError
 from cfx.job import output as files
 from cfx.job.console import report
 from cfx.job.output import Output
-from cfx.job.parts import Parts, choose_device, complete, make_protocol, make_simulator
+from cfx.job.parts import Parts, choose_device, complete, make_protocol
 from cfx.job.results import JobResult
 from cfx.learners.curves import best_losses
 from cfx.pairs import PairBatch, PairSet
@@ -120,25 +120,25 @@ def _context(
 ) -> ProtocolContext:
     """Returns what the protocol works with."""
     batch = PairBatch.of(pairs, dtype=getattr(torch, config.dtype), device=device)
-    simulator = make_simulator(config, parts.model, batch.dt)
+    stepper = parts.simulator.stepper(parts.model, batch.dt)
     cache_folder = None
     workspace = None
     if config.cache.enabled:
         cache_folder = Path(config.cache.folder).expanduser()
         workspace = cache_folder / "training"
     calibrator = Calibrator(
-        simulator,
+        stepper,
         parts.optimizer,
         seed=config.seed,
         cache=Cache(cache_folder),
-        memory=config.simulation.memory_mb * 2**20,
+        memory=parts.simulator.settings.memory_mb * 2**20,
         progress=Task,
     )
     return ProtocolContext(
         pairs=pairs,
         batch=batch,
         style=style,
-        simulator=simulator,
+        simulator=stepper,
         model_node=config.model,
         policy_node=config.policy,
         calibrator=calibrator,

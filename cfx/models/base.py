@@ -84,6 +84,9 @@ class DrivingModel(Component):
             expects of it. Tested.
         follows: with constant parameters the model reacts to its leader. A model without that has parameters that are the control
             itself: constant ones are no baseline, and reports do not compare with them. Tested.
+        needs_simulator: name of the simulator that alone can drive the model; "" for a model with
+            equations in Python, which every simulator that uses them can drive. Where it is given,
+            `next_speed` raises a ConfigError.
         reference: where the equations come from.
         temperature: how gradually regimes switch; 0, the exact model, everywhere but in a learner's training (`smoothed`).
     """
@@ -93,10 +96,11 @@ class DrivingModel(Component):
     settings: ModelSettings
 
     parameters: ClassVar[ParameterSpace]
-    memory_size: int = 0
+    memory_size: ClassVar[int] = 0
     differentiable: ClassVar[bool] = True
     collision_free: ClassVar[bool] = False
     has_constant_baseline: ClassVar[bool] = True
+    needs_simulator: ClassVar[str] = ""
     reference: ClassVar[str] = ""
     temperature: Temperature = 0.0
 

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from cfx.component import Settings
 from cfx.errors import ConfigError
-from cfx.models.base import Follower, Leader, ModelSettings
-from cfx.models.vtype import SumoOnly, VType
+from cfx.models.base import DrivingModel, Follower, Leader, ModelSettings
+from cfx.models.vtype import VType
 from cfx.parameters import ParameterOverride, ParameterSpace
 
 _UNITS = {
@@ -56,7 +56,7 @@ class SumoVTypeSettings(ModelSettings):
     )
 
 
-class SumoVType(SumoOnly):
+class SumoVType(DrivingModel):
     """Whatever SUMO drives: its parameters are vType attributes, by SUMO's names, from the config.
 
         model=sumo_vtype model.car_follow_model=EIDM 'model.parameters={tau: {low: 0.5, high: 3, default: 1}}'
@@ -72,6 +72,8 @@ class SumoVType(SumoOnly):
     reference = "SUMO's own definition of vehicle types"
     schema: ClassVar[type[Settings]] = SumoVTypeSettings
     settings: SumoVTypeSettings
+    differentiable = False
+    needs_simulator = "sumo"
     parameters = ParameterSpace((), open=True)
 
     def __init__(self, settings: Settings | None = None, **options: object) -> None:
@@ -93,7 +95,7 @@ class SumoVType(SumoOnly):
         self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
     ) -> NoReturn:
         raise ConfigError(
-            "model=sumo_vtype has no equations in Python, SUMO alone drives it; add simulator=sumo"
+            "model=sumo_vtype has no equations in Python; add simulator=sumo, which alone drives it"
         )
 
     def sumo_vtype(self, p: Mapping[str, Tensor]) -> VType:

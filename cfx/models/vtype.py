@@ -8,8 +8,6 @@ from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
-from cfx.models.base import DrivingModel
-
 
 @dataclass(frozen=True)
 class VType:
@@ -42,9 +40,3 @@ class InSumo(Protocol):
         Raises:
             ConfigError: as the model is set up, SUMO has none that drives so; says what to set.
         """
-
-
-class SumoOnly(DrivingModel):
-    """Base of models that have no equations here: SUMO alone drives them. They implement `sumo_vtype`."""
-
-    differentiable = False

@@ -10,7 +10,17 @@ from cfx.report.read import Job
 from cfx.tracking.provenance import flatten
 
 GROUPS = ("model", "policy", "learner", "protocol", "optimizer", "data")
-_NO_DIFFERENCE = ("tracking.", "cache.", "figures.", "simulation.", "threads", "device", "preset")
+_NO_DIFFERENCE = (
+    "tracking.",
+    "cache.",
+    "figures.",
+    "simulation.",
+    "simulator.compile",
+    "simulator.memory_mb",
+    "threads",
+    "device",
+    "preset",
+)
 """Settings that change where or how fast a job runs, not what comes out."""
 
 _MOST = 4

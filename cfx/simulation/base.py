@@ -4,21 +4,25 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from torch import Tensor
 
 from cfx.models.base import DrivingModel, Follower, Leader
-
-if TYPE_CHECKING:
-    from cfx.simulation.rollout import Start
+from cfx.simulation.trajectory import Start
 
 
-class BaseSimulator(ABC):
+class Stepper(ABC):
     """Advances followers of one model at one time step.
 
+    A simulator (`cfx.Simulator`) makes one for each job. Calibration, learning and evaluation call
+    `begin` once for each rollout and `advance` as often as parameters change; the job calls `close`
+    at its end.
+
+    Shapes: `*batch` are the followers' leading dimensions, K is a number of steps.
+
     Args:
-        model: what drives.
+        model: the driving model whose steps are taken.
         dt: time step, s.
 
     Attributes:
@@ -42,21 +46,33 @@ class BaseSimulator(ABC):
         """Takes K steps with constant parameters.
 
         Args:
-            follower: state at the first frame, `(*batch,)`.
-            leader: frames 0 to K - 1, `(K, *batch)` each (the length without time), broadcasting to the follower's batch.
+            follower: state at the first frame, `(*batch,)`. Either from `begin` or from the call
+                before, so that a simulator may return a `Follower` that knows more.
+            leader: frames 0 to K - 1, `(K, *batch)` each (the length without time), broadcasting to
+                the follower's batch.
             p: one tensor per parameter, broadcasting to `(*batch,)`.
 
         Returns:
             The follower at frame K, and positions and speeds `(K, *batch)` of frames 1 to K.
+
+        Raises:
+            CfxError: an input wants gradients, and `differentiable` is False.
         """
 
-    def for_work(self, steps: int) -> BaseSimulator:
-        """Returns what takes so many vehicle steps that belong together, however many calls of `advance` they are cut into."""
+    def for_work(self, steps: int) -> Stepper:
+        """Returns what takes a number of vehicle steps that belong together.
+
+        Args:
+            steps: of all vehicles, however many calls of `advance` they are cut into.
+        """
         return self
 
-    def close(self) -> None:  # noqa: B027 - most simulators hold nothing
+    def close(self) -> None:  # noqa: B027 - most hold nothing
         """Lets go of what takes the steps, such as processes; `advance` may start it again."""
 
     @abstractmethod
     def identity(self) -> str:
         """Returns what results depend on besides the model and the time step; caches carry it."""
+
+
+BaseSimulator = Stepper

@@ -14,7 +14,7 @@ import math
 import shutil
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -22,9 +22,11 @@ from torch import Tensor
 from cfx.component import folder_hash
 from cfx.errors import ParameterError
 from cfx.models.base import DrivingModel, Follower, Leader
-from cfx.simulation.base import BaseSimulator
+from cfx.simulation.base import Stepper
 from cfx.simulation.step import advance_vehicle
 from cfx.simulation.threads import one_thread
+from cfx.simulation.trajectory import Start as Start  # noqa: PLC0414 - earlier home
+from cfx.simulation.trajectory import Trajectory as Trajectory  # noqa: PLC0414 - earlier home
 
 Compile = Literal["auto", "always", "never"]
 _Parameters = dict[str, Tensor]
@@ -44,32 +46,7 @@ values that a model reads and writes stay in the cache; otherwise memory sets th
 for each other after every small operation, thirty times as long where another program wants the core."""
 
 
-class Start(NamedTuple):
-    """A follower's state when a rollout begins; all tensors `(*batch,)`, SI units."""
-
-    position: Tensor
-    speed: Tensor
-    acceleration: Tensor
-
-
-class Trajectory(NamedTuple):
-    """What a rollout gives; all tensors `(*batch, time)`, frame 0 being the start.
-
-    Attributes:
-        position: front bumper, m.
-        speed: m/s.
-        gap: bumper to bumper, m; negative from a collision on.
-        collided: bool, the gap is negative. A rollout goes on after a collision: nothing is hidden. False where the
-            gap is NaN.
-    """
-
-    position: Tensor
-    speed: Tensor
-    gap: Tensor
-    collided: Tensor
-
-
-class Simulator(BaseSimulator):
+class MemoryStepper(Stepper):
     """Advances followers of one model at one time step.
 
     Compiles the model's step once that pays (`compile="auto"`), where a compiler is found; runs it eagerly otherwise and
@@ -86,8 +63,8 @@ class Simulator(BaseSimulator):
     def identity(self) -> str:
         return folder_hash(__file__)
 
-    def for_work(self, steps: int) -> Simulator:
-        return Simulator(self.model, self.dt, compile="always") if self._pays(steps) else self
+    def for_work(self, steps: int) -> MemoryStepper:
+        return MemoryStepper(self.model, self.dt, compile="always") if self._pays(steps) else self
 
     def advance(
         self, follower: Follower, leader: Leader, p: Mapping[str, Tensor]
@@ -359,8 +336,8 @@ def simulate(
     shapes = [leader.position.shape[:-1], leader.length.shape, *(state.shape for state in start)]
     shapes += [value.shape for _, _, p in windows for value in p.values()]
     batch = torch.broadcast_shapes(*shapes)  # type: ignore[no-untyped-call]  # torch leaves it untyped
-    simulator = Simulator(model, dt, compile=compile)
-    follower = simulator.begin(Start(*(state.expand(batch) for state in start)))
+    stepper = MemoryStepper(model, dt, compile=compile)
+    follower = stepper.begin(Start(*(state.expand(batch) for state in start)))
     in_time = Leader(
         _time_first(leader.position),
         _time_first(leader.speed),
@@ -369,7 +346,7 @@ def simulate(
     )
     positions, speeds = [follower.position[None]], [follower.speed[None]]
     for first, last, p in windows:
-        follower, position, speed = simulator.advance(follower, _frames(in_time, first, last), p)
+        follower, position, speed = stepper.advance(follower, _frames(in_time, first, last), p)
         positions.append(position)
         speeds.append(speed)
     position = torch.cat(positions).movedim(0, -1)
@@ -422,3 +399,6 @@ def _windows(
 def _columns(parameters: Tensor) -> Tensor:
     """Returns the same tensor with each parameter contiguous in memory, as a step reads them."""
     return parameters.movedim(-1, 0).contiguous().movedim(0, -1)
+
+
+Simulator = MemoryStepper

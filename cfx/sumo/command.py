@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from cfx.sumo.installed import require_sumo
+from cfx.simulators.sumo.installed import require_sumo
 
 
 def drive_scenario(options: argparse.Namespace, sumos: Sequence[str]) -> None:

@@ -29,8 +29,8 @@ from cfx.evaluation.result import Drive, Evaluation
 from cfx.files import atomic_write
 from cfx.pairs import Pair, PairBatch, PairSet
 from cfx.policies.trained import ALL, TrainedPolicy
-from cfx.sumo.channel import Message, receive, send
-from cfx.sumo.installed import require_sumo
+from cfx.simulators.sumo.channel import Message, receive, send
+from cfx.simulators.sumo.installed import require_sumo
 from cfx.sumo.motorway import ABREAST, Motorway, read_motorway
 from cfx.sumo.replay import FOLLOWERS
 from cfx.sumo.shown import Array, Shown, evaluation_in_sumo

@@ -17,8 +17,8 @@ from typing import Any, TextIO
 from cfx.errors import ConfigError, DataError, OutputError, SumoError, nearest
 from cfx.files import atomic_write
 from cfx.progress import Task
+from cfx.simulators.sumo.installed import require_sumo
 from cfx.sumo.fleet import Fleet
-from cfx.sumo.installed import require_sumo
 
 
 @dataclass

@@ -23,7 +23,6 @@ from cfx import registry
 from cfx.calibration.settings import WindowSettings
 from cfx.errors import DataError, ParameterError, SumoError
 from cfx.models.base import DrivingModel, Follower, Leader
-from cfx.models.vtype import SumoOnly
 from cfx.policies.base import ConstantNetwork
 from cfx.policies.features import History
 from cfx.policies.fixed import FixedPolicy
@@ -105,7 +104,7 @@ class Driver:
         self.speed_mode = speed_mode
         self.source = source
         self.model = model or cast(DrivingModel, registry.create("model", policy.model_node))
-        if isinstance(self.model, SumoOnly):
+        if self.model.needs_simulator:
             raise DataError(
                 f"{source} chooses parameters of model={policy.model_node['name']}, which SUMO alone drives: nobody can change"
                 " them on the way; a live driver needs a model that cfx has, such as krauss or w99"

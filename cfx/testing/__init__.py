@@ -28,10 +28,12 @@ if TYPE_CHECKING:
     from cfx.testing.optimizers import OptimizerContract as OptimizerContract
     from cfx.testing.policies import PolicyContract as PolicyContract
     from cfx.testing.protocols import ProtocolContract as ProtocolContract
+    from cfx.testing.simulators import SimulatorContract as SimulatorContract
 
 _HOMES = {
     "DatasetContract": "cfx.testing.datasets",
     "ModelContract": "cfx.testing.models",
+    "SimulatorContract": "cfx.testing.simulators",
     "OptimizerContract": "cfx.testing.optimizers",
     "PolicyContract": "cfx.testing.policies",
     "LearnerContract": "cfx.testing.learners",
@@ -46,6 +48,7 @@ _HOMES = {
 _CHECKS = {
     "dataset": "cfx.testing.checks.datasets",
     "model": "cfx.testing.checks.models",
+    "simulator": "cfx.testing.checks.simulators",
     "optimizer": "cfx.testing.checks.optimizers",
     "policy": "cfx.testing.checks.policies",
     "learner": "cfx.testing.checks.learners",

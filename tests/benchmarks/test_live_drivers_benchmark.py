@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from cfx.sumo.network import network
+from cfx.simulators.sumo.network import network
 from tests.sumo.policies import adaptive
 
 pytest.importorskip("traci", reason="needs the extra sumo")

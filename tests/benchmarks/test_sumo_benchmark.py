@@ -24,8 +24,7 @@ from torch import Tensor
 
 from cfx.models.base import Leader
 from cfx.models.krauss_sumo import KraussSumo
-from cfx.simulation.rollout import Start
-from cfx.simulation.settings import SumoSettings
+from cfx.simulation.trajectory import Start
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("libsumo") is None,
@@ -91,10 +90,10 @@ def alone(request: str) -> list[float]:
 
 @pytest.mark.benchmark(group="sumo")
 def test_pair_runs_in_sumo(benchmark: Any) -> None:
-    from cfx.sumo.simulator import SumoSimulator
+    from cfx.simulators.sumo.stepper import SumoStepper
 
     case, cores = Case(), len(os.sched_getaffinity(0))
-    simulator = SumoSimulator(case.model, DT, SumoSettings())
+    simulator = SumoStepper(case.model, DT)
 
     def drive() -> Tensor:
         return simulator.advance(simulator.begin(case.start), case.leader, case.p)[2]

@@ -11,8 +11,8 @@ import pytest
 import cfx
 from cfx.config import DemoSettings
 from cfx.errors import ConfigError, DataError, SumoError
+from cfx.simulators.sumo.channel import Message
 from cfx.sumo import motorway
-from cfx.sumo.channel import Message
 from cfx.sumo.demo import _ask, check_demo
 from cfx.sumo.motorway import SHIPPED, find_netconvert, read_motorway
 from cfx.sumo.replay import FOLLOWERS

@@ -17,6 +17,7 @@ from cfx.testing.suite import hold
 SUITES = {
     "dataset": cfx.testing.DatasetContract,
     "model": cfx.testing.ModelContract,
+    "simulator": cfx.testing.SimulatorContract,
     "optimizer": cfx.testing.OptimizerContract,
     "policy": cfx.testing.PolicyContract,
     "learner": cfx.testing.LearnerContract,

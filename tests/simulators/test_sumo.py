@@ -1,4 +1,4 @@
-"""`SumoSimulator` takes the steps that the models' own equations take, and says clearly where it cannot."""
+"""`SumoStepper` takes the steps that the models' own equations take, and says clearly where it cannot."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from cfx.models.krauss_sumo import KraussSumo
 from cfx.models.sumo_vtype import SumoVType
 from cfx.models.w74 import W74
 from cfx.models.w99 import W99
-from cfx.simulation.rollout import Simulator, Start
-from cfx.simulation.settings import SumoSettings
+from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.trajectory import Start
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("libsumo") is None,
@@ -68,9 +68,9 @@ def case() -> Case:
 
 
 def in_sumo(model: DrivingModel, **settings: int) -> Iterator[object]:
-    from cfx.sumo.simulator import SumoSimulator
+    from cfx.simulators.sumo.stepper import SumoStepper
 
-    simulator = SumoSimulator(model, DT, SumoSettings(**({"workers": 1} | settings)))
+    simulator = SumoStepper(model, DT, **({"workers": 1} | settings))
     yield simulator
     simulator.close()
 
@@ -84,7 +84,7 @@ def eidm() -> Iterator[object]:
     "model", [KRAUSS, KraussSumo(), IdmSumo(), W99()], ids=lambda model: type(model).__name__
 )
 def test_drives_in_sumo_are_drives_in_memory(model: DrivingModel, case: Case) -> None:
-    memory, p = Simulator(model, DT), case.parameters(model)
+    memory, p = MemoryStepper(model, DT), case.parameters(model)
     for sumo in in_sumo(model, workers=2, followers=4):
         expected = memory.advance(memory.begin(case.start), case.leader, p)
         found = sumo.advance(sumo.begin(case.start), case.leader, p)
@@ -97,12 +97,12 @@ def test_drives_in_sumo_are_drives_in_memory(model: DrivingModel, case: Case) ->
 @pytest.mark.parametrize("model", [KraussSumo(), IdmSumo()], ids=lambda model: type(model).__name__)
 @pytest.mark.parametrize("dt", [0.2, 0.5, 1.0])
 def test_longer_time_steps_are_sumos_too(model: DrivingModel, dt: float, case: Case) -> None:
-    from cfx.sumo.simulator import SumoSimulator
+    from cfx.simulators.sumo.stepper import SumoStepper
 
     p, memory, sumo = (
         case.parameters(model),
-        Simulator(model, dt),
-        SumoSimulator(model, dt, SumoSettings(workers=1)),
+        MemoryStepper(model, dt),
+        SumoStepper(model, dt, workers=1),
     )
     far = Start(case.start.position - 20.0, case.start.speed, case.start.acceleration)
     expected = memory.advance(memory.begin(far), case.part(0, 12), p)[2]
@@ -158,7 +158,7 @@ def test_a_follower_whose_parameters_change_begins_anew_and_the_others_do_not(
 
 def test_leaders_and_parameters_broadcast_and_single_precision_stays(case: Case) -> None:
     model = IdmSumo()
-    memory = Simulator(model, DT)
+    memory = MemoryStepper(model, DT)
     leader = Leader(*(x.float()[..., None] for x in case.leader))
     start = Start(*(x.float()[:, None].expand(PAIRS, 3) for x in case.start))
     p = {
@@ -213,19 +213,19 @@ def test_the_same_request_gives_the_same_drives_whatever_came_before(case: Case)
 
 
 def test_settings_that_change_drives_are_part_of_what_caches_see(eidm: object) -> None:
-    from cfx.sumo.simulator import SumoSimulator
+    from cfx.simulators.sumo.stepper import SumoStepper
 
-    assert SumoSimulator(EIDM, DT, SumoSettings(workers=3)).identity() == eidm.identity()
+    assert SumoStepper(EIDM, DT, workers=3).identity() == eidm.identity()
     assert (
-        SumoSimulator(EIDM, DT, SumoSettings(seed=1)).identity()
+        SumoStepper(EIDM, DT, seed=1).identity()
         != eidm.identity()
-        != Simulator(EIDM, DT).identity()
+        != MemoryStepper(EIDM, DT).identity()
     )
 
 
 def test_gradients_are_refused(eidm: object, case: Case) -> None:
     assert not eidm.differentiable
-    assert Simulator(KraussSumo(), DT).differentiable
+    assert MemoryStepper(KraussSumo(), DT).differentiable
     p = {"tau": torch.tensor(1.0, dtype=torch.float64, requires_grad=True)}
     with pytest.raises(
         SumoError,
@@ -276,10 +276,10 @@ def test_nobody_or_no_time_is_no_drive(eidm: object, case: Case) -> None:
 def test_what_sumo_cannot_drive_is_refused_before_any_work(
     model: DrivingModel, dt: float, sentence: str
 ) -> None:
-    from cfx.sumo.simulator import SumoSimulator
+    from cfx.simulators.sumo.stepper import SumoStepper
 
     with pytest.raises(ConfigError) as error:
-        SumoSimulator(model, dt)
+        SumoStepper(model, dt)
     assert sentence in str(error.value)
 
 

@@ -1,4 +1,4 @@
-"""A SUMO process: `python -m cfx.sumo.worker FOLDER` drives followers behind leaders, one request after the other.
+"""A SUMO process: `python -m cfx.simulators.sumo.worker FOLDER` drives followers behind leaders, one request after the other.
 
 A process of its own, because libsumo holds one simulation in a process and does not get on with pyarrow, which jobs load. It ends
 when its standard input does, and so with its job, however that ends. A request loads the network of parallel roads anew in the
@@ -23,8 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from cfx.sumo.channel import Array, Message, receive, send
-from cfx.sumo.network import FOLLOWER, LANE, LEADER, Placed, network, routes
+from cfx.simulators.sumo.channel import Array, Message, receive, send
+from cfx.simulators.sumo.network import FOLLOWER, LANE, LEADER, Placed, network, routes
 
 LOG = "sumo.log"
 """File in the folder that takes what SUMO prints."""

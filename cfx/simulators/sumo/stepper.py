@@ -15,12 +15,11 @@ from cfx.component import content_key, folder_hash
 from cfx.errors import ConfigError, SumoError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.vtype import InSumo, VType
-from cfx.simulation.base import BaseSimulator
-from cfx.simulation.settings import SumoSettings
-from cfx.sumo.channel import Array, Message
-from cfx.sumo.installed import require_sumo
-from cfx.sumo.schema import check_vtype
-from cfx.sumo.session import Session
+from cfx.simulation.base import Stepper
+from cfx.simulators.sumo.channel import Array, Message
+from cfx.simulators.sumo.installed import require_sumo
+from cfx.simulators.sumo.schema import check_vtype
+from cfx.simulators.sumo.session import Session
 
 _REPLAYED = {"sigma": "0", "maxSpeed": "130"}
 """Attributes of every leader; how it drives is told it at each step."""
@@ -31,7 +30,7 @@ _STILL = {"speedFactor": "1", "sigma": "0"}
 _Values = dict[str, Tensor | str]
 
 
-class SumoSimulator(BaseSimulator):
+class SumoStepper(Stepper):
     """Drives followers in SUMO, each on a road of its own behind its own leader.
 
     A follower enters with its exact position, speed and acceleration, and its leader has exactly the given ones at each step. One
@@ -44,12 +43,14 @@ class SumoSimulator(BaseSimulator):
     A follower that runs into its leader stays, with a negative gap; one that enters ahead of its leader drives on freely, as SUMO
     sees nobody ahead of it.
 
-    Differences to `cfx.simulation.rollout.Simulator`: no gradients; always in double precision.
+    Differences to `cfx.simulation.rollout.MemoryStepper`: no gradients; always in double precision.
 
     Args:
         model: one that SUMO has.
         dt: time step, s, in whole milliseconds.
-        settings: how many processes and followers, and the seed.
+        workers: SUMO processes at most; None: one for each core.
+        followers: in one network, each on its own road.
+        seed: SUMO's own, for models that draw random numbers.
 
     Raises:
         ConfigError: SUMO does not have the model, or not as it is set up, or cannot count the time step.
@@ -57,20 +58,33 @@ class SumoSimulator(BaseSimulator):
     """
 
     def __init__(
-        self, model: DrivingModel, dt: float, settings: SumoSettings | None = None
+        self,
+        model: DrivingModel,
+        dt: float,
+        *,
+        workers: int | None = None,
+        followers: int = 50,
+        seed: int = 23423,
     ) -> None:
         super().__init__(model, dt)
         self._model = require_in_sumo(model)
-        self._settings = settings or SumoSettings()
+        self._followers = followers
+        self._seed = seed
         if round(dt * 1000) < 1 or abs(dt - round(dt * 1000) / 1000) > 1e-9:
             raise ConfigError(
                 f"simulator=sumo: SUMO counts in milliseconds, so it cannot take the recording's steps of {dt:g} s"
             )
-        self._session = Session(self._settings.workers or _cores())
+        self._session = Session(workers or _cores())
 
     def identity(self) -> str:
-        settings = self._settings.model_dump(exclude={"workers"})
-        return content_key({"sumo": require_sumo(), "code": folder_hash(__file__), **settings})
+        return content_key(
+            {
+                "sumo": require_sumo(),
+                "code": folder_hash(__file__),
+                "followers": self._followers,
+                "seed": self._seed,
+            }
+        )
 
     def close(self) -> None:
         self._session.close()
@@ -103,7 +117,7 @@ class SumoSimulator(BaseSimulator):
     def _last(self, drive: _Drive, kind: VType, steps: int) -> tuple[Tensor, Tensor]:
         """Drives everybody from his entry on; returns positions and speeds `(steps, n)` of the last steps."""
         count, frames = len(drive.entry), len(drive.leader_position)
-        networks = math.ceil(count / self._settings.followers)
+        networks = math.ceil(count / self._followers)
         cuts = list(itertools.pairwise(round(count * k / networks) for k in range(networks + 1)))
         answers = self._session.drive(self._request(drive, kind, slice(a, b)) for a, b in cuts)
         rows = frames - drive.entry + torch.arange(-steps, 0)[:, None]
@@ -125,7 +139,7 @@ class SumoSimulator(BaseSimulator):
         leader_constants, leader_names, leader_attributes = _columns(drive.leader_attributes, own)
         header = {
             "dt": round(self.dt * 1000) / 1000,
-            "seed": self._settings.seed,
+            "seed": self._seed,
             "car_follow_model": kind.car_follow_model,
             "constants": _STILL | constants,
             "names": names,

@@ -19,9 +19,9 @@ import psutil
 import pytest
 
 from cfx.errors import SumoError
-from cfx.sumo import installed
-from cfx.sumo.channel import Message
-from cfx.sumo.session import Session
+from cfx.simulators.sumo import installed
+from cfx.simulators.sumo.channel import Message
+from cfx.simulators.sumo.session import Session
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -110,8 +110,8 @@ def test_a_process_that_dies_is_told_in_one_sentence_and_the_session_can_start_a
 def test_nothing_is_left_when_the_job_is_killed() -> None:
     script = textwrap.dedent("""
         import time
-        from tests.sumo.test_session import request
-        from cfx.sumo.session import Session
+        from tests.simulators.test_sumo_session import request
+        from cfx.simulators.sumo.session import Session
         session = Session(1)
         session.drive([request()])
         print(session.processes[0], session._started[0]._folder.name, flush=True)

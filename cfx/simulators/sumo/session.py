@@ -16,17 +16,17 @@ from pathlib import Path
 
 import cfx
 from cfx.errors import SumoError
-from cfx.sumo.channel import Message, receive, send
-from cfx.sumo.installed import require_sumo
-from cfx.sumo.network import ROAD
-from cfx.sumo.worker import LOG
+from cfx.simulators.sumo.channel import Message, receive, send
+from cfx.simulators.sumo.installed import require_sumo
+from cfx.simulators.sumo.network import ROAD
+from cfx.simulators.sumo.worker import LOG
 
 _PATIENCE_S = 5.0
 """How long a process that was told to end may take."""
 
 
 class Session:
-    """Answers requests in SUMO; `cfx.sumo.worker` says what they hold.
+    """Answers requests in SUMO; `cfx.simulators.sumo.worker` says what they hold.
 
     Processes start with the first request. They end, and their folders go, with `close`, when nobody holds the session any more,
     and when this process ends, however that happens.
@@ -105,7 +105,7 @@ class _Worker:
     def __init__(self) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="cfx-sumo-", ignore_cleanup_errors=True)
         self._process = subprocess.Popen(  # noqa: S603 - this Python, a module of ours, a folder of ours
-            [sys.executable, "-m", "cfx.sumo.worker", self._folder.name],
+            [sys.executable, "-m", "cfx.simulators.sumo.worker", self._folder.name],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env=os.environ | {"PYTHONPATH": _search_path(), "OMP_NUM_THREADS": "1"},

@@ -1,0 +1,1 @@
+"""Simulators: what takes the steps of calibration, learning and evaluation."""
