@@ -1,1 +1,1 @@
-"""Classic driving models for cfx: `gipps`, `ovm`, `fvdm` and `newell`."""
+"""Classic driving models for cfx: `gipps`, `gipps_delay`, `ovm`, `fvdm` and `newell`."""

@@ -41,7 +41,10 @@ class FVDM(DrivingModel):
     Differences from SUMO: SUMO has no full-velocity-difference model.
     """
 
-    reference = "Jiang, Wu and Zhu (2001), Phys. Rev. E 64, 017101; Treiber and Kesting (2013), section 10.7"
+    reference = (
+        "Jiang, Wu and Zhu (2001), Phys. Rev. E 64, 017101;"
+        " Treiber and Kesting (2013), section 10.7"
+    )
     parameters = ParameterSpace.of(
         *OPTIMAL_VELOCITY,
         Parameter(

@@ -1,4 +1,4 @@
-"""The optimal velocity: the speed that a gap deserves. `ovm` and `fvdm` share it."""
+"""The optimal velocity: the speed that drivers choose at a gap. `ovm` and `fvdm` share it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from torch import Tensor
 
 from cfx import Parameter
 
-_BOOK = "default: Treiber and Kesting (2013), section 10.6, motorway; bounds: about those of Kesting and Treiber (2008)"
+_BOOK = (
+    "default: Treiber and Kesting (2013), section 10.6, motorway;"
+    " bounds: about those of Kesting and Treiber (2008)"
+)
 
 OPTIMAL_VELOCITY = (
     Parameter("v0", "m/s", 1.0, 70.0, 120 / 3.6, "desired speed on a free road", _BOOK),
@@ -29,8 +32,10 @@ OPTIMAL_VELOCITY = (
 
 
 def optimal_velocity(gap: Tensor, p: Mapping[str, Tensor]) -> Tensor:
-    """Returns V, m/s: `v0 (tanh(gap / width - beta) + tanh(beta)) / (1 + tanh(beta))`, 0 where the gap is gone; gaps in m."""
+    """Returns V, m/s: `v0 (tanh(gap / width - beta) + tanh(beta)) / (1 + tanh(beta))`.
+
+    V is 0 where the gap, in m, is negative.
+    """
     shift = torch.tanh(p["beta"])
-    return (
-        p["v0"] * (torch.tanh(gap.clamp(min=0.0) / p["width"] - p["beta"]) + shift) / (1.0 + shift)
-    )
+    rise = torch.tanh(gap.clamp(min=0.0) / p["width"] - p["beta"]) + shift
+    return p["v0"] * rise / (1.0 + shift)

@@ -1,8 +1,8 @@
 """The optimal-velocity model (`ovm`).
 
-M. Bando, K. Hasebe, A. Nakayama, A. Shibata and Y. Sugiyama (1995), *Dynamical model of traffic congestion and numerical
-simulation*, Physical Review E 51(2), 1035-1042; in SI units: M. Treiber and A. Kesting (2013), *Traffic Flow Dynamics*,
-section 10.6.
+M. Bando, K. Hasebe, A. Nakayama, A. Shibata and Y. Sugiyama (1995), *Dynamical model of traffic
+congestion and numerical simulation*, Physical Review E 51(2), 1035-1042; in SI units: M. Treiber
+and A. Kesting (2013), *Traffic Flow Dynamics*, section 10.6.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from cfx_classics.optimal_velocity import OPTIMAL_VELOCITY, optimal_velocity
 
 
 class OVM(DrivingModel):
-    """Relaxes towards the speed that the gap deserves.
+    """Relaxes towards the optimal velocity of the gap.
 
     With s the bumper gap:
 
@@ -24,13 +24,14 @@ class OVM(DrivingModel):
         dv/dt = (V(s) - v) / tau
         v'    = max(0, v + dv/dt dt)
 
-    At equilibrium the gap is `width (beta + artanh((1 + tanh(beta)) v / v0 - tanh(beta)))`. A platoon is string stable where
-    `V'(s) <= 1 / (2 tau)`; with the defaults it is not, at medium gaps. The model does not look at the leader's speed: it
-    reacts late, and it can collide.
+    At equilibrium the gap is `width (beta + artanh((1 + tanh(beta)) v / v0 - tanh(beta)))`. A
+    platoon is string stable where `V'(s) <= 1 / (2 tau)`; with the defaults it is not, at medium
+    gaps. The model does not use the leader's speed, so it reacts late and can collide.
 
-    Differences from the paper: it has `V(h) = tanh(h - 2) + tanh(2)` without units, of the distance h between the vehicles'
-    fronts, and the sensitivity 1 / tau. Here it is in SI units and of the bumper gap, so that the speed is 0 where the gap
-    is, and v0, width and beta are free. Forward Euler in dt for a model that is continuous in time.
+    Differences from the paper: it has `V(h) = tanh(h - 2) + tanh(2)` without units, of the distance
+    h between the vehicles' fronts, and the sensitivity 1 / tau. Here V is in SI units and depends
+    on the bumper gap, so that speed and gap are 0 together; v0, width and beta can be chosen. The
+    step is forward Euler in dt; the paper's model is continuous in time.
 
     Differences from SUMO: SUMO has no optimal-velocity model.
     """
@@ -45,7 +46,8 @@ class OVM(DrivingModel):
             20.0,
             0.65,
             "relaxation time",
-            "default: Treiber and Kesting (2013), section 10.6; low: Euler steps of up to 0.2 s do not overshoot",
+            "default: Treiber and Kesting (2013), section 10.6;"
+            " low: Euler steps of up to 0.2 s do not overshoot",
         ),
     )
 

@@ -35,10 +35,11 @@ def gain(
     pace: float,
     dt: float = 0.02,
 ) -> Tensor:
-    """Returns by how much each follower amplifies a swing of its leader's speed, of angular frequency `pace` in 1/s; `(n,)`.
+    """Returns by how much each follower amplifies a swing of its leader's speed, `(n,)`.
 
-    The leaders drive at `speed` plus a swing of 1 cm/s, the followers start at the equilibrium `gap`, both `(n,)`. The last of
-    four periods is measured, when what the start stirred up has died away.
+    The leaders drive at `speed` plus a swing of 1 cm/s and of angular frequency `pace`, 1/s. The
+    followers start at the equilibrium `gap`; both `(n,)`. The last of four periods is measured,
+    when the transient of the start has died away.
     """
     period = 2 * math.pi / pace
     t = torch.arange(round(4 * period / dt), dtype=torch.float64) * dt

@@ -77,7 +77,8 @@ def test_a_step_of_tau_is_the_papers(gap: float, v: float, v_l: float) -> None:
 def test_the_safe_speed_is_the_root_of_the_papers_condition(
     v: float, v_l: float, gap: float
 ) -> None:
-    # The paper's condition: stopped by b after tau and tau / 2 more, the driver stands s0 behind the leader, who braked by b_hat.
+    # The paper's condition: stopped by b after tau and tau / 2 more, the driver stands s0 behind
+    # the leader, who braked by b_hat.
     def clearance(speed: float) -> float:
         own = (v + speed) * TAU / 2 + speed * TAU / 2 + speed**2 / (2 * 3.4)
         return gap + v_l**2 / (2 * 3.2) - own - 2.0
@@ -87,7 +88,8 @@ def test_the_safe_speed_is_the_root_of_the_papers_condition(
 
 
 def test_the_greatest_acceleration_on_a_free_road_is_about_a() -> None:
-    # 2.5 (1 - r) sqrt(0.025 + r) peaks at r = (1 - 2 * 0.025) / 3 with 0.996: the constants make `a` the greatest acceleration.
+    # 2.5 (1 - r) sqrt(0.025 + r) peaks at r = (1 - 2 * 0.025) / 3 with 0.996: the constants make
+    # `a` the greatest acceleration.
     found = max(
         (next_speed(Gipps(), gap=1e6, v=v / 10, v_l=20.0) - v / 10) / 0.1 for v in range(200)
     )

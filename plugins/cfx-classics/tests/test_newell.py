@@ -1,4 +1,4 @@
-"""`newell`: the contract, the paper's translation of the leader's path, and what a shorter step makes of it."""
+"""`newell`: the contract, the paper's translated path, and the effect of a shorter step."""
 
 from __future__ import annotations
 
@@ -58,9 +58,7 @@ def test_with_steps_of_tau_it_is_the_papers_translated_path() -> None:
     torch.testing.assert_close(out.position[:, 1:], leader.position[:, :-1] - LENGTH - D)
 
 
-def test_behind_an_accelerating_leader_the_gap_is_smaller_than_the_papers_by_half_a_tau_squared() -> (
-    None
-):
+def test_behind_an_accelerating_leader_the_gap_is_smaller_by_half_a_tau_squared() -> None:
     a, dt = 0.5, 0.01
     t = torch.arange(3_000, dtype=torch.float64) * dt
     leader = Leader(

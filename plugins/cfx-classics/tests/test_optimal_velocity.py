@@ -1,4 +1,4 @@
-"""`ovm` and `fvdm`: contract, the papers' functions, string stability in closed form, the differential equation by SciPy."""
+"""`ovm` and `fvdm`: contract, the papers' functions, string stability, SciPy's solution."""
 
 from __future__ import annotations
 
@@ -111,7 +111,8 @@ CASES = {  # gap, m; tau, s; lambda, 1/s
 
 @pytest.mark.parametrize("model", [OVM(), FVDM()], ids=["ovm", "fvdm"])
 def test_swings_grow_exactly_where_the_linear_theory_says(model: DrivingModel) -> None:
-    # Linearised: x'' = (V' (x_l - x) - x') / tau + lambda (x_l' - x'); long waves grow unless V' <= 1 / (2 tau) + lambda.
+    # Linearised: x'' = (V' (x_l - x) - x') / tau + lambda (x_l' - x'); long waves grow unless
+    # V' <= 1 / (2 tau) + lambda.
     pace, cases = 0.15, CASES[type(model)]
     theory, stable = [], []
     for gap, tau, sensitivity in cases:
