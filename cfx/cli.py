@@ -17,7 +17,7 @@ from cfx.errors import CfxError
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the program; returns its exit code: 0; 2 for a user's mistake; 1 for a bug; 130 after Ctrl-C; 143 after SIGTERM."""
     arguments = list(sys.argv[1:] if argv is None else argv)
-    command = _COMMANDS.get(arguments[0]) if arguments else None
+    command = COMMANDS.get(arguments[0]) if arguments else None
     try:
         if command is None:
             from cfx.application import start
@@ -202,7 +202,7 @@ def _export(arguments: Sequence[str]) -> int:
     return 0
 
 
-_COMMANDS = {
+COMMANDS = {
     "plugins": _plugins,
     "data": _data,
     "report": _report,
@@ -210,3 +210,4 @@ _COMMANDS = {
     "drive": _drive,
     "export": _export,
 }
+"""The sub-commands, by name; whatever else comes first on the command line is Hydra's."""

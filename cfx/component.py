@@ -6,6 +6,7 @@ import functools
 import hashlib
 import inspect
 import json
+from abc import ABC
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -32,7 +33,7 @@ class Settings(BaseModel):
     )
 
 
-class Component:
+class Component(ABC):
     """Base of every dataset, model, optimizer, policy, learner and protocol.
 
     Life cycle: the registry imports the class when a config names it, validates the config node against

@@ -408,7 +408,7 @@ def _check(found: Entry, cls: Any) -> None:
         raise PluginError(
             f"{found} says kind='{cls.kind}', but a {found.kind} keeps kind='{base.kind}' of its base class"
         )
-    missing = sorted(getattr(cls, "__abstractmethods__", ()) or _unimplemented(cls))
+    missing = sorted(cls.__abstractmethods__)
     if missing:
         raise PluginError(f"{found} does not implement {', '.join(missing)}")
     schema = cls.schema
@@ -441,15 +441,6 @@ def _check_model(found: Entry, cls: Any) -> None:
 def _resolve(target: str) -> Any:
     module, _, attribute = target.partition(":")
     return getattr(importlib.import_module(module), attribute)
-
-
-def _unimplemented(cls: type) -> set[str]:
-    """Returns names that are still marked abstract; `Component` needs no ABCMeta for its subclasses to be checked."""
-    return {
-        name
-        for name in dir(cls)
-        if getattr(inspect.getattr_static(cls, name), "__isabstractmethod__", False)
-    }
 
 
 def _without_blanks(schema: type[BaseModel], values: Mapping[str, Any]) -> dict[str, Any]:

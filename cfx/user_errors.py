@@ -15,8 +15,6 @@ from omegaconf.errors import OmegaConfBaseException
 from cfx import hydra_source
 from cfx.errors import CfxError, nearest
 
-SUBCOMMANDS = ("plugins", "data", "ui")
-
 
 def is_user_error(error: BaseException) -> bool:
     """Says whether an error raised outside the job itself is the user's to mend."""
@@ -77,7 +75,10 @@ def _unknown_option(path: str, options: Sequence[str]) -> str:
 def _unreadable(error: OverrideParseException) -> str:
     word = error.override
     if "=" not in word:
-        return f"{word}: neither key=value nor a sub-command.{nearest(word, SUBCOMMANDS)} See cfx --help."
+        from cfx.cli import COMMANDS
+
+        advice = nearest(word, COMMANDS)
+        return f"{word}: neither key=value nor a sub-command.{advice} See cfx --help."
     words = [
         line
         for line in error.message.splitlines()

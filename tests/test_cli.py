@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from cfx import application, cli, ui
 from cfx.datasets.tidy import write_tidy
 from cfx.errors import CfxError, ConfigError, DataError
 from cfx.tracking.store import open_store
+from tests.conftest import ROOT
 from tests.drives import straight_pairs
 
 JOB = """
@@ -294,6 +296,39 @@ def test_help_lists_the_groups_and_names_only_keys_that_exist(run: Run, capsys) 
     ):
         assert override in printed
         assert run("--cfg", "job", override) == 0
+
+
+@pytest.mark.parametrize("command", sorted(cli.COMMANDS))
+def test_every_sub_command_is_in_the_help_and_is_the_advice_for_a_slip(
+    run: Run, command: str, capsys
+) -> None:
+    assert run("--help") == 0
+    assert f"cfx {command} " in capsys.readouterr().out
+    slip = command + command[-1]
+    assert run(slip) == 2
+    assert f"Did you mean '{command}'?" in capsys.readouterr().err
+
+
+def named_commands() -> list[tuple[str, str]]:
+    """Returns the commands of cfx that the package, its configuration and its templates name."""
+    found = []
+    for folder, pattern in (("cfx", "*.py"), ("cfx", "*.jinja"), ("conf", "*.yaml")):
+        for path in sorted((ROOT / folder).rglob(pattern)):
+            text = path.read_text(encoding="utf-8")
+            for words in re.findall(r"(?:python -m cfx|`cfx) +([^`\"\n{]+)", text):
+                found.append((str(path.relative_to(ROOT)), words))
+    return found
+
+
+def test_every_command_that_a_text_names_exists() -> None:
+    commands = named_commands()
+    assert len(commands) > 30
+    for where, words in commands:
+        first, *further = words.split()
+        is_override = "=" in first or first.isupper() or first.startswith("-")
+        assert is_override or first in cli.COMMANDS, f"{where} names cfx {words}"
+        if first in {"plugins", "data"} and further and further[0].isalpha():
+            assert further[0] in {"check", "show", "new", "describe", "fetch"}, f"{where}: {words}"
 
 
 @pytest.mark.parametrize(

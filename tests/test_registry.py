@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 
 import pytest
@@ -236,3 +237,11 @@ def test_every_built_in_component_keeps_its_contract() -> None:
     for kind in registry.KINDS:
         for name in registry.names(kind):
             assert registry.get(kind, name).kind == kind
+
+
+@pytest.mark.parametrize("kind", registry.KINDS)
+def test_a_class_that_leaves_its_contract_open_cannot_be_made(kind: str) -> None:
+    module, _, name = registry.KINDS[kind].base.partition(":")
+    base = getattr(importlib.import_module(module), name)
+    with pytest.raises(TypeError, match="abstract"):
+        base()

@@ -111,7 +111,7 @@ def the_table_has_a_row_for_each_pair_and_method(protocol: Protocol) -> None:
         if name not in evaluation.table
     ]
     assert not missing, (
-        f"reports, figures and `cfx show` read these columns of the table: {', '.join(missing)}"
+        f"reports, figures and `cfx report` read these columns of the table: {', '.join(missing)}"
     )
     assert {"default", "fixed", "policy"} <= set(evaluation.methods), (
         f"the policy is compared with the model's defaults and with the driver's own fixed parameters; there are only"
