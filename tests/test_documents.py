@@ -19,6 +19,14 @@ from cfx.models.base import DrivingModel
 from tests.conftest import ROOT
 from tests.drives import straight_pairs
 
+DOCUMENTS = [
+    "README.md",
+    "CONTRIBUTING.md",
+    "docs/results.md",
+    "docs/tried.md",
+    "docs/decisions/README.md",
+]
+
 
 def blocks(name: str, language: str) -> list[str]:
     text = (ROOT / name).read_text(encoding="utf-8")
@@ -57,15 +65,40 @@ def test_there_are_commands_to_check() -> None:
     assert len(summarised()) == 6
 
 
-@pytest.mark.parametrize(
-    "name", ["README.md", "CONTRIBUTING.md", "docs/results.md", "docs/tried.md"]
-)
+def anchors(text: str) -> set[str]:
+    """Returns what links may point to within a document: its headings, as GitHub writes them."""
+    found = set()
+    for heading in re.findall(r"^#+ (.*)$", text, flags=re.MULTILINE):
+        letters = re.sub(r"[^\w\- ]", "", heading.lower())
+        found.add(letters.replace(" ", "-"))
+    return found
+
+
+@pytest.mark.parametrize("name", DOCUMENTS)
 def test_links_lead_somewhere(name: str) -> None:
     text = (ROOT / name).read_text(encoding="utf-8")
-    links = [
-        link.partition("#")[0] for link in re.findall(r"\]\(([^)\s]+)\)", text) if "://" not in link
-    ]
-    assert all((ROOT / name).parent.joinpath(link).exists() for link in links), links
+    wrong = []
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        if "://" in link:
+            continue
+        file, _, anchor = link.partition("#")
+        target = (ROOT / name).parent / file if file else ROOT / name
+        if not target.exists() or (anchor and anchor not in anchors(target.read_text("utf-8"))):
+            wrong.append(link)
+    assert not wrong
+
+
+def test_every_decision_is_in_the_index_and_has_its_three_parts() -> None:
+    folder = ROOT / "docs" / "decisions"
+    index = (folder / "README.md").read_text(encoding="utf-8")
+    records = sorted(folder.glob("[0-9]*.md"))
+    for number, path in enumerate(records, start=1):
+        assert path.name.startswith(f"{number:04d}-")
+        assert f"]({path.name})" in index
+        text = path.read_text(encoding="utf-8")
+        assert text.startswith(f"# {number}. ")
+        for part in ("Context", "Decision", "Consequence"):
+            assert f"\n**{part}.** " in text, f"{path.name}: {part}"
 
 
 @pytest.mark.parametrize(
@@ -90,7 +123,7 @@ def test_the_readmes_python_runs(
     assert "pair_id" in capsys.readouterr().out
 
 
-def test_the_model_in_contributing_drives() -> None:
+def test_the_model_in_contributing_can_be_simulated() -> None:
     (block,) = [
         one for one in blocks("CONTRIBUTING.md", "python") if "class Pipes(DrivingModel)" in one
     ]
@@ -106,10 +139,10 @@ def test_the_model_in_contributing_drives() -> None:
     start = cfx.Start(
         batch.follower_position[:, 0], batch.follower_speed[:, 0], batch.follower_acceleration[:, 0]
     )
-    drive = cfx.simulate(kind(), {"headway": 2.0}, leader, start, batch.dt)
-    assert not bool(drive.collided.any())
+    out = cfx.simulate(kind(), {"headway": 2.0}, leader, start, batch.dt)
+    assert not bool(out.collided.any())
     torch.testing.assert_close(
-        drive.gap[0, -1], torch.tensor(20.0, dtype=torch.float64), atol=0.5, rtol=0
+        out.gap[0, -1], torch.tensor(20.0, dtype=torch.float64), atol=0.5, rtol=0
     )
 
 
@@ -145,7 +178,7 @@ def guide() -> list[tuple[str, str]]:
 
 @pytest.mark.slow
 def test_the_guide_to_a_plugin_works_as_printed(tmp_path: Path) -> None:
-    """In an environment of its own that sees this one's packages; pip is told by its variables to stay off the network."""
+    """An environment of its own that sees this one's packages; pip stays off the network."""
     home = tmp_path / "env"
     venv.create(home, with_pip=False, symlinks=True)
     (site,) = home.glob("lib/python*/site-packages")

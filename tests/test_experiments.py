@@ -1,4 +1,4 @@
-"""The experiments: each is one command that says what it asks, how to start it and how long it takes."""
+"""Each experiment is one command that says its question, how to start it and how long it takes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The distributions in plugins/: they build offline, announce what they bring, and use nothing but the public API."""
+"""The distributions in plugins/ build offline, announce components, use the public API."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PLUGINS = sorted(path.parent for path in (ROOT / "plugins").glob("*/pyproject.to
 PUBLIC_MODULES = {"cfx", "cfx.errors"} | {
     kind.base.partition(":")[0] for kind in registry.KINDS.values()
 }
-"""What a plugin may import from: the top level, the errors, the base classes; and `cfx.testing`, whole."""
+"""What a plugin may import from: the top level, errors and base classes; `cfx.testing` as well."""
 
 BUILD = """
 import os, sys
@@ -42,7 +42,7 @@ def project(plugin: Path) -> dict[str, object]:
 
 @pytest.fixture(scope="module")
 def wheels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Builds all wheels in one process, without isolation and so without the network; by distribution."""
+    """Builds all wheels in one process, without isolation and so offline; by distribution."""
     folder = tmp_path_factory.mktemp("wheels")
     done = subprocess.run(
         [sys.executable, "-c", BUILD, folder, *PLUGINS], capture_output=True, text=True, check=False
@@ -155,8 +155,9 @@ def test_it_uses_the_public_api_alone(plugin: Path) -> None:
 def test_the_check_of_imports_sees_what_is_private(tmp_path: Path) -> None:
     path = tmp_path / "plugin.py"
     path.write_text(
-        "import cfx\nimport cfx.registry\nfrom cfx import nodes, Settings\nfrom cfx.models.guarded import root\n"
-        "from cfx.models.base import DrivingModel, _x\nfrom cfx.testing.models import ModelContract\ncfx.job\ncfx.get\n"
+        "import cfx\nimport cfx.registry\nfrom cfx import nodes, Settings\n"
+        "from cfx.models.guarded import root\nfrom cfx.models.base import DrivingModel, _x\n"
+        "from cfx.testing.models import ModelContract\ncfx.job\ncfx.get\n"
     )
     assert [text.partition(": ")[2] for text in private_uses(path)] == [
         "cfx.registry",

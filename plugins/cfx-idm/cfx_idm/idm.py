@@ -1,7 +1,8 @@
 """The Intelligent Driver Model (`idm`).
 
-M. Treiber, A. Hennecke and D. Helbing (2000), *Congested traffic states in empirical observations and microscopic simulations*,
-Physical Review E 62(2), 1805-1824. M. Treiber and A. Kesting (2013), *Traffic Flow Dynamics*, Springer, chapter 11.
+M. Treiber, A. Hennecke and D. Helbing (2000), *Congested traffic states in empirical observations
+and microscopic simulations*, Physical Review E 62(2), 1805-1824. M. Treiber and A. Kesting (2013),
+*Traffic Flow Dynamics*, Springer, chapter 11.
 """
 
 from __future__ import annotations
@@ -13,10 +14,13 @@ from torch import Tensor
 
 from cfx import DrivingModel, Follower, Leader, Parameter, ParameterSpace, bumper_gap
 
-_PAPER = "default: Treiber et al. (2000), table I; bounds: about those of Kesting and Treiber (2008), Transp. Res. Rec. 2088"
+_PAPER = (
+    "default: Treiber et al. (2000), table I;"
+    " bounds: about those of Kesting and Treiber (2008), Transp. Res. Rec. 2088"
+)
 
 CLOSEST = 0.1
-"""Gap, m, that a smaller one counts as: the desired gap is divided by it."""
+"""Smallest gap, m: a smaller one counts as this, because the desired gap is divided by it."""
 
 IDM_PARAMETERS = ParameterSpace.of(
     Parameter("v0", "m/s", 1.0, 70.0, 120 / 3.6, "desired speed on a free road", _PAPER),
@@ -54,14 +58,15 @@ class IDM(DrivingModel):
 
     At equilibrium (v = v_l < v0) the gap is `(s0 + v T) / sqrt(1 - (v / v0)^delta)`.
 
-    Differences from the paper: the dynamic part of s* is kept from being negative, as Treiber and Kesting (2013) do, so that
-    a leader who drives off fast is not taken for one who comes too close; s1 = 0, as in the paper's table; a gap below 0.1 m,
-    or none, counts as 0.1 m. The paper's model is continuous in time: here a step is forward Euler, of first order in dt.
+    Differences from the paper: the dynamic part of s* is never negative, as in Treiber and Kesting
+    (2013); otherwise a leader who accelerates away would seem too close. s1 = 0, as in the paper's
+    table. A gap below 0.1 m, or a negative one, counts as 0.1 m. The paper's model is continuous in
+    time: here a step is forward Euler, of first order in dt.
 
-    Differences from SUMO: with v0 = maxSpeed, T = tau, s0 = minGap, a = accel, b = decel it is SUMO's IDM wherever SUMO takes
-    one sub-step, that is for steps up to 0.37 s unless its `stepping` is changed (longer ones it cuts up). SUMO also brakes no
-    harder than emergencyDecel (9 m/s2 by default; here nothing but standstill bounds braking), rounds speeds below 1e-5 m/s to
-    0, and lets the road's limit lower v0.
+    Differences from SUMO: with v0 = maxSpeed, T = tau, s0 = minGap, a = accel, b = decel it is
+    SUMO's IDM wherever SUMO takes one sub-step, that is for steps up to 0.37 s unless its
+    `stepping` is changed. SUMO also brakes no harder than emergencyDecel (9 m/s2 by default; here
+    braking has no bound), rounds speeds below 1e-5 m/s to 0, and the road's limit lowers v0.
     """
 
     reference = "Treiber, Hennecke and Helbing (2000), Phys. Rev. E 62(2)"

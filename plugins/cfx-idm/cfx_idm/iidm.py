@@ -1,6 +1,7 @@
 """The Improved Intelligent Driver Model (`iidm`).
 
-M. Treiber and A. Kesting (2013), *Traffic Flow Dynamics: Data, Models and Simulation*, Springer, section 11.3.7.
+M. Treiber and A. Kesting (2013), *Traffic Flow Dynamics: Data, Models and Simulation*, Springer,
+section 11.3.7.
 """
 
 from __future__ import annotations
@@ -13,15 +14,14 @@ from torch import Tensor
 from cfx import DrivingModel, Follower, Leader, bumper_gap
 from cfx_idm.idm import CLOSEST, IDM_PARAMETERS, desired_gap
 
-_NEARLY_ZERO = (
-    1e-6  # m/s2: a smaller free acceleration is 0 in all but the exponent that it divides
-)
+_NEARLY_ZERO = 1e-6
+"""m/s2: least free acceleration in the exponent that it divides."""
 
 
 class IIDM(DrivingModel):
-    """The Intelligent Driver Model, with a gap of exactly `s0 + v T` and gentle braking above the desired speed.
+    """The Intelligent Driver Model with an equilibrium gap of exactly `s0 + v T`.
 
-    With s* as in `idm` and z = s* / s:
+    Above the desired speed it brakes gently. With s* as in `idm` and z = s* / s:
 
         a_free = a (1 - (v / v0)^delta)               v <= v0
                  -b (1 - (v0 / v)^(a delta / b))      v > v0
@@ -33,11 +33,12 @@ class IIDM(DrivingModel):
 
         v'     = max(0, v + dv/dt dt)
 
-    At equilibrium (v = v_l < v0) the gap is `s0 + v T`: the time gap T is kept at every speed, where in `idm` it grows without
-    bound towards v0. On a free road the deceleration above v0 never exceeds b.
+    At equilibrium (v = v_l < v0) the gap is `s0 + v T`: the time gap is T at every speed, while in
+    `idm` it grows without bound towards v0. On a free road the deceleration above v0 never exceeds
+    b.
 
-    Differences from the book: a gap below 0.1 m, or none, counts as 0.1 m. Defaults and bounds are those of `idm`, so that
-    the two differ by nothing but their equations.
+    Differences from the book: a gap below 0.1 m, or a negative one, counts as 0.1 m. Defaults and
+    bounds are those of `idm`, so the two differ in their equations only.
 
     Differences from SUMO: its IDM is `idm`; it has no model with this acceleration function alone.
     """
@@ -54,7 +55,7 @@ class IIDM(DrivingModel):
         ratio = v / p["v0"]
         fast, crowded = ratio > 1.0, z >= 1.0
 
-        # Each power is taken of a number up to 1 also in the branch that is not chosen, so that values and gradients stay finite.
+        # Bases are at most 1 also in the branch not chosen: values and gradients are finite.
         gaining = a * (1.0 - torch.pow(ratio.clamp(max=1.0), delta))
         losing = -b * (1.0 - torch.pow(ratio.clamp(min=1.0).reciprocal(), a * delta / b))
         approach = torch.pow(z.clamp(max=1.0), 2.0 * a / gaining.clamp(min=_NEARLY_ZERO))

@@ -21,7 +21,7 @@ from cfx.testing.models import Equilibrium, ModelContract
 from cfx_idm.idm import IDM
 from cfx_idm.iidm import IIDM
 
-from .drives import order
+from .rollouts import order
 
 PAPER = {"v0": 120 / 3.6, "T": 1.6, "s0": 2.0, "a": 0.73, "b": 1.67, "delta": 4.0}
 
@@ -97,7 +97,8 @@ def test_limits_that_the_paper_states(model: cfx.DrivingModel) -> None:
 def test_braking_for_a_standing_obstacle_squares_the_deceleration_that_is_needed(
     needed: float,
 ) -> None:
-    # The paper's braking strategy: where v^2 / (2 s) is needed to stop in time, the model brakes by its square over b.
+    # The paper's braking strategy: where v^2 / (2 s) is needed to stop in time, the model brakes
+    # by its square over b.
     v = 20.0
     found = acceleration(IDM(), gap=v * v / (2 * needed), v=v, v_l=0.0, T=0.0, s0=0.0, v0=1e6)
     assert found == pytest.approx(0.73 - needed**2 / 1.67)

@@ -1,4 +1,4 @@
-"""Drives behind a leader whose speed is a smooth function of time: by cfx in steps, and by SciPy as a differential equation."""
+"""Followers of a leader with a smooth speed: by cfx in steps, by SciPy as an equation."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def stepped(
 def integrated(
     acceleration: Acceleration, p: Mapping[str, float], gap: float, speed: float, times: np.ndarray
 ) -> np.ndarray:
-    """Returns the speeds of the continuous model, by a Runge-Kutta method of order 8 to ten digits."""
+    """Returns the speeds of the continuous model, by a Runge-Kutta method of order 8."""
 
     def slope(t: float, state: np.ndarray) -> tuple[float, float]:
         x, v = state
@@ -72,7 +72,7 @@ def order(
     gap: float,
     speed: float,
 ) -> float:
-    """Returns how the largest deviation from the continuous model falls with the step: 1 where halving it halves the error."""
+    """Returns the order of convergence to the continuous model."""
     errors = []
     for dt in (0.1, 0.05, 0.025):
         exact = integrated(acceleration, p, gap, speed, np.arange(round(END / dt) + 1) * dt)
