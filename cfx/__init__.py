@@ -30,7 +30,9 @@ if TYPE_CHECKING:
     from cfx.models.base import Leader as Leader
     from cfx.models.base import ModelSettings as ModelSettings
     from cfx.models.base import bumper_gap as bumper_gap
-    from cfx.optimizers.base import Objective as Objective
+    from cfx.objectives.base import FrameValues as FrameValues
+    from cfx.objectives.base import Objective as Objective
+    from cfx.optimizers.base import CandidateLosses as CandidateLosses
     from cfx.optimizers.base import Optimizer as Optimizer
     from cfx.pairs import Pair as Pair
     from cfx.pairs import PairBatch as PairBatch
@@ -73,7 +75,9 @@ _HOMES = {
     "SimulatorSettings": "cfx.simulators.base",
     "Stepper": "cfx.simulation.base",
     "Optimizer": "cfx.optimizers.base",
-    "Objective": "cfx.optimizers.base",
+    "CandidateLosses": "cfx.optimizers.base",
+    "Objective": "cfx.objectives.base",
+    "FrameValues": "cfx.objectives.base",
     "Policy": "cfx.policies.base",
     "PolicySettings": "cfx.policies.base",
     "PolicyNetwork": "cfx.policies.base",

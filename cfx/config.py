@@ -71,6 +71,7 @@ class JobConfig(Settings):
     model: Node = Field(description="the driving model's node")
     policy: Node = Field(description="the policy's node")
     optimizer: Node = Field(description="the optimizer's node")
+    objective: Node = Field({"name": "speed_rmse"}, description="the objective's node")
     learner: Node = Field(description="the learner's node")
     protocol: Node = Field(description="the protocol's node")
     simulator: Node = Field({"name": "memory"}, description="the simulator's node")

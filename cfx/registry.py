@@ -92,6 +92,13 @@ KINDS: dict[str, Kind] = {
             "cfx.simulators.base:Simulator",
             "cfx.smoke_checks:smoke_check_simulator",
         ),
+        Kind(
+            "objective",
+            "objective",
+            "cfx.objectives",
+            "cfx.objectives.base:Objective",
+            "cfx.smoke_checks:smoke_check_objective",
+        ),
         Kind("learner", "learner", "cfx.learners", "cfx.learners.base:Learner"),
         Kind("protocol", "protocol", "cfx.protocols", "cfx.protocols.base:Protocol"),
     )

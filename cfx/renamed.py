@@ -64,7 +64,8 @@ _METRICS: tuple[tuple[str, str], ...] = (
 _COLUMNS: tuple[tuple[str, str], ...] = (
     (r"^later_rmse_speed$", "steady_rmse_speed"),
     (r"^whole_", "full_trajectory_"),
-    (r"^spread_mps$", "sensitivity_mps"),
+    (r"^loss_mps$", "loss"),
+    (r"^spread_mps$", "sensitivity"),
     (r"_base$", "_shrunk"),
 )
 

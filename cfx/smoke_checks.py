@@ -17,6 +17,7 @@ from torch import Tensor
 from cfx.errors import CfxError, PluginError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.krauss import Krauss
+from cfx.objectives.base import FrameValues, Objective
 from cfx.optimizers.base import Optimizer
 from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy, PolicyNetwork
@@ -252,6 +253,46 @@ def smoke_check_optimizer(optimizer: Optimizer) -> None:
         raise PluginError(
             f"space_filling() gives more than the {evaluations} evaluations that evaluations() gives"
         )
+
+
+@torch.no_grad()
+def smoke_check_objective(objective: Objective) -> None:
+    """Asks for the loss of a few ordinary trajectories, in double and in single precision.
+
+    Raises:
+        PluginError: it has no unit, or signals that do not exist; a loss has another shape or dtype than
+            the trajectories, is negative or not finite, or reads a signal that it does not name.
+    """
+    if not isinstance(getattr(objective, "unit", None), str):
+        raise PluginError("it has no `unit`; it must say the unit of its loss, '' if there is none")
+    signals = set(objective.signals)
+    if not signals or not signals <= {"speed", "gap"}:
+        raise PluginError(
+            f"its `signals` are {objective.signals!r}; they must be of 'speed', 'gap'"
+        )
+    for dtype in (torch.float64, torch.float32):
+        loss = objective(_trajectories(objective, dtype), torch.ones((LENGTH, 1), dtype=dtype))
+        _require_tensor(loss, "finish", (DRIVERS,), dtype, "(*batch,)")
+        if not bool((loss.isfinite() & (loss >= 0)).all()):
+            raise PluginError(
+                f"it gives the losses {loss.tolist()} of ordinary trajectories; losses must be finite"
+                f" and not negative (it says that it reads {' and '.join(sorted(signals))} alone)"
+            )
+
+
+def _trajectories(objective: Objective, dtype: torch.dtype) -> FrameValues:
+    """Returns a few trajectories `(LENGTH, DRIVERS)`; a signal that the objective does not name is NaN."""
+    draw = torch.Generator().manual_seed(0)
+    values = {}
+    for signal in ("speed", "gap"):
+        measured = 5.0 + 10.0 * torch.rand((LENGTH, DRIVERS), generator=draw, dtype=torch.float64)
+        error = torch.randn((LENGTH, DRIVERS), generator=draw, dtype=torch.float64)
+        for name, signals in {signal: measured + error, f"measured_{signal}": measured}.items():
+            if signal in objective.signals:
+                values[name] = signals.to(dtype)
+            else:
+                values[name] = torch.full_like(measured, torch.nan, dtype=dtype)
+    return FrameValues(**values, dt=DT)
 
 
 def _whole(value: object, name: str, *, least: int) -> int:

@@ -22,7 +22,7 @@ FLOORS = (
     ("models",),
     ("simulation",),
     ("simulators",),
-    ("datasets", "style", "optimizers", "calibration"),
+    ("datasets", "style", "optimizers", "objectives", "calibration"),
     ("policies", "learners"),
     ("evaluation", "smoke_checks"),
     ("protocols",),

@@ -131,11 +131,11 @@ def test_every_window_has_its_label_and_spread(finished: cfx.JobResult) -> None:
     labels = pd.read_parquet(finished.folder / "labels.parquet")
     # 200 frames are 39 windows of 5 steps, of which the first 80 % are calibrated.
     assert labels.groupby("pair_id").size().tolist() == [31, 31, 31]
-    assert {"time_s", "parameter_t_r", "parameter_t_i", "loss_mps", "sensitivity_mps"} <= set(
+    assert {"time_s", "parameter_t_r", "parameter_t_i", "loss", "sensitivity"} <= set(
         labels.columns
     )
-    assert bool((labels.sensitivity_mps >= 0).all())
-    assert finished.metrics["labels/loss"] == pytest.approx(labels.loss_mps.mean())
+    assert bool((labels.sensitivity >= 0).all())
+    assert finished.metrics["labels/loss"] == pytest.approx(labels.loss.mean())
 
 
 def test_synthetic_data_keeps_its_truth(finished: cfx.JobResult) -> None:

@@ -1,13 +1,12 @@
-"""The calibrator: fixed parameters of each pair, and the labels of each window.
+"""The calibrator: constant parameters of each driver, pooled ones, and those of each window.
 
-Both are the same thing to an optimizer: independent problems, each a drive from a measured state. Pairs are solved in groups and
-each pair's result is cached on its own, so an interrupted calibration goes on where it stopped.
+All three are the same to an optimizer: independent problems, each the loss of segments simulated from a
+measured state. Every result is cached on its own, so an interrupted calibration goes on where it stopped.
 """
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,13 +15,16 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.cache import Arrays, Cache
-from cfx.calibration.objective import DriveObjective, JointObjective
-from cfx.calibration.windows import Windows
+from cfx.calibration.losses import PooledLosses, SegmentLosses
+from cfx.calibration.windows import Windows, WindowSettings
 from cfx.component import content_key, folder_hash
+from cfx.objectives.base import Objective
+from cfx.objectives.rmse import SpeedRmse
 from cfx.optimizers.base import Optimizer, Progress
-from cfx.pairs import PairBatch, PairSet
+from cfx.pairs import Pair, PairBatch, PairSet
+from cfx.parameters import ParameterSpace
 from cfx.progress import Task
-from cfx.simulation.base import BaseSimulator
+from cfx.simulation.base import Stepper
 
 _GROUP = 1024
 """Problems solved together: enough to fill the batch, few enough that an interruption loses little."""
@@ -34,11 +36,13 @@ class Labels:
 
     Attributes:
         windows: which windows.
-        parameters: `(W, n)`, SI units: of those with a loss within `windows.tie_tolerance` of the lowest, the nearest to
-            the pair's fixed parameters; so where nothing tells candidates apart they are the fixed parameters.
-        loss: `(W,)`, RMSE of speed with these parameters, m/s.
-        spread: `(W,)`, how much the choice of parameters matters there: median loss of the space-filling candidates minus
-            `loss`, m/s. 0 where every candidate drives alike: such a label is arbitrary.
+        parameters: `(W, n)`, SI units: of those with a loss within the tie tolerance of the lowest, the
+            nearest to the driver-specific parameters; so where nothing tells candidates apart they are
+            the driver-specific parameters.
+        loss: `(W,)`, the objective's loss with these parameters, in its unit.
+        sensitivity: `(W,)`, how much the choice of parameters matters in the window: median loss of the
+            space-filling candidates minus `loss`. 0 where all candidates have the same loss: such a
+            label is arbitrary.
         diverged: `(W,)` int64, candidates whose loss was not a number.
     """
 
@@ -49,7 +53,10 @@ class Labels:
     diverged: Tensor
 
     def select(self, pairs: Tensor) -> Labels:
-        """Returns the labels of some pairs, `(D,)` int64, which are numbered anew; a pair may stand there more than once."""
+        """Returns the labels of some pairs, `(D,)` int64, which are numbered anew.
+
+        A pair may stand there more than once.
+        """
         windows, places = self.windows.select(pairs.cpu())
         places = places.to(self.loss.device)
         return Labels(
@@ -61,30 +68,31 @@ class Labels:
         )
 
     def metrics(self) -> dict[str, float]:
-        """Returns the means over windows, m/s: `labels/loss` and `labels/sensitivity`."""
+        """Returns means over windows, in the objective's unit: `labels/loss`, `labels/sensitivity`."""
         return {
             "labels/loss": float(self.loss.mean()),
             "labels/sensitivity": float(self.sensitivity.mean()),
         }
 
-    def to_frame(self, pairs: PairSet, names: tuple[str, ...]) -> pd.DataFrame:
-        """Returns a row per window: pair_id, window, time_s (its start), `parameter_NAME`, loss_mps, sensitivity_mps, diverged."""
+    def to_frame(self, pairs: PairSet, names: Sequence[str]) -> pd.DataFrame:
+        """Returns a row per window.
+
+        Columns: pair_id, window, time_s (its start), `parameter_NAME`, loss and sensitivity (in the
+        objective's unit), diverged.
+        """
         windows = self.windows
         ids = [pair.pair_id for pair in pairs]
-        return pd.DataFrame(
-            {
-                "pair_id": [ids[index] for index in windows.pair.tolist()],
-                "window": windows.number.numpy(),
-                "time_s": windows.first.numpy() * pairs.dt,
-                **{
-                    f"parameter_{name}": column.cpu().numpy()
-                    for name, column in zip(names, self.parameters.T, strict=True)
-                },
-                "loss_mps": self.loss.cpu().numpy(),
-                "sensitivity_mps": self.sensitivity.cpu().numpy(),
-                "diverged": self.diverged.cpu().numpy(),
-            }
-        )
+        columns: dict[str, Any] = {
+            "pair_id": [ids[index] for index in windows.pair.tolist()],
+            "window": windows.number.numpy(),
+            "time_s": windows.first.numpy() * pairs.dt,
+        }
+        for column, name in enumerate(names):
+            columns[f"parameter_{name}"] = self.parameters[:, column].cpu().numpy()
+        columns["loss"] = self.loss.cpu().numpy()
+        columns["sensitivity"] = self.sensitivity.cpu().numpy()
+        columns["diverged"] = self.diverged.cpu().numpy()
+        return pd.DataFrame(columns)
 
 
 class Calibrator:
@@ -93,68 +101,76 @@ class Calibrator:
     Args:
         simulator: the model and its time step.
         optimizer: solves the problems.
+        objective: what is minimised; RMSE of speed unless given.
         seed: the same seed gives the same parameters.
         cache: where results are kept.
         memory: bound for one chunk, bytes.
         progress: makes a progress display, given a description and a total.
+        reported: objectives by name whose losses `losses` reports beside the minimised one.
     """
 
     def __init__(
         self,
-        simulator: BaseSimulator,
+        simulator: Stepper,
         optimizer: Optimizer,
         *,
         seed: int,
         cache: Cache,
         memory: int,
         progress: Callable[[str, int], Task],
+        objective: Objective | None = None,
+        reported: Mapping[str, Objective] | None = None,
     ) -> None:
         self.simulator = simulator
         self.optimizer = optimizer
+        self.objective = objective if objective is not None else SpeedRmse()
         self.seed = seed
         self.cache = cache
         self.memory = memory
         self.progress = progress
+        self.reported = dict(reported or {})
 
     @property
-    def space(self) -> Any:
+    def space(self) -> ParameterSpace:
         """The model's parameter space."""
         return self.simulator.model.space
 
+    def tie_tolerance(self, settings: WindowSettings) -> float:
+        """Returns which losses of a window count as equal, in the objective's unit."""
+        if settings.tie_tolerance is None:
+            return self.objective.tie_tolerance
+        return settings.tie_tolerance
+
     def fixed(self, pairs: PairSet, batch: PairBatch, last: Tensor) -> Tensor:
-        """Finds one parameter set per pair.
+        """Finds one parameter set per pair: the driver-specific parameters.
 
         Args:
             pairs: P pairs.
             batch: the same as tensors.
-            last: `(P,)`, the last frame that may be used; the drive is simulated from frame 0 to it as one closed loop.
+            last: `(P,)`, the last frame that may be used; the pair is simulated from frame 0 to it in
+                one closed loop.
 
         Returns:
             `(P, n)`, SI units.
         """
         device = batch.lengths.device
         last = last.to(device)
-        keys = [
-            self._key("fixed", pair.fingerprint, frames=int(end))
-            for pair, end in zip(pairs, last, strict=True)
-        ]
-        guess = self.space.to_unit(self.space.defaults(device=device))[None, None, :]
+        keys = []
+        for pair, end in zip(pairs, last.tolist(), strict=True):
+            keys.append(self._key("fixed", pair.fingerprint, frames=end))
 
         def solve(chosen: Tensor, report: Progress) -> list[Arrays]:
             chosen = chosen.to(device)
-            objective = DriveObjective.of_segments(
-                self.simulator, batch, chosen, torch.zeros_like(chosen), last[chosen]
-            )
-            found = self._minimize(objective, guess.expand(len(chosen), 1, -1), report)
-            return [{name: values[i] for name, values in found.items()} for i in range(len(chosen))]
+            losses = self._segments(batch, chosen, last[chosen])
+            return _rows(self._minimize(losses, self._defaults(len(chosen), device), report))
 
-        results = self._cached("Fixed parameters", keys, [1] * len(pairs), solve)
-        return torch.stack(
-            [torch.as_tensor(entry["parameters"], device=device) for entry in results]
-        )
+        results = self._cached("Driver-specific parameters", keys, [1] * len(pairs), solve)
+        return _stacked(results, device)
 
     def population(self, pairs: PairSet, batch: PairBatch, last: Tensor, members: Tensor) -> Tensor:
-        """Finds one parameter set for each of K groups of pairs, calibrated jointly: see `JointObjective`.
+        """Finds one parameter set for each of K groups of pairs: the pooled parameters.
+
+        Their loss is the mean of their pairs' losses: see `PooledLosses`.
 
         Args:
             pairs: P pairs.
@@ -167,35 +183,22 @@ class Calibrator:
         """
         device = batch.lengths.device
         members, last = members.cpu(), last.to(device)
-        keys = [
-            self._key(
-                "population",
-                "",
-                pairs=sorted(
-                    (pairs[i].fingerprint, int(last[i])) for i in row.nonzero()[:, 0].tolist()
-                ),
-            )
-            for row in members
-        ]
-        guess = self.space.to_unit(self.space.defaults(device=device))[None, None, :]
+        keys = []
+        for row in members:
+            keys.append(self._key("population", "", pairs=_group_key(pairs, last, row)))
 
         def solve(chosen: Tensor, report: Progress) -> list[Arrays]:
             groups = members[chosen.cpu()].to(device)
-            drives = groups.any(0).nonzero()[:, 0]
-            segments = DriveObjective.of_segments(
-                self.simulator, batch, drives, torch.zeros_like(drives), last[drives]
-            )
-            objective = JointObjective(segments, groups[:, drives], self.memory)
-            found = self._minimize(objective, guess.expand(len(chosen), 1, -1), report)
-            return [{name: values[i] for name, values in found.items()} for i in range(len(chosen))]
+            used = groups.any(0).nonzero()[:, 0]
+            segments = self._segments(batch, used, last[used])
+            losses = PooledLosses(segments, groups[:, used], self.memory)
+            return _rows(self._minimize(losses, self._defaults(len(chosen), device), report))
 
-        results = self._cached("Population's parameters", keys, [1] * len(members), solve)
-        return torch.stack(
-            [torch.as_tensor(entry["parameters"], device=device) for entry in results]
-        )
+        results = self._cached("Pooled parameters", keys, [1] * len(members), solve)
+        return _stacked(results, device)
 
     def labels(self, pairs: PairSet, batch: PairBatch, windows: Windows, fixed: Tensor) -> Labels:
-        """Finds the parameters of each window; ties go to the pair's fixed parameters.
+        """Finds the parameters of each window; ties go to the driver-specific parameters.
 
         Args:
             pairs: P pairs.
@@ -204,60 +207,100 @@ class Calibrator:
             fixed: `(P, n)`, SI units: the first guess in each window, before the model's defaults.
         """
         device = batch.lengths.device
-        counts = torch.bincount(windows.pair, minlength=len(pairs))
-        description = windows.settings.model_dump()
-        keys = [
-            self._key(
-                "labels", pair.fingerprint, windows=int(count), fixed=row.tolist(), **description
+        counts = torch.bincount(windows.pair, minlength=len(pairs)).tolist()
+        tolerance = self.tie_tolerance(windows.settings)
+        description = {**windows.settings.model_dump(), "tie_tolerance": tolerance}
+        keys = []
+        for pair, count, row in zip(pairs, counts, fixed.tolist(), strict=True):
+            keys.append(
+                self._key("labels", pair.fingerprint, windows=count, fixed=row, **description)
             )
-            for pair, count, row in zip(pairs, counts, fixed, strict=True)
-        ]
-        guesses = self.space.to_unit(
-            torch.stack([fixed, self.space.defaults(device=device).expand_as(fixed)], dim=1)
-        )
+        defaults = self.space.defaults(device=device).expand_as(fixed)
+        guesses = self.space.to_unit(torch.stack([fixed, defaults], dim=1))
 
         def solve(chosen: Tensor, report: Progress) -> list[Arrays]:
             own = torch.isin(windows.pair, chosen)
             pair, first = windows.pair[own].to(device), windows.first[own].to(device)
-            objective = DriveObjective.of_segments(
-                self.simulator, batch, pair, first, torch.full_like(first, windows.settings.length)
+            steps = torch.full_like(first, windows.settings.length)
+            losses = SegmentLosses.of_segments(
+                self.simulator, self.objective, batch, pair, first, steps
             )
-            found = self._minimize(objective, guesses[pair], report, windows.settings.tie_tolerance)
-            return [
-                {name: values[windows.pair[own] == p] for name, values in found.items()}
-                for p in chosen
-            ]
+            found = self._minimize(losses, guesses[pair], report, tolerance)
+            return _by_pair(found, windows.pair[own], chosen)
 
-        results = self._cached("Window labels", keys, counts.tolist(), solve, **description)
-        joined = {
-            name: torch.cat([torch.as_tensor(entry[name]) for entry in results]).to(device)
-            for name in results[0]
-        }
+        title = "Per-window calibrated parameters (labels)"
+        results = self._cached(title, keys, counts, solve, **description)
+        joined = {}
+        for name in results[0]:
+            parts = [torch.as_tensor(entry[name]) for entry in results]
+            joined[name] = torch.cat(parts).to(device)
         return Labels(windows=windows, **joined)
+
+    @torch.no_grad()
+    def losses(
+        self,
+        batch: PairBatch,
+        last: Tensor,
+        parameters: Tensor,
+        members: Tensor | None = None,
+    ) -> dict[str, float]:
+        """Returns the mean loss of constant parameters over pairs, by each objective of `reported`.
+
+        Args:
+            batch: P pairs.
+            last: `(P,)`, the last frame that is compared; simulated from frame 0 in one closed loop.
+            parameters: `(P, n)`, one set per pair; with `members` `(K, n)`, one per group. SI units.
+            members: `(K, P)` bool, the pairs of each group.
+        """
+        device = batch.lengths.device
+        pair = torch.arange(len(batch), device=device)
+        row = pair
+        if members is not None:
+            row, pair = members.to(device).nonzero().unbind(1)
+        unit = self.space.to_unit(parameters.to(device))[row][:, None]
+        segments = self._segments(batch, pair, last.to(device)[pair])
+        size = max(1, self.memory // max(1, segments.bytes_per_candidate))
+        totals = dict.fromkeys(self.reported, 0.0)
+        for part in torch.split(torch.arange(len(pair), device=device), size):
+            chosen = segments.take(part)
+            frames = chosen.simulate(unit[part], gap=True)
+            for name, objective in self.reported.items():
+                loss = objective(frames, chosen.counted[..., None])
+                totals[name] += float(loss.sum())
+        return {name: total / len(pair) for name, total in totals.items()}
+
+    def _segments(self, batch: PairBatch, pair: Tensor, last: Tensor) -> SegmentLosses:
+        """Returns the losses of pairs `(S,)` from their frame 0 to a last one `(S,)`."""
+        first = torch.zeros_like(pair)
+        return SegmentLosses.of_segments(self.simulator, self.objective, batch, pair, first, last)
+
+    def _defaults(self, problems: int, device: torch.device) -> Tensor:
+        """Returns the model's defaults as the first guess of each problem, `(problems, 1, n)`."""
+        guess = self.space.to_unit(self.space.defaults(device=device))
+        return guess[None, None, :].expand(problems, 1, -1)
 
     def _minimize(
         self,
-        objective: DriveObjective | JointObjective,
+        losses: SegmentLosses | PooledLosses,
         guesses: Tensor,
         report: Progress,
         tolerance: float = 0.0,
     ) -> Arrays:
         solution = self.optimizer.minimize(
-            objective,
+            losses,
             guesses,
             seed=self.seed,
-            objective_bytes=objective.bytes_per_candidate,
+            objective_bytes=losses.bytes_per_candidate,
             memory=self.memory,
             progress=report,
             tolerance=tolerance,
         )
-        found = {
-            "parameters": self.space.from_unit(solution.best),
-            "loss": solution.loss,
-            "sensitivity": solution.sensitivity,
-            "diverged": solution.diverged,
+        return {
+            "parameters": self.space.from_unit(solution.best).cpu().numpy(),
+            "loss": solution.loss.cpu().numpy(),
+            "sensitivity": solution.sensitivity.cpu().numpy(),
+            "diverged": solution.diverged.cpu().numpy(),
         }
-        return {name: values.cpu().numpy() for name, values in found.items()}
 
     def _cached(
         self,
@@ -267,51 +310,35 @@ class Calibrator:
         solve: Callable[[Tensor, Progress], list[Arrays]],
         **scope: Any,
     ) -> list[Arrays]:
-        """Returns one entry per key, solving in groups what neither the cache holds nor another process is solving.
+        """Returns one entry per key; solves what neither the cache nor another process provides.
 
         Args:
+            what: what is calibrated, for the progress display.
+            keys: of the entries.
             problems: how many each entry stands for.
+            solve: takes the numbers of entries and returns these entries.
             scope: settings that all keys share, besides those of the calibrator.
         """
-        entries = [self.cache.get(key) for key in keys]
-        missing = [index for index, entry in enumerate(entries) if entry is None]
-        todo = sum(problems[index] for index in missing)
-        each = self.optimizer.evaluations()
-        shares = self.cache.shares([keys[index] for index in missing], self._key(what, "", **scope))
-        wanted = {
-            name: [missing[position] for position in positions]
-            for name, positions in shares.items()
-        }
-        with self.progress(f"{what} ({self.optimizer_name}, {todo} problems)", todo * each) as task:
+        work = _Work(self.cache, keys, problems, self.optimizer.evaluations(), solve)
+        wanted = work.shares(self._key(what, "", **scope))
+        optimizer = type(self.optimizer).__name__
+        objective = type(self.objective).__name__
+        if self.objective.unit:
+            objective = f"{objective} in {self.objective.unit}"
+        title = f"{what} ({optimizer}, {objective}, {work.missing_problems} problems)"
+        with self.progress(title, work.missing_problems * work.evaluations) as task:
             while wanted:
-                sizes = {
-                    name: sum(problems[index] for index in indices)
-                    for name, indices in wanted.items()
-                }
+                sizes = {name: work.size(indices) for name, indices in wanted.items()}
                 with self.cache.claim(sizes, _GROUP) as claimed:
-                    mine = sorted(index for name in claimed for index in wanted.pop(name))
-                    for index in mine:  # another process may have solved them before the claim
-                        entries[index] = self.cache.get(keys[index])
-                    task.advance(
-                        each * sum(problems[index] for index in mine if entries[index] is not None)
-                    )
-                    for group in _groups(
-                        [index for index in mine if entries[index] is None], problems
-                    ):
-                        for index, entry in zip(
-                            group, solve(torch.tensor(group), task.advance), strict=True
-                        ):
-                            self.cache.put(keys[index], entry)
-                            entries[index] = entry
-        return [entry for entry in entries if entry is not None]
-
-    @functools.cached_property
-    def optimizer_name(self) -> str:
-        """The optimizer's class name, for people."""
-        return type(self.optimizer).__name__
+                    mine = []
+                    for name in claimed:
+                        mine += wanted.pop(name)
+                    work.do(sorted(mine), task)
+        return work.results()
 
     def _key(self, what: str, pair: str, **details: Any) -> str:
         model = self.simulator.model
+        parameters = [(p.name, p.low, p.high, p.default, p.tuned) for p in self.space]
         return content_key(
             {
                 "what": what,
@@ -320,16 +347,74 @@ class Calibrator:
                 "simulation": self.simulator.identity(),
                 "calibration": folder_hash(__file__),
                 "model": model.identity(),
-                "parameters": [(p.name, p.low, p.high, p.default, p.tuned) for p in self.space],
+                "parameters": parameters,
                 "optimizer": self.optimizer.identity(),
+                "objective": self.objective.identity(),
                 "seed": self.seed,
                 **details,
             }
         )
 
 
+class _Work:
+    """The entries of one calibration: what the cache holds, and what is still to be solved.
+
+    Attributes:
+        evaluations: of each problem.
+        missing_problems: problems of the entries that the cache did not hold at the start.
+    """
+
+    def __init__(
+        self,
+        cache: Cache,
+        keys: list[str],
+        problems: list[int],
+        evaluations: int,
+        solve: Callable[[Tensor, Progress], list[Arrays]],
+    ) -> None:
+        self._cache = cache
+        self._keys = keys
+        self._problems = problems
+        self._solve = solve
+        self._entries = [cache.get(key) for key in keys]
+        self.evaluations = evaluations
+        self.missing_problems = self.size(self._missing(range(len(keys))))
+
+    def shares(self, scope: str) -> dict[str, list[int]]:
+        """Returns which entries are missing, by the share of the cache in which they are claimed."""
+        missing = self._missing(range(len(self._keys)))
+        shares = {}
+        keys = [self._keys[index] for index in missing]
+        for name, positions in self._cache.shares(keys, scope).items():
+            shares[name] = [missing[position] for position in positions]
+        return shares
+
+    def size(self, indices: Sequence[int]) -> int:
+        """Returns how many problems some entries stand for."""
+        return sum(self._problems[index] for index in indices)
+
+    def do(self, indices: list[int], task: Task) -> None:
+        """Provides claimed entries: another process may have solved some before the claim."""
+        for index in indices:
+            self._entries[index] = self._cache.get(self._keys[index])
+        left = self._missing(indices)
+        task.advance(self.evaluations * (self.size(indices) - self.size(left)))
+        for group in _groups(left, self._problems):
+            solved = self._solve(torch.tensor(group), task.advance)
+            for index, entry in zip(group, solved, strict=True):
+                self._cache.put(self._keys[index], entry)
+                self._entries[index] = entry
+
+    def results(self) -> list[Arrays]:
+        """Returns all entries."""
+        return [entry for entry in self._entries if entry is not None]
+
+    def _missing(self, indices: Sequence[int]) -> list[int]:
+        return [index for index in indices if self._entries[index] is None]
+
+
 def _groups(indices: list[int], problems: list[int]) -> Iterator[list[int]]:
-    """Yields runs of indices with at most `_GROUP` problems together, or one index if it alone has more."""
+    """Yields runs of indices with at most `_GROUP` problems, or one index if it alone has more."""
     group: list[int] = []
     size = 0
     for index in indices:
@@ -340,3 +425,34 @@ def _groups(indices: list[int], problems: list[int]) -> Iterator[list[int]]:
         size += problems[index]
     if group:
         yield group
+
+
+def _group_key(pairs: Sequence[Pair] | PairSet, last: Tensor, members: Tensor) -> list[Any]:
+    """Returns what identifies a group of pairs `(P,)` bool: each one's content and last frame."""
+    found = []
+    for index in members.nonzero()[:, 0].tolist():
+        found.append((pairs[index].fingerprint, int(last[index])))
+    return sorted(found)
+
+
+def _rows(found: Arrays) -> list[Arrays]:
+    """Returns an entry for each problem."""
+    entries = []
+    for number in range(len(found["loss"])):
+        entries.append({name: values[number] for name, values in found.items()})
+    return entries
+
+
+def _by_pair(found: Arrays, pair: Tensor, chosen: Tensor) -> list[Arrays]:
+    """Returns an entry for each chosen pair, with all its windows; `pair` `(W,)` is whose each is."""
+    entries = []
+    for number in chosen.tolist():
+        own = (pair == number).numpy()
+        entries.append({name: values[own] for name, values in found.items()})
+    return entries
+
+
+def _stacked(entries: list[Arrays], device: torch.device) -> Tensor:
+    """Returns the entries' parameters `(entries, n)`."""
+    rows = [torch.as_tensor(entry["parameters"], device=device) for entry in entries]
+    return torch.stack(rows)

@@ -16,11 +16,13 @@ class WindowSettings(Settings):
         ge=1,
         description="steps from one window's start to the next; parameters change this often",
     )
-    tie_tolerance: float = Field(
-        0.05,
+    tie_tolerance: float | None = Field(
+        None,
         ge=0,
-        description="m/s: losses in a window this close to the lowest count as equal, and the label is what is nearest to the"
-        " pair's fixed parameters; about what a speed in NGSIM is accurate to; 0 in the paper",
+        description="in the objective's unit: losses in a window this close to the lowest count as"
+        " equal, and the label is what is nearest to the driver-specific parameters; null: the"
+        " objective's own, about the accuracy of recordings (0.05 m/s for speed_rmse, as NGSIM's"
+        " speeds); 0 in the paper",
     )
 
     @model_validator(mode="after")

@@ -223,8 +223,12 @@ def write_provenance(
     protocol_result: ProtocolResult,
     *,
     has_constant_baseline: bool,
+    objective: Mapping[str, str],
 ) -> None:
     """Writes `data.json`: where the data came from, and what a report must know of the model.
+
+    Args:
+        objective: name and unit of what calibration has minimised; losses of labels have this unit.
 
     Raises:
         OutputError: the file cannot be written.
@@ -245,6 +249,7 @@ def write_provenance(
         "dropped": dropped,
         "parameters": parameters,
         "has_constant_baseline": has_constant_baseline,
+        "objective": dict(objective),
         "cfx": version(),
     }
     output.json("data.json", values)

@@ -14,6 +14,7 @@ from cfx.datasets.base import Dataset
 from cfx.errors import ConfigError
 from cfx.learners.base import Learner
 from cfx.models.base import DrivingModel
+from cfx.objectives.base import Objective
 from cfx.optimizers.base import Optimizer
 from cfx.policies.base import Policy
 from cfx.protocols.base import Protocol
@@ -34,6 +35,7 @@ class Parts:
     model: DrivingModel
     simulator: Simulator
     optimizer: Optimizer
+    objective: Objective
     policy: Policy
     learner: Learner
     protocol: Protocol
@@ -60,10 +62,27 @@ class Parts:
             model=model,
             simulator=simulator,
             optimizer=cast(Optimizer, registry.create("optimizer", config.optimizer)),
+            objective=cast(Objective, registry.create("objective", config.objective)),
             policy=policy,
             learner=learner,
             protocol=protocol,
         )
+
+
+def reported_objectives(config: JobConfig, objective: Objective) -> dict[str, Objective]:
+    """Returns the objectives whose values a calibration reports: cfx's own and the chosen one.
+
+    Args:
+        config: names the chosen objective.
+        objective: the chosen objective.
+    """
+    reported = {}
+    for entry in registry.entries("objective"):
+        if entry.distribution == registry.OWN:
+            made = registry.create("objective", {"name": entry.name})
+            reported[entry.name] = cast(Objective, made)
+    reported[config.objective["name"]] = objective
+    return reported
 
 
 def make_protocol(config: JobConfig) -> Protocol:

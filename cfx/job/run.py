@@ -20,7 +20,13 @@ from cfx.errors import PluginError
 from cfx.job import output as files
 from cfx.job.console import report
 from cfx.job.output import Output
-from cfx.job.parts import Parts, choose_device, complete, make_protocol
+from cfx.job.parts import (
+    Parts,
+    choose_device,
+    complete,
+    make_protocol,
+    reported_objectives,
+)
 from cfx.job.results import JobResult
 from cfx.learners.curves import best_losses
 from cfx.pairs import PairBatch, PairSet
@@ -133,6 +139,8 @@ def _context(
         cache=Cache(cache_folder),
         memory=parts.simulator.settings.memory_mb * 2**20,
         progress=Task,
+        objective=parts.objective,
+        reported=reported_objectives(config, parts.objective),
     )
     return ProtocolContext(
         pairs=pairs,
@@ -176,6 +184,7 @@ def _keep(
     if protocol_result.labels is not None:
         of_training |= protocol_result.labels.metrics()
     of_training |= best_losses(protocol_result.curves)
+    of_training |= protocol_result.calibration
     metrics = renamed.Metrics(evaluation.metrics() | of_training)
 
     policy_folder = output.folder / "policy"
@@ -188,6 +197,7 @@ def _keep(
         pairs,
         protocol_result,
         has_constant_baseline=parts.model.has_constant_baseline,
+        objective={"name": config.objective["name"], "unit": parts.objective.unit},
     )
     # Before MLflow, so that no failure there loses it.
     files.write_metrics(output, metrics)

@@ -6,7 +6,7 @@ Shapes: P pairs, N networks, W windows of the longest training part, n tuned par
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
@@ -18,6 +18,8 @@ from cfx.calibration.windows import Split, WindowSettings
 from cfx.component import Component
 from cfx.errors import ConfigError
 from cfx.models.base import DrivingModel
+from cfx.objectives.base import Objective
+from cfx.objectives.rmse import SpeedRmse
 from cfx.pairs import PairBatch
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.trained import Scaler
@@ -45,6 +47,7 @@ class TrainingData:
             `fixed` is the population's; None where nobody drives without. Only learners of offsets read them.
         drivers: whose pair each is; None if each is another's.
         workspace: a folder for what training needs to go on after an interruption; None: nothing is kept.
+        objective: what training that simulates in closed loop minimises; calibration has minimised it too.
     """
 
     simulator: BaseSimulator
@@ -59,6 +62,7 @@ class TrainingData:
     base: Tensor | None = None
     drivers: tuple[str, ...] | None = None
     workspace: Path | None = None
+    objective: Objective = field(default_factory=SpeedRmse)
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ TIE_RELATIVE, TIE_ABSOLUTE = 1e-6, 1e-9
 """Losses within `TIE_ABSOLUTE + TIE_RELATIVE * best` of the best count as equal: above rounding, below anything that matters."""
 
 
-class Objective(Protocol):
+class CandidateLosses(Protocol):
     """P independent problems that are evaluated together."""
 
     @property
@@ -37,7 +37,7 @@ class Objective(Protocol):
         """Returns losses `(P, q)` of candidates `(P, q, n)` in unit space; NaN or infinity where a candidate diverges."""
         ...
 
-    def select(self, first: int, last: int) -> Objective:
+    def select(self, first: int, last: int) -> CandidateLosses:
         """Returns the objective of problems `first` to `last - 1` alone."""
         ...
 
@@ -86,7 +86,9 @@ class Optimizer(Component):
     kind = "optimizer"
 
     @abstractmethod
-    def solve(self, objective: Objective, guesses: Tensor, *, seed: int) -> tuple[Tensor, Tensor]:
+    def solve(
+        self, objective: CandidateLosses, guesses: Tensor, *, seed: int
+    ) -> tuple[Tensor, Tensor]:
         """Evaluates candidates of all problems of one chunk.
 
         Args:
@@ -116,7 +118,7 @@ class Optimizer(Component):
 
     def minimize(
         self,
-        objective: Objective,
+        objective: CandidateLosses,
         guesses: Tensor,
         *,
         seed: int,
@@ -205,7 +207,9 @@ def _reduce(
 class _Guarded:
     """An objective whose NaN losses are infinity, that counts evaluations and refuses candidates outside the bounds."""
 
-    def __init__(self, objective: Objective, progress: Progress, n: int, optimizer: str) -> None:
+    def __init__(
+        self, objective: CandidateLosses, progress: Progress, n: int, optimizer: str
+    ) -> None:
         self._objective = objective
         self._progress = progress
         self._n = n
@@ -235,7 +239,7 @@ class _Guarded:
         self._progress(losses.numel())
         return losses.nan_to_num(nan=torch.inf, posinf=torch.inf, neginf=torch.inf)
 
-    def select(self, first: int, last: int) -> Objective:
+    def select(self, first: int, last: int) -> CandidateLosses:
         return _Guarded(
             self._objective.select(first, last), self._progress, self._n, self._optimizer
         )

@@ -39,7 +39,7 @@ from pydantic import Field
 from torch import Tensor
 
 from cfx.component import Settings
-from cfx.optimizers.base import Objective, Optimizer
+from cfx.optimizers.base import CandidateLosses, Optimizer
 from cfx.optimizers.random import AT_ONCE, check_room, evaluate_in_blocks, sobol
 
 _NOISE = 1e-6
@@ -131,7 +131,9 @@ class BotorchOptimizer(Optimizer):
         climb = self.settings.restarts * (24 * seen + 12 * n)
         return 8 * (max(query, climb, 24 * seen * seen) + 8 * seen * n)
 
-    def solve(self, objective: Objective, guesses: Tensor, *, seed: int) -> tuple[Tensor, Tensor]:
+    def solve(
+        self, objective: CandidateLosses, guesses: Tensor, *, seed: int
+    ) -> tuple[Tensor, Tensor]:
         settings = self.settings
         problems, g, n = guesses.shape
         check_room(settings.initial, g, key="initial")

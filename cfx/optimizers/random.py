@@ -14,7 +14,7 @@ from torch import Tensor
 
 from cfx.component import Settings
 from cfx.errors import ConfigError
-from cfx.optimizers.base import Objective, Optimizer
+from cfx.optimizers.base import CandidateLosses, Optimizer
 
 AT_ONCE = 512
 """Candidates of one problem in one call of the objective: its intermediate values then stay small whatever `samples` is."""
@@ -45,7 +45,9 @@ class RandomSearch(Optimizer):
     def bytes_per_problem(self, n: int) -> int:
         return 8 * self.evaluations_at_once() * (n + 2)
 
-    def solve(self, objective: Objective, guesses: Tensor, *, seed: int) -> tuple[Tensor, Tensor]:
+    def solve(
+        self, objective: CandidateLosses, guesses: Tensor, *, seed: int
+    ) -> tuple[Tensor, Tensor]:
         problems, g, n = guesses.shape
         check_room(self.settings.samples, g, key="samples")
         points = sobol(self.settings.samples - g, n, seed=seed, like=guesses)
@@ -53,7 +55,7 @@ class RandomSearch(Optimizer):
         return candidates, evaluate_in_blocks(objective, candidates)
 
 
-def evaluate_in_blocks(objective: Objective, candidates: Tensor) -> Tensor:
+def evaluate_in_blocks(objective: CandidateLosses, candidates: Tensor) -> Tensor:
     """Returns losses `(P, q)` of candidates `(P, q, n)`, at most `AT_ONCE` of each problem in one call."""
     return torch.cat([objective(block) for block in torch.split(candidates, AT_ONCE, dim=1)], dim=1)
 

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-_KINDS = "dataset (or data), model, simulator, optimizer, policy, learner or protocol"
+_KINDS = "dataset (or data), model, simulator, optimizer, objective, policy, learner or protocol"
 
 
 def main(arguments: Sequence[str]) -> int:

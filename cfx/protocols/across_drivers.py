@@ -132,7 +132,11 @@ class AcrossDrivers(Protocol):
             policy=policy,
         )
         evaluation = test.evaluation(self.settings.histories, fold=fold[tested])
-        return ProtocolResult(evaluation, policy, training_result.curves, labels, notes)
+        calibration = context.calibration_metrics("fixed", split.frame, fixed)
+        calibration |= context.calibration_metrics("population", whole.frame, population, members)
+        return ProtocolResult(
+            evaluation, policy, training_result.curves, labels, notes, calibration=calibration
+        )
 
     def folds(self, pairs: PairSet, *, seed: int) -> Tensor:
         """Returns in which fold each pair is tested, `(P,)` int64; -1 for a pair that is only learned from.
@@ -204,6 +208,7 @@ class AcrossDrivers(Protocol):
             network=network.to(device),
             names=names,
             seed=context.seed,
+            objective=context.objective,
             # Also where both are the same: unseen drivers differ in that nothing of their history was read.
             base=base[index.to(device)] if base is not None else start[network.to(device)],
             drivers=tuple(context.pairs[number].driver for number in index.tolist()),

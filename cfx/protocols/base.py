@@ -20,6 +20,7 @@ from cfx.component import Component
 from cfx.errors import PluginError
 from cfx.evaluation.result import Evaluation
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingResult
+from cfx.objectives.base import Objective
 from cfx.pairs import PairBatch, PairSet
 from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy
@@ -66,6 +67,11 @@ class ProtocolContext:
         """The driving model's parameters."""
         return self.simulator.model.space
 
+    @property
+    def objective(self) -> Objective:
+        """What calibration minimises and closed-loop training back-propagates."""
+        return self.calibrator.objective
+
     def labels(self, counts: Tensor, fixed: Tensor) -> Labels | None:
         """Finds window labels, if the learner needs any.
 
@@ -78,14 +84,30 @@ class ProtocolContext:
         labels = self.calibrator.labels(
             self.pairs, self.batch, Windows.of(counts, self.windows), fixed
         )
-        told = float((labels.sensitivity > self.windows.tie_tolerance).double().mean())
+        tolerance = self.calibrator.tie_tolerance(self.windows)
+        sensitive = float((labels.sensitivity > tolerance).double().mean())
         log.info(
-            "Window labels: %d windows; parameters matter by more than %g m/s in %.0f %% of them",
+            "Per-window calibrated parameters (labels): %d windows; the choice of parameters changes"
+            " the loss by more than %s in %.0f %% of them",
             len(labels.windows),
-            self.windows.tie_tolerance,
-            100 * told,
+            self.objective.worded(tolerance),
+            100 * sensitive,
         )
         return labels
+
+    def calibration_metrics(
+        self, method: str, last: Tensor, parameters: Tensor, members: Tensor | None = None
+    ) -> dict[str, float]:
+        """Returns `calibration/OBJECTIVE/METHOD`: mean losses of constant parameters where they were found.
+
+        Args:
+            method: what the parameters are called in metrics: `fixed` or `population`.
+            last: `(P,)`, the last frame of each pair's calibrated part.
+            parameters: `(P, n)`, one set per pair; with `members` `(K, n)`, one per group. SI units.
+            members: `(K, P)` bool, the pairs of each group.
+        """
+        losses = self.calibrator.losses(self.batch, last, parameters, members)
+        return {f"calibration/{name}/{method}": loss for name, loss in losses.items()}
 
     def constant(self, policy: Policy, parameters: Tensor) -> TrainedPolicy:
         """Makes a policy drive as built, without training: the baselines.
@@ -159,6 +181,7 @@ class ProtocolResult:
         policy: the policy that drove in it.
         curves: learning curves; empty if nothing was learned.
         labels: window labels; None if none were needed.
+        calibration: further metrics, of the calibration itself: `ProtocolContext.calibration_metrics`.
         notes: what a reader of the results should know of the design, name -> a number or text; kept in `data.json`.
     """
 
@@ -167,6 +190,7 @@ class ProtocolResult:
     curves: pd.DataFrame
     labels: Labels | None
     notes: Mapping[str, Any] = field(default_factory=dict)
+    calibration: Mapping[str, float] = field(default_factory=dict)
 
 
 @torch.no_grad()

@@ -100,7 +100,12 @@ class Transfer(Protocol):
             "drivers_named_as_some_learned_from": _named_alike(policy, pairs),
         }
         return ProtocolResult(
-            test.evaluation(), policy, pd.DataFrame(columns=CURVE_COLUMNS), None, notes
+            test.evaluation(),
+            policy,
+            pd.DataFrame(columns=CURVE_COLUMNS),
+            None,
+            notes,
+            calibration=context.calibration_metrics("fixed", split.frame, fixed),
         )
 
     def _check(self, policy: TrainedPolicy, pairs: PairSet) -> None:

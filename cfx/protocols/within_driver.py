@@ -60,6 +60,7 @@ class WithinDriver(Protocol):
                 network=network,
                 names=groups,
                 seed=context.seed,
+                objective=context.objective,
                 base=fixed if self.settings.networks == "all" else None,
                 drivers=tuple(pair.driver for pair in pairs),
                 workspace=context.workspace,
@@ -92,4 +93,10 @@ class WithinDriver(Protocol):
             seed=context.seed,
             platoon=platoon,
         )
-        return ProtocolResult(evaluation, policy, training_result.curves, labels)
+        return ProtocolResult(
+            evaluation,
+            policy,
+            training_result.curves,
+            labels,
+            calibration=context.calibration_metrics("fixed", split.frame, fixed),
+        )

@@ -9,7 +9,7 @@ from typing import Any
 from cfx.report.read import Job
 from cfx.tracking.provenance import flatten
 
-GROUPS = ("model", "policy", "learner", "protocol", "optimizer", "data")
+GROUPS = ("model", "policy", "learner", "protocol", "objective", "optimizer", "data")
 _NO_DIFFERENCE = (
     "tracking.",
     "cache.",

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from cfx.testing.datasets import DatasetContract as DatasetContract
     from cfx.testing.learners import LearnerContract as LearnerContract
     from cfx.testing.models import ModelContract as ModelContract
+    from cfx.testing.objectives import ObjectiveContract as ObjectiveContract
     from cfx.testing.optimizers import OptimizerContract as OptimizerContract
     from cfx.testing.policies import PolicyContract as PolicyContract
     from cfx.testing.protocols import ProtocolContract as ProtocolContract
@@ -34,6 +35,7 @@ _HOMES = {
     "DatasetContract": "cfx.testing.datasets",
     "ModelContract": "cfx.testing.models",
     "SimulatorContract": "cfx.testing.simulators",
+    "ObjectiveContract": "cfx.testing.objectives",
     "OptimizerContract": "cfx.testing.optimizers",
     "PolicyContract": "cfx.testing.policies",
     "LearnerContract": "cfx.testing.learners",
@@ -50,6 +52,7 @@ _CHECKS = {
     "model": "cfx.testing.checks.models",
     "simulator": "cfx.testing.checks.simulators",
     "optimizer": "cfx.testing.checks.optimizers",
+    "objective": "cfx.testing.checks.objectives",
     "policy": "cfx.testing.checks.policies",
     "learner": "cfx.testing.checks.learners",
     "protocol": "cfx.testing.checks.protocols",

@@ -65,7 +65,15 @@ class Tracker:
         values = config.model_dump(mode="json")
         names = {
             kind: str(values[kind].get("name", ""))
-            for kind in ("data", "model", "policy", "optimizer", "learner", "protocol")
+            for kind in (
+                "data",
+                "model",
+                "policy",
+                "optimizer",
+                "objective",
+                "learner",
+                "protocol",
+            )
         }
         tags = {
             **names,

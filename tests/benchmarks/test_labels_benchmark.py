@@ -18,18 +18,19 @@ from botorch.optim import optimize_acqf
 from gpytorch.mlls import ExactMarginalLogLikelihood
 from torch import Tensor
 
-from cfx.calibration.objective import DriveObjective
+from cfx.calibration.losses import SegmentLosses
 from cfx.models.base import DrivingModel, Leader
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
+from cfx.objectives.rmse import SpeedRmse
 from cfx.optimizers.botorch import BotorchOptimizer
 from cfx.optimizers.random import RandomSearch
-from cfx.simulation.rollout import Simulator, Start
+from cfx.simulation.rollout import MemoryStepper, Start
 
 WINDOWS, STEPS, DT, LOOPED = 128, 5, 0.1, 2
 
 
-def windows(model: DrivingModel) -> DriveObjective:
+def windows(model: DrivingModel) -> SegmentLosses:
     """Returns windows of drivers of this model whose parameters nobody knows, behind leaders that accelerate and brake."""
     draw = torch.Generator().manual_seed(0)
 
@@ -46,16 +47,26 @@ def windows(model: DrivingModel) -> DriveObjective:
     length = torch.full((WINDOWS,), 4.5, dtype=torch.float64)
     leader = Leader(leader_position, leader_speed, acceleration.expand(STEPS, -1), length)
     start = Start(torch.zeros_like(speed), speed, uniform(-1.0, 1.0))
-    simulator = Simulator(model, DT, compile="never")
+    simulator = MemoryStepper(model, DT, compile="never")
     truth = torch.rand(WINDOWS, len(model.space), generator=draw, dtype=torch.float64)
-    _, _, observed = simulator.advance(
+    _, position, observed = simulator.advance(
         simulator.begin(start), leader, model.space.unpack(model.space.from_unit(truth))
     )
     observed = observed + 0.02 * torch.randn(observed.shape, generator=draw, dtype=torch.float64)
-    return DriveObjective(simulator, *leader, *start, observed, torch.ones_like(observed))
+    rear = leader_position + leader_speed * DT - length
+    return SegmentLosses(
+        simulator,
+        SpeedRmse(),
+        *leader,
+        *start,
+        leader_rear=rear,
+        measured_speed=observed,
+        measured_gap=rear - position,
+        counted=torch.ones_like(observed),
+    )
 
 
-def plain_loop(objective: DriveObjective, guess: Tensor, *, initial: int, iterations: int) -> float:
+def plain_loop(objective: SegmentLosses, guess: Tensor, *, initial: int, iterations: int) -> float:
     """Returns the loss that BoTorch's tutorial reaches in one window."""
     n = guess.shape[-1]
     bounds = torch.tensor([[0.0], [1.0]], dtype=torch.float64).expand(2, n)

@@ -12,16 +12,17 @@ from typing import Any
 import pytest
 import torch
 
-from cfx.calibration.objective import DriveObjective, JointObjective
+from cfx.calibration.losses import PooledLosses, SegmentLosses
 from cfx.models.base import DrivingModel
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
-from cfx.simulation.rollout import Simulator
+from cfx.objectives.rmse import SpeedRmse
+from cfx.simulation.rollout import MemoryStepper
 
 DRIVES, FOLDS, STEPS, CANDIDATES, DT, MEMORY = 70, 5, 600, 512, 0.1, 1 << 30
 
 
-def drives(model: DrivingModel) -> DriveObjective:
+def drives(model: DrivingModel) -> SegmentLosses:
     """Returns drives behind leaders that speed up and slow down."""
     draw = torch.Generator().manual_seed(0)
     phase, swing = torch.rand((2, DRIVES), generator=draw, dtype=torch.float64)
@@ -29,8 +30,9 @@ def drives(model: DrivingModel) -> DriveObjective:
     speed = 10.0 + 4.0 * swing * torch.sin(0.3 * time_s + 6.0 * phase)
     acceleration = torch.diff(speed, dim=0, append=speed[-1:]) / DT
     nothing = torch.zeros(DRIVES, dtype=torch.float64)
-    return DriveObjective(
-        simulator=Simulator(model, DT),
+    return SegmentLosses(
+        simulator=MemoryStepper(model, DT),
+        objective=SpeedRmse(),
         leader_position=25.0 + speed.cumsum(0) * DT,
         leader_speed=speed,
         leader_acceleration=acceleration,
@@ -38,7 +40,9 @@ def drives(model: DrivingModel) -> DriveObjective:
         start_position=nothing,
         start_speed=speed[0],
         start_acceleration=nothing,
-        observed=speed,
+        leader_rear=20.5 + speed.cumsum(0) * DT,
+        measured_speed=speed,
+        measured_gap=torch.full_like(speed, 20.0),
         counted=torch.ones_like(speed),
     )
 
@@ -47,7 +51,7 @@ def drives(model: DrivingModel) -> DriveObjective:
 @pytest.mark.parametrize("model", [Krauss(), W99()], ids=["krauss", "w99"])
 def test_population(benchmark: Any, model: DrivingModel) -> None:
     compiled = drives(model)
-    eager = replace(compiled, simulator=Simulator(model, DT, compile="never"))
+    eager = replace(compiled, simulator=MemoryStepper(model, DT, compile="never"))
     fold = torch.arange(DRIVES) % FOLDS
     members = (fold != torch.arange(FOLDS + 1)[:, None]) | (
         torch.arange(FOLDS + 1)[:, None] == FOLDS
@@ -57,9 +61,9 @@ def test_population(benchmark: Any, model: DrivingModel) -> None:
     )
     candidates = points.expand(FOLDS + 1, -1, -1)
     losses = benchmark.pedantic(
-        JointObjective(compiled, members, MEMORY), args=(candidates,), rounds=3, warmup_rounds=1
+        PooledLosses(compiled, members, MEMORY), args=(candidates,), rounds=3, warmup_rounds=1
     )
-    one_by_one = JointObjective(eager, members, MEMORY)
+    one_by_one = PooledLosses(eager, members, MEMORY)
     began = time.perf_counter()
     expected = torch.cat(
         [one_by_one.select(k, k + 1)(candidates[k : k + 1]) for k in range(FOLDS + 1)]

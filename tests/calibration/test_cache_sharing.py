@@ -29,7 +29,7 @@ from cfx.models.krauss import Krauss
 from cfx.optimizers.random import RandomSearch
 from cfx.pairs import PairBatch
 from cfx.progress import Task
-from cfx.simulation.rollout import Simulator
+from cfx.simulation.rollout import MemoryStepper
 from tests.drives import wavy_pairs
 
 here, seconds = Path(sys.argv[1]), float(sys.argv[2])
@@ -48,7 +48,7 @@ class Advanced(Task):
         assert error[0] is not None or self.done == self.total, (self.done, self.total)
 
 pairs = wavy_pairs(Krauss(), torch.linspace(1, 3, {PAIRS}, dtype=torch.float64)[:, None].repeat(1, 2) * 0.4)
-tool = module.Calibrator(Simulator(Krauss(), 0.1), Logged(samples=16), seed=0, cache=Cache(here / "cache"), memory=1 << 28,
+tool = module.Calibrator(MemoryStepper(Krauss(), 0.1), Logged(samples=16), seed=0, cache=Cache(here / "cache"), memory=1 << 28,
                          progress=Advanced)
 (here / f"ready-{{os.getpid()}}").touch()
 while not (here / "go").exists():

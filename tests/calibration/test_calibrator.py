@@ -10,19 +10,20 @@ from torch import Tensor
 
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
-from cfx.calibration.objective import DriveObjective
+from cfx.calibration.losses import SegmentLosses
 from cfx.calibration.windows import Windows, WindowSettings
 from cfx.datasets.synthetic import SyntheticDataset
 from cfx.errors import OutputError
 from cfx.models.base import DrivingModel
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
-from cfx.optimizers.base import Objective
+from cfx.objectives.rmse import SpeedRmse
+from cfx.optimizers.base import CandidateLosses
 from cfx.optimizers.botorch import BotorchOptimizer
 from cfx.optimizers.random import RandomSearch
 from cfx.pairs import PairBatch, PairSet
 from cfx.progress import Task
-from cfx.simulation.rollout import Simulator
+from cfx.simulation.rollout import MemoryStepper
 from tests.drives import straight_pairs, wavy_pairs
 
 SETTINGS = WindowSettings()
@@ -37,7 +38,9 @@ class Counting(RandomSearch):
         self.solved = 0
         self.stop_after = stop_after
 
-    def solve(self, objective: Objective, guesses: Tensor, *, seed: int) -> tuple[Tensor, Tensor]:
+    def solve(
+        self, objective: CandidateLosses, guesses: Tensor, *, seed: int
+    ) -> tuple[Tensor, Tensor]:
         if self.solved + len(guesses) > self.stop_after:
             raise KeyboardInterrupt
         self.solved += len(guesses)
@@ -51,7 +54,7 @@ def calibrator(
     **changes: object,
 ) -> Calibrator:
     arguments = {"seed": 0, "cache": Cache(folder), "memory": 1 << 28, "progress": Task} | changes
-    return Calibrator(Simulator(model or Krauss(), 0.1), optimizer, **arguments)  # type: ignore[arg-type]  # the test's own mix
+    return Calibrator(MemoryStepper(model or Krauss(), 0.1), optimizer, **arguments)  # type: ignore[arg-type]  # the test's own mix
 
 
 def everything(tool: Calibrator, pairs: PairSet) -> tuple[Tensor, Tensor]:
@@ -102,7 +105,7 @@ def test_labels_of_a_driver_who_changes_follow_him() -> None:
     medians = [float(labels.parameters[(windows.pair == p) & told, 0].median()) for p in (0, 1)]
     assert medians[0] == pytest.approx(1.0, abs=0.3)
     assert medians[1] == pytest.approx(2.5, abs=0.3)
-    assert float(labels.loss.max()) < 0.05 + SETTINGS.tie_tolerance
+    assert float(labels.loss.max()) < 0.05 + SpeedRmse.tie_tolerance
 
 
 def test_windows_that_determine_nothing_get_the_fixed_parameters() -> None:
@@ -208,7 +211,9 @@ def test_the_objective_is_the_rmse_of_the_rollout() -> None:
     pairs = wavy_pairs(model, TRUE)
     batch = PairBatch.of(pairs)
     pair, first, steps = torch.tensor([0, 2]), torch.tensor([10, 50]), torch.tensor([7, 20])
-    objective = DriveObjective.of_segments(Simulator(model, 0.1), batch, pair, first, steps)
+    objective = SegmentLosses.of_segments(
+        MemoryStepper(model, 0.1), SpeedRmse(), batch, pair, first, steps
+    )
     candidates = torch.rand(
         (2, 5, 2), dtype=torch.float64, generator=torch.Generator().manual_seed(0)
     )

@@ -29,7 +29,10 @@ def test_reach_never_moves_bounds_inwards() -> None:
     ("adaptation_bounds", "message"),
     [
         ({"tr": (0.0, 1.0)}, "Did you mean 't_r'"),
-        ({"t_r": (2.0, 1.0)}, r"model\.adaptation_bounds\.t_r=\[2\.0, 1\.0\]: the first must be below"),
+        (
+            {"t_r": (2.0, 1.0)},
+            r"model\.adaptation_bounds\.t_r=\[2\.0, 1\.0\]: the first must be below",
+        ),
         ({"t_r": None, "t_i": None}, "could move none"),
     ],
 )

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from cfx.errors import PluginError
-from cfx.optimizers.base import TIE_ABSOLUTE, Objective, Optimizer
+from cfx.optimizers.base import TIE_ABSOLUTE, CandidateLosses, Optimizer
 from cfx.testing.optimizers import Problems, distance
 
 
@@ -14,7 +14,9 @@ class Listed(Optimizer):
 
     points = torch.tensor([[0.2], [0.9], [0.4]], dtype=torch.float64)
 
-    def solve(self, objective: Objective, guesses: Tensor, *, seed: int) -> tuple[Tensor, Tensor]:
+    def solve(
+        self, objective: CandidateLosses, guesses: Tensor, *, seed: int
+    ) -> tuple[Tensor, Tensor]:
         candidates = torch.cat([guesses, self.points.expand(len(guesses), -1, -1)], dim=1)
         return candidates, objective(candidates)
 

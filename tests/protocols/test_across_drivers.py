@@ -16,12 +16,13 @@ import torch
 import cfx
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
-from cfx.calibration.objective import DriveObjective, JointObjective
+from cfx.calibration.losses import PooledLosses, SegmentLosses
 from cfx.calibration.windows import Split, WindowSettings
 from cfx.datasets.synthetic import SyntheticDataset
 from cfx.datasets.tidy import write_tidy
 from cfx.errors import DataError
 from cfx.models.krauss import Krauss
+from cfx.objectives.rmse import SpeedRmse
 from cfx.optimizers.random import RandomSearch
 from cfx.pairs import SIGNALS, PairBatch, PairSet
 from cfx.policies.ensemble import Ensemble
@@ -146,7 +147,9 @@ def test_a_joint_objective_is_the_mean_of_its_drives() -> None:
     batch = PairBatch.of(wavy_pairs(Krauss(), truth))
     simulator = Simulator(Krauss(), 0.1)
     index, steps = torch.arange(3), torch.full((3,), 150)
-    drives = DriveObjective.of_segments(simulator, batch, index, torch.zeros_like(index), steps)
+    drives = SegmentLosses.of_segments(
+        simulator, SpeedRmse(), batch, index, torch.zeros_like(index), steps
+    )
     ensemble_size = torch.tensor([[True, True, False], [True, True, True]])
     candidates = torch.rand(
         (2, 7, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64
@@ -155,27 +158,30 @@ def test_a_joint_objective_is_the_mean_of_its_drives() -> None:
         candidates,
         candidates[:1].expand(2, -1, -1),
     ):  # also where a drive of both problems is simulated once
-        joint = JointObjective(drives, ensemble_size, memory=1 << 30)
+        joint = PooledLosses(drives, ensemble_size, memory=1 << 30)
         first, second = (drives(asked[[k, k, k]]) for k in range(2))
         expected = torch.stack([first[:2].mean(0), second.mean(0)])
         torch.testing.assert_close(joint(asked), expected)
         torch.testing.assert_close(joint.select(1, 2)(asked[1:]), expected[1:])
         # One candidate at a time gives the same.
-        torch.testing.assert_close(JointObjective(drives, ensemble_size, memory=1)(asked), expected)
+        torch.testing.assert_close(PooledLosses(drives, ensemble_size, memory=1)(asked), expected)
 
 
 def test_a_drive_that_diverges_spoils_only_its_own_problems() -> None:
     pairs = wavy_pairs(Krauss(), torch.tensor([[1.0, 0.1], [2.0, 0.4]], dtype=torch.float64))
     batch = PairBatch.of(pairs)
     index = torch.arange(2)
-    drives = DriveObjective.of_segments(
-        Simulator(Krauss(), 0.1), batch, index, torch.zeros_like(index), torch.full((2,), 150)
+    drives = SegmentLosses.of_segments(
+        Simulator(Krauss(), 0.1),
+        SpeedRmse(),
+        batch,
+        index,
+        torch.zeros_like(index),
+        torch.full((2,), 150),
     )
-    drives.observed[10, 1] = torch.nan
+    drives.measured_speed[10, 1] = torch.nan
     same = torch.full((2, 3, 2), 0.5, dtype=torch.float64)
-    losses = JointObjective(drives, torch.tensor([[True, False], [True, True]]), memory=1 << 30)(
-        same
-    )
+    losses = PooledLosses(drives, torch.tensor([[True, False], [True, True]]), memory=1 << 30)(same)
     assert losses.isnan().tolist() == [[False] * 3, [True] * 3]
 
 
@@ -185,13 +191,18 @@ def test_joint_losses_are_the_same_where_their_work_is_worth_compiling_for(
     pairs = wavy_pairs(Krauss(), torch.tensor([[1.0, 0.1], [2.0, 0.4]], dtype=torch.float64))
     index = torch.arange(2)
     simulator = Simulator(Krauss(), 0.1)
-    drives = DriveObjective.of_segments(
-        simulator, PairBatch.of(pairs), index, torch.zeros_like(index), torch.full((2,), 23)
+    drives = SegmentLosses.of_segments(
+        simulator,
+        SpeedRmse(),
+        PairBatch.of(pairs),
+        index,
+        torch.zeros_like(index),
+        torch.full((2,), 23),
     )
     candidates = torch.rand(
         (1, 9, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64
     )
-    joint = JointObjective(drives, torch.tensor([[True, True]]), memory=1)
+    joint = PooledLosses(drives, torch.tensor([[True, True]]), memory=1)
     expected = joint(candidates)
     # 2 drives, 9 candidates and 23 steps are worth it together; a turn of one candidate is not.
     monkeypatch.setattr("cfx.simulation.rollout._WORTH_COMPILING", 2 * 9 * 23)

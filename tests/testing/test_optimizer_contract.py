@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from cfx.errors import PluginError
-from cfx.optimizers.base import Objective, Optimizer
+from cfx.optimizers.base import CandidateLosses, Optimizer
 from cfx.optimizers.random import RandomSearch
 from cfx.testing import violations
 from cfx.testing.checks import optimizers as checks
@@ -29,7 +29,9 @@ class Small(RandomSearch):
             (count, n), generator=torch.Generator().manual_seed(seed), dtype=torch.float64
         ).expand(problems, -1, -1)
 
-    def solve(self, objective: Objective, guesses: Tensor, *, seed: int) -> tuple[Tensor, Tensor]:
+    def solve(
+        self, objective: CandidateLosses, guesses: Tensor, *, seed: int
+    ) -> tuple[Tensor, Tensor]:
         problems, g, n = guesses.shape
         candidates = torch.cat([guesses, self.draw(problems, 60 - g, n, seed)], dim=1)
         return candidates, objective(candidates)
@@ -66,7 +68,9 @@ class Numbering(Small):
 class Deaf(Small):
     """Does not look at the guesses."""
 
-    def solve(self, objective: Objective, guesses: Tensor, *, seed: int) -> tuple[Tensor, Tensor]:
+    def solve(
+        self, objective: CandidateLosses, guesses: Tensor, *, seed: int
+    ) -> tuple[Tensor, Tensor]:
         candidates = self.draw(len(guesses), 60, guesses.shape[2], seed).clone()
         return candidates, objective(candidates)
 
@@ -74,7 +78,9 @@ class Deaf(Small):
 class Gossiping(Small):
     """Searches around the best candidate of all problems together."""
 
-    def solve(self, objective: Objective, guesses: Tensor, *, seed: int) -> tuple[Tensor, Tensor]:
+    def solve(
+        self, objective: CandidateLosses, guesses: Tensor, *, seed: int
+    ) -> tuple[Tensor, Tensor]:
         problems, g, n = guesses.shape
         first = torch.cat([guesses, self.draw(problems, 30 - g, n, seed)], dim=1)
         losses = objective(first)
@@ -126,7 +132,9 @@ class Overfilled(Small):
 class Twice(Small):
     """Evaluates everything twice."""
 
-    def solve(self, objective: Objective, guesses: Tensor, *, seed: int) -> tuple[Tensor, Tensor]:
+    def solve(
+        self, objective: CandidateLosses, guesses: Tensor, *, seed: int
+    ) -> tuple[Tensor, Tensor]:
         super().solve(objective, guesses, seed=seed)
         return super().solve(objective, guesses, seed=seed)
 

@@ -18,6 +18,7 @@ SUITES = {
     "dataset": cfx.testing.DatasetContract,
     "model": cfx.testing.ModelContract,
     "simulator": cfx.testing.SimulatorContract,
+    "objective": cfx.testing.ObjectiveContract,
     "optimizer": cfx.testing.OptimizerContract,
     "policy": cfx.testing.PolicyContract,
     "learner": cfx.testing.LearnerContract,

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from cfx.errors import PluginError
-from cfx.optimizers.base import Objective, Optimizer, Solution
+from cfx.optimizers.base import CandidateLosses, Optimizer, Solution
 from cfx.testing.contract import NotApplicable, contract_of
 
 Function = Callable[[Tensor, Tensor], Tensor]
@@ -299,7 +299,7 @@ def returns_the_loss_of_what_it_returns(optimizer: Optimizer) -> None:
 
 
 def _solve(
-    optimizer: Optimizer, problems: Objective, *, n: int, guesses: int = 1, seed: int = 1
+    optimizer: Optimizer, problems: CandidateLosses, *, n: int, guesses: int = 1, seed: int = 1
 ) -> Solution:
     return optimizer.minimize(problems, _random(problems.problems, guesses, n, seed=99), seed=seed)
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 
-from cfx import Objective, Optimizer, Settings
+from cfx import CandidateLosses, Optimizer, Settings
 from cfx.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -73,7 +73,9 @@ class CmaOptimizer(Optimizer):
         # An evolution strategy took 30 kB at 9 parameters; it holds about ten (n, n) matrices.
         return 50_000 + 8 * (12 * n * n + 3 * self.evaluations_at_once() * (n + 2))
 
-    def solve(self, objective: Objective, guesses: Tensor, *, seed: int) -> tuple[Tensor, Tensor]:
+    def solve(
+        self, objective: CandidateLosses, guesses: Tensor, *, seed: int
+    ) -> tuple[Tensor, Tensor]:
         problems, g, n = guesses.shape
         if g > self._initial:
             raise ConfigError(

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from cfx import Objective, Optimizer, Settings
+from cfx import CandidateLosses, Optimizer, Settings
 from cfx.errors import ConfigError
 
 Floats = NDArray[np.float64]
@@ -93,7 +93,9 @@ class DifferentialEvolution(Optimizer):
         # A paused solver took 25 kB at 9 parameters: its frames, its part of the stack, and about ten arrays of a generation.
         return 60_000 + 8 * 16 * self.settings.population * (n + 2)
 
-    def solve(self, objective: Objective, guesses: Tensor, *, seed: int) -> tuple[Tensor, Tensor]:
+    def solve(
+        self, objective: CandidateLosses, guesses: Tensor, *, seed: int
+    ) -> tuple[Tensor, Tensor]:
         problems, g, n = guesses.shape
         size = self.settings.population
         if g > size:

@@ -1,0 +1,240 @@
+"""What an optimizer minimises in a calibration: the objective of simulated segments of trajectories."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from cfx.models.base import Leader
+from cfx.objectives.base import FrameValues, Objective
+from cfx.pairs import PairBatch
+from cfx.simulation.base import Stepper
+from cfx.simulation.rollout import Start
+
+_NOT_BATCHED = ("simulator", "objective")
+"""Fields of `SegmentLosses` that all its segments share."""
+
+
+@dataclass(frozen=True)
+class SegmentLosses:
+    """Losses of P segments simulated in closed loop, for q candidate parameter sets each.
+
+    Each segment starts from a measured state behind its measured leader and lasts up to K steps.
+
+    Attributes:
+        simulator: the model and its time step.
+        objective: compares the simulated segment with the measured one.
+        leader_position, leader_speed, leader_acceleration: frames 0 to K - 1, `(K, P)`.
+        leader_length: `(P,)`, m.
+        start_position, start_speed, start_acceleration: measured follower at frame 0, `(P,)`.
+        leader_rear: position of the leader's rear bumper at frames 1 to K, `(K, P)`, m.
+        measured_speed: follower at frames 1 to K, `(K, P)`, m/s.
+        measured_gap: bumper to bumper at frames 1 to K, `(K, P)`, m.
+        counted: frames that count, `(K, P)`, 1 or 0.
+    """
+
+    simulator: Stepper
+    objective: Objective
+    leader_position: Tensor
+    leader_speed: Tensor
+    leader_acceleration: Tensor
+    leader_length: Tensor
+    start_position: Tensor
+    start_speed: Tensor
+    start_acceleration: Tensor
+    leader_rear: Tensor
+    measured_speed: Tensor
+    measured_gap: Tensor
+    counted: Tensor
+
+    @classmethod
+    def of_segments(
+        cls,
+        simulator: Stepper,
+        objective: Objective,
+        batch: PairBatch,
+        pair: Tensor,
+        first: Tensor,
+        steps: Tensor,
+    ) -> SegmentLosses:
+        """Cuts segments out of pairs.
+
+        Args:
+            simulator: the model and its time step.
+            objective: compares the simulated segments with the measured ones.
+            batch: the pairs.
+            pair: `(P,)`, index of each segment's pair in the batch.
+            first: `(P,)`, frame at which the segment starts (the measured state).
+            steps: `(P,)`, steps to simulate; frames `first + 1` to `first + steps` are compared.
+        """
+        k = torch.arange(int(steps.max()), device=pair.device)[:, None]
+        now = (first + k).clamp(max=batch.mask.shape[1] - 1)
+        after = (now + 1).clamp(max=batch.mask.shape[1] - 1)
+        leader_rear = batch.leader_position[pair, after] - batch.leader_length[pair]
+        return cls(
+            simulator=simulator,
+            objective=objective,
+            leader_position=batch.leader_position[pair, now],
+            leader_speed=batch.leader_speed[pair, now],
+            leader_acceleration=batch.leader_acceleration[pair, now],
+            leader_length=batch.leader_length[pair],
+            start_position=batch.follower_position[pair, first],
+            start_speed=batch.follower_speed[pair, first],
+            start_acceleration=batch.follower_acceleration[pair, first],
+            leader_rear=leader_rear,
+            measured_speed=batch.follower_speed[pair, after],
+            measured_gap=leader_rear - batch.follower_position[pair, after],
+            counted=(k < steps).to(batch.follower_speed.dtype),
+        )
+
+    @property
+    def problems(self) -> int:
+        """P."""
+        return len(self.leader_length)
+
+    @property
+    def steps(self) -> int:
+        """K."""
+        return len(self.measured_speed)
+
+    @property
+    def bytes_per_candidate(self) -> int:
+        """Memory that one candidate of one problem needs, with the intermediate values of one block.
+
+        Positions, speeds, a term and its masked copy; a gap needs another value and another term.
+        """
+        values = 6 if "gap" in self.objective.signals else 4
+        return (values * self.steps + 32) * self.measured_speed.element_size()
+
+    def select(self, first: int, last: int) -> SegmentLosses:
+        """Returns problems `first` to `last - 1`."""
+        return self._cut(slice(first, last))
+
+    def take(self, problems: Tensor) -> SegmentLosses:
+        """Returns the problems of these numbers, `(S,)` int64; one may stand there more than once."""
+        return self._cut(problems)
+
+    def _cut(self, which: slice | Tensor) -> SegmentLosses:
+        parts: dict[str, Any] = {}
+        for field in fields(self):
+            if field.name not in _NOT_BATCHED:
+                parts[field.name] = getattr(self, field.name)[..., which]
+        return replace(self, **parts)
+
+    @torch.no_grad()
+    def __call__(self, candidates: Tensor) -> Tensor:
+        """Returns losses `(P, q)` of candidates `(P, q, n)` in unit space, in the objective's unit."""
+        frames = self.simulate(candidates, gap="gap" in self.objective.signals)
+        return self.objective(frames, self.counted[..., None])
+
+    def simulate(self, candidates: Tensor, *, gap: bool) -> FrameValues:
+        """Returns frames 1 to K: simulated signals `(K, P, q)` and measured ones `(K, P, 1)`.
+
+        Args:
+            candidates: `(P, q, n)` in unit space.
+            gap: compute the simulated gap; without, it is NaN.
+        """
+        follower = self.simulator.begin(self._start(candidates.shape[:2]))
+        _, position, speed = self.simulator.advance(
+            follower, self._leader(), self._parameters(candidates)
+        )
+        simulated_gap = speed.new_tensor(torch.nan)
+        if gap:
+            simulated_gap = self.leader_rear[..., None] - position
+        return FrameValues(
+            speed=speed,
+            gap=simulated_gap,
+            measured_speed=self.measured_speed[..., None],
+            measured_gap=self.measured_gap[..., None],
+            dt=self.simulator.dt,
+        )
+
+    def _parameters(self, candidates: Tensor) -> dict[str, Tensor]:
+        space = self.simulator.model.space
+        values = space.unpack(space.from_unit(candidates.to(self.measured_speed.dtype)))
+        return {name: value.contiguous() for name, value in values.items()}
+
+    def _start(self, shape: torch.Size) -> Start:
+        return Start(
+            self.start_position[:, None].expand(shape),
+            self.start_speed[:, None].expand(shape),
+            self.start_acceleration[:, None].expand(shape),
+        )
+
+    def _leader(self) -> Leader:
+        return Leader(
+            self.leader_position[..., None],
+            self.leader_speed[..., None],
+            self.leader_acceleration[..., None],
+            self.leader_length[..., None],
+        )
+
+
+_BYTES_AT_ONCE = 1 << 27
+"""Most bytes that pooled losses simulate at once. 1 GB took three times as long as 256 MB, all of it in
+fetching pages."""
+
+
+@dataclass(frozen=True)
+class PooledLosses:
+    """One parameter set for many segments: the mean over the segments of each one's loss.
+
+    The mean of losses, not the loss over all frames: every driver counts alike, and the mean is what an
+    evaluation reports. Where all problems ask for the same candidates, as space-filling ones are, a
+    segment that belongs to several problems is simulated once.
+
+    Attributes:
+        segments: D segments.
+        members: the segments of each of K problems, bool `(K, D)`.
+        memory: bound in bytes for what is simulated at once; candidates are simulated in blocks where
+            all segments of all of them need more.
+    """
+
+    segments: SegmentLosses
+    members: Tensor
+    memory: int
+
+    @property
+    def problems(self) -> int:
+        """K."""
+        return len(self.members)
+
+    @property
+    def bytes_per_candidate(self) -> int:
+        """Memory that one candidate of one problem needs besides the blocks: the segments' losses."""
+        return 2 * self.members.shape[1] * self.segments.measured_speed.element_size()
+
+    def select(self, first: int, last: int) -> PooledLosses:
+        """Returns problems `first` to `last - 1`."""
+        return replace(self, members=self.members[first:last])
+
+    @torch.no_grad()
+    def __call__(self, candidates: Tensor) -> Tensor:
+        """Returns losses `(K, q)` of candidates `(K, q, n)` in unit space, in the objective's unit."""
+        problem, segment = self.members.nonzero().unbind(1)
+        if bool((candidates == candidates[:1]).all()):
+            used = self.members.any(0)
+            simulated, place = used.nonzero()[:, 0], used.cumsum(0) - 1
+            once = self._simulated(simulated, torch.zeros_like(simulated), candidates)
+            losses = once[place[segment]]
+        else:
+            losses = self._simulated(segment, problem, candidates)
+        total = losses.new_zeros(candidates.shape[:2]).index_add_(0, problem, losses)
+        return total / self.members.sum(1, keepdim=True)
+
+    def _simulated(self, segment: Tensor, problem: Tensor, candidates: Tensor) -> Tensor:
+        """Returns losses `(S, q)` of segments `(S,)`, each with the candidates of a problem `(S,)`."""
+        segments, count = self.segments.take(segment), candidates.shape[1]
+        # The blocks are small, but there are many: together they may be worth compiling for, which
+        # none of them is alone.
+        simulator = segments.simulator.for_work(segments.steps * len(segment) * count)
+        segments = replace(segments, simulator=simulator)
+        bound = min(self.memory, _BYTES_AT_ONCE)
+        block = max(1, bound // (segments.bytes_per_candidate * len(segment)))
+        losses = []
+        for part in torch.split(candidates, block, dim=1):
+            losses.append(segments(part[problem]))
+        return torch.cat(losses, dim=1)

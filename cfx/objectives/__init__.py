@@ -1,0 +1,1 @@
+"""Objectives: what calibration minimises and what closed-loop training back-propagates."""
