@@ -29,7 +29,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from cfx import hydra_source, nodes, renamed
+from cfx import hydra_source, nodes, registry, renamed
 from cfx.errors import CfxError, ConfigError
 from cfx.sweep import (
     STATUS,
@@ -167,7 +167,7 @@ class Terminated(BaseException):
 
 def start(arguments: Sequence[str], *, target: str = JOB) -> int:
     """Runs the Hydra application and returns its exit code; prints each message once."""
-    arguments = renamed.overrides(arguments)
+    arguments = todays(arguments)
     overrides = [one for one in arguments if not one.startswith("-")]
     show_traceback = wants_traceback(arguments)
     job = JobFunction(target, uuid.uuid4().hex, show_traceback)
@@ -215,7 +215,7 @@ def run(overrides: Sequence[str] = (), *, target: str = JOB) -> JobResult:
     """
     if isinstance(overrides, str):
         raise ConfigError(f"give a list of overrides: cfx.run({overrides.split()!r})")
-    overrides = renamed.overrides(overrides)
+    overrides = todays(overrides)
     try:
         config = hydra_source.composed(overrides)
         values = hydra_source.plain(config)
@@ -237,6 +237,20 @@ def wants_traceback(arguments: Sequence[str]) -> bool:
     return asked or any(
         one.startswith("hydra.verbose=") and not one.lower().endswith("=false") for one in arguments
     )
+
+
+def todays(arguments: Sequence[str]) -> list[str]:
+    """Returns arguments under today's names; see `cfx.renamed`."""
+    chosen = {}
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        chosen[key.lstrip("+")] = value.split(",")
+
+    def is_current(path: str) -> bool:
+        names = chosen.get(path.partition(".")[0], [])
+        return any(registry.has_setting(name, path) for name in names)
+
+    return renamed.overrides(arguments, is_current)
 
 
 def _call(target: str, values: Any, folder: Path) -> Any:

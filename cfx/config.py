@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator
 
-from cfx import renamed
+from cfx import registry, renamed
 from cfx.calibration.settings import WindowSettings
 from cfx.component import Settings, validate
 from cfx.errors import ConfigError
@@ -107,4 +107,9 @@ class JobConfig(Settings):
             raise ConfigError(
                 f"a configuration is a mapping of keys to values, not {type(values).__name__}"
             )
-        return validate(cls, renamed.config(values), where="")
+        current = renamed.config(values)
+        for group in registry.GROUPS:
+            node = current.get(group)
+            if isinstance(node, Mapping):
+                current[group] = registry.current_node(group, node)
+        return validate(cls, current, where="")

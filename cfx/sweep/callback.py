@@ -9,8 +9,9 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf, open_dict
 
+from cfx import renamed
 from cfx.sweep.running import Sweep
 
 
@@ -25,6 +26,7 @@ class SweepFolder(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         try:
+            _rename_parameters(config)
             SweepFolder._current = Sweep.open(config)
             SweepFolder._current.lead(config)
         except Exception as error:
@@ -35,3 +37,18 @@ class SweepFolder(Callback):
         """Returns the sweep that was started, if one was, and forgets it."""
         sweep, cls._current = cls._current, None
         return sweep
+
+
+def _rename_parameters(config: DictConfig) -> None:
+    """Gives the parameters of a sweep that a configuration file asks for today's names."""
+    given = OmegaConf.select(config, "hydra.sweeper.params")
+    if not given:
+        return
+    arguments = [f"{key}={value}" for key, value in given.items()]
+    parameters = {}
+    for argument in renamed.overrides(arguments):
+        key, _, value = argument.partition("=")
+        parameters[key] = value
+    if parameters != {str(key): str(value) for key, value in given.items()}:
+        with open_dict(config.hydra):
+            config.hydra.sweeper.params = parameters
