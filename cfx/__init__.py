@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from cfx.learners.base import Learner as Learner
     from cfx.learners.base import TrainingData as TrainingData
     from cfx.learners.base import TrainingResult as TrainingResult
+    from cfx.metrics.base import Metric as Metric
+    from cfx.metrics.base import Trajectories as Trajectories
     from cfx.models.base import DrivingModel as DrivingModel
     from cfx.models.base import Follower as Follower
     from cfx.models.base import Leader as Leader
@@ -87,6 +89,8 @@ _HOMES = {
     "Protocol": "cfx.protocols.base",
     "ProtocolContext": "cfx.protocols.base",
     "ProtocolResult": "cfx.protocols.base",
+    "Metric": "cfx.metrics.base",
+    "Trajectories": "cfx.metrics.base",
     "Parameter": "cfx.parameters",
     "ParameterSpace": "cfx.parameters",
     "Settings": "cfx.component",

@@ -75,6 +75,9 @@ class JobConfig(Settings):
     learner: Node = Field(description="the learner's node")
     protocol: Node = Field(description="the protocol's node")
     simulator: Node = Field({"name": "memory"}, description="the simulator's node")
+    metrics: Literal["all"] | tuple[str, ...] = Field(
+        "all", description="what is measured: all that are installed, or some by name"
+    )
     seed: int = Field(0, ge=0, lt=2**32, description="seed of everything random")
     device: str = Field("auto", description="auto, cpu, cuda or cuda:N")
     dtype: Literal["float32", "float64"] = Field("float64", description="precision of simulations")
@@ -95,6 +98,13 @@ class JobConfig(Settings):
         if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", device):
             raise ValueError("choose auto, cpu, cuda or cuda:N")
         return device
+
+    @field_validator("metrics", mode="before")
+    @classmethod
+    def _several(cls, metrics: Any) -> Any:
+        if isinstance(metrics, str) and metrics != "all":
+            return (metrics,)
+        return metrics
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> JobConfig:

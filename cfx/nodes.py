@@ -75,10 +75,11 @@ def file_path(entry: registry.Entry) -> Path:
 
 
 def built_in() -> list[registry.Entry]:
-    """Returns the entries of cfx itself."""
+    """Returns the entries of cfx itself that have a config node."""
     return [
         entry
-        for kind in registry.KINDS
+        for kind, about in registry.KINDS.items()
+        if about.chosen
         for entry in registry.entries(kind)
         if entry.distribution == DISTRIBUTION
     ]

@@ -50,7 +50,9 @@ class Kind:
         group: its config group, the folder in `conf/` and the key in configs.
         entry_points: its entry-point group.
         base: module and class that its components extend.
-        probe: module and function that tries a new component for some milliseconds; "" where its base class checks what it gives.
+        smoke_check: module and function that tries a new component for some milliseconds; "" where its base
+            class checks what it gives.
+        chosen: a job chooses one of this kind, by a config group; metrics are all measured.
     """
 
     name: str
@@ -58,6 +60,7 @@ class Kind:
     entry_points: str
     base: str
     smoke_check: str = ""
+    chosen: bool = True
 
 
 KINDS: dict[str, Kind] = {
@@ -101,11 +104,19 @@ KINDS: dict[str, Kind] = {
         ),
         Kind("learner", "learner", "cfx.learners", "cfx.learners.base:Learner"),
         Kind("protocol", "protocol", "cfx.protocols", "cfx.protocols.base:Protocol"),
+        Kind(
+            "metric",
+            "metrics",
+            "cfx.metrics",
+            "cfx.metrics.base:Metric",
+            "cfx.smoke_checks:smoke_check_metric",
+            chosen=False,
+        ),
     )
 }
 
-GROUPS: dict[str, Kind] = {kind.group: kind for kind in KINDS.values()}
-"""Kinds by config group."""
+GROUPS: dict[str, Kind] = {kind.group: kind for kind in KINDS.values() if kind.chosen}
+"""Kinds by config group, of which a job chooses one component each."""
 
 
 @dataclass(frozen=True)
@@ -147,12 +158,12 @@ def kind_of(kind: str) -> Kind:
     Raises:
         PluginError: there is no such kind.
     """
-    found = KINDS.get(kind) or GROUPS.get(kind)
-    if found is None:
-        raise PluginError(
-            f"there is no kind of component '{kind}'.{nearest(kind, KINDS)} Known: {', '.join(KINDS)}."
-        )
-    return found
+    for found in KINDS.values():
+        if kind in {found.name, found.group}:
+            return found
+    raise PluginError(
+        f"there is no kind of component '{kind}'.{nearest(kind, KINDS)} Known: {', '.join(KINDS)}."
+    )
 
 
 def entries(kind: str) -> tuple[Entry, ...]:
@@ -452,6 +463,10 @@ def _check(found: Entry, cls: Any) -> None:
         raise PluginError(
             f"{found}: its schema must extend {base.schema.__module__}.{base.schema.__name__}"
         )
+    if found.kind == "metric":
+        wrong = _resolve("cfx.metrics.base:declared_wrongly")(cls)
+        if wrong:
+            raise PluginError(f"{found} {wrong}")
 
 
 def _check_model(found: Entry, cls: Any) -> None:

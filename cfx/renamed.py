@@ -90,6 +90,8 @@ _COLUMNS: tuple[tuple[str, str], ...] = (
     (r"^later_rmse_speed$", "steady_rmse_speed"),
     (r"^whole_", "full_trajectory_"),
     (r"^loss_mps$", "loss"),
+    (r"^rms_jerk$", "jerk"),
+    (r"^real_rms_jerk$", "real_jerk"),
     (r"^spread_mps$", "sensitivity"),
     (r"_base$", "_shrunk"),
 )

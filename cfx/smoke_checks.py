@@ -15,11 +15,12 @@ import torch
 from torch import Tensor
 
 from cfx.errors import CfxError, PluginError
+from cfx.metrics.base import Metric, Trajectories
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.krauss import Krauss
 from cfx.objectives.base import FrameValues, Objective
 from cfx.optimizers.base import Optimizer
-from cfx.parameters import ParameterSpace
+from cfx.parameters import Parameter, ParameterSpace
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import token_width
 from cfx.simulation.base import Stepper
@@ -29,6 +30,7 @@ from cfx.simulators.base import Simulator
 STATES = 24
 DT = 0.1
 NETWORKS, DRIVERS, WINDOWS, PARAMETERS, LENGTH = 3, 2, 4, 5, 5
+PAIRS, FRAMES = 4, 60
 
 
 @torch.no_grad()
@@ -293,6 +295,52 @@ def _trajectories(objective: Objective, dtype: torch.dtype) -> FrameValues:
             else:
                 values[name] = torch.full_like(measured, torch.nan, dtype=dtype)
     return FrameValues(**values, dt=DT)
+
+
+@torch.no_grad()
+def smoke_check_metric(metric: Metric) -> None:
+    """Measures a few trajectories, in double and in single precision.
+
+    Raises:
+        PluginError: it gives something else than one floating-point number for each pair.
+    """
+    for dtype in (torch.float64, torch.float32):
+        values = metric.compute(_metric_trajectories(dtype))
+        if not isinstance(values, Tensor) or values.shape != (PAIRS,):
+            raise PluginError(
+                f"compute gives {_shown(values)}; it must give a number for each pair, (pairs,)"
+            )
+        if not values.is_floating_point():
+            raise PluginError(f"compute gives {values.dtype}; it must give floating-point numbers")
+
+
+def _metric_trajectories(dtype: torch.dtype) -> Trajectories:
+    """Returns followers that swing around the recorded ones; the last of them has a few frames only."""
+    time = 0.1 * torch.arange(FRAMES, dtype=torch.float64)
+    phase = torch.arange(PAIRS, dtype=torch.float64)[:, None]
+    measured_speed = 12.0 + 2.0 * torch.sin(0.5 * time + phase)
+    speed = measured_speed + 0.5 * torch.sin(time + 2 * phase)
+    measured_gap = 20.0 + 2.0 * torch.cos(0.5 * time + phase)
+    gap = measured_gap - (DT * (speed - measured_speed)).cumsum(1)
+    frames = torch.full((PAIRS, 1), FRAMES)
+    frames[-1] = 6
+    counted = torch.arange(FRAMES) < frames
+    counted[:, 0] = False
+    space = ParameterSpace.of(
+        Parameter("tau", "s", 0.5, 3.0, 1.0, "time gap"),
+        Parameter("a", "m/s2", 1.0, 3.0, 2.0, "maximum acceleration"),
+    )
+    return Trajectories(
+        speed=speed.to(dtype),
+        gap=gap.to(dtype),
+        measured_speed=measured_speed.to(dtype),
+        measured_gap=measured_gap.to(dtype),
+        leader_speed=(measured_speed + 0.3).to(dtype),
+        parameters=torch.full((PAIRS, FRAMES, 2), 1.5, dtype=dtype),
+        counted=counted,
+        dt=DT,
+        space=space,
+    )
 
 
 def _whole(value: object, name: str, *, least: int) -> int:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 
-from cfx.evaluation.result import Drive, Evaluation, Improvement, Platoon
+from cfx.evaluation.result import Evaluation, Improvement, PairTrajectory, Platoon
+from cfx.evaluation.tables import VALUE_COLUMNS
+from cfx.metrics.base import MetricInfo
 from cfx.parameters import Parameter, ParameterSpace
 from cfx.style.result import CLUSTERS, StyleResult
 
@@ -44,14 +48,23 @@ def make_results(
     """Makes up an evaluation, a style and learning curves (one network per pair unless told)."""
     rng = np.random.default_rng(seed)
     drives = tuple(make_drive(k, frames, space, rng, methods) for k in range(pairs))
-    table = pd.DataFrame(
-        [row for k, drive in enumerate(drives) for row in rows_of(k, drive, space)]
-    )
-    bounds = np.array([[p.low for p in space.tuned], [p.high for p in space.tuned]])
-    improvements = {baseline: summarize(table) for baseline in methods if baseline != "policy"}
+    about = pd.DataFrame([row for k, one in enumerate(drives) for row in about_of(k, one, space)])
+    values = make_values(drives)
     evaluation = Evaluation(
-        table, improvements, drives, space.names, tuple(p.unit for p in space.tuned), bounds
+        about=about,
+        values=values,
+        measured=MEASURED,
+        improvements={},
+        trajectories=drives,
+        names=space.names,
+        units=tuple(p.unit for p in space.tuned),
+        bounds=np.array([[p.low for p in space.tuned], [p.high for p in space.tuned]]),
     )
+    improvements = {}
+    for baseline in methods:
+        if baseline != "policy":
+            improvements[baseline] = summarize(evaluation.table)
+    evaluation = dataclasses.replace(evaluation, improvements=improvements)
     curves = make_curves(pairs if networks is None else networks, epochs, seed)
     return MadeUp(evaluation, make_style([drive.driver for drive in drives], rng), curves)
 
@@ -62,7 +75,7 @@ def make_drive(
     space: ParameterSpace,
     rng: np.random.Generator,
     methods: tuple[str, ...] = ("default", "fixed", "policy"),
-) -> Drive:
+) -> PairTrajectory:
     low, high = np.array([p.low for p in space.tuned]), np.array([p.high for p in space.tuned])
     time = 56.0 + 0.1 * np.arange(frames + 1)
     leader = np.clip(8 + 5 * np.sin(0.25 * time + k) + 2.0 * np.sin(0.9 * time + 2 * k), 0, None)
@@ -90,7 +103,7 @@ def make_drive(
     }
     parameters = {method: parameters[method] for method in methods}
     number = 1000 + 7 * k
-    return Drive(
+    return PairTrajectory(
         f"i80-0400-{number}-{number - 10}",
         f"i80-0400/{number}",
         time,
@@ -142,7 +155,9 @@ def make_platoon(networks: dict[str, int], seconds: float = 40.0) -> Platoon:
     return Platoon(pd.concat(tables, ignore_index=True), pd.DataFrame(measures))
 
 
-def make_history(drives: tuple[Drive, ...], gains: dict[tuple[str, str], float]) -> pd.DataFrame:
+def make_history(
+    drives: tuple[PairTrajectory, ...], gains: dict[tuple[str, str], float]
+) -> pd.DataFrame:
     """What a policy gained, by base and amount of history."""
     rows = [
         {
@@ -169,14 +184,12 @@ GAINS = {
 }
 
 
-def rows_of(k: int, drive: Drive, space: ParameterSpace) -> list[dict[str, object]]:
-    rmse = {
-        method: float(np.sqrt(np.mean((drive.speed[method] - drive.real_speed) ** 2)))
-        for method in drive.speed
-    }
+def about_of(k: int, drive: PairTrajectory, space: ParameterSpace) -> list[dict[str, object]]:
+    """What is known of a pair, a row per method."""
     follower, leader = drive.pair_id.split("-")[-2:]
-    return [
-        {
+    rows = []
+    for method in drive.speed:
+        row: dict[str, object] = {
             "pair_id": drive.pair_id,
             "recording": "i80-0400",
             "leader_id": leader,
@@ -184,20 +197,80 @@ def rows_of(k: int, drive: Drive, space: ParameterSpace) -> list[dict[str, objec
             "driver": drive.driver,
             "cluster": k % 3,
             "style_score": 0.2 + 0.005 * k,
-            "method": method,
-            "rmse_speed": rmse[method],
-            "rmse_gap": float(np.sqrt(np.mean((drive.gap[method] - drive.real_gap) ** 2))),
-            "improvement": (rmse["fixed"] - rmse[method]) / rmse["fixed"],
-            "collisions": int((drive.gap[method] < 0).any()),
-            "frames": len(drive.time) - 1,
             "fold": 0,
-            **{
-                f"parameter_{p.name}": float(drive.parameters[method][:, j].mean())
-                for j, p in enumerate(space.tuned)
-            },
+            "method": method,
+            "frames": len(drive.time) - 1,
         }
-        for method in drive.speed
-    ]
+        for j, p in enumerate(space.tuned):
+            row[f"parameter_{p.name}"] = float(drive.parameters[method][:, j].mean())
+        rows.append(row)
+    return rows
+
+
+def info(name: str, *scopes: str, summary: str = "mean") -> MetricInfo:
+    """What tables need to know of a metric; of the test part unless scopes are named."""
+    return MetricInfo(
+        name=name,
+        unit="m/s",
+        direction="lower",
+        summary=summary,
+        heading=name.replace("_", " "),
+        meaning=f"the {name}",
+        scopes=scopes or ("test",),
+        headline=name in HEADLINES,
+        distribution="cfx-driving",
+    )
+
+
+HEADLINES = ("rmse_speed", "rmse_gap", "collisions")
+MEASURED = (
+    info("rmse_speed"),
+    info("rmse_gap"),
+    info("collisions", summary="sum"),
+)
+
+
+def make_values(drives: tuple[PairTrajectory, ...]) -> pd.DataFrame:
+    """The long table of `MEASURED` for the test part."""
+    rows = []
+    for drive in drives:
+        for method in drive.speed:
+            speed, gap = drive.speed[method], drive.gap[method]
+            found = {
+                "rmse_speed": float(np.sqrt(np.mean((speed - drive.real_speed) ** 2))),
+                "rmse_gap": float(np.sqrt(np.mean((gap - drive.real_gap) ** 2))),
+                "collisions": float((gap < 0).any()),
+            }
+            for metric, value in found.items():
+                rows.append((drive.pair_id, drive.driver, method, "test", metric, value))
+    return pd.DataFrame(rows, columns=list(VALUE_COLUMNS))
+
+
+def with_metric(
+    evaluation: Evaluation,
+    metric: str,
+    by_method: Mapping[str, float],
+    *,
+    scope: str = "test",
+    summary: str = "mean",
+) -> Evaluation:
+    """Adds a metric whose value is the same for all pairs of a method."""
+    rows = []
+    for drive in evaluation.trajectories:
+        for method, value in by_method.items():
+            rows.append((drive.pair_id, drive.driver, method, scope, metric, float(value)))
+    added = pd.DataFrame(rows, columns=list(VALUE_COLUMNS))
+    infos = {one.name: one for one in evaluation.measured}
+    scopes = (*infos[metric].scopes, scope) if metric in infos else (scope,)
+    if metric in infos:
+        infos[metric] = dataclasses.replace(infos[metric], scopes=scopes)
+    else:
+        infos[metric] = info(metric, *scopes, summary=summary)
+    return dataclasses.replace(
+        evaluation,
+        values=pd.concat([evaluation.values, added], ignore_index=True),
+        measured=tuple(infos.values()),
+    )
 
 
 def make_style(drivers: list[str], rng: np.random.Generator) -> StyleResult:

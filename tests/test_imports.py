@@ -20,7 +20,7 @@ FLOORS = (
     ("parameters", "pairs", "progress", "console", "files"),
     ("registry",),
     ("models",),
-    ("simulation",),
+    ("simulation", "metrics"),
     ("simulators",),
     ("datasets", "style", "optimizers", "objectives", "calibration"),
     ("policies", "learners"),

@@ -15,7 +15,7 @@ from cfx.evaluation.result import Evaluation
 from cfx.job.console import report
 from cfx.job.output import Output, write_further_tables
 from cfx.job.results import JobResult
-from tests.made_up import GAINS, make_history, make_platoon, make_results
+from tests.made_up import GAINS, make_history, make_platoon, make_results, with_metric
 
 
 class Untracked:
@@ -39,10 +39,8 @@ def said(evaluation: Evaluation, *, has_constant_baseline: bool = True) -> str:
 
 def measured(hard_braking: dict[str, int], at_bounds: dict[str, float]) -> Evaluation:
     evaluation = make_results(pairs=4, frames=20).evaluation
-    table = evaluation.table.assign(rms_jerk=1.0, real_rms_jerk=1.0)
-    table["hard_braking"] = table["method"].map(hard_braking)
-    table["at_bounds"] = table["method"].map(at_bounds)
-    return dataclasses.replace(evaluation, table=table)
+    evaluation = with_metric(evaluation, "hard_braking", hard_braking, summary="sum")
+    return with_metric(evaluation, "at_bounds", at_bounds)
 
 
 def test_a_safe_drive_is_not_talked_about() -> None:
@@ -77,7 +75,7 @@ def test_platoon_and_history_are_written_and_old_ones_go(tmp_path: Path, present
     for name in names:
         (tmp_path / name).write_bytes(b"of an earlier job")
     if present:
-        history = make_history(evaluation.drives, GAINS)
+        history = make_history(evaluation.trajectories, GAINS)
         evaluation = dataclasses.replace(
             evaluation, platoon=make_platoon({"policy": 1}), history=history
         )

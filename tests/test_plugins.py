@@ -280,6 +280,10 @@ def test_show_tells_everything_about_every_component(capsys) -> None:
                 assert (kind, setting) == ("model", "parameters") or re.search(
                     rf"^ *{setting}[ .]", printed, re.MULTILINE
                 )
+    assert cli.main(["plugins", "show", "metric", "min_ttc"]) == 0
+    printed = capsys.readouterr().out
+    assert "Every job measures it" in printed
+    assert "Hayward" in printed
     assert cli.main(["plugins", "show", "optimizer", "random"]) == 0
     printed = capsys.readouterr().out
     assert "Sobol'" in printed

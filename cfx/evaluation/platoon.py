@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from cfx.evaluation.result import METHODS, Array, Platoon
-from cfx.evaluation.safety import hard_braking
+from cfx.metrics.safety import hard_braking_frames
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.policies.features import History
 from cfx.policies.trained import TrainedPolicy
@@ -257,7 +257,7 @@ def _measures(
         "settled": settled,
         "min_gap": gap[..., after].amin((0, 2)),
         "collisions": collisions,
-        "hard_braking": hard_braking(speed[1:, :, after], counted, dt).sum(0),
+        "hard_braking": hard_braking_frames(speed[1:, :, after], counted, dt).sum(0),
     }
     values = {name: np.asarray(column.double().cpu().numpy()) for name, column in columns.items()}
     return pd.DataFrame({"method": method, "network": list(names), **values})

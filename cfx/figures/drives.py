@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from cfx.errors import ConfigError, nearest
-from cfx.evaluation.result import METHODS, Drive, Evaluation
+from cfx.evaluation.result import METHODS, Evaluation, PairTrajectory
 from cfx.figures.look import (
     BAND,
     COLOURS,
@@ -186,7 +186,9 @@ def chosen_parameters(evaluation: Evaluation, pair_id: str | None = None) -> Fig
     return figure
 
 
-def _parameter(axes: Axes, drive: Drive, k: int, name: str, unit: str, bounds: Array) -> None:
+def _parameter(
+    axes: Axes, drive: PairTrajectory, k: int, name: str, unit: str, bounds: Array
+) -> None:
     low, high = float(bounds[0]), float(bounds[1])
     seen = []
     for method in _shown(drive.parameters):
@@ -209,9 +211,9 @@ def _parameter(axes: Axes, drive: Drive, k: int, name: str, unit: str, bounds: A
 
 def _choose(
     evaluation: Evaluation, pair_id: str | Sequence[str] | None, n: int
-) -> list[tuple[str, Drive]]:
+) -> list[tuple[str, PairTrajectory]]:
     """Returns (label, drive) of the pairs to show."""
-    by_id = {drive.pair_id: drive for drive in evaluation.drives}
+    by_id = {drive.pair_id: drive for drive in evaluation.trajectories}
     if pair_id is not None:
         wanted = [pair_id] if isinstance(pair_id, str) else list(pair_id)
         for name in wanted:
@@ -226,7 +228,7 @@ def _choose(
         if name in by_id
     ]
     if not ranked:
-        return [("pair ", drive) for drive in evaluation.drives[:n]]
+        return [("pair ", drive) for drive in evaluation.trajectories[:n]]
     places = (
         [len(ranked) // 2]
         if n == 1
@@ -325,7 +327,7 @@ def _note(axes: Axes, text: str, height: float) -> None:
     )
 
 
-def _mark_collisions(axes: Axes, drive: Drive) -> None:
+def _mark_collisions(axes: Axes, drive: PairTrajectory) -> None:
     """Marks where a simulated gap becomes negative."""
     for method, gap in drive.gap.items():
         hit = np.flatnonzero(_finite(gap) < 0)

@@ -9,7 +9,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from cfx.evaluation.metrics import mean_interval
+from cfx.evaluation.statistics import mean_interval
 from cfx.figures.look import COLOURS, INK, canvas, percent, styled
 
 BASES = {"own": "fixed", "population": "population"}

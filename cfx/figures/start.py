@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from cfx.evaluation.result import Array, Drive, Evaluation
+from cfx.evaluation.result import Array, Evaluation, PairTrajectory
 from cfx.figures.look import INK, canvas, method_handles, method_line, styled
 
 _LEAST = 0.9
@@ -27,7 +27,7 @@ def error_over_time(evaluation: Evaluation) -> Figure:
         figure.subplots(1, 2), ("speed", "gap"), ("m/s", "m"), strict=True
     ):
         for method in methods:
-            seconds, error = errors_over_time(evaluation.drives, method, signal)
+            seconds, error = errors_over_time(evaluation.trajectories, method, signal)
             method_line(axes, method, seconds, error)
         axes.set_xlabel("time since the test part began (s)")
         axes.set_ylabel(f"RMSE of {signal} over pairs ({unit})")
@@ -38,7 +38,9 @@ def error_over_time(evaluation: Evaluation) -> Figure:
     return figure
 
 
-def errors_over_time(drives: Sequence[Drive], method: str, signal: str) -> tuple[Array, Array]:
+def errors_over_time(
+    drives: Sequence[PairTrajectory], method: str, signal: str
+) -> tuple[Array, Array]:
     """Returns seconds since the test part began, and the RMSE over the pairs that drive then, `(T,)` each.
 
     Args:

@@ -11,9 +11,13 @@ from rich.table import Table
 
 from cfx.evaluation.result import Evaluation, Improvement
 from cfx.job.results import JobResult
+from cfx.metrics.base import MetricInfo, key_of
 
 if TYPE_CHECKING:
     from cfx.tracking.tracker import Tracker
+
+_TITLES = {"full_trajectory": "full trajectory: "}
+"""What stands before the heading of a metric outside of the test part."""
 
 
 def report(
@@ -24,86 +28,127 @@ def report(
     *,
     has_constant_baseline: bool = True,
 ) -> None:
-    """Prints the table, where the results are and how to open them; `has_constant_baseline` as `DrivingModel.has_constant_baseline`."""
-    table = Table(
-        title=f"{len(evaluation.drives)} pair{'s' * (len(evaluation.drives) != 1)}, test part in closed loop",
-        title_justify="left",
-    )
-    m = result.metrics
-    columns = {"RMSE speed [m/s]": "rmse_speed", "RMSE gap [m]": "rmse_gap"}
-    if evaluation.full_trajectory_improvements:
-        columns |= {
-            "whole speed [m/s]": "full_trajectory/rmse_speed",
-            "whole gap [m]": "full_trajectory/rmse_gap",
-        }
-    table.add_column("method")
-    for heading in (*columns, "collisions"):
-        table.add_column(heading, justify="right")
-    for method in evaluation.methods:
-        values = [
-            f"{m[f'{key}/{method}']:.3f}" if f"{key}/{method}" in m else ""
-            for key in columns.values()
-        ]
-        table.add_row(method, *values, f"{m[f'collisions/{method}']:.0f}")
-    console.print(table)
-    if not has_constant_baseline:
-        text = "With constant parameters the model follows no leader: compare the policy's RMSE with other jobs'."
-        console.print(text, soft_wrap=True)
+    """Prints the table, where the results are and how to open them.
+
+    Args:
+        result: of the job.
+        evaluation: what was measured.
+        console: where it is printed.
+        tracker: says how to open the job's run.
+        has_constant_baseline: as `DrivingModel.has_constant_baseline`.
+    """
+    console.print(methods_table(evaluation, result.metrics))
+    if has_constant_baseline:
+        _print_improvements(evaluation, console)
     else:
-        _tell(evaluation.improvement, "fixed", console)
-        if "fixed" in evaluation.steady_improvements:
-            _tell(evaluation.steady_improvements["fixed"], "fixed beyond the first 5 s", console)
-        if "shrunk" in evaluation.improvements:
-            _tell(
-                evaluation.improvements["shrunk"],
-                "shrunk (own, shrunk towards the default)",
-                console,
-            )
-        if "population" in evaluation.improvements:
-            _tell(evaluation.improvements["population"], "population", console)
-        if "population" in evaluation.full_trajectory_improvements:
-            _tell(
-                evaluation.full_trajectory_improvements["population"],
-                "population on whole drives",
-                console,
-            )
-    _warn(evaluation, m, console)
+        text = (
+            "With constant parameters the model follows no leader: compare the policy's RMSE"
+            " with other jobs'."
+        )
+        console.print(text, soft_wrap=True)
+    _print_safety(evaluation, result.metrics, console)
+    for one in evaluation.left_out:
+        text = f"Not measured: {one.name} of the distribution {one.distribution} ({one.reason})."
+        console.print(text, soft_wrap=True, highlight=False)
     console.print(f"Results: {result.folder}", soft_wrap=True, highlight=False)
     for line in tracker.how_to_open():
         console.print(line, soft_wrap=True, highlight=False)
 
 
-def _tell(i: Improvement, baseline: str, console: Console) -> None:
-    known = math.isfinite(i.ci95_low)
-    interval = (
-        f"95 % interval {i.ci95_low:+.1%} to {i.ci95_high:+.1%}"
-        if known
-        else "no interval: it needs two drivers"
-    )
+def methods_table(evaluation: Evaluation, metrics: Mapping[str, float]) -> Table:
+    """Returns a row per method with the metrics that are headlines, of the test part and of full trajectories."""
+    count = len(evaluation.trajectories)
+    plural = "" if count == 1 else "s"
+    title = f"{count} pair{plural}, test part in closed loop"
+    table = Table(title=title, title_justify="left")
+    table.add_column("method")
+    shown = _headlines(evaluation)
+    for metric, scope in shown:
+        table.add_column(_TITLES.get(scope, "") + metric.title, justify="right")
+    for method in evaluation.methods:
+        cells = []
+        for metric, scope in shown:
+            cells.append(_cell(metric, metrics.get(key_of(metric.name, method, scope))))
+        table.add_row(method, *cells)
+    return table
+
+
+def _headlines(evaluation: Evaluation) -> list[tuple[MetricInfo, str]]:
+    """Returns the columns of the table: metrics and scopes."""
+    scopes = ["test"]
+    if evaluation.full_trajectory_improvements:
+        scopes.append("full_trajectory")
+    found = []
+    for scope in scopes:
+        for metric in evaluation.measured:
+            if metric.headline and scope in metric.scopes:
+                found.append((metric, scope))
+    return found
+
+
+def _cell(metric: MetricInfo, value: float | None) -> str:
+    """Returns a number as the table shows it: sums of whole numbers without decimals."""
+    if value is None:
+        return ""
+    if metric.summary == "sum" and value == round(value):
+        return f"{value:.0f}"
+    return f"{value:.3f}"
+
+
+def _print_improvements(evaluation: Evaluation, console: Console) -> None:
+    """Prints a sentence for each comparison of the policy with a baseline."""
+    test, full = evaluation.improvements, evaluation.full_trajectory_improvements
+    sentences = [
+        (test, "fixed", "fixed"),
+        (evaluation.steady_improvements, "fixed", "fixed after the transient"),
+        (test, "shrunk", "shrunk (the driver's own, shrunk towards the default)"),
+        (test, "population", "population"),
+        (full, "population", "population on full trajectories"),
+    ]
+    for improvements, baseline, words in sentences:
+        if baseline in improvements:
+            _print_improvement(improvements[baseline], words, console)
+
+
+def _print_improvement(i: Improvement, baseline: str, console: Console) -> None:
+    interval = "no interval: it needs two drivers"
+    if math.isfinite(i.ci95_low):
+        interval = f"95 % interval {i.ci95_low:+.1%} to {i.ci95_high:+.1%}"
+    pairs = "1 pair" if i.pairs == 1 else f"{i.pairs} pairs"
     console.print(
-        f"Improvement of policy over {baseline}, RMSE of speed: mean {i.mean:+.1%} ({interval}), trimmed mean"
-        f" {i.trimmed_mean:+.1%}, median {i.median:+.1%}; better for {i.win_rate:.0%} of {i.pairs}"
-        f" {'pair' if i.pairs == 1 else 'pairs'}; Wilcoxon p = {i.p_value:.2g}",
+        f"Improvement of policy over {baseline}, RMSE of speed: mean {i.mean:+.1%} ({interval}),"
+        f" trimmed mean {i.trimmed_mean:+.1%}, median {i.median:+.1%};"
+        f" better for {i.win_rate:.0%} of {pairs}; Wilcoxon p = {i.p_value:.2g}",
         soft_wrap=True,
         highlight=False,
     )
     if i.undefined:
         console.print(
-            f"{i.undefined} pairs have no improvement: a drive diverged, or {baseline} drives without any error."
+            f"{i.undefined} pairs have no improvement: a simulation diverged,"
+            f" or {baseline} has no error at all."
         )
 
 
-def _warn(evaluation: Evaluation, metrics: Mapping[str, float], console: Console) -> None:
-    """Prints a line about what is not safe or not free in what was driven; nothing if there is nothing."""
+def _print_safety(evaluation: Evaluation, metrics: Mapping[str, float], console: Console) -> None:
+    """Prints a line about hard braking and about parameters at their bounds; nothing if there is nothing."""
+    sentences = []
+    braking = _methods_above(evaluation, metrics, "hard_braking", 1, ".0f")
+    if braking:
+        sentences.append(f"Frames with an acceleration below -8 m/s2: {braking}.")
+    if metrics.get("at_bounds/policy", 0.0) >= 0.01:
+        at_bounds = _methods_above(evaluation, metrics, "at_bounds", 0.01, ".0%")
+        sentences.append(f"Parameters at their bounds: {at_bounds}.")
+    if sentences:
+        console.print(" ".join(sentences), soft_wrap=True, highlight=False)
 
-    def listed(name: str, least: float, form: str) -> str:
-        found = {method: metrics.get(f"{name}/{method}", 0.0) for method in evaluation.methods}
-        return ", ".join(
-            f"{method} {value:{form}}" for method, value in found.items() if value >= least
-        )
 
-    braking, stuck = listed("hard_braking", 1, ".0f"), metrics.get("at_bounds/policy", 0.0) >= 0.01
-    said = [f"Frames with an acceleration below -8 m/s2: {braking}."] if braking else []
-    said += [f"Parameters at their bounds: {listed('at_bounds', 0.01, '.0%')}."] if stuck else []
-    if said:
-        console.print(" ".join(said), soft_wrap=True, highlight=False)
+def _methods_above(
+    evaluation: Evaluation, metrics: Mapping[str, float], name: str, least: float, form: str
+) -> str:
+    """Lists the methods whose metric is at least so much, with its value."""
+    found = []
+    for method in evaluation.methods:
+        value = metrics.get(key_of(name, method), 0.0)
+        if value >= least:
+            found.append(f"{method} {value:{form}}")
+    return ", ".join(found)

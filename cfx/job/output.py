@@ -6,6 +6,7 @@ import functools
 import json
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ TRACKED = (
     "config.yaml",
     "metrics.json",
     "pairs.csv",
+    "pair_metrics.parquet",
     "style.csv",
     "data.json",
     "trajectories.parquet",
@@ -131,6 +133,8 @@ def write_tables(
     evaluation = protocol_result.evaluation
     trajectories, curves = evaluation.trajectories_table, typed_curves(protocol_result.curves)
     output.file("pairs.csv", lambda path: evaluation.table.to_csv(path, index=False))
+    values = evaluation.values
+    output.file("pair_metrics.parquet", lambda path: values.to_parquet(path, index=False))
     output.file("trajectories.parquet", lambda path: trajectories().to_parquet(path, index=False))
     output.file("curves.parquet", lambda path: curves.to_parquet(path, index=False))
     output.file("style.csv", lambda path: style.table.to_csv(path, index=False))
@@ -250,6 +254,8 @@ def write_provenance(
         "parameters": parameters,
         "has_constant_baseline": has_constant_baseline,
         "objective": dict(objective),
+        "metrics": [metric.to_json() for metric in evaluation.measured],
+        "metrics_left_out": [asdict(one) for one in evaluation.left_out],
         "cfx": version(),
     }
     output.json("data.json", values)

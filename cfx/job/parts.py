@@ -13,6 +13,7 @@ from cfx.config import JobConfig
 from cfx.datasets.base import Dataset
 from cfx.errors import ConfigError
 from cfx.learners.base import Learner
+from cfx.metrics.installed import MetricSet
 from cfx.models.base import DrivingModel
 from cfx.objectives.base import Objective
 from cfx.optimizers.base import Optimizer
@@ -39,6 +40,7 @@ class Parts:
     policy: Policy
     learner: Learner
     protocol: Protocol
+    metrics: MetricSet
 
     @classmethod
     def of(cls, config: JobConfig, protocol: Protocol) -> Parts:
@@ -66,6 +68,7 @@ class Parts:
             policy=policy,
             learner=learner,
             protocol=protocol,
+            metrics=MetricSet.of(config.metrics),
         )
 
 

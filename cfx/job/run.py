@@ -156,6 +156,7 @@ def _context(
         split=config.split,
         seed=config.seed,
         workspace=workspace,
+        metrics=parts.metrics,
     )
 
 

@@ -6,7 +6,9 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-_KINDS = "dataset (or data), model, simulator, optimizer, objective, policy, learner or protocol"
+_KINDS = (
+    "dataset (or data), model, simulator, optimizer, objective, policy, learner, protocol or metric"
+)
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -130,10 +130,15 @@ def _write(kind: registry.Kind, words: dict[str, Any], target: Path) -> None:
 
 
 def _next_steps(kind: registry.Kind, name: str, target: Path) -> str:
+    job = f"{kind.group}={name}"
+    if kind.name == "dataset":
+        job += " data.path=FILE.csv"
+    if not kind.chosen:
+        job = "  # every job measures it"
     return (
         f"Wrote {target}, a package with the {kind.name} '{name}'. Next:\n"
         f"  pip install --editable {target}\n"
         f"  python -m pytest {target}\n"
         f"  python -m cfx plugins check {kind.name} {name}\n"
-        f"  python -m cfx {kind.group}={name}{' data.path=FILE.csv' if kind.name == 'dataset' else ''}"
+        f"  python -m cfx {job}"
     )

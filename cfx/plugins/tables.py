@@ -49,7 +49,10 @@ def show(kind: str, name: str) -> None:
     entry = registry.entry(kind, name)
     cls: Any = registry.get(kind, name)
     group = registry.kind_of(kind).group
-    print(f"{entry}\n{entry.location}\nChoose it with {group}={name}.\n")
+    chosen = f"Choose it with {group}={name}."
+    if not registry.kind_of(kind).chosen:
+        chosen = f"Every job measures it; with {group}={name} no others but those that a job needs."
+    print(f"{entry}\n{entry.location}\n{chosen}\n")
     if cls.deprecated:
         print(f"Deprecated: {cls.deprecated}\n")
     print(f"{inspect.getdoc(cls) or '(its class has no docstring)'}\n")
@@ -57,6 +60,8 @@ def show(kind: str, name: str) -> None:
         print(f"{line}\n")
     if entry.kind == "model":
         put(_parameters(cls))
+    if entry.kind == "metric":
+        put(_metric(cls))
     settings = blank_table(
         "setting",
         "default",
@@ -81,6 +86,14 @@ def _reference(cls: type[Component]) -> Iterator[str]:
     about = inspect.getdoc(inspect.getmodule(cls))
     if about:
         yield f"From its module: {about}"
+
+
+def _metric(cls: Any) -> Table:
+    """Returns what tables say of a metric."""
+    rows = blank_table("heading", "unit", "better", "over pairs", "scopes", "meaning")
+    scopes = ", ".join(cls.scopes)
+    rows.add_row(cls.heading, cls.unit, cls.direction, cls.summary, scopes, cls.meaning)
+    return rows
 
 
 def _parameters(cls: Any) -> Table:

@@ -20,6 +20,7 @@ from cfx.component import Component
 from cfx.errors import PluginError
 from cfx.evaluation.result import Evaluation
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingResult
+from cfx.metrics.installed import MetricSet
 from cfx.objectives.base import Objective
 from cfx.pairs import PairBatch, PairSet
 from cfx.parameters import ParameterSpace
@@ -45,6 +46,7 @@ class ProtocolContext:
         windows: how drives are cut.
         split: share of each pair's windows for training.
         seed: for everything random.
+        metrics: what is measured; None: cfx's own metrics.
         workspace: a folder where interrupted training finds what it needs to go on; None: it begins again.
     """
 
@@ -61,6 +63,7 @@ class ProtocolContext:
     split: float
     seed: int
     workspace: Path | None = None
+    metrics: MetricSet | None = None
 
     @property
     def space(self) -> ParameterSpace:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from cfx.evaluation.closed_loop import ClosedLoop, drive
-from cfx.evaluation.metrics import closed_loop_errors, evaluate
+from cfx.evaluation.evaluate import closed_loop_errors, evaluate
 from cfx.evaluation.platoon import measure_platoons
 from cfx.evaluation.result import Evaluation
 from cfx.pairs import PairBatch, PairSet
@@ -91,7 +91,7 @@ class HeldOut:
             loops["shrunk"] = drive(
                 context.simulator, context.constant(FixedPolicy(), self.base), batch, first, each
             )
-        whole = {
+        full_trajectory = {
             name: drive(context.simulator, one, batch, torch.zeros_like(first), network)
             for name, one in cold_start_fraction.items()
         }
@@ -105,7 +105,8 @@ class HeldOut:
             adaptation_space=self.policy.space,
             seed=context.seed,
             fold=fold,
-            whole=whole,
+            full_trajectory=full_trajectory,
+            metrics=context.metrics,
             platoon=measure_platoons(model, platoons),
             history=self.history(histories, loops["fixed"])
             if self.policy.base is not None and histories

@@ -10,7 +10,7 @@ from pydantic import Field
 from cfx.calibration.windows import Split
 from cfx.component import Settings
 from cfx.evaluation.closed_loop import drive
-from cfx.evaluation.metrics import evaluate
+from cfx.evaluation.evaluate import evaluate
 from cfx.evaluation.platoon import measure_platoons
 from cfx.learners.base import TrainingData
 from cfx.policies.default import DefaultPolicy
@@ -92,6 +92,7 @@ class WithinDriver(Protocol):
             adaptation_space=policy.space,
             seed=context.seed,
             platoon=platoon,
+            metrics=context.metrics,
         )
         return ProtocolResult(
             evaluation,

@@ -314,7 +314,7 @@ def statistics(table: pd.DataFrame, baseline: str) -> Improvement:
         table: some rows of `Job.by_pair`.
         baseline: what the policy is compared with.
     """
-    from cfx.evaluation.metrics import improvement_statistics  # imports torch
+    from cfx.evaluation.statistics import improvement_statistics  # imports scipy
 
     before, after = (
         table[f"rmse_speed/{method}"].to_numpy(dtype=float) for method in (baseline, "policy")

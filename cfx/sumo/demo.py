@@ -25,7 +25,7 @@ import torch
 import cfx
 from cfx.config import DemoSettings, JobConfig
 from cfx.errors import DataError, SumoError
-from cfx.evaluation.result import Drive, Evaluation
+from cfx.evaluation.result import Evaluation, PairTrajectory
 from cfx.files import atomic_write
 from cfx.pairs import Pair, PairBatch, PairSet
 from cfx.policies.trained import ALL, TrainedPolicy
@@ -154,7 +154,9 @@ def drive_in_sumo(
     require_sumo()
     by_id = _fitting(pairs, road)
     chosen = _choose(
-        [drive for drive in evaluation.drives if drive.pair_id in by_id], evaluation.table, count
+        [drive for drive in evaluation.trajectories if drive.pair_id in by_id],
+        evaluation.table,
+        count,
     )
     networks = _networks(evaluation, policy)
     header: dict[str, Any] = {
@@ -215,7 +217,9 @@ def _fitting(pairs: PairSet, road: Motorway) -> dict[str, Pair]:
     return found
 
 
-def _choose(drives: Sequence[Drive], table: pd.DataFrame, count: int) -> list[Drive]:
+def _choose(
+    drives: Sequence[PairTrajectory], table: pd.DataFrame, count: int
+) -> list[PairTrajectory]:
     """Returns drives spread evenly from the best to the worst improvement; those without one come last."""
     policy = table[table["method"] == "policy"]
     improvement = dict(
@@ -232,7 +236,7 @@ def _networks(evaluation: Evaluation, policy: TrainedPolicy) -> dict[str, str]:
     """Returns which of the policy's networks drove each pair in the evaluation."""
     table = evaluation.table.drop_duplicates("pair_id").set_index("pair_id")
     found = {}
-    for drive in evaluation.drives:
+    for drive in evaluation.trajectories:
         own = [drive.pair_id, ALL, policy.names[0]]
         if "fold" in table and pd.notna(table["fold"][drive.pair_id]):
             own.insert(0, f"fold {int(table['fold'][drive.pair_id])}")
@@ -275,7 +279,7 @@ def _renewed(first: int, policy: TrainedPolicy, known: Known) -> int:
     return min(first, -(-_since(first, policy, known) // stride) * stride)
 
 
-def _request(number: int, pair: Pair, drive: Drive, road: Motorway) -> dict[str, Any]:
+def _request(number: int, pair: Pair, drive: PairTrajectory, road: Motorway) -> dict[str, Any]:
     abreast = len(road.tracks) // ABREAST
     scene, side = divmod(number, abreast)
     # Tracks are numbered from the right; seen in driving direction the real follower comes first from the left.
@@ -347,7 +351,7 @@ def _ask(request: Message) -> Message:
 
 
 def _shown(
-    number: int, drive: Drive, pair: Pair, request: dict[str, Any], found: dict[str, Array]
+    number: int, drive: PairTrajectory, pair: Pair, request: dict[str, Any], found: dict[str, Array]
 ) -> Shown:
     first = int(request["first"])
     speed = {kind: found[f"{number}/{kind}/motion"][:, 0] for kind in FOLLOWERS}

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from cfx.evaluation.result import Drive, Evaluation
+from cfx.evaluation.result import Evaluation, PairTrajectory
 from cfx.pairs import Pair
 from cfx.sumo.replay import CAR_LENGTH, FOLLOWERS
 
@@ -33,7 +33,7 @@ class Shown:
         table: of this pair, as in `demo_rmse.csv`.
     """
 
-    drive: Drive
+    drive: PairTrajectory
     pair: Pair
     first: int
     scene: int
@@ -48,17 +48,23 @@ def evaluation_in_sumo(evaluation: Evaluation, shown: Sequence[Shown]) -> Evalua
     """Returns a job's evaluation of the pairs that were shown, as they drove in SUMO instead of in memory."""
     methods = FOLLOWERS[1:]
     ids = [one.pair.pair_id for one in shown]
-    table = evaluation.table[
-        evaluation.table["pair_id"].isin(ids) & evaluation.table["method"].isin(methods)
-    ].copy()
+    about, values = evaluation.about, evaluation.values
+    about = about[about["pair_id"].isin(ids) & about["method"].isin(methods)]
+    values = values[values["pair_id"].isin(ids) & values["method"].isin(methods)].copy()
     found = pd.concat([one.table for one in shown]).set_index(["pair_id", "method"])
-    places = pd.MultiIndex.from_frame(table[["pair_id", "method"]])
-    for column in ("rmse_speed", "rmse_gap"):
-        table[column] = found[f"{column}_sumo"].reindex(places).to_numpy()
-    return replace(evaluation, table=table, drives=tuple(_drive(one, methods) for one in shown))
+    for metric in ("rmse_speed", "rmse_gap"):
+        rows = (values["metric"] == metric) & (values["scope"] == "test")
+        places = pd.MultiIndex.from_frame(values.loc[rows, ["pair_id", "method"]])
+        values.loc[rows, "value"] = found[f"{metric}_sumo"].reindex(places).to_numpy()
+    return replace(
+        evaluation,
+        about=about.reset_index(drop=True),
+        values=values,
+        trajectories=tuple(_drive(one, methods) for one in shown),
+    )
 
 
-def _drive(one: Shown, methods: Sequence[str]) -> Drive:
+def _drive(one: Shown, methods: Sequence[str]) -> PairTrajectory:
     tested = slice(one.first, one.first + len(one.drive.time))
     parameters = {name: one.drive.parameters[name] for name in methods}
     chosen = one.parameters[tested]

@@ -41,7 +41,10 @@ def fingerprint(values: Mapping[str, Any]) -> str:
     parts = {
         "config": values,
         "cfx": provenance.version(),
-        "plugins": provenance.distributions(values),
+        "plugins": {
+            **provenance.distributions(values),
+            **provenance.metric_distributions(values),
+        },
         "data": state,
     }
     return content_key(parts)

@@ -23,7 +23,7 @@ from cfx.sweep.fingerprint import command_of
 from cfx.sweep.folder import LOCK, find_folder
 from cfx.sweep.record import RECORD, Record
 from cfx.sweep.status import JobStatus, worst
-from cfx.sweep.summary import SUMMARY, rows, summary_table, write_summary
+from cfx.sweep.summary import SUMMARY, metric_columns, rows, summary_table, write_summary
 
 log = logging.getLogger(__name__)
 
@@ -108,7 +108,7 @@ class Sweep:
                 return self._nothing(code, interrupted=interrupted)
             table = rows(statuses)
             write_summary(self.folder / SUMMARY, table)
-            put(summary_table(table))
+            put(summary_table(table, metric_columns(list(statuses))))
             code = self._tell(statuses, code)
             if any(status.code == 0 for status in statuses.values()):
                 for line in (

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,47 +22,72 @@ SUMMARY = "summary.csv"
 _BASELINES = ("population", "fixed")
 """What a policy is compared with, the first that was measured: one set for all training drivers if drivers are unseen."""
 
-_FIXED_COLUMNS = frozenset(
-    ["folder", "improvement_over", "seconds", "state", "message"]
-    + [f"improvement_{name}" for name in ("mean", "ci95_low", "ci95_high")]
-    + [f"rmse_speed_{name}" for name in ("default", "fixed", "population", "policy")]
-)
+_STATISTICS = ("mean", "ci95_low", "ci95_high")
+_METHODS = ("default", "fixed", "population", "policy")
+_SHOWN = ("default", "fixed", "policy")
+_AFTER_OVERRIDES = "improvement_over"
+
+
+@dataclass(frozen=True)
+class MetricColumn:
+    """A metric of the policy in the table of a sweep.
+
+    Attributes:
+        metric: its name.
+        title: its heading, with the unit.
+        headline: it is printed, and not only written into `summary.csv`.
+    """
+
+    metric: str
+    title: str
+    headline: bool
+
+    @property
+    def name(self) -> str:
+        """The column of `summary.csv`."""
+        return f"{self.metric}_policy"
+
+
+def metric_columns(folders: Sequence[Path]) -> list[MetricColumn]:
+    """Returns the metrics that any of these jobs has measured, besides the RMSE of speed, in their order."""
+    found: dict[str, MetricColumn] = {}
+    for folder in folders:
+        for info in _metrics_said(folder):
+            name, unit = str(info["name"]), str(info.get("unit", ""))
+            title = str(info.get("heading", name))
+            if unit:
+                title = f"{title} [{unit}]"
+            if name != "rmse_speed":
+                found.setdefault(name, MetricColumn(name, title, bool(info.get("headline"))))
+    return list(found.values())
 
 
 def rows(statuses: Mapping[Path, JobStatus]) -> list[dict[str, Any]]:
-    """Returns a row per job of the summary: folder, the overrides that differ, improvement, RMSE of speed, seconds and state."""
-    given = [
-        dict(one.partition("=")[::2] for one in status.overrides) for status in statuses.values()
-    ]
-    keys = list(dict.fromkeys(key for one in given for key in one))
-    differing = [key for key in keys if len({one.get(key) for one in given}) > 1] or keys
+    """Returns a row per job of the summary.
+
+    Columns: folder, the overrides that differ, the improvement, the RMSE of speed, other metrics of the
+    policy, seconds and state.
+    """
+    given = [_as_mapping(status.overrides) for status in statuses.values()]
+    differing = _differing(given)
+    columns = metric_columns(list(statuses))
     table = []
     for (folder, status), own in zip(statuses.items(), given, strict=True):
-        found = {} if status.code else metrics_of(folder)
-        baseline = next((one for one in _BASELINES if f"rmse_improvement/{one}/mean" in found), "")
-        prefix = f"rmse_improvement/{baseline}" if baseline else "rmse_improvement"
-        improvement = {
-            f"improvement_{name}": found.get(f"{prefix}/{name}")
-            for name in ("mean", "ci95_low", "ci95_high")
-        }
-        rmse = {
-            f"rmse_speed_{name}": found.get(f"rmse_speed/{name}")
-            for name in ("default", "fixed", "population", "policy")
-        }
-        table.append(
-            {
-                "folder": folder.name,
-                **{key: own.get(key, "") for key in differing},
-                "improvement_over": (baseline or "fixed")
-                if improvement["improvement_mean"] is not None
-                else "",
-                **improvement,
-                **rmse,
-                "seconds": round(status.seconds, 1),
-                "state": status.state,
-                "message": status.message,
-            }
-        )
+        found: dict[str, float] = {}
+        if not status.code:
+            found = metrics_of(folder)
+        row: dict[str, Any] = {"folder": folder.name}
+        for key in differing:
+            row[key] = own.get(key, "")
+        row |= _improvement(found)
+        for method in _METHODS:
+            row[f"rmse_speed_{method}"] = found.get(f"rmse_speed/{method}")
+        for column in columns:
+            row[column.name] = found.get(f"{column.metric}/policy")
+        row["seconds"] = round(status.seconds, 1)
+        row["state"] = status.state
+        row["message"] = status.message
+        table.append(row)
     return table
 
 
@@ -72,37 +99,100 @@ def write_summary(path: Path, table: Sequence[Mapping[str, Any]]) -> None:
         writer.writerows(table)
 
 
-def summary_table(table: Sequence[Mapping[str, Any]]) -> Table:
-    """Returns `rows` as a rich table."""
+def summary_table(
+    table: Sequence[Mapping[str, Any]], columns: Sequence[MetricColumn] = ()
+) -> Table:
+    """Returns `rows` as a rich table.
+
+    Args:
+        columns: what else than the RMSE of speed was measured; those that are headlines are shown.
+    """
     over = {row["improvement_over"] for row in table} - {""}
     several = len(over) > 1
-    columns = [key for key in table[0] if key not in _FIXED_COLUMNS]
-    shown = blank_table(*(columns or ["job"]), title="The sweep")
-    heading = f"improvement over {min(over)}" if len(over) == 1 else "improvement"
+    first = list(table[0])
+    overrides = first[1 : first.index(_AFTER_OVERRIDES)]
+    headlines = [column for column in columns if column.headline]
+    shown = blank_table(*(overrides or ["job"]), title="The sweep")
+    heading = "improvement"
+    if len(over) == 1:
+        heading = f"improvement over {min(over)}"
     shown.add_column(f"{heading}\n(95 % interval)", justify="right")
-    for name in ("default", "fixed", "policy"):
-        shown.add_column(f"RMSE speed [m/s]\n{name}", justify="right")
+    for method in _SHOWN:
+        shown.add_column(f"RMSE speed [m/s]\n{method}", justify="right")
+    for column in headlines:
+        shown.add_column(f"{column.title}\npolicy", justify="right")
     shown.add_column("time [s]", justify="right")
     shown.add_column("state")
     for row in table:
-        shown.add_row(
-            *([str(row[column]) for column in columns] or [row["folder"]]),
-            _improvement(row)
-            + (f" over {row['improvement_over']}" if several and row["improvement_over"] else ""),
-            *(_number(row[f"rmse_speed_{name}"]) for name in ("default", "fixed", "policy")),
-            f"{row['seconds']:.1f}",
-            row["state"],
-        )
+        cells = [str(row[key]) for key in overrides] or [row["folder"]]
+        cells.append(_improvement_said(row, named=several))
+        for method in _SHOWN:
+            cells.append(_number(row[f"rmse_speed_{method}"]))
+        for column in headlines:
+            cells.append(_number(row[column.name]))
+        shown.add_row(*cells, f"{row['seconds']:.1f}", row["state"])
     return shown
 
 
-def _improvement(row: Mapping[str, Any]) -> str:
-    if row["improvement_mean"] is None:
+def _as_mapping(overrides: Sequence[str]) -> dict[str, str]:
+    found = {}
+    for one in overrides:
+        key, _, value = one.partition("=")
+        found[key] = value
+    return found
+
+
+def _differing(given: Sequence[Mapping[str, str]]) -> list[str]:
+    """Returns the keys in which the jobs differ; all if they differ in none."""
+    keys: dict[str, set[str | None]] = {}
+    for one in given:
+        for key in one:
+            keys.setdefault(key, set())
+    for one in given:
+        for key, values in keys.items():
+            values.add(one.get(key))
+    return [key for key, values in keys.items() if len(values) > 1] or list(keys)
+
+
+def _metrics_said(folder: Path) -> list[Mapping[str, Any]]:
+    """Returns the list `metrics` of a job's `data.json`; empty for a job that left none."""
+    try:
+        said = json.loads((folder / "data.json").read_text(encoding="utf-8"))["metrics"]
+        return [one for one in said if "name" in one]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+
+
+def _improvement(found: Mapping[str, float]) -> dict[str, Any]:
+    """Returns the improvement over the baseline that counts, None where it was not measured."""
+    prefix, over = "rmse_improvement", "fixed"
+    for baseline in _BASELINES:
+        if f"rmse_improvement/{baseline}/mean" in found:
+            prefix, over = f"rmse_improvement/{baseline}", baseline
+            break
+    if f"{prefix}/mean" not in found:
+        over = ""
+    row: dict[str, Any] = {_AFTER_OVERRIDES: over}
+    for name in _STATISTICS:
+        row[f"improvement_{name}"] = found.get(f"{prefix}/{name}")
+    return row
+
+
+def _improvement_said(row: Mapping[str, Any], *, named: bool) -> str:
+    """Returns the improvement in words; `named`: with its baseline."""
+    mean = row["improvement_mean"]
+    if mean is None:
         return ""
-    ends = [row["improvement_ci95_low"], row["improvement_ci95_high"]]
-    interval = "" if None in ends else f" ({ends[0]:+.1%} to {ends[1]:+.1%})"
-    return f"{row['improvement_mean']:+.1%}{interval}"
+    said = f"{mean:+.1%}"
+    low, high = row["improvement_ci95_low"], row["improvement_ci95_high"]
+    if low is not None and high is not None:
+        said += f" ({low:+.1%} to {high:+.1%})"
+    if named:
+        said += f" over {row['improvement_over']}"
+    return said
 
 
 def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.3f}"
+    if value is None:
+        return ""
+    return f"{value:.3f}"

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from cfx.testing.contract import violations as violations
     from cfx.testing.datasets import DatasetContract as DatasetContract
     from cfx.testing.learners import LearnerContract as LearnerContract
+    from cfx.testing.metrics import MetricContract as MetricContract
     from cfx.testing.models import ModelContract as ModelContract
     from cfx.testing.objectives import ObjectiveContract as ObjectiveContract
     from cfx.testing.optimizers import OptimizerContract as OptimizerContract
@@ -40,6 +41,7 @@ _HOMES = {
     "PolicyContract": "cfx.testing.policies",
     "LearnerContract": "cfx.testing.learners",
     "ProtocolContract": "cfx.testing.protocols",
+    "MetricContract": "cfx.testing.metrics",
     "Equilibrium": "cfx.testing.checks.models",
     "Problems": "cfx.testing.checks.optimizers",
     "Contract": "cfx.testing.contract",
@@ -56,6 +58,7 @@ _CHECKS = {
     "policy": "cfx.testing.checks.policies",
     "learner": "cfx.testing.checks.learners",
     "protocol": "cfx.testing.checks.protocols",
+    "metric": "cfx.testing.checks.metrics",
 }
 
 __all__ = [  # noqa: PLE0604 - the public names, from the one table that also says where they live

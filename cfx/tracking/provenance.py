@@ -75,6 +75,25 @@ def distributions(values: Mapping[str, Any]) -> dict[str, str]:
     return found
 
 
+def metric_distributions(values: Mapping[str, Any]) -> dict[str, str]:
+    """Returns the plugin distributions, and their versions, of the metrics that a job measures.
+
+    Args:
+        values: a job's configuration.
+
+    Raises:
+        PluginError: there is no metric of that name.
+    """
+    from cfx import registry
+    from cfx.metrics.installed import entries_of
+
+    found = {}
+    for entry in entries_of(values.get("metrics", "all")):
+        if entry.distribution != registry.OWN:
+            found[entry.distribution] = entry.version
+    return found
+
+
 def process_tags() -> dict[str, str]:
     """Returns tags that tell later whether the process that made a run is still there."""
     process = psutil.Process()

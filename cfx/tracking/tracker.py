@@ -75,7 +75,10 @@ class Tracker:
                 "protocol",
             )
         }
+        plugins = provenance.distributions(values)
+        every_plugin = {**plugins, **provenance.metric_distributions(values)}
         tags = {
+            **provenance.plugin_tags(every_plugin),
             **names,
             "style.cluster": config.style.cluster,
             "seed": str(config.seed),
@@ -87,7 +90,7 @@ class Tracker:
             run_name="-".join(names[kind] for kind in ("model", "policy", "optimizer", "data")),
             parameters=provenance.flatten(values),
             tags=tags,
-            plugins=provenance.distributions(values),
+            plugins=plugins,
             sweep=config.tracking.sweep,
         ) as tracker:
             yield tracker

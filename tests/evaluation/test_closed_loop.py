@@ -10,7 +10,7 @@ from torch import Tensor
 
 from cfx.calibration.windows import WindowSettings
 from cfx.evaluation.closed_loop import ClosedLoop, drive
-from cfx.evaluation.metrics import evaluate
+from cfx.evaluation.evaluate import evaluate
 from cfx.models.base import DrivingModel, Leader
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
@@ -218,7 +218,7 @@ def test_the_table_says_what_the_loops_did() -> None:
     assert table.loc[("p1", "policy"), "improvement"] == pytest.approx(1)
     assert table.loc[("p1", "policy"), "parameter_t_r"] == pytest.approx(3.0)
     assert table.loc[("p1", "fixed"), "frames"] == 99
-    real, simulated = pairs[0].follower_speed[151:], result.drives[0].speed["fixed"][1:]
+    real, simulated = pairs[0].follower_speed[151:], result.trajectories[0].speed["fixed"][1:]
     expected = math.sqrt(((real - simulated) ** 2).mean())
     assert table.loc[("p0", "fixed"), "rmse_speed"] == pytest.approx(expected)
     metrics = result.metrics()

@@ -38,13 +38,15 @@ def texts(figure: Figure) -> str:
     return "\n".join(artist.get_text() for artist in figure.findobj(mpl.text.Text))
 
 
-def with_improvement(results: MadeUp, values: dict[int, float]) -> Evaluation:
+def with_improvement(results: MadeUp, gains: dict[int, float]) -> Evaluation:
     """Returns results in which some pairs' improvements are replaced."""
-    table = results.evaluation.table.copy()
-    rows = table.index[table["method"] == "policy"]
-    for k, value in values.items():
-        table.loc[rows[k], "improvement"] = value
-    return dataclasses.replace(results.evaluation, table=table)
+    values = results.evaluation.values.copy()
+    speed = values["metric"] == "rmse_speed"
+    before = values.loc[speed & (values["method"] == "fixed"), "value"].to_numpy()
+    rows = values.index[speed & (values["method"] == "policy")]
+    for k, value in gains.items():
+        values.loc[rows[k], "value"] = before[k] * (1 - value)
+    return dataclasses.replace(results.evaluation, values=values)
 
 
 @pytest.mark.parametrize(
@@ -79,7 +81,7 @@ def test_every_size_of_job_is_drawn(tmp_path: Path, options: dict[str, Any], fil
 
 
 def test_errors_over_time_are_those_of_the_pairs_that_still_drive() -> None:
-    drives = make_results(pairs=4, frames=30).evaluation.drives
+    drives = make_results(pairs=4, frames=30).evaluation.trajectories
     short = [
         dataclasses.replace(
             d,
@@ -130,12 +132,8 @@ def test_undefined_improvements_are_counted_and_not_drawn() -> None:
 def test_an_outlier_is_labelled_and_does_not_shrink_the_others() -> None:
     results = make_results(pairs=20, frames=20)
     tame = with_improvement(results, {k: 0.3 - 0.02 * k for k in range(20)})
-    figure = improvement_per_driver(
-        dataclasses.replace(
-            tame,
-            table=with_improvement(dataclasses.replace(results, evaluation=tame), {19: -7.0}).table,
-        )
-    )
+    wild = with_improvement(dataclasses.replace(results, evaluation=tame), {19: -7.0})
+    figure = improvement_per_driver(wild)
     assert "\N{MINUS SIGN}700 %" in texts(figure)
     assert figure.axes[0].get_ylim()[0] > -2.0
 
@@ -143,7 +141,7 @@ def test_an_outlier_is_labelled_and_does_not_shrink_the_others() -> None:
 def test_drives_shows_best_median_and_worst() -> None:
     results = make_results(pairs=7, frames=20)
     evaluation = with_improvement(results, {k: 0.1 * k for k in range(7)})
-    ids = [drive.pair_id for drive in evaluation.drives]
+    ids = [drive.pair_id for drive in evaluation.trajectories]
     written = texts(drives(evaluation))
     for rank, k in (("best", 6), ("median", 3), ("worst", 0)):
         assert f"{rank} pair, {ids[k]}:  {percent(0.1 * k)}" in written
@@ -167,18 +165,18 @@ def test_an_unknown_pair_is_named_with_the_nearest() -> None:
 
 def test_a_default_driver_far_away_does_not_shrink_the_others() -> None:
     evaluation = make_results(pairs=1, frames=50).evaluation
-    drive = evaluation.drives[0]
+    drive = evaluation.trajectories[0]
     far = dataclasses.replace(
         drive, gap={**drive.gap, "default": drive.real_gap + np.linspace(0, 500, 51)}
     )
-    figure = drives(dataclasses.replace(evaluation, drives=(far,)))
+    figure = drives(dataclasses.replace(evaluation, trajectories=(far,)))
     assert figure.axes[1].get_ylim()[1] < 120
     assert "default up to" in texts(figure)
 
 
 def test_a_collision_is_marked_and_a_diverged_drive_is_survived() -> None:
     evaluation = make_results(pairs=1, frames=50).evaluation
-    drive = evaluation.drives[0]
+    drive = evaluation.trajectories[0]
     bad = dataclasses.replace(
         drive,
         gap={
@@ -188,7 +186,7 @@ def test_a_collision_is_marked_and_a_diverged_drive_is_survived() -> None:
         },
         speed={**drive.speed, "fixed": np.full(51, np.nan)},
     )
-    figure = drives(dataclasses.replace(evaluation, drives=(bad,)))
+    figure = drives(dataclasses.replace(evaluation, trajectories=(bad,)))
     figure.canvas.draw()
     assert "policy collides" in texts(figure)
 
@@ -196,11 +194,11 @@ def test_a_collision_is_marked_and_a_diverged_drive_is_survived() -> None:
 def test_names_are_text_and_never_formulas(tmp_path: Path) -> None:
     results = make_results(pairs=1, frames=20)
     name = "50$ \\frac{1}{0} $ 跟车 " + "x" * 80
-    table = results.evaluation.table.assign(pair_id=name)
     evaluation = dataclasses.replace(
         results.evaluation,
-        table=table,
-        drives=(dataclasses.replace(results.evaluation.drives[0], pair_id=name),),
+        about=results.evaluation.about.assign(pair_id=name),
+        values=results.evaluation.values.assign(pair_id=name),
+        trajectories=(dataclasses.replace(results.evaluation.trajectories[0], pair_id=name),),
     )
     assert len(write_figures(tmp_path, evaluation, results.style, results.curves)) == 7
 
@@ -298,7 +296,7 @@ def test_a_panel_per_method_shows_the_worst_platoon() -> None:
 
 
 def test_history_is_drawn_from_least_to_most_with_its_intervals() -> None:
-    history = make_history(make_results(pairs=6, frames=20).evaluation.drives, GAINS)
+    history = make_history(make_results(pairs=6, frames=20).evaluation.trajectories, GAINS)
     assert amounts_of(history) == ["0 s", "10 s", "80 %"]
     # A drive may be shorter than the longest amount in seconds.
     short = history.assign(
@@ -315,7 +313,7 @@ def test_history_is_drawn_from_least_to_most_with_its_intervals() -> None:
 
 def test_platoon_and_history_are_written_where_a_protocol_delivered_them(tmp_path: Path) -> None:
     results = make_results(pairs=3, frames=20)
-    history = make_history(results.evaluation.drives, GAINS)
+    history = make_history(results.evaluation.trajectories, GAINS)
     further = dataclasses.replace(
         results.evaluation, platoon=make_platoon({"policy": 2}), history=history
     )

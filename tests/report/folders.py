@@ -9,15 +9,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import yaml
 
-from cfx.evaluation.metrics import improvement_statistics
 from cfx.evaluation.result import Evaluation, Improvement
+from cfx.evaluation.statistics import improvement_statistics
+from cfx.evaluation.tables import values_of
 from cfx.parameters import ParameterSpace
 from cfx.style.result import CLUSTERS
-from tests.made_up import GAINS, TWO, make_history, make_platoon, make_results
+from tests.made_up import GAINS, TWO, info, make_history, make_platoon, make_results, with_metric
 
 WITHIN = ("default", "fixed", "policy")
 ACROSS = ("default", "population", "fixed", "policy")
@@ -73,6 +73,7 @@ def write_job(
     }
     (folder / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False), encoding="utf-8")
     evaluation.table.to_csv(folder / "pairs.csv", index=False)
+    evaluation.values.to_parquet(folder / "pair_metrics.parquet", index=False)
     made.style.table.to_csv(folder / "style.csv", index=False)
     evaluation.trajectories_table().to_parquet(folder / "trajectories.parquet", index=False)
     made.curves.astype({"network": str}).to_parquet(folder / "curves.parquet", index=False)
@@ -85,6 +86,7 @@ def write_job(
         "dropped": dropped,
         "parameters": units,
         "has_constant_baseline": has_constant_baseline,
+        "metrics": [metric.to_json() for metric in evaluation.measured],
     }
     (folder / "data.json").write_text(json.dumps(data), encoding="utf-8")
     (folder / ".hydra").mkdir()
@@ -103,51 +105,69 @@ def write_job(
 
 
 def _with_further_results(evaluation: Evaluation) -> Evaluation:
-    table = evaluation.table.assign(hard_braking=1, rms_jerk=2.5, real_rms_jerk=0.4, at_bounds=0.25)
+    methods = evaluation.methods
+    further = {"hard_braking": 1.0, "jerk": 2.5, "at_bounds": 0.25}
+    for metric, value in further.items():
+        summary = "sum" if metric == "hard_braking" else "mean"
+        by_method = dict.fromkeys(methods, value)
+        if metric == "jerk":
+            by_method["real"] = 0.4
+        evaluation = with_metric(evaluation, metric, by_method, summary=summary)
+    unseen = [method for method in methods if method != "fixed"]
     if evaluation.full_trajectory_improvements:
-        table = table.assign(full_trajectory_collisions=0.0, full_trajectory_hard_braking=2.0)
-    methods = [method for method in evaluation.methods if method != "fixed"]
-    platoon = make_platoon(dict.fromkeys(methods, 2))
+        for metric, value in {"collisions": 0.0, "hard_braking": 2.0}.items():
+            by_method = dict.fromkeys(unseen, value)
+            evaluation = with_metric(evaluation, metric, by_method, scope="full_trajectory")
     return dataclasses.replace(
-        evaluation, table=table, platoon=platoon, history=make_history(evaluation.drives, GAINS)
+        evaluation,
+        platoon=make_platoon(dict.fromkeys(unseen, 2)),
+        history=make_history(evaluation.trajectories, GAINS),
     )
 
 
 def _completed(evaluation: Evaluation, methods: Sequence[str], cluster: str) -> Evaluation:
-    """Gives a made-up evaluation the columns and statistics that a real one has."""
-    table = evaluation.table.copy()
-    table["cluster"] = [CLUSTERS[k] for k in table["cluster"]] if cluster == "all" else cluster
-    speeds = table.pivot_table(index="pair_id", columns="method", values="rmse_speed", sort=False)
-    rmse = table["pair_id"].map
+    """Gives a made-up evaluation the clusters and statistics that a real one has."""
+    about = evaluation.about.copy()
+    if cluster == "all":
+        about["cluster"] = [CLUSTERS[k] for k in about["cluster"]]
+    else:
+        about["cluster"] = cluster
+    speeds = values_of(evaluation.values, "rmse_speed", "test")
     whole = "population" in methods
     improvements, improvements_whole = {}, {}
-    for baseline in (method for method in methods if method != "policy"):
+    for baseline in methods:
+        if baseline == "policy":
+            continue
         improvements[baseline] = _statistics(speeds[baseline], speeds["policy"])
-        if baseline != "fixed":
-            before = rmse(speeds[baseline]).astype(float)
-            table[f"improvement_over_{baseline}"] = (before - table["rmse_speed"]) / before
+        if whole and baseline != "fixed":
             improvements_whole[baseline] = _statistics(
                 1.3 * speeds[baseline], 1.1 * speeds["policy"]
             )
+    values, measured = evaluation.values, evaluation.measured
     if whole:
-        factor = (
-            table["method"]
-            .map({"default": 1.3, "population": 1.3, "policy": 1.1, "fixed": np.nan})
-            .astype(float)
+        values = pd.concat([values, _full_trajectory(values)], ignore_index=True)
+        measured = (
+            info("rmse_speed", "test", "full_trajectory"),
+            info("rmse_gap", "test", "full_trajectory"),
+            *measured[2:],
         )
-        table["full_trajectory_rmse_speed"], table["full_trajectory_rmse_gap"] = (
-            factor * table["rmse_speed"],
-            factor * table["rmse_gap"],
-        )
-    return Evaluation(
-        table,
-        improvements,
-        evaluation.drives,
-        evaluation.names,
-        evaluation.units,
-        evaluation.bounds,
-        improvements_whole if whole else {},
+    return dataclasses.replace(
+        evaluation,
+        about=about,
+        values=values,
+        measured=measured,
+        improvements=improvements,
+        full_trajectory_improvements=improvements_whole,
     )
+
+
+def _full_trajectory(values: pd.DataFrame) -> pd.DataFrame:
+    """Returns errors over full trajectories: those of the test part, some percent larger; none of `fixed`."""
+    factors = {"default": 1.3, "population": 1.3, "policy": 1.1}
+    errors = values["metric"].isin(["rmse_speed", "rmse_gap"]) & values["method"].isin(factors)
+    found = values[errors].assign(scope="full_trajectory")
+    found["value"] *= found["method"].map(factors)
+    return found
 
 
 def _statistics(before: pd.Series[float], after: pd.Series[float]) -> Improvement:

@@ -13,7 +13,7 @@ from torch import Tensor
 import cfx.sumo
 from cfx.errors import DataError, ParameterError, SumoError
 from cfx.evaluation.closed_loop import drive
-from cfx.evaluation.metrics import evaluate
+from cfx.evaluation.evaluate import evaluate
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.pairs import PairBatch

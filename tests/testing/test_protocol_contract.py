@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from cfx.calibration.windows import Split
-from cfx.evaluation.result import Drive, Evaluation
+from cfx.evaluation.result import Evaluation, PairTrajectory
 from cfx.learners.base import TrainingData, TrainingResult
 from cfx.learners.imitation import ImitationLearner
 from cfx.policies.base import Policy
@@ -27,35 +27,39 @@ class Retelling(WithinDriver):
         return replace(protocol_result, evaluation=self.retell(protocol_result.evaluation))
 
     def retell(self, evaluation: Evaluation) -> Evaluation:
-        return replace(evaluation, drives=tuple(self.redrive(drive) for drive in evaluation.drives))
+        return replace(
+            evaluation, trajectories=tuple(self.redrive(drive) for drive in evaluation.trajectories)
+        )
 
-    def redrive(self, drive: Drive) -> Drive:
+    def redrive(self, drive: PairTrajectory) -> PairTrajectory:
         return drive
 
 
 class Shorter(Retelling):
-    def redrive(self, drive: Drive) -> Drive:
+    def redrive(self, drive: PairTrajectory) -> PairTrajectory:
         return replace(drive, speed={**drive.speed, "policy": drive.speed["policy"][:-5]})
 
 
 class Elsewhere(Retelling):
-    def redrive(self, drive: Drive) -> Drive:
+    def redrive(self, drive: PairTrajectory) -> PairTrajectory:
         return replace(drive, speed={**drive.speed, "policy": drive.speed["policy"] + 0.1})
 
 
 class Copying(Retelling):
-    def redrive(self, drive: Drive) -> Drive:
+    def redrive(self, drive: PairTrajectory) -> PairTrajectory:
         return replace(drive, speed={**drive.speed, "policy": drive.real_speed})
 
 
 class Narrow(Retelling):
     def retell(self, evaluation: Evaluation) -> Evaluation:
-        return replace(evaluation, table=evaluation.table.drop(columns="rmse_gap"))
+        measured = tuple(one for one in evaluation.measured if one.name != "rmse_gap")
+        return replace(evaluation, measured=measured)
 
 
 class Double(Retelling):
     def retell(self, evaluation: Evaluation) -> Evaluation:
-        return replace(evaluation, table=evaluation.table.loc[[0, *evaluation.table.index]])
+        about = evaluation.about.loc[[0, *evaluation.about.index]]
+        return replace(evaluation, about=about.reset_index(drop=True))
 
 
 class Mute(Retelling):

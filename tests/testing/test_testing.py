@@ -23,6 +23,7 @@ SUITES = {
     "policy": cfx.testing.PolicyContract,
     "learner": cfx.testing.LearnerContract,
     "protocol": cfx.testing.ProtocolContract,
+    "metric": cfx.testing.MetricContract,
 }
 
 

@@ -18,7 +18,7 @@ from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.windows import WindowSettings
 from cfx.datasets.synthetic import SyntheticDataset
-from cfx.evaluation.result import METHODS, Drive
+from cfx.evaluation.result import METHODS, PairTrajectory
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.learners.imitation import ImitationLearner
 from cfx.models.krauss import Krauss
@@ -83,7 +83,7 @@ def all_methods_drive_the_same_frames(protocol: Protocol) -> None:
     assert isinstance(protocol_result, ProtocolResult), (
         f"`run` must return a cfx.ProtocolResult, not a {type(protocol_result).__name__}"
     )
-    for drive in protocol_result.evaluation.drives:
+    for drive in protocol_result.evaluation.trajectories:
         where = f"(pair {drive.pair_id})"
         for method in protocol_result.evaluation.methods:
             speed, gap = drive.speed[method], drive.gap[method]
@@ -130,9 +130,9 @@ def the_table_has_a_row_for_each_pair_and_method(protocol: Protocol) -> None:
     assert len(counts) == len(evaluation.methods) * evaluation.table["pair_id"].nunique(), (
         "every method is tested on every pair"
     )
-    assert {drive.pair_id for drive in evaluation.drives} == set(evaluation.table["pair_id"]), (
-        "the drives are those that the table measures"
-    )
+    assert {drive.pair_id for drive in evaluation.trajectories} == set(
+        evaluation.table["pair_id"]
+    ), "the drives are those that the table measures"
 
 
 def no_method_sees_the_measured_follower_of_the_test_part(protocol: Protocol) -> None:
@@ -255,11 +255,11 @@ class _Refusing(ImitationLearner):
         )
 
 
-def _drives(protocol_result: ProtocolResult) -> dict[str, Drive]:
-    return {drive.pair_id: drive for drive in protocol_result.evaluation.drives}
+def _drives(protocol_result: ProtocolResult) -> dict[str, PairTrajectory]:
+    return {drive.pair_id: drive for drive in protocol_result.evaluation.trajectories}
 
 
-def _poisoned(pairs: PairSet, tested: Drive, *, leader: bool) -> PairSet:
+def _poisoned(pairs: PairSet, tested: PairTrajectory, *, leader: bool) -> PairSet:
     """Changes one driver's frames after the last measured state that his test part starts from."""
     return PairSet(
         tuple(
@@ -270,7 +270,7 @@ def _poisoned(pairs: PairSet, tested: Drive, *, leader: bool) -> PairSet:
     )
 
 
-def _changed(pair: Pair, tested: Drive, leader: bool) -> Pair:
+def _changed(pair: Pair, tested: PairTrajectory, leader: bool) -> Pair:
     first = len(pair) - (len(tested.time) - 1)
     steady = np.arange(len(pair)) >= first
     ramp = np.where(steady, np.arange(len(pair)) - first + 1.0, 0.0)

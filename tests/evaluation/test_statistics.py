@@ -3,19 +3,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pandas as pd
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from cfx.evaluation.closed_loop import ClosedLoop
-from cfx.evaluation.metrics import evaluate, improvement_statistics
-from cfx.models.krauss import Krauss
-from cfx.pairs import PairBatch
-from cfx.style.result import StyleResult
-from tests.drives import straight_pairs
+from cfx.evaluation.statistics import improvement_statistics, mean_interval
 
 
 def test_the_papers_pair() -> None:
@@ -90,40 +83,10 @@ def test_nothing_is_invented(values: list[tuple[float, float]]) -> None:
     assert result.win_rate == (gain > 0).mean()
 
 
-def test_what_comes_after_the_start_is_measured_on_its_own() -> None:
-    """Errors of 1 m/s in the first five seconds, and of 0.5 (fixed) and 0.2 m/s (policy) from there on; one pair ends before."""
-    pairs = straight_pairs([100, 45])
-    batch, first = PairBatch.of(pairs), torch.tensor([9, 4])
-    frames = torch.arange(91)
-    counted = (first[:, None] + frames < batch.lengths[:, None]) & (frames > 0)
-    parameters = Krauss().space.from_unit(torch.full((2, 91, 2), 0.5).double())
-
-    def loop(steady: float) -> ClosedLoop:
-        speed = 10 + torch.where(frames <= 50, 1.0, steady).double().expand(2, -1)
-        return ClosedLoop(speed, speed + 10, parameters, counted)
-
-    style = StyleResult(
-        pd.DataFrame({"driver": [p.driver for p in pairs], "score": [0.2, 0.8], "cluster": [0, 2]}),
-        {},
-        (0.3, 0.7),
-    )
-    loops = {"fixed": loop(0.5), "policy": loop(0.2)}
-    found = evaluate(pairs, batch, first, loops, Krauss().space, style, seed=0)
-    table = found.table.set_index(["pair_id", "method"])["steady_rmse_speed"]
-    assert table["p0"].to_dict() == pytest.approx({"fixed": 0.5, "policy": 0.2})
-    assert table["p1"].isna().all()
-    metrics = found.metrics()
-    assert metrics["steady/rmse_speed/policy"] == pytest.approx(0.2)
-    assert metrics["steady/rmse_improvement/fixed/mean"] == pytest.approx(0.6)
-    assert found.steady_improvements["fixed"].undefined == 1
-    alone = {method: ClosedLoop(*(values[1:] for values in one)) for method, one in loops.items()}
-    short = evaluate(
-        pairs.select([False, True], "long"),
-        batch[1:],
-        first[1:],
-        alone,
-        Krauss().space,
-        style,
-        seed=0,
-    )
-    assert not [name for name in short.metrics() if name.startswith("steady")]
+def test_a_mean_has_an_interval_over_drivers() -> None:
+    values = [0.1, 0.3, 0.2, math.nan, 0.4]
+    mean, low, high = mean_interval(values, ["a", "b", "c", "d", "e"], seed=0)
+    assert mean == pytest.approx(0.25)
+    assert low < mean < high
+    assert math.isnan(mean_interval(values, ["a"] * 5, seed=0)[1])
+    assert all(math.isnan(value) for value in mean_interval([math.nan], ["a"], seed=0))

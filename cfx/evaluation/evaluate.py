@@ -1,0 +1,310 @@
+"""From closed loops to the table of all metrics and to statistics over drivers.
+
+Shapes: P pairs, K + 1 frames, n tuned parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cfx import registry
+from cfx.evaluation.closed_loop import ClosedLoop
+from cfx.evaluation.result import METHODS, Array, Evaluation, Improvement, PairTrajectory, Platoon
+from cfx.evaluation.statistics import improvement_statistics
+from cfx.evaluation.tables import long_table, values_of
+from cfx.metrics.base import RECORDED, MetricInfo, Trajectories
+from cfx.metrics.errors import RmseGap, RmseSpeed
+from cfx.metrics.installed import LeftOut, MeasuredMetric, MetricSet, leave_out
+from cfx.pairs import PairBatch, PairSet
+from cfx.parameters import ParameterSpace
+from cfx.style.result import CLUSTERS, StyleResult
+
+TRANSIENT_S = 5.0
+"""How long the transient of a test part is (`transient_s`): constant parameters lead from the measured state to a
+steady one of their own within some such time."""
+
+Measured = dict[tuple[str, str, str], NDArray[np.float64]]
+"""By metric, scope and method the value of each pair, `(P,)`."""
+
+
+def evaluate(
+    pairs: PairSet,
+    batch: PairBatch,
+    first: Tensor,
+    loops: Mapping[str, ClosedLoop],
+    space: ParameterSpace,
+    style: StyleResult,
+    *,
+    seed: int,
+    adaptation_space: ParameterSpace | None = None,
+    fold: Tensor | None = None,
+    full_trajectory: Mapping[str, ClosedLoop] | None = None,
+    platoon: Platoon | None = None,
+    history: pd.DataFrame | None = None,
+    metrics: MetricSet | None = None,
+) -> Evaluation:
+    """Measures closed loops against the recording.
+
+    Args:
+        pairs: P pairs.
+        batch: the same as tensors.
+        first: `(P,)`, the frame of the last measured state.
+        loops: the closed loops of each method of `METHODS`, on the same frames; `fixed` and `policy` are among them.
+        space: the model's parameters, in the bounds of constant ones.
+        adaptation_space: the same in the bounds of `policy`; None: the same bounds.
+        style: score and cluster of each driver.
+        seed: of the bootstrap.
+        fold: `(P,)`, in which fold each pair was tested; None if there was one.
+        full_trajectory: closed loops from frame 0 on, of methods that nothing of these drivers went into; None
+            if there are none.
+        platoon, history: further results, handed on; see `Evaluation`.
+        metrics: what is measured; None: cfx's own metrics.
+    """
+    loops = {method: loops[method] for method in METHODS if method in loops}
+    policy_space = space if adaptation_space is None else adaptation_space
+    spaces = {method: policy_space if method == "policy" else space for method in METHODS}
+    test = trajectories_of(batch, first, loops, spaces)
+    scopes = {"test": test, "steady": _after_transient(test)}
+    if full_trajectory:
+        start = torch.zeros_like(first)
+        scopes["full_trajectory"] = trajectories_of(batch, start, full_trajectory, spaces)
+    measured, infos, left_out = _measure(metrics or MetricSet.own(), scopes)
+    drivers = [pair.driver for pair in pairs]
+    values = long_table([pair.pair_id for pair in pairs], drivers, measured)
+    improvements = {}
+    for scope in ("test", "steady", "full_trajectory"):
+        improvements[scope] = _improvements(values, scope, drivers, seed)
+    return Evaluation(
+        about=_about(pairs, style, fold, test, space.names),
+        values=values,
+        measured=infos,
+        improvements=improvements["test"],
+        steady_improvements=improvements["steady"],
+        trajectories=_pair_trajectories(pairs, batch, first, loops),
+        names=space.names,
+        units=tuple(parameter.unit for parameter in space.tuned),
+        bounds=policy_space.bounds().numpy(),
+        full_trajectory_improvements=improvements["full_trajectory"],
+        platoon=platoon,
+        history=history,
+        left_out=left_out,
+    )
+
+
+def closed_loop_errors(batch: PairBatch, first: Tensor, loop: ClosedLoop) -> tuple[Array, Array]:
+    """Returns the RMSE of speed (m/s) and of gap (m) of P closed loops that begin at frames `first`, `(P,)` each."""
+    trajectories = _trajectories(batch, first, loop, ParameterSpace(()))
+    return _array(RmseSpeed().compute(trajectories)), _array(RmseGap().compute(trajectories))
+
+
+def trajectories_of(
+    batch: PairBatch,
+    first: Tensor,
+    loops: Mapping[str, ClosedLoop],
+    spaces: Mapping[str, ParameterSpace],
+) -> dict[str, Trajectories]:
+    """Returns closed loops that begin at frames `first` `(P,)`, and the recorded drivers (`real`), beside the recording.
+
+    Args:
+        spaces: for each method the bounds within which its parameters were chosen.
+    """
+    found = {}
+    for method, loop in loops.items():
+        found[method] = _trajectories(batch, first, loop, spaces[method])
+    of_any = next(iter(found.values()))
+    found[RECORDED] = replace(
+        of_any,
+        speed=of_any.measured_speed,
+        gap=of_any.measured_gap,
+        parameters=torch.full_like(of_any.parameters, torch.nan),
+    )
+    return found
+
+
+def _trajectories(
+    batch: PairBatch, first: Tensor, loop: ClosedLoop, space: ParameterSpace
+) -> Trajectories:
+    index = _frames(batch, first, loop.counted.shape[1])
+    return Trajectories(
+        speed=loop.speed,
+        gap=loop.gap,
+        measured_speed=batch.follower_speed.gather(1, index),
+        measured_gap=batch.gap.gather(1, index),
+        leader_speed=batch.leader_speed.gather(1, index),
+        parameters=loop.parameters,
+        counted=loop.counted,
+        dt=batch.dt,
+        space=space,
+    )
+
+
+def _frames(batch: PairBatch, first: Tensor, count: int) -> Tensor:
+    """Returns the frames of the recording that closed loops from frames `first` on are compared with, `(P, count)`."""
+    frames = first[:, None] + torch.arange(count, device=first.device)
+    return frames.clamp(max=batch.mask.shape[1] - 1)
+
+
+def _after_transient(trajectories: Mapping[str, Trajectories]) -> dict[str, Trajectories]:
+    """Returns the same trajectories, of which only the frames after the transient count."""
+    found = {}
+    for method, one in trajectories.items():
+        time = torch.arange(one.counted.shape[1], device=one.counted.device) * one.dt
+        found[method] = one.counting(one.counted & (time > TRANSIENT_S + 1e-6))
+    return found
+
+
+def _measure(
+    metrics: MetricSet, scopes: Mapping[str, Mapping[str, Trajectories]]
+) -> tuple[Measured, tuple[MetricInfo, ...], tuple[LeftOut, ...]]:
+    """Computes every metric for every scope and method; a plugin's that fails is left out with a warning."""
+    measured: Measured = {}
+    infos = []
+    left_out = list(metrics.left_out)
+    for one in metrics.metrics:
+        try:
+            measured |= _values(one, scopes)
+        except (
+            Exception
+        ) as error:  # a plugin may raise anything, and must not cost the job its results
+            if one.distribution == registry.OWN:
+                raise
+            left_out.append(leave_out(one.name, one.distribution, registry.in_words(error)))
+            continue
+        infos.append(_info(one, scopes))
+    return measured, tuple(infos), tuple(left_out)
+
+
+@torch.no_grad()
+def _values(one: MeasuredMetric, scopes: Mapping[str, Mapping[str, Trajectories]]) -> Measured:
+    found: Measured = {}
+    for scope, by_method in scopes.items():
+        for method, trajectories in by_method.items():
+            if method == RECORDED and (scope != "test" or not one.metric.is_of_recording):
+                continue
+            values = one.metric.compute(trajectories)
+            if values.shape != (len(trajectories),):
+                raise ValueError(f"compute gives the shape {tuple(values.shape)}, not (pairs,)")
+            # Where no frame counts nothing is defined, a count of zero neither.
+            some = trajectories.counted.any(1)
+            found[one.name, scope, method] = _array(torch.where(some, values, torch.nan))
+    return found
+
+
+def _info(one: MeasuredMetric, scopes: Mapping[str, Mapping[str, Trajectories]]) -> MetricInfo:
+    metric = one.metric
+    return MetricInfo(
+        name=one.name,
+        unit=metric.unit,
+        direction=metric.direction,
+        summary=metric.summary,
+        heading=metric.heading,
+        meaning=metric.meaning,
+        scopes=tuple(scope for scope in metric.scopes if scope in scopes),
+        headline=metric.headline,
+        distribution=one.distribution,
+    )
+
+
+def _improvements(
+    values: pd.DataFrame, scope: str, drivers: Sequence[str], seed: int
+) -> dict[str, Improvement]:
+    """Returns the policy's improvement over every other method; empty where the policy has no error."""
+    speed = values_of(values, "rmse_speed", scope)
+    if "policy" not in speed:
+        return {}
+    policy = speed["policy"].to_numpy()
+    if scope == "steady" and not np.isfinite(policy).any():
+        return {}
+    found = {}
+    for method in METHODS:
+        if method in speed and method != "policy":
+            before = speed[method].to_numpy()
+            found[method] = improvement_statistics(before, policy, drivers, seed=seed)
+    return found
+
+
+def _about(
+    pairs: PairSet,
+    style: StyleResult,
+    fold: Tensor | None,
+    test: Mapping[str, Trajectories],
+    names: Sequence[str],
+) -> pd.DataFrame:
+    """Returns `Evaluation.about`."""
+    by_driver = style.table.set_index("driver")
+    methods = [method for method in test if method != RECORDED]
+    parameters = {method: _mean_parameters(test[method]) for method in methods}
+    frames = next(iter(test.values())).counted.sum(1).tolist()
+    rows = []
+    for i, pair in enumerate(pairs):
+        for method in methods:
+            row = {
+                "pair_id": pair.pair_id,
+                "recording": pair.recording,
+                "leader_id": pair.leader_id,
+                "follower_id": pair.follower_id,
+                "driver": pair.driver,
+                "cluster": CLUSTERS[by_driver["cluster"][pair.driver]],
+                "style_score": float(by_driver["score"][pair.driver]),
+                "fold": 0 if fold is None else int(fold[i]),
+                "method": method,
+                "frames": frames[i],
+            }
+            for k, name in enumerate(names):
+                row[f"parameter_{name}"] = float(parameters[method][i, k])
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _mean_parameters(trajectories: Trajectories) -> Array:
+    """Returns the mean of each parameter over the frames that count, `(P, n)`."""
+    weight = trajectories.counted[..., None]
+    return _array(torch.where(weight, trajectories.parameters, 0.0).sum(1) / weight.sum(1))
+
+
+def _pair_trajectories(
+    pairs: PairSet, batch: PairBatch, first: Tensor, loops: Mapping[str, ClosedLoop]
+) -> tuple[PairTrajectory, ...]:
+    index = _frames(batch, first, next(iter(loops.values())).counted.shape[1])
+    ends = (batch.lengths - first).tolist()
+    leader_speed = _array(batch.leader_speed.gather(1, index))
+    real_speed = _array(batch.follower_speed.gather(1, index))
+    real_gap = _array(batch.gap.gather(1, index))
+    speed, gap, parameters = {}, {}, {}
+    for method, loop in loops.items():
+        speed[method] = _array(loop.speed)
+        gap[method] = _array(loop.gap)
+        parameters[method] = _array(loop.parameters)
+    found = []
+    for i, pair in enumerate(pairs):
+        end = ends[i]
+        frame = int(first[i]) + np.arange(len(real_speed[i, :end]), dtype=np.float64)
+        trajectory = PairTrajectory(
+            pair_id=pair.pair_id,
+            driver=pair.driver,
+            time=frame * pair.dt,
+            leader_speed=leader_speed[i, :end],
+            real_speed=real_speed[i, :end],
+            real_gap=real_gap[i, :end],
+            speed=_rows(speed, i, end),
+            gap=_rows(gap, i, end),
+            parameters=_rows(parameters, i, end),
+        )
+        found.append(trajectory)
+    return tuple(found)
+
+
+def _rows(by_method: Mapping[str, Array], i: int, end: int) -> dict[str, Array]:
+    """Returns of each method the frames of pair i that were recorded."""
+    return {method: values[i, :end] for method, values in by_method.items()}
+
+
+def _array(values: Tensor) -> Array:
+    return np.asarray(values.double().cpu().numpy())

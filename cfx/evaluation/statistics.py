@@ -1,0 +1,120 @@
+"""Statistics over pairs that count the drivers: pairs of one driver are not independent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from cfx.evaluation.result import Improvement
+
+_TRIMMED = 0.1
+"""Share dropped at each end of the improvements for the trimmed mean, as in the paper."""
+
+_RESAMPLES = 9_999
+
+Floats = NDArray[np.float64]
+
+
+def improvement_statistics(
+    baseline: Floats, policy: Floats, drivers: Sequence[str] | None = None, *, seed: int
+) -> Improvement:
+    """Compares two methods over P pairs.
+
+    Pairs of one driver are not independent: the bootstrap resamples drivers (a cluster bootstrap), and the
+    test compares drivers.
+
+    Args:
+        baseline, policy: RMSE of speed of each pair, `(P,)`, m/s; a pair counts where both are finite and
+            `baseline` is positive.
+        drivers: the driver of each pair, `(P,)`; None if each pair has a driver of its own.
+        seed: of the bootstrap.
+    """
+    counts = np.isfinite(baseline) & np.isfinite(policy) & (baseline > 0)
+    before, after = baseline[counts], policy[counts]
+    if not counts.any():
+        return _undefined(len(baseline))
+    if drivers is None:
+        who = np.arange(len(before))
+    else:
+        who = np.unique(np.asarray(drivers)[counts], return_inverse=True)[1]
+    gain = (before - after) / before
+    low, high = _interval(gain, who, seed)
+    number = np.bincount(who)
+    before, after = np.bincount(who, before) / number, np.bincount(who, after) / number
+    p_value = 1.0  # without a single difference the test has nothing to rank
+    if np.any(before != after):
+        p_value = float(stats.wilcoxon(before, after, zero_method="zsplit").pvalue)
+    return Improvement(
+        mean=float(gain.mean()),
+        trimmed_mean=float(stats.trim_mean(gain, _TRIMMED)),
+        median=float(np.median(gain)),
+        ci95_low=low,
+        ci95_high=high,
+        win_rate=float((gain > 0).mean()),
+        p_value=p_value,
+        pairs=int(counts.sum()),
+        undefined=int((~counts).sum()),
+        drivers=len(number),
+    )
+
+
+def mean_interval(
+    values: Sequence[float], drivers: Sequence[str], *, seed: int
+) -> tuple[float, float, float]:
+    """Returns the mean over pairs and its 95 % bootstrap interval over drivers; NaN where it is not defined.
+
+    Args:
+        values: one for each pair; those that are not finite do not count.
+        drivers: the driver of each pair.
+        seed: of the bootstrap.
+    """
+    every = np.asarray(values, dtype=np.float64)
+    counts = np.isfinite(every)
+    if not counts.any():
+        return float("nan"), float("nan"), float("nan")
+    who = np.unique(np.asarray(drivers)[counts], return_inverse=True)[1]
+    low, high = _interval(every[counts], who, seed)
+    return float(every[counts].mean()), low, high
+
+
+def _undefined(pairs: int) -> Improvement:
+    """Returns the statistics of pairs none of which counts."""
+    nan = float("nan")
+    return Improvement(
+        mean=nan,
+        trimmed_mean=nan,
+        median=nan,
+        ci95_low=nan,
+        ci95_high=nan,
+        win_rate=nan,
+        p_value=nan,
+        pairs=0,
+        undefined=pairs,
+        drivers=0,
+    )
+
+
+def _interval(gain: Floats, who: NDArray[np.intp], seed: int) -> tuple[float, float]:
+    """Returns the 95 % interval of the mean gain; drivers are resampled with all their pairs.
+
+    It is NaN for a single driver.
+    """
+    number = np.bincount(who).astype(float)
+    if len(number) < 2:
+        return float("nan"), float("nan")
+
+    def mean(total: Floats, pairs: Floats, axis: int = -1) -> Floats:
+        return np.asarray(total.sum(axis) / pairs.sum(axis))
+
+    interval = stats.bootstrap(
+        (np.bincount(who, gain), number),
+        mean,
+        n_resamples=_RESAMPLES,
+        paired=True,
+        method="percentile",
+        rng=np.random.default_rng(seed),
+    ).confidence_interval
+    return float(interval.low), float(interval.high)

@@ -1,0 +1,149 @@
+"""One long table of values, and the two forms that are made of it: a row per pair, and a number per metric.
+
+The long table has a row per pair, method, scope and metric: `pair_id`, `driver`, `method`, `scope`, `metric`, `value`.
+The recorded drivers stand in it as the method `real`, with the metrics that say something of a recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from cfx.metrics.base import RECORDED, SCOPES, MetricInfo, column_of, key_of
+
+VALUE_COLUMNS = ("pair_id", "driver", "method", "scope", "metric", "value")
+"""Columns of the long table, which a job writes as `pair_metrics.parquet`."""
+
+_ID = ["pair_id", "method"]
+
+Floats = NDArray[np.float64]
+
+
+def long_table(
+    pair_ids: Sequence[str],
+    drivers: Sequence[str],
+    measured: Mapping[tuple[str, str, str], Floats],
+) -> pd.DataFrame:
+    """Returns the long table.
+
+    Args:
+        pair_ids, drivers: of P pairs.
+        measured: by metric, scope and method the value of each pair, `(P,)`.
+    """
+    groups: dict[tuple[str, str], dict[str, Floats]] = {}
+    for (metric, scope, method), values in measured.items():
+        groups.setdefault((metric, scope), {})[method] = values
+    parts = []
+    for (metric, scope), by_method in groups.items():
+        # Pair by pair, the methods in turn: in its last bit pandas' mean over groups depends on the order.
+        methods = list(by_method)
+        columns = {
+            "pair_id": np.repeat(np.asarray(pair_ids, dtype=object), len(methods)),
+            "driver": np.repeat(np.asarray(drivers, dtype=object), len(methods)),
+            "method": methods * len(pair_ids),
+            "scope": scope,
+            "metric": metric,
+            "value": np.stack(list(by_method.values()), axis=1).reshape(-1),
+        }
+        parts.append(pd.DataFrame(columns))
+    return pd.concat(parts, ignore_index=True)
+
+
+def values_of(values: pd.DataFrame, metric: str, scope: str) -> pd.DataFrame:
+    """Returns one metric in one scope: a row per pair, in the order of the pairs, and a column per method."""
+    rows = values[(values["metric"] == metric) & (values["scope"] == scope)]
+    # `pivot_table` would drop a method whose values are all undefined.
+    wide = rows.pivot(index="pair_id", columns="method", values="value")  # noqa: PD010
+    return wide.reindex(rows["pair_id"].drop_duplicates())
+
+
+def wide_table(
+    about: pd.DataFrame, values: pd.DataFrame, metrics: Sequence[MetricInfo]
+) -> pd.DataFrame:
+    """Returns a row per pair and method: what `about` says, and the metrics as columns.
+
+    Columns besides those of `about`: METRIC, `steady_METRIC`, `full_trajectory_METRIC` and, of the recorded
+    driver, `real_METRIC`; `improvement` over `fixed` and `improvement_over_BASELINE`.
+    """
+    parameters = [name for name in about if str(name).startswith("parameter_")]
+    columns: dict[str, pd.Series] = {}
+    places = pd.MultiIndex.from_frame(about[_ID])
+    for scope in SCOPES:
+        for metric in metrics:
+            if scope in metric.scopes:
+                column = _column(values, metric.name, scope, places)
+                if metric.summary == "sum":
+                    column = _whole_numbers(column)
+                columns[column_of(metric.name, scope)] = column
+        if scope == "test":
+            columns |= _improvements(about, values)
+    for metric in metrics:
+        recorded = values_of(values, metric.name, "test")
+        if RECORDED in recorded:
+            columns[f"{RECORDED}_{metric.name}"] = about["pair_id"].map(recorded[RECORDED])
+    first = about.drop(columns=parameters)
+    return pd.concat([first, pd.DataFrame(columns, index=about.index), about[parameters]], axis=1)
+
+
+def summaries(
+    values: pd.DataFrame, metrics: Sequence[MetricInfo], scope: str, methods: Sequence[str]
+) -> dict[str, float]:
+    """Returns the metrics of one scope as one number for each method, under their names in `metrics.json`.
+
+    Pairs whose value is not defined do not count.
+    """
+    found = {}
+    for metric in metrics:
+        rows = values[(values["metric"] == metric.name) & (values["scope"] == scope)]
+        if scope not in metric.scopes or rows.empty:
+            continue
+        is_recorded = rows["method"] == RECORDED
+        by_method = rows[~is_recorded].groupby("method")["value"]
+        if metric.summary == "sum":
+            summary = by_method.sum(min_count=1)
+        else:
+            summary = by_method.agg(metric.summary)
+        for method in methods:
+            if method in summary:
+                found[key_of(metric.name, method, scope)] = float(summary[method])
+        recorded = rows.loc[is_recorded, "value"]
+        if len(recorded):
+            found[key_of(metric.name, RECORDED, scope)] = summarize(recorded, metric.summary)
+    return found
+
+
+def summarize(values: pd.Series, summary: str) -> float:
+    """Returns the mean, sum, least or greatest of the defined values; NaN where none is."""
+    if summary == "sum":
+        return float(values.sum(min_count=1))
+    return float(values.agg(summary))
+
+
+def _column(values: pd.DataFrame, metric: str, scope: str, places: pd.MultiIndex) -> pd.Series:
+    """Returns a metric at each place (pair and method)."""
+    rows = values[(values["metric"] == metric) & (values["scope"] == scope)]
+    return rows.set_index(_ID)["value"].reindex(places).reset_index(drop=True)
+
+
+def _whole_numbers(column: pd.Series) -> pd.Series:
+    """Returns counts as whole numbers, where all are defined."""
+    if bool(np.isfinite(column).all()) and not bool((column % 1).any()):
+        return column.astype("int64")
+    return column
+
+
+def _improvements(about: pd.DataFrame, values: pd.DataFrame) -> dict[str, pd.Series]:
+    """Returns each method's improvement of the RMSE of speed over each baseline, by column."""
+    speed = values_of(values, "rmse_speed", "test")
+    own = _column(values, "rmse_speed", "test", pd.MultiIndex.from_frame(about[_ID]))
+    columns = {}
+    for baseline in about["method"].drop_duplicates():
+        if baseline == "policy":
+            continue
+        before = about["pair_id"].map(speed[baseline])
+        name = "improvement" if baseline == "fixed" else f"improvement_over_{baseline}"
+        columns[name] = ((before - own) / before).where(before > 0)
+    return dict(sorted(columns.items()))

@@ -1,0 +1,29 @@
+"""How smooth a simulated trajectory is. Shapes: P pairs, K + 1 frames."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from cfx.metrics.base import Metric, Trajectories
+from cfx.metrics.masked import root_mean_square
+
+
+class Jerk(Metric):
+    """Root mean square jerk; NaN where fewer than two frames count.
+
+    The jerk is the difference of successive accelerations over the time step. The acceleration at the
+    start is the recorded driver's own and does not count: nobody caused the jump from it.
+    """
+
+    unit = "m/s3"
+    direction = "none"
+    heading = "RMS jerk"
+    meaning = "root mean square of the simulated jerk; the recorded drivers' is the measure of what is usual"
+    is_of_recording = True
+    headline = False
+    order = 24
+
+    def compute(self, trajectories: Trajectories) -> Tensor:
+        counted = trajectories.counted
+        jerk = trajectories.speed.diff(n=2, dim=-1) / trajectories.dt**2
+        return root_mean_square(jerk, counted[:, 2:] & counted[:, 1:-1])
