@@ -6,9 +6,9 @@ by linear interpolation between frames: M. Treiber, A. Kesting and D. Helbing (2
 inaccuracies and anticipation in microscopic traffic models*, Physica A 360(1), 71-88, section 2.1.
 
 Shapes: `*batch` as in `cfx.DrivingModel`; K frames; m = `memory_width(K)`, the width of the memory.
-The memory holds the number of frames seen so far, then K gaps, K speeds and K leader speeds, the
-latest first. All zeros is the memory of a driver who has seen nothing; whoever has seen fewer than
-K frames is taken to have seen the first one ever since.
+The memory holds the number of frames seen so far, then gap, speed and leader speed of each frame,
+the latest first. All zeros is the memory of a driver who has seen nothing. A driver who has seen
+fewer frames than they want to recall gets the first one they saw.
 """
 
 from __future__ import annotations
@@ -35,9 +35,12 @@ class Perception(NamedTuple):
     leader_speed: Tensor
 
 
+_SIGNALS = len(Perception._fields)
+
+
 def memory_width(frames: int) -> int:
     """Returns m, the width of a memory of so many frames."""
-    return 1 + len(Perception._fields) * frames
+    return 1 + _SIGNALS * frames
 
 
 def perceive(follower: Follower, leader: Leader) -> Perception:
@@ -49,11 +52,8 @@ def perceive(follower: Follower, leader: Leader) -> Perception:
 
 def remember(memory: Tensor, seen: Perception) -> Tensor:
     """Returns the memory `(*batch, m)` with one frame more; the oldest frame is forgotten."""
-    count = memory[..., :1]
-    now = torch.stack(seen, dim=-1)[..., None]
-    past = _past(memory, now)
-    frames = torch.cat([now, past[..., :-1]], dim=-1)
-    return torch.cat([count + 1.0, frames.flatten(-2)], dim=-1)
+    count = memory[..., :1] + 1.0
+    return torch.cat([count, torch.stack(seen, dim=-1), memory[..., 1:-_SIGNALS]], dim=-1)
 
 
 def recall(memory: Tensor, seen: Perception, delay: Tensor) -> Perception:
@@ -65,16 +65,16 @@ def recall(memory: Tensor, seen: Perception, delay: Tensor) -> Perception:
         delay: in frames, not necessarily a whole number, broadcasting to `(*batch,)`; a delay
             beyond the memory reads its oldest frame.
     """
-    now = torch.stack(seen, dim=-1)[..., None]
-    frames = torch.cat([now, _past(memory, now)], dim=-1)
-    oldest = frames.shape[-1] - 1
-    bounded = delay.expand_as(seen.speed).clamp(0.0, float(oldest))
-    # An index must be a number; where the delay is none, `share` still carries the NaN on.
-    later = torch.nan_to_num(bounded.detach()).floor().clamp(max=float(oldest - 1))
+    capacity = (memory.shape[-1] - 1) // _SIGNALS
+    oldest = frames_seen(memory).clamp(max=float(capacity))
+    bounded = torch.minimum(delay.clamp(min=0.0), oldest)
+    # An index must be a number; where the delay is NaN, `share` passes it on.
+    later = torch.nan_to_num(bounded.detach()).floor()
+    earlier = torch.minimum(later + 1.0, oldest)
+    now = torch.stack(seen, dim=-1)
+    start = _frame(memory, now, later)
+    end = _frame(memory, now, earlier)
     share = (bounded - later)[..., None]
-    index = later.long()[..., None, None].expand(*now.shape)
-    start = frames.gather(-1, index)[..., 0]
-    end = frames.gather(-1, index + 1)[..., 0]
     gap, speed, leader_speed = (start + (end - start) * share).unbind(dim=-1)
     return Perception(gap, speed, leader_speed)
 
@@ -84,8 +84,9 @@ def frames_seen(memory: Tensor) -> Tensor:
     return memory[..., 0]
 
 
-def _past(memory: Tensor, now: Tensor) -> Tensor:
-    """Returns the remembered frames `(*batch, 3, K)`; the present `(*batch, 3, 1)` if none are."""
-    stored = memory[..., 1:].reshape(*memory.shape[:-1], len(Perception._fields), -1)
-    nothing_seen = frames_seen(memory)[..., None, None] == 0.0
-    return torch.where(nothing_seen, now, stored)
+def _frame(memory: Tensor, now: Tensor, number: Tensor) -> Tensor:
+    """Returns the signals `(*batch, 3)` of the frame `number`, `(*batch,)`, counted backwards."""
+    first = 1 + _SIGNALS * (number.long() - 1).clamp(min=0)
+    columns = first[..., None] + torch.arange(_SIGNALS, device=memory.device)
+    remembered = memory.gather(-1, columns)
+    return torch.where(number[..., None] == 0.0, now, remembered)
