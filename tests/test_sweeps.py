@@ -214,6 +214,30 @@ def test_a_job_runs_again_if_anything_differs_that_its_results_depend_on(
     assert len(jobs(Path("s"))) == 2
 
 
+@pytest.mark.parametrize("path", ["[a.csv,b.csv]", "*.csv"])
+def test_a_job_runs_again_if_one_of_several_files_changed(run: Run, path: str) -> None:
+    for name in ("a.csv", "b.csv"):
+        Path(name).write_text("a")
+    command = ["-m", "seed=0,1", "data=tidy", f"data.path={path}", "hydra.sweep.dir=s"]
+    assert run(*command) == 0
+    assert run(*command) == 0
+    assert len(ran()) == 2
+    Path("b.csv").write_text("ab")
+    assert run(*command) == 0
+    assert len(ran()) == 2
+
+
+def test_a_sweep_that_a_file_of_the_version_before_asks_for_has_todays_names(run: Run) -> None:
+    Path("mine/experiment").mkdir(parents=True)
+    Path("mine/experiment/old.yaml").write_text(
+        "# @package _global_\ndefaults:\n  - override /learner: rollout\nhydra:\n  mode: MULTIRUN\n"
+        "  sweeper:\n    params:\n      learner.members: 2,3\n"
+    )
+    assert run("--config-dir", "mine", "experiment=old") == 0
+    (folder,) = sweeps()
+    assert [row["learner.ensemble_size"] for row in summary(folder)] == ["2", "3"]
+
+
 def test_a_sweep_that_runs_is_left_alone(run: Run, capsys) -> None:
     Path("fail-1").touch()
     assert run("-m", "seed=0,1") == 2

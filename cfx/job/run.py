@@ -209,7 +209,7 @@ def _keep(
     tracker.log_figures(figures)
     tracker.log_policy(policy_folder)
     tracked = [output.folder / name for name in files.TRACKED]
-    tracker.log_files([*tracked, *further, *demo])
+    tracker.log_files(tracked + further + demo)
     return JobResult(
         metrics,
         evaluation.table,

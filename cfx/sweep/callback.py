@@ -16,11 +16,14 @@ from cfx.sweep.running import Sweep
 
 
 class Refused(BaseException):
-    """A sweep cannot start; the cause says why. Hydra swallows a callback's `Exception`, so this is none."""
+    """A sweep cannot start; the cause says why.
+
+    It is no `Exception`, because Hydra swallows those in a callback.
+    """
 
 
 class SweepFolder(Callback):
-    """Chooses the folder when Hydra starts a multirun; `conf/config.yaml` names it as a callback."""
+    """Chooses the folder when Hydra starts a multirun; `conf/config.yaml` names this class."""
 
     _current: ClassVar[Sweep | None] = None
 
@@ -35,7 +38,8 @@ class SweepFolder(Callback):
     @classmethod
     def take(cls) -> Sweep | None:
         """Returns the sweep that was started, if one was, and forgets it."""
-        sweep, cls._current = cls._current, None
+        sweep = cls._current
+        cls._current = None
         return sweep
 
 
@@ -44,11 +48,14 @@ def _rename_parameters(config: DictConfig) -> None:
     given = OmegaConf.select(config, "hydra.sweeper.params")
     if not given:
         return
-    arguments = [f"{key}={value}" for key, value in given.items()]
-    parameters = {}
+    before = {}
+    for key, value in given.items():
+        before[str(key)] = str(value)
+    arguments = [f"{key}={value}" for key, value in before.items()]
+    today = {}
     for argument in renamed.overrides(arguments):
         key, _, value = argument.partition("=")
-        parameters[key] = value
-    if parameters != {str(key): str(value) for key, value in given.items()}:
+        today[key] = value
+    if today != before:
         with open_dict(config.hydra):
-            config.hydra.sweeper.params = parameters
+            config.hydra.sweeper.params = today

@@ -6,6 +6,7 @@ Importing this module makes `${cfx_job:}` known to OmegaConf.
 from __future__ import annotations
 
 import contextlib
+import glob
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,7 +20,9 @@ from cfx.component import content_key
 
 
 def fingerprint(values: Mapping[str, Any]) -> str:
-    """Returns a hash of what a job's results depend on: configuration, versions of cfx and of plugins, state of the data file.
+    """Returns a hash of what a job's results depend on.
+
+    It covers the configuration, the versions of cfx and of plugins, and the state of the data file.
 
     Args:
         values: the job's resolved configuration.
@@ -29,15 +32,6 @@ def fingerprint(values: Mapping[str, Any]) -> str:
     """
     from cfx.tracking import provenance
 
-    node = values.get("data")
-    path = node.get("path") if isinstance(node, Mapping) else None
-    state = None
-    if path:
-        with contextlib.suppress(
-            OSError
-        ):  # a file that is not there is the dataset's to complain about
-            found = Path(str(path)).expanduser().stat()
-            state = [found.st_size, found.st_mtime_ns]
     parts = {
         "config": values,
         "cfx": provenance.version(),
@@ -45,30 +39,38 @@ def fingerprint(values: Mapping[str, Any]) -> str:
             **provenance.distributions(values),
             **provenance.metric_distributions(values),
         },
-        "data": state,
+        "data": _state_of_data(values.get("data")),
     }
     return content_key(parts)
 
 
 def job_name(_root_: Any) -> str:
-    """Returns the end of a job folder's name, the same for the same overrides in any order: `${cfx_job:}` in Hydra's config."""
+    """Returns the end of a job folder's name: `${cfx_job:}` in Hydra's configuration.
+
+    It is the same for the same overrides in any order.
+    """
     task: Any = OmegaConf.to_container(_root_.hydra.overrides.task, resolve=False)
-    given = {
-        one.partition("=")[0]: one for one in task
-    }  # where a key is given twice the last one counts
+    given = {}
+    for override in task:
+        key = override.partition("=")[0]
+        given[key] = override  # where a key is given twice the last one counts
     return content_key([sorted(given.values()), *_sources(_root_)])[:8]
 
 
 def command_of(config: DictConfig) -> tuple[tuple[str, ...], str, int | None]:
-    """Returns what was asked for: as typed, as a hash that knows no order, and how many jobs that makes.
+    """Returns the command of a sweep: as typed, as a hash, and how many jobs it makes.
 
-    Of Hydra's own overrides only those of the sweeper count: the same sweep may go on with another launcher.
+    The hash knows no order. Of Hydra's own overrides only those of the sweeper count: the same
+    sweep may go on with another launcher. The number of jobs is None if the sweeper decides as it
+    goes.
     """
     typed: Any = OmegaConf.to_container(config.hydra.overrides, resolve=False)
     sweeper: Any = OmegaConf.to_container(config.hydra.sweeper, resolve=False)
-    asked = [
-        f"{key}={value}" for key, value in (sweeper.pop("params", None) or {}).items()
-    ] + typed["task"]
+    asked = []
+    for key, value in (sweeper.pop("params", None) or {}).items():
+        asked.append(f"{key}={value}")
+    asked += typed["task"]
+
     values: dict[str, list[str]] = {}
     parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())
     for override in parser.parse_overrides(asked):
@@ -77,22 +79,37 @@ def command_of(config: DictConfig) -> tuple[tuple[str, ...], str, int | None]:
             values[key] = sorted(override.sweep_string_iterator())
         else:
             values[key] = [str(override.input_line)]
-    basic = str(sweeper.get("_target_", "")).endswith(".BasicSweeper")
-    jobs = math.prod(len(set(one)) for one in values.values()) if basic else None
-    return (
-        (*typed["task"], *typed["hydra"]),
-        content_key([values, sweeper, *_sources(config)]),
-        jobs,
-    )
+
+    jobs = None
+    if str(sweeper.get("_target_", "")).endswith(".BasicSweeper"):
+        jobs = math.prod(len(set(options)) for options in values.values())
+    command = (*typed["task"], *typed["hydra"])
+    return command, content_key([values, sweeper, *_sources(config)]), jobs
+
+
+def _state_of_data(node: Any) -> list[list[int]] | None:
+    """Returns size and time of change (ns) of each data file; None if the dataset names none."""
+    if not isinstance(node, Mapping) or not node.get("path"):
+        return None
+    named = node["path"]
+    patterns = named if isinstance(named, list | tuple) else [named]
+    states = []
+    for pattern in patterns:
+        path = Path(str(pattern)).expanduser()
+        files = [str(path)] if path.exists() else sorted(glob.glob(str(path)))  # noqa: PTH207 - the pattern may be absolute, Path.glob takes none
+        for file in files:
+            with contextlib.suppress(OSError):  # the dataset complains about a file that is gone
+                found = Path(file).stat()
+                states.append([found.st_size, found.st_mtime_ns])
+    return states
 
 
 def _sources(config: Any) -> tuple[Any, ...]:
-    """Returns what else on the command line decides what the overrides mean: --config-name and --config-dir."""
-    given = [
-        str(source.path)
-        for source in config.hydra.runtime.config_sources
-        if source.provider == "command-line"
-    ]
+    """Returns what else decides what the overrides mean: --config-name and --config-dir."""
+    given = []
+    for source in config.hydra.runtime.config_sources:
+        if source.provider == "command-line":
+            given.append(str(source.path))
     return str(config.hydra.job.config_name), given
 
 

@@ -1,4 +1,4 @@
-"""The folder of a sweep: which one a command continues or makes, and the locks that keep others out.
+"""The folder of a sweep: which one a command continues or makes, and the locks around it.
 
 A folder and a job are used by one process at a time. The operating system frees their locks when
 the process ends, however it ends.
@@ -21,13 +21,18 @@ from cfx.sweep.record import Record
 log = logging.getLogger(__name__)
 
 LOCK = ".lock"
+"""File that a process locks in the folder of a sweep or a job while it works there."""
 
 _DATED = re.compile(r"\$\{\s*now\s*:")
+"""A configured folder that holds the time: no two sweeps share it."""
 
 
 @contextlib.contextmanager
 def only_one(folder: Path) -> Iterator[None]:
-    """Holds a job's folder: the worker of a killed sweep may still be at that job, and is waited for."""
+    """Holds a job's folder.
+
+    The worker of a sweep that was killed may still run that job; this process then waits for it.
+    """
     lock = FileLock(folder / LOCK)
     try:
         lock.acquire(timeout=0)
@@ -56,34 +61,36 @@ def find_folder(
         OSError: the folder cannot be made.
     """
     if not _DATED.search(configured):
-        return _asked_for(wanted, resumable=resumable)
+        return _named_folder(wanted, resumable=resumable)
     if resumable:
-        found = _left_over(_pattern(configured), command_hash)
+        found = _incomplete_folder(_pattern(configured), command_hash)
         if found is not None:
             return found
-    return _fresh(wanted)
+    return _new_folder(wanted)
 
 
 def _pattern(folder: str) -> str:
     """Returns the glob of a configured folder: what is interpolated may be anything."""
-    before, text = "", folder
-    while before != text:
-        before, text = text, re.sub(r"\$\{[^${}]*\}", "\0", text)
+    text = folder
+    while True:
+        shorter = re.sub(r"\$\{[^${}]*\}", "\0", text)  # innermost interpolations first
+        if shorter == text:
+            break
+        text = shorter
     return "*".join(glob.escape(part) for part in text.split("\0"))
 
 
-def _left_over(pattern: str, command_hash: str) -> tuple[Path, FileLock] | None:
-    """Returns, locked, the newest sweep of this command that no other process runs, unless it is complete."""
-    folders = [Path(path) for path in glob.glob(pattern)]  # noqa: PTH207 - the pattern may be absolute, Path.glob takes none
-    known = [
-        (record.started, folder)
-        for folder in folders
-        if (record := Record.read(folder)) is not None
-    ]
-    for _, folder in sorted(known, reverse=True):
-        record = Record.read(folder)
-        if record is None or record.command_hash != command_hash:
-            continue
+def _incomplete_folder(pattern: str, command_hash: str) -> tuple[Path, FileLock] | None:
+    """Returns the newest sweep of this command that no other process runs, locked.
+
+    None if there is no such sweep, or if it is complete.
+    """
+    candidates = []
+    for path in glob.glob(pattern):  # noqa: PTH207 - the pattern may be absolute, Path.glob takes none
+        record = Record.read(Path(path))
+        if record is not None and record.command_hash == command_hash:
+            candidates.append((record.started, Path(path)))
+    for _, folder in sorted(candidates, reverse=True):
         lock = _try_lock(folder)
         if lock is None:
             continue
@@ -95,9 +102,10 @@ def _left_over(pattern: str, command_hash: str) -> tuple[Path, FileLock] | None:
     return None
 
 
-def _fresh(wanted: Path) -> tuple[Path, FileLock]:
+def _new_folder(wanted: Path) -> tuple[Path, FileLock]:
     """Returns a new folder, locked."""
-    folder, number = wanted, 1
+    folder = wanted
+    number = 1
     while True:
         with contextlib.suppress(FileExistsError):
             folder.mkdir(parents=True)
@@ -108,24 +116,27 @@ def _fresh(wanted: Path) -> tuple[Path, FileLock]:
         folder = wanted.with_name(f"{wanted.name}-{number}")
 
 
-def _asked_for(folder: Path, *, resumable: bool) -> tuple[Path, FileLock]:
+def _named_folder(folder: Path, *, resumable: bool) -> tuple[Path, FileLock]:
     """Returns the folder that the user named, locked."""
     folder.mkdir(parents=True, exist_ok=True)
     lock = _try_lock(folder)
     if lock is None:
         raise ConfigError(
-            f"{folder}: another sweep runs in this folder; wait for it, or choose another hydra.sweep.dir"
+            f"{folder}: another sweep runs in this folder;"
+            " wait for it, or choose another hydra.sweep.dir"
         )
     if not resumable and Record.read(folder) is not None:
         lock.release()
         raise ConfigError(
-            f"{folder}: holds a sweep already, and hydra.sweep.subdir names its jobs' folders in a way that jobs of another"
-            " order would overwrite; end it with -${cfx_job:}, or choose another hydra.sweep.dir"
+            f"{folder}: holds a sweep already, and hydra.sweep.subdir names its jobs' folders in a"
+            " way that jobs of another order would overwrite; end it with -${cfx_job:},"
+            " or choose another hydra.sweep.dir"
         )
     return folder, lock
 
 
 def _try_lock(folder: Path) -> FileLock | None:
+    """Returns the lock of a folder, held by this process; None if another one holds it."""
     lock = FileLock(folder / LOCK)
     try:
         lock.acquire(timeout=0)

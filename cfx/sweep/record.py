@@ -48,27 +48,33 @@ class Record:
         write_json(folder / RECORD, asdict(self))
 
     def statuses(self, folder: Path, multirun: str) -> dict[Path, JobStatus]:
-        """Returns, by folder and in the sweep's order, the jobs that this start has seen and those that were done before."""
-        found = {
-            path.parent: JobStatus.read(path.parent)
-            for path in sorted(folder.rglob(STATUS))
-            if _is_in(path.parent, folder)
-        }
-        ours = {
-            path: status if status.multirun == multirun else replace(status, before=True)
-            for path, status in found.items()
-            if status is not None
-            and (
-                status.multirun == multirun
-                or (status.code == 0 and status.command == self.command_hash)
-            )
-        }
-        return dict(sorted(ours.items(), key=lambda item: item[1].number))
+        """Returns the jobs that this start has seen and those that were done before.
+
+        Args:
+            folder: of the sweep.
+            multirun: this start of the sweep.
+
+        Returns:
+            How each job ended, by its folder and in the sweep's order.
+        """
+        found: dict[Path, JobStatus] = {}
+        for marker in sorted(folder.rglob(STATUS)):
+            job = marker.parent
+            status = JobStatus.read(job)
+            if status is None or not _belongs_to(job, folder):
+                continue
+            if status.multirun == multirun:
+                found[job] = status
+            elif status.code == 0 and status.command == self.command_hash:
+                found[job] = replace(status, before=True)
+        return dict(sorted(found.items(), key=lambda item: item[1].number))
 
 
-def _is_in(job: Path, sweep: Path) -> bool:
+def _belongs_to(job: Path, sweep: Path) -> bool:
     """Says whether a folder below a sweep's belongs to it, and not to another sweep below."""
-    between = job.relative_to(sweep).parents
-    return not any(
-        (sweep / one / RECORD).exists() for one in [job.relative_to(sweep), *between][:-1]
-    )
+    current = job
+    while current != sweep:
+        if (current / RECORD).exists():
+            return False
+        current = current.parent
+    return True

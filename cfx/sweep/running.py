@@ -1,4 +1,4 @@
-"""A sweep that runs in this process: from the folder that it finds to the summary that it leaves."""
+"""A sweep that runs in this process: it finds its folder and leaves a summary there."""
 
 from __future__ import annotations
 
@@ -57,7 +57,10 @@ class Sweep:
 
     @classmethod
     def open(cls, config: DictConfig) -> Self:
-        """Finds or makes the folder of the multirun that `config` describes, and holds its lock until `close`.
+        """Finds or makes the folder of a multirun, and holds its lock until `close`.
+
+        Args:
+            config: the master configuration, with Hydra's node.
 
         Raises:
             ConfigError: another sweep runs in the folder that was asked for.
@@ -68,30 +71,37 @@ class Sweep:
         wanted = Path(str(config.hydra.sweep.dir))
         resumable = "cfx_job" in str(raw["subdir"])
         folder, lock = find_folder(str(raw["dir"]), wanted, digest, resumable=resumable)
-        now = _now()
         earlier = Record.read(folder)
-        record = Record(str(folder), command, digest, now, jobs)
+        record = Record(str(folder), command, digest, _now(), jobs)
         if earlier is not None:
-            same = earlier.command_hash == digest
-            record = replace(record, name=earlier.name, started=earlier.started if same else now)
+            record = replace(record, name=earlier.name)
+            if earlier.command_hash == digest:
+                record = replace(record, started=earlier.started)
             print(_continuing(folder, record, earlier), flush=True)
         record.write(folder)
         return cls(folder, lock, record, _tracking(config), resumable=resumable)
 
     def lead(self, config: DictConfig) -> None:
-        """Sends Hydra into the folder: `config` itself, and the overrides that each job is composed from."""
+        """Sends Hydra into the folder.
+
+        Args:
+            config: the master configuration; changed in place, as are the overrides in it that each
+                job is composed from.
+        """
         path = str(self.folder)
+        escaped = path.replace("'", "\\'")
         given: Any = OmegaConf.to_container(config.hydra.overrides.hydra, resolve=False)
-        overrides = [one for one in given if not one.startswith("hydra.sweep.dir=")]
+        overrides = []
+        for override in given:
+            if not override.startswith("hydra.sweep.dir="):
+                overrides.append(override)
+        overrides.append(f"hydra.sweep.dir='{escaped}'")
         with open_dict(config.hydra):
             config.hydra.sweep.dir = path
-            config.hydra.overrides.hydra = [
-                *overrides,
-                "hydra.sweep.dir='" + path.replace("'", "\\'") + "'",
-            ]
+            config.hydra.overrides.hydra = overrides
 
     def close(self, multirun: str, code: int, *, interrupted: bool) -> int:
-        """Says how the sweep ended, on the terminal and in `summary.csv`, and lets go of its folder.
+        """Says how the sweep ended, on the terminal and in `summary.csv`, and frees its folder.
 
         Args:
             multirun: this start of the sweep.
@@ -103,63 +113,65 @@ class Sweep:
         """
         try:
             statuses = self.record.statuses(self.folder, multirun)
-            lines = self._tracked() if statuses or interrupted else ()
-            if not statuses:
-                return self._nothing(code, interrupted=interrupted)
-            table = rows(statuses)
-            write_summary(self.folder / SUMMARY, table)
-            put(summary_table(table, metric_columns(list(statuses))))
-            code = self._tell(statuses, code)
-            if any(status.code == 0 for status in statuses.values()):
-                for line in (
-                    *lines,
-                    f"Report of the whole sweep: python -m cfx report {shlex.quote(str(self.folder))}",
-                ):
-                    print(line)
-            if code == 0:
-                replace(self.record, completed=_now()).write(self.folder)
-            elif self.resumable:
-                print(_AGAIN)
-            return code
+            if statuses:
+                return self._finish(statuses, code)
+            if interrupted:
+                self._close_runs()
+            return self._finish_without_jobs(code, interrupted=interrupted)
         finally:
             self._lock.release()
 
-    def _tell(self, statuses: Mapping[Path, JobStatus], code: int) -> int:
-        """Prints how many jobs are done, and which failed and why; returns the exit code."""
-        failed = {path: status for path, status in statuses.items() if status.code}
-        total = max(self.record.jobs or 0, len(statuses))
-        print(f"{len(statuses) - len(failed)} of {total} jobs done; their folders: {self.folder}")
-        for path, status in failed.items():
-            print(
-                f"failed: {' '.join(status.overrides)}: {status.message} ({path})", file=sys.stderr
-            )
-        if total > len(statuses) and not code:
-            print(
-                f"{total - len(statuses)} jobs left no outcome; see the launcher's own logs",
-                file=sys.stderr,
-            )
-            code = 1
-        return worst(code, *(status.code for status in failed.values()))
-
-    def _nothing(self, code: int, *, interrupted: bool) -> int:
-        if not code:
-            print(
-                f"no job left its outcome in {self.folder}; see the launcher's own logs",
-                file=sys.stderr,
-            )
-            return 1
-        if not interrupted and not any(path.is_dir() for path in self.folder.iterdir()):
-            # A wrong command line that no job was made of leaves no folder.
-            for name in (RECORD, "multirun.yaml", LOCK):
-                (self.folder / name).unlink(missing_ok=True)
-            with contextlib.suppress(OSError):
-                self.folder.rmdir()
+    def _finish(self, statuses: Mapping[Path, JobStatus], code: int) -> int:
+        """Writes and prints the summary, and says how to go on; returns the exit code."""
+        lines = self._close_runs()
+        table = rows(statuses)
+        write_summary(self.folder / SUMMARY, table)
+        put(summary_table(table, metric_columns(list(statuses))))
+        code = self._count(statuses, code)
+        if any(status.code == 0 for status in statuses.values()):
+            for line in lines:
+                print(line)
+            folder = shlex.quote(str(self.folder))
+            print(f"Report of the whole sweep: python -m cfx report {folder}")
+        if code == 0:
+            replace(self.record, completed=_now()).write(self.folder)
         elif self.resumable:
             print(_AGAIN)
         return code
 
-    def _tracked(self) -> tuple[str, ...]:
-        """Closes runs that killed jobs left open; returns lines that tell where the sweep is in MLflow."""
+    def _count(self, statuses: Mapping[Path, JobStatus], code: int) -> int:
+        """Prints how many jobs are done, and which failed and why; returns the exit code."""
+        failed = {path: status for path, status in statuses.items() if status.code}
+        total = max(self.record.jobs or 0, len(statuses))
+        missing = total - len(statuses)
+        print(f"{len(statuses) - len(failed)} of {total} jobs done; their folders: {self.folder}")
+        for path, status in failed.items():
+            overrides = " ".join(status.overrides)
+            print(f"failed: {overrides}: {status.message} ({path})", file=sys.stderr)
+        if missing and code == 0:
+            print(f"{missing} jobs left no outcome; see the launcher's own logs", file=sys.stderr)
+            code = 1
+        return worst(code, *(status.code for status in failed.values()))
+
+    def _finish_without_jobs(self, code: int, *, interrupted: bool) -> int:
+        """Says that no job ended, or removes a wrong command's folder; returns the exit code."""
+        if code == 0:
+            text = f"no job left its outcome in {self.folder}; see the launcher's own logs"
+            print(text, file=sys.stderr)
+            return 1
+        has_jobs = any(path.is_dir() for path in self.folder.iterdir())
+        if interrupted or has_jobs:
+            if self.resumable:
+                print(_AGAIN)
+            return code
+        for name in (RECORD, "multirun.yaml", LOCK):
+            (self.folder / name).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            self.folder.rmdir()
+        return code
+
+    def _close_runs(self) -> tuple[str, ...]:
+        """Closes MLflow's runs that killed jobs left open; returns lines that lead to them."""
         from cfx.errors import TrackingError
         from cfx.tracking.store import sqlite_file, tracking_uri
 
@@ -183,14 +195,24 @@ class Sweep:
 
 
 def _continuing(folder: Path, record: Record, earlier: Record) -> str:
-    done = sum(one.code == 0 for one in record.statuses(folder, "").values())
-    if earlier.command_hash == record.command_hash:
-        return f"continuing sweep {folder}: {done}{f' of {record.jobs}' if record.jobs else ''} jobs are done"
-    return f"continuing in {folder}, which holds another command's sweep: jobs that both have in common are not run again"
+    if earlier.command_hash != record.command_hash:
+        return (
+            f"continuing in {folder}, which holds another command's sweep:"
+            " jobs that both have in common are not run again"
+        )
+    statuses = record.statuses(folder, "").values()
+    done = sum(status.code == 0 for status in statuses)
+    total = ""
+    if record.jobs:
+        total = f" of {record.jobs}"
+    return f"continuing sweep {folder}: {done}{total} jobs are done"
 
 
 def _tracking(config: DictConfig) -> dict[str, Any]:
-    """Returns the resolved configuration of tracking; nothing where only a job's own configuration can say it."""
+    """Returns the resolved configuration of tracking.
+
+    It is empty where only a job's own configuration can say it.
+    """
     try:
         with resolving(copy.deepcopy(config)):  # it makes what it is given read-only
             return cast("dict[str, Any]", OmegaConf.to_container(config.tracking, resolve=True))

@@ -20,14 +20,14 @@ class JobStatus:
 
     Attributes:
         code: exit code: 0; 2 for a user's mistake; 1 for a bug.
-        message: one sentence for people, empty if all went well.
+        message: one sentence for people; empty if all went well.
         detail: the traceback of a bug.
         overrides: what was asked for.
         multirun: the start of the sweep that last saw this job.
         command: the sweep's command, see `Record.command_hash`.
         fingerprint: of everything that the results depend on, see `fingerprint`.
         number: the job's place in the sweep.
-        seconds: how long it took.
+        seconds: how long it took, s.
         before: an earlier start of the sweep did it.
     """
 
@@ -44,7 +44,7 @@ class JobStatus:
 
     @classmethod
     def read(cls, folder: Path) -> Self | None:
-        """Returns the outcome of the job in `folder`; None if it left none that can be read."""
+        """Returns how the job in `folder` ended; None if it left no marker that can be read."""
         try:
             values = json.loads((folder / STATUS).read_text(encoding="utf-8"))
             return cls(**{**values, "overrides": tuple(values["overrides"])})
@@ -58,24 +58,29 @@ class JobStatus:
     @property
     def state(self) -> str:
         """For people: done, done before or failed."""
-        return "failed" if self.code else "done before" if self.before else "done"
+        if self.code:
+            return "failed"
+        if self.before:
+            return "done before"
+        return "done"
 
 
 def metrics_of(folder: Path) -> dict[str, float]:
-    """Returns the finite metrics of a finished job, by their MLflow names; empty if there are none."""
+    """Returns the finite metrics of a finished job; empty if there are none."""
     try:
         values = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     if not isinstance(values, dict):
         return {}
-    return {
-        name: float(value)
-        for name, value in values.items()
-        if isinstance(value, int | float) and math.isfinite(value)
-    }
+    finite = {}
+    for name, value in values.items():
+        if isinstance(value, int | float) and math.isfinite(value):
+            finite[name] = float(value)
+    return finite
 
 
 def worst(*codes: int) -> int:
     """Returns the exit code that weighs most: a signal, then a bug, then a user's mistake."""
-    return max(codes, key=lambda code: {0: 0, 2: 1, 1: 2}.get(code, 3))
+    weights = {0: 0, 2: 1, 1: 2}
+    return max(codes, key=lambda code: weights.get(code, 3))

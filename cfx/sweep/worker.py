@@ -9,22 +9,30 @@ import time
 from collections.abc import Iterator
 
 _AT_WORK = threading.Lock()
+"""Held while this process runs a job."""
+
 _WATCHED: set[int] = set()
+"""Processes of sweeps whose end this worker watches for."""
+
 _WATCH_S = 1.0
+"""Seconds between two looks."""
 
 
 @contextlib.contextmanager
 def worker_of(process: int) -> Iterator[None]:
-    """Runs a job; a worker whose sweep is killed ends when the job does: joblib's would wait for ever for the next.
+    """Runs a job; a worker whose sweep was killed ends when its job does.
+
+    joblib's workers would wait for the next job for ever.
 
     Args:
         process: the one that runs the sweep.
     """
-    if os.getpid() != process == os.getppid() and process not in _WATCHED:
+    is_its_worker = os.getpid() != process and os.getppid() == process
+    if is_its_worker and process not in _WATCHED:
         _WATCHED.add(process)
         threading.Thread(target=_end_with, args=(process,), daemon=True).start()
     elif process in _WATCHED and os.getppid() != process:
-        os._exit(1)  # a job that was handed over already is the next start's
+        os._exit(1)  # the next start of the sweep runs a job that was handed over already
     with _AT_WORK:
         yield
 
