@@ -73,8 +73,10 @@ ATTRIBUTES: dict[str, str] = {
     "traits": "driver_features",
     "reads_traits": "uses_driver_features",
     "require_no_traits": "require_no_driver_features",
+    "traits_of": "driver_features_of",
+    "read": "burn_in",
 }
-"""Attributes of components, which plugins read."""
+"""Attributes of components and of a job's policy, which plugins read."""
 
 DECLARED = ("follows", "reads_traits")
 """Those of them that plugins' classes set."""

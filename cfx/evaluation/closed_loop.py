@@ -1,7 +1,10 @@
-"""The closed loop: a policy chooses parameters, the model drives with them, and the policy sees what came of it.
+"""The closed loop: an agent chooses parameters, the model drives with them, and the agent sees the result.
 
-From the last measured state before the test part on, the follower is simulated against the measured leader; the policy sees the
-*simulated* follower, never the measured one. Before that it has read the measured history of the training part.
+From the last measured state before the test part on, the follower is simulated against the measured
+leader. The agent sees the *simulated* follower there, never the measured one. Before that it has
+observed the measured history (burn-in).
+
+Shapes: P pairs, K simulated frames, L frames of a token, T = L + K columns, n tuned parameters.
 """
 
 from __future__ import annotations
@@ -11,17 +14,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from cfx.agents.agent import Agent, AgentState
+from cfx.agents.context import DriverContext
 from cfx.models.base import Leader
 from cfx.pairs import PairBatch
 from cfx.policies.features import History
-from cfx.policies.trained import TrainedPolicy
 from cfx.simulation.base import BaseSimulator
 from cfx.simulation.rollout import Start
 from cfx.simulation.threads import one_thread
 
 
 class ClosedLoop(NamedTuple):
-    """P closed-loop drives, frame 0 being the last measured state; SI units.
+    """P simulated trajectories, frame 0 being the last measured state; SI units.
 
     Attributes:
         speed, gap: `(P, K + 1)`.
@@ -37,9 +41,9 @@ class ClosedLoop(NamedTuple):
 
 @torch.no_grad()
 @one_thread()
-def drive(
+def simulate_closed_loop(
     simulator: BaseSimulator,
-    policy: TrainedPolicy,
+    agent: Agent,
     batch: PairBatch,
     first: Tensor,
     network: Tensor,
@@ -47,72 +51,123 @@ def drive(
     base: Tensor | None = None,
     history: float | None = None,
 ) -> ClosedLoop:
-    """Lets a policy drive the test part of P pairs.
+    """Simulates the test part of P pairs with an agent in the loop.
 
     Args:
         simulator: the model and its time step.
-        policy: chooses the parameters of each window.
-        batch: P pairs, whole.
+        agent: chooses the parameters of each window.
+        batch: P pairs, complete.
         first: `(P,)`, the frame of the last measured state.
-        network: `(P,)`, which of the policy's networks drives each pair.
-        base: `(P, n)` in SI units, what a policy's offsets are from; None: the policy's own base.
-        history: seconds of measured history before `first` that the policy reads, and from which the driver's driver features are
-            measured; None: all there is.
+        network: `(P,)`, which of the agent's networks drives each pair.
+        base: `(P, n)` in SI units, the drivers' base parameters; None: the agent's own base.
+        history: seconds of measured history before `first` that the agent observes, and in which driver
+            features are measured; None: all there is.
     """
-    length, stride = policy.windows.length, policy.windows.stride
-    steps = int((batch.lengths - 1 - first).max())
-    frames = first[:, None] + torch.arange(1 - length, steps + 1, device=first.device)
-    index = frames.clamp(min=0, max=batch.mask.shape[1] - 1)
-    leader_position, leader_speed, leader_acceleration = (
-        signal.gather(1, index)
-        for signal in (batch.leader_position, batch.leader_speed, batch.leader_acceleration)
-    )
-    # Columns of these buffers: `length - 1` measured frames, frame 0, and then what is simulated.
-    position = batch.follower_position.gather(1, index)
-    speed = batch.follower_speed.gather(1, index)
-    acceleration = batch.follower_acceleration.gather(1, index)
-    now = length - 1
-    for buffer in (position, speed, acceleration):
-        buffer[:, now + 1 :] = torch.nan  # nothing measured may be seen from here on
-    since = None if history is None else (first - round(history / simulator.dt)).clamp(min=0)
-    state = policy.read(
-        batch,
-        first,
-        policy.begin(network, base, policy.driver_features_of(batch, first, since)),
-        since,
-    )
-    follower = simulator.begin(Start(position[:, now], speed[:, now], acceleration[:, now]))
-    parameters = speed.new_empty((len(batch), steps + 1, len(policy.space)))
-    gap = leader_position - batch.leader_length[:, None] - position
-    for begin in range(0, steps, stride):
-        end = min(begin + stride, steps)
-        recent = slice(begin, begin + length)
-        seen = History(
-            leader_speed[:, recent],
-            leader_acceleration[:, recent],
-            speed[:, recent],
-            acceleration[:, recent],
-            gap[:, recent],
-        )
-        chosen, state = policy.act(seen, state)
-        ahead = slice(now + begin, now + end)
-        leader = Leader(
-            leader_position[:, ahead].T,
-            leader_speed[:, ahead].T,
-            leader_acceleration[:, ahead].T,
-            batch.leader_length,
-        )
-        follower, positions, speeds = simulator.advance(
-            follower, leader, policy.space.unpack(chosen)
-        )
-        done = slice(now + begin + 1, now + end + 1)
-        position[:, done] = positions.T
-        speed[:, done] = speeds.T
-        acceleration[:, done] = (speed[:, done] - speed[:, now + begin : now + end]) / simulator.dt
-        gap[:, done] = leader_position[:, done] - batch.leader_length[:, None] - position[:, done]
+    state = _burnt_in(agent, batch, first, network, base, history, simulator.dt)
+    track = _Track(batch, first, agent.windows.length)
+    position, speed, acceleration = track.now()
+    follower = simulator.begin(Start(position, speed, acceleration))
+    parameters = track.speed.new_empty((len(batch), track.steps + 1, len(agent.space)))
+    for begin in range(0, track.steps, agent.windows.stride):
+        end = min(begin + agent.windows.stride, track.steps)
+        chosen, state = agent.act(track.history(begin), state)
+        p = agent.space.unpack(chosen)
+        follower, positions, speeds = simulator.advance(follower, track.leader(begin, end), p)
+        track.write(begin, end, positions.T, speeds.T, simulator.dt)
         parameters[:, begin + 1 : end + 1] = chosen[:, None]
         if begin == 0:
             parameters[:, 0] = chosen
-    counted = frames[:, now:] < batch.lengths[:, None]
-    counted[:, 0] = False
-    return ClosedLoop(speed[:, now:], gap[:, now:], parameters, counted)
+    speed, gap, counted = track.result()
+    return ClosedLoop(speed, gap, parameters, counted)
+
+
+def _burnt_in(
+    agent: Agent,
+    batch: PairBatch,
+    first: Tensor,
+    network: Tensor,
+    base: Tensor | None,
+    history: float | None,
+    dt: float,
+) -> AgentState:
+    """Returns the agent's state at the last measured frame."""
+    since = None
+    if history is not None:
+        since = (first - round(history / dt)).clamp(min=0)
+    features = agent.driver_features_of(batch, first, since)
+    state = agent.begin(network, DriverContext(base, features))
+    return agent.burn_in(batch, first, state, since)
+
+
+class _Track:
+    """Signals of P pairs: `L - 1` measured columns, frame 0, then K columns that are simulated.
+
+    Attributes:
+        steps: K.
+        speed: of the followers, `(P, T)`; NaN where nothing was simulated yet.
+    """
+
+    def __init__(self, batch: PairBatch, first: Tensor, length: int) -> None:
+        self.steps = int((batch.lengths - 1 - first).max())
+        self._length = length
+        self._now = length - 1
+        self._lengths = batch.lengths
+        columns = torch.arange(1 - length, self.steps + 1, device=first.device)
+        self._frames = first[:, None] + columns
+        index = self._frames.clamp(min=0, max=batch.mask.shape[1] - 1)
+        self._leader_position = batch.leader_position.gather(1, index)
+        self._leader_speed = batch.leader_speed.gather(1, index)
+        self._leader_acceleration = batch.leader_acceleration.gather(1, index)
+        self._leader_length = batch.leader_length
+        self._position = batch.follower_position.gather(1, index)
+        self.speed = batch.follower_speed.gather(1, index)
+        self._acceleration = batch.follower_acceleration.gather(1, index)
+        # The agent must see nothing measured of the follower from here on.
+        for signal in (self._position, self.speed, self._acceleration):
+            signal[:, self._now + 1 :] = torch.nan
+        self._gap = self._leader_position - batch.leader_length[:, None] - self._position
+
+    def now(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Returns the last measured position, speed and acceleration of the followers, `(P,)` each."""
+        return (
+            self._position[:, self._now],
+            self.speed[:, self._now],
+            self._acceleration[:, self._now],
+        )
+
+    def history(self, begin: int) -> History:
+        """Returns the L frames up to step `begin`, `(P, L)` each."""
+        recent = slice(begin, begin + self._length)
+        return History(
+            self._leader_speed[:, recent],
+            self._leader_acceleration[:, recent],
+            self.speed[:, recent],
+            self._acceleration[:, recent],
+            self._gap[:, recent],
+        )
+
+    def leader(self, begin: int, end: int) -> Leader:
+        """Returns the leaders at steps `begin` to `end - 1`, time first."""
+        ahead = slice(self._now + begin, self._now + end)
+        return Leader(
+            self._leader_position[:, ahead].T,
+            self._leader_speed[:, ahead].T,
+            self._leader_acceleration[:, ahead].T,
+            self._leader_length,
+        )
+
+    def write(self, begin: int, end: int, position: Tensor, speed: Tensor, dt: float) -> None:
+        """Writes what was simulated between two steps, `(P, end - begin)` each."""
+        done = slice(self._now + begin + 1, self._now + end + 1)
+        before = slice(self._now + begin, self._now + end)
+        self._position[:, done] = position
+        self.speed[:, done] = speed
+        self._acceleration[:, done] = (self.speed[:, done] - self.speed[:, before]) / dt
+        leader_rear = self._leader_position[:, done] - self._leader_length[:, None]
+        self._gap[:, done] = leader_rear - self._position[:, done]
+
+    def result(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Returns speed, gap and which frames count, `(P, K + 1)` each."""
+        counted = self._frames[:, self._now :] < self._lengths[:, None]
+        counted[:, 0] = False
+        return self.speed[:, self._now :], self._gap[:, self._now :], counted

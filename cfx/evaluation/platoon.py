@@ -18,11 +18,11 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from cfx.agents.agent import Agent
 from cfx.evaluation.result import METHODS, Array, Platoon
 from cfx.metrics.safety import hard_braking_frames
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.policies.features import History
-from cfx.policies.trained import TrainedPolicy
 from cfx.simulation.rollout import Simulator, Start
 from cfx.simulation.threads import one_thread
 
@@ -144,7 +144,7 @@ class _Road:
 
 def measure_platoons(
     model: DrivingModel,
-    policies: Mapping[str, tuple[TrainedPolicy, Sequence[str]]],
+    policies: Mapping[str, tuple[Agent, Sequence[str]]],
     manoeuvre: Manoeuvre | None = None,
 ) -> Platoon | None:
     """Lets every network of every method drive a platoon of its own, and measures how a disturbance travels through it.
@@ -177,7 +177,7 @@ def measure_platoons(
 @torch.no_grad()
 @one_thread()
 def drive_platoons(
-    model: DrivingModel, policies: Sequence[TrainedPolicy], manoeuvre: Manoeuvre
+    model: DrivingModel, policies: Sequence[Agent], manoeuvre: Manoeuvre
 ) -> list[tuple[Tensor, Tensor]]:
     """Lets each network of each policy drive a platoon. It has read no history: it knows only what it sees here.
 

@@ -10,9 +10,10 @@ from pathlib import Path
 import pandas as pd
 
 from cfx import renamed
+from cfx.agents import checkpoint
+from cfx.agents.agent import Agent
 from cfx.errors import DataError
 from cfx.evaluation.result import Evaluation
-from cfx.policies.trained import TrainedPolicy
 from cfx.style.result import StyleResult
 from cfx.tracking.store import folder_of
 
@@ -34,7 +35,7 @@ class JobResult:
 
     metrics: dict[str, float]
     pairs: pd.DataFrame
-    policy: TrainedPolicy
+    policy: Agent
     figures: tuple[Path, ...]
     folder: Path
     run_id: str = ""
@@ -67,5 +68,5 @@ def load(folder_or_run: str | Path) -> JobResult:
         else:
             values[name] = float(value)
     figures = tuple(sorted((folder / "figures").glob("*.png")))
-    policy = TrainedPolicy.load(folder / "policy")
+    policy = checkpoint.load(folder / "policy")
     return JobResult(renamed.metrics(values), pairs, policy, figures, folder)

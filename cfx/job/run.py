@@ -11,6 +11,7 @@ import torch
 from rich.console import Console
 
 from cfx import registry, renamed
+from cfx.agents import checkpoint
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.settings import WindowSettings
@@ -190,7 +191,7 @@ def _keep(
 
     policy_folder = output.folder / "policy"
     further = files.write_tables(output, pairs, style, protocol_result)
-    output.run(lambda: protocol_result.policy.save(policy_folder))
+    output.run(lambda: checkpoint.save(protocol_result.policy, policy_folder))
     figures = files.write_figures(output, config, style, protocol_result)
     demo = files.write_demo(output, config, pairs, protocol_result)
     files.write_provenance(

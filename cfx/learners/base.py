@@ -13,6 +13,7 @@ from typing import ClassVar
 import pandas as pd
 from torch import Tensor
 
+from cfx.agents.scaler import Scaler
 from cfx.calibration.calibrator import Labels
 from cfx.calibration.windows import Split, WindowSettings
 from cfx.component import Component
@@ -22,7 +23,6 @@ from cfx.objectives.base import Objective
 from cfx.objectives.rmse import SpeedRmse
 from cfx.pairs import PairBatch
 from cfx.policies.base import Policy, PolicyNetwork
-from cfx.policies.trained import Scaler
 from cfx.simulation.base import BaseSimulator
 
 CURVE_COLUMNS = ["network", "epoch", "train_loss", "validation_loss"]
@@ -73,15 +73,17 @@ class TrainingResult:
         network: N trained networks, in evaluation mode.
         scaler: how their tokens are normalised.
         curves: columns network, epoch, train_loss, validation_loss (NaN where not measured).
-        base: `(N, n)`, SI units: the parameters that answers are offsets from (`cfx.policies.offsets`) for a driver who brings
-            none of his own; the networks then read tokens with the base appended, and answer in the model's `adaptation_bounds`. None:
-            answers are the parameters themselves, in its `space`.
+        base: parameters that answers refer to for drivers without a base of their own, `(N, n)`, SI
+            units; None where the head needs none.
+        head: what makes parameters of answers (`cfx.agents.heads.HEADS`); None: `offset` where there
+            is a base, otherwise `direct`.
     """
 
     network: PolicyNetwork
     scaler: Scaler
     curves: pd.DataFrame
     base: Tensor | None = None
+    head: str | None = None
 
 
 class Learner(Component):

@@ -19,10 +19,10 @@ import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from torch import Tensor
 
+from cfx.agents.placement import driver_places
 from cfx.files import atomic_write
 from cfx.learners.base import CURVE_COLUMNS
 from cfx.policies.base import PolicyNetwork
-from cfx.policies.trained import driver_places
 from cfx.progress import Task
 from cfx.simulation.threads import one_thread
 

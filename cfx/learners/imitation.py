@@ -17,13 +17,13 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
+from cfx.agents.scaler import Scaler
 from cfx.component import Settings
 from cfx.errors import DataError
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.learners.batched import BatchedModule, Grid, fit
 from cfx.policies.base import Policy, PolicyNetwork
-from cfx.policies.features import token_width, tokens
-from cfx.policies.trained import Scaler, measured_history
+from cfx.policies.features import measured_history, token_width, tokens
 from cfx.progress import Task
 
 

@@ -95,16 +95,26 @@ def of_set(
 
 
 def check_names(names: Sequence[str], known: Collection[str], what: str) -> None:
-    """Raises ConfigError if a name of `policy.{what}s` is unknown or stands twice."""
+    """Checks names that a policy's settings give.
+
+    Args:
+        names: what was given.
+        known: what there is.
+        what: one of them in words, such as `input`.
+
+    Raises:
+        ConfigError: a name is unknown or stands twice.
+    """
+    setting = f"policy.{what.replace(' ', '_')}s"
     for name in names:
         if name not in known:
             raise ConfigError(
-                f"policy.{what}s: unknown {what} '{name}'.{nearest(name, known)} Known: {', '.join(known)}."
+                f"{setting}: unknown {what} '{name}'.{nearest(name, known)}"
+                f" Known: {', '.join(known)}."
             )
     if len(set(names)) != len(names):
-        raise ConfigError(
-            f"policy.{what}s: {'an' if what[0] in 'aeiou' else 'a'} {what} stands twice in {', '.join(names)}"
-        )
+        article = "an" if what[0] in "aeiou" else "a"
+        raise ConfigError(f"{setting}: {article} {what} stands twice in {', '.join(names)}")
 
 
 def named_inputs(value: object) -> object:
@@ -128,4 +138,28 @@ def tokens(history: History, names: tuple[str, ...], summary: Summary) -> Tensor
     """Returns tokens `(*batch, f)`."""
     return torch.stack(
         [value for name in names for value in _SUMMARIES[summary](INPUTS[name](history))], dim=-1
+    )
+
+
+def measured_history(batch: PairBatch, pair: Tensor, frame: Tensor, length: int) -> History:
+    """Returns the last measured frames up to a frame; a pair's first frame stands for those before it.
+
+    Args:
+        batch: P pairs.
+        pair: which of them, `(*shape)`.
+        frame: `(*shape)`, or what broadcasts with it.
+        length: how many frames.
+
+    Returns:
+        Signals of `(*shape, length)`.
+    """
+    past = torch.arange(1 - length, 1, device=frame.device)
+    index = (frame[..., None] + past).clamp(min=0)
+    rows = pair[..., None]
+    return History(
+        batch.leader_speed[rows, index],
+        batch.leader_acceleration[rows, index],
+        batch.follower_speed[rows, index],
+        batch.follower_acceleration[rows, index],
+        batch.gap[rows, index],
     )

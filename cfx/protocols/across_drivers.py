@@ -15,14 +15,16 @@ from scipy.sparse.csgraph import connected_components
 from sklearn.model_selection import GroupKFold
 from torch import Tensor
 
+from cfx.agents.agent import Agent
+from cfx.agents.context import ContextRule
+from cfx.agents.heads.offset import shrunk
+from cfx.agents.placement import ALL
 from cfx.calibration.calibrator import Labels
 from cfx.calibration.windows import Split
 from cfx.component import Settings
 from cfx.errors import DataError
 from cfx.learners.base import TrainingData, TrainingResult
 from cfx.pairs import Pair, PairSet
-from cfx.policies.offsets import drawn
-from cfx.policies.trained import ALL, TrainedPolicy
 from cfx.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.protocols.held_out import HeldOut
 
@@ -111,7 +113,7 @@ class AcrossDrivers(Protocol):
         ).expand_as(population)
         strange = default if self.settings.base == "default" else population
         own = (
-            drawn(context.simulator.model.adaptation_space, fixed, self.settings.shrinkage)
+            shrunk(context.simulator.model.adaptation_space, fixed, self.settings.shrinkage)
             if self.settings.base == "own"
             else None
         )
@@ -186,7 +188,7 @@ class AcrossDrivers(Protocol):
         base: Tensor | None,
         labels: Labels | None,
         names: tuple[str, ...],
-    ) -> tuple[TrainedPolicy, TrainingResult]:
+    ) -> tuple[Agent, TrainingResult]:
         """Trains a network for each row of `members` `(K, P)` on these pairs' whole drives.
 
         Args:
@@ -231,12 +233,12 @@ class AcrossDrivers(Protocol):
         training_result = context.learner.fit(context.policy, training_data)
         policy = context.ready(context.policy, training_result, names)
         own = self.settings.base == "own"
-        return replace(
-            policy,
+        rule = ContextRule(
+            driver_specific=own,
             shrinkage=self.settings.shrinkage if own else 0.0,
-            own=own,
-            history=self.settings.history,
-        ), training_result
+            history_s=self.settings.history,
+        )
+        return replace(policy, context_rule=rule), training_result
 
 
 def _platoons(pairs: Sequence[Pair]) -> list[int]:
@@ -269,13 +271,13 @@ def _overlap(pairs: PairSet, fold: Tensor, *, apart: bool) -> dict[str, Any]:
     places = [int(number) for number in fold]
     tested = {pair.driver: k for pair, k in zip(pairs, places, strict=True) if k >= 0}
     # Of whom somebody learns: in which fold they do not.
-    training_result = {
+    not_trained_in = {
         pair.driver: k if k >= 0 else -2 - k for pair, k in zip(pairs, places, strict=True)
     }
     behind_trained, leaders = 0, set()
     for pair, k in zip(pairs, places, strict=True):
         leader = f"{pair.recording}/{pair.leader_id}"
-        behind_trained += k >= 0 and leader in training_result and training_result[leader] != k
+        behind_trained += k >= 0 and leader in not_trained_in and not_trained_in[leader] != k
         if leader in tested and tested[leader] not in {k, -2 - k}:
             leaders.add(leader)
     folds, count = max(places) + 1, sum(k >= 0 for k in places)

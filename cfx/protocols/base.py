@@ -14,6 +14,11 @@ import torch
 from torch import Tensor
 
 from cfx import registry
+from cfx.agents.agent import Agent
+from cfx.agents.core import AgentCore
+from cfx.agents.heads import HEADS, head_name
+from cfx.agents.heads.base import ParameterHead
+from cfx.agents.scaler import Scaler
 from cfx.calibration.calibrator import Calibrator, Labels
 from cfx.calibration.windows import Windows, WindowSettings
 from cfx.component import Component
@@ -26,7 +31,6 @@ from cfx.pairs import PairBatch, PairSet
 from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy
 from cfx.policies.features import token_width
-from cfx.policies.trained import Scaler, TrainedPolicy
 from cfx.simulation.base import BaseSimulator
 from cfx.style.result import StyleResult
 
@@ -112,7 +116,7 @@ class ProtocolContext:
         losses = self.calibrator.losses(self.batch, last, parameters, members)
         return {f"calibration/{name}/{method}": loss for name, loss in losses.items()}
 
-    def constant(self, policy: Policy, parameters: Tensor) -> TrainedPolicy:
+    def constant(self, policy: Policy, parameters: Tensor) -> Agent:
         """Makes a policy drive as built, without training: the baselines.
 
         Args:
@@ -141,7 +145,7 @@ class ProtocolContext:
 
     def ready(
         self, policy: Policy, training_result: TrainingResult, names: tuple[str, ...]
-    ) -> TrainedPolicy:
+    ) -> Agent:
         """Returns networks that are ready to drive; `names` says what each is for.
 
         Raises:
@@ -153,26 +157,37 @@ class ProtocolContext:
             len(names),
             len(self.space),
         )
-        adaptation_space = self.simulator.model.adaptation_space
-        if policy.trainable and training_result.base is None and adaptation_space != self.space:
-            log.info(
-                "model.adaptation_bounds changes nothing here: this policy answers parameters, not offsets (learner=rollout)"
-            )
-        return TrainedPolicy(
-            policy=policy,
-            network=training_result.network,
-            scaler=training_result.scaler,
+        head = self._head(policy, training_result)
+        # Constant parameters are calibrated on these pairs, too.
+        learned_from = {pair.content: pair.driver for pair in self.pairs}
+        return Agent(
+            core=AgentCore(policy, training_result.network, training_result.scaler, head),
             model_node=self.model_node,
             policy_node=self.policy_node,
-            space=self.space if training_result.base is None else adaptation_space,
             windows=self.windows,
             dt=self.simulator.dt,
             names=names,
             base=training_result.base,
-            learned_from={
-                pair.content: pair.driver for pair in self.pairs
-            },  # constants are calibrated on them, too
+            learned_from=learned_from,
         )
+
+    def _head(self, policy: Policy, training_result: TrainingResult) -> ParameterHead:
+        """Returns the head that the learner trained its networks for."""
+        has_base = training_result.base is not None
+        name = training_result.head or head_name(has_base=has_base)
+        if name not in HEADS:
+            raise PluginError(
+                f"{registry.origin(self.learner)} breaks its contract: there is no head '{name}';"
+                f" write one of {', '.join(HEADS)}"
+            )
+        model = self.simulator.model
+        head = HEADS[name].for_model(model, training_result.scaler.mean.device)
+        if policy.trainable and head.space != model.adaptation_space:
+            log.info(
+                "model.adaptation_bounds changes nothing here: this policy answers parameters,"
+                " not offsets (learner=rollout)"
+            )
+        return head
 
 
 @dataclass(frozen=True)
@@ -189,7 +204,7 @@ class ProtocolResult:
     """
 
     evaluation: Evaluation
-    policy: TrainedPolicy
+    policy: Agent
     curves: pd.DataFrame
     labels: Labels | None
     notes: Mapping[str, Any] = field(default_factory=dict)

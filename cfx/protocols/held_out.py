@@ -10,14 +10,14 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from cfx.evaluation.closed_loop import ClosedLoop, drive
+from cfx.agents.agent import Agent
+from cfx.evaluation.closed_loop import ClosedLoop, simulate_closed_loop
 from cfx.evaluation.evaluate import closed_loop_errors, evaluate
 from cfx.evaluation.platoon import measure_platoons
 from cfx.evaluation.result import Evaluation
 from cfx.pairs import PairBatch, PairSet
 from cfx.policies.default import DefaultPolicy
 from cfx.policies.fixed import FixedPolicy
-from cfx.policies.trained import TrainedPolicy
 from cfx.protocols.base import ProtocolContext
 
 
@@ -45,7 +45,7 @@ class HeldOut:
     base: Tensor | None
     strange: Tensor
     population: Tensor | None
-    policy: TrainedPolicy
+    policy: Agent
 
     def evaluation(
         self, histories: Sequence[float] = (), *, fold: Tensor | None = None
@@ -63,7 +63,7 @@ class HeldOut:
             "default": context.constant(DefaultPolicy(), defaults.expand(len(names), -1)),
             "policy": self.policy,
         }
-        platoons: dict[str, tuple[TrainedPolicy, Sequence[str]]] = {
+        platoons: dict[str, tuple[Agent, Sequence[str]]] = {
             "default": (context.constant(DefaultPolicy(), defaults[None]), ("any",)),
             "policy": (self.policy, names),
         }
@@ -72,27 +72,33 @@ class HeldOut:
             platoons["population"] = (cold_start_fraction["population"], names)
         base = self.strange if self.base is None else self.base
         loops = {
-            name: drive(
+            name: simulate_closed_loop(
                 context.simulator,
                 one,
                 batch,
                 first,
                 network,
                 base=base,
-                history=self.policy.history,
+                history=self.policy.context_rule.history_s,
             )
             for name, one in cold_start_fraction.items()
         }
         each = torch.arange(len(first), device=first.device)
-        loops["fixed"] = drive(
+        loops["fixed"] = simulate_closed_loop(
             context.simulator, context.constant(FixedPolicy(), self.fixed), batch, first, each
         )
-        if self.base is not None and self.policy.base is not None and self.policy.shrinkage > 0:
-            loops["shrunk"] = drive(
+        if (
+            self.base is not None
+            and self.policy.base is not None
+            and self.policy.context_rule.shrinkage > 0
+        ):
+            loops["shrunk"] = simulate_closed_loop(
                 context.simulator, context.constant(FixedPolicy(), self.base), batch, first, each
             )
         full_trajectory = {
-            name: drive(context.simulator, one, batch, torch.zeros_like(first), network)
+            name: simulate_closed_loop(
+                context.simulator, one, batch, torch.zeros_like(first), network
+            )
             for name, one in cold_start_fraction.items()
         }
         return evaluate(
@@ -126,7 +132,7 @@ class HeldOut:
         rows = []
         for base, values in {**bases, "population": self.strange}.items():
             for amount in (*sorted(histories), None):
-                loop = drive(
+                loop = simulate_closed_loop(
                     context.simulator,
                     self.policy,
                     batch,

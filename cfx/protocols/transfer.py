@@ -11,13 +11,14 @@ import pandas as pd
 import torch
 from pydantic import Field
 
+from cfx.agents import checkpoint
+from cfx.agents.agent import Agent
 from cfx.calibration.windows import Split
 from cfx.component import Settings
 from cfx.errors import DataError
 from cfx.files import FilePath
 from cfx.learners.base import CURVE_COLUMNS
 from cfx.pairs import PairSet
-from cfx.policies.trained import TrainedPolicy
 from cfx.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.protocols.held_out import HeldOut
 
@@ -54,14 +55,14 @@ class Transfer(Protocol):
     jobs = ("run",)
 
     @cached_property
-    def policy(self) -> TrainedPolicy:
+    def policy(self) -> Agent:
         """The policy that is tested, on the CPU.
 
         Raises:
             DataError: the folder holds none, or none for other drivers than those it was trained for.
         """
         try:
-            return TrainedPolicy.load(self.settings.run / "policy").for_unseen_drivers()
+            return checkpoint.load(self.settings.run / "policy").for_unseen_drivers()
         except DataError as error:
             raise DataError(f"protocol.run={self.settings.run}: {error}") from None
 
@@ -89,7 +90,9 @@ class Transfer(Protocol):
             network=torch.zeros(len(pairs), dtype=torch.int64, device=device),
             first=split.frame.to(device),
             fixed=fixed,
-            base=policy.base_of(fixed) if policy.base is not None and policy.own else None,
+            base=policy.base_of(fixed)
+            if policy.base is not None and policy.context_rule.driver_specific
+            else None,
             strange=start.expand(len(pairs), -1),
             population=policy.population.to(fixed.dtype) if policy.population is not None else None,
             policy=policy,
@@ -108,7 +111,7 @@ class Transfer(Protocol):
             calibration=context.calibration_metrics("fixed", split.frame, fixed),
         )
 
-    def _check(self, policy: TrainedPolicy, pairs: PairSet) -> None:
+    def _check(self, policy: Agent, pairs: PairSet) -> None:
         """Raises DataError if the policy cannot drive these pairs, or has learned from some of them."""
         where = f"protocol.run={self.settings.run}"
         if abs(pairs.dt - policy.dt) > 1e-6:
@@ -135,6 +138,6 @@ class Transfer(Protocol):
             )
 
 
-def _named_alike(policy: TrainedPolicy, pairs: PairSet) -> int:
+def _named_alike(policy: Agent, pairs: PairSet) -> int:
     """Counts drivers here who have the name of one whom the policy learned from."""
     return len({pair.driver for pair in pairs} & set(policy.learned_from.values()))

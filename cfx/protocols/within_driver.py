@@ -7,15 +7,15 @@ from typing import ClassVar, Literal
 import torch
 from pydantic import Field
 
+from cfx.agents.placement import ALL, group_by
 from cfx.calibration.windows import Split
 from cfx.component import Settings
-from cfx.evaluation.closed_loop import drive
+from cfx.evaluation.closed_loop import simulate_closed_loop
 from cfx.evaluation.evaluate import evaluate
 from cfx.evaluation.platoon import measure_platoons
 from cfx.learners.base import TrainingData
 from cfx.policies.default import DefaultPolicy
 from cfx.policies.fixed import FixedPolicy
-from cfx.policies.trained import ALL, group_by
 from cfx.protocols.base import Protocol, ProtocolContext, ProtocolResult
 
 
@@ -71,10 +71,14 @@ class WithinDriver(Protocol):
         policy = context.ready(context.policy, training_result, groups)
         first = split.frame.to(device)
         loops = {
-            name: drive(context.simulator, context.constant(constant, fixed), batch, first, own)
+            name: simulate_closed_loop(
+                context.simulator, context.constant(constant, fixed), batch, first, own
+            )
             for name, constant in {"default": DefaultPolicy(), "fixed": FixedPolicy()}.items()
         }
-        loops["policy"] = drive(context.simulator, policy, batch, first, network, base=fixed)
+        loops["policy"] = simulate_closed_loop(
+            context.simulator, policy, batch, first, network, base=fixed
+        )
         platoon = None
         if self.settings.networks == "all" and context.policy.trainable:
             default = context.constant(DefaultPolicy(), fixed[:1])

@@ -23,12 +23,13 @@ import pandas as pd
 import torch
 
 import cfx
+from cfx.agents.agent import Agent
+from cfx.agents.placement import ALL
 from cfx.config import DemoSettings, JobConfig
 from cfx.errors import DataError, SumoError
 from cfx.evaluation.result import Evaluation, PairTrajectory
 from cfx.files import atomic_write
 from cfx.pairs import Pair, PairBatch, PairSet
-from cfx.policies.trained import ALL, TrainedPolicy
 from cfx.simulators.sumo.channel import Message, receive, send
 from cfx.simulators.sumo.installed import require_sumo
 from cfx.sumo.motorway import ABREAST, Motorway, read_motorway
@@ -57,7 +58,7 @@ def write_demo(
     folder: Path,
     policy_folder: Path,
     pairs: PairSet,
-    policy: TrainedPolicy,
+    policy: Agent,
     evaluation: Evaluation,
     config: JobConfig,
 ) -> list[Path]:
@@ -131,7 +132,7 @@ class Known:
 def drive_in_sumo(
     policy_folder: Path,
     pairs: PairSet,
-    policy: TrainedPolicy,
+    policy: Agent,
     evaluation: Evaluation,
     road: Motorway,
     count: int,
@@ -232,7 +233,7 @@ def _choose(
     return [ranked[place] for place in places]
 
 
-def _networks(evaluation: Evaluation, policy: TrainedPolicy) -> dict[str, str]:
+def _networks(evaluation: Evaluation, policy: Agent) -> dict[str, str]:
     """Returns which of the policy's networks drove each pair in the evaluation."""
     table = evaluation.table.drop_duplicates("pair_id").set_index("pair_id")
     found = {}
@@ -255,13 +256,13 @@ def _base(evaluation: Evaluation, pair_id: str, known: Known) -> dict[str, float
     )
 
 
-def _since(first: int, policy: TrainedPolicy, known: Known) -> int:
+def _since(first: int, policy: Agent, known: Known) -> int:
     """Returns the frame from which on the driver is known."""
     return 0 if known.history is None else max(0, first - round(known.history / policy.dt))
 
 
 def _driver_features(
-    pair: Pair, first: int, policy: TrainedPolicy, known: Known
+    pair: Pair, first: int, policy: Agent, known: Known
 ) -> dict[str, float] | None:
     """Returns the driver features that the policy was told of a pair's driver."""
     until, since = (torch.tensor([frame]) for frame in (first, _since(first, policy, known)))
@@ -273,7 +274,7 @@ def _driver_features(
     return dict(zip(policy.policy.driver_features, driver_features[0].tolist(), strict=True))
 
 
-def _renewed(first: int, policy: TrainedPolicy, known: Known) -> int:
+def _renewed(first: int, policy: Agent, known: Known) -> int:
     """Returns the frame from which on the policy remembers: the first whole window of what it may read."""
     stride = policy.windows.stride
     return min(first, -(-_since(first, policy, known) // stride) * stride)

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from cfx.agents.agent import Agent
 from cfx.evaluation.result import Evaluation
 from cfx.figures.look import COLOURS, LABELS
 from cfx.files import atomic_write
-from cfx.policies.trained import TrainedPolicy
 from cfx.report.drive_plots import drive
 from cfx.report.figure import Plot
 from cfx.report.read import Job
@@ -31,7 +31,7 @@ def write_page(
     road: Motorway,
     shown: Sequence[Shown],
     evaluation: Evaluation,
-    policy: TrainedPolicy,
+    policy: Agent,
     source: str,
 ) -> Path:
     """Writes the page; returns its path.
@@ -57,7 +57,7 @@ def render(
     road: Motorway,
     shown: Sequence[Shown],
     evaluation: Evaluation,
-    policy: TrainedPolicy,
+    policy: Agent,
     source: str,
 ) -> str:
     """Returns the page as HTML."""

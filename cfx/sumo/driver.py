@@ -20,13 +20,19 @@ import torch
 from torch import Tensor
 
 from cfx import registry
+from cfx.agents import checkpoint
+from cfx.agents.agent import Agent, AgentState
+from cfx.agents.context import DriverContext
+from cfx.agents.core import AgentCore
+from cfx.agents.heads.direct import DirectHead
+from cfx.agents.placement import ALL
+from cfx.agents.scaler import Scaler
 from cfx.calibration.settings import WindowSettings
 from cfx.errors import DataError, ParameterError, SumoError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.policies.base import ConstantNetwork
 from cfx.policies.features import History
 from cfx.policies.fixed import FixedPolicy
-from cfx.policies.trained import ALL, PolicyState, Scaler, TrainedPolicy
 from cfx.simulation.step import advance_vehicle
 from cfx.simulation.threads import one_thread
 from cfx.tracking.store import folder_of
@@ -78,7 +84,7 @@ class Driver:
 
     def __init__(
         self,
-        policy: TrainedPolicy,
+        policy: Agent,
         *,
         network: str | None = ALL,
         look_ahead: float = 200.0,
@@ -182,13 +188,11 @@ class Driver:
                 )
             values[space.names.index(name)] = value
         unit = space.to_unit(values)[None]
-        policy = TrainedPolicy(
-            policy=FixedPolicy(),
-            network=ConstantNetwork(unit),
-            scaler=Scaler(unit.new_zeros((1, 1)), unit.new_ones((1, 1))),
+        scaler = Scaler(unit.new_zeros((1, 1)), unit.new_ones((1, 1)))
+        policy = Agent(
+            core=AgentCore(FixedPolicy(), ConstantNetwork(unit), scaler, DirectHead(space)),
             model_node={"name": type(model).__name__},
             policy_node={"name": "fixed"},
-            space=space,
             windows=WindowSettings(),
             dt=dt,
             names=(ALL,),
@@ -223,7 +227,7 @@ class Driver:
                 towards the default as in training; None: what it has for unseen drivers. Policies that answer parameters themselves
                 have no use for it.
             driver features: a driver's driver features, name -> value, where the policy was trained to know some (`policy.driver_features`;
-                `TrainedPolicy.traits_of` measures them); None: those of an unseen driver. What a vehicle does while it is watched
+                `Agent.traits_of` measures them); None: those of an unseen driver. What a vehicle does while it is watched
                 changes nothing of them.
 
         Raises:
@@ -481,12 +485,11 @@ class Driver:
         begun = self._begun(slots)
         store.state[slots] = begun.state[begun.network, begun.place]
 
-    def _begun(self, slots: Tensor) -> PolicyState:
+    def _begun(self, slots: Tensor) -> AgentState:
         """Returns the state of vehicles before their first window."""
         base = None if self.policy.base is None else self._store.base[slots]
-        return self.policy.begin(
-            self._store.network[slots], base, self._store.driver_features[slots]
-        )
+        context = DriverContext(base, self._store.driver_features[slots])
+        return self.policy.begin(self._store.network[slots], context)
 
     def _take_over(self, connection: Connection, name: str, slot: int) -> None:
         """From here on this vehicle is driven: with a new window and a new memory, however long it was watched."""
@@ -569,7 +572,7 @@ class _Store:
     driven: Tensor
 
     @classmethod
-    def of(cls, policy: TrainedPolicy, model: DrivingModel, count: int) -> _Store:
+    def of(cls, policy: Agent, model: DrivingModel, count: int) -> _Store:
         """Makes place for `count` vehicles."""
         state = policy.begin(torch.zeros(1, dtype=torch.int64)).state
         real = torch.float64
@@ -600,7 +603,7 @@ class _Store:
         )
 
 
-def _trained(run: str | Path) -> TrainedPolicy:
+def _trained(run: str | Path) -> Agent:
     """Reads the policy of a run.
 
     Raises:
@@ -609,7 +612,7 @@ def _trained(run: str | Path) -> TrainedPolicy:
     folder = folder_of(run)
     if not (folder / "policy.json").is_file():
         folder /= "policy"
-    policy = TrainedPolicy.load(folder)
+    policy = checkpoint.load(folder)
     trained = json.loads((folder / "policy.json").read_text(encoding="utf-8"))["parameters"]
     if tuple(trained) != policy.space.names:
         raise DataError(

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from cfx.agents.placement import ALL
 from cfx.errors import DataError
-from cfx.policies.trained import ALL
 from cfx.sumo.driver import Connection, Driver
 
 

@@ -13,9 +13,9 @@ class ServedPolicy(PythonModel):
     """Measured history in the tidy pair layout in; `pair_id` and the parameters of the next window out, a row per pair."""
 
     def load_context(self, context: PythonModelContext) -> None:
-        from cfx.policies.trained import TrainedPolicy
+        from cfx.agents import checkpoint
 
-        self._policy = TrainedPolicy.load(context.artifacts["policy"])
+        self._policy = checkpoint.load(context.artifacts["policy"])
 
     def predict(
         self,

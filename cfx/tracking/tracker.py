@@ -124,7 +124,7 @@ class Tracker:
         """Logs a saved policy as a model: `mlflow.pyfunc.load_model(tracker.model_uri).predict(frame)`.
 
         Args:
-            folder: what `TrainedPolicy.save` wrote.
+            folder: what `Agent.save` wrote.
         """
 
     def how_to_open(self) -> tuple[str, ...]:

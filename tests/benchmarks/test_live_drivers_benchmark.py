@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from cfx.agents import checkpoint
 from cfx.simulators.sumo.network import network
 from tests.sumo.policies import adaptive
 
@@ -49,7 +50,7 @@ def test_three_hundred_live_drivers(benchmark, tmp_path: Path) -> None:
         '<time><step-length value="0.1"/></time></configuration>'
     )
     for name in ("krauss", "w99"):
-        adaptive({"name": name}).save(tmp_path / name / "policy")
+        checkpoint.save(adaptive({"name": name}), tmp_path / name / "policy")
 
     def run() -> list[float]:
         command = [sys.executable, "-c", SCRIPT, str(SECONDS)]

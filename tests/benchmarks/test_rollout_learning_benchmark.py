@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 import torch
 
+from cfx.agents.heads.offset import NONE
 from cfx.calibration.windows import Split, WindowSettings
 from cfx.learners.base import TrainingData
 from cfx.learners.rollout import RolloutModule, RolloutSettings
@@ -24,7 +25,6 @@ from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.pairs import PairBatch
 from cfx.policies.gru import GruPolicy
-from cfx.policies.offsets import NONE
 from cfx.simulation.rollout import Simulator
 from cfx.simulation.threads import one_thread
 from tests.drives import wavy_pairs

@@ -8,8 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from cfx.agents.agent import Agent
+from cfx.agents.core import AgentCore
+from cfx.agents.heads.direct import DirectHead
+from cfx.agents.scaler import Scaler
 from cfx.calibration.windows import WindowSettings
-from cfx.evaluation.closed_loop import ClosedLoop, drive
+from cfx.evaluation.closed_loop import ClosedLoop, simulate_closed_loop
 from cfx.evaluation.evaluate import evaluate
 from cfx.models.base import DrivingModel, Leader
 from cfx.models.krauss import Krauss
@@ -18,29 +22,26 @@ from cfx.pairs import PairBatch
 from cfx.policies.base import ConstantNetwork, Policy
 from cfx.policies.fixed import FixedPolicy
 from cfx.policies.gru import GruPolicy
-from cfx.policies.trained import Scaler, TrainedPolicy
 from cfx.simulation.rollout import Simulator, Start, simulate
 from cfx.style.result import StyleResult
 from tests.drives import wavy_pairs
 
 
-def constant(model: DrivingModel, parameters: Tensor) -> TrainedPolicy:
+def constant(model: DrivingModel, parameters: Tensor) -> Agent:
     unit = model.space.to_unit(parameters)
     count = len(unit)
-    return TrainedPolicy(
-        FixedPolicy(),
-        ConstantNetwork(unit),
-        Scaler(torch.zeros((count, 1)).double(), torch.ones((count, 1)).double()),
+    scaler = Scaler(torch.zeros((count, 1)).double(), torch.ones((count, 1)).double())
+    return Agent(
+        AgentCore(FixedPolicy(), ConstantNetwork(unit), scaler, DirectHead(model.space)),
         {"name": "krauss"},
         {"name": "fixed"},
-        model.space,
         WindowSettings(),
         0.1,
         tuple(f"p{i}" for i in range(count)),
     )
 
 
-def adaptive(model: DrivingModel, policy: Policy, networks: int, features: int) -> TrainedPolicy:
+def adaptive(model: DrivingModel, policy: Policy, networks: int, features: int) -> Agent:
     network = policy.build(
         features,
         model.space.to_unit(model.space.defaults()),
@@ -49,13 +50,10 @@ def adaptive(model: DrivingModel, policy: Policy, networks: int, features: int) 
     )
     scaler = Scaler(torch.full((networks, features), 8.0), torch.full((networks, features), 3.0))
     names = tuple(f"p{i}" for i in range(networks))
-    return TrainedPolicy(
-        policy,
-        network.eval(),
-        scaler,
+    return Agent(
+        AgentCore(policy, network.eval(), scaler, DirectHead(model.space)),
         {"name": "krauss"},
         {"name": "gru"},
-        model.space,
         WindowSettings(),
         0.1,
         names,
@@ -69,7 +67,7 @@ def test_true_parameters_drive_exactly_like_the_driver(model: DrivingModel) -> N
     true = true.clamp(low, high)
     pairs = wavy_pairs(model, true)
     batch = PairBatch.of(pairs)
-    loop = drive(
+    loop = simulate_closed_loop(
         Simulator(model, 0.1),
         constant(model, true),
         batch,
@@ -90,7 +88,9 @@ def test_constant_parameters_are_the_plain_rollout() -> None:
         wavy_pairs(model, torch.tensor([[1.5, 0.1], [3.0, 0.5]], dtype=torch.float64))
     )
     first = torch.tensor([150, 150])
-    loop = drive(Simulator(model, 0.1), constant(model, parameters), batch, first, torch.arange(2))
+    loop = simulate_closed_loop(
+        Simulator(model, 0.1), constant(model, parameters), batch, first, torch.arange(2)
+    )
     leader = Leader(
         batch.leader_position[:, 150:],
         batch.leader_speed[:, 150:],
@@ -115,7 +115,9 @@ def closed_loop_of(batch: PairBatch, model: DrivingModel, first: Tensor) -> Clos
         len(batch),
         15,
     )
-    return drive(Simulator(model, 0.1), policy, batch, first, torch.arange(len(batch)))
+    return simulate_closed_loop(
+        Simulator(model, 0.1), policy, batch, first, torch.arange(len(batch))
+    )
 
 
 def test_the_policy_never_sees_the_measured_follower_of_the_test_part() -> None:
@@ -160,10 +162,12 @@ def test_a_pair_drives_the_same_whatever_drives_beside_it() -> None:
     true = torch.tensor([[1.5, 0.1], [3.0, 0.5], [2.0, 0.0]], dtype=torch.float64)
     batch = PairBatch.of(wavy_pairs(model, true))
     policy = adaptive(model, GruPolicy(start="middle"), 3, 10)
-    together = drive(
+    together = simulate_closed_loop(
         Simulator(model, 0.1), policy, batch, torch.tensor([150, 200, 100]), torch.arange(3)
     )
-    alone = drive(Simulator(model, 0.1), policy, batch[1:2], torch.tensor([200]), torch.tensor([1]))
+    alone = simulate_closed_loop(
+        Simulator(model, 0.1), policy, batch[1:2], torch.tensor([200]), torch.tensor([1])
+    )
     steps = alone.speed.shape[1]
     torch.testing.assert_close(together.speed[1:2, :steps], alone.speed, atol=1e-5, rtol=1e-5)
 
@@ -174,10 +178,10 @@ def test_several_drivers_share_one_network() -> None:
         wavy_pairs(model, torch.tensor([[1.5, 0.1], [3.0, 0.5]], dtype=torch.float64))
     )
     shared = adaptive(model, GruPolicy(start="middle"), 1, 10)
-    both = drive(
+    both = simulate_closed_loop(
         Simulator(model, 0.1), shared, batch, torch.tensor([150, 150]), torch.tensor([0, 0])
     )
-    second = drive(
+    second = simulate_closed_loop(
         Simulator(model, 0.1), shared, batch[1:2], torch.tensor([150]), torch.tensor([0])
     )
     torch.testing.assert_close(both.parameters[1:2], second.parameters, atol=1e-5, rtol=1e-5)
@@ -191,21 +195,23 @@ def test_the_table_says_what_the_loops_did() -> None:
     first = torch.tensor([150, 200])
     simulator = Simulator(model, 0.1)
     loops = {
-        "default": drive(
+        "default": simulate_closed_loop(
             simulator,
             constant(model, model.space.defaults().expand(2, 2)),
             batch,
             first,
             torch.arange(2),
         ),
-        "fixed": drive(
+        "fixed": simulate_closed_loop(
             simulator,
             constant(model, torch.tensor([[4.0, 0.1], [4.0, 0.1]]).double()),
             batch,
             first,
             torch.arange(2),
         ),
-        "policy": drive(simulator, constant(model, true), batch, first, torch.arange(2)),
+        "policy": simulate_closed_loop(
+            simulator, constant(model, true), batch, first, torch.arange(2)
+        ),
     }
     style = StyleResult(
         pd.DataFrame({"driver": [p.driver for p in pairs], "score": [0.2, 0.8], "cluster": [0, 2]}),
@@ -233,7 +239,7 @@ def test_a_collision_is_counted() -> None:
     pairs = wavy_pairs(model, torch.tensor([[1.5, 0.1]], dtype=torch.float64))
     batch = PairBatch.of(pairs)
     first = torch.tensor([150])
-    loop = drive(
+    loop = simulate_closed_loop(
         Simulator(model, 0.1),
         constant(model, torch.tensor([[1.5, 0.1]]).double()),
         batch,

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.evaluation.closed_loop import drive
+from cfx.evaluation.closed_loop import simulate_closed_loop
 from cfx.evaluation.platoon import (
     LENGTH,
     VEHICLES,
@@ -133,7 +133,9 @@ def test_each_vehicle_drives_as_it_would_alone_behind_the_one_before() -> None:
             torch.ones(2, frames).bool(),
             0.1,
         )
-        alone = drive(Simulator(model, 0.1), policy, batch, torch.zeros(2).long(), torch.arange(2))
+        alone = simulate_closed_loop(
+            Simulator(model, 0.1), policy, batch, torch.zeros(2).long(), torch.arange(2)
+        )
         torch.testing.assert_close(alone.speed, own, atol=1e-5, rtol=0)
         torch.testing.assert_close(alone.gap, gap[vehicle - 1], atol=1e-4, rtol=0)
 

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from cfx.agents.placement import group_by
 from cfx.calibration.calibrator import Labels
 from cfx.calibration.windows import Split, Windows, WindowSettings
 from cfx.errors import DataError
@@ -13,7 +14,6 @@ from cfx.learners.imitation import ImitationLearner
 from cfx.models.krauss import Krauss
 from cfx.pairs import PairBatch
 from cfx.policies.gru import GruPolicy
-from cfx.policies.trained import group_by
 from cfx.simulation.rollout import Simulator
 from tests.drives import wavy_pairs
 

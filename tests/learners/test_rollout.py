@@ -10,9 +10,13 @@ import pandas as pd
 import pytest
 import torch
 
+from cfx.agents.agent import Agent
+from cfx.agents.core import AgentCore
+from cfx.agents.heads import HEADS, head_name
+from cfx.agents.heads.offset import coordinates
 from cfx.calibration.windows import Split, WindowSettings
 from cfx.errors import ConfigError
-from cfx.evaluation.closed_loop import ClosedLoop, drive
+from cfx.evaluation.closed_loop import ClosedLoop, simulate_closed_loop
 from cfx.learners.base import TrainingData, TrainingResult
 from cfx.learners.rollout import RolloutLearner, RolloutModule, RolloutSettings
 from cfx.learners.rollout.dataset import BaseErrors, RolloutBatch, RolloutDataset, RolloutInputs
@@ -27,8 +31,6 @@ from cfx.policies.driver_features import measure
 from cfx.policies.ensemble import Ensemble
 from cfx.policies.gru import GruPolicy
 from cfx.policies.lstm import LstmPolicy
-from cfx.policies.offsets import coordinates
-from cfx.policies.trained import TrainedPolicy
 from cfx.simulation.rollout import Simulator
 from tests.drives import wavy_pairs
 
@@ -81,15 +83,13 @@ def training_data(
     )
 
 
-def ready(training_result: TrainingResult, dataset: TrainingData, policy: Policy) -> TrainedPolicy:
+def ready(training_result: TrainingResult, dataset: TrainingData, policy: Policy) -> Agent:
     model, names = dataset.simulator.model, dataset.names
-    return TrainedPolicy(
-        policy,
-        training_result.network,
-        training_result.scaler,
+    head = HEADS[head_name(has_base=training_result.base is not None)].for_model(model)
+    return Agent(
+        AgentCore(policy, training_result.network, training_result.scaler, head),
         {},
         {},
-        model.space,
         WINDOWS,
         0.1,
         names,
@@ -105,7 +105,7 @@ def loop(
     **options: Any,
 ) -> ClosedLoop:
     frames = torch.full_like(dataset.network, first)
-    return drive(
+    return simulate_closed_loop(
         dataset.simulator,
         ready(training_result, dataset, policy),
         dataset.batch,

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from cfx import hydra_source, registry
+from cfx.agents.heads.offset import moved
 from cfx.errors import ConfigError, ParameterError
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
-from cfx.policies.offsets import moved
 
 
 def test_reach_moves_bounds_outwards_for_policies_alone() -> None:

@@ -16,14 +16,16 @@ from pydantic import ValidationError
 from sklearn.linear_model import Ridge
 
 import cfx
+from cfx.agents import checkpoint
+from cfx.agents.agent import Agent
+from cfx.agents.context import DriverContext
 from cfx.datasets.tidy import write_tidy
 from cfx.errors import ConfigError
 from cfx.models.krauss import Krauss
 from cfx.pairs import PairBatch
 from cfx.policies.driver_features import DRIVER_FEATURES, LEAST, MOVING, measure
-from cfx.policies.features import History
+from cfx.policies.features import History, measured_history
 from cfx.policies.gru import GruPolicy
-from cfx.policies.trained import TrainedPolicy, measured_history
 from tests.drives import straight_pairs, wavy_pairs
 from tests.sumo.policies import adaptive
 
@@ -115,7 +117,7 @@ def test_who_was_hardly_measured_or_stood_is_unknown() -> None:
     assert measured(moving, 0, 200)[0, :-1].tolist() == pytest.approx(still, abs=1e-9)
 
 
-def one_that_knows() -> TrainedPolicy:
+def one_that_knows() -> Agent:
     """Two networks for whom an unknown driver feature is 6, the mean of those they learned from."""
     return adaptive(
         {"name": "krauss"},
@@ -125,7 +127,7 @@ def one_that_knows() -> TrainedPolicy:
     )
 
 
-def first_answer(policy: TrainedPolicy, driver_features: list[float] | None) -> list[float]:
+def first_answer(policy: Agent, driver_features: list[float] | None) -> list[float]:
     now = History(
         *(
             torch.full((1, policy.windows.length), value).double()
@@ -133,9 +135,9 @@ def first_answer(policy: TrainedPolicy, driver_features: list[float] | None) -> 
         )
     )
     told = None if driver_features is None else torch.tensor([driver_features]).double()
-    return policy.act(now, policy.begin(torch.ones(1, dtype=torch.long), driver_features=told))[0][
-        0
-    ].tolist()
+    return policy.act(
+        now, policy.begin(torch.ones(1, dtype=torch.long), DriverContext(None, told))
+    )[0][0].tolist()
 
 
 def test_a_stranger_is_taken_for_the_mean_of_those_who_were_learned_from() -> None:
@@ -150,14 +152,14 @@ def test_a_stranger_is_taken_for_the_mean_of_those_who_were_learned_from() -> No
 
 def test_a_saved_policy_knows_the_same_traits(tmp_path: Path) -> None:
     policy = one_that_knows()
-    policy.save(tmp_path)
-    for again in (TrainedPolicy.load(tmp_path), TrainedPolicy.load(tmp_path).for_unseen_drivers()):
+    checkpoint.save(policy, tmp_path)
+    for again in (checkpoint.load(tmp_path), checkpoint.load(tmp_path).for_unseen_drivers()):
         now = History(
             *(torch.full((1, 5), value).double() for value in (8.0, 0.1, 9.0, -0.2, 15.0))
         )
         network = torch.tensor([len(again.names) - 1])
         answer, _ = again.act(
-            now, again.begin(network, driver_features=torch.tensor([[0.7, -0.5]]).double())
+            now, again.begin(network, DriverContext(None, torch.tensor([[0.7, -0.5]]).double()))
         )
         assert answer[0].tolist() == pytest.approx(first_answer(policy, [0.7, -0.5]), rel=1e-6)
 
@@ -169,7 +171,9 @@ def test_whoever_asks_with_a_table_is_answered_with_its_drivers_traits(tmp_path:
     until, network = BATCH.lengths - 1, torch.zeros(3, dtype=torch.long)
     chosen = {}
     for driver_features in (policy.driver_features_of(BATCH, until), None):
-        state = policy.read(BATCH, until, policy.begin(network, driver_features=driver_features))
+        state = policy.burn_in(
+            BATCH, until, policy.begin(network, DriverContext(None, driver_features))
+        )
         now = measured_history(BATCH, torch.arange(3), until, policy.windows.length)
         chosen[driver_features is None] = policy.act(now, state)[0][:, 0].tolist()
     found = policy.predict_frame(table)["t_r"].tolist()

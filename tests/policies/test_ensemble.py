@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from cfx.agents.heads.offset import NONE
 from cfx.policies.base import ConstantNetwork, Policy, PolicyNetwork
 from cfx.policies.ensemble import Ensemble
 from cfx.policies.gru import GruPolicy
-from cfx.policies.offsets import NONE
 from cfx.testing.checks import policies as checks
 
 

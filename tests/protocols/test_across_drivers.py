@@ -397,7 +397,7 @@ def test_a_job_learns_by_rollout_and_tells_how_much_history_matters(tmp_path: Pa
     again = cfx.load(tmp_path / "one").policy
     assert again.base is not None
     assert torch.equal(again.base, result.policy.base)  # type: ignore[arg-type]  # it has one
-    assert again.shrinkage == result.policy.shrinkage == 0.7
+    assert again.context_rule.shrinkage == result.policy.context_rule.shrinkage == 0.7
     assert isinstance(again.network, Ensemble)
     assert again.network.size == 2
     kept = result.policy.network.state_dict()

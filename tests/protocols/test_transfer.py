@@ -12,12 +12,13 @@ import torch
 import yaml
 
 import cfx
+from cfx.agents import checkpoint
+from cfx.agents.placement import ALL
 from cfx.datasets.synthetic import SyntheticDataset
 from cfx.datasets.tidy import write_tidy
 from cfx.errors import CfxError, DataError, TrackingError
-from cfx.evaluation.closed_loop import drive
+from cfx.evaluation.closed_loop import simulate_closed_loop
 from cfx.pairs import PairBatch, PairSet
-from cfx.policies.trained import ALL, TrainedPolicy
 from cfx.protocols.base import Protocol
 from cfx.protocols.transfer import Transfer
 from cfx.simulation.rollout import Simulator
@@ -96,11 +97,13 @@ def test_it_drives_with_the_network_of_all_from_the_populations_parameters(
     cold_start_fraction: Path, tmp_path: Path
 ) -> None:
     result = transferred(cold_start_fraction, tmp_path)
-    policy = TrainedPolicy.load(cold_start_fraction / "policy")
+    policy = checkpoint.load(cold_start_fraction / "policy")
     batch = PairBatch.of(elsewhere())
     number = torch.full((3,), policy.names.index(ALL))
     model = cfx.get("model", "krauss")()
-    loop = drive(Simulator(model, 0.1), policy, batch, torch.zeros(3, dtype=torch.int64), number)
+    loop = simulate_closed_loop(
+        Simulator(model, 0.1), policy, batch, torch.zeros(3, dtype=torch.int64), number
+    )
     error = loop.speed - batch.follower_speed[:, : loop.speed.shape[1]]
     rows = result.pairs[result.pairs.method == "policy"]
     torch.testing.assert_close(
@@ -262,6 +265,6 @@ def test_a_job_that_drives_a_saved_policy_hands_it_on(
     twice = transferred(once.folder, tmp_path / "twice")
     pd.testing.assert_frame_equal(twice.pairs, once.pairs)
     assert (
-        TrainedPolicy.load(twice.folder / "policy").learned_from
-        == TrainedPolicy.load(cold_start_fraction / "policy").learned_from
+        checkpoint.load(twice.folder / "policy").learned_from
+        == checkpoint.load(cold_start_fraction / "policy").learned_from
     )

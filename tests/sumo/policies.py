@@ -8,10 +8,14 @@ from typing import Any
 import torch
 
 from cfx import registry
+from cfx.agents.agent import Agent
+from cfx.agents.core import AgentCore
+from cfx.agents.heads.direct import DirectHead
+from cfx.agents.heads.offset import OffsetHead
+from cfx.agents.scaler import Scaler
 from cfx.calibration.windows import WindowSettings
 from cfx.models.base import DrivingModel
 from cfx.policies.gru import GruPolicy
-from cfx.policies.trained import Scaler, TrainedPolicy
 
 INPUTS = ("leader_speed", "follower_speed", "gap", "follower_acceleration", "leader_acceleration")
 
@@ -24,7 +28,7 @@ def adaptive(
     length: int = 5,
     offsets: bool = False,
     driver_features: tuple[str, ...] = (),
-) -> TrainedPolicy:
+) -> Agent:
     """Returns a GRU for each name; what it chooses depends on all it sees.
 
     With `offsets` it answers offsets, from the middle between the bounds for who brings no base.
@@ -47,10 +51,9 @@ def adaptive(
         torch.full((networks, features), 6.0).double(),
         torch.full((networks, features), 4.0).double(),
     )
-    return TrainedPolicy(
-        policy=policy,
-        network=network,
-        scaler=scaler,
+    head = OffsetHead(model.space) if offsets else DirectHead(model.space)
+    return Agent(
+        core=AgentCore(policy, network, scaler, head),
         model_node=dict(node),
         policy_node={
             "name": "gru",
@@ -58,7 +61,6 @@ def adaptive(
             "driver_features": list(driver_features),
             "start": "middle",
         },
-        space=model.space,
         windows=WindowSettings(length=length, stride=5),
         dt=dt,
         names=names,

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 import cfx
+from cfx.agents import checkpoint
 from cfx.config import DemoSettings
 from cfx.errors import ConfigError, DataError, SumoError
 from cfx.simulators.sumo.channel import Message
@@ -221,7 +222,7 @@ def test_what_sumo_refuses_is_one_sentence() -> None:
         "pairs": [pair],
     }
     with tempfile.TemporaryDirectory() as folder:
-        adaptive({"name": "krauss"}).save(Path(folder))
+        checkpoint.save(adaptive({"name": "krauss"}), Path(folder))
         with pytest.raises(
             SumoError,
             match=r"^SUMO lost a vehicle or refuses one \(The edge 'nowhere' within the route 'from0'",

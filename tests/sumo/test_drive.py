@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from cfx import cli
+from cfx.agents import checkpoint
 from cfx.console import ConsoleHandler
 from cfx.errors import ConfigError
 from cfx.sumo.drive import Driven, Tally, parse_drivers, report
@@ -47,7 +48,7 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / f"{name}.sumocfg").write_text(CONFIGURATION.format(net=SHIPPED, **values))
     (folder / "torn.sumocfg").write_text("<configuration><input><net-file")
     for name, model in (("calm", "krauss"), ("hasty", "w99")):
-        adaptive({"name": model}).save(folder / name / "policy")
+        checkpoint.save(adaptive({"name": model}), folder / name / "policy")
     return folder
 
 

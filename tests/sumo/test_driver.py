@@ -11,8 +11,15 @@ import torch
 from torch import Tensor
 
 import cfx.sumo
+from cfx.agents import checkpoint
+from cfx.agents.agent import Agent
+from cfx.agents.context import ContextRule
+from cfx.agents.core import AgentCore
+from cfx.agents.heads.direct import DirectHead
+from cfx.agents.heads.offset import shrunk
+from cfx.agents.scaler import Scaler
 from cfx.errors import DataError, ParameterError, SumoError
-from cfx.evaluation.closed_loop import drive
+from cfx.evaluation.closed_loop import simulate_closed_loop
 from cfx.evaluation.evaluate import evaluate
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
@@ -20,8 +27,6 @@ from cfx.pairs import PairBatch
 from cfx.policies.base import ConstantNetwork
 from cfx.policies.default import DefaultPolicy
 from cfx.policies.fixed import FixedPolicy
-from cfx.policies.offsets import drawn
-from cfx.policies.trained import Scaler, TrainedPolicy
 from cfx.simulation.rollout import Simulator
 from cfx.style.entropy import measure_style
 from cfx.style.result import StyleResult
@@ -112,16 +117,16 @@ def platoon(count: int, **settings: Any) -> Road:
     )
 
 
-def counted(policy: TrainedPolicy, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def counted(policy: Agent, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Returns a list that grows by the number of drivers at each call of the policy."""
     calls: list[int] = []
-    original = TrainedPolicy.act
+    original = Agent.act
 
-    def act(self: TrainedPolicy, history: Any, state: Any) -> tuple[Tensor, Any]:
+    def act(self: Agent, history: Any, state: Any) -> tuple[Tensor, Any]:
         calls.append(len(history.gap))
         return original(self, history, state)
 
-    monkeypatch.setattr(TrainedPolicy, "act", act)
+    monkeypatch.setattr(Agent, "act", act)
     return calls
 
 
@@ -282,9 +287,9 @@ def test_traits_are_told_by_name_to_a_policy_that_knows_them() -> None:
 def test_a_drivers_own_parameters_are_drawn_towards_the_default_as_in_training() -> None:
     plain = adaptive({"name": "krauss"}, offsets=True)
     own, found = torch.tensor([[4.0, 1.0]], dtype=torch.float64), []
-    middle = drawn(plain.space, own, 0.5)[0].tolist()
+    middle = shrunk(plain.space, own, 0.5)[0].tolist()
     for policy, values in (
-        (replace(plain, shrinkage=0.5), own[0].tolist()),
+        (replace(plain, context_rule=ContextRule(shrinkage=0.5)), own[0].tolist()),
         (plain, middle),
         (plain, own[0].tolist()),
     ):
@@ -320,7 +325,7 @@ def test_what_cannot_be_driven_is_one_sentence(tmp_path: Path) -> None:
     untold = adaptive(node)
     with pytest.raises(DataError, match="SUMO alone drives"):
         Driver(untold)
-    adaptive({"name": "krauss"}, ("p1", "p2")).save(tmp_path / "policy")
+    checkpoint.save(adaptive({"name": "krauss"}, ("p1", "p2")), tmp_path / "policy")
     with pytest.raises(
         DataError,
         match=r"has 2 networks, each for one driver \(p1, \.\.\.\), and none for unseen drivers",
@@ -347,7 +352,7 @@ def test_a_fleet_drives_each_type_by_its_own_and_finds_who_comes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, model in (("calm", "krauss"), ("hasty", "w99")):
-        adaptive({"name": model}).save(tmp_path / name / "policy")
+        checkpoint.save(adaptive({"name": model}), tmp_path / name / "policy")
     fleet = Fleet.load(
         {"calm": tmp_path / "calm", "normal": tmp_path / "calm", "hasty": tmp_path / "hasty"}
     )
@@ -393,17 +398,16 @@ def test_the_package_gives_the_driver_and_imports_no_sumo() -> None:
         _ = cfx.sumo.Rider
 
 
-def _baseline(policy: TrainedPolicy, component: Any, pairs: int) -> TrainedPolicy:
+def _baseline(policy: Agent, component: Any, pairs: int) -> Agent:
     unit = policy.space.to_unit(policy.space.defaults()).expand(pairs, -1)
     blank = torch.zeros((pairs, 1)).double()
     names = tuple(str(i) for i in range(pairs))
-    return TrainedPolicy(
-        policy=component,
-        network=ConstantNetwork(unit),
-        scaler=Scaler(blank, blank + 1),
+    return Agent(
+        core=AgentCore(
+            component, ConstantNetwork(unit), Scaler(blank, blank + 1), DirectHead(policy.space)
+        ),
         model_node=policy.model_node,
         policy_node={"name": "default"},
-        space=policy.space,
         windows=policy.windows,
         dt=policy.dt,
         names=names,
@@ -450,13 +454,19 @@ def test_in_sumo_a_policy_drives_as_in_memory(
         offsets=history is not None,
         driver_features=driver_features,
     )
-    policy.save(tmp_path / "policy")
+    checkpoint.save(policy, tmp_path / "policy")
     first, own = torch.tensor([0, 215, 100, frames - 100]), torch.arange(4)
     simulator, base = Simulator(model, 0.1), model.space.defaults().expand(4, -1)
     loops = {
-        "policy": drive(simulator, policy, batch, first, own, base=base, history=history),
-        "default": drive(simulator, _baseline(policy, DefaultPolicy(), 4), batch, first, own),
-        "fixed": drive(simulator, _baseline(policy, FixedPolicy(), 4), batch, first, own),
+        "policy": simulate_closed_loop(
+            simulator, policy, batch, first, own, base=base, history=history
+        ),
+        "default": simulate_closed_loop(
+            simulator, _baseline(policy, DefaultPolicy(), 4), batch, first, own
+        ),
+        "fixed": simulate_closed_loop(
+            simulator, _baseline(policy, FixedPolicy(), 4), batch, first, own
+        ),
     }
     evaluation = evaluate(pairs, batch, first, loops, model.space, style_of(pairs), seed=0)
     known = Known("fixed", history)

@@ -10,10 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from cfx.agents.scaler import Scaler
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.policies.base import Policy, PolicyNetwork
-from cfx.policies.features import tokens
-from cfx.policies.trained import Scaler, measured_history
+from cfx.policies.features import measured_history, tokens
 from cfx.testing.checks import learners as checks
 
 EPOCHS = 12

@@ -17,6 +17,11 @@ import pandas as pd
 import pytest
 import torch
 
+from cfx.agents import checkpoint
+from cfx.agents.agent import Agent
+from cfx.agents.core import AgentCore
+from cfx.agents.heads.direct import DirectHead
+from cfx.agents.scaler import Scaler
 from cfx.calibration.windows import WindowSettings
 from cfx.config import JobConfig
 from cfx.datasets.tidy import write_tidy
@@ -24,7 +29,6 @@ from cfx.errors import TrackingError
 from cfx.models.krauss import Krauss
 from cfx.policies.features import token_width
 from cfx.policies.gru import GruPolicy
-from cfx.policies.trained import Scaler, TrainedPolicy
 from cfx.tracking import provenance
 from cfx.tracking.store import download_run, quiet, translate_errors
 from cfx.tracking.tracker import CURVE_POINTS, MlflowTracker, Tracker, sweep_link
@@ -362,18 +366,17 @@ def saved_policy(tmp_path: Path) -> SimpleNamespace:
     model, policy, windows = Krauss(), GruPolicy(hidden_size=8), WindowSettings()
     width = token_width(policy.inputs, policy.summary, windows.length)
     blank = torch.zeros((1, 2))
-    trained = TrainedPolicy(
-        policy=policy,
-        network=policy.build(width, blank[0], blank, torch.Generator().manual_seed(3)).eval(),
-        scaler=Scaler(torch.zeros((1, width)), torch.ones((1, width))),
+    network = policy.build(width, blank[0], blank, torch.Generator().manual_seed(3)).eval()
+    scaler = Scaler(torch.zeros((1, width)), torch.ones((1, width)))
+    trained = Agent(
+        core=AgentCore(policy, network, scaler, DirectHead(model.space)),
         model_node={"name": "krauss"},
         policy_node={"name": "gru", "hidden_size": 8},
-        space=model.space,
         windows=windows,
         dt=0.1,
         names=("all",),
     )
-    trained.save(tmp_path / "policy")
+    checkpoint.save(trained, tmp_path / "policy")
     pairs = wavy_pairs(model, torch.tensor([[1.5, 0.1], [2.0, 0.3]]).double(), frames=60)
     write_tidy(pairs, tmp_path / "pairs.parquet")
     return SimpleNamespace(
@@ -419,7 +422,7 @@ def test_a_job_comes_back_from_its_run(
     assert (folder / "metrics.json").read_text() == "{}"
     expected = saved_policy.policy.predict_frame(saved_policy.frame)
     pd.testing.assert_frame_equal(
-        TrainedPolicy.load(folder / "policy").predict_frame(saved_policy.frame), expected
+        checkpoint.load(folder / "policy").predict_frame(saved_policy.frame), expected
     )
     for wrong, message in (
         ("nothing", "neither a job's output folder nor the id"),

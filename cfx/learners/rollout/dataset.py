@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from cfx.agents.heads.offset import coordinates
+from cfx.agents.scaler import Scaler
 from cfx.learners.base import TrainingData
 from cfx.learners.batched import Grid
 from cfx.learners.rollout.step import LeaderWindow, LoopState, WindowStep
@@ -20,9 +22,7 @@ from cfx.models.base import Leader
 from cfx.pairs import PairBatch
 from cfx.policies.base import Policy
 from cfx.policies.driver_features import measure
-from cfx.policies.features import tokens
-from cfx.policies.offsets import coordinates
-from cfx.policies.trained import Scaler, measured_history
+from cfx.policies.features import measured_history, tokens
 from cfx.simulation.rollout import Start
 
 _FEW_DRIVERS = 5

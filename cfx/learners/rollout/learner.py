@@ -26,6 +26,8 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
+from cfx.agents.heads.offset import NONE
+from cfx.agents.scaler import Scaler
 from cfx.component import Settings, content_key
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.learners.batched import BatchedModule, fit
@@ -42,8 +44,6 @@ from cfx.models.direct import Direct
 from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.ensemble import Ensemble
-from cfx.policies.offsets import NONE
-from cfx.policies.trained import Scaler
 from cfx.progress import Task
 from cfx.simulation.rollout import Compile, Simulator, can_compile
 
@@ -184,7 +184,7 @@ class RolloutSettings(Settings):
 class RolloutLearner(Learner):
     """Back-propagates the error of closed-loop drives into the policy.
 
-    Networks answer offsets (`cfx.policies.offsets`): untrained, each driver is driven by his base parameters, so training starts
+    Networks answer offsets (`cfx.agents.heads.offset`): untrained, each driver is driven by his base parameters, so training starts
     from a fixed model. Before a drive the policy reads the driver's measured history up to there; unseen drivers' drives begin with
     none. The drivers of all networks (at most `drivers` of each) drive at once, from random measured states. Models with regimes
     are smoothed meanwhile, and validated as they are; they can be `taught` first, by networks that set the acceleration itself.

@@ -1,7 +1,7 @@
 """One window of a closed loop under gradients: the policy chooses, the model drives, for all networks and drives at once.
 
 This is what training by rollout repeats thousands of times, so it is one function of plain tensors that `torch.compile` turns
-into few kernels, forwards and backwards. It is the same loop as `cfx.evaluation.closed_loop.drive`; a test holds them equal.
+into few kernels, forwards and backwards. It is the same loop as `cfx.evaluation.closed_loop.simulate_closed_loop`; a test holds them equal.
 
 Shapes: N networks, D drives of each, L frames that a token holds, S steps of a window, n tuned parameters, k driver features, s width of
 the policy's state, m of the model's memory.
@@ -16,12 +16,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from cfx.agents.core import AgentCore
+from cfx.agents.heads.offset import OffsetHead
+from cfx.agents.scaler import Scaler
 from cfx.calibration.windows import WindowSettings
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.policies.base import Policy, PolicyNetwork
-from cfx.policies.features import History, tokens
-from cfx.policies.offsets import moved
-from cfx.policies.trained import Scaler
+from cfx.policies.features import History
 from cfx.simulation.step import advance_vehicle
 
 
@@ -60,16 +61,15 @@ class WindowStep:
         windows: WindowSettings,
         dt: float,
     ) -> None:
+        head = OffsetHead.for_model(model, scaler.mean.device)
+        self.core = AgentCore(policy, network, scaler, head)
         self.network = network
-        self.scaler = scaler
         self.model = model
-        self.inputs, self.summary = policy.inputs, policy.summary
         self.length, self.stride = windows.length, windows.stride
         self.dt = dt
-        self.space = model.adaptation_space
+        self.space = head.space
         low, high = self.space.bounds(dtype=scaler.mean.dtype, device=scaler.mean.device)
         self.low, self.range = low, high - low
-        self.free = self.space.free(device=low.device)
 
     def compile(self) -> None:
         """Lets `torch.compile` make one function of each of the two."""
@@ -93,11 +93,7 @@ class WindowStep:
         Returns:
             The network's state afterwards.
         """
-        return torch.where(there[..., None], self._answer(seen, told, state)[1], state)
-
-    def _answer(self, seen: Tensor, told: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        answer, after = self.network(self.scaler(torch.cat([seen, told], -1)[:, :, None]), state)
-        return answer[:, :, 0], after
+        return self.core.observe(torch.cat([seen, told], -1), state, there)
 
     def drive(
         self,
@@ -128,8 +124,8 @@ class WindowStep:
             recent.acceleration,
             gap,
         )
-        answer, state = self._answer(tokens(history, self.inputs, self.summary), told, recent.state)
-        p = self.space.unpack(self.low + moved(base, answer, self.free) * self.range)
+        unit, state = self.core.act(history, base, told, recent.state)
+        p = self.space.unpack(self.low + unit * self.range)
         follower = Follower(
             recent.position[..., now],
             recent.speed[..., now],

@@ -14,18 +14,20 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
+from cfx.agents.agent import Agent
+from cfx.agents.core import AgentCore
+from cfx.agents.heads import HEADS, head_name
+from cfx.agents.heads.offset import NONE
 from cfx.calibration.calibrator import Labels
 from cfx.calibration.windows import Split, Windows, WindowSettings
 from cfx.datasets.synthetic import SyntheticDataset
-from cfx.evaluation.closed_loop import drive
+from cfx.evaluation.closed_loop import simulate_closed_loop
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.models.krauss import Krauss
 from cfx.pairs import SIGNALS, PairBatch, PairSet
 from cfx.policies.ensemble import Ensemble
-from cfx.policies.features import token_width
+from cfx.policies.features import measured_history, token_width
 from cfx.policies.gru import GruPolicy
-from cfx.policies.offsets import NONE
-from cfx.policies.trained import TrainedPolicy, measured_history
 from cfx.simulation.rollout import Simulator
 from cfx.testing.contract import contract_of
 
@@ -283,7 +285,7 @@ def _answers(training_result: TrainingResult, dataset: TrainingData) -> Tensor:
 
 def _rmse(training_result: TrainingResult, dataset: TrainingData) -> float:
     """Returns the RMSE of speed in closed loop over the training parts, m/s."""
-    loop = drive(
+    loop = simulate_closed_loop(
         dataset.simulator,
         _ready(training_result, dataset),
         dataset.batch,
@@ -296,14 +298,13 @@ def _rmse(training_result: TrainingResult, dataset: TrainingData) -> float:
     return float(error.square().mean().sqrt())
 
 
-def _ready(training_result: TrainingResult, dataset: TrainingData) -> TrainedPolicy:
-    return TrainedPolicy(
-        policy=_POLICY,
-        network=training_result.network,
-        scaler=training_result.scaler,
+def _ready(training_result: TrainingResult, dataset: TrainingData) -> Agent:
+    name = training_result.head or head_name(has_base=training_result.base is not None)
+    head = HEADS[name].for_model(dataset.simulator.model)
+    return Agent(
+        core=AgentCore(_POLICY, training_result.network, training_result.scaler, head),
         model_node={},
         policy_node={},
-        space=dataset.simulator.model.space,
         windows=WINDOWS,
         dt=dataset.simulator.dt,
         names=dataset.names,

@@ -4,8 +4,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cfx.agents.heads.offset import NONE, coordinates, moved, shrunk
 from cfx.models.krauss import Krauss
-from cfx.policies.offsets import NONE, coordinates, drawn, moved
 
 unit = st.floats(0.0, 1.0)
 
@@ -53,14 +53,14 @@ def test_a_set_that_is_not_drawn_stays_exactly_and_one_drawn_fully_is_the_defaul
     own: float,
 ) -> None:
     values = krauss(own)
-    assert torch.equal(drawn(SPACE, values, 0.0), values)
-    torch.testing.assert_close(drawn(SPACE, values, 1.0)[0], SPACE.defaults(), rtol=0, atol=1e-9)
+    assert torch.equal(shrunk(SPACE, values, 0.0), values)
+    torch.testing.assert_close(shrunk(SPACE, values, 1.0)[0], SPACE.defaults(), rtol=0, atol=1e-9)
 
 
 @given(unit, st.floats(0.001, 1.0), st.floats(0.001, 1.0))
 def test_the_more_a_set_is_drawn_the_nearer_it_comes(own: float, one: float, other: float) -> None:
     less, more = sorted((one, other))
-    far, near = ((drawn(SPACE, krauss(own), s) - SPACE.defaults()).abs() for s in (less, more))
+    far, near = ((shrunk(SPACE, krauss(own), s) - SPACE.defaults()).abs() for s in (less, more))
     assert bool((near <= far + 1e-9).all())
 
 

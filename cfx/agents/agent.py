@@ -1,0 +1,332 @@
+"""The agent: what drives in evaluation, in platoons and in SUMO, and what a saved policy is.
+
+An agent is made of three things: a context of each driver (`cfx.agents.context`), networks with their
+scaler and inputs, and a parameter head (both in `cfx.agents.core`). Training through the simulation
+uses the same core on the same grid.
+
+Life cycle for D drivers: `begin` once; `observe` (or `burn_in` over measured history) any number of
+times; then `act` once per window.
+
+Shapes: N networks, D drivers in any order, B drivers of the network that has most, L frames of a
+token, n tuned parameters, c features of conditioning, s width of the networks' state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from cfx import renamed
+from cfx.agents.context import UNSEEN, ContextRule, DriverContext
+from cfx.agents.core import AgentCore
+from cfx.agents.heads.base import ParameterHead
+from cfx.agents.heads.offset import shrunk
+from cfx.agents.placement import ALL, driver_places
+from cfx.agents.scaler import Scaler
+from cfx.calibration.windows import WindowSettings
+from cfx.errors import DataError
+from cfx.pairs import PairBatch, PairSet
+from cfx.parameters import ParameterSpace
+from cfx.policies.base import Policy, PolicyNetwork
+from cfx.policies.driver_features import measure
+from cfx.policies.features import History, measured_history
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+class AgentState(NamedTuple):
+    """Where D drivers stand between two windows.
+
+    Attributes:
+        network: which network drives each, `(D,)` int64.
+        place: its place among that network's drivers, `(D,)` int64.
+        state: of the networks, `(N, B, s)`.
+        base: `(D, n)` in unit space; None where the head needs none.
+        conditioning: what networks read of each driver in every window, `(D, c)`.
+    """
+
+    network: Tensor
+    place: Tensor
+    state: Tensor
+    base: Tensor | None
+    conditioning: Tensor
+
+
+@dataclass(frozen=True)
+class Agent:
+    """N networks that are ready to drive.
+
+    Attributes:
+        core: the networks with their scaler, inputs and head.
+        model_node, policy_node: config nodes of the driving model and of the policy.
+        windows: how often parameters change, and how many frames a token holds.
+        dt: time step, s.
+        names: what each network was trained for (a pair's id, a fold, or `ALL`), N of them.
+        base: parameters that answers refer to for drivers without a base of their own, `(N, n)`, SI
+            units; None where the head needs none.
+        context_rule: how a driver's context is made.
+        population: pooled parameters calibrated on the drivers that each network learned from,
+            `(N, n)`, SI units; None if there are none.
+        learned_from: the pairs that were learned from or calibrated on: `Pair.content` and the
+            driver's name.
+    """
+
+    core: AgentCore
+    model_node: Mapping[str, Any]
+    policy_node: Mapping[str, Any]
+    windows: WindowSettings
+    dt: float
+    names: tuple[str, ...]
+    base: Tensor | None = None
+    context_rule: ContextRule = field(default_factory=ContextRule)
+    population: Tensor | None = None
+    learned_from: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def policy(self) -> Policy:
+        """The component that built the networks."""
+        return self.core.policy
+
+    @property
+    def network(self) -> PolicyNetwork:
+        """The networks."""
+        return self.core.network
+
+    @property
+    def scaler(self) -> Scaler:
+        """Normalises what the networks read."""
+        return self.core.scaler
+
+    @property
+    def head(self) -> ParameterHead:
+        """Makes parameters of answers."""
+        return self.core.head
+
+    @property
+    def space(self) -> ParameterSpace:
+        """The parameters that the agent chooses, with their bounds."""
+        return self.core.head.space
+
+    def __getattr__(self, name: str) -> Any:
+        new = renamed.attribute(type(self), name)
+        if new is None:
+            raise AttributeError(f"an agent has no attribute '{name}'")
+        return getattr(self, new)
+
+    def base_of(self, parameters: Tensor) -> Tensor:
+        """Returns the base of drivers with these calibrated parameters; both `(D, n)`, SI units."""
+        return shrunk(self.space, parameters, self.context_rule.shrinkage)
+
+    def driver_features_of(
+        self, batch: PairBatch, until: Tensor, since: Tensor | None = None
+    ) -> Tensor | None:
+        """Measures the driver features of D drivers.
+
+        Args:
+            batch: their D pairs.
+            until: `(D,)`, the frame before which each is measured.
+            since: `(D,)`, the frame from which on; None: the first.
+
+        Returns:
+            `(D, k)`, NaN for drivers of whom too little was measured; None if the policy reads none.
+        """
+        if not self.core.driver_features:
+            return None
+        if since is None:
+            since = torch.zeros_like(until)
+        return measure(batch, self.core.driver_features, self.dt, since, until)
+
+    def begin(self, network: Tensor, context: DriverContext = UNSEEN) -> AgentState:
+        """Returns the state of D drivers before their first window.
+
+        Args:
+            network: which network drives each, `(D,)`.
+            context: what is known of them.
+        """
+        place = driver_places(network)
+        base = self._unit_base(network, context)
+        known = base if base is not None else self.scaler.mean.new_zeros((len(network), 0)).double()
+        features = self._known_features(network, context)
+        state = self.network.initial_state(len(self.names), int(place.max()) + 1)
+        return AgentState(network, place, state, base, self.core.condition(known, features))
+
+    def observe(self, history: History, state: AgentState, present: Tensor) -> AgentState:
+        """Lets networks see one window of D drivers without acting.
+
+        Args:
+            history: the last `windows.length` frames, `(D, L)` each, SI units.
+            state: where the drivers stand.
+            present: which of them have this window; the others keep their state, bool `(D,)`.
+        """
+        grid = self._features(history, state)
+        seen = torch.zeros(grid.shape[:2], dtype=torch.bool, device=grid.device)
+        seen[state.network, state.place] = present
+        with torch.no_grad():
+            return state._replace(state=self.core.observe(grid, state.state, seen))
+
+    @torch.no_grad()
+    def act(self, history: History, state: AgentState) -> tuple[Tensor, AgentState]:
+        """Chooses the parameters of the next window.
+
+        Args:
+            history: the last `windows.length` frames of D drivers, `(D, L)` each, SI units.
+            state: where they stand.
+
+        Returns:
+            Parameters `(D, n)` in SI units, in the dtype of the history, and the state afterwards.
+        """
+        dtype = history.follower_speed.dtype
+        answers, after = self.core.answer(self._features(history, state), state.state)
+        answer = answers[state.network, state.place].to(dtype)
+        unit = self.head.unit_parameters(answer.double(), state.base).to(dtype)
+        return self.space.from_unit(unit), state._replace(state=after)
+
+    def burn_in(
+        self, batch: PairBatch, until: Tensor, state: AgentState, since: Tensor | None = None
+    ) -> AgentState:
+        """Lets networks observe the measured history of D drivers.
+
+        Args:
+            batch: their D pairs.
+            until: `(D,)`, the frame at which each starts to drive; windows that start before it are
+                observed.
+            state: where the drivers stand.
+            since: `(D,)`, the frame from which on; None: the first.
+        """
+        if since is None:
+            since = torch.zeros_like(until)
+        stride = self.windows.stride
+        pairs = torch.arange(len(batch), device=until.device)
+        for first in range(int(since.min()) // stride * stride, int(until.max()), stride):
+            frame = torch.full_like(until, first)
+            history = measured_history(batch, pairs, frame, self.windows.length)
+            state = self.observe(history, state, (frame < until) & (frame >= since))
+        return state
+
+    def predict_frame(self, frame: pd.DataFrame) -> pd.DataFrame:
+        """Chooses parameters for the end of each pair in a tidy table.
+
+        Args:
+            frame: measured history in the tidy pair layout, one or more pairs with the agent's time
+                step.
+
+        Returns:
+            A row per pair: `pair_id` and one column per tuned parameter (SI units), for the window
+            that starts at the pair's last frame. A pair that the agent was trained for is driven by
+            its own network; any other by the only network there is, or the one named `all`.
+
+        Raises:
+            DataError: the table is not in the tidy layout, its time step is another, or it is not
+                clear which network to use.
+        """
+        import pandas as pd
+
+        from cfx.datasets.tidy import pairs_from_frame
+
+        pairs = pairs_from_frame(frame, source="the table given to the policy")
+        if abs(pairs.dt - self.dt) > 1e-6:
+            raise DataError(
+                f"the policy was trained at time steps of {self.dt:g} s, the table has"
+                f" {pairs.dt:g} s; resample the table"
+            )
+        batch = PairBatch.of(pairs)
+        until = batch.lengths - 1
+        context = DriverContext(driver_features=self.driver_features_of(batch, until))
+        state = self.burn_in(batch, until, self.begin(self.networks_for(pairs), context))
+        everyone = torch.arange(len(batch))
+        now = measured_history(batch, everyone, until, self.windows.length)
+        chosen, _ = self.act(now, state)
+        table = pd.DataFrame(chosen.tolist(), columns=list(self.space.names))
+        table.insert(0, "pair_id", [pair.pair_id for pair in pairs])
+        return table
+
+    def networks_for(self, pairs: PairSet) -> Tensor:
+        """Returns which network drives each pair, `(P,)`.
+
+        Raises:
+            DataError: a pair is none of those that the networks were trained for, and no network is
+                for any driver.
+        """
+        if len(self.names) == 1:
+            return torch.zeros(len(pairs), dtype=torch.int64)
+        numbers = []
+        for pair in pairs:
+            if pair.pair_id in self.names:
+                numbers.append(self.names.index(pair.pair_id))
+            elif ALL in self.names:
+                numbers.append(self.names.index(ALL))
+            else:
+                raise DataError(
+                    f"pair '{pair.pair_id}' has no network of its own among the {len(self.names)}"
+                    " that were trained, one per pair; train with protocol.networks=all or"
+                    " protocol=across_drivers to drive others"
+                )
+        return torch.tensor(numbers)
+
+    def for_unseen_drivers(self) -> Agent:
+        """Returns the one network that drives anybody: the only one there is, or the one named `all`.
+
+        Raises:
+            DataError: each network is for a pair of its own.
+        """
+        if len(self.names) == 1:
+            return self
+        if ALL not in self.names:
+            raise DataError(
+                f"the policy has {len(self.names)} networks, one for each of its own pairs, and none"
+                " for others; train one with protocol.networks=all or protocol=across_drivers"
+            )
+        number = self.names.index(ALL)
+        row = slice(number, number + 1)
+        return replace(
+            self,
+            core=self.core.only(number),
+            names=(ALL,),
+            base=None if self.base is None else self.base[row],
+            population=None if self.population is None else self.population[row],
+        )
+
+    def to(self, device: torch.device) -> Agent:
+        """Moves everything to a device."""
+        return replace(
+            self,
+            core=self.core.to(device),
+            base=None if self.base is None else self.base.to(device),
+            population=None if self.population is None else self.population.to(device),
+        )
+
+    def _unit_base(self, network: Tensor, context: DriverContext) -> Tensor | None:
+        """Returns the drivers' base in unit space, `(D, n)`, in double precision."""
+        if not self.head.needs_base:
+            return None
+        base = context.base
+        if base is None:
+            if self.base is None:
+                raise ValueError(f"the {self.head.name} head needs a base, and this agent has none")
+            base = self.base[network]
+        return self.space.to_unit(base.double())
+
+    def _known_features(self, network: Tensor, context: DriverContext) -> Tensor | None:
+        """Returns driver features `(D, k)`, the training drivers' mean where they are unknown."""
+        count = len(self.core.driver_features)
+        if count == 0:
+            return None
+        usual = self.scaler.mean[network, -count:].double()
+        features = context.driver_features
+        if features is None:
+            return usual
+        return torch.where(features.isnan(), usual, features.to(usual))
+
+    def _features(self, history: History, state: AgentState) -> Tensor:
+        """Returns what the networks read, `(N, B, f + c)`, not normalised; 0 at empty places."""
+        seen = self.core.encode(history)
+        features = torch.cat([seen, state.conditioning.to(seen.dtype)], -1)
+        networks, drivers, _ = state.state.shape
+        grid = self.scaler.mean.new_zeros((networks, drivers, features.shape[-1]))
+        grid[state.network, state.place] = features.to(grid.dtype)
+        return grid

@@ -1,0 +1,17 @@
+"""Parameter heads: how answers of networks become parameters. A new head is a file here and a line below."""
+
+from __future__ import annotations
+
+from cfx.agents.heads.base import ParameterHead
+from cfx.agents.heads.direct import DirectHead
+from cfx.agents.heads.offset import OffsetHead
+
+HEADS: dict[str, type[ParameterHead]] = {head.name: head for head in (DirectHead, OffsetHead)}
+"""Heads by the names that saved policies give."""
+
+
+def head_name(*, has_base: bool) -> str:
+    """Returns the head of policies that name none, as those of earlier versions."""
+    if has_base:
+        return OffsetHead.name
+    return DirectHead.name

@@ -1,0 +1,82 @@
+"""The contract of a parameter head: it turns what networks answer into parameters.
+
+Shapes: `*batch` any leading dimensions, N networks, n tuned parameters, c features of conditioning.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from cfx.models.base import DrivingModel
+from cfx.parameters import ParameterSpace
+
+
+class ParameterHead(ABC):
+    """Base of every parameter head.
+
+    A head is a pure function of tensors, elementwise over leading dimensions: training and
+    evaluation use the same. A saved policy names its head; `cfx.agents.heads.HEADS` lists them.
+
+    Attributes:
+        name: in saved policies.
+        needs_base: whether parameters depend on each driver's base parameters.
+        space: the parameters that it answers, with their bounds.
+    """
+
+    name: ClassVar[str]
+    needs_base: ClassVar[bool] = False
+
+    def __init__(self, space: ParameterSpace, device: torch.device | str | None = None) -> None:
+        self.space = space
+
+    @classmethod
+    @abstractmethod
+    def for_model(cls, model: DrivingModel, device: torch.device | str | None = None) -> Self:
+        """Returns the head for a driving model's parameters: it chooses the parameter space."""
+
+    def to(self, device: torch.device | str) -> Self:
+        """Returns the same head for tensors of a device."""
+        return type(self)(self.space, device)
+
+    @property
+    def width(self) -> int:
+        """The number of features by which networks learn of the base, c."""
+        return 0
+
+    def condition(self, base: Tensor) -> Tensor:
+        """Returns what networks read of the base.
+
+        Args:
+            base: `(*batch, n)` in unit space.
+
+        Returns:
+            `(*batch, c)`, not normalised.
+        """
+        return base[..., :0]
+
+    @abstractmethod
+    def untrained_answer(self, fixed: Tensor) -> Tensor:
+        """Returns the answers with which untrained networks start.
+
+        Args:
+            fixed: each network's fixed parameters in unit space, `(N, n)`.
+
+        Returns:
+            `(N, n)` in [0, 1], what `Policy.build` takes as `fixed`.
+        """
+
+    @abstractmethod
+    def unit_parameters(self, answer: Tensor, base: Tensor | None) -> Tensor:
+        """Returns the parameters that an answer means.
+
+        Args:
+            answer: of the networks, `(*batch, n)` in [0, 1].
+            base: `(*batch, n)` in unit space; None for heads without a base.
+
+        Returns:
+            `(*batch, n)` in unit space, in the dtype of the answer.
+        """

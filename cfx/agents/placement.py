@@ -1,0 +1,34 @@
+"""Drivers on networks: D drivers in any order are placed on a grid of N networks by B places."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+ALL = "all"
+"""Name of the network that is for any driver."""
+
+
+def driver_places(network: Tensor) -> Tensor:
+    """Numbers the drivers of each network from 0.
+
+    Args:
+        network: which network each driver has, `(D,)`.
+
+    Returns:
+        `(D,)` int64.
+    """
+    same = network[:, None] == network[None, :]
+    return torch.tril(same, diagonal=-1).sum(1)
+
+
+def group_by(names: Sequence[str]) -> tuple[Tensor, tuple[str, ...]]:
+    """Groups D drivers by name.
+
+    Returns:
+        The number of each driver's group `(D,)`, and the groups' names in order of appearance.
+    """
+    groups = tuple(dict.fromkeys(names))
+    return torch.tensor([groups.index(name) for name in names]), groups
