@@ -1,4 +1,7 @@
-"""The configuration of a job as one frozen object. Nothing below the command line knows where it came from."""
+"""The configuration of a job as one frozen object.
+
+Nothing below the command line knows where it came from.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,8 @@ from cfx.errors import ConfigError
 from cfx.style.settings import StyleSettings
 
 Node = dict[str, Any]
-"""A component's node, `{name: ..., settings...}`: `cfx.registry.create` validates it against the component's own schema."""
+"""A component's node, `{name: ..., settings...}`: `cfx.registry.create` validates it against the
+component's own schema."""
 
 
 class CacheSettings(Settings):
@@ -50,11 +54,13 @@ class DemoSettings(Settings):
 
     enabled: bool = Field(
         False,
-        description="show the job's drives on a motorway in SUMO; into the folder `sumo` of the job's",
+        description="show the job's trajectories on a motorway in SUMO; into the folder `sumo` of"
+        " the job's",
     )
     osm: Path | None = Field(
         None,
-        description="an OpenStreetMap extract of your own (.osm.xml), or a SUMO network (.net.xml); null: a hand-made motorway",
+        description="an OpenStreetMap extract of your own (.osm.xml), or a SUMO network"
+        " (.net.xml); null: a hand-made motorway",
     )
     pairs: int = Field(
         6, ge=1, description="pairs at most, spread evenly from the best to the worst improvement"
@@ -85,7 +91,7 @@ class JobConfig(Settings):
     split: float = Field(
         0.8, gt=0, lt=1, description="share of each pair that is calibrated and learned on"
     )
-    windows: WindowSettings = Field(WindowSettings(), description="how drives are cut")
+    windows: WindowSettings = Field(WindowSettings(), description="how trajectories are cut")
     style: StyleSettings = Field(StyleSettings(), description="driving style")
     cache: CacheSettings = Field(CacheSettings(), description="cache of calibrations")
     tracking: TrackingSettings = Field(TrackingSettings(), description="MLflow")

@@ -1,11 +1,12 @@
 """A cache of calibration results, by content.
 
-An entry's name is the SHA-256 of everything that the result depends on, so a hit is always the right answer and nothing ever
-needs to be invalidated. Entries are NumPy archives read without pickle; each appears whole or not at all, and a damaged one is
-computed again.
+An entry's name is the SHA-256 of everything that the result depends on. A hit is therefore always
+right, and nothing ever needs to be invalidated. Entries are NumPy archives that are read without
+pickle. Each appears whole or not at all; a damaged one is computed again.
 
-Processes that need the same entries share the work: each claims what it is about to compute, by a file lock, and leaves what
-another has claimed for later. The operating system frees a claim when its process ends, however it ends.
+Processes that need the same entries share the work. Each claims what it is about to compute by a
+file lock, and comes back later to what another process has claimed. The operating system frees a
+claim when its process ends, however it ends.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from cfx.files import atomic_write
 log = logging.getLogger(__name__)
 
 Arrays = dict[str, NDArray[Any]]
+"""What an entry holds, by name."""
 
 _SHARES = 32
 """Parts in which processes claim the entries of one calibration."""
@@ -37,7 +39,7 @@ _POLL_S = 0.2
 
 
 class Cache:
-    """Named arrays by content key, in one folder; `folder=None` remembers nothing."""
+    """Named arrays by content key, in one folder; with `folder=None` nothing is kept."""
 
     def __init__(self, folder: Path | None) -> None:
         self.folder = folder
@@ -48,7 +50,7 @@ class Cache:
         if path is None or not path.is_file():
             return None
         try:
-            # A file of our own: NumPy leaves the one it opens behind when the archive is damaged.
+            # NumPy does not close a file that it has opened itself when the archive is damaged.
             with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
                 return {name: archive[name] for name in archive.files}
         except (OSError, ValueError, zipfile.BadZipFile, EOFError):
@@ -67,7 +69,8 @@ class Cache:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with atomic_write(path) as temporary:
-                np.savez(temporary, **arrays)  # type: ignore[arg-type]  # the stubs take every name for `allow_pickle`
+                # NumPy's stubs take every name for `allow_pickle`.
+                np.savez(temporary, **arrays)  # type: ignore[arg-type]
         except OSError as error:
             raise self._unwritable(error) from error
 
@@ -75,28 +78,36 @@ class Cache:
         """Returns the parts in which entries are claimed: the part's name -> positions in `keys`.
 
         Args:
-            scope: what all keys of one calibration have in common: calibrations that share no entry then share no claim, but
-                for a rare coincidence, which costs a little waiting and nothing else.
+            keys: of the entries.
+            scope: what all keys of one calibration have in common. Calibrations without a common
+                entry then have no common claim, but for a rare coincidence, which costs a little
+                waiting and nothing else.
         """
         parts: dict[str, list[int]] = {}
         for position, key in enumerate(keys):
-            share = int(key[:8], 16) % _SHARES if self.folder is not None else 0
-            # Three digits: there are never more than 4096 lock files, however many calibrations the cache sees.
-            parts.setdefault(
-                hashlib.sha256(f"{scope} {share}".encode()).hexdigest()[:3], []
-            ).append(position)
+            share = 0
+            if self.folder is not None:
+                share = int(key[:8], 16) % _SHARES
+            # Three digits: there are never more than 4096 lock files, however many calibrations the
+            # cache sees.
+            name = hashlib.sha256(f"{scope} {share}".encode()).hexdigest()[:3]
+            parts.setdefault(name, []).append(position)
         return parts
 
     @contextmanager
     def claim(self, sizes: Mapping[str, int], enough: int) -> Iterator[list[str]]:
-        """Claims shares for as long as the block lasts; nothing is claimed while this waits, so there is no deadlock.
+        """Claims shares while the block lasts.
+
+        Nothing is claimed while this waits, so there is no deadlock.
 
         Args:
-            sizes: problems in each share that is wanted, at least one share.
-            enough: claims stop before they hold more problems than this, but at least one share is claimed.
+            sizes: problems in each share that is wanted; at least one share.
+            enough: no further share is claimed that would bring the claimed problems above this
+                number; at least one share is always claimed.
 
         Yields:
-            The shares' names: free ones if there are any, else the first one that another process lets go.
+            The names of the claimed shares: free ones if there are any, else the first one that
+            another process lets go.
 
         Raises:
             OutputError: the folder cannot be written.
@@ -105,9 +116,8 @@ class Cache:
             claimed: list[str] = []
             problems = 0
             for name, size in sizes.items():
-                if (not claimed or problems + size <= enough) and self._acquire(
-                    held, name, wait=False
-                ):
+                fits = not claimed or problems + size <= enough
+                if fits and self._acquire(held, name, wait=False):
                     claimed.append(name)
                     problems += size
             if not claimed:
@@ -120,9 +130,12 @@ class Cache:
         if self.folder is None:
             return True
         lock = FileLock(self.folder / "claims" / f"{name}.lock")
+        timeout = 0
+        if wait:
+            timeout = -1
         try:
             Path(lock.lock_file).parent.mkdir(parents=True, exist_ok=True)
-            held.enter_context(lock.acquire(timeout=-1 if wait else 0, poll_interval=_POLL_S))
+            held.enter_context(lock.acquire(timeout=timeout, poll_interval=_POLL_S))
         except Timeout:
             return False
         except OSError as error:
@@ -131,10 +144,11 @@ class Cache:
 
     def _unwritable(self, error: OSError) -> OutputError:
         return OutputError(
-            f"cannot write the calibration cache {self.folder}: {error.strerror}; set cache.folder to a folder that can"
-            f" be written,"
-            " or cache.enabled=false"
+            f"cannot write the calibration cache {self.folder}: {error.strerror};"
+            " set cache.folder to a folder that can be written, or cache.enabled=false"
         )
 
     def _path(self, key: str) -> Path | None:
-        return None if self.folder is None else self.folder / key[:2] / f"{key}.npz"
+        if self.folder is None:
+            return None
+        return self.folder / key[:2] / f"{key}.npz"

@@ -1,7 +1,8 @@
 """The calibrator: constant parameters of each driver, pooled ones, and those of each window.
 
-All three are the same to an optimizer: independent problems, each the loss of segments simulated from a
-measured state. Every result is cached on its own, so an interrupted calibration goes on where it stopped.
+All three are the same to an optimizer: independent problems, each the loss of segments simulated
+from a measured state. Every result is cached on its own, so an interrupted calibration goes on
+where it stopped.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
@@ -27,7 +29,8 @@ from cfx.progress import Task
 from cfx.simulation.base import Stepper
 
 _GROUP = 1024
-"""Problems solved together: enough to fill the batch, few enough that an interruption loses little."""
+"""Problems solved together: enough to fill the batch, few enough that an interruption loses
+little."""
 
 
 @dataclass(frozen=True)
@@ -36,13 +39,13 @@ class Labels:
 
     Attributes:
         windows: which windows.
-        parameters: `(W, n)`, SI units: of those with a loss within the tie tolerance of the lowest, the
-            nearest to the driver-specific parameters; so where nothing tells candidates apart they are
-            the driver-specific parameters.
+        parameters: `(W, n)`, SI units: of those with a loss within the tie tolerance of the lowest,
+            the nearest to the driver-specific parameters; so where nothing tells candidates apart
+            they are the driver-specific parameters.
         loss: `(W,)`, the objective's loss with these parameters, in its unit.
-        sensitivity: `(W,)`, how much the choice of parameters matters in the window: median loss of the
-            space-filling candidates minus `loss`. 0 where all candidates have the same loss: such a
-            label is arbitrary.
+        sensitivity: `(W,)`, how much the choice of parameters matters in the window: median loss of
+            the space-filling candidates minus `loss`. 0 where all candidates have the same loss:
+            such a label is arbitrary.
         diverged: `(W,)` int64, candidates whose loss was not a number.
     """
 
@@ -68,7 +71,7 @@ class Labels:
         )
 
     def metrics(self) -> dict[str, float]:
-        """Returns means over windows, in the objective's unit: `labels/loss`, `labels/sensitivity`."""
+        """Returns the means over windows `labels/loss` and `labels/sensitivity`, in its unit."""
         return {
             "labels/loss": float(self.loss.mean()),
             "labels/sensitivity": float(self.sensitivity.mean()),
@@ -81,9 +84,8 @@ class Labels:
         objective's unit), diverged.
         """
         windows = self.windows
-        ids = [pair.pair_id for pair in pairs]
         columns: dict[str, Any] = {
-            "pair_id": [ids[index] for index in windows.pair.tolist()],
+            "pair_id": [pairs[index].pair_id for index in windows.pair.tolist()],
             "window": windows.number.numpy(),
             "time_s": windows.first.numpy() * pairs.dt,
         }
@@ -123,12 +125,14 @@ class Calibrator:
     ) -> None:
         self.simulator = simulator
         self.optimizer = optimizer
-        self.objective = objective if objective is not None else SpeedRmse()
+        self.objective: Objective = SpeedRmse()
+        if objective is not None:
+            self.objective = objective
         self.seed = seed
         self.cache = cache
         self.memory = memory
         self.progress = progress
-        self.reported = dict(reported or {})
+        self.reported = reported or {}
 
     @property
     def space(self) -> ParameterSpace:
@@ -147,8 +151,8 @@ class Calibrator:
         Args:
             pairs: P pairs.
             batch: the same as tensors.
-            last: `(P,)`, the last frame that may be used; the pair is simulated from frame 0 to it in
-                one closed loop.
+            last: `(P,)`, the last frame that may be used; the pair is simulated from frame 0 to it
+                in one closed loop.
 
         Returns:
             `(P, n)`, SI units.
@@ -232,8 +236,8 @@ class Calibrator:
         results = self._cached(title, keys, counts, solve, **description)
         joined = {}
         for name in results[0]:
-            parts = [torch.as_tensor(entry[name]) for entry in results]
-            joined[name] = torch.cat(parts).to(device)
+            parts = np.concatenate([entry[name] for entry in results])
+            joined[name] = torch.as_tensor(parts).to(device)
         return Labels(windows=windows, **joined)
 
     @torch.no_grad()
@@ -248,8 +252,10 @@ class Calibrator:
 
         Args:
             batch: P pairs.
-            last: `(P,)`, the last frame that is compared; simulated from frame 0 in one closed loop.
-            parameters: `(P, n)`, one set per pair; with `members` `(K, n)`, one per group. SI units.
+            last: `(P,)`, the last frame that is compared; simulated from frame 0 in one closed
+                loop.
+            parameters: `(P, n)`, one set per pair; with `members` `(K, n)`, one per group. SI
+                units.
             members: `(K, P)` bool, the pairs of each group.
         """
         device = batch.lengths.device
@@ -260,14 +266,14 @@ class Calibrator:
         unit = self.space.to_unit(parameters.to(device))[row][:, None]
         segments = self._segments(batch, pair, last.to(device)[pair])
         size = max(1, self.memory // max(1, segments.bytes_per_candidate))
-        totals = dict.fromkeys(self.reported, 0.0)
+        means = dict.fromkeys(self.reported, 0.0)
         for part in torch.split(torch.arange(len(pair), device=device), size):
             chosen = segments.take(part)
             frames = chosen.simulate(unit[part], gap=True)
             for name, objective in self.reported.items():
                 loss = objective(frames, chosen.counted[..., None])
-                totals[name] += float(loss.sum())
-        return {name: total / len(pair) for name, total in totals.items()}
+                means[name] += float(loss.sum()) / len(pair)
+        return means
 
     def _segments(self, batch: PairBatch, pair: Tensor, last: Tensor) -> SegmentLosses:
         """Returns the losses of pairs `(S,)` from their frame 0 to a last one `(S,)`."""
@@ -328,7 +334,9 @@ class Calibrator:
         title = f"{what} ({optimizer}, {objective}, {work.missing_problems} problems)"
         with self.progress(title, work.missing_problems * work.evaluations) as task:
             while wanted:
-                sizes = {name: work.size(indices) for name, indices in wanted.items()}
+                sizes = {}
+                for name, indices in wanted.items():
+                    sizes[name] = work.size(indices)
                 with self.cache.claim(sizes, _GROUP) as claimed:
                     mine = []
                     for name in claimed:
@@ -381,7 +389,7 @@ class _Work:
         self.missing_problems = self.size(self._missing(range(len(keys))))
 
     def shares(self, scope: str) -> dict[str, list[int]]:
-        """Returns which entries are missing, by the share of the cache in which they are claimed."""
+        """Returns the missing entries by the share of the cache in which they are claimed."""
         missing = self._missing(range(len(self._keys)))
         shares = {}
         keys = [self._keys[index] for index in missing]
@@ -391,7 +399,10 @@ class _Work:
 
     def size(self, indices: Sequence[int]) -> int:
         """Returns how many problems some entries stand for."""
-        return sum(self._problems[index] for index in indices)
+        total = 0
+        for index in indices:
+            total += self._problems[index]
+        return total
 
     def do(self, indices: list[int], task: Task) -> None:
         """Provides claimed entries: another process may have solved some before the claim."""
@@ -444,7 +455,13 @@ def _rows(found: Arrays) -> list[Arrays]:
 
 
 def _by_pair(found: Arrays, pair: Tensor, chosen: Tensor) -> list[Arrays]:
-    """Returns an entry for each chosen pair, with all its windows; `pair` `(W,)` is whose each is."""
+    """Returns an entry for each chosen pair, with all its windows.
+
+    Args:
+        found: a row per window.
+        pair: `(W,)`, the pair of each window.
+        chosen: the pairs.
+    """
     entries = []
     for number in chosen.tolist():
         own = (pair == number).numpy()
@@ -454,5 +471,5 @@ def _by_pair(found: Arrays, pair: Tensor, chosen: Tensor) -> list[Arrays]:
 
 def _stacked(entries: list[Arrays], device: torch.device) -> Tensor:
     """Returns the entries' parameters `(entries, n)`."""
-    rows = [torch.as_tensor(entry["parameters"], device=device) for entry in entries]
-    return torch.stack(rows)
+    rows = np.stack([entry["parameters"] for entry in entries])
+    return torch.as_tensor(rows, device=device)

@@ -1,4 +1,4 @@
-"""What an optimizer minimises in a calibration: the objective of simulated segments of trajectories."""
+"""What an optimizer minimises in a calibration: losses of simulated segments of trajectories."""
 
 from __future__ import annotations
 
@@ -102,11 +102,14 @@ class SegmentLosses:
 
     @property
     def bytes_per_candidate(self) -> int:
-        """Memory that one candidate of one problem needs, with the intermediate values of one block.
+        """Memory that one candidate of one problem needs.
 
-        Positions, speeds, a term and its masked copy; a gap needs another value and another term.
+        Positions, speeds, a term, its masked copy and the intermediate values of one block; a gap
+        is another value with another term.
         """
-        values = 6 if "gap" in self.objective.signals else 4
+        values = 4
+        if "gap" in self.objective.signals:
+            values = 6
         return (values * self.steps + 32) * self.measured_speed.element_size()
 
     def select(self, first: int, last: int) -> SegmentLosses:
@@ -114,7 +117,7 @@ class SegmentLosses:
         return self._cut(slice(first, last))
 
     def take(self, problems: Tensor) -> SegmentLosses:
-        """Returns the problems of these numbers, `(S,)` int64; one may stand there more than once."""
+        """Returns the problems of numbers `(S,)` int64; one may stand there more than once."""
         return self._cut(problems)
 
     def _cut(self, which: slice | Tensor) -> SegmentLosses:
@@ -126,7 +129,7 @@ class SegmentLosses:
 
     @torch.no_grad()
     def __call__(self, candidates: Tensor) -> Tensor:
-        """Returns losses `(P, q)` of candidates `(P, q, n)` in unit space, in the objective's unit."""
+        """Returns losses `(P, q)`, in the objective's unit, of candidates `(P, q, n)`."""
         frames = self.simulate(candidates, gap="gap" in self.objective.signals)
         return self.objective(frames, self.counted[..., None])
 
@@ -154,8 +157,11 @@ class SegmentLosses:
 
     def _parameters(self, candidates: Tensor) -> dict[str, Tensor]:
         space = self.simulator.model.space
-        values = space.unpack(space.from_unit(candidates.to(self.measured_speed.dtype)))
-        return {name: value.contiguous() for name, value in values.items()}
+        values = space.from_unit(candidates.to(self.measured_speed.dtype))
+        parameters = {}
+        for name, value in space.unpack(values).items():
+            parameters[name] = value.contiguous()
+        return parameters
 
     def _start(self, shape: torch.Size) -> Start:
         return Start(
@@ -174,23 +180,23 @@ class SegmentLosses:
 
 
 _BYTES_AT_ONCE = 1 << 27
-"""Most bytes that pooled losses simulate at once. 1 GB took three times as long as 256 MB, all of it in
-fetching pages."""
+"""Most bytes that pooled losses simulate at once. 1 GB took three times as long as 256 MB, all of
+it in fetching pages."""
 
 
 @dataclass(frozen=True)
 class PooledLosses:
     """One parameter set for many segments: the mean over the segments of each one's loss.
 
-    The mean of losses, not the loss over all frames: every driver counts alike, and the mean is what an
-    evaluation reports. Where all problems ask for the same candidates, as space-filling ones are, a
-    segment that belongs to several problems is simulated once.
+    The mean of losses, not the loss over all frames: every driver counts alike, and the mean is
+    what an evaluation reports. Where all problems ask for the same candidates, as space-filling
+    ones are, a segment that belongs to several problems is simulated once.
 
     Attributes:
         segments: D segments.
         members: the segments of each of K problems, bool `(K, D)`.
-        memory: bound in bytes for what is simulated at once; candidates are simulated in blocks where
-            all segments of all of them need more.
+        memory: bound in bytes for what is simulated at once; candidates are simulated in blocks
+            where all segments of all of them need more.
     """
 
     segments: SegmentLosses
@@ -204,7 +210,7 @@ class PooledLosses:
 
     @property
     def bytes_per_candidate(self) -> int:
-        """Memory that one candidate of one problem needs besides the blocks: the segments' losses."""
+        """Memory of one candidate of one problem besides the blocks: the segments' losses."""
         return 2 * self.members.shape[1] * self.segments.measured_speed.element_size()
 
     def select(self, first: int, last: int) -> PooledLosses:
@@ -213,7 +219,7 @@ class PooledLosses:
 
     @torch.no_grad()
     def __call__(self, candidates: Tensor) -> Tensor:
-        """Returns losses `(K, q)` of candidates `(K, q, n)` in unit space, in the objective's unit."""
+        """Returns losses `(K, q)`, in the objective's unit, of candidates `(K, q, n)`."""
         problem, segment = self.members.nonzero().unbind(1)
         if bool((candidates == candidates[:1]).all()):
             used = self.members.any(0)
@@ -226,7 +232,7 @@ class PooledLosses:
         return total / self.members.sum(1, keepdim=True)
 
     def _simulated(self, segment: Tensor, problem: Tensor, candidates: Tensor) -> Tensor:
-        """Returns losses `(S, q)` of segments `(S,)`, each with the candidates of a problem `(S,)`."""
+        """Returns losses `(S, q)` of segments `(S,)` with the candidates of problems `(S,)`."""
         segments, count = self.segments.take(segment), candidates.shape[1]
         # The blocks are small, but there are many: together they may be worth compiling for, which
         # none of them is alone.

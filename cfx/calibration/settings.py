@@ -1,4 +1,7 @@
-"""What a user may choose about windows; imports no torch, so that a wrong configuration is answered at once."""
+"""What a user may choose about windows.
+
+Imports no torch, so that a wrong configuration is answered at once.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from cfx.component import Settings
 
 
 class WindowSettings(Settings):
-    """How drives are cut; both 5 steps (0.5 s at NGSIM's 0.1 s) in the paper."""
+    """How trajectories are cut; both 5 steps (0.5 s at NGSIM's 0.1 s) in the paper."""
 
     length: int = Field(5, ge=1, description="steps that a window simulates")
     stride: int = Field(
@@ -29,10 +32,11 @@ class WindowSettings(Settings):
     def _covers(self) -> WindowSettings:
         if self.length < self.stride:
             raise ValueError(
-                f"windows.length={self.length} leaves frames out between windows of stride {self.stride}; give at least that"
+                f"windows.length={self.length} leaves frames out between windows of stride"
+                f" {self.stride}; give at least that"
             )
         return self
 
     def count(self, frames: int) -> int:
-        """Returns how many whole windows fit a drive of `frames` frames."""
+        """Returns how many whole windows fit a trajectory of `frames` frames."""
         return max(0, (frames - 1 - self.length) // self.stride + 1)

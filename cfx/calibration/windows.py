@@ -1,7 +1,9 @@
-"""Windows: the short stretches of a drive for which one set of parameters holds.
+"""Windows: the short parts of a trajectory for which one set of parameters holds.
 
-A window starts at a measured state and spans `length` steps; one starts every `stride` steps. Window k of a pair starts at frame
-`k stride` and is compared at the `length` frames after it. Shapes: P pairs, W windows of all pairs together.
+A window starts at a measured state and spans `length` steps; one starts every `stride` steps.
+Window k of a pair starts at frame `k stride` and is compared at the `length` frames after it.
+
+Shapes: P pairs, W windows of all pairs together.
 """
 
 from __future__ import annotations
@@ -20,10 +22,11 @@ __all__ = ["Split", "WindowSettings", "Windows"]
 
 @dataclass(frozen=True)
 class Split:
-    """Where each pair's training part ends: the frame of the last measured state that calibration and learning may use.
+    """Where each pair's training part ends.
 
     Attributes:
-        frame: `(P,)` int64; the test part starts from this frame's measured state and is compared after it.
+        frame: `(P,)` int64, the last measured state that calibration and learning may use. The test
+            part starts from this frame's measured state and is compared after it.
         windows: `(P,)` int64, whole windows up to that frame.
     """
 
@@ -35,32 +38,48 @@ class Split:
         """Splits each pair so that `share` of its windows come first.
 
         Raises:
-            DataError: a pair is too short to have at least two windows for training and one for testing.
+            DataError: a pair is too short for two windows of training and one of testing.
         """
-        counts = [settings.count(len(pair)) for pair in pairs]
-        training = [int(share * count + 1e-9) for count in counts]
-        for pair, count, first in zip(pairs, counts, training, strict=True):
+        frames, windows = [], []
+        for pair in pairs:
+            count = settings.count(len(pair))
+            first = _training_windows(share, count)
             if first < 2 or first >= count:
-                needed = next(n for n in range(3, 10**6) if 2 <= int(share * n + 1e-9) < n)
-                frames = (needed - 1) * settings.stride + settings.length + 1
                 raise DataError(
-                    f"pair {pair.pair_id} has {len(pair)} frames, too few for windows of {settings.length} steps with"
-                    f" split={share:g};"
-                    f" set data.min_frames to at least {frames}"
+                    f"pair {pair.pair_id} has {len(pair)} frames, too few for windows of"
+                    f" {settings.length} steps with split={share:g};"
+                    f" set data.min_frames to at least {_least_frames(settings, share)}"
                 )
-        frame = torch.tensor([first * settings.stride for first in training])
-        whole = torch.tensor([settings.count(int(last) + 1) for last in frame])
-        return cls(frame, whole)
+            last = first * settings.stride
+            frames.append(last)
+            windows.append(settings.count(last + 1))
+        return cls(torch.tensor(frames), torch.tensor(windows))
 
     @classmethod
     def none(cls, pairs: PairSet, settings: WindowSettings) -> Split:
         """Gives each pair whole to training: for drivers who are not tested."""
-        frame = torch.tensor([len(pair) - 1 for pair in pairs])
-        return cls(frame, torch.tensor([settings.count(len(pair)) for pair in pairs]))
+        frames, windows = [], []
+        for pair in pairs:
+            frames.append(len(pair) - 1)
+            windows.append(settings.count(len(pair)))
+        return cls(torch.tensor(frames), torch.tensor(windows))
 
     def __getitem__(self, index: Tensor) -> Split:
         """Selects pairs by their numbers, `(D,)`."""
         return Split(self.frame[index], self.windows[index])
+
+
+def _training_windows(share: float, count: int) -> int:
+    """Returns how many of `count` windows belong to training."""
+    return int(share * count + 1e-9)
+
+
+def _least_frames(settings: WindowSettings, share: float) -> int:
+    """Returns how many frames a pair needs at least to be split."""
+    count = 3
+    while not 2 <= _training_windows(share, count) < count:
+        count += 1
+    return (count - 1) * settings.stride + settings.length + 1
 
 
 @dataclass(frozen=True)
@@ -94,7 +113,9 @@ class Windows:
         return self.number * self.settings.stride
 
     def select(self, pairs: Tensor) -> tuple[Windows, Tensor]:
-        """Returns the windows of some pairs, which are numbered anew, and the places of these windows among all.
+        """Returns the windows of some pairs, and the places of these windows among all.
+
+        The pairs are numbered anew.
 
         Args:
             pairs: `(D,)` int64; a pair may stand there more than once.
@@ -106,7 +127,15 @@ class Windows:
         return Windows(chosen.pair, self.number[places], self.settings), places
 
     def to_grid(self, values: Tensor, pairs: int) -> tuple[Tensor, Tensor]:
-        """Arranges `(W, ...)` as `(P, windows, ...)`, zero where a pair has no such window; and the mask `(P, windows)`."""
+        """Arranges values by pair and number of the window.
+
+        Args:
+            values: `(W, ...)`.
+            pairs: P.
+
+        Returns:
+            `(P, windows, ...)`, 0 where a pair has no such window, and the mask `(P, windows)`.
+        """
         width = int(self.number.max()) + 1
         pair, number = self.pair.to(values.device), self.number.to(values.device)
         grid = values.new_zeros((pairs, width, *values.shape[1:]))

@@ -1,8 +1,8 @@
 """The contract of an objective: how far a simulated trajectory is from the measured one.
 
-An objective is a pure function in two parts. `terms` says what each frame contributes, `finish` turns
-the sums over frames into the loss. The sums can therefore be accumulated frame by frame while a
-rollout is running, in a compiled step as well, without keeping the trajectory.
+An objective is a pure function in two parts. `terms` says what each frame contributes, `finish`
+turns the sums over frames into the loss. The sums can therefore be accumulated frame by frame while
+a rollout is running, in a compiled step as well, without keeping the trajectory.
 
 Shapes: K frames, any batch of trajectories. All tensors broadcast against each other.
 """
@@ -43,26 +43,26 @@ class FrameValues(NamedTuple):
 class Objective(Component):
     """Base of every objective.
 
-    Life cycle: a job makes one objective. Calibration minimises it for the driver-specific parameters,
-    for the pooled ones and for those of each window; closed-loop training minimises its mean over
-    trajectories by gradient. Both call the object itself, or `sums` and `finish`.
+    Life cycle: a job makes one objective. Calibration minimises it for the driver-specific
+    parameters, for the pooled ones and for those of each window; closed-loop training minimises its
+    mean over trajectories by gradient. Both call the object itself, or `sums` and `finish`.
 
     A subclass implements `terms` and `finish`: pure functions of tensors without Python branches on
     their values, on any device, in float32 and float64, differentiable wherever the loss is.
     `cfx.testing.ObjectiveContract` tests all this.
 
     Punzo, Zheng and Montanino (2021), *About calibration of car-following dynamics of automated and
-    human-driven vehicles: Methodology, guidelines and codes*, Transportation Research Part C, find that
-    errors of spacing identify parameters better than errors of speed.
+    human-driven vehicles: Methodology, guidelines and codes*, Transportation Research Part C, find
+    that errors of spacing identify parameters better than errors of speed.
 
     Attributes:
         unit: the loss's unit, such as "m/s"; "" for a loss without unit.
         signals: the signals that `terms` reads; the others are not computed for it.
         tie_tolerance: losses of a window that differ by less, in `unit`, count as equal where
             `windows.tie_tolerance` is null: about the accuracy of recorded trajectories.
-        floor: a small loss, in `unit`. Training that divides a loss by that of constant parameters adds
-            it to the divisor, so that a trajectory which these parameters follow almost perfectly
-            does not outweigh all others.
+        floor: a small loss, in `unit`. Training that divides a loss by that of constant parameters
+            adds it to the divisor, so that a trajectory which these parameters follow almost
+            perfectly does not outweigh all others.
     """
 
     kind = "objective"
@@ -79,7 +79,8 @@ class Objective(Component):
             frames: one frame `(*batch,)` or many, such as `(K, *batch)`.
 
         Returns:
-            A tuple of the same length in every call, of tensors that broadcast to the frames' shape.
+            A tuple of the same length in every call, of tensors that broadcast to the frames'
+            shape.
         """
 
     @abstractmethod
@@ -110,7 +111,7 @@ class Objective(Component):
     def __call__(
         self, frames: FrameValues, counted: Tensor, *, dim: int = 0, epsilon: float = 0.0
     ) -> Tensor:
-        """Returns the loss `(*batch,)` of whole trajectories, in `unit`; 0 where no frame counts.
+        """Returns the loss `(*batch,)` of full trajectories, in `unit`; 0 where no frame counts.
 
         Args:
             frames: many frames, such as `(K, *batch)`.
@@ -138,7 +139,6 @@ def root_mean_square(total: Tensor, count: Tensor, epsilon: float = 0.0) -> Tens
     return (total / count + epsilon).sqrt()
 
 
-def ratio(part: Tensor, whole: Tensor) -> Tensor:
-    """Returns `part / whole` of tensors that are not negative, and 0 where both are 0."""
-    empty = whole == 0
-    return part / whole.masked_fill(empty, 1.0)
+def ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
+    """Returns the ratio of tensors that are not negative, and 0 where both are 0."""
+    return numerator / denominator.masked_fill(denominator == 0, 1.0)

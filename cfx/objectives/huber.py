@@ -1,6 +1,7 @@
 """Errors of speed of which outliers count less.
 
-P. J. Huber (1964), *Robust estimation of a location parameter*, Annals of Mathematical Statistics 35.
+P. J. Huber (1964), *Robust estimation of a location parameter*, Annals of Mathematical Statistics
+35.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ class SpeedHuberSettings(Settings):
 
 
 class SpeedHuber(Objective):
-    """Root of twice the mean Huber loss of speed, m/s: large errors weigh less than in `speed_rmse`.
+    """Root of twice the mean Huber loss of speed, m/s: large errors weigh less than in an RMSE.
 
     An error up to `delta` counts squared, as in `speed_rmse`; a larger one counts
     `delta (2 |error| - delta)`. Without larger errors the loss is the root mean squared error.

@@ -11,8 +11,8 @@ from cfx.component import Settings
 from cfx.objectives.base import FrameValues, Objective, root_mean_square
 
 _LEAST_RMS = 1.0
-"""m/s and m: a measured signal with a smaller RMS counts as this large. A driver who stands has a speed
-of 0, by which no error can be divided."""
+"""m/s and m: a measured signal with a smaller RMS counts as this large. A driver who stands has a
+speed of 0, by which no error can be divided."""
 
 
 class MixedSettings(Settings):
@@ -34,12 +34,12 @@ class MixedSettings(Settings):
 class Mixed(Objective):
     """Weighted sum of the normalised errors of speed and gap, without unit.
 
-    Each part is a root mean squared error divided by the root mean square of the measured signal (at
-    least 1 m/s or 1 m): `w_v RMSE(v) / RMS(v_measured) + w_s RMSE(s) / RMS(s_measured)`.
+    Each part is a root mean squared error divided by the root mean square of the measured signal
+    (at least 1 m/s or 1 m): `w_v RMSE(v) / RMS(v_measured) + w_s RMSE(s) / RMS(s_measured)`.
 
-    Errors of spacing identify parameters better than errors of speed: Punzo, Zheng and Montanino (2021),
-    *About calibration of car-following dynamics of automated and human-driven vehicles: Methodology,
-    guidelines and codes*, Transportation Research Part C.
+    Errors of spacing identify parameters better than errors of speed: Punzo, Zheng and Montanino
+    (2021), *About calibration of car-following dynamics of automated and human-driven vehicles:
+    Methodology, guidelines and codes*, Transportation Research Part C.
     """
 
     schema: ClassVar[type[Settings]] = MixedSettings

@@ -31,9 +31,9 @@ class GapRmse(Objective):
     """Root mean squared error of the gap, m.
 
     Errors of spacing identify parameters better than errors of speed, because an error of the gap
-    keeps what an error of speed has added up to: Punzo, Zheng and Montanino (2021), *About calibration
-    of car-following dynamics of automated and human-driven vehicles: Methodology, guidelines and
-    codes*, Transportation Research Part C.
+    keeps what an error of speed has added up to: Punzo, Zheng and Montanino (2021), *About
+    calibration of car-following dynamics of automated and human-driven vehicles: Methodology,
+    guidelines and codes*, Transportation Research Part C.
     """
 
     unit = "m"

@@ -25,12 +25,12 @@ class TheilU(Objective):
     """Theil's U: an error between 0 (perfect) and 1, without unit.
 
     The root mean squared error, divided by the sum of the root mean squares of the simulated and of
-    the measured signal: `U = RMSE / (RMS_simulated + RMS_measured)`, Theil's form of 1961. U is 0 where
-    both signals are 0.
+    the measured signal: `U = RMSE / (RMS_simulated + RMS_measured)`, Theil's form of 1961. U is 0
+    where both signals are 0.
 
-    Errors of spacing (`objective.signal=gap`) identify parameters better than errors of speed: Punzo,
-    Zheng and Montanino (2021), *About calibration of car-following dynamics of automated and human-driven
-    vehicles: Methodology, guidelines and codes*, Transportation Research Part C.
+    Errors of spacing (`objective.signal=gap`) identify parameters better than errors of speed:
+    Punzo, Zheng and Montanino (2021), *About calibration of car-following dynamics of automated and
+    human-driven vehicles: Methodology, guidelines and codes*, Transportation Research Part C.
     """
 
     schema: ClassVar[type[Settings]] = TheilUSettings

@@ -1,7 +1,8 @@
 """The contract of an optimizer: many independent bounded problems in one call.
 
-Shapes: P problems, q candidates for each in one call, n parameters, g guesses, e evaluations of each problem in all.
-Everything here is float64: Gaussian processes need it, and losses of neighbouring candidates differ by little.
+Shapes: P problems, q candidates for each in one call, n parameters, g guesses, e evaluations of
+each problem in all. Everything here is float64: Gaussian processes need it, and losses of
+neighbouring candidates differ by little.
 """
 
 from __future__ import annotations
@@ -19,14 +20,18 @@ from cfx.component import Component
 from cfx.errors import PluginError
 
 Progress = Callable[[int], None]
-"""Told how many more evaluations are done; in all they sum to problems times evaluations."""
+"""Called with how many more evaluations are done; they sum to problems times evaluations."""
 
 TIE_RELATIVE, TIE_ABSOLUTE = 1e-6, 1e-9
-"""Losses within `TIE_ABSOLUTE + TIE_RELATIVE * best` of the best count as equal: above rounding, below anything that matters."""
+"""Losses within `TIE_ABSOLUTE + TIE_RELATIVE * best` of the best count as equal: above rounding,
+below anything that matters."""
 
 
 class CandidateLosses(Protocol):
-    """P independent problems that are evaluated together."""
+    """What an optimizer minimises: the losses of candidates in P independent problems.
+
+    In a calibration these are values of the job's objective (`cfx.Objective`), in its unit.
+    """
 
     @property
     def problems(self) -> int:
@@ -34,11 +39,15 @@ class CandidateLosses(Protocol):
         ...
 
     def __call__(self, candidates: Tensor) -> Tensor:
-        """Returns losses `(P, q)` of candidates `(P, q, n)` in unit space; NaN or infinity where a candidate diverges."""
+        """Returns losses `(P, q)`; NaN or infinity where a candidate diverges.
+
+        Args:
+            candidates: `(P, q, n)` in unit space.
+        """
         ...
 
     def select(self, first: int, last: int) -> CandidateLosses:
-        """Returns the objective of problems `first` to `last - 1` alone."""
+        """Returns the losses of problems `first` to `last - 1` alone."""
         ...
 
 
@@ -47,12 +56,13 @@ class Solution:
     """What an optimizer found.
 
     Attributes:
-        best: `(P, n)` in unit space: of the candidates whose loss ties with the lowest, the one nearest to the problem's first
-            guess; the first guess itself if every candidate diverged.
+        best: `(P, n)` in unit space: of the candidates whose loss ties with the lowest, the nearest
+            to the problem's first guess; the first guess itself if every candidate diverged.
         loss: `(P,)`, the loss of `best`; infinity if every candidate diverged.
-        filling: `(P, 3)`, lowest, median and highest finite loss of the space-filling candidates (`Optimizer.space_filling`;
-            neither guesses nor what an optimizer chose by looking at losses count). The median of an even number is the lower of
-            the middle two. NaN if none is finite.
+        filling: `(P, 3)`, lowest, median and highest finite loss of the space-filling candidates
+            (`Optimizer.space_filling`): neither guesses nor what an optimizer chose by looking at
+            losses. The median of an even number is the lower of the middle two. NaN if none is
+            finite.
         diverged: `(P,)` int64, number of candidates whose loss was NaN or infinite.
     """
 
@@ -63,24 +73,24 @@ class Solution:
 
     @property
     def sensitivity(self) -> Tensor:
-        """How much the choice of parameters matters, `(P,)`: the median loss of the space-filling candidates minus `loss`.
+        """How much the choice of parameters matters, `(P,)`, in the unit of the loss.
 
-        In the unit of the loss, never negative; 0 where nothing tells candidates apart or every candidate diverged.
+        The median loss of the space-filling candidates minus `loss`; never negative. It is 0 where
+        nothing tells candidates apart or every candidate diverged.
         """
-        return (
-            (self.filling[:, 1] - self.loss)
-            .nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
-            .clamp(min=0.0)
-        )
+        difference = self.filling[:, 1] - self.loss
+        return difference.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0).clamp(min=0.0)
 
 
 class Optimizer(Component):
     """Base of every optimizer.
 
-    Life cycle: calibration calls `minimize` once per group of problems; `minimize` cuts the group into chunks that respect the
-    memory bound, calls `solve` for each, checks what comes back and reduces it to a `Solution`. A subclass implements `solve`,
-    `evaluations` and `bytes_per_problem`. It keeps no state between calls, and the result for a problem must not depend on which
-    other problems stand beside it, beyond rounding. `cfx.testing.optimizers.OptimizerContract` tests all this.
+    Life cycle: calibration calls `minimize` once per group of problems. `minimize` cuts the group
+    into chunks that respect the memory bound, calls `solve` for each, checks what comes back and
+    reduces it to a `Solution`. A subclass implements `solve`, `evaluations` and
+    `bytes_per_problem`. It keeps no state between calls. The result of a problem must not depend on
+    which other problems stand beside it, beyond rounding. `cfx.testing.OptimizerContract` tests all
+    this.
     """
 
     kind = "optimizer"
@@ -92,12 +102,15 @@ class Optimizer(Component):
         """Evaluates candidates of all problems of one chunk.
 
         Args:
-            objective: takes candidates within [0, 1]; returns finite losses or infinity, never NaN. It counts evaluations.
-            guesses: `(P, g, n)` in unit space, g >= 1: candidates to evaluate first; they count as evaluations.
+            objective: returns the losses of candidates within [0, 1]: finite or infinity, never
+                NaN. It counts evaluations.
+            guesses: `(P, g, n)` in unit space, g >= 1: candidates to evaluate first; they count as
+                evaluations.
             seed: the same for every chunk; 0 is a seed like any other.
 
         Returns:
-            Candidates `(P, e, n)` and their losses `(P, e)` in the order of evaluation; may be expanded views.
+            Candidates `(P, e, n)` and their losses `(P, e)` in the order of evaluation; may be
+            expanded views.
         """
 
     @abstractmethod
@@ -106,14 +119,23 @@ class Optimizer(Component):
 
     @abstractmethod
     def bytes_per_problem(self, n: int) -> int:
-        """Returns an upper estimate of the memory that `solve` needs for one problem, besides its result and the objective."""
+        """Returns an upper estimate of the memory that `solve` needs for one problem.
+
+        Its result and the losses do not count.
+
+        Args:
+            n: number of parameters.
+        """
 
     def evaluations_at_once(self) -> int:
-        """Returns how many candidates of one problem `solve` hands to the objective in one call at most; 1 unless overridden."""
+        """Returns the most candidates of one problem in one call of the losses; 1 by default."""
         return 1
 
     def space_filling(self) -> int:
-        """Returns how many first evaluations, guesses included, are chosen without looking at losses; all unless overridden."""
+        """Returns how many first evaluations are chosen without looking at losses.
+
+        Guesses are included. All evaluations unless overridden.
+        """
         return self.evaluations()
 
     def minimize(
@@ -127,19 +149,22 @@ class Optimizer(Component):
         progress: Progress = lambda _: None,
         tolerance: float = 0.0,
     ) -> Solution:
-        """Solves all problems of `objective`.
+        """Solves all problems.
 
         Args:
+            objective: losses of the problems.
             guesses: `(P, g, n)` in unit space, g >= 1.
             seed: the same seed gives the same result.
-            objective_bytes: memory that the objective needs for one candidate of one problem.
+            objective_bytes: memory that the loss of one candidate of one problem needs.
             memory: bound in bytes for one chunk; a chunk holds at least one problem.
             progress: called with the number of evaluations done since the last call.
-            tolerance: losses this close to the lowest, in their unit, count as equal besides those that rounding makes equal.
+            tolerance: losses this close to the lowest, in their unit, count as equal besides those
+                that rounding makes equal.
 
         Raises:
-            PluginError: the optimizer asks for a candidate outside [0, 1], of another shape or not in float64; or it returns NaN,
-                anything of another shape or dtype, or another number of evaluations than it says.
+            PluginError: the optimizer asks for a candidate outside [0, 1], of another shape or not
+                in float64; or it returns NaN, anything of another shape or dtype, or another number
+                of evaluations than it says.
         """
         problems, _, n = guesses.shape
         returned = 8 * self.evaluations() * (2 * n + 4)
@@ -162,18 +187,19 @@ class Optimizer(Component):
         expected = (problems, self.evaluations())
         if losses.shape != expected or candidates.shape != (*expected, n):
             raise PluginError(
-                f"{registry.origin(self)}: solve must return candidates {(*expected, n)} and losses {expected}"
-                f" as evaluations() says, but returned {tuple(candidates.shape)} and {tuple(losses.shape)}"
+                f"{registry.origin(self)}: solve must return candidates {(*expected, n)} and losses"
+                f" {expected} as evaluations() says, but returned {tuple(candidates.shape)} and"
+                f" {tuple(losses.shape)}"
             )
         if {candidates.dtype, losses.dtype} != {torch.float64}:
             raise PluginError(
-                f"{registry.origin(self)}: solve must return float64, but returned candidates in {candidates.dtype} and losses in"
-                f" {losses.dtype}"
+                f"{registry.origin(self)}: solve must return float64, but returned candidates in"
+                f" {candidates.dtype} and losses in {losses.dtype}"
             )
         if bool(losses.isnan().any()) or not bool(((candidates >= 0) & (candidates <= 1)).all()):
             raise PluginError(
-                f"{registry.origin(self)}: solve must return candidates within [0, 1] and losses that are numbers or infinity,"
-                " but returned NaN or a candidate outside"
+                f"{registry.origin(self)}: solve must return candidates within [0, 1] and losses"
+                " that are numbers or infinity, but returned NaN or a candidate outside"
             )
 
 
@@ -191,8 +217,10 @@ def _reduce(
     some = finite.any(dim=1)
     best = best.where(some[:, None], guesses[:, 0])
     loss = losses.gather(1, index).squeeze(1).where(some, torch.inf)
-    # An optimizer whose initial design is all guesses still says something about the spread through them.
-    first = g if space_filling > g else 0
+    # Where all space-filling evaluations are guesses, the guesses count.
+    first = 0
+    if space_filling > g:
+        first = g
     filled = losses[:, first:space_filling]
     filled = filled.where(filled.isfinite(), torch.nan)
     usable = filled.isnan().logical_not().any(dim=1)
@@ -205,7 +233,10 @@ def _reduce(
 
 
 class _Guarded:
-    """An objective whose NaN losses are infinity, that counts evaluations and refuses candidates outside the bounds."""
+    """Losses without NaN, which becomes infinity.
+
+    Counts evaluations and refuses candidates outside the bounds.
+    """
 
     def __init__(
         self, objective: CandidateLosses, progress: Progress, n: int, optimizer: str
@@ -227,13 +258,14 @@ class _Guarded:
             or (shape[0], shape[2]) != (self.problems, self._n)
         ):
             raise PluginError(
-                f"{self._optimizer}: it asked for candidates {shape} in {candidates.dtype}; it must ask for"
-                f" ({self.problems}, q, {self._n}) in float64"
+                f"{self._optimizer}: it asked for candidates {shape} in {candidates.dtype}; it must"
+                f" ask for ({self.problems}, q, {self._n}) in float64"
             )
         # Written so that NaN fails too.
         if not bool(((candidates >= 0) & (candidates <= 1)).all()):
             raise PluginError(
-                f"{self._optimizer}: it asked for a candidate outside the bounds [0, 1] of unit space"
+                f"{self._optimizer}: it asked for a candidate outside the bounds [0, 1] of unit"
+                " space"
             )
         losses = self._objective(candidates).to(torch.float64)
         self._progress(losses.numel())

@@ -1,12 +1,17 @@
-"""Bayesian optimisation of many independent problems as one batch: a Gaussian process and LogEI for each.
+"""Bayesian optimisation of many independent problems as one batch.
 
-Model, likelihood, prior, standardisation, fitting loop and acquisition function are BoTorch's and GPyTorch's own:
+Each problem has a Gaussian process and LogEI of its own.
 
-- S. Ament et al. (2023), *Unexpected improvements to expected improvement for Bayesian optimization* (LogEI).
-- C. Hvarfner, E. O. Hellsten and L. Nardi (2024), *Vanilla Bayesian optimization performs great in high dimensions* (the
-  lengthscale prior, which `SingleTaskGP` uses by default).
-- R. G. Regis and C. A. Shoemaker (2013), *Combining radial basis function surrogates and dynamic coordinate search in
-  high-dimensional expensive black-box optimization* (candidates that change only some coordinates of the best point).
+Model, likelihood, prior, standardisation, fitting loop and acquisition function are BoTorch's and
+GPyTorch's own:
+
+- S. Ament et al. (2023), *Unexpected improvements to expected improvement for Bayesian
+  optimization* (LogEI).
+- C. Hvarfner, E. O. Hellsten and L. Nardi (2024), *Vanilla Bayesian optimization performs great in
+  high dimensions* (the lengthscale prior, which `SingleTaskGP` uses by default).
+- R. G. Regis and C. A. Shoemaker (2013), *Combining radial basis function surrogates and dynamic
+  coordinate search in high-dimensional expensive black-box optimization* (candidates that change
+  only some coordinates of the best point).
 """
 
 from __future__ import annotations
@@ -43,16 +48,19 @@ from cfx.optimizers.base import CandidateLosses, Optimizer
 from cfx.optimizers.random import AT_ONCE, check_room, evaluate_in_blocks, sobol
 
 _NOISE = 1e-6
-"""Variance of the standardised values: a simulation has no noise, this only keeps matrices positive definite."""
+"""Variance of the standardised values: a simulation has no noise, this only keeps matrices positive
+definite."""
 
 _LEARNING_RATE = 0.2
 """Of Adam on the logarithm of lengthscales, where a step means a factor."""
 
 _NEAR_STEPS = (0.01, 0.5)
-"""Standard deviations of the steps away from the best point, in unit space; drawn uniformly in the logarithm."""
+"""Standard deviations of the steps away from the best point, in unit space; drawn uniformly in the
+logarithm."""
 
 _COORDINATES_CHANGED = 3
-"""On average, in a candidate near the best point. Few parameters matter at a time: which, depends on the regime of the window."""
+"""On average, in a candidate near the best point. Few parameters matter at a time: which, depends
+on the regime of the window."""
 
 
 class BotorchSettings(Settings):
@@ -71,8 +79,9 @@ class BotorchSettings(Settings):
     screening: int = Field(
         2048,
         ge=0,
-        description="further Sobol points evaluated at the start; the first Gaussian process sees the best of them. Nearly free"
-        " where simulation is batched, and w99 needs it; 0 where each evaluation is dear",
+        description="further Sobol points evaluated at the start; the first Gaussian process sees"
+        " the best of them. Nearly free where simulation is batched, and w99 needs it; 0 where each"
+        " evaluation is expensive",
     )
     first_fit_steps: int = Field(
         60, ge=1, description="steps of Adam in the first fit of a Gaussian process"
@@ -92,24 +101,29 @@ class BotorchSettings(Settings):
 
 
 class BotorchOptimizer(Optimizer):
-    """Gaussian-process optimisation of all problems of a chunk at once, one evaluation of each problem per iteration (q = 1).
+    """Gaussian-process optimisation of all problems of a chunk at once.
 
-    Life of one problem: guesses and Sobol points are evaluated, `initial` in all; then, `iterations` times, a Gaussian process is
-    fitted to everything seen and the candidate with the greatest expected improvement is evaluated.
+    One candidate of each problem is evaluated per iteration (q = 1). First, guesses and Sobol
+    points are evaluated, `initial` in all. Then, `iterations` times, a Gaussian process is fitted
+    to everything seen, and the candidate with the greatest expected improvement is evaluated.
 
-    What makes it work on losses of drives:
+    What makes it work on losses of trajectories:
 
-    - The process models `-log sqrt(loss^2 + best^2)`. Losses span orders of magnitude with a kink at the optimum; this magnifies
-      the neighbourhood of the best loss down to its own size and no further, so that it stays smooth there.
+    - The process models `-log sqrt(loss^2 + best^2)`. Losses span orders of magnitude with a kink
+      at the optimum; this magnifies the neighbourhood of the best loss down to its own size and no
+      further, so that it stays smooth there.
     - Matern 3/2: driving models switch between regimes, so losses have kinks.
-    - Noise is fixed at almost nothing: the prior on noise that suits experiments blurs a simulation's narrow valleys.
+    - Noise is fixed at almost nothing: the prior on noise that suits experiments blurs a
+      simulation's narrow valleys.
 
-    What makes it fast: one model with a batch of P Gaussian processes; marginal variances only; a few steps of Adam from the last
-    lengthscales instead of a fit from scratch (BoTorch's batched L-BFGS costs ten times as much and finds no better losses).
-    Every sum over problems separates, and the numbers of steps are fixed, so problems do not influence each other.
+    What makes it fast: one model with a batch of P Gaussian processes; marginal variances only; a
+    few steps of Adam from the last lengthscales instead of a fit from scratch (BoTorch's batched
+    L-BFGS costs ten times as much and finds no better losses). Every sum over problems separates,
+    and the numbers of steps are fixed, so problems do not influence each other.
 
-    Robust by construction: diverged candidates count as the worst finite loss of their problem; a constant objective standardises
-    to zeros; duplicates are carried by the noise; candidates are clamped.
+    Robust by construction: diverged candidates count as the worst finite loss of their problem; a
+    constant objective standardises to zeros; duplicates are carried by the noise; candidates are
+    clamped.
     """
 
     schema: ClassVar[type[Settings]] = BotorchSettings
@@ -125,7 +139,8 @@ class BotorchOptimizer(Optimizer):
         return min(AT_ONCE, self.space_filling())
 
     def bytes_per_problem(self, n: int) -> int:
-        # Measured: a fit holds about 24 matrices (seen, seen) for its gradient, LogEI about 8 of (raw samples, seen).
+        # Measured: a fit holds about 24 matrices (seen, seen) for its gradient, LogEI about 8 of
+        # (raw samples, seen).
         seen = self.settings.initial + self.settings.iterations
         query = self.settings.raw_samples * (8 * seen + 6 * n)
         climb = self.settings.restarts * (24 * seen + 12 * n)
@@ -172,20 +187,20 @@ class _Search:
 
     def ask(self) -> Tensor:
         """Returns the candidates `(P, 1, n)` with the greatest expected improvement."""
-        values = Standardize(1, batch_shape=self._seen.shape[:1])(_values(self._losses)[..., None])[
-            0
-        ]
+        standardize = Standardize(1, batch_shape=self._seen.shape[:1])
+        values, _ = standardize(_values(self._losses)[..., None])
+        steps = self._settings.fit_steps
+        if self._fits == 0:
+            steps = self._settings.first_fit_steps
         with _quiet_and_patient():
             process = _MarginalGP(self._seen, values, self._mean, self._kernel)
-            _fit(
-                process, self._settings.fit_steps if self._fits else self._settings.first_fit_steps
-            )
+            _fit(process, steps)
             self._fits += 1
             improvement = LogExpectedImprovement(_Marginals(process), best_f=values.amax(dim=1))
             return self._maximise(improvement)
 
     def _maximise(self, improvement: LogExpectedImprovement) -> Tensor:
-        """Returns `(P, 1, n)`: the best raw samples climbed by Adam; each problem's climb is its own."""
+        """Returns `(P, 1, n)`: the best raw samples, improved by Adam, each problem on its own."""
         with torch.no_grad():
             raw = self._raw_samples()
             value = improvement(raw[..., None, :])
@@ -211,12 +226,15 @@ class _Search:
         return start.gather(0, chosen[None, :, None].expand(1, -1, start.shape[-1])).transpose(0, 1)
 
     def _raw_samples(self) -> Tensor:
-        """Returns `(raw_samples, P, n)`: anywhere, and near each problem's best; the same random numbers in every problem."""
+        """Returns `(raw_samples, P, n)`: points anywhere and points near each problem's best.
+
+        The random numbers are the same in every problem.
+        """
         problems, _, n = self._seen.shape
         everywhere = self._settings.raw_samples // 4
         near = self._settings.raw_samples - everywhere
         draw = partial(torch.rand, generator=self._generator, dtype=torch.float64)
-        low, high = (math.log(step) for step in _NEAR_STEPS)
+        low, high = math.log(_NEAR_STEPS[0]), math.log(_NEAR_STEPS[1])
         size = torch.exp(low + (high - low) * draw(near, 1))
         changed = draw(near, n) < min(1.0, _COORDINATES_CHANGED / n)
         changed[torch.arange(near), torch.randint(n, (near,), generator=self._generator)] = True
@@ -236,15 +254,17 @@ def _best_of(losses: Tensor, guesses: int, count: int) -> Tensor:
 
 
 def _values(losses: Tensor) -> Tensor:
-    """Returns what the Gaussian process models, `(P, e)`, more is better: `-log sqrt(excess^2 + scale^2)`.
+    """Returns what the Gaussian process models, `(P, e)`: `-log sqrt(excess^2 + scale^2)`.
 
-    For losses that are not negative, the excess is the loss and the scale is the best loss (at least a ten-thousandth of the
-    median). Otherwise the excess is taken over the best loss, and the scale is a tenth of its median.
+    For losses that are not negative, the excess is the loss and the scale is the best loss (at
+    least a ten-thousandth of the median). Otherwise the excess is taken over the best loss, and the
+    scale is a tenth of its median.
     """
     finite = losses.isfinite()
     worst = losses.where(finite, -torch.inf).amax(dim=1, keepdim=True)
     losses = losses.where(finite, worst).where(worst.isfinite(), 0.0)
-    # Half the losses' difference is finite where the difference is not; the logarithm does not mind the factor.
+    # Half the losses' difference is finite where the difference is not; the logarithm does not mind
+    # the factor.
     lowest = 0.5 * losses.amin(dim=1, keepdim=True)
     excess = 0.5 * losses - lowest.clamp(max=0.0)
     median = excess.median(dim=1, keepdim=True).values
@@ -259,7 +279,8 @@ def _values(losses: Tensor) -> Tensor:
 def _kernel(n: int, batch: torch.Size) -> Kernel:
     """Returns a Matern 3/2 kernel with one lengthscale per parameter and Hvarfner et al.'s prior.
 
-    As BoTorch's `get_covar_module_with_dim_scaled_prior`, but for the smoothness, and fitted in the logarithm of the lengthscale.
+    As BoTorch's `get_covar_module_with_dim_scaled_prior`, but for the smoothness, and fitted in the
+    logarithm of the lengthscale.
     """
     prior = LogNormalPrior(loc=math.sqrt(2) + 0.5 * math.log(n), scale=math.sqrt(3))
     constraint = GreaterThan(
@@ -275,9 +296,14 @@ def _kernel(n: int, batch: torch.Size) -> Kernel:
 
 
 def _fit(process: SingleTaskGP, steps: int) -> None:
-    """Takes a fixed number of steps: a stopping rule would look at the sum over problems and couple them."""
+    """Takes a fixed number of steps.
+
+    A stopping rule would look at the sum over problems and couple them.
+    """
     likelihood = ExactMarginalLogLikelihood(process.likelihood, process).train()
-    before = {name: parameter.detach().clone() for name, parameter in process.named_parameters()}
+    before = {}
+    for name, parameter in process.named_parameters():
+        before[name] = parameter.detach().clone()
     adam = partial(torch.optim.Adam, lr=_LEARNING_RATE)
     fit_gpytorch_mll_torch(likelihood, step_limit=steps, stopping_criterion=None, optimizer=adam)
     with torch.no_grad():
@@ -288,16 +314,20 @@ def _fit(process: SingleTaskGP, steps: int) -> None:
 
 @contextmanager
 def _quiet_and_patient() -> Iterator[None]:
-    """Lets the Cholesky decomposition add jitter, to the matrices that need it only, as often as it takes, without a warning."""
+    """Lets the Cholesky decomposition add jitter as often as it takes, without a warning.
+
+    Jitter is added to the matrices alone that need it.
+    """
     with cholesky_max_tries(9), warnings.catch_warnings():
         warnings.simplefilter("ignore", NumericalWarning)
         yield
 
 
 class _MarginalGP(SingleTaskGP):
-    """A `SingleTaskGP` of P problems, queried at `(P, m, n)`, that gives the m marginals instead of the joint distribution.
+    """A `SingleTaskGP` of P problems, queried at `(P, m, n)`, that gives the m marginals alone.
 
-    GPyTorch's own posterior would evaluate the covariance of the queries among each other, most of the work, for its diagonal.
+    GPyTorch's own posterior would evaluate the covariance of the queries among each other, most of
+    the work, for its diagonal.
     """
 
     def __init__(self, seen: Tensor, values: Tensor, mean: Mean, kernel: Kernel) -> None:
@@ -323,7 +353,10 @@ class _MarginalGP(SingleTaskGP):
 
 
 class _Marginals(Model):
-    """Hands queries `(m, P, 1, n)`, as acquisition functions pose them, to the processes as `(P, m, n)`: one product each."""
+    """Hands queries `(m, P, 1, n)` of acquisition functions to the processes as `(P, m, n)`.
+
+    That is one matrix product for each process.
+    """
 
     def __init__(self, process: _MarginalGP) -> None:
         super().__init__()
@@ -337,8 +370,10 @@ class _Marginals(Model):
     def batch_shape(self) -> torch.Size:
         return torch.Size(self._process.batch_shape)
 
-    def posterior(self, X: Tensor, *_: Any, **__: Any) -> Posterior:  # noqa: N803  # BoTorch's name, passed as keyword
-        # Without this, the few queries of a climb would be taken as dense and their diagonal covariance filled up.
+    # X is BoTorch's name, passed as keyword.
+    def posterior(self, X: Tensor, *_: Any, **__: Any) -> Posterior:  # noqa: N803
+        # Without this, the few queries of a climb would be taken as dense and their diagonal
+        # covariance filled up.
         with max_eager_kernel_size(0):
             found = self._process.posterior(X.squeeze(-2).transpose(0, 1))
             return _Normal(
@@ -347,7 +382,7 @@ class _Marginals(Model):
 
 
 class _Normal(Posterior):
-    """Independent normal distributions: all that an analytic acquisition function reads of a posterior."""
+    """Independent normal distributions: what an analytic acquisition function needs."""
 
     def __init__(self, mean: Tensor, variance: Tensor) -> None:
         self._mean, self._variance = mean, variance

@@ -1,12 +1,14 @@
-"""Random search over a scrambled Sobol sequence: the yardstick of every optimizer, and nearly free where simulation is batched.
+"""Random search over a scrambled Sobol sequence: the baseline of every optimizer.
 
-I. M. Sobol' (1967), *On the distribution of points in a cube and the approximate evaluation of integrals*; scrambling after
-A. B. Owen (1998) and J. Matousek (1998), as PyTorch implements it.
+It is nearly free where simulation is batched.
+
+I. M. Sobol' (1967), *On the distribution of points in a cube and the approximate evaluation of
+integrals*; scrambling after A. B. Owen (1998) and J. Matousek (1998), as PyTorch implements it.
 """
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from pydantic import Field
@@ -17,7 +19,8 @@ from cfx.errors import ConfigError
 from cfx.optimizers.base import CandidateLosses, Optimizer
 
 AT_ONCE = 512
-"""Candidates of one problem in one call of the objective: its intermediate values then stay small whatever `samples` is."""
+"""Candidates of one problem in one call of the losses: intermediate values stay small whatever
+`samples` is."""
 
 
 class RandomSettings(Settings):
@@ -29,8 +32,8 @@ class RandomSettings(Settings):
 class RandomSearch(Optimizer):
     """Evaluates the guesses and the same scrambled Sobol points in every problem.
 
-    The points are the same for every problem, so that neighbouring windows are compared on the same ground, and a problem's
-    result does not depend on its companions.
+    The points are the same for every problem, so that neighbouring windows are compared on the same
+    ground, and a problem's result does not depend on its companions.
     """
 
     schema: ClassVar[type[Settings]] = RandomSettings
@@ -56,22 +59,32 @@ class RandomSearch(Optimizer):
 
 
 def evaluate_in_blocks(objective: CandidateLosses, candidates: Tensor) -> Tensor:
-    """Returns losses `(P, q)` of candidates `(P, q, n)`, at most `AT_ONCE` of each problem in one call."""
-    return torch.cat([objective(block) for block in torch.split(candidates, AT_ONCE, dim=1)], dim=1)
+    """Returns losses `(P, q)` of candidates `(P, q, n)`, asked for in blocks of `AT_ONCE`."""
+    losses = []
+    for block in torch.split(candidates, AT_ONCE, dim=1):
+        losses.append(objective(block))
+    return torch.cat(losses, dim=1)
 
 
 def check_room(evaluations: int, guesses: int, *, key: str) -> None:
-    """Raises ConfigError if the setting `key` allows fewer evaluations than there are first guesses."""
+    """Checks that the setting `key` allows as many evaluations as there are first guesses.
+
+    Raises:
+        ConfigError: it does not.
+    """
     if evaluations < guesses:
         raise ConfigError(
-            f"optimizer.{key}={evaluations}: there are {guesses} first guesses; set optimizer.{key} >= {guesses}"
+            f"optimizer.{key}={evaluations}: there are {guesses} first guesses;"
+            f" set optimizer.{key} >= {guesses}"
         )
 
 
 def sobol(count: int, n: int, *, seed: int, like: Tensor) -> Tensor:
-    """Returns `count` scrambled Sobol points `(count, n)` within [0, 1], float64, on the device of `like`."""
+    """Returns scrambled Sobol points `(count, n)` within [0, 1], float64, on `like`'s device."""
     if count == 0:
         return like.new_empty((0, n))
-    engine = torch.quasirandom.SobolEngine(n, scramble=True, seed=seed)  # type: ignore[no-untyped-call]  # torch leaves it untyped
+    # torch leaves the engine untyped.
+    make: Any = torch.quasirandom.SobolEngine
+    engine = make(n, scramble=True, seed=seed)
     points: Tensor = engine.draw(count, dtype=torch.float64)
     return points.to(like.device)

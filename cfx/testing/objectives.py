@@ -14,7 +14,7 @@ from cfx.testing.suite import hold, statements
 
 
 class ObjectiveContract:
-    """What every objective must hold: each statement of `cfx.testing.checks.objectives` is a test."""
+    """What every objective must hold; `cfx.testing.checks.objectives` has the statements."""
 
     @pytest.fixture
     def objective(self) -> Objective:

@@ -1,4 +1,7 @@
-"""The contract of an optimizer, as tests: subclass `OptimizerContract`, fill in the fixture `optimizer`; pytest does the rest."""
+"""The contract of an optimizer, as tests.
+
+Subclass `OptimizerContract`, fill in the fixture `optimizer`, and pytest does the rest.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +21,15 @@ class OptimizerContract:
     """What every optimizer must hold: each statement of `cfx.testing.checks.optimizers` is a test.
 
     Attributes:
-        tolerance: how far in unit space from a known optimum of two parameters the optimizer may end.
+        tolerance: how far in unit space from a known optimum of two parameters the optimizer may
+            end.
     """
 
     tolerance: ClassVar[float] = TOLERANCE
 
     @pytest.fixture
     def optimizer(self) -> Optimizer:
-        """Returns the optimizer under test; choose few evaluations, for it runs some fifty times."""
+        """Returns the optimizer under test; choose few evaluations: it runs some fifty times."""
         raise NotImplementedError(
             "the subclass of OptimizerContract must define the fixture `optimizer`"
         )

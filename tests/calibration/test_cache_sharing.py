@@ -1,4 +1,4 @@
-"""Processes that need the same calibration share its work: each problem is solved once, whoever dies."""
+"""Processes that need the same calibration share its work; each problem is solved once."""
 
 from __future__ import annotations
 
@@ -47,9 +47,12 @@ class Advanced(Task):
         super().__exit__(*error)
         assert error[0] is not None or self.done == self.total, (self.done, self.total)
 
-pairs = wavy_pairs(Krauss(), torch.linspace(1, 3, {PAIRS}, dtype=torch.float64)[:, None].repeat(1, 2) * 0.4)
-tool = module.Calibrator(MemoryStepper(Krauss(), 0.1), Logged(samples=16), seed=0, cache=Cache(here / "cache"), memory=1 << 28,
-                         progress=Advanced)
+truth = torch.linspace(1, 3, {PAIRS}, dtype=torch.float64)[:, None].repeat(1, 2) * 0.4
+pairs = wavy_pairs(Krauss(), truth)
+tool = module.Calibrator(
+    MemoryStepper(Krauss(), 0.1), Logged(samples=16), seed=0, cache=Cache(here / "cache"),
+    memory=1 << 28, progress=Advanced
+)
 (here / f"ready-{{os.getpid()}}").touch()
 while not (here / "go").exists():
     time.sleep(0.01)

@@ -104,7 +104,7 @@ def test_mixed_needs_a_weight() -> None:
 
 
 def test_an_objective_that_is_accumulated_in_a_compiled_step_has_one_graph() -> None:
-    """A rollout may take the terms of each frame inside its compiled step: nothing breaks the graph."""
+    """A rollout may take the terms of each frame inside its compiled step."""
     frame = FrameValues(*torch.rand(4, 3, generator=torch.Generator().manual_seed(0)), dt=0.1)
     for objective in SHIPPED.values():
 

@@ -16,13 +16,11 @@ import torch
 import cfx
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
-from cfx.calibration.losses import PooledLosses, SegmentLosses
 from cfx.calibration.windows import Split, WindowSettings
 from cfx.datasets.synthetic import SyntheticDataset
 from cfx.datasets.tidy import write_tidy
 from cfx.errors import DataError
 from cfx.models.krauss import Krauss
-from cfx.objectives.rmse import SpeedRmse
 from cfx.optimizers.random import RandomSearch
 from cfx.pairs import SIGNALS, PairBatch, PairSet
 from cfx.policies.ensemble import Ensemble
@@ -140,75 +138,6 @@ def calibrator(memory: int = 1 << 28, samples: int = 256) -> Calibrator:
         memory=memory,
         progress=Task,
     )
-
-
-def test_a_joint_objective_is_the_mean_of_its_drives() -> None:
-    truth = torch.tensor([[1.0, 0.1], [2.0, 0.4], [3.0, 0.8]], dtype=torch.float64)
-    batch = PairBatch.of(wavy_pairs(Krauss(), truth))
-    simulator = Simulator(Krauss(), 0.1)
-    index, steps = torch.arange(3), torch.full((3,), 150)
-    drives = SegmentLosses.of_segments(
-        simulator, SpeedRmse(), batch, index, torch.zeros_like(index), steps
-    )
-    ensemble_size = torch.tensor([[True, True, False], [True, True, True]])
-    candidates = torch.rand(
-        (2, 7, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64
-    )
-    for asked in (
-        candidates,
-        candidates[:1].expand(2, -1, -1),
-    ):  # also where a drive of both problems is simulated once
-        joint = PooledLosses(drives, ensemble_size, memory=1 << 30)
-        first, second = (drives(asked[[k, k, k]]) for k in range(2))
-        expected = torch.stack([first[:2].mean(0), second.mean(0)])
-        torch.testing.assert_close(joint(asked), expected)
-        torch.testing.assert_close(joint.select(1, 2)(asked[1:]), expected[1:])
-        # One candidate at a time gives the same.
-        torch.testing.assert_close(PooledLosses(drives, ensemble_size, memory=1)(asked), expected)
-
-
-def test_a_drive_that_diverges_spoils_only_its_own_problems() -> None:
-    pairs = wavy_pairs(Krauss(), torch.tensor([[1.0, 0.1], [2.0, 0.4]], dtype=torch.float64))
-    batch = PairBatch.of(pairs)
-    index = torch.arange(2)
-    drives = SegmentLosses.of_segments(
-        Simulator(Krauss(), 0.1),
-        SpeedRmse(),
-        batch,
-        index,
-        torch.zeros_like(index),
-        torch.full((2,), 150),
-    )
-    drives.measured_speed[10, 1] = torch.nan
-    same = torch.full((2, 3, 2), 0.5, dtype=torch.float64)
-    losses = PooledLosses(drives, torch.tensor([[True, False], [True, True]]), memory=1 << 30)(same)
-    assert losses.isnan().tolist() == [[False] * 3, [True] * 3]
-
-
-def test_joint_losses_are_the_same_where_their_work_is_worth_compiling_for(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    pairs = wavy_pairs(Krauss(), torch.tensor([[1.0, 0.1], [2.0, 0.4]], dtype=torch.float64))
-    index = torch.arange(2)
-    simulator = Simulator(Krauss(), 0.1)
-    drives = SegmentLosses.of_segments(
-        simulator,
-        SpeedRmse(),
-        PairBatch.of(pairs),
-        index,
-        torch.zeros_like(index),
-        torch.full((2,), 23),
-    )
-    candidates = torch.rand(
-        (1, 9, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64
-    )
-    joint = PooledLosses(drives, torch.tensor([[True, True]]), memory=1)
-    expected = joint(candidates)
-    # 2 drives, 9 candidates and 23 steps are worth it together; a turn of one candidate is not.
-    monkeypatch.setattr("cfx.simulation.rollout._WORTH_COMPILING", 2 * 9 * 23)
-    assert simulator.for_work(2 * 9 * 23) is not simulator
-    assert simulator.for_work(2 * 9 * 23 - 1) is simulator
-    torch.testing.assert_close(joint(candidates), expected)
 
 
 def test_the_populations_parameters_fit_all_their_drivers() -> None:

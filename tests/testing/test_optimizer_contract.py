@@ -182,7 +182,8 @@ BROKEN: dict[str, tuple[Optimizer, Any, str]] = {
 @pytest.mark.parametrize("broken", BROKEN)
 def test_it_fails(broken: str) -> None:
     component, check, sentence = BROKEN[broken]
-    # A PluginError is the sentence with which `minimize` itself refuses what no calibration could use.
+    # A PluginError is the sentence with which `minimize` itself refuses what no calibration could
+    # use.
     with pytest.raises((AssertionError, PluginError), match=sentence):
         check(component)
 

@@ -81,7 +81,7 @@ def reads_only_the_signals_it_names(objective: Objective) -> None:
 def a_loss_is_finite_and_never_negative(objective: Objective) -> None:
     loss = objective(_frames(), _counted())
     assert loss.shape == (PROBLEMS, CANDIDATES), (
-        f"a loss has the shape of the batch, here {(PROBLEMS, CANDIDATES)}; it has {tuple(loss.shape)}"
+        f"a loss has the shape of the batch, here {(PROBLEMS, CANDIDATES)}, not {tuple(loss.shape)}"
     )
     assert bool(loss.isfinite().all()), "ordinary trajectories have a finite loss"
     assert bool((loss >= 0).all()), "a loss is never negative: training divides by it"

@@ -1,4 +1,4 @@
-"""The contract of an optimizer, statement by statement. Letters as in `cfx.optimizers.base`."""
+"""The contract of an optimizer, statement by statement. Shapes as in `cfx.optimizers.base`."""
 
 from __future__ import annotations
 
@@ -26,31 +26,33 @@ class Problems:
     """P functions as an objective, which remembers what it was asked."""
 
     def __init__(
-        self, function: Function, driver_features: Tensor, asked: list[Tensor] | None = None
+        self, function: Function, optima: Tensor, asked: list[Tensor] | None = None
     ) -> None:
         self._function = function
-        self._driver_features = driver_features
-        self.asked = [] if asked is None else asked
+        self._optima = optima
+        self.asked: list[Tensor] = []
+        if asked is not None:
+            self.asked = asked
 
     @property
     def problems(self) -> int:
         """P."""
-        return len(self._driver_features)
+        return len(self._optima)
 
     def __call__(self, candidates: Tensor) -> Tensor:
         assert candidates.shape[0] == self.problems, (
             "an objective is asked about all its problems at once"
         )
         self.asked.append(candidates.detach().clone())
-        return self._function(candidates, self._driver_features[:, None])
+        return self._function(candidates, self._optima[:, None])
 
     def select(self, first: int, last: int) -> Problems:
         """Returns problems `first` to `last - 1`; what they are asked is remembered here."""
-        return Problems(self._function, self._driver_features[first:last], self.asked)
+        return Problems(self._function, self._optima[first:last], self.asked)
 
 
 def distance(candidates: Tensor, optimum: Tensor) -> Tensor:
-    """Returns the distance to the optimum: a kink there, as the RMSE of a drive has."""
+    """Returns the distance to the optimum: a kink there, as an RMSE has."""
     return (candidates - optimum).square().sum(dim=-1).sqrt()
 
 
@@ -112,8 +114,9 @@ def recovers_a_known_optimum(optimizer: Optimizer, tolerance: float = TOLERANCE)
         found = _solve(optimizer, Problems(function, optima), n=2)
         worst = torch.linalg.vector_norm(found.best - optima, dim=-1).max().item()
         assert worst <= tolerance, (
-            f"the optimum of a smooth function of two parameters must be found to {tolerance:g} in unit space, or calibration"
-            f" says nothing about the driver; '{function.__name__}' was missed by {worst:.3g}"
+            f"the optimum of a smooth function of two parameters must be found to {tolerance:g} in"
+            " unit space, or calibration says nothing about the driver;"
+            f" '{function.__name__}' was missed by {worst:.3g}"
         )
 
 
@@ -129,7 +132,8 @@ def never_leaves_the_bounds(optimizer: Optimizer) -> None:
         for asked in [*problems.asked, found.best]:
             inside = bool(((asked >= 0) & (asked <= 1)).all())
             assert inside, (
-                "a candidate lies outside [0, 1]: a model would drive with parameters outside its bounds"
+                "a candidate lies outside [0, 1]: a model would drive with parameters outside its"
+                " bounds"
             )
 
 
@@ -142,7 +146,8 @@ def survives_whatever_the_losses_are(optimizer: Optimizer) -> None:
                 f"the parameters of a window must be numbers whatever its losses are{what}"
             )
             assert not bool(found.loss.isnan().any()), (
-                f"a loss is a number, or infinity where every candidate diverged, for means are taken over losses{what}"
+                "a loss is a number, or infinity where every candidate diverged, for means are"
+                f" taken over losses{what}"
             )
 
 
@@ -153,7 +158,8 @@ def survives_duplicate_guesses(optimizer: Optimizer) -> None:
     torch.testing.assert_close(
         found.best,
         optima,
-        msg="the guesses were the optimum, so it must be returned: what was evaluated and what is returned are the same numbers",
+        msg="the guesses were the optimum, so it must be returned: what was evaluated and what is"
+        " returned are the same numbers",
     )
 
 
@@ -161,8 +167,8 @@ def finds_a_corner(optimizer: Optimizer, tolerance: float = TOLERANCE) -> None:
     found = _solve(optimizer, Problems(corner, _random(3, 2, seed=5)), n=2)
     reached = found.best.min().item()
     assert reached >= 1 - 2 * tolerance, (
-        f"the best parameters of real drivers often lie at a bound, so the bounds must be within reach; the optimum is the corner"
-        f" (1, 1), the optimizer stayed at {reached:.3g}"
+        "the best parameters of real drivers often lie at a bound, so the bounds must be within"
+        f" reach; the optimum is the corner (1, 1), the optimizer stayed at {reached:.3g}"
     )
 
 
@@ -176,25 +182,27 @@ def a_problem_alone_and_all_diverged(optimizer: Optimizer) -> None:
         "where every candidate diverges, the loss is infinity: nobody may take it for a result"
     )
     assert found.diverged.tolist() == [optimizer.evaluations()], (
-        "every diverged candidate is counted: users are told of models that fail within their bounds"
+        "every diverged candidate is counted: users see which models fail within their bounds"
     )
     assert found.sensitivity.tolist() == [0.0], (
-        "where every candidate diverges, nothing tells candidates apart: such a window must weigh nothing"
+        "where every candidate diverges, nothing tells candidates apart: such a window must weigh"
+        " nothing"
     )
 
 
 def the_same_seed_gives_the_same_result(optimizer: Optimizer) -> None:
-    driver_features = _random(3, 2, seed=5)
+    optima = _random(3, 2, seed=5)
     for seed in (0, 7):
         with _kept_random_states():
             _set_random_states(1)
-            one = _solve(optimizer, Problems(rugged, driver_features), n=2, seed=seed)
+            one = _solve(optimizer, Problems(rugged, optima), n=2, seed=seed)
             _set_random_states(2)
             before = _random_states()
-            two = _solve(optimizer, Problems(rugged, driver_features), n=2, seed=seed)
+            two = _solve(optimizer, Problems(rugged, optima), n=2, seed=seed)
             after = _random_states()
         assert torch.equal(one.best, two.best), (
-            f"seed={seed} twice gave two results: randomness must come from `seed` alone, or no result can be repeated"
+            f"seed={seed} twice gave two results: randomness must come from `seed` alone, or no"
+            " result can be repeated"
         )
         for name, state in before.items():
             assert state == after[name], (
@@ -211,17 +219,20 @@ def another_seed_searches_elsewhere(optimizer: Optimizer) -> None:
     if optimizer.evaluations() == 1:
         raise NotApplicable("only the first guess is evaluated")
     assert not torch.equal(*asked), (
-        "seeds 0 and 7 asked for the same candidates: `seed` must reach the search, or repeating a study with other seeds shows a"
-        " spread that is not there"
+        "seeds 0 and 7 asked for the same candidates: `seed` must reach the search, or repeating a"
+        " study with other seeds shows less variation than there is"
     )
 
 
 def problems_are_independent(optimizer: Optimizer) -> None:
-    driver_features, guesses = _random(10, 3, seed=5), _random(10, 2, 3, seed=6)
-    message = "a problem's result must not depend on the problems beside it: caches and chunks would change results"
+    optima, guesses = _random(10, 3, seed=5), _random(10, 2, 3, seed=6)
+    message = (
+        "a problem's result must not depend on the problems beside it: caches and chunks would"
+        " change results"
+    )
     for function in (distance, bowl, some_nan):
-        together = optimizer.minimize(Problems(function, driver_features), guesses, seed=1)
-        alone = optimizer.minimize(Problems(function, driver_features[3:7]), guesses[3:7], seed=1)
+        together = optimizer.minimize(Problems(function, optima), guesses, seed=1)
+        alone = optimizer.minimize(Problems(function, optima[3:7]), guesses[3:7], seed=1)
         torch.testing.assert_close(
             alone.loss, together.loss[3:7], rtol=1e-3, atol=1e-6, msg=message
         )
@@ -255,13 +266,15 @@ def evaluates_exactly_what_it_says(optimizer: Optimizer) -> None:
     for k in range(2):
         tried = (asked == guesses[:, k : k + 1]).all(dim=-1).any(dim=1)
         assert bool(tried.all()), (
-            "every guess is evaluated, and counts as an evaluation: no result may be worse than what was known before"
+            "every guess is evaluated, and counts as an evaluation: no result may be worse than"
+            " what was known before"
         )
 
 
 def says_how_many_evaluations_fill_the_space(optimizer: Optimizer) -> None:
     assert 1 <= optimizer.space_filling() <= optimizer.evaluations(), (
-        "space_filling() is a number of evaluations: the spread, which weighs windows, is measured over the first of them"
+        "space_filling() is a number of evaluations: the sensitivity, which weighs windows, is"
+        " measured over the first of them"
     )
     found = _solve(optimizer, Problems(distance, _random(3, 2, seed=5)), n=2, guesses=1)
     low, median, high = found.filling.unbind(1)
@@ -269,7 +282,7 @@ def says_how_many_evaluations_fill_the_space(optimizer: Optimizer) -> None:
         "filling holds the lowest, median and highest loss"
     )
     assert bool((found.sensitivity > 0).all()), (
-        "where the choice of parameters matters, the spread is positive"
+        "where the choice of parameters matters, the sensitivity is positive"
     )
 
 
@@ -281,7 +294,7 @@ def ties_go_to_the_first_guess(optimizer: Optimizer) -> None:
             "a window that says nothing about the parameters keeps the first guess"
         )
         assert found.sensitivity.tolist() == [0.0] * 3, (
-            "a window that says nothing about the parameters has no spread"
+            "a window that says nothing about the parameters has a sensitivity of 0"
         )
 
 
@@ -291,7 +304,8 @@ def returns_the_loss_of_what_it_returns(optimizer: Optimizer) -> None:
     torch.testing.assert_close(
         problems(found.best[:, None])[:, 0],
         found.loss,
-        msg="`loss` must be the loss of `best`: candidates and losses that are returned belong together",
+        msg="`loss` must be the loss of `best`: candidates and losses that are returned belong"
+        " together",
     )
     assert bool((found.loss <= problems(guesses).amin(dim=1) * (1 + 1e-5)).all()), (
         "the result is worse than a guess, which was evaluated too"
@@ -310,7 +324,8 @@ def _random(*shape: int, seed: int) -> Tensor:
 
 
 def _random_states() -> dict[str, object]:
-    name, keys, *rest = np.random.get_state(legacy=True)  # noqa: NPY002 - it is the global state that is looked at
+    # The global state is what is looked at.
+    name, keys, *rest = np.random.get_state(legacy=True)  # noqa: NPY002
     return {
         "torch": torch.get_rng_state().tolist(),
         "numpy": (name, list(keys), *rest),

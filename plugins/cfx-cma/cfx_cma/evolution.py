@@ -1,8 +1,9 @@
 """CMA-ES, the covariance matrix adaptation evolution strategy, for many problems at once.
 
-N. Hansen and A. Ostermeier (2001), *Completely derandomized self-adaptation in evolution strategies*, Evolutionary Computation
-9(2); restarts after A. Auger and N. Hansen (2005), *Performance evaluation of an advanced local search evolutionary algorithm*,
-IEEE CEC. The implementation is Hansen's own: the package `cma`.
+N. Hansen and A. Ostermeier (2001), *Completely derandomized self-adaptation in evolution
+strategies*, Evolutionary Computation 9(2); restarts after A. Auger and N. Hansen (2005),
+*Performance evaluation of an advanced local search evolutionary algorithm*, IEEE CEC. The
+implementation is Hansen's own: the package `cma`.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 _LARGEST = 1e100
-"""Losses are cut here, infinity too: cma squares and subtracts them, and only their order matters to it."""
+"""Losses are cut here, infinity too: cma squares and subtracts them, and only their order matters
+to it."""
 
 _MOST_PER_GENERATION = 18
 """4 + 3 ln n at 100 parameters: more than any driving model has."""
@@ -36,8 +38,8 @@ class CmaSettings(Settings):
     initial: int = Field(
         16,
         ge=1,
-        description="first evaluations, guesses and space-filling points; the search starts at the best of them, and their losses"
-        " tell how much the choice of parameters matters",
+        description="first evaluations, guesses and space-filling points; the search starts at the"
+        " best of them, and their losses say how much the choice of parameters matters",
     )
     population: int | None = Field(
         None, ge=4, description="candidates in a generation; null: 4 + 3 ln n, as cma has it"
@@ -48,13 +50,15 @@ class CmaSettings(Settings):
 
 
 class CmaOptimizer(Optimizer):
-    """One `cma.CMAEvolutionStrategy` for each problem; the generations of all problems are one call of the objective.
+    """One `cma.CMAEvolutionStrategy` for each problem.
 
-    A search that has converged, or that sees only equal losses, starts again at a random point until the evaluations are spent.
-    Every problem draws the same random numbers, made from the seed alone, so its result does not depend on its companions.
+    The generations of all problems are evaluated in one call. A search that has converged, or that
+    sees only equal losses, starts again at a random point until the evaluations are spent. Every
+    problem draws the same random numbers, made from the seed alone, so its result does not depend
+    on its companions.
 
-    Differences from `cma.fmin2`: the start is the best of a few space-filling points, and restarts keep the size of the
-    population. Bounds are kept by cma's own transformation.
+    Differences from `cma.fmin2`: the start is the best of a few space-filling points, and restarts
+    keep the size of the population. Bounds are kept by cma's own transformation.
     """
 
     schema: ClassVar[type[Settings]] = CmaSettings
@@ -79,26 +83,27 @@ class CmaOptimizer(Optimizer):
         problems, g, n = guesses.shape
         if g > self._initial:
             raise ConfigError(
-                f"there are {g} first guesses; set optimizer.initial and optimizer.samples to at least {g}"
-                f" (they are {self.settings.initial} and {self.settings.samples})"
+                f"there are {g} first guesses; set optimizer.initial and optimizer.samples to at"
+                f" least {g} (they are {self.settings.initial} and {self.settings.samples})"
             )
         points = _sobol(self._initial - g, n, seed=seed).to(guesses.device)
         candidates = [torch.cat([guesses, points.expand(problems, -1, -1)], dim=1)]
         losses = [objective(candidates[0])]
-        best = (
-            candidates[0]
-            .gather(1, losses[0].argmin(dim=1)[:, None, None].expand(-1, 1, n))
-            .squeeze(1)
-        )
+        best = losses[0].argmin(dim=1)[:, None, None].expand(-1, 1, n)
+        starts = candidates[0].gather(1, best).squeeze(1)
         size = self.settings.population or 4 + int(3 * math.log(n))
-        searches = [_Search(start, size, self.settings.sigma, seed) for start in best.cpu().numpy()]
-        while (left := self.settings.samples - sum(part.shape[1] for part in losses)) > 0:
+        searches = [
+            _Search(start, size, self.settings.sigma, seed) for start in starts.cpu().numpy()
+        ]
+        left = self.settings.samples - self._initial
+        while left > 0:
             asked = np.stack([search.ask() for search in searches])[:, :left]
             candidates.append(torch.from_numpy(asked).to(guesses.device))
             losses.append(objective(candidates[-1]))
             if left > size:
                 for search, loss in zip(searches, losses[-1].cpu().numpy(), strict=True):
                     search.tell(loss)
+            left -= asked.shape[1]
         return torch.cat(candidates, dim=1), torch.cat(losses, dim=1)
 
     @property
@@ -133,7 +138,8 @@ class _Search:
         from cma import CMAEvolutionStrategy
 
         # cma refuses to search in one dimension: it gets a second one, which changes nothing.
-        padded = np.append(start, 0.5) if self._n == 1 else start
+        if self._n == 1:
+            start = np.append(start, 0.5)
         options = {
             "bounds": [0.0, 1.0],
             "popsize": self._size,
@@ -144,13 +150,15 @@ class _Search:
             "verb_disp": 0,
             "verb_log": 0,
         }
-        return CMAEvolutionStrategy(padded, self._sigma, options)
+        return CMAEvolutionStrategy(start, self._sigma, options)
 
 
 def _sobol(count: int, n: int, *, seed: int) -> Tensor:
     """Returns `count` scrambled Sobol points `(count, n)` within [0, 1], float64."""
     if count == 0:
         return torch.empty((0, n), dtype=torch.float64)
-    engine = torch.quasirandom.SobolEngine(n, scramble=True, seed=seed)  # type: ignore[no-untyped-call]  # torch leaves it untyped
+    # torch leaves the engine untyped.
+    make: Any = torch.quasirandom.SobolEngine
+    engine = make(n, scramble=True, seed=seed)
     points: Tensor = engine.draw(count, dtype=torch.float64)
     return points

@@ -30,7 +30,10 @@ def random(*shape: int) -> torch.Tensor:
 
 
 def valley(candidates: torch.Tensor, optimum: torch.Tensor) -> torch.Tensor:
-    """Returns a narrow valley that lies across the axes: only a search that learns its direction gets to the bottom."""
+    """Returns a narrow valley across the axes.
+
+    Only a search that learns its direction gets to the bottom.
+    """
     away = candidates - optimum
     return away.sum(-1).square() + 1e-4 * away.square().sum(-1)
 

@@ -1,11 +1,13 @@
 """Differential evolution, the usual calibrator of car-following models, for many problems at once.
 
-R. Storn and K. Price (1997), *Differential evolution - a simple and efficient heuristic for global optimization over continuous
-spaces*, Journal of Global Optimization 11; as `scipy.optimize.differential_evolution` implements it.
+R. Storn and K. Price (1997), *Differential evolution - a simple and efficient heuristic for global
+optimization over continuous spaces*, Journal of Global Optimization 11; as
+`scipy.optimize.differential_evolution` implements it.
 
-SciPy solves one problem at a time, and asks for a generation's losses by calling a function. Here each problem's solver runs as a
-greenlet (a coroutine that may pause in the middle of any function): when it calls, it pauses. Once all solvers have paused, their
-generations are evaluated together, and each solver goes on with its losses. SciPy's public function does all the work, unchanged.
+SciPy solves one problem at a time, and asks for a generation's losses by calling a function. Here
+each problem's solver runs as a greenlet (a coroutine that may pause in the middle of any function):
+when it calls, it pauses. Once all solvers have paused, their generations are evaluated together,
+and each solver goes on with its losses. SciPy's public function does all the work, unchanged.
 """
 
 from __future__ import annotations
@@ -25,7 +27,25 @@ from cfx.errors import ConfigError
 Floats = NDArray[np.float64]
 
 _LARGEST = 1e100
-"""Losses are cut here, infinity too: SciPy takes their standard deviation, and only their order matters to the search."""
+"""Losses are cut here, infinity too: SciPy takes their standard deviation, and only their order
+matters to the search."""
+
+
+Strategy = Literal[
+    "best1bin",
+    "best1exp",
+    "rand1bin",
+    "rand1exp",
+    "rand2bin",
+    "rand2exp",
+    "randtobest1bin",
+    "randtobest1exp",
+    "currenttobest1bin",
+    "currenttobest1exp",
+    "best2exp",
+    "best2bin",
+]
+"""SciPy's strategies."""
 
 
 class DifferentialEvolutionSettings(Settings):
@@ -41,10 +61,9 @@ class DifferentialEvolutionSettings(Settings):
         ge=0,
         description="generations after the first; evaluations = population * (generations + 1)",
     )
-    strategy: Literal[
-        "best1bin", "best1exp", "rand1bin", "rand1exp", "rand2bin", "rand2exp", "randtobest1bin", "randtobest1exp",
-        "currenttobest1bin", "currenttobest1exp", "best2exp", "best2bin",
-    ] = Field("best1bin", description="how a candidate is made from others, in SciPy's names")  # fmt: skip
+    strategy: Strategy = Field(
+        "best1bin", description="how a candidate is made from others, in SciPy's names"
+    )
     mutation_low: float = Field(0.5, ge=0, lt=2, description="least weight of a difference")
     mutation_high: float = Field(
         1.0,
@@ -60,21 +79,23 @@ class DifferentialEvolutionSettings(Settings):
     def _in_order(self) -> Self:
         if self.mutation_low > self.mutation_high:
             raise ValueError(
-                f"optimizer.mutation_low={self.mutation_low:g} is above optimizer.mutation_high={self.mutation_high:g}; give a"
-                " range"
+                f"optimizer.mutation_low={self.mutation_low:g} is above"
+                f" optimizer.mutation_high={self.mutation_high:g}; give a range"
             )
         return self
 
 
 class DifferentialEvolution(Optimizer):
-    """One `scipy.optimize.differential_evolution` for each problem; the generations of all are one call of the objective.
+    """One `scipy.optimize.differential_evolution` for each problem.
 
-    Every problem draws the same random numbers, made from the seed alone, so its result does not depend on its companions.
+    The generations of all problems are evaluated in one call. Every problem draws the same random
+    numbers, made from the seed alone, so its result does not depend on its companions.
 
-    Differences from SciPy's defaults: the size of the population does not grow with the number of parameters, so that all
-    models get the same evaluations; the search is not stopped when the population has converged, and not polished by a gradient
-    method, so that every problem gets the same evaluations. A population without differences, which cannot change any more,
-    spends the rest on its best candidate.
+    Differences from SciPy's defaults: the size of the population does not grow with the number of
+    parameters, so that all models get the same evaluations; the search is not stopped when the
+    population has converged, and not polished by a gradient method, so that every problem gets the
+    same evaluations. A population without differences, which cannot change any more, spends the
+    rest on its best candidate.
     """
 
     schema: ClassVar[type[Settings]] = DifferentialEvolutionSettings
@@ -90,7 +111,8 @@ class DifferentialEvolution(Optimizer):
         return self.settings.population
 
     def bytes_per_problem(self, n: int) -> int:
-        # A paused solver took 25 kB at 9 parameters: its frames, its part of the stack, and about ten arrays of a generation.
+        # A paused solver took 25 kB at 9 parameters: its frames, its part of the stack, and about
+        # ten arrays of a generation.
         return 60_000 + 8 * 16 * self.settings.population * (n + 2)
 
     def solve(
@@ -100,18 +122,18 @@ class DifferentialEvolution(Optimizer):
         size = self.settings.population
         if g > size:
             raise ConfigError(
-                f"optimizer.population={size}: there are {g} first guesses; set optimizer.population >= {g}"
+                f"optimizer.population={size}: there are {g} first guesses;"
+                f" set optimizer.population >= {g}"
             )
         points = _sobol(size - g, n, seed=seed).to(guesses.device)
         candidates = [torch.cat([guesses, points.expand(problems, -1, -1)], dim=1)]
         losses = [objective(candidates[0])]
         searches = [_Search(start, self.settings, seed) for start in candidates[0].cpu().numpy()]
         for _ in range(self.settings.generations):
-            told = losses[-1].cpu().numpy()
-            asked = np.stack(
-                [search.tell(loss) for search, loss in zip(searches, told, strict=True)]
-            )
-            candidates.append(torch.from_numpy(asked).to(guesses.device))
+            asked = []
+            for search, loss in zip(searches, losses[-1].cpu().numpy(), strict=True):
+                asked.append(search.tell(loss))
+            candidates.append(torch.from_numpy(np.stack(asked)).to(guesses.device))
             losses.append(objective(candidates[-1]))
         return torch.cat(candidates, dim=1), torch.cat(losses, dim=1)
 
@@ -125,10 +147,15 @@ class _Search:
         self._settings = settings
         self._seed = seed
         self._solver = greenlet(self._solve)
-        self._solver.switch()  # up to the question for the first generation's losses, which the caller has
+        # Up to the question for the first generation's losses, which the caller has.
+        self._solver.switch()
 
     def tell(self, losses: Floats) -> Floats:
-        """Takes the losses `(size,)` of the last generation and returns the next one, `(size, n)` within [0, 1]."""
+        """Takes the losses `(size,)` of the last generation and returns the next one.
+
+        Returns:
+            `(size, n)` within [0, 1].
+        """
         asked: Floats = self._solver.switch(np.clip(losses, -_LARGEST, _LARGEST))
         return np.clip(asked, 0.0, 1.0)
 
@@ -151,7 +178,8 @@ class _Search:
             vectorized=True,
             updating="deferred",
         )
-        # SciPy ends early where all losses are equal: whatever is asked from now on, the answer is its best candidate.
+        # SciPy ends early where all losses are equal: whatever is asked from now on, the answer is
+        # its best candidate.
         while True:
             self._ask(np.repeat(solution.x[:, None], s.population, axis=1))
 
@@ -166,6 +194,8 @@ def _sobol(count: int, n: int, *, seed: int) -> Tensor:
     """Returns `count` scrambled Sobol points `(count, n)` within [0, 1], float64."""
     if count == 0:
         return torch.empty((0, n), dtype=torch.float64)
-    engine = torch.quasirandom.SobolEngine(n, scramble=True, seed=seed)  # type: ignore[no-untyped-call]  # torch leaves it untyped
+    # torch leaves the engine untyped.
+    make: Any = torch.quasirandom.SobolEngine
+    engine = make(n, scramble=True, seed=seed)
     points: Tensor = engine.draw(count, dtype=torch.float64)
     return points

@@ -1,0 +1,138 @@
+"""Losses of segments and pooled losses, against single rollouts."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from cfx.calibration.losses import PooledLosses, SegmentLosses
+from cfx.models.base import Leader
+from cfx.models.krauss import Krauss
+from cfx.objectives.base import FrameValues, Objective
+from cfx.objectives.mixed import Mixed
+from cfx.objectives.rmse import GapRmse, SpeedRmse
+from cfx.objectives.theil import TheilU
+from cfx.pairs import PairBatch
+from cfx.simulation.rollout import MemoryStepper, Start, simulate
+from tests.drives import wavy_pairs
+
+TRUE = torch.tensor([[1.2, 0.1], [2.0, 0.4], [3.0, 0.8]], dtype=torch.float64)
+
+
+OBJECTIVES = [SpeedRmse(), GapRmse(), Mixed(), TheilU(signal="gap")]
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES, ids=lambda one: type(one).__name__)
+def test_losses_are_the_objective_of_the_rollout(objective: Objective) -> None:
+    model = Krauss()
+    batch = PairBatch.of(wavy_pairs(model, TRUE))
+    pair, first, steps = torch.tensor([0, 2]), torch.tensor([10, 50]), torch.tensor([7, 20])
+    losses = SegmentLosses.of_segments(
+        MemoryStepper(model, 0.1), objective, batch, pair, first, steps
+    )
+    candidates = torch.rand(
+        (2, 5, 2), dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+    )
+    found = losses(candidates)
+    for i in range(2):
+        frames = slice(int(first[i]), int(first[i] + steps[i]) + 1)
+        for j in range(5):
+            parameters = model.space.from_unit(candidates[i, j])
+            expected = loss_of(objective, model, batch, int(pair[i]), frames, parameters)
+            torch.testing.assert_close(found[i, j], expected)
+    torch.testing.assert_close(losses.select(1, 2)(candidates[1:]), found[1:])
+
+
+def loss_of(
+    objective: Objective,
+    model: Krauss,
+    batch: PairBatch,
+    p: int,
+    frames: slice,
+    parameters: torch.Tensor,
+) -> torch.Tensor:
+    """Returns the objective of one rollout by the public function."""
+    leader = Leader(
+        batch.leader_position[p, frames],
+        batch.leader_speed[p, frames],
+        batch.leader_acceleration[p, frames],
+        batch.leader_length[p],
+    )
+    first = frames.start
+    start = Start(
+        batch.follower_position[p, first],
+        batch.follower_speed[p, first],
+        batch.follower_acceleration[p, first],
+    )
+    simulated = simulate(model, parameters, leader, start, 0.1)
+    speed, gap = batch.follower_speed[p, frames], batch.gap[p, frames]
+    values = FrameValues(simulated.speed[1:], simulated.gap[1:], speed[1:], gap[1:], 0.1)
+    return objective(values, torch.ones(len(speed) - 1))
+
+
+def test_a_pooled_loss_is_the_mean_of_its_segments() -> None:
+    truth = torch.tensor([[1.0, 0.1], [2.0, 0.4], [3.0, 0.8]], dtype=torch.float64)
+    batch = PairBatch.of(wavy_pairs(Krauss(), truth))
+    simulator = MemoryStepper(Krauss(), 0.1)
+    index, steps = torch.arange(3), torch.full((3,), 150)
+    segments = SegmentLosses.of_segments(
+        simulator, SpeedRmse(), batch, index, torch.zeros_like(index), steps
+    )
+    members = torch.tensor([[True, True, False], [True, True, True]])
+    candidates = torch.rand(
+        (2, 7, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    # Also where a segment of both problems is simulated once.
+    for asked in (candidates, candidates[:1].expand(2, -1, -1)):
+        pooled = PooledLosses(segments, members, memory=1 << 30)
+        first, second = (segments(asked[[k, k, k]]) for k in range(2))
+        expected = torch.stack([first[:2].mean(0), second.mean(0)])
+        torch.testing.assert_close(pooled(asked), expected)
+        torch.testing.assert_close(pooled.select(1, 2)(asked[1:]), expected[1:])
+        # One candidate at a time gives the same.
+        torch.testing.assert_close(PooledLosses(segments, members, memory=1)(asked), expected)
+
+
+def test_a_segment_that_diverges_spoils_only_its_own_problems() -> None:
+    pairs = wavy_pairs(Krauss(), torch.tensor([[1.0, 0.1], [2.0, 0.4]], dtype=torch.float64))
+    batch = PairBatch.of(pairs)
+    index = torch.arange(2)
+    segments = SegmentLosses.of_segments(
+        MemoryStepper(Krauss(), 0.1),
+        SpeedRmse(),
+        batch,
+        index,
+        torch.zeros_like(index),
+        torch.full((2,), 150),
+    )
+    segments.measured_speed[10, 1] = torch.nan
+    same = torch.full((2, 3, 2), 0.5, dtype=torch.float64)
+    members = torch.tensor([[True, False], [True, True]])
+    losses = PooledLosses(segments, members, memory=1 << 30)(same)
+    assert losses.isnan().tolist() == [[False] * 3, [True] * 3]
+
+
+def test_pooled_losses_are_the_same_where_their_work_is_worth_compiling_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pairs = wavy_pairs(Krauss(), torch.tensor([[1.0, 0.1], [2.0, 0.4]], dtype=torch.float64))
+    index = torch.arange(2)
+    simulator = MemoryStepper(Krauss(), 0.1)
+    segments = SegmentLosses.of_segments(
+        simulator,
+        SpeedRmse(),
+        PairBatch.of(pairs),
+        index,
+        torch.zeros_like(index),
+        torch.full((2,), 23),
+    )
+    candidates = torch.rand(
+        (1, 9, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    pooled = PooledLosses(segments, torch.tensor([[True, True]]), memory=1)
+    expected = pooled(candidates)
+    # 2 segments, 9 candidates and 23 steps are worth it together; a block of one candidate is not.
+    monkeypatch.setattr("cfx.simulation.rollout._WORTH_COMPILING", 2 * 9 * 23)
+    assert simulator.for_work(2 * 9 * 23) is not simulator
+    assert simulator.for_work(2 * 9 * 23 - 1) is simulator
+    torch.testing.assert_close(pooled(candidates), expected)
