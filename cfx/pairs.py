@@ -1,7 +1,8 @@
 """Leader-follower pairs: what every dataset delivers and everything else reads.
 
-Glossary (SI units everywhere): *leader* drives ahead of *follower*; *position* is the front bumper's, along the lane;
-*gap* is bumper to bumper, `leader position - leader length - follower position`; *relative speed* is leader minus follower.
+Glossary (SI units everywhere): *leader* drives ahead of *follower*; *position* is the front
+bumper's, along the lane; *gap* is bumper to bumper, `leader position - leader length - follower
+position`; *relative speed* is leader minus follower.
 Shapes: P pairs, T frames of the longest pair.
 """
 
@@ -94,7 +95,7 @@ class Pair:
 
     @cached_property
     def content(self) -> str:
-        """SHA-256 of the drive itself, whatever it and its recording are called."""
+        """SHA-256 of the trajectories alone, whatever the pair and its recording are called."""
         return self._digest(f"{self.dt!r}|{self.leader_length!r}")
 
     def _digest(self, header: str) -> str:
@@ -106,7 +107,11 @@ class Pair:
 
 @dataclass(frozen=True)
 class Dropped:
-    """A count of what a dataset left out, and why. `unit` says what was counted: rows, pairs, vehicles."""
+    """A count of what a dataset left out, and why.
+
+    Attributes:
+        unit: what was counted: rows, pairs or vehicles.
+    """
 
     reason: str
     count: int
@@ -139,13 +144,14 @@ class PairSet(Sequence[Pair]):
 
     def select(self, keep: Sequence[bool], reason: str) -> PairSet:
         """Keeps the pairs marked True and counts the others under `reason`."""
-        kept = tuple(pair for pair, wanted in zip(self.pairs, keep, strict=True) if wanted)
+        kept = []
+        for pair, wanted in zip(self.pairs, keep, strict=True):
+            if wanted:
+                kept.append(pair)
         lost = len(self.pairs) - len(kept)
-        return replace(
-            self,
-            pairs=kept,
-            dropped=(*self.dropped, Dropped(reason, lost)) if lost else self.dropped,
-        )
+        if lost == 0:
+            return replace(self, pairs=tuple(kept))
+        return replace(self, pairs=tuple(kept), dropped=(*self.dropped, Dropped(reason, lost)))
 
     @property
     def dt(self) -> float:
@@ -156,25 +162,29 @@ class PairSet(Sequence[Pair]):
         """
         steps = sorted({round(pair.dt, 9) for pair in self.pairs})
         if len(steps) != 1:
+            listed = ", ".join(f"{step:g} s" for step in steps)
             raise DataError(
-                f"{self.source}: the pairs have different time steps ({', '.join(f'{step:g} s' for step in steps)});"
-                " a job needs one: bring them to one with data.time_step, or split the file"
+                f"{self.source}: the pairs have different time steps ({listed}); a job needs one:"
+                " bring them to one with data.time_step, or split the file"
             )
         return steps[0]
 
     @property
     def fingerprint(self) -> str:
         """SHA-256 over all pairs, in order."""
-        return hashlib.sha256("".join(pair.fingerprint for pair in self.pairs).encode()).hexdigest()
+        digest = hashlib.sha256()
+        for pair in self.pairs:
+            digest.update(pair.fingerprint.encode())
+        return digest.hexdigest()
 
 
 @dataclass(frozen=True)
 class PairBatch:
     """Pairs as padded tensors.
 
-    Beyond its end a pair is continued at its last speed with zero acceleration, so that a rollout stays finite there;
-    `mask` says what is real. Positions are relative to the follower's first position, so that float32 resolves
-    millimetres on a road of any length.
+    Beyond its end a pair is continued at its last speed with zero acceleration, so that a rollout
+    stays finite there; `mask` says what is real. Positions are relative to the follower's first
+    position, so that float32 resolves millimetres on a road of any length.
 
     Attributes:
         leader_position ... follower_acceleration: `(P, T)`, SI units.
@@ -213,23 +223,17 @@ class PairBatch:
         if not len(pairs):
             raise DataError("no pairs to stack")
         pair_set = pairs if isinstance(pairs, PairSet) else PairSet(tuple(pairs), "pairs")
-        dt = pair_set.dt
+        dt, dtype = pair_set.dt, dtype or torch.float64
         length = max(len(pair) for pair in pair_set)
-        stacked = {
-            name: np.stack([_extend(pair, name, length) for pair in pair_set]) for name in SIGNALS
-        }
+        signals = {}
+        for name in SIGNALS:
+            rows = [_extend(pair, name, length) for pair in pair_set]
+            signals[name] = torch.as_tensor(np.stack(rows)).to(device=device, dtype=dtype)
+        leader_lengths = [pair.leader_length for pair in pair_set]
         lengths = torch.tensor([len(pair) for pair in pair_set])
-        tensors = {
-            name: torch.as_tensor(values).to(device=device, dtype=dtype or torch.float64)
-            for name, values in stacked.items()
-        }
         return cls(
-            **tensors,
-            leader_length=torch.tensor(
-                [pair.leader_length for pair in pair_set],
-                dtype=dtype or torch.float64,
-                device=device,
-            ),
+            **signals,
+            leader_length=torch.tensor(leader_lengths, dtype=dtype, device=device),
             lengths=lengths.to(device),
             mask=(torch.arange(length) < lengths[:, None]).to(device),
             dt=dt,
@@ -245,12 +249,18 @@ class PairBatch:
 
     def __getitem__(self, index: Any) -> PairBatch:
         """Selects pairs (a slice, an index tensor or a boolean mask over P); time stays whole."""
-        changed = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "dt"}
-        return replace(self, **changed)
+        chosen: dict[str, Any] = {}
+        for one in fields(self):
+            if one.name != "dt":
+                chosen[one.name] = getattr(self, one.name)[index]
+        return replace(self, **chosen)
 
 
 def _extend(pair: Pair, name: str, length: int) -> Array:
-    """Returns a signal continued to `length` frames at constant speed, positions relative to the follower's first."""
+    """Returns a signal `(length,)`, continued at constant speed.
+
+    Positions are relative to the follower's first.
+    """
     values = np.asarray(getattr(pair, name), dtype=np.float64)
     missing = length - len(values)
     tail: Array
@@ -259,7 +269,8 @@ def _extend(pair: Pair, name: str, length: int) -> Array:
         tail = values[-1] + speed * pair.dt * np.arange(1, missing + 1)
         origin = float(pair.follower_position[0])
     else:
-        tail = np.full(missing, values[-1] if name.endswith("speed") else 0.0)
+        last = values[-1] if name.endswith("speed") else 0.0
+        tail = np.full(missing, last)
         origin = 0.0
     extended: Array = np.concatenate([values, tail]) - origin
     return extended

@@ -1,16 +1,20 @@
 """Parameters of driving models: one frozen specification that feeds everything else.
 
-Calibration bounds, policy outputs, config nodes, the documentation table and the contract tests all read the
-same `ParameterSpace`. A *tuned* parameter is calibrated and adapted; the others are constants of the config
-that a user may set, or turn into tuned ones (`model.parameters.a.tuned=true`).
+Calibration bounds, policy outputs, config nodes, the documentation table and the contract tests all
+read the same `ParameterSpace`. A *tuned* parameter is calibrated and adapted. The others are
+constants of the config that a user may set, or turn into tuned ones
+(`model.parameters.a.tuned=true`). A tuned parameter is *frozen* where policies of offsets leave it
+at its base, and *adaptable* otherwise.
 
-Shape convention used throughout: a parameter tensor is `(*batch, n)` with n the number of *tuned* parameters, in
-the order of `ParameterSpace.names`. *Unit space* is the same tensor mapped linearly so that each bound is 0 or 1.
+Shapes: a parameter tensor is `(*batch, n)`, n being the number of *tuned* parameters, in the order
+of `ParameterSpace.names`. *Unit space* is the same tensor mapped linearly so that each bound is 0
+or 1.
 """
 
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -37,7 +41,8 @@ class Parameter:
         meaning: one line.
         source: where default and bounds come from.
         tuned: whether calibration and policies choose it; a constant otherwise.
-        held: whether policies of offsets leave it at their base (`ModelSettings.adaptation_bounds`).
+        frozen: whether policies of offsets leave it at its base
+            (`ModelSettings.adaptation_bounds`).
     """
 
     name: str
@@ -48,10 +53,11 @@ class Parameter:
     meaning: str
     source: str = ""
     tuned: bool = True
-    held: bool = False
+    frozen: bool = False
 
     def __post_init__(self) -> None:
-        if not all(math.isfinite(value) for value in (self.low, self.high, self.default)):
+        finite = math.isfinite(self.low) and math.isfinite(self.high)
+        if not finite or not math.isfinite(self.default):
             raise ParameterError(
                 f"parameter {self.name}: bounds and default must be finite numbers"
             )
@@ -61,13 +67,20 @@ class Parameter:
             )
         if not self.low <= self.default <= self.high:
             raise ParameterError(
-                f"parameter {self.name}: default {self.default} lies outside its bounds [{self.low}, {self.high}] {self.unit};"
-                f" give a value within them, or move model.parameters.{self.name}.low or .high"
+                f"parameter {self.name}: default {self.default} lies outside its bounds"
+                f" [{self.low}, {self.high}] {self.unit}; give a value within them, or move"
+                f" model.parameters.{self.name}.low or .high"
             )
+
+    @property
+    def held(self) -> bool:
+        """The earlier name of `frozen`."""
+        _warn("Parameter.held", "frozen")
+        return self.frozen
 
 
 class ParameterOverride(Settings):
-    """What a config may change of one parameter; what it leaves out stays as the model declares it."""
+    """What a config may change of one parameter; the rest stays as the model declares it."""
 
     low: float | None = Field(None, description="lower bound")
     high: float | None = Field(None, description="upper bound")
@@ -115,7 +128,8 @@ class ParameterSpace:
     def __getitem__(self, name: str) -> Parameter:
         if name not in self._by_name:
             raise ParameterError(
-                f"unknown parameter '{name}'.{nearest(name, self._by_name)} Known: {', '.join(self._by_name)}."
+                f"unknown parameter '{name}'.{nearest(name, self._by_name)} Known:"
+                f" {', '.join(self._by_name)}."
             )
         return self._by_name[name]
 
@@ -134,20 +148,24 @@ class ParameterSpace:
         Raises:
             ParameterError: an unknown name, or bounds and default that contradict each other.
         """
-        added = [name for name in changes if name not in self._by_name]
-        for name in added:
+        merged = []
+        for parameter in self.parameters:
+            change = changes.get(parameter.name)
+            if change is None:
+                merged.append(parameter)
+            else:
+                merged.append(replace(parameter, **change.model_dump(exclude_none=True)))
+        for name, given in changes.items():
+            if name in self._by_name:
+                continue
             if not self.open:
-                self[name]
-        merged = tuple(
-            replace(parameter, **changes[parameter.name].model_dump(exclude_none=True))
-            if parameter.name in changes
-            else parameter
-            for parameter in self.parameters
-        )
-        space = ParameterSpace((*merged, *(_added(name, changes[name]) for name in added)))
+                self[name]  # raises, and says which there are
+            merged.append(_added(name, given))
+        space = ParameterSpace(tuple(merged))
         if not space.parameters:
             raise ParameterError(
-                "give the parameters, such as model.parameters='{tau: {low: 0.5, high: 3, default: 1}}'"
+                "give the parameters, such as"
+                " model.parameters='{tau: {low: 0.5, high: 3, default: 1}}'"
             )
         if not space.tuned:
             raise ParameterError(
@@ -155,44 +173,44 @@ class ParameterSpace:
             )
         return space
 
-    def for_adaptation(
-        self, adaptation_space: Mapping[str, tuple[float, float] | None]
-    ) -> ParameterSpace:
-        """Returns the space in which policies of offsets move; see `ModelSettings.adaptation_bounds`.
+    def for_adaptation(self, bounds: Mapping[str, tuple[float, float] | None]) -> ParameterSpace:
+        """Returns the space in which policies of offsets move parameters.
 
         Args:
-            reach: bounds, name -> (low, high), which move outwards as far as they are not there already; None: held.
+            bounds: name -> (low, high), to which bounds move outwards as far as they are not there
+                already; None: frozen. Those of other parameters stay.
 
         Raises:
-            ParameterError: an unknown name, a lower bound that is not below the upper one, or nothing is left to move.
+            ParameterError: an unknown name, a lower bound that is not below the upper one, or
+                nothing is left to move.
         """
-        for name, bounds in adaptation_space.items():
-            self[name]
-            if bounds is not None and not (
-                math.isfinite(bounds[0]) and math.isfinite(bounds[1]) and bounds[0] < bounds[1]
-            ):
-                raise ParameterError(
-                    f"model.adaptation_bounds.{name}=[{bounds[0]}, {bounds[1]}]: the first must be below the second, and both finite"
-                )
-        space = replace(
-            self,
-            parameters=tuple(
-                _for_adaptation(p, adaptation_space[p.name]) if p.name in adaptation_space else p
-                for p in self.parameters
-            ),
-        )
-        if all(parameter.held for parameter in space.tuned):
+        _check_adaptation(self, bounds)
+        parameters = []
+        for parameter in self.parameters:
+            if parameter.name in bounds:
+                parameters.append(_for_adaptation(parameter, bounds[parameter.name]))
+            else:
+                parameters.append(parameter)
+        space = replace(self, parameters=tuple(parameters))
+        if all(parameter.frozen for parameter in space.tuned):
             raise ParameterError(
-                "model.adaptation_bounds: every tuned parameter is null, so a policy of offsets could move none; leave one out"
+                "model.adaptation_bounds: every tuned parameter is null, so a policy of offsets"
+                " could move none; leave one out"
             )
         return space
 
-    def free(self, *, device: torch.device | str | None = None) -> Tensor | None:
+    def adaptable(self, *, device: torch.device | str | None = None) -> Tensor | None:
         """Returns which tuned parameters a policy of offsets moves, bool `(n,)`; None: all."""
         import torch
 
-        held = [parameter.held for parameter in self.tuned]
-        return ~torch.tensor(held, device=device) if any(held) else None
+        frozen = [parameter.frozen for parameter in self.tuned]
+        if not any(frozen):
+            return None
+        return ~torch.tensor(frozen, device=device)
+
+    def free(self, *, device: torch.device | str | None = None) -> Tensor | None:
+        """The earlier name of `adaptable`."""
+        return self.adaptable(device=device)
 
     def bounds(
         self, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None
@@ -224,30 +242,64 @@ class ParameterSpace:
         return (low + unit * (high - low)).clamp(low, high)
 
     def unpack(self, values: Tensor) -> dict[str, Tensor]:
-        """Splits `(*batch, n)` into one tensor `(*batch,)` per parameter, constants (0-dimensional) included."""
+        """Splits `(*batch, n)` into one tensor `(*batch,)` per parameter, in SI units.
+
+        Constants are included; they are 0-dimensional.
+
+        Raises:
+            ParameterError: another number of parameters.
+        """
         if values.shape[-1] != len(self):
             raise ParameterError(
                 f"expected {len(self)} parameters ({', '.join(self.names)}), got {values.shape[-1]}"
             )
-        tuned = dict(zip(self.names, values.unbind(-1), strict=True))
-        return {
-            p.name: tuned[p.name] if p.tuned else values.new_tensor(p.default)
-            for p in self.parameters
-        }
+        columns = dict(zip(self.names, values.unbind(-1), strict=True))
+        named = {}
+        for parameter in self.parameters:
+            if parameter.tuned:
+                named[parameter.name] = columns[parameter.name]
+            else:
+                named[parameter.name] = values.new_tensor(parameter.default)
+        return named
 
     def check(self, values: Mapping[str, float]) -> None:
-        """Raises ParameterError if a value lies outside its parameter's bounds or its name is unknown."""
+        """Checks values by name, in SI units.
+
+        Raises:
+            ParameterError: a value lies outside its parameter's bounds, or its name is unknown.
+        """
         for name, value in values.items():
             parameter = self[name]
             if not parameter.low <= value <= parameter.high:
                 raise ParameterError(
-                    f"parameter {name}={value} lies outside its bounds [{parameter.low}, {parameter.high}] {parameter.unit}"
+                    f"parameter {name}={value} lies outside its bounds"
+                    f" [{parameter.low}, {parameter.high}] {parameter.unit}"
                 )
+
+
+def _check_adaptation(
+    space: ParameterSpace, bounds: Mapping[str, tuple[float, float] | None]
+) -> None:
+    for name, ends in bounds.items():
+        space[name]  # raises where there is no such parameter
+        if ends is None:
+            continue
+        low, high = ends
+        if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            raise ParameterError(
+                f"model.adaptation_bounds.{name}=[{low}, {high}]: the first must be below the"
+                " second, and both finite"
+            )
+
+
+def _warn(old: str, new: str) -> None:
+    text = f"{old} is now called {new}; the old name goes with the next version"
+    warnings.warn(text, DeprecationWarning, stacklevel=3)
 
 
 def _for_adaptation(parameter: Parameter, bounds: tuple[float, float] | None) -> Parameter:
     if bounds is None:
-        return replace(parameter, held=True)
+        return replace(parameter, frozen=True)
     return replace(
         parameter, low=min(parameter.low, bounds[0]), high=max(parameter.high, bounds[1])
     )

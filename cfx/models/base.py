@@ -1,9 +1,11 @@
 """The contract of a driving model.
 
-A model is a pure function of (follower state, leader state, parameters, time step), batched over any leading
-dimensions, differentiable almost everywhere, on any device and dtype. It never integrates: `cfx.simulation` does.
+A model is a pure function of (follower state, leader state, parameters, time step). It is batched
+over any leading dimensions, differentiable almost everywhere, and runs on any device and dtype. It
+never integrates: `cfx.simulation` does.
 
-Shapes: `*batch` are the leading dimensions; leader tensors and parameters may have fewer of them and broadcast.
+Shapes: `*batch` are the leading dimensions; leader tensors and parameters may have fewer of them
+and broadcast.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from pydantic import Field
 from torch import Tensor
 
 from cfx.component import Component, Settings
+from cfx.models.earlier import EarlierNames
 from cfx.models.regimes import Temperature
 from cfx.parameters import ParameterOverride, ParameterSpace
 
@@ -63,32 +66,36 @@ class ModelSettings(Settings):
     )
     adaptation_bounds: dict[str, tuple[float, float] | None] | None = Field(
         None,
-        description="what a policy of offsets (learner=rollout) may move, where that is not what calibration may:"
-        " {NAME: [low, high]}, farther; {NAME: null}, not at all",
+        description="what a policy of offsets (learner=rollout) may move, where that is not what"
+        " calibration may: {NAME: [low, high]}, farther; {NAME: null}, not at all",
     )
 
 
-class DrivingModel(Component):
+class DrivingModel(EarlierNames, Component):
     """Base of every driving model.
 
-    Life cycle: constructed once per job; `next_speed` (and `next_memory`, if the model has a memory) is called once per
-    time step for all rollouts at once, possibly inside `torch.compile` and under autograd.
+    Life cycle: constructed once per job. `next_speed` (and `next_memory`, if the model has a
+    memory) is called once per time step for all rollouts at once, possibly inside `torch.compile`
+    and under autograd.
 
     A subclass declares `parameters` and implements `next_speed`. That is all.
 
     Attributes:
         parameters: the full specification, constants included.
         memory_size: m, the width of the model's own memory; 0 for most.
-        differentiable: `next_speed` has useful gradients with respect to states and parameters. Tested.
-        collision_free: with its default parameters the model does not hit a leader that brakes as hard as the model
-            expects of it. Tested.
-        follows: with constant parameters the model reacts to its leader. A model without that has parameters that are the control
-            itself: constant ones are no baseline, and reports do not compare with them. Tested.
+        differentiable: `next_speed` has useful gradients with respect to states and parameters.
+            Tested.
+        collision_free: with its default parameters the model does not hit a leader that brakes as
+            hard as the model expects of it. Tested.
+        has_constant_baseline: with constant parameters the model reacts to its leader. A model
+            without that has parameters that are the control itself. Constant ones are then no
+            baseline, and reports do not compare with them. Tested.
         needs_simulator: name of the simulator that alone can drive the model; "" for a model with
             equations in Python, which every simulator that uses them can drive. Where it is given,
             `next_speed` raises a ConfigError.
         reference: where the equations come from.
-        temperature: how gradually regimes switch; 0, the exact model, everywhere but in a learner's training (`smoothed`).
+        temperature: how gradually regimes switch; 0 is the exact model. It is 0 everywhere but in
+            training through the simulation (`at_temperature`).
     """
 
     kind = "model"
@@ -107,23 +114,27 @@ class DrivingModel(Component):
     def __init__(self, settings: Settings | None = None, **options: object) -> None:
         super().__init__(settings, **options)
         self.space = self.parameters.override(self.settings.parameters)
-        self.space.for_adaptation(
-            self.settings.adaptation_bounds or {}
-        )  # says now what is wrong with it
+        self._adaptation_bounds = self.settings.adaptation_bounds or {}
+        self.space.for_adaptation(self._adaptation_bounds)  # says now what is wrong with them
 
     @property
     def adaptation_space(self) -> ParameterSpace:
-        """The parameters in the bounds within which a policy of offsets moves them: those of `space` and beyond."""
-        return self.space.for_adaptation(self.settings.adaptation_bounds or {})
+        """The parameters in the bounds within which a policy of offsets moves them.
+
+        They are those of `space`, or wider.
+        """
+        return self.space.for_adaptation(self._adaptation_bounds)
 
     def at_temperature(self, temperature: Temperature) -> Self:
         """Returns the model with its regime switches smoothed, for training by gradients.
 
-        A model that chooses between cases reads `self.temperature` in `next_speed` and, where it is not 0, mixes the cases near
-        their thresholds (`cfx.models.regimes`). In all others nothing changes.
+        A model that chooses between cases reads `self.temperature` in `next_speed`. Where that is
+        not 0, it mixes the cases near their thresholds (`cfx.models.regimes`). In all others
+        nothing changes.
 
         Args:
-            temperature: how gradual the switches are, in multiples of the model's own scales; 0 is the exact model.
+            temperature: how gradual the switches are, in multiples of the model's own scales; 0 is
+                the exact model.
         """
         model = copy.copy(self)
         model.temperature = temperature
@@ -147,14 +158,25 @@ class DrivingModel(Component):
     def next_memory(
         self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float, speed: Tensor
     ) -> Tensor:
-        """Returns the memory `(*batch, m)` one time step later; `speed` is what `next_speed` returned."""
+        """Returns the memory `(*batch, m)` one time step later.
+
+        Args:
+            speed: what `next_speed` returned, `(*batch,)`, m/s. The others as there.
+        """
         return follower.memory
 
     def initial_memory(self, speed: Tensor) -> Tensor:
-        """Returns the memory `(*batch, m)` at the start of a rollout, given the speed `(*batch,)`."""
+        """Returns the memory `(*batch, m)` at the start of a rollout.
+
+        Args:
+            speed: of the followers, `(*batch,)`, m/s.
+        """
         return torch.zeros((*speed.shape, self.memory_size), dtype=speed.dtype, device=speed.device)
 
 
 def bumper_gap(follower: Follower, leader: Leader) -> Tensor:
-    """Net gap `(*batch,)`, m: leader's rear bumper to follower's front bumper; negative after a collision."""
+    """Returns the net gap `(*batch,)`, m: leader's rear bumper to follower's front bumper.
+
+    It is negative after a collision.
+    """
     return leader.position - leader.length - follower.position

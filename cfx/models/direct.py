@@ -1,4 +1,4 @@
-"""No driving model: whoever chooses the parameters sets the acceleration itself."""
+"""No driving model: the parameter is the acceleration itself."""
 
 from __future__ import annotations
 
@@ -12,18 +12,20 @@ from cfx.parameters import Parameter, ParameterSpace
 
 
 class Direct(DrivingModel):
-    """Drives with the acceleration that it is given: the ceiling that models with adaptive parameters are compared with.
+    """Drives with the acceleration that it is given: the upper reference of adaptive models.
 
         v' = max(0, min(v_max, v + acceleration dt))
 
-    A policy that drives it sets the acceleration anew for each window. No equation of traffic stands between the policy and the
-    vehicle, so this shows how close a policy can come to a driver from what it sees, and what a driving model with few parameters
-    costs beside it. What it does not show is safety: nothing keeps it from running into its leader, or behind a leader other
-    than those it has learned from, from driving senselessly.
+    A policy that drives it sets the acceleration anew for each window. No equation of traffic
+    stands between the policy and the vehicle. So this shows how close a policy can come to a driver
+    from what it sees, and what a driving model with few parameters costs beside it. It does not
+    show safety. Nothing keeps the vehicle from running into its leader, or from driving senselessly
+    behind a leader unlike those that the policy has learned from.
 
-    With constant parameters it holds a constant acceleration, whatever its leader does. So its `default`, `population` and
-    `fixed` are no baselines and improvements over them mean nothing (`has_constant_baseline = False`; reports leave them out). Compare its
-    absolute RMSE with other jobs' on the same data.
+    With constant parameters it holds a constant acceleration, whatever its leader does. So its
+    `default`, `population` and `fixed` are no baselines and improvements over them mean nothing
+    (`has_constant_baseline = False`; reports leave them out). Compare its absolute RMSE with other
+    jobs' on the same data.
     """
 
     reference = "longitudinal kinematics, forward Euler"

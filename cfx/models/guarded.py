@@ -1,7 +1,8 @@
-"""Arithmetic that stays finite, in value and in gradient, in the branch of a `torch.where` that is not taken.
+"""Arithmetic that stays finite in the branch of a `torch.where` that is not taken.
 
-Autograd multiplies the slope of the branch not taken by 0; where that slope is infinite (a square root at 0, a division by 0) the
-product is NaN. These functions replace the argument before the operation instead of the result after it.
+It stays finite in value and in gradient. Autograd multiplies the slope of the branch not taken by
+0. Where that slope is infinite (a square root at 0, a division by 0) the product is NaN. These
+functions replace the argument before the operation instead of the result after it.
 """
 
 from __future__ import annotations

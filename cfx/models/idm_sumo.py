@@ -1,4 +1,7 @@
-"""The Intelligent Driver Model as SUMO computes it (`idm_sumo`), restated from measured behaviour (SUMO 1.28)."""
+"""The Intelligent Driver Model as SUMO computes it (`idm_sumo`).
+
+It is restated from measured behaviour (SUMO 1.28).
+"""
 
 from __future__ import annotations
 
@@ -20,18 +23,19 @@ _CLOSEST = 1e-3  # m: what a smaller gap counts as
 
 
 class IdmSumo(DrivingModel):
-    """Accelerates towards a desired speed and brakes as the gap falls below a desired one, as SUMO's IDM.
+    """Accelerates towards a desired speed, and brakes as the gap falls below a desired one.
 
     With s the bumper gap:
 
         s* = minGap + max(0, v tau + v (v - v_l) / (2 sqrt(accel decel)))
         dv/dt = accel (1 - (v / maxSpeed)^delta - (s* / s)^2)
 
-    A time step of 0.375 s or more is cut into parts of about 0.25 s, between which s shrinks by what the follower gains. Around
-    it SUMO's limits hold: v' is at most v + accel dt and maxSpeed, and braking at most emergencyDecel.
+    A time step of 0.375 s or more is cut into parts of about 0.25 s, between which s shrinks by
+    what the follower gains. Around it SUMO's limits hold: v' is at most v + accel dt and maxSpeed,
+    and braking at most emergencyDecel.
 
-    Differences from Treiber, Hennecke and Helbing (2000): these limits; a fast leader never shortens s* below minGap; a gap below
-    1 mm, or none, counts as 1 mm.
+    Differences from Treiber, Hennecke and Helbing (2000): these limits; a fast leader never
+    shortens s* below minGap; a gap below 1 mm, or none, counts as 1 mm.
     """
 
     reference = (
@@ -62,10 +66,10 @@ class IdmSumo(DrivingModel):
     ) -> Tensor:
         start, v_l = follower.speed, leader.speed
         parts = max(1, int(dt / _STEPPING + 0.5))
-        temperature = 2.0 * torch.sqrt(p["accel"] * p["decel"])
+        scale = 2.0 * torch.sqrt(p["accel"] * p["decel"])
         v, gap = start, bumper_gap(follower, leader)
         for _ in range(parts):
-            wanted_gap = p["minGap"] + (v * p["tau"] + v * (v - v_l) / temperature).clamp(min=0.0)
+            wanted_gap = p["minGap"] + (v * p["tau"] + v * (v - v_l) / scale).clamp(min=0.0)
             crowding = wanted_gap / gap.clamp(min=_CLOSEST)
             acceleration = p["accel"] * (
                 1.0 - torch.pow(v / p["maxSpeed"], p["delta"]) - crowding * crowding

@@ -1,7 +1,8 @@
 """Krauss's safe-speed model.
 
-S. Krauß (1998), *Microscopic modeling of traffic flow: investigation of collision free vehicle dynamics*, DLR
-Forschungsbericht 98-08; in the form with reaction and brake build-up time of Yang, Masuda and Tatsubori (2021).
+S. Krauß (1998), *Microscopic modeling of traffic flow: investigation of collision free vehicle
+dynamics*, DLR Forschungsbericht 98-08; in the form with reaction and brake build-up time of Yang,
+Masuda and Tatsubori (2021).
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ class KraussSettings(ModelSettings):
 
     variant: Literal["paper", "sumo"] = Field(
         "paper",
-        description="paper: the equations as derived; sumo: with KraussOrig1's brake cap, standing-leader rule and rounding",
+        description="paper: the equations as derived; sumo: with KraussOrig1's brake cap,"
+        " standing-leader rule and rounding",
     )
     leader_deceleration: float | None = Field(
         None,
@@ -42,9 +44,9 @@ class KraussSettings(ModelSettings):
 class Krauss(DrivingModel):
     """Drives as fast as it safely can.
 
-    A driver's stopping distance is `v t_lag + v^2 / (2 b)`; the follower lags by `t_r + t_i / 2` (reaction plus half the brake
-    build-up time), the leader by `t_i / 2`. Safe is the speed from which the follower can stop within the gap g plus
-    the leader's stopping distance:
+    A driver's stopping distance is `v t_lag + v^2 / (2 b)`; the follower lags by `t_r + t_i / 2`
+    (reaction plus half the brake build-up time), the leader by `t_i / 2`. Safe is the speed from
+    which the follower can stop within the gap g plus the leader's stopping distance:
 
         T      = t_r + t_i / 2
         v_safe = -b T + sqrt(b^2 T^2 + b (v_l t_i + v_l^2 / b_l + 2 (g - min_gap)))
@@ -52,11 +54,13 @@ class Krauss(DrivingModel):
 
     At equilibrium (v = v_l) the gap is `v t_r + min_gap` whatever t_i, if b_l = b.
 
-    Differences from the paper: the printed v_safe is dimensionally wrong (`v_i t_i * v_t^2 / a` for `v_l t_i + v_l^2 / b_l`, and
-    2 g outside the product with b). A negative radicand (the gap is gone) gives v_safe = -b T, hence a stop.
+    Differences from the paper: the printed v_safe is dimensionally wrong (`v_i t_i * v_t^2 / a` for
+    `v_l t_i + v_l^2 / b_l`, and 2 g outside the product with b). A negative radicand (the gap is
+    gone) gives v_safe = -b T, hence a stop.
 
-    Differences from SUMO: with t_i = 0 and `variant=sumo` the model is SUMO's KraussOrig1 with tau = t_r, sigma = 0 and
-    minGap = min_gap, but for a negative radicand, where SUMO gets NaN and ignores the leader.
+    Differences from SUMO: with t_i = 0 and `variant=sumo` the model is SUMO's KraussOrig1 with tau
+    = t_r, sigma = 0 and minGap = min_gap, but for a negative radicand, where SUMO gets NaN and
+    ignores the leader.
     """
 
     reference = "Krauß (1998), DLR-FB 98-08; Yang, Masuda and Tatsubori (2021)"
@@ -98,7 +102,9 @@ class Krauss(DrivingModel):
         self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
     ) -> Tensor:
         b = p["b"]
-        b_l = b if self.settings.leader_deceleration is None else self.settings.leader_deceleration
+        b_l: Tensor | float = b
+        if self.settings.leader_deceleration is not None:
+            b_l = self.settings.leader_deceleration
         g = bumper_gap(follower, leader) - p["min_gap"]
         v, v_l = follower.speed, leader.speed
         lag = p["t_r"] + 0.5 * p["t_i"]
@@ -121,9 +127,10 @@ class Krauss(DrivingModel):
             or lag.default != 0
         ):
             raise ConfigError(
-                "simulator=sumo: SUMO has model=krauss (its KraussOrig1) only without a brake build-up time; add"
-                " model.variant=sumo model.leader_deceleration=null model.parameters.t_i.default=0"
-                " model.parameters.t_i.tuned=false, or choose model=krauss_sumo"
+                "simulator=sumo: SUMO has model=krauss (its KraussOrig1) only without a brake"
+                " build-up time; add model.variant=sumo model.leader_deceleration=null"
+                " model.parameters.t_i.default=0 model.parameters.t_i.tuned=false, or choose"
+                " model=krauss_sumo"
             )
         names = {
             "t_r": "tau",

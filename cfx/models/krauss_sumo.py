@@ -1,4 +1,7 @@
-"""SUMO's default car-following model (`krauss_sumo`), restated from measured behaviour (SUMO 1.28)."""
+"""SUMO's default car-following model (`krauss_sumo`).
+
+It is restated from measured behaviour (SUMO 1.28).
+"""
 
 from __future__ import annotations
 
@@ -21,21 +24,24 @@ _ALARM = 1.2  # how much harder than needed SUMO brakes in an emergency
 
 
 class KraussSumo(DrivingModel):
-    """Drives as fast as lets it stop behind a leader who brakes to a standstill, in SUMO's own steps.
+    """Drives as fast as it can still stop behind a braking leader, in SUMO's own steps.
 
-    With g = gap - minGap, speeds that fall by `decel dt` in each step, and D_l the way on which the leader stops like that (with
-    the harder of decel and its own decel_leader), safe is the largest x with
+    With g = gap - minGap, speeds that fall by `decel dt` in each step, and D_l the way on which the
+    leader stops like that (with the harder of decel and its own decel_leader), safe is the largest
+    x with
 
         x tau + dt sum_k max(0, x - k decel dt) <= g + D_l - 0.001
 
-    Where reaching x needs a harder braking than decel, it brakes with 1.2 b instead, but no softer than decel and no harder than
-    reaching x needs, b being what the situation asks for: v^2 / (2 (g + v_l^2 / (2 d))), or, where that is above d,
-    (v^2 - v_l^2) / (2 g), with d = decel_leader; emergencyDecel where g = 0. Where g < 0 it brakes as hard as it can.
+    Where reaching x needs a harder braking than decel, it brakes with 1.2 b instead, but no softer
+    than decel and no harder than reaching x needs, b being what the situation asks for: v^2 / (2 (g
+    + v_l^2 / (2 d))), or, where that is above d, (v^2 - v_l^2) / (2 g), with d = decel_leader;
+    emergencyDecel where g = 0. Where g < 0 it brakes as hard as it can.
 
         v' = max(0, min(maxSpeed, v + accel dt, x)), braking no harder than emergencyDecel
 
-    This is what SUMO runs where no carFollowModel is given, with sigma = 0. Differences from Krauß (1998) and from `krauss`:
-    whole braking steps take the place of v^2 / (2 b); the emergency rule; the leader's own deceleration.
+    This is what SUMO runs where no carFollowModel is given, with sigma = 0. Differences from Krauß
+    (1998) and from `krauss`: whole braking steps take the place of v^2 / (2 b); the emergency rule;
+    the leader's own deceleration.
     """
 
     reference = "Krauß (1998), DLR-FB 98-08; SUMO's carFollowModel Krauss"
@@ -91,15 +97,17 @@ class KraussSumo(DrivingModel):
 
 
 def _stopping(speed: Tensor, drop: Tensor, dt: float) -> Tensor:
-    """Returns the way, m, on which a vehicle stops whose speed falls by `drop`, m/s, in each step."""
+    """Returns the stopping distance, m, of a speed that falls by `drop`, m/s, in each step."""
     steps = torch.floor(speed / drop)
     return dt * (steps * speed - 0.5 * drop * steps * (steps + 1.0))
 
 
 def _safe_speed(room: Tensor, drop: Tensor, tau: Tensor, dt: float) -> Tensor:
-    """Returns the largest speed that stops within `room`, m: `tau` at full speed, then steps that each lose `drop`, m/s.
+    """Returns the largest speed from which a vehicle stops within `room`, m.
 
-    With n braking steps the way is `x tau + dt (n x - drop n (n + 1) / 2)`; n is the largest for which `n drop` still stops.
+    It drives for `tau` at full speed, then in steps that each lose `drop`, m/s. With n braking
+    steps the way is `x tau + dt (n x - drop n (n + 1) / 2)`; n is the largest for which `n drop`
+    still stops.
     """
     room = room.clamp(min=0.0)
     half = tau / dt - 0.5

@@ -1,20 +1,28 @@
 """Choosing between the regimes of a driving model, exactly or smoothly.
 
-A regime model (Wiedemann's) takes one of several accelerations, whichever case holds. The choice is a step, so its gradient with
-respect to the thresholds is 0 almost everywhere and says nothing of the jump: gradient descent cannot see that a shorter time
-gap would have ended the braking. For training, a model can be asked for its smoothed self (`DrivingModel.at_temperature`): each case
-then counts with a weight between 0 and 1, a logistic function of the distance from its threshold. Simulation, calibration and
-evaluation always take the exact choice.
+A regime model (Wiedemann's) takes one of several accelerations, whichever case holds. The choice is
+a step: its gradient with respect to the thresholds is 0 almost everywhere and says nothing of the
+jump. Gradient descent cannot see that a shorter time gap would have ended the braking. For
+training, a model can be asked for its smoothed self (`DrivingModel.at_temperature`). Each case then
+counts with a weight between 0 and 1, a logistic function of the distance from its threshold.
+Simulation, calibration and evaluation always take the exact choice.
 """
 
 from __future__ import annotations
+
+import warnings
 
 import torch
 from torch import Tensor
 
 Temperature = float | Tensor
-"""How gradually regimes switch, in multiples of the scales below; 0 is exact. A 0-dimensional tensor may change while compiled
-code runs, and is never exact."""
+"""How gradually regimes switch, in multiples of the scales below; 0 is exact.
+
+A 0-dimensional tensor may change while compiled code runs, and is never exact.
+"""
+
+Softness = Temperature
+"""Earlier name of `Temperature`."""
 
 SPACING = 2.0
 """m: how gradually a threshold of distance is crossed at temperature 1."""
@@ -35,15 +43,18 @@ def below(
     no: Tensor,
     *,
     scale: float,
-    temperature: Temperature,
+    temperature: Temperature = 0.0,
+    softness: Temperature | None = None,
 ) -> Tensor:
-    """Returns `yes` where `value < threshold`, else `no`; with temperature, a mixture of both near the threshold.
+    """Returns `yes` where `value < threshold`, else `no`; a mixture near it at a temperature.
 
     Args:
         value, threshold, yes, no: `(*batch,)`, broadcasting; finite.
         scale: width of the transition at temperature 1, in the unit of `value`.
-        temperature: how gradual.
+        temperature: how gradual; 0 is exact.
+        softness: earlier name of `temperature`.
     """
+    temperature = _today(temperature, softness)
     if exact(temperature):
         return torch.where(value < threshold, yes, no)
     return torch.lerp(no, yes, torch.sigmoid((threshold - value) / (scale * temperature)))
@@ -56,9 +67,21 @@ def up_to(
     no: Tensor,
     *,
     scale: float,
-    temperature: Temperature,
+    temperature: Temperature = 0.0,
+    softness: Temperature | None = None,
 ) -> Tensor:
     """As `below`, for `value <= threshold`."""
+    temperature = _today(temperature, softness)
     if exact(temperature):
         return torch.where(value <= threshold, yes, no)
     return below(value, threshold, yes, no, scale=scale, temperature=temperature)
+
+
+def _today(temperature: Temperature, softness: Temperature | None) -> Temperature:
+    """Returns the temperature, also where it is given by its earlier name."""
+    if softness is None:
+        return temperature
+    if not torch.compiler.is_compiling():  # a warning would break the compiled graph
+        text = "softness= is now called temperature=; the old name goes with the next version"
+        warnings.warn(text, DeprecationWarning, stacklevel=3)
+    return softness

@@ -1,4 +1,7 @@
-"""What SUMO does around every car-following model in one Euler step, restated from measured behaviour (SUMO 1.28)."""
+"""What SUMO does around every car-following model in one Euler step.
+
+It is restated from measured behaviour (SUMO 1.28).
+"""
 
 from __future__ import annotations
 
@@ -16,11 +19,12 @@ def sumo_speed(
     v_max: Tensor,
     dt: float,
 ) -> Tensor:
-    """Returns the speed `(*batch,)` that SUMO realises when a car-following model wants `wanted`, both m/s.
+    """Returns the speed `(*batch,)`, m/s, that SUMO realises when a model wants `wanted`.
 
-    With `top = min(v + accel dt, v_max)` the plan is `min(top, wanted)`; it is bounded by 0 and by `v - emergency_decel dt`, so
-    that `emergency_decel` is the brake cap, not `decel`, unless that is the larger one. Speeds below 1e-5 m/s become 0. The
-    lane's limit is taken to be above `v_max`.
+    With `top = min(v + accel dt, v_max)` the plan is `min(top, wanted)`; it is bounded by 0 and by
+    `v - emergency_decel dt`, so that `emergency_decel` is the brake cap, not `decel`, unless that
+    is the larger one. Speeds below 1e-5 m/s become 0. The lane's limit is taken to be above
+    `v_max`.
 
     Args:
         v: speed now, m/s.

@@ -16,30 +16,31 @@ from cfx.models.vtype import VType
 from cfx.parameters import ParameterOverride, ParameterSpace
 
 _UNITS = {
-    **dict.fromkeys(
-        (
-            "tau",
-            "actionStepLength",
-            "startupDelay",
-            "treaction",
-            "tpreview",
-            "tPersDrive",
-            "tPersEstimate",
-        ),
-        "s",
-    ),
-    **dict.fromkeys(("accel", "decel", "emergencyDecel", "apparentDecel", "taccmax"), "m/s2"),
-    **dict.fromkeys(("maxSpeed", "desiredMaxSpeed"), "m/s"),
-    **dict.fromkeys(("speedFactor", "sigma", "delta", "collisionMinGapFactor", "ccoolness"), "1"),
+    "tau": "s",
+    "actionStepLength": "s",
+    "startupDelay": "s",
+    "treaction": "s",
+    "tpreview": "s",
+    "tPersDrive": "s",
+    "tPersEstimate": "s",
+    "stepping": "s",
+    "accel": "m/s2",
+    "decel": "m/s2",
+    "emergencyDecel": "m/s2",
+    "apparentDecel": "m/s2",
+    "taccmax": "m/s2",
+    "maxSpeed": "m/s",
+    "desiredMaxSpeed": "m/s",
+    "speedFactor": "1",
+    "sigma": "1",
+    "delta": "1",
+    "collisionMinGapFactor": "1",
+    "ccoolness": "1",
     "minGap": "m",
     "jerkmax": "m/s3",
-    "stepping": "s",
 }
-_DRAWN = (
-    "sigmaleader",
-    "sigmagap",
-    "sigmaerror",
-)  # of EIDM; `sigma` of others is 0 unless it is given, too
+_RANDOM = ("sigmaleader", "sigmagap", "sigmaerror")
+"""Attributes by which EIDM is random; `sigma` of others is 0 unless it is given, too."""
 
 
 class SumoVTypeSettings(ModelSettings):
@@ -59,12 +60,14 @@ class SumoVTypeSettings(ModelSettings):
 class SumoVType(DrivingModel):
     """Whatever SUMO drives: its parameters are vType attributes, by SUMO's names, from the config.
 
-        model=sumo_vtype model.car_follow_model=EIDM 'model.parameters={tau: {low: 0.5, high: 3, default: 1}}'
+        model=sumo_vtype model.car_follow_model=EIDM
+        'model.parameters={tau: {low: 0.5, high: 3, default: 1}}'
 
-    It has no equations here, so it needs `simulator=sumo`. What is neither a parameter nor in `attributes` has SUMO's default,
-    but for what makes a drive random: sigma (0.5 in SUMO's Krauss) and EIDM's sigmaleader, sigmagap and sigmaerror are 0 unless
-    they are given. Some models draw random numbers all the same (W99, Wiedemann): the same request gives the same drives, but a
-    follower on another road draws others.
+    It has no equations here, so it needs `simulator=sumo`. What is neither a parameter nor in
+    `attributes` has SUMO's default, but for what is random: sigma (0.5 in SUMO's Krauss)
+    and EIDM's sigmaleader, sigmagap and sigmaerror are 0 unless they are given. Some models draw
+    random numbers all the same (W99, Wiedemann): the same request gives the same trajectories,
+    but a follower on another road draws other numbers.
 
     Differences from SUMO: none.
     """
@@ -78,18 +81,17 @@ class SumoVType(DrivingModel):
 
     def __init__(self, settings: Settings | None = None, **options: object) -> None:
         super().__init__(settings, **options)
-        named = (
-            replace(one, unit=_UNITS.get(one.name, "SUMO's unit"), meaning=f"SUMO's {one.name}")
-            for one in self.space
-        )
-        self.space = ParameterSpace(tuple(named))
-        twice = sorted(
-            (self.settings.attributes or {}).keys() & {parameter.name for parameter in self.space}
-        )
-        if twice:
-            raise ConfigError(
-                f"model.attributes.{twice[0]}: it is among model.parameters too; give it once"
-            )
+        described = []
+        for one in self.space:
+            unit = _UNITS.get(one.name, "SUMO's unit")
+            described.append(replace(one, unit=unit, meaning=f"SUMO's {one.name}"))
+        self.space = ParameterSpace(tuple(described))
+        attributes = self.settings.attributes or {}
+        for one in self.space:
+            if one.name in attributes:
+                raise ConfigError(
+                    f"model.attributes.{one.name}: it is among model.parameters too; give it once"
+                )
 
     def next_speed(
         self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
@@ -100,9 +102,10 @@ class SumoVType(DrivingModel):
 
     def sumo_vtype(self, p: Mapping[str, Tensor]) -> VType:
         name = self.settings.car_follow_model
-        still = dict.fromkeys(_DRAWN, "0") if name == "EIDM" else {}
-        given = {
-            key: value if isinstance(value, str) else repr(value)
-            for key, value in (self.settings.attributes or {}).items()
-        }
-        return VType(name, {**still, **given, **p}, remembers=True)
+        attributes: dict[str, Tensor | str] = {}
+        if name == "EIDM":
+            attributes.update(dict.fromkeys(_RANDOM, "0"))
+        for key, value in (self.settings.attributes or {}).items():
+            attributes[key] = value if isinstance(value, str) else repr(value)
+        attributes.update(p)
+        return VType(name, attributes, remembers=True)

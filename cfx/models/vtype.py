@@ -15,10 +15,11 @@ class VType:
 
     Attributes:
         car_follow_model: SUMO's name of the model, such as `Krauss`.
-        attributes: by SUMO's names: a tensor that broadcasts to the followers' batch where they may differ, or a text for all.
+        attributes: by SUMO's names: a tensor that broadcasts to the followers' batch where they may
+            differ, or a text for all.
         leader: the same for the vehicle ahead, as some models read what it could do.
-        remembers: in SUMO the model may keep a state besides position, speed and acceleration, so that a drive in parts is not
-            the drive in one.
+        remembers: in SUMO the model may keep a state besides position, speed and acceleration, so
+            that a drive in parts is not the drive in one.
     """
 
     car_follow_model: str

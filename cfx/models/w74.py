@@ -1,10 +1,12 @@
 """Wiedemann's 1974 model (`w74`): four regimes between perception thresholds.
 
-R. Wiedemann (1974), *Simulation des Straßenverkehrsflusses*, Schriftenreihe des Instituts für Verkehrswesen, Universität
-Karlsruhe, Heft 8: the thresholds and the regimes. R. Wiedemann and U. Reiter (1992), *Microscopic traffic simulation: the
-simulation system MISSION, background and actual state*, CEC Project ICARUS (V1052), final report, vol. 2, appendix A: the
-accelerations, as J. Janson Olstam and A. Tapani (2004), *Comparison of car-following models*, VTI meddelande 960A, restate them.
-The thresholds' form with five tuned parameters is that of Yang, Masuda and Tatsubori (2021).
+R. Wiedemann (1974), *Simulation des Straßenverkehrsflusses*, Schriftenreihe des Instituts für
+Verkehrswesen, Universität Karlsruhe, Heft 8: the thresholds and the regimes. R. Wiedemann and U.
+Reiter (1992), *Microscopic traffic simulation: the simulation system MISSION, background and actual
+state*, CEC Project ICARUS (V1052), final report, vol. 2, appendix A: the accelerations, as J.
+Janson Olstam and A. Tapani (2004), *Comparison of car-following models*, VTI meddelande 960A,
+restate them. The thresholds' form with five tuned parameters is that of Yang, Masuda and Tatsubori
+(2021).
 """
 
 from __future__ import annotations
@@ -21,17 +23,22 @@ from cfx.models.guarded import root
 from cfx.models.regimes import SPACING, SPEED, below, exact, up_to
 from cfx.parameters import Parameter, ParameterSpace
 
-_NEAREST_ROOM = 1e-3  # m: bounds quotients (and their gradients) beside a threshold; the brake cap acts long before
+_NEAREST_ROOM = 1e-3
+"""m: bounds quotients, and their gradients, beside a threshold; the brake cap acts long before."""
 
-_VISSIM = "default: PTV Vissim's Wiedemann 74 (ax 2 m, bx 2 + 3 z with z = 0.5); bounds: wide enough for drivers who stay far behind"
+_VISSIM = (
+    "default: PTV Vissim's Wiedemann 74 (ax 2 m, bx 2 + 3 z with z = 0.5); bounds: wide enough for"
+    " drivers who stay far behind"
+)
 _REITER = "default: Wiedemann and Reiter (1992), the middle of the drivers; bounds: wide"
 
 
 class W74(DrivingModel):
     """Drives freely, approaches, follows unconsciously or brakes hard, by what a driver perceives.
 
-    With s the spacing front bumper to front bumper, L the leader's length, and `c = v - v_l` the **closing speed, positive when
-    the follower is faster** (Wiedemann's sign; everywhere else in cfx the relative speed is `dv = v_l - v = -c`):
+    With s the spacing front bumper to front bumper, L the leader's length, and `c = v - v_l` the
+    **closing speed, positive when the follower is faster** (Wiedemann's sign; everywhere else in
+    cfx the relative speed is `dv = v_l - v = -c`):
 
         AX   = L + ax_add                        spacing wanted at standstill
         BX   = bx_add sqrt(min(v, v_l))
@@ -42,36 +49,44 @@ class W74(DrivingModel):
 
     The first case that holds decides on the acceleration:
 
-    1. *Emergency*, s <= ABX: `min(0, c^2 / (2 (AX - s)) + a_l + b_min (ABX - s) / BX)`, with c = 0 where the gap opens; b_min
-       where s <= AX.
-    2. *Approaching*, c > SDV: `c^2 / (2 (ABX - s)) + a_l`: uniform braking that reaches ABX as the speeds become equal.
-    3. *Following*, c > OPDV and s < SDX: `+b_null` if the last acceleration was positive, else `-b_null`. Free driving leads into
-       this case accelerating and the two braking cases lead into it braking, so the last acceleration says which
-       threshold was crossed.
+    1. *Emergency*, s <= ABX: `min(0, c^2 / (2 (AX - s)) + a_l + b_min (ABX - s) / BX)`, with c = 0
+       where the gap opens; b_min where s <= AX.
+    2. *Approaching*, c > SDV: `c^2 / (2 (ABX - s)) + a_l`: uniform braking that reaches ABX as the
+       speeds become equal.
+    3. *Following*, c > OPDV and s < SDX: `+b_null` if the last acceleration was positive, else
+       `-b_null`. Free driving leads into this case accelerating and the two braking cases lead into
+       it braking, so the last acceleration says which threshold was crossed.
     4. *Free*: `b_max (1 - v / v_desired)`.
 
-    The result is kept between b_min and the free acceleration (or b_null, if that is larger), and the speed at 0 or above.
+    The result is kept between b_min and the free acceleration (or b_null, if that is larger), and
+    the speed at 0 or above.
 
     Units: SDV is a speed, so cx is a length over the root of a speed, (m s)^0.5; so is bx_add.
 
-    Differences from the paper: it drops the root in BX. Everything that Wiedemann draws at random for each driver and each
-    decision (estimation errors, driver types) is at its mean, in the parameters.
+    Differences from the paper: it drops the root in BX. Everything that Wiedemann draws at random
+    for each driver and each decision (estimation errors, driver types) is at its mean, in the
+    parameters.
 
-    Differences from Wiedemann and Reiter: the paper's SDX is a multiple of ABX, theirs is AX + EX BX; their threshold CLDV for
-    closing in while already following is SDV; there is no largest distance (150 m) for approaching; their FAKTORV is v_max /
-    v_desired, so that v_max cancels out of the free acceleration, whose b_max is their BMAXmult v_max; an emergency counts
-    the speed difference only where the gap closes, and never accelerates.
+    Differences from Wiedemann and Reiter: the paper's SDX is a multiple of ABX, theirs is AX + EX
+    BX; their threshold CLDV for closing in while already following is SDV; there is no largest
+    distance (150 m) for approaching; their FAKTORV is v_max / v_desired, so that v_max cancels out
+    of the free acceleration, whose b_max is their BMAXmult v_max; an emergency counts the speed
+    difference only where the gap closes, and never accelerates.
 
-    Differences from SUMO's `Wiedemann`: that one has two parameters, security and estimation, which stand for
-    ax_add = 1 + 2 security, bx_add = 1 + 7 security and cx = 25 (1 + security + estimation). Its BX takes the follower's own
-    speed; it draws OPDV at random, ignores a_l, accelerates freely by another rule, and its b_null is a fifth of its largest
-    acceleration.
+    Differences from SUMO's `Wiedemann`: that one has two parameters, security and estimation, which
+    stand for ax_add = 1 + 2 security, bx_add = 1 + 7 security and cx = 25 (1 + security +
+    estimation). Its BX takes the follower's own speed; it draws OPDV at random, ignores a_l,
+    accelerates freely by another rule, and its b_null is a fifth of its largest acceleration.
 
-    Not differentiable in the thresholds themselves: gradients are those of the case that holds; while following they are those of
-    b_null alone. `smoothed` makes them differentiable for training.
+    Not differentiable in the thresholds themselves: gradients are those of the case that holds;
+    while following they are those of b_null alone. `at_temperature` makes them differentiable for
+    training.
     """
 
-    reference = "Wiedemann (1974); Wiedemann and Reiter (1992); Janson Olstam and Tapani (2004), VTI meddelande 960A"
+    reference = (
+        "Wiedemann (1974); Wiedemann and Reiter (1992); Janson Olstam and Tapani (2004), VTI"
+        " meddelande 960A"
+    )
     collision_free: ClassVar[bool] = True
 
     parameters = ParameterSpace.of(
@@ -180,16 +195,13 @@ class W74(DrivingModel):
         emergency = torch.where(s <= ax, b_min, emergency.clamp(max=0.0))
 
         most = torch.maximum(free, b_null)
-        if not exact(
-            self.temperature
-        ):  # they are mixed, so each must be something that the vehicle can do
-            approaching, emergency = (
-                a.maximum(b_min).minimum(most) for a in (approaching, emergency)
-            )
+        if not exact(self.temperature):
+            # They are mixed, so each must be something that the vehicle can do.
+            approaching = approaching.maximum(b_min).minimum(most)
+            emergency = emergency.maximum(b_min).minimum(most)
         # Nested, not joined by `&`, as in w99: masks of doubles are slow to join.
-        near_by, slower = (
-            partial(below, scale=scale, temperature=self.temperature) for scale in (SPACING, SPEED)
-        )
+        near_by = partial(below, scale=SPACING, temperature=self.temperature)
+        slower = partial(below, scale=SPEED, temperature=self.temperature)
         calm = slower(opdv, closing, near_by(s, sdx, following, free), free)
         calm = slower(sdv, closing, approaching, calm)
         acceleration = up_to(s, abx, emergency, calm, scale=SPACING, temperature=self.temperature)

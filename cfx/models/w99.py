@@ -1,7 +1,8 @@
 """Wiedemann's 1999 model (`w99`), as SUMO computes it.
 
-R. Wiedemann's psycho-physical model in its ten-parameter form: PTV Vissim's user manual names the parameters CC0 to CC9; the
-decision rules are those of SUMO's implementation (M. Gao, *Wiedemann 99 in SUMO*), restated here from measured behaviour.
+R. Wiedemann's psycho-physical model in its ten-parameter form: PTV Vissim's user manual names the
+parameters CC0 to CC9; the decision rules are those of SUMO's implementation (M. Gao, *Wiedemann 99
+in SUMO*), restated here from measured behaviour.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ class W99Settings(ModelSettings):
 
     variant: Literal["sumo", "vissim"] = Field(
         "sumo",
-        description="sumo: CC8 caps every acceleration, so CC9 has no effect; vissim: CC8 at standstill to CC9 at 80 km/h",
+        description="sumo: CC8 caps every acceleration, so CC9 has no effect; vissim: CC8 at"
+        " standstill to CC9 at 80 km/h",
     )
 
 
@@ -49,26 +51,30 @@ class W99(DrivingModel):
 
     The first case that holds decides on the acceleration:
 
-    1. *Too close*, dv < open and dx <= near. Let held = 0, but as hard as the brakes go if one more step at this speed ends less
-       than a tenth of CC0 behind where the leader is now (dx < v dt + CC0 / 10). Behind a standing leader a = held. Otherwise
-       a = held if dv >= 0; min(0, a_l + dv^2 / (CC0 - dx)) if dv < 0 and dx > CC0; min(0, a_l + (dv - open) / 2) if dv < 0 and
-       dx <= CC0; then -CC7 if a > -CC7, else max(a, -10 + sqrt(v) / 2).
+    1. *Too close*, dv < open and dx <= near. Let blocked = 0, but as hard as the brakes go if one
+       more step at this speed ends less than a tenth of CC0 behind where the leader is now (dx < v
+       dt + CC0 / 10). Behind a standing leader a = blocked. Otherwise a = blocked if dv >= 0;
+       min(0, a_l + dv^2 / (CC0 - dx)) if dv < 0 and dx > CC0; min(0, a_l + (dv - open) / 2) if dv <
+       0 and dx <= CC0; then -CC7 if a > -CC7, else max(a, -10 + sqrt(v) / 2).
     2. *Approaching*, dv < close and dx < perc: a = dv^2 / (2 (near - dx - 0.1)).
     3. *Following*, dv < open and dx < far: a = min(a_old, -CC7) if a_old <= 0 else max(a_old, CC7).
-    4. *Free*, dx > near: a = min(dv^2 / (far - dx), amax) if dx < far, else amax. Where dx <= near: 0.
+    4. *Free*, dx > near: a = min(dv^2 / (far - dx), amax) if dx < far, else amax. Where dx <= near:
+       0.
 
-    In case 4 amax = CC8 + CC9 min(v, 22.2). SUMO realises the result with CC8 as the cap on acceleration, so amax is never felt
-    and **CC9 has no effect** (`variant=vissim` reads it as Vissim does: amax goes from CC8 at standstill to CC9 at 80 km/h, and
-    is the cap).
+    In case 4 amax = CC8 + CC9 min(v, 22.2). SUMO realises the result with CC8 as the cap on
+    acceleration, so amax is never felt and **CC9 has no effect** (`variant=vissim` reads it as
+    Vissim does: amax goes from CC8 at standstill to CC9 at 80 km/h, and is the cap).
 
-    Differences from SUMO: this is the deterministic part. SUMO adds u in [0, 1) to amax (cut off by the cap) and, while closing
-    in on a leader that accelerates by 1 m/s2 or more, takes CC1 max(0, v_l + dv r) with r in [-0.5, 0.5) for CC1 v; here that is
-    CC1 v always. SUMO's gap to be kept, minGap, is CC0.
+    Differences from SUMO: this is the deterministic part. SUMO adds u in [0, 1) to amax (cut off by
+    the cap) and, while closing in on a leader that accelerates by 1 m/s2 or more, takes CC1 max(0,
+    v_l + dv r) with r in [-0.5, 0.5) for CC1 v; here that is CC1 v always. SUMO's gap to be kept,
+    minGap, is CC0.
 
-    Differences from the paper: it lists the 1974 thresholds but ran SUMO's ten-parameter model, which this is.
+    Differences from the paper: it lists the 1974 thresholds but ran SUMO's ten-parameter model,
+    which this is.
 
-    Not differentiable in the thresholds themselves: gradients are those of the case that holds. `smoothed` makes them
-    differentiable for training.
+    Not differentiable in the thresholds themselves: gradients are those of the case that holds.
+    `at_temperature` makes them differentiable for training.
     """
 
     reference = "Wiedemann (1974, 1999); PTV Vissim manual, CC0 to CC9; SUMO's carFollowModel W99"
@@ -157,12 +163,8 @@ class W99(DrivingModel):
     ) -> Tensor:
         cc0, cc4, cc5, cc7, cc8 = p["cc0"], p["cc4"], p["cc5"], p["cc7"], p["cc8"]
         dx = bumper_gap(follower, leader)
-        v, v_l, a_l, a_old = (
-            follower.speed,
-            leader.speed,
-            leader.acceleration,
-            follower.acceleration,
-        )
+        v, a_old = follower.speed, follower.acceleration
+        v_l, a_l = leader.speed, leader.acceleration
         dv = v_l - v
         near = torch.where(v_l > 0, cc0 + p["cc1"] * v, cc0)
         far = near + p["cc2"]
@@ -171,41 +173,37 @@ class W99(DrivingModel):
         closing_threshold = torch.where(v > 0, cc4 - sensitivity, 0.0)
         opening_threshold = torch.where(v_l > cc5, sensitivity + cc5, sensitivity)
 
-        # 1. Too close. One step more at this speed ends less than a tenth of CC0 behind where the leader is now: brake.
-        held = torch.where(dx < v * dt + _RESERVE * cc0, -p["b_max"], 0.0)
+        # 1. Too close. One step more at this speed ends less than a tenth of CC0 behind where the
+        # leader is now: brake.
+        blocked = torch.where(dx < v * dt + _RESERVE * cc0, -p["b_max"], 0.0)
         beyond = dx > cc0
         brake = a_l + torch.where(
             beyond, dv * dv / divisor(cc0 - dx, beyond), 0.5 * (dv - opening_threshold)
         )
-        brake = torch.where(dv < 0, brake.clamp(max=0.0), held)
+        brake = torch.where(dv < 0, brake.clamp(max=0.0), blocked)
         brake = torch.where(brake > -cc7, -cc7, torch.maximum(brake, 0.5 * root(v) - 10.0))
-        too_close = torch.where(v_l > 0, brake, held)
+        too_close = torch.where(v_l > 0, brake, blocked)
         # 2. Approaching.
         room = near - dx - 0.1
         approaching = 0.5 * dv * dv / divisor(room, room.abs() > 0)
         # 3. Following, unconsciously.
         following = torch.where(a_old <= 0, torch.minimum(a_old, -cc7), torch.maximum(a_old, cc7))
         # 4. Free, or closing the gap.
-        speed_share = v.clamp(max=_CC9_SPEED)
-        if self.settings.variant == "sumo":
-            a_max, cap = cc8 + p["cc9"] * speed_share, cc8
-        else:
-            a_max = cc8 + (p["cc9"] - cc8) * speed_share / _CC9_SPEED
-            cap = a_max
+        a_max, cap = self._limits(v, cc8, p["cc9"])
         inside = dx < far
         free = torch.where(inside, torch.minimum(dv * dv / divisor(far - dx, inside), a_max), a_max)
         free = torch.where(dx > near, free, 0.0)
 
-        if not exact(
-            self.temperature
-        ):  # they are mixed, so each must be something that the vehicle can do
-            approaching, too_close, free = (
-                a.clamp(min=-p["b_max"]).minimum(cap) for a in (approaching, too_close, free)
-            )
-        # Nested, not joined by `&`: compiled in float64 that is three times as fast (masks of doubles are joined as integers).
-        near_by, slower = (
-            partial(below, scale=scale, temperature=self.temperature) for scale in (SPACING, SPEED)
-        )
+        if not exact(self.temperature):
+            # They are mixed, so each must be something that the vehicle can do.
+            hardest = -p["b_max"]
+            approaching = approaching.clamp(min=hardest).minimum(cap)
+            too_close = too_close.clamp(min=hardest).minimum(cap)
+            free = free.clamp(min=hardest).minimum(cap)
+        # Nested, not joined by `&`: compiled in float64 that is three times as fast (masks of
+        # doubles are joined as integers).
+        near_by = partial(below, scale=SPACING, temperature=self.temperature)
+        slower = partial(below, scale=SPEED, temperature=self.temperature)
         rest = slower(dv, opening_threshold, near_by(dx, far, following, free), free)
         rest = slower(dv, closing_threshold, near_by(dx, perceived, approaching, rest), rest)
         too_near = up_to(dx, near, too_close, rest, scale=SPACING, temperature=self.temperature)
@@ -215,10 +213,19 @@ class W99(DrivingModel):
             v, wanted, accel=cap, decel=p["b"], emergency_decel=p["b_max"], v_max=p["v_max"], dt=dt
         )
 
+    def _limits(self, v: Tensor, cc8: Tensor, cc9: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns the acceleration wanted on a free road and the cap on every one, m/s2."""
+        slow = v.clamp(max=_CC9_SPEED)
+        if self.settings.variant == "sumo":
+            return cc8 + cc9 * slow, cc8
+        wanted = cc8 + (cc9 - cc8) * slow / _CC9_SPEED
+        return wanted, wanted
+
     def sumo_vtype(self, p: Mapping[str, Tensor]) -> VType:
         if self.settings.variant != "sumo":
             raise ConfigError(
-                f"simulator=sumo: SUMO has model=w99 as variant=sumo only, not {self.settings.variant}"
+                "simulator=sumo: SUMO has model=w99 as variant=sumo only, not"
+                f" {self.settings.variant}"
             )
         names = {"cc0": "minGap", "b": "decel", "b_max": "emergencyDecel", "v_max": "maxSpeed"}
         return VType("W99", {names.get(ours, ours): value for ours, value in p.items()})

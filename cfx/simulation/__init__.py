@@ -1,1 +1,1 @@
-"""The batched rollout of a driving model along leaders; the only place that integrates."""
+"""The batched rollout of a driving model along leaders; `step` alone integrates."""

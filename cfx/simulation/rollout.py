@@ -1,19 +1,21 @@
 """The rollout: one driving model along recorded leaders, for any number of followers at once.
 
-Every step is `cfx.simulation.step.advance_vehicle`; the model sees the leader **at t**.
+Each step is `cfx.simulation.step.advance_vehicle`: forward Euler, and the model sees the leader
+**at t**. This module says in which order, layout and precision steps are taken, and when they are
+compiled.
 
-Shapes: public tensors are `(*batch, time)`. Inside, time comes first, so that each step reads contiguous memory, and
-leaders broadcast: a leader `(pairs, 1)` drives ahead of followers `(pairs, candidates)` without a copy.
+Shapes: public tensors are `(*batch, time)`. Inside, time comes first, so that each step reads
+contiguous memory, and leaders broadcast: a leader `(pairs, 1)` drives ahead of followers `(pairs,
+candidates)` without a copy.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import itertools
-import math
 import shutil
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar, Literal
 
 import torch
@@ -25,6 +27,7 @@ from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.simulation.base import Stepper
 from cfx.simulation.step import advance_vehicle
 from cfx.simulation.threads import one_thread
+from cfx.simulation.tiles import Tile, tile_size, tiles
 from cfx.simulation.trajectory import Start as Start  # noqa: PLC0414 - earlier home
 from cfx.simulation.trajectory import Trajectory as Trajectory  # noqa: PLC0414 - earlier home
 
@@ -33,25 +36,24 @@ _Parameters = dict[str, Tensor]
 _Step = Callable[[Follower, Leader, _Parameters], tuple[Follower, Tensor, Tensor]]
 
 _BLOCK = 5
-"""Steps that one compiled call takes: a window of the paper. State and parameters stay in registers meanwhile; longer blocks
-were not faster and take long to compile."""
+"""Steps that one compiled call takes: a window of the paper. State and parameters stay in registers
+meanwhile; longer blocks were not faster and take long to compile.
+"""
 
 _WORTH_COMPILING = 20_000_000
-"""Vehicle steps in one call, or in calls that belong together (`for_work`), from which compiling pays: about a second of eager
-work. The rule looks at these alone, so that the same call gives the same bits whatever came before it."""
-
-_TILE_BYTES = 1 << 17
-"""What one tile of followers takes for each value. A tile does all its steps before the next begins, so that the twenty or so
-values that a model reads and writes stay in the cache; otherwise memory sets the speed. Tiles run on one thread: two would wait
-for each other after every small operation, thirty times as long where another program wants the core."""
+"""Vehicle steps in one call, or in calls that belong together (`for_work`), from which compiling
+pays: about a second of eager work. The rule looks at these alone, so that the same call gives the
+same bits whatever came before it.
+"""
 
 
 class MemoryStepper(Stepper):
     """Advances followers of one model at one time step.
 
-    Compiles the model's step once that pays (`compile="auto"`), where a compiler is found; runs it eagerly otherwise and
-    whenever gradients are wanted. Both give the same numbers to the last few bits. A simulator has no state: compiled code
-    is kept for the process, and simulators of equal models share it.
+    Compiles the model's step once that pays (`compile="auto"`), where a compiler is found; runs it
+    eagerly otherwise and whenever gradients are wanted. Both give the same numbers to the last few
+    bits. A stepper has no state: compiled code is kept for the process, and steppers of equal
+    models share it.
     """
 
     differentiable: ClassVar[bool] = True
@@ -74,38 +76,44 @@ class MemoryStepper(Stepper):
             nothing = follower.speed.new_empty((0, *batch))
             return follower, nothing, nothing
         eager = _stepper(self.model, self.dt)
-        if torch.is_grad_enabled() and any(
-            tensor.requires_grad for tensor in (*follower, *leader, *p.values())
-        ):
+        inputs = (*follower, *leader, *p.values())
+        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
             return eager(follower, leader, dict(p))
         with torch.no_grad():
             compiled = self._compiles(steps, follower.speed)
-            size = _tile_size(follower.speed)
+            size = tile_size(follower.speed)
             if not compiled and follower.speed.numel() <= size:
                 return eager(follower, leader, dict(p))
-            end = Follower(
-                *(
-                    torch.empty_like(state, memory_format=torch.contiguous_format)
-                    for state in follower
-                )
-            )
-            position, speed = (follower.speed.new_empty((steps, *batch)) for _ in range(2))
-            with one_thread():
-                for tile in _tiles(batch, size):
-                    drive = (
-                        self._compiled_drive if compiled and len(tile) > 1 else self._eager_drive
-                    )
-                    tile.put(
-                        end,
-                        drive(
-                            tile,
-                            follower,
-                            leader,
-                            tile.parameters(p),
-                            tile.rows(position),
-                            tile.rows(speed),
-                        ),
-                    )
+            return self._in_tiles(follower, leader, p, size, compiled=compiled)
+
+    def _in_tiles(
+        self,
+        follower: Follower,
+        leader: Leader,
+        p: Mapping[str, Tensor],
+        size: int,
+        *,
+        compiled: bool,
+    ) -> tuple[Follower, Tensor, Tensor]:
+        """As `advance`, a tile of at most `size` followers after the other."""
+        steps, batch = len(leader.position), follower.speed.shape
+        end = Follower(
+            _empty_like(follower.position),
+            _empty_like(follower.speed),
+            _empty_like(follower.acceleration),
+            _empty_like(follower.memory),
+        )
+        position = follower.speed.new_empty((steps, *batch))
+        speed = follower.speed.new_empty((steps, *batch))
+        with one_thread():
+            for tile in tiles(batch, size):
+                own, own_p = tile.follower(follower), tile.parameters(p)
+                rows, speed_rows = tile.rows(position), tile.rows(speed)
+                if compiled and len(tile) > 1:
+                    last = self._take_compiled(tile, own, leader, own_p, rows, speed_rows)
+                else:
+                    last = self._take_eager(tile, own, leader, own_p, rows, speed_rows)
+                tile.write(end, last)
         return end, position, speed
 
     def _compiles(self, steps: int, like: Tensor) -> bool:
@@ -114,9 +122,9 @@ class MemoryStepper(Stepper):
     def _pays(self, steps: int) -> bool:
         return self._mode == "always" or (self._mode == "auto" and steps >= _WORTH_COMPILING)
 
-    def _eager_drive(
+    def _take_eager(
         self,
-        tile: _Tile,
+        tile: Tile,
         follower: Follower,
         leader: Leader,
         p: _Parameters,
@@ -124,39 +132,43 @@ class MemoryStepper(Stepper):
         speed: Tensor,
     ) -> Follower:
         """Takes all steps of one tile; writes positions and speeds `(time, rows, columns)`."""
-        last, at, fast = _stepper(self.model, self.dt)(
-            tile.follower(follower), tile.leader(leader, 0, len(position)), p
-        )
-        position.copy_(at.view_as(position))
-        speed.copy_(fast.view_as(speed))
+        take = _stepper(self.model, self.dt)
+        last, positions, speeds = take(follower, tile.leader(leader, 0, len(position)), p)
+        position.copy_(positions.view_as(position))
+        speed.copy_(speeds.view_as(speed))
         return last
 
-    def _compiled_drive(
+    def _take_compiled(
         self,
-        tile: _Tile,
+        tile: Tile,
         follower: Follower,
         leader: Leader,
         p: _Parameters,
         position: Tensor,
         speed: Tensor,
     ) -> Follower:
-        """As `_eager_drive`, in compiled blocks; what is left over goes step by step."""
+        """As `_take_eager`, in compiled blocks; what is left over goes step by step."""
         steps = len(position)
-        cuts = [
-            *range(0, steps - steps % _BLOCK, _BLOCK),
-            *range(steps - steps % _BLOCK, steps + 1),
-        ]
-        current = tile.follower(follower)
+        blocks = steps - steps % _BLOCK
+        cuts = [*range(0, blocks, _BLOCK), *range(blocks, steps + 1)]
+        current = follower
         for first, last in itertools.pairwise(cuts):
             take = _compiled_stepper(self.model, self.dt, last - first)
-            current, at, fast = take(current, tile.leader(leader, first, last), p)
-            position[first:last].copy_(at.view(-1, *tile.shape))
-            speed[first:last].copy_(fast.view(-1, *tile.shape))
+            current, positions, speeds = take(current, tile.leader(leader, first, last), p)
+            position[first:last].copy_(positions.view(-1, *tile.shape))
+            speed[first:last].copy_(speeds.view(-1, *tile.shape))
         return current
 
 
+def _empty_like(state: Tensor) -> Tensor:
+    return torch.empty_like(state, memory_format=torch.contiguous_format)
+
+
 def _stepper(model: DrivingModel, dt: float) -> _Step:
-    """Returns the function that takes all steps of a leader's frames; `advance` without its layout."""
+    """Returns the function that takes all steps of a leader's frames.
+
+    It is `advance` without its layout.
+    """
 
     def take(follower: Follower, leader: Leader, p: _Parameters) -> tuple[Follower, Tensor, Tensor]:
         positions, speeds = [], []
@@ -183,111 +195,27 @@ def _compiled_stepper(model: DrivingModel, dt: float, steps: int) -> _Step:
         steps,
     )
     if key not in _COMPILED:
-        # Each model and block has a cache of its own: torch counts recompilations per function, and gives up after eight.
+        # Each model and block has a cache of its own: torch counts recompilations per function, and
+        # gives up after eight.
+        take = _stepper(model, dt)
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore", DeprecationWarning
-            )  # torch's own, about itself, as it imports its compiler
-            _COMPILED[key] = torch.compile(  # type: ignore[call-overload]  # torch's overloads leave isolate_recompiles out
-                _stepper(model, dt), dynamic=True, isolate_recompiles=True
-            )
+            # torch's own, about itself, as it imports its compiler
+            warnings.simplefilter("ignore", DeprecationWarning)
+            # torch's overloads leave isolate_recompiles out.
+            _COMPILED[key] = torch.compile(take, dynamic=True, isolate_recompiles=True)  # type: ignore[call-overload]
     return _COMPILED[key]
 
 
 def can_compile(device: torch.device) -> bool:
-    """Says whether `torch.compile` has what it needs here: a C++ compiler for the CPU, Triton for CUDA."""
+    """Says whether `torch.compile` has what it needs here.
+
+    That is a C++ compiler for the CPU and Triton for CUDA.
+    """
     if device.type == "cuda":
         return importlib.util.find_spec("triton") is not None
-    return device.type == "cpu" and any(shutil.which(name) for name in ("g++", "clang++", "c++"))
-
-
-class _Tile:
-    """A rectangle of a batch that is seen as rows and columns, `(prod(batch[:-1]), batch[-1])`.
-
-    What goes into a step is copied into new one-dimensional tensors (`(time, n)` for the leader), whatever the caller's batch
-    looks like: the compiler makes other code for other strides, offsets and views, and this way all batches share one. The
-    copies stay in the cache.
-    """
-
-    def __init__(self, batch: torch.Size, rows: slice, columns: slice) -> None:
-        self._batch = batch
-        self._grid = (batch[:-1].numel(), batch[-1]) if batch else (1, 1)
-        self._rows, self._columns = rows, columns
-        self.shape = (rows.stop - rows.start, columns.stop - columns.start)
-
-    def __len__(self) -> int:
-        """The number of followers, n."""
-        return math.prod(self.shape)
-
-    def rows(self, whole: Tensor) -> Tensor:
-        """Returns the tile of a contiguous `(time, *batch)` as a view `(time, rows, columns)`."""
-        return whole.view(len(whole), *self._grid)[:, self._rows, self._columns]
-
-    def follower(self, follower: Follower) -> Follower:
-        position, speed, acceleration = (self._flat(state) for state in follower[:3])
-        width = follower.memory.shape[-1]
-        memory = follower.memory.new_empty((len(self), width))
-        memory.view(*self.shape, width).copy_(
-            follower.memory.reshape(*self._grid, width)[self._rows, self._columns]
-        )
-        return Follower(position, speed, acceleration, memory)
-
-    def leader(self, leader: Leader, first: int, last: int) -> Leader:
-        position, speed, acceleration = (
-            self._flat_frames(signal[first:last]) for signal in leader[:3]
-        )
-        return Leader(position, speed, acceleration, self._flat(leader.length))
-
-    def parameters(self, p: Mapping[str, Tensor]) -> _Parameters:
-        """Constants stay 0-dimensional: they cost no memory traffic."""
-        return {
-            name: value.clone() if value.dim() == 0 else self._flat(value)
-            for name, value in p.items()
-        }
-
-    def put(self, end: Follower, last: Follower) -> None:
-        """Writes the tile's last state into the whole batch's."""
-        for whole, part in zip(end[:3], last[:3], strict=True):
-            self.rows(whole[None])[0].copy_(part.view(self.shape))
-        width = end.memory.shape[-1]
-        end.memory.view(*self._grid, width)[self._rows, self._columns].copy_(
-            last.memory.view(*self.shape, width)
-        )
-
-    def _flat(self, value: Tensor) -> Tensor:
-        return self._copy(value.expand(self._batch).reshape(self._grid))
-
-    def _flat_frames(self, signal: Tensor) -> Tensor:
-        frames = len(signal)
-        missing = (1,) * (len(self._batch) - signal.dim() + 1)
-        whole = signal.reshape(frames, *missing, *signal.shape[1:]).expand(frames, *self._batch)
-        return self._copy(whole.reshape(frames, *self._grid))
-
-    def _copy(self, grid: Tensor) -> Tensor:
-        """Copies the tile out of `(*time, all rows, all columns)` into a new `(*time, n)`."""
-        time = grid.shape[:-2]
-        copy = grid.new_empty((*time, len(self)))
-        copy.view(*time, *self.shape).copy_(grid[..., self._rows, self._columns])
-        return copy
-
-
-def _tile_size(like: Tensor) -> int:
-    """Returns how many followers one tile holds; on an accelerator, all."""
-    if like.device.type != "cpu":
-        return max(1, like.numel())
-    return _TILE_BYTES // like.element_size()
-
-
-def _tiles(batch: torch.Size, size: int) -> Iterator[_Tile]:
-    """Cuts a batch into tiles of at most `size` followers: whole rows, or parts of one."""
-    rows, columns = (batch[:-1].numel(), batch[-1]) if batch else (1, 1)
-    width = min(size, columns)
-    height = max(1, size // max(1, width)) if width == columns else 1
-    for top in range(0, rows, height):
-        for left in range(0, columns, width):
-            yield _Tile(
-                batch, slice(top, min(top + height, rows)), slice(left, min(left + width, columns))
-            )
+    if device.type != "cpu":
+        return False
+    return any(shutil.which(name) for name in ("g++", "clang++", "c++"))
 
 
 def _frames(leader: Leader, first: int, last: int) -> Leader:
@@ -309,35 +237,37 @@ def simulate(
     window: int | None = None,
     compile: Compile = "auto",
 ) -> Trajectory:
-    """Drives followers behind recorded leaders: the batched rollout that calibration, learning and evaluation use.
+    """Simulates followers behind recorded leaders, as calibration, learning and evaluation do.
 
     Args:
         model: the driving model.
-        parameters: `(*batch, n)` tuned parameters, constant; or `(*batch, windows, n)` with `window` given, one set for each
-            `window` steps (the last set is kept if the drive is longer); or a mapping name -> value, the others at their
-            defaults; or None for all defaults.
+        parameters: `(*batch, n)` tuned parameters, constant; or `(*batch, windows, n)` with
+            `window` given, one set for each `window` steps (the last set is kept if the rollout is
+            longer); or a mapping name -> value, the others at their defaults; or None for all
+            defaults.
         leader: `(*batch, time)` each, its length `(*batch,)`.
         start: the followers at frame 0, `(*batch,)`.
         dt: time step, s.
         window: steps for which one set of parameters holds.
         compile: `auto` compiles where that pays.
 
-    The leading dimensions of `parameters`, `leader` and `start` broadcast: a leader `(pairs, 1, time)` drives ahead of
-    candidates `(pairs, candidates, n)`.
+    The leading dimensions of `parameters`, `leader` and `start` broadcast: a leader `(pairs, 1,
+    time)` drives ahead of candidates `(pairs, candidates, n)`.
 
     Returns:
         Frames 0 to time - 1, `(*batch, time)`.
 
     Raises:
-        ParameterError: the number of parameters or a name does not fit the model, or `window` does not fit their shape. Values
-            outside the bounds are simulated as they are.
+        ParameterError: the number of parameters or a name does not fit the model, or `window` does
+            not fit their shape. Values outside the bounds are simulated as they are.
     """
     windows = _windows(model, parameters, start.speed, leader.position.shape[-1] - 1, window)
-    shapes = [leader.position.shape[:-1], leader.length.shape, *(state.shape for state in start)]
-    shapes += [value.shape for _, _, p in windows for value in p.values()]
-    batch = torch.broadcast_shapes(*shapes)  # type: ignore[no-untyped-call]  # torch leaves it untyped
+    batch = _batch(leader, start, windows)
     stepper = MemoryStepper(model, dt, compile=compile)
-    follower = stepper.begin(Start(*(state.expand(batch) for state in start)))
+    everywhere = Start(
+        start.position.expand(batch), start.speed.expand(batch), start.acceleration.expand(batch)
+    )
+    follower = stepper.begin(everywhere)
     in_time = Leader(
         _time_first(leader.position),
         _time_first(leader.speed),
@@ -354,6 +284,20 @@ def simulate(
     return Trajectory(position, torch.cat(speeds).movedim(0, -1), gap, gap < 0)
 
 
+def _batch(
+    leader: Leader, start: Start, windows: Sequence[tuple[int, int, _Parameters]]
+) -> torch.Size:
+    """Returns the shape to which leaders, starts and parameters broadcast, without time."""
+    shapes = [leader.position.shape[:-1], leader.length.shape]
+    for state in start:
+        shapes.append(state.shape)
+    for _, _, p in windows:
+        for value in p.values():
+            shapes.append(value.shape)
+    batch: torch.Size = torch.broadcast_shapes(*shapes)  # type: ignore[no-untyped-call]
+    return batch
+
+
 def _time_first(signal: Tensor) -> Tensor:
     return signal.movedim(-1, 0).contiguous()
 
@@ -365,24 +309,16 @@ def _windows(
     steps: int,
     window: int | None,
 ) -> list[tuple[int, int, _Parameters]]:
-    """Returns (first step, last step, parameters by name) of each stretch with constant parameters."""
+    """Returns (first step, last step, parameters by name) of each stretch with constant ones."""
     space = model.space
     if not isinstance(parameters, Tensor):
-        given = dict(parameters or {})
-        for name in given:
-            space[name]
-        named = {
-            p.name: torch.as_tensor(
-                given.get(p.name, p.default), dtype=like.dtype, device=like.device
-            )
-            for p in space
-        }
-        return [(0, steps, named)]
+        return [(0, steps, _named(model, parameters or {}, like))]
     if window is None:
         return [(0, steps, space.unpack(_columns(parameters)))]
     if window < 1 or parameters.dim() < 2:
         raise ParameterError(
-            f"window={window}: parameters per window need a window of at least one step and shape (*batch, windows, n)"
+            f"window={window}: parameters per window need a window of at least one step and shape"
+            " (*batch, windows, n)"
         )
     count = parameters.shape[-2]
     if count == 0:
@@ -390,10 +326,21 @@ def _windows(
     cuts = [*range(0, min(steps, count * window), window)]
     ends = [*cuts[1:], steps]
     columns = _columns(parameters)
-    return [
-        (a, b, space.unpack(columns[..., k, :]))
-        for k, (a, b) in enumerate(zip(cuts, ends, strict=True))
-    ]
+    windows = []
+    for k, (first, last) in enumerate(zip(cuts, ends, strict=True)):
+        windows.append((first, last, space.unpack(columns[..., k, :])))
+    return windows
+
+
+def _named(model: DrivingModel, given: Mapping[str, Tensor | float], like: Tensor) -> _Parameters:
+    """Returns every parameter by name: the given ones, the others at their defaults."""
+    for name in given:
+        model.space[name]  # raises where there is no such parameter
+    named = {}
+    for parameter in model.space:
+        value = given.get(parameter.name, parameter.default)
+        named[parameter.name] = torch.as_tensor(value, dtype=like.dtype, device=like.device)
+    return named
 
 
 def _columns(parameters: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ __all__ = ["SimulatorContract"]
 
 
 class SimulatorContract:
-    """What every simulator must hold: each statement of `cfx.testing.checks.simulators` is a test."""
+    """What every simulator must hold: a test for each check in `cfx.testing.checks.simulators`."""
 
     @pytest.fixture
     def simulator(self) -> Simulator:

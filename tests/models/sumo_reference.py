@@ -1,12 +1,13 @@
 """Followers in SUMO itself: a job as JSON on stdin, their trajectories as JSON on stdout.
 
-Runs as a process of its own, because libsumo and pyarrow do not get on in one. All followers of a job drive at once, each on
-its own road behind its own leader.
+Runs as a process of its own, because libsumo and pyarrow do not get on in one. All followers of a
+job drive at once, each on its own road behind its own leader.
 
-Job: `{"dt": s, "runs": [run, ...]}`. Run: `model` (SUMO's name), `parameters` and `leader` (SUMO's vType attributes of the
-follower and of the leader), `leader_speed` (frames 0 to T - 1), `leader_position`, `leader_acceleration` (frame 0),
-`leader_length`, and `position`, `speed`, `acceleration` of the follower at frame 0. SI units. Answer: `{"runs": [{"speed": [...],
-"position": [...], "leader_position": [...]}, ...]}`, T frames each.
+Job: `{"dt": s, "runs": [run, ...]}`. Run: `model` (SUMO's name), `parameters` and `leader` (SUMO's
+vType attributes of the follower and of the leader), `leader_speed` (frames 0 to T - 1),
+`leader_position`, `leader_acceleration` (frame 0), `leader_length`, and `position`, `speed`,
+`acceleration` of the follower at frame 0. SI units. Answer: `{"runs": [{"speed": [...], "position":
+[...], "leader_position": [...]}, ...]}`, T frames each.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""The driving models are SUMO's, wherever SUMO draws no random number: one step and whole drives agree to 1e-9 m/s.
+"""The driving models are SUMO's, wherever SUMO draws no random number: one step and whole drives
+agree to 1e-9 m/s.
 
 `pytest tests/models/test_sumo_parity.py -s` prints the largest difference of each model and case.
 """
@@ -373,7 +374,8 @@ def test_free_drives_behind_real_leaders(twin: Twin, real_leaders: list[Array]) 
 
 @every_twin
 def test_free_drives_behind_leaders_that_stop_and_go(twin: Twin) -> None:
-    # Where SUMO draws numbers, leaders that accelerate by less than 1 m/s2: then none matters, and whole drives are compared.
+    # Where SUMO draws numbers, leaders that accelerate by less than 1 m/s2: then none matters, and
+    # whole drives are compared.
     rng = np.random.default_rng(2)
     leaders = synthetic(rng, 30, gentle=0.95 if twin.draws else 3.0)
     assert compare(twin, "stop and go", drives(leaders, twin.draw(rng, 30), rng)) > 0.7
@@ -381,7 +383,8 @@ def test_free_drives_behind_leaders_that_stop_and_go(twin: Twin) -> None:
 
 @every_twin
 def test_single_steps_from_random_states(twin: Twin) -> None:
-    # States that a drive seldom visits: nearly touching, overlapping, standing, and every case of the rules.
+    # States that a drive seldom visits: nearly touching, overlapping, standing, and every case of
+    # the rules.
     rng = np.random.default_rng(5)
     cases = []
     for p in twin.draw(rng, 800):
@@ -428,9 +431,11 @@ def sumos_wiedemann(p: Mapping[str, Tensor]) -> VType:
 
 
 def wiedemanns_case(follower: Follower, leader: Leader, p: Mapping[str, Tensor]) -> Tensor:
-    """Says in which states `w74` and SUMO's Wiedemann decide alike: unconscious following while not opening, and approaching.
+    """Says in which states `w74` and SUMO's Wiedemann decide alike: unconscious following while not
+    opening, and approaching.
 
-    Not alike are free driving (another rule), emergencies (SUMO brakes as hard as it can), and opening gaps (a random threshold).
+    Not alike are free driving (another rule), emergencies (SUMO brakes as hard as it can), and
+    opening gaps (a random threshold).
     """
     v, v_l = follower.speed, leader.speed
     spacing, closing = leader.position - follower.position, v - v_l

@@ -37,7 +37,8 @@ def test_cc9_has_no_effect_in_sumo_and_is_the_acceleration_at_80_kmh_in_vissim()
 
 
 def test_it_does_not_creep_into_a_standing_leader() -> None:
-    # Too close behind a standing leader SUMO's rule says a = 0, but the last tenth of CC0 is never given up.
+    # Too close behind a standing leader SUMO's rule says a = 0, but the last tenth of CC0 is never
+    # given up.
     p = W99().space.unpack(W99().space.defaults())
     leader = Leader(*(torch.tensor(x, dtype=torch.float64) for x in (5.3, 0.0, 0.0, 5.0)))
     for speed, wanted in ((0.3, 0.3), (0.6, 0.0)):

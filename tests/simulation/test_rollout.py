@@ -197,7 +197,8 @@ def test_single_precision_stays_near_double(model: DrivingModel) -> None:
         DT,
     )
     assert single.speed.dtype == torch.float32
-    # Thresholds amplify the last bit for a while; over six seconds it stays far below measurement noise.
+    # Thresholds amplify the last bit for a while; over six seconds it stays far below measurement
+    # noise.
     assert (single.speed.double() - double.speed).abs().max() < 0.1
 
 
@@ -273,7 +274,7 @@ def test_tiles_change_nothing(
     )
     p = candidates(model, *batch)
     whole = simulate(model, p, leader, start_of(batch), DT)
-    monkeypatch.setattr(rollout, "_tile_size", lambda like: 4)
+    monkeypatch.setattr(rollout, "tile_size", lambda like: 4)
     tiled = simulate(model, p, leader, start_of(batch), DT)
     assert all(torch.equal(a, b) for a, b in zip(whole, tiled, strict=True))
 
@@ -289,7 +290,7 @@ class Remembers(Krauss):
 
 def test_memory_is_carried_through_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
     simulator, leader = Simulator(Remembers(), DT), wavy_leader(3, 8)
-    monkeypatch.setattr(rollout, "_tile_size", lambda like: 4)
+    monkeypatch.setattr(rollout, "tile_size", lambda like: 4)
     in_time = Leader(*(x.T[:, :, None] for x in leader[:3]), leader.length[:, None])
     p = Krauss().space.unpack(candidates(Krauss(), 3, 5))
     end, _, speed = simulator.advance(simulator.begin(start_of((3, 5))), in_time, p)
@@ -314,10 +315,11 @@ def fresh_compiler() -> Iterator[None]:
 @pytest.mark.usefixtures("fresh_compiler")
 def test_compiled_equals_eager_and_shapes_do_not_recompile(monkeypatch: pytest.MonkeyPatch) -> None:
     model = Krauss()
-    monkeypatch.setattr(rollout, "_tile_size", lambda like: 64)
+    monkeypatch.setattr(rollout, "tile_size", lambda like: 64)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        # The shapes of a job: windows of many candidates, one candidate for each window, last chunks, whole drives.
+        # The shapes of a job: windows of many candidates, one candidate for each window, last
+        # chunks, whole drives.
         for batch, frames in (
             ((16, 128), 6),
             ((300, 1), 6),

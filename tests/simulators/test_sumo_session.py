@@ -77,9 +77,9 @@ def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_processes_stay_and_end_with_the_session(scratch: Path) -> None:
     with Session(2) as session:
         assert session.processes == ()
-        one = session.drive([request()])
+        one = session.answer([request()])
         assert len(session.processes) == 1
-        many = session.drive([request(speed) for speed in (10.0, 11.0, 12.0, 13.0)])
+        many = session.answer([request(speed) for speed in (10.0, 11.0, 12.0, 13.0)])
         processes = session.processes
         assert len(processes) == len(list(scratch.iterdir())) == 2
         assert [answer.arrays["speed"][0, 0] for answer in many] == pytest.approx(
@@ -95,14 +95,14 @@ def test_a_process_that_dies_is_told_in_one_sentence_and_the_session_can_start_a
     scratch: Path,
 ) -> None:
     with Session(1) as session:
-        session.drive([request()])
+        session.answer([request()])
         os.kill(session.processes[0], signal.SIGKILL)
         with pytest.raises(
             SumoError, match=r"^a SUMO process ended by itself \(signal SIGKILL\); run again"
         ):
-            session.drive([request()])
+            session.answer([request()])
         assert session.processes == ()
-        assert len(session.drive([request()])) == 1
+        assert len(session.answer([request()])) == 1
     assert not list(scratch.iterdir())
 
 
@@ -113,7 +113,7 @@ def test_nothing_is_left_when_the_job_is_killed() -> None:
         from tests.simulators.test_sumo_session import request
         from cfx.simulators.sumo.session import Session
         session = Session(1)
-        session.drive([request()])
+        session.answer([request()])
         print(session.processes[0], session._started[0]._folder.name, flush=True)
         time.sleep(60)
     """)
@@ -146,7 +146,7 @@ def test_a_vehicle_beyond_the_roads_end_is_no_result(position: float, leader: fl
             SumoError, match=r"^SUMO lost a vehicle .*: it left the 1000 km of its road;"
         ),
     ):
-        session.drive([far])
+        session.answer([far])
 
 
 def test_a_missing_sumo_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

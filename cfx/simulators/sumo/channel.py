@@ -1,6 +1,7 @@
-"""Messages between a job and its SUMO processes: a JSON header and arrays, as `.npz` bytes with their length ahead.
+"""Messages between a job and its SUMO processes.
 
-Nothing is pickled. Imports neither torch nor SUMO: both sides read this.
+A message is a JSON header and arrays, as `.npz` bytes with their length ahead. Nothing is pickled.
+This module imports neither torch nor SUMO: both sides read it.
 """
 
 from __future__ import annotations
@@ -41,9 +42,8 @@ def send(
         OSError: nobody reads the stream any more.
     """
     buffer = io.BytesIO()
-    np.savez(
-        buffer, allow_pickle=False, **{_HEADER: np.array(json.dumps(header))}, **dict(arrays or {})
-    )
+    named: dict[str, Any] = {_HEADER: np.array(json.dumps(header)), **(arrays or {})}
+    np.savez(buffer, allow_pickle=False, **named)
     data = buffer.getvalue()
     stream.write(_LENGTH.pack(len(data)))
     stream.write(data)
@@ -61,4 +61,5 @@ def receive(stream: IO[bytes]) -> Message | None:
         return None
     with np.load(io.BytesIO(data), allow_pickle=False) as found:
         header: dict[str, Any] = json.loads(str(found[_HEADER][()]))
-        return Message(header, {name: found[name] for name in found.files if name != _HEADER})
+        arrays = {name: found[name] for name in found.files if name != _HEADER}
+        return Message(header, arrays)

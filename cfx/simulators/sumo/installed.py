@@ -1,4 +1,7 @@
-"""Whether SUMO is there, told from metadata alone: libsumo is never imported into a job's process."""
+"""Whether SUMO is installed, by metadata alone.
+
+libsumo is never imported into a job's process.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,8 @@ def require_sumo() -> str:
     """Returns the version of the libsumo that is installed.
 
     Raises:
-        SumoError: it is not installed, or its version is not one that cfx works with; says what to install.
+        SumoError: it is not installed, or its version is not one that cfx works with; says what to
+            install.
     """
     wanted = f"SUMO {_text(OLDEST)} or newer, below {BELOW[0]}"
     try:
@@ -27,7 +31,8 @@ def require_sumo() -> str:
     number = re.match(r"(\d+)\.(\d+)", version)
     if number is None or not OLDEST <= (int(number[1]), int(number[2])) < BELOW:
         raise SumoError(
-            f'SUMO {version} is installed (the package libsumo), but cfx works with {wanted}: pip install "cfx-driving[sumo]"'
+            f"SUMO {version} is installed (the package libsumo), but cfx works with {wanted}: pip"
+            ' install "cfx-driving[sumo]"'
         )
     return version
 

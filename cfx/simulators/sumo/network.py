@@ -1,6 +1,8 @@
-"""SUMO's input for followers behind replayed leaders: parallel single-lane roads, two vehicles on each.
+"""SUMO's input for followers behind replayed leaders.
 
-Written by hand, as straight roads need no netconvert. Imports neither torch nor SUMO: the SUMO processes write these files.
+It is parallel single-lane roads with two vehicles on each. It is written without SUMO's tools, as
+straight roads need no netconvert. This module imports neither torch nor SUMO: the SUMO processes
+write these files.
 """
 
 from __future__ import annotations
@@ -25,26 +27,38 @@ Attributes = Mapping[str, float | str]
 def network(roads: int) -> str:
     """Returns a network file (`.net.xml`) of parallel roads."""
     box = f"0,0,{ROAD},{_APART * roads}"
-    lines = ['<net version="1.20">']
-    lines.append(
-        f'<location netOffset="0,0" convBoundary="{box}" origBoundary="0,0,1,1" projParameter="!"/>'
-    )
+    lines = [
+        '<net version="1.20">',
+        f'<location netOffset="0,0" convBoundary="{box}" origBoundary="0,0,1,1"'
+        ' projParameter="!"/>',
+    ]
     for i in range(roads):
-        y = _APART * i
-        lines.append(
-            f'<edge id="road{i}" from="from{i}" to="to{i}" priority="1"><lane id="{LANE.format(i)}" index="0"'
-        )
-        lines.append(f' speed="{LANE_SPEED}" length="{ROAD}" shape="0,{y} {ROAD},{y}"/></edge>')
+        lines += _edge(i)
     for i in range(roads):
-        y = _APART * i
-        lines.append(
-            f'<junction id="from{i}" type="dead_end" x="0" y="{y}" incLanes="" intLanes="" shape="0,{y}"/>'
-        )
-        lines.append(
-            f'<junction id="to{i}" type="dead_end" x="{ROAD}" y="{y}" incLanes="{LANE.format(i)}" intLanes=""'
-        )
-        lines.append(f' shape="{ROAD},{y}"/>')
-    return "\n".join([*lines, "</net>"])
+        lines += _ends(i)
+    lines.append("</net>")
+    return "\n".join(lines)
+
+
+def _edge(i: int) -> list[str]:
+    y = _APART * i
+    return [
+        f'<edge id="road{i}" from="from{i}" to="to{i}" priority="1">'
+        f'<lane id="{LANE.format(i)}" index="0"',
+        f' speed="{LANE_SPEED}" length="{ROAD}" shape="0,{y} {ROAD},{y}"/></edge>',
+    ]
+
+
+def _ends(i: int) -> list[str]:
+    """Returns the junctions at which road i begins and ends."""
+    y = _APART * i
+    return [
+        f'<junction id="from{i}" type="dead_end" x="0" y="{y}" incLanes="" intLanes=""'
+        f' shape="0,{y}"/>',
+        f'<junction id="to{i}" type="dead_end" x="{ROAD}" y="{y}"'
+        f' incLanes="{LANE.format(i)}" intLanes=""',
+        f' shape="{ROAD},{y}"/>',
+    ]
 
 
 class Placed:
@@ -56,20 +70,24 @@ class Placed:
         self.speed = speed
 
     def lines(self, name: str, road: int) -> tuple[str, str]:
-        """Returns the elements of its type and of itself. SUMO refuses to insert above what type and lane allow."""
+        """Returns the elements of its type and of itself.
+
+        SUMO refuses to insert a vehicle above what its type and the lane allow.
+        """
         limit = min(LANE_SPEED, float(self.attributes.get("maxSpeed", LANE_SPEED)))
-        given = " ".join(
-            f"{key}={quoteattr(_text(value))}" for key, value in self.attributes.items()
-        )
+        speed = max(0.0, min(self.speed, limit))
+        given = []
+        for key, value in self.attributes.items():
+            given.append(f"{key}={quoteattr(_text(value))}")
         return (
-            f'<vType id="type_{name}" speedDev="0" {given}/>',
-            f'<vehicle id="{name}" type="type_{name}" route="route{road}" depart="0" insertionChecks="none"'
-            f' departPos="{self.position!r}" departSpeed="{max(0.0, min(self.speed, limit))!r}"/>',
+            f'<vType id="type_{name}" speedDev="0" {" ".join(given)}/>',
+            f'<vehicle id="{name}" type="type_{name}" route="route{road}" depart="0"'
+            f' insertionChecks="none" departPos="{self.position!r}" departSpeed="{speed!r}"/>',
         )
 
 
 def routes(leaders: Sequence[Placed], followers: Sequence[Placed]) -> str:
-    """Returns a route file (`.rou.xml`): leader and follower i on road i, both from the first step on."""
+    """Returns a route file (`.rou.xml`): leader and follower i on road i, from the start on."""
     types, vehicles = [], []
     for i, (leader, follower) in enumerate(zip(leaders, followers, strict=True)):
         types.append(f'<route id="route{i}" edges="road{i}"/>')

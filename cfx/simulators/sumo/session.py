@@ -1,4 +1,4 @@
-"""SUMO processes that stay: started once, they answer one request after the other until their job ends."""
+"""SUMO processes that are started once and answer requests until their job ends."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ _PATIENCE_S = 5.0
 class Session:
     """Answers requests in SUMO; `cfx.simulators.sumo.worker` says what they hold.
 
-    Processes start with the first request. They end, and their folders go, with `close`, when nobody holds the session any more,
-    and when this process ends, however that happens.
+    Processes start with the first request. They end, and their folders go, with `close`, when
+    nobody holds the session any more, and when this process ends, however that happens.
 
     Args:
         workers: processes at most.
@@ -51,11 +51,12 @@ class Session:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def drive(self, requests: Iterable[Message]) -> list[Message]:
+    def answer(self, requests: Iterable[Message]) -> list[Message]:
         """Answers all requests, in their order; which process answers which makes no difference.
 
         Raises:
-            SumoError: SUMO refuses a request, a vehicle is lost, or a process ended; the session is closed then.
+            SumoError: SUMO refuses a request, a vehicle is lost, or a process ended; the session is
+                closed then.
         """
         todo = list(requests)
         for _ in range(min(self._workers, len(todo)) - len(self._started)):
@@ -77,7 +78,7 @@ class Session:
             raise
 
     def close(self) -> None:
-        """Ends the processes; the next `drive` starts new ones."""
+        """Ends the processes; the next `answer` starts new ones."""
         _close(self._started)
         self._idle = queue.LifoQueue()
 
@@ -126,7 +127,8 @@ class _Worker:
             found = None
         if found is None:
             raise SumoError(
-                f"a SUMO process ended by itself ({self._end()}); run again: what was calibrated so far is cached"
+                f"a SUMO process ended by itself ({self._end()}); run again: what was calibrated so"
+                " far is cached"
             )
         if "error" in found.header:
             raise SumoError(_in_words(found.header["error"], self._log()))
@@ -152,12 +154,11 @@ class _Worker:
         except subprocess.TimeoutExpired:
             return "it no longer answers"
         how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-        said = [
-            line
-            for line in self._log().splitlines()
-            if line.strip() and not line.startswith("Warning")
-        ]
-        return f"{how}: {said[-1].strip()}" if said else how
+        last = ""
+        for line in self._log().splitlines():
+            if line.strip() and not line.startswith("Warning"):
+                last = line.strip()
+        return f"{how}: {last}" if last else how
 
     def _log(self) -> str:
         with contextlib.suppress(OSError):
@@ -166,18 +167,26 @@ class _Worker:
 
 
 def _in_words(error: str, log: str) -> str:
-    """Joins the error that libsumo raised and what SUMO printed beside it: only the two together say what is wrong."""
-    errors = (line.removeprefix("Error:") for line in log.splitlines() if line.startswith("Error:"))
-    said = dict.fromkeys(line.strip().rstrip(".") for line in errors)
+    """Joins the error that libsumo raised and what SUMO printed beside it.
+
+    Only the two together say what is wrong.
+    """
+    first = error.strip().rstrip(".")
     if "is not known" in error:
         return (
-            f"SUMO lost a vehicle ({error.strip().rstrip('.')}): it left the {ROAD / 1000:.0f} km of its road; look for positions"
-            " far out in the data, and for bounds of parameters that mean nothing"
+            f"SUMO lost a vehicle ({first}): it left the {ROAD / 1000:.0f} km of its road; look for"
+            " positions far out in the data, and for bounds of parameters that mean nothing"
         )
-    return f"SUMO refuses the vehicles: {': '.join([error.strip().rstrip('.'), *said])}"
+    said = [first]
+    for line in log.splitlines():
+        text = line.removeprefix("Error:").strip().rstrip(".")
+        if line.startswith("Error:") and text not in said[1:]:
+            said.append(text)
+    return f"SUMO refuses the vehicles: {': '.join(said)}"
 
 
 def _search_path() -> str:
     """Returns PYTHONPATH with the folder of this cfx ahead, wherever it was imported from."""
     here = str(Path(cfx.__file__).resolve().parent.parent)
-    return os.pathsep.join(part for part in (here, os.environ.get("PYTHONPATH", "")) if part)
+    given = os.environ.get("PYTHONPATH", "")
+    return f"{here}{os.pathsep}{given}" if given else here

@@ -1,4 +1,4 @@
-"""`simulator=sumo`: the same rollouts, with SUMO taking the steps."""
+"""The steps of `simulator=sumo`: the same rollouts, with SUMO taking the steps."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,26 +23,27 @@ from cfx.simulators.sumo.schema import check_vtype
 from cfx.simulators.sumo.session import Session
 
 _REPLAYED = {"sigma": "0", "maxSpeed": "130"}
-"""Attributes of every leader; how it drives is told it at each step."""
+"""Attributes of every leader; its movement is prescribed at each step."""
 
 _STILL = {"speedFactor": "1", "sigma": "0"}
-"""Attributes of a follower, unless its model gives them: SUMO's defaults would draw both at random."""
+"""Attributes of a follower, unless its model gives them; SUMO's defaults make both random."""
 
 _Values = dict[str, Tensor | str]
 
 
 class SumoStepper(Stepper):
-    """Drives followers in SUMO, each on a road of its own behind its own leader.
+    """Advances followers in SUMO, each on a road of its own behind its own leader.
 
-    A follower enters with its exact position, speed and acceleration, and its leader has exactly the given ones at each step. One
-    `advance` is one entry. What a model of SUMO's remembers beyond these three is kept from one `advance` to the next for
-    followers whose parameters stay the same (they drive their whole way again, from where their parameters last changed); where a
-    policy changes them, such a model begins anew. The models that cfx has equations of remember nothing else. Entering anew every
-    0.5 s changed speeds within 30 s by less than 1e-11 m/s for Krauss, KraussOrig1, IDM, W99 and ACC, by up to 0.08 m/s for EIDM,
-    0.04 for IDMM and 0.9 for CACC.
+    A follower enters with its exact position, speed and acceleration, and its leader has exactly
+    the given ones at each step. One `advance` is one entry. What a model of SUMO's remembers beyond
+    these three is kept from one `advance` to the next for followers whose parameters stay the same
+    (they are simulated again from where their parameters last changed). Where a policy changes
+    them, such a model begins anew. The models that cfx has equations of remember nothing
+    else. Entering anew every 0.5 s changed speeds within 30 s by less than 1e-11 m/s for Krauss,
+    KraussOrig1, IDM, W99 and ACC, by up to 0.08 m/s for EIDM, 0.04 for IDMM and 0.9 for CACC.
 
-    A follower that runs into its leader stays, with a negative gap; one that enters ahead of its leader drives on freely, as SUMO
-    sees nobody ahead of it.
+    A follower that runs into its leader stays, with a negative gap; one that enters ahead of its
+    leader drives on freely, as SUMO sees nobody ahead of it.
 
     Differences to `cfx.simulation.rollout.MemoryStepper`: no gradients; always in double precision.
 
@@ -53,7 +55,8 @@ class SumoStepper(Stepper):
         seed: SUMO's own, for models that draw random numbers.
 
     Raises:
-        ConfigError: SUMO does not have the model, or not as it is set up, or cannot count the time step.
+        ConfigError: SUMO does not have the model, or not as it is set up, or cannot count the time
+            step.
         SumoError: SUMO is not installed, or another version.
     """
 
@@ -72,7 +75,8 @@ class SumoStepper(Stepper):
         self._seed = seed
         if round(dt * 1000) < 1 or abs(dt - round(dt * 1000) / 1000) > 1e-9:
             raise ConfigError(
-                f"simulator=sumo: SUMO counts in milliseconds, so it cannot take the recording's steps of {dt:g} s"
+                "simulator=sumo: SUMO counts in milliseconds, so it cannot take the recording's"
+                f" steps of {dt:g} s"
             )
         self._session = Session(workers or _cores())
 
@@ -92,51 +96,60 @@ class SumoStepper(Stepper):
     def advance(
         self, follower: Follower, leader: Leader, p: Mapping[str, Tensor]
     ) -> tuple[Follower, Tensor, Tensor]:
-        if torch.is_grad_enabled() and any(
-            tensor.requires_grad for tensor in (*follower, *leader, *p.values())
-        ):
+        inputs = (*follower, *leader, *p.values())
+        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
             raise SumoError(
-                "SUMO gives no gradients: learn with learner=imitation, or drive with simulator=memory"
+                "SUMO gives no gradients: learn with learner=imitation, or drive with"
+                " simulator=memory"
             )
         steps, batch = len(leader.position), follower.speed.shape
         if steps * follower.speed.numel() == 0:
             nothing = follower.speed.new_empty((steps, *batch))
             return follower, nothing, nothing
         kind = self._model.sumo_vtype(p)
-        drive = _Drive.of(follower, leader, kind)
-        if kind.remembers and isinstance(follower, _Driven):
-            drive = follower.drive.then(drive)
-        position, speed = (
-            found.to(follower.speed).view(steps, *batch) for found in self._last(drive, kind, steps)
-        )
+        scene = _Scene.of(follower, leader, kind)
+        if kind.remembers and isinstance(follower, _Remembering):
+            scene = follower.scene.then(scene)
+        positions, speeds = self._last(scene, kind, steps)
+        position = positions.to(follower.speed).view(steps, *batch)
+        speed = speeds.to(follower.speed).view(steps, *batch)
         before = speed[-2] if steps > 1 else follower.speed
-        end = _Driven(position[-1], speed[-1], (speed[-1] - before) / self.dt, follower.memory)
-        end.drive = drive
-        return end if kind.remembers else Follower(*end), position, speed
+        acceleration = (speed[-1] - before) / self.dt
+        if not kind.remembers:
+            end = Follower(position[-1], speed[-1], acceleration, follower.memory)
+            return end, position, speed
+        remembering = _Remembering(position[-1], speed[-1], acceleration, follower.memory)
+        remembering.scene = scene
+        return remembering, position, speed
 
-    def _last(self, drive: _Drive, kind: VType, steps: int) -> tuple[Tensor, Tensor]:
-        """Drives everybody from his entry on; returns positions and speeds `(steps, n)` of the last steps."""
-        count, frames = len(drive.entry), len(drive.leader_position)
+    def _last(self, scene: _Scene, kind: VType, steps: int) -> tuple[Tensor, Tensor]:
+        """Simulates every follower from its entry on.
+
+        Returns:
+            Positions and speeds `(steps, n)` of the last steps.
+        """
+        count, frames = len(scene.entry), len(scene.leader_position)
         networks = math.ceil(count / self._followers)
-        cuts = list(itertools.pairwise(round(count * k / networks) for k in range(networks + 1)))
-        answers = self._session.drive(self._request(drive, kind, slice(a, b)) for a, b in cuts)
-        rows = frames - drive.entry + torch.arange(-steps, 0)[:, None]
+        cuts = [round(count * k / networks) for k in range(networks + 1)]
+        parts = [slice(first, last) for first, last in itertools.pairwise(cuts)]
+        answers = self._session.answer([self._request(scene, kind, part) for part in parts])
+        rows = frames - scene.entry + torch.arange(-steps, 0)[:, None]
+        positions, speeds = [], []
+        for part, answer in zip(parts, answers, strict=True):
+            own = rows[:, part]
+            positions.append(torch.from_numpy(answer.arrays["position"]).gather(0, own))
+            speeds.append(torch.from_numpy(answer.arrays["speed"]).gather(0, own))
+        return torch.cat(positions, dim=1), torch.cat(speeds, dim=1)
 
-        def joined(name: str) -> Tensor:
-            parts = (torch.from_numpy(answer.arrays[name]) for answer in answers)
-            return torch.cat(
-                [part.gather(0, rows[:, a:b]) for part, (a, b) in zip(parts, cuts, strict=True)],
-                dim=1,
-            )
+    def _request(self, scene: _Scene, kind: VType, own: slice) -> Message:
+        """Returns the request for some followers, each from its entry on.
 
-        return joined("position"), joined("speed")
-
-    def _request(self, drive: _Drive, kind: VType, own: slice) -> Message:
-        """Returns the request for some followers, each from his entry on; for who enters late the last frame is repeated."""
-        frames, entry = len(drive.leader_position), drive.entry[own]
+        For those that enter late the last frame is repeated.
+        """
+        frames, entry = len(scene.leader_position), scene.entry[own]
         rows = (entry + torch.arange(frames - int(entry.min()))[:, None]).clamp(max=frames - 1)
-        constants, names, attributes = _columns(drive.attributes, own)
-        leader_constants, leader_names, leader_attributes = _columns(drive.leader_attributes, own)
+        constants, names, attributes = _columns(scene.attributes, own)
+        leader_constants, leader_names, leader_attributes = _columns(scene.leader_attributes, own)
         header = {
             "dt": round(self.dt * 1000) / 1000,
             "seed": self._seed,
@@ -149,23 +162,25 @@ class SumoStepper(Stepper):
         arrays = {
             "attributes": attributes,
             "leader_attributes": leader_attributes,
-            "start": drive.start[:, own].numpy(),
-            "leader_position": drive.leader_position[:, own].gather(0, rows).numpy(),
-            "leader_speed": drive.leader_speed[:, own].gather(0, rows).numpy(),
-            "leader_acceleration": drive.leader_acceleration[:, own].gather(0, rows).numpy(),
+            "start": scene.start[:, own].numpy(),
+            "leader_position": scene.leader_position[:, own].gather(0, rows).numpy(),
+            "leader_speed": scene.leader_speed[:, own].gather(0, rows).numpy(),
+            "leader_acceleration": scene.leader_acceleration[:, own].gather(0, rows).numpy(),
         }
         return Message(header, arrays)
 
 
-class _Driven(Follower):
-    """A follower that knows its drive so far, for models that remember more than its state."""
+class _Remembering(Follower):
+    """A follower of a model that remembers more than its state: it knows its scene so far."""
 
-    drive: _Drive
+    scene: _Scene
 
 
 @dataclass(frozen=True)
-class _Drive:
-    """n drives from the frame on from which each follower's parameters hold; on the CPU, in double precision.
+class _Scene:
+    """What SUMO simulates: n followers, each from where its parameters begin to hold.
+
+    The tensors lie on the CPU, in double precision.
 
     Attributes:
         leader_position, leader_speed, leader_acceleration: `(T, n)`, from the first `advance` on.
@@ -183,38 +198,27 @@ class _Drive:
     leader_attributes: _Values
 
     @classmethod
-    def of(cls, follower: Follower, leader: Leader, kind: VType) -> _Drive:
-        batch, steps = follower.speed.shape, len(leader.position)
-
-        def frames(signal: Tensor) -> Tensor:
-            missing = (1,) * (len(batch) - signal.dim() + 1)
-            whole = (
-                signal.detach().reshape(steps, *missing, *signal.shape[1:]).expand(steps, *batch)
-            )
-            return whole.reshape(steps, -1).to("cpu", torch.float64)
-
-        def flat(values: Mapping[str, Tensor | str]) -> _Values:
-            return {
-                name: value if isinstance(value, str) else _flat(value, batch)
-                for name, value in values.items()
-            }
-
+    def of(cls, follower: Follower, leader: Leader, kind: VType) -> _Scene:
+        batch = follower.speed.shape
+        states = (follower.position, follower.speed, follower.acceleration)
         return cls(
-            leader_position=frames(leader.position),
-            leader_speed=frames(leader.speed),
-            leader_acceleration=frames(leader.acceleration),
+            leader_position=_frames(leader.position, batch),
+            leader_speed=_frames(leader.speed, batch),
+            leader_acceleration=_frames(leader.acceleration, batch),
             entry=torch.zeros(batch.numel(), dtype=torch.int64),
-            start=torch.stack([_flat(state, batch) for state in follower[:3]]),
-            attributes=flat(kind.attributes),
-            leader_attributes=flat({"length": leader.length, **kind.leader}),
+            start=torch.stack([_flat(state, batch) for state in states]),
+            attributes=_flat_values(kind.attributes, batch),
+            leader_attributes=_flat_values({"length": leader.length, **kind.leader}, batch),
         )
 
-    def then(self, following: _Drive) -> _Drive:
-        """Returns this drive continued, where parameters stay the same, and the following one alone where they change."""
-        if (
-            len(self.entry) != len(following.entry)
-            or self.attributes.keys() != following.attributes.keys()
-        ):
+    def then(self, following: _Scene) -> _Scene:
+        """Returns this scene continued for followers whose parameters stay the same.
+
+        The others enter anew, as in the following scene alone.
+        """
+        if len(self.entry) != len(following.entry):
+            return following
+        if self.attributes.keys() != following.attributes.keys():
             return following
         same = torch.ones_like(self.entry, dtype=torch.bool)
         for name, value in following.attributes.items():
@@ -222,7 +226,7 @@ class _Drive:
                 same &= value == self.attributes[name]
         if not bool(same.any()):
             return following
-        return _Drive(
+        return _Scene(
             torch.cat([self.leader_position, following.leader_position]),
             torch.cat([self.leader_speed, following.leader_speed]),
             torch.cat([self.leader_acceleration, following.leader_acceleration]),
@@ -243,8 +247,8 @@ def require_in_sumo(model: DrivingModel) -> InSumo:
     require_sumo()
     if not isinstance(model, InSumo):
         raise ConfigError(
-            f"simulator=sumo: SUMO has no car-following model {type(model).__name__}; choose model=krauss_sumo, idm_sumo, w99,"
-            " krauss or sumo_vtype, or simulator=memory"
+            f"simulator=sumo: SUMO has no car-following model {type(model).__name__}; choose"
+            " model=krauss_sumo, idm_sumo, w99, krauss or sumo_vtype, or simulator=memory"
         )
     check_vtype(model.sumo_vtype(model.space.unpack(model.space.defaults())))
     return model
@@ -253,15 +257,32 @@ def require_in_sumo(model: DrivingModel) -> InSumo:
 def _columns(
     values: Mapping[str, Tensor | str], own: slice
 ) -> tuple[dict[str, str], list[str], Array]:
-    """Splits attributes into those that are one text for all, and the names and columns `(n, names)` of the others."""
-    constants = {name: value for name, value in values.items() if isinstance(value, str)}
-    columns = {name: value[own] for name, value in values.items() if isinstance(value, Tensor)}
-    table = (
-        torch.stack(list(columns.values()), dim=1)
-        if columns
-        else torch.empty((own.stop - own.start, 0), dtype=torch.float64)
-    )
-    return constants, list(columns), table.numpy()
+    """Splits attributes into constants, and the names and columns `(n, names)` of the others."""
+    constants: dict[str, str] = {}
+    columns: dict[str, Tensor] = {}
+    for name, value in values.items():
+        if isinstance(value, str):
+            constants[name] = value
+        else:
+            columns[name] = value[own]
+    if not columns:
+        return constants, [], np.empty((own.stop - own.start, 0))
+    return constants, list(columns), torch.stack(list(columns.values()), dim=1).numpy()
+
+
+def _frames(signal: Tensor, batch: torch.Size) -> Tensor:
+    """Returns a leader's signal as `(T, n)`."""
+    steps = len(signal)
+    missing = (1,) * (len(batch) - signal.dim() + 1)
+    full = signal.detach().reshape(steps, *missing, *signal.shape[1:]).expand(steps, *batch)
+    return full.reshape(steps, -1).to("cpu", torch.float64)
+
+
+def _flat_values(values: Mapping[str, Tensor | str], batch: torch.Size) -> _Values:
+    flat: _Values = {}
+    for name, value in values.items():
+        flat[name] = value if isinstance(value, str) else _flat(value, batch)
+    return flat
 
 
 def _flat(value: Tensor, batch: torch.Size) -> Tensor:
@@ -270,4 +291,6 @@ def _flat(value: Tensor, batch: torch.Size) -> Tensor:
 
 def _cores() -> int:
     """Returns how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

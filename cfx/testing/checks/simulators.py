@@ -228,7 +228,7 @@ def the_same_again_gives_the_same(simulator: Simulator, model: DrivingModel | No
     _, _, first = _advance(stepper, scene)
     _, _, second = _advance(stepper, scene)
     assert torch.equal(first, second), (
-        "the same call must give the same speeds to the last bit: caches and resumed jobs rely on it"
+        "the same call must give the same speeds to the last bit: caches rely on it"
     )
 
 

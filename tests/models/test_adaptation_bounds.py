@@ -51,12 +51,12 @@ def test_a_reach_needs_both_ends() -> None:
 def test_what_is_held_stays_at_its_base_whatever_a_network_answers() -> None:
     adaptation_space = Krauss(adaptation_bounds={"t_i": None}).adaptation_space
     base = adaptation_space.to_unit(torch.tensor([[1.5, 0.2], [3.0, 2.0]]).double())
-    free = adaptation_space.free()
+    free = adaptation_space.adaptable()
     assert free is not None
     found = moved(base, torch.tensor([[0.9, 0.9], [0.1, 0.1]]).double(), free)
     assert torch.equal(found[:, 1], base[:, 1])
     assert torch.equal(found[:, 0], moved(base, torch.tensor([[0.9], [0.1]]).double())[:, 0])
-    assert Krauss().adaptation_space.free() is None
+    assert Krauss().adaptation_space.adaptable() is None
 
 
 def test_the_preset_krauss_headway_holds_t_i() -> None:
@@ -65,7 +65,7 @@ def test_the_preset_krauss_headway_holds_t_i() -> None:
     )
     assert isinstance(model, Krauss)
     assert model.space == Krauss().space
-    assert [parameter.name for parameter in model.adaptation_space.tuned if parameter.held] == [
+    assert [parameter.name for parameter in model.adaptation_space.tuned if parameter.frozen] == [
         "t_i"
     ]
 
