@@ -82,7 +82,7 @@ class DrivingModel(EarlierNames, Component):
 
     Attributes:
         parameters: the full specification, constants included.
-        memory_size: m, the width of the model's own memory; 0 for most.
+        memory_size: m, the width of the model's own memory; 0 for most. It may depend on settings.
         differentiable: `next_speed` has useful gradients with respect to states and parameters.
             Tested.
         collision_free: with its default parameters the model does not hit a leader that brakes as
@@ -103,7 +103,7 @@ class DrivingModel(EarlierNames, Component):
     settings: ModelSettings
 
     parameters: ClassVar[ParameterSpace]
-    memory_size: ClassVar[int] = 0
+    memory_size: int = 0
     differentiable: ClassVar[bool] = True
     collision_free: ClassVar[bool] = False
     has_constant_baseline: ClassVar[bool] = True

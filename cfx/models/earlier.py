@@ -8,7 +8,8 @@ may be overridden.
 from __future__ import annotations
 
 import warnings
-from typing import Any, cast
+from types import MethodType
+from typing import Any
 
 import torch
 
@@ -36,13 +37,14 @@ class EarlierNames:
         _warn(type(self), "softness")
         self.temperature = value
 
-    def smoothed(self, softness: Any) -> Any:
+    @property
+    def smoothed(self) -> Any:
         """The earlier name of `at_temperature`."""
         from cfx.models.base import DrivingModel
 
         _warn(type(self), "smoothed")
         # Not self.at_temperature: an override of `smoothed` has become that, and calls this.
-        return DrivingModel.at_temperature(cast(DrivingModel, self), softness)
+        return MethodType(DrivingModel.at_temperature, self)
 
 
 def _warn(cls: type, old: str) -> None:
