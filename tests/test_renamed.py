@@ -271,6 +271,8 @@ def test_tables_get_todays_columns_and_methods() -> None:
         {
             "method": ["policy", "base"],
             "later_rmse_speed": [1.0, 2.0],
+            "rms_jerk": [1.0, 2.0],
+            "real_rms_jerk": [1.0, 2.0],
             "whole_rmse_gap": [1.0, 2.0],
             "improvement_over_base": [0.1, 0.0],
         }
@@ -279,6 +281,8 @@ def test_tables_get_todays_columns_and_methods() -> None:
     assert list(today) == [
         "method",
         "steady_rmse_speed",
+        "jerk",
+        "real_jerk",
         "full_trajectory_rmse_gap",
         "improvement_over_shrunk",
     ]

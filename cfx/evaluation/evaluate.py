@@ -27,8 +27,10 @@ from cfx.parameters import ParameterSpace
 from cfx.style.result import CLUSTERS, StyleResult
 
 TRANSIENT_S = 5.0
-"""How long the transient of a test part is (`transient_s`): constant parameters lead from the measured state to a
-steady one of their own within some such time."""
+"""`transient_s`, how long the transient of a test part is.
+
+Within some such time constant parameters lead from the measured state to a steady one of their own.
+"""
 
 Measured = dict[tuple[str, str, str], NDArray[np.float64]]
 """By metric, scope and method the value of each pair, `(P,)`."""
@@ -56,20 +58,23 @@ def evaluate(
         pairs: P pairs.
         batch: the same as tensors.
         first: `(P,)`, the frame of the last measured state.
-        loops: the closed loops of each method of `METHODS`, on the same frames; `fixed` and `policy` are among them.
+        loops: the closed loops of each method of `METHODS`, on the same frames; `fixed` and
+            `policy` are among them.
         space: the model's parameters, in the bounds of constant ones.
         adaptation_space: the same in the bounds of `policy`; None: the same bounds.
         style: score and cluster of each driver.
         seed: of the bootstrap.
         fold: `(P,)`, in which fold each pair was tested; None if there was one.
-        full_trajectory: closed loops from frame 0 on, of methods that nothing of these drivers went into; None
-            if there are none.
+        full_trajectory: closed loops from frame 0 on, of methods that nothing of these drivers went
+            into; None if there are none.
         platoon, history: further results, handed on; see `Evaluation`.
         metrics: what is measured; None: cfx's own metrics.
     """
     loops = {method: loops[method] for method in METHODS if method in loops}
-    policy_space = space if adaptation_space is None else adaptation_space
-    spaces = {method: policy_space if method == "policy" else space for method in METHODS}
+    policy_space = space
+    if adaptation_space is not None:
+        policy_space = adaptation_space
+    spaces = dict.fromkeys(METHODS, space) | {"policy": policy_space}
     test = trajectories_of(batch, first, loops, spaces)
     scopes = {"test": test, "steady": _after_transient(test)}
     if full_trajectory:
@@ -99,7 +104,11 @@ def evaluate(
 
 
 def closed_loop_errors(batch: PairBatch, first: Tensor, loop: ClosedLoop) -> tuple[Array, Array]:
-    """Returns the RMSE of speed (m/s) and of gap (m) of P closed loops that begin at frames `first`, `(P,)` each."""
+    """Returns the RMSE of speed (m/s) and of the gap (m), `(P,)` each.
+
+    Args:
+        first: `(P,)`, the frame of the recording at which each closed loop begins.
+    """
     trajectories = _trajectories(batch, first, loop, ParameterSpace(()))
     return _array(RmseSpeed().compute(trajectories)), _array(RmseGap().compute(trajectories))
 
@@ -110,9 +119,10 @@ def trajectories_of(
     loops: Mapping[str, ClosedLoop],
     spaces: Mapping[str, ParameterSpace],
 ) -> dict[str, Trajectories]:
-    """Returns closed loops that begin at frames `first` `(P,)`, and the recorded drivers (`real`), beside the recording.
+    """Returns closed loops, and the recorded drivers (`real`), beside the recording.
 
     Args:
+        first: `(P,)`, the frame of the recording at which each closed loop begins.
         spaces: for each method the bounds within which its parameters were chosen.
     """
     found = {}
@@ -146,7 +156,7 @@ def _trajectories(
 
 
 def _frames(batch: PairBatch, first: Tensor, count: int) -> Tensor:
-    """Returns the frames of the recording that closed loops from frames `first` on are compared with, `(P, count)`."""
+    """Returns the frames of the recording from frames `first` `(P,)` on, `(P, count)`."""
     frames = first[:, None] + torch.arange(count, device=first.device)
     return frames.clamp(max=batch.mask.shape[1] - 1)
 
@@ -163,7 +173,10 @@ def _after_transient(trajectories: Mapping[str, Trajectories]) -> dict[str, Traj
 def _measure(
     metrics: MetricSet, scopes: Mapping[str, Mapping[str, Trajectories]]
 ) -> tuple[Measured, tuple[MetricInfo, ...], tuple[LeftOut, ...]]:
-    """Computes every metric for every scope and method; a plugin's that fails is left out with a warning."""
+    """Computes every metric for every scope and method.
+
+    A plugin's metric that fails is left out with a warning.
+    """
     measured: Measured = {}
     infos = []
     left_out = list(metrics.left_out)
@@ -215,7 +228,7 @@ def _info(one: MeasuredMetric, scopes: Mapping[str, Mapping[str, Trajectories]])
 def _improvements(
     values: pd.DataFrame, scope: str, drivers: Sequence[str], seed: int
 ) -> dict[str, Improvement]:
-    """Returns the policy's improvement over every other method; empty where the policy has no error."""
+    """Returns the policy's improvement over every other method; empty if it was not simulated."""
     speed = values_of(values, "rmse_speed", scope)
     if "policy" not in speed:
         return {}
@@ -242,6 +255,9 @@ def _about(
     methods = [method for method in test if method != RECORDED]
     parameters = {method: _mean_parameters(test[method]) for method in methods}
     frames = next(iter(test.values())).counted.sum(1).tolist()
+    folds = [0] * len(pairs)
+    if fold is not None:
+        folds = fold.tolist()
     rows = []
     for i, pair in enumerate(pairs):
         for method in methods:
@@ -253,7 +269,7 @@ def _about(
                 "driver": pair.driver,
                 "cluster": CLUSTERS[by_driver["cluster"][pair.driver]],
                 "style_score": float(by_driver["score"][pair.driver]),
-                "fold": 0 if fold is None else int(fold[i]),
+                "fold": folds[i],
                 "method": method,
                 "frames": frames[i],
             }

@@ -1,4 +1,4 @@
-"""What an evaluation delivers: plain arrays and tables that tracking, figures and the command line read.
+"""What an evaluation delivers: plain arrays and tables for tracking, figures and the console.
 
 Shapes: K + 1 frames, n tuned parameters.
 """
@@ -20,13 +20,17 @@ from cfx.metrics.installed import LeftOut
 Array = NDArray[np.float64]
 
 METHODS = ("default", "population", "fixed", "shrunk", "policy")
-"""What an evaluation may compare, in the order in which it is shown; always on the same frames from the same measured state.
+"""What an evaluation may compare, in the order in which it is shown.
 
-`default`: the model's default parameters. `population`: one set calibrated jointly on the training drivers,
-none of whom is tested (pooled calibration). `fixed`: the driver's own set, calibrated on the first part of
-the trajectory. `shrunk`: that set shrunk towards the default and kept constant: what a policy of offsets
-starts from where that is not `fixed` itself, so that what adapting adds can be told from what shrinking does.
-`policy`: parameters that a policy chooses at each window.
+All start from the same measured state and are compared on the same frames.
+
+`default`: the model's default parameters.
+`population`: one set, calibrated jointly on the training drivers (pooled calibration), none of whom
+is tested.
+`fixed`: the driver's own set, calibrated on the first part of the trajectory.
+`shrunk`: that set shrunk towards the default and kept constant. A policy of offsets starts from it
+where it is not `fixed` itself; it separates what adapting adds from what shrinking does.
+`policy`: parameters that a policy chooses for each window.
 """
 
 STATISTICS = ("mean", "trimmed_mean", "median", "ci95_low", "ci95_high", "win_rate", "p_value")
@@ -59,13 +63,15 @@ class PairTrajectory:
 
 @dataclass(frozen=True)
 class Improvement:
-    """`(RMSE_baseline - RMSE_policy) / RMSE_baseline` of speed over the pairs, as fractions (0.1 is 10 %).
+    """`(RMSE_baseline - RMSE_policy) / RMSE_baseline` of speed over the pairs (0.1 is 10 %).
 
     Attributes:
         mean, trimmed_mean, median: over pairs; the trimmed mean drops the top and the bottom 10 %.
-        ci95_low, ci95_high: bootstrap confidence interval of the mean; drivers are resampled with all their pairs.
+        ci95_low, ci95_high: bootstrap confidence interval of the mean; drivers are resampled with
+            all their pairs.
         win_rate: share of pairs with a positive improvement.
-        p_value: two-sided Wilcoxon signed-rank test of RMSE_baseline against RMSE_policy, means over each driver's pairs.
+        p_value: two-sided Wilcoxon signed-rank test of RMSE_baseline against RMSE_policy, means
+            over each driver's pairs.
         pairs: number of pairs that count.
         undefined: number of pairs left out because RMSE_baseline is 0 or a rollout diverged.
         drivers: number of drivers of the pairs that count.
@@ -104,18 +110,22 @@ _PLATOON_SUMMARIES = {
 
 @dataclass(frozen=True)
 class Platoon:
-    """Platoons of followers that use one method each, behind a leader that brakes (`cfx.evaluation.platoon`).
+    """Platoons of followers behind a leader that brakes (`cfx.evaluation.platoon`).
+
+    All followers of a platoon use the same method.
 
     Attributes:
-        table: a row per method, network, vehicle and frame: method, network (which network or parameter set
-            chooses the parameters), vehicle (0 is the leader), time_s, speed (m/s), gap (m; NaN for the leader).
-        measures: a row per method and network: method, network, drop_leader, drop_first, drop_last (m/s, by how
-            much the leader, the first and the last follower slow down), amplification (drop_last / drop_first),
-            head_to_tail (drop_last / drop_leader), collisions (followers whose gap became negative; with one the
-            two ratios are NaN), settled (1 if all followed steadily before the leader braked), string_stable (1
-            if no vehicle slows down more than the vehicle ahead, of those that settled and did not collide), and
-            from the moment on at which the leader brakes min_gap (m) and hard_braking (frames with an
-            acceleration below -8 m/s2).
+        table: a row per method, network, vehicle and frame: method, network (which network or
+            parameter set chooses the parameters), vehicle (0 is the leader), time_s, speed (m/s),
+            gap (m; NaN for the leader).
+        measures: a row per method and network: method, network, drop_leader, drop_first, drop_last
+            (m/s, by how much the leader, the first and the last follower slow down), amplification
+            (drop_last / drop_first), head_to_tail (drop_last / drop_leader), collisions (followers
+            whose gap became negative; with one the two ratios are NaN), settled (1 if all followed
+            steadily before the leader braked), string_stable (1 if no vehicle slows down more than
+            the vehicle ahead, of those that settled and did not collide), and from the moment on at
+            which the leader brakes min_gap (m) and hard_braking (frames with an acceleration below
+            -8 m/s2).
     """
 
     table: pd.DataFrame
@@ -127,7 +137,10 @@ class Platoon:
         return _in_order(self.measures["method"])
 
     def metrics(self) -> dict[str, float]:
-        """Returns `platoon/MEASURE/METHOD`: over the method's networks the mean, the least gap, and sums of what is counted."""
+        """Returns `platoon/MEASURE/METHOD`.
+
+        It is the mean over the method's networks, the least gap, and the sum of what is counted.
+        """
         values: dict[str, float] = {}
         for column, summary in _PLATOON_SUMMARIES.items():
             found = self.measures.groupby("method")[column].agg(summary)
@@ -140,22 +153,24 @@ class Platoon:
 class Evaluation:
     """The comparison of all methods.
 
-    `values` is the one table of what was measured; `table`, `metrics()` and `pair_metrics.parquet` are made of it.
+    `values` is the one table of what was measured; `table`, `metrics()` and `pair_metrics.parquet`
+    are made of it.
 
     Metrics (`metrics`), under their names in metrics.json and MLflow; METHOD is one of `methods`:
-        `METRIC/METHOD`: of the test part; `steady/METRIC/METHOD`: after its transient, during which the
-            simulation still comes from the measured state; `full_trajectory/METRIC/METHOD`: from the first
-            frame on, where that was simulated. `measured` says what each is, its unit, and how the pairs
-            become one number. `METRIC/real`: the recorded drivers'.
-        `rmse_improvement/STATISTIC`, `rmse_improvement/BASELINE/STATISTIC`: see `Improvement`; against
-            `fixed` unless named; `steady/...` and `full_trajectory/...` as above.
+        `METRIC/METHOD`: of the test part; `steady/METRIC/METHOD`: after its transient, during which
+            the simulation still comes from the measured state; `full_trajectory/METRIC/METHOD`:
+            from the first frame on, where that was simulated. `measured` says what each is, its
+            unit, and how the pairs become one number. `METRIC/real`: the recorded drivers'.
+        `rmse_improvement/STATISTIC`, `rmse_improvement/BASELINE/STATISTIC`: see `Improvement`;
+            against `fixed` unless named; `steady/...` and `full_trajectory/...` as above.
         `platoon/MEASURE/METHOD`: see `Platoon`.
-        `history/BASE/AMOUNT/rmse_improvement`: see `history`; of "80 %" the name is `80pct`, of "10 s" `10s`.
+        `history/BASE/AMOUNT/rmse_improvement`: see `history`; AMOUNT is `80pct` for "80 %" and
+            `10s` for "10 s".
 
     Attributes:
-        about: a row per pair and method: pair_id, recording, leader_id, follower_id, driver, cluster,
-            style_score, fold, method, frames (that count), and a column `parameter_NAME` with the mean of each
-            tuned parameter over them.
+        about: a row per pair and method: pair_id, recording, leader_id, follower_id, driver,
+            cluster, style_score, fold, method, frames (that count), and a column `parameter_NAME`
+            with the mean of each tuned parameter over them.
         values: a row per pair, method, scope and metric; see `cfx.evaluation.tables`.
         measured: the metrics, in the order in which they are shown.
         improvements: statistics of the policy's improvement over each baseline.
@@ -163,15 +178,17 @@ class Evaluation:
         names: the tuned parameters' names.
         units: their units.
         bounds: `(2, n)`, those within which the policy chooses.
-        full_trajectory_improvements: as `improvements`, over full trajectories of drivers that nothing was
-            fitted to; empty if there were none.
-        platoon: ten followers in a row behind a braking leader; None if no network is for any driver.
-        history: what the policy gains from its burn-in; None if that was not tried. A row per pair, base and
-            amount: pair_id, driver, base (what the policy's answers are offsets from, `own` or `population`),
-            history_s (seconds of measured history before the test part that the policy has seen), amount (the
-            same in words, "10 s" or "80 %"), rmse_speed, rmse_gap, improvement (over the driver's own fixed
-            parameters, a fraction).
-        steady_improvements: as `improvements`, after the transient; empty if no test part is longer.
+        full_trajectory_improvements: as `improvements`, over full trajectories of drivers that
+            nothing was fitted to; empty if there were none.
+        platoon: ten followers in a row behind a braking leader; None if no network is for any
+            driver.
+        history: what the policy gains from its burn-in; None if that was not tried. A row per pair,
+            base and amount: pair_id, driver, base (what the policy's answers are offsets from,
+            `own` or `population`), history_s (seconds of measured history before the test part that
+            the policy has seen), amount (the same in words, "10 s" or "80 %"), rmse_speed,
+            rmse_gap, improvement (over the driver's own fixed parameters, a fraction).
+        steady_improvements: as `improvements`, after the transient; empty if no test part is
+            longer.
         left_out: plugins' metrics that are broken.
     """
 
@@ -191,7 +208,7 @@ class Evaluation:
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """A row per pair and method, as in `pairs.csv`: `about` and the metrics as columns, see `wide_table`."""
+        """A row per pair and method, as in `pairs.csv`; see `wide_table`."""
         return wide_table(self.about, self.values, self.measured)
 
     @property
@@ -230,8 +247,9 @@ class Evaluation:
     def trajectories_table(self) -> pd.DataFrame:
         """Returns the closed loops in long form, SI units.
 
-        Columns: pair_id, time_s, leader_speed, real_speed, real_gap; for each method speed_METHOD, gap_METHOD and, for each tuned
-        parameter, NAME_METHOD. A pair's first row is the last measured state before the simulation takes over.
+        Columns: pair_id, time_s, leader_speed, real_speed, real_gap; for each method speed_METHOD,
+            gap_METHOD and, for each tuned parameter, NAME_METHOD. A pair's first row is the last
+            measured state before the simulation takes over.
         """
         tables = [self._trajectory_table(trajectory) for trajectory in self.trajectories]
         return pd.concat(tables, ignore_index=True)

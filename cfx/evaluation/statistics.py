@@ -23,12 +23,12 @@ def improvement_statistics(
 ) -> Improvement:
     """Compares two methods over P pairs.
 
-    Pairs of one driver are not independent: the bootstrap resamples drivers (a cluster bootstrap), and the
-    test compares drivers.
+    Pairs of one driver are not independent: the bootstrap resamples drivers (a cluster bootstrap),
+    and the test compares drivers.
 
     Args:
-        baseline, policy: RMSE of speed of each pair, `(P,)`, m/s; a pair counts where both are finite and
-            `baseline` is positive.
+        baseline, policy: RMSE of speed of each pair, `(P,)`, m/s; a pair counts where both are
+            finite and `baseline` is positive.
         drivers: the driver of each pair, `(P,)`; None if each pair has a driver of its own.
         seed: of the bootstrap.
     """
@@ -64,7 +64,9 @@ def improvement_statistics(
 def mean_interval(
     values: Sequence[float], drivers: Sequence[str], *, seed: int
 ) -> tuple[float, float, float]:
-    """Returns the mean over pairs and its 95 % bootstrap interval over drivers; NaN where it is not defined.
+    """Returns the mean over pairs and its 95 % bootstrap interval over drivers.
+
+    They are NaN where they are not defined.
 
     Args:
         values: one for each pair; those that are not finite do not count.

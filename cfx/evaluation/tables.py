@@ -1,7 +1,8 @@
-"""One long table of values, and the two forms that are made of it: a row per pair, and a number per metric.
+"""The long table of values, and what is made of it: a row per pair, and a number per metric.
 
-The long table has a row per pair, method, scope and metric: `pair_id`, `driver`, `method`, `scope`, `metric`, `value`.
-The recorded drivers stand in it as the method `real`, with the metrics that say something of a recording.
+The long table has a row per pair, method, scope and metric: `pair_id`, `driver`, `method`, `scope`,
+`metric`, `value`. The recorded drivers stand in it as the method `real`, with the metrics that say
+something of a recording.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ def long_table(
         groups.setdefault((metric, scope), {})[method] = values
     parts = []
     for (metric, scope), by_method in groups.items():
-        # Pair by pair, the methods in turn: in its last bit pandas' mean over groups depends on the order.
+        # Pair by pair, the methods in turn: in its last bit pandas' mean over groups depends on the
+        # order.
         methods = list(by_method)
         columns = {
             "pair_id": np.repeat(np.asarray(pair_ids, dtype=object), len(methods)),
@@ -53,7 +55,7 @@ def long_table(
 
 
 def values_of(values: pd.DataFrame, metric: str, scope: str) -> pd.DataFrame:
-    """Returns one metric in one scope: a row per pair, in the order of the pairs, and a column per method."""
+    """Returns one metric in one scope: a row per pair, in their order, and a column per method."""
     rows = values[(values["metric"] == metric) & (values["scope"] == scope)]
     # `pivot_table` would drop a method whose values are all undefined.
     wide = rows.pivot(index="pair_id", columns="method", values="value")  # noqa: PD010
@@ -65,8 +67,8 @@ def wide_table(
 ) -> pd.DataFrame:
     """Returns a row per pair and method: what `about` says, and the metrics as columns.
 
-    Columns besides those of `about`: METRIC, `steady_METRIC`, `full_trajectory_METRIC` and, of the recorded
-    driver, `real_METRIC`; `improvement` over `fixed` and `improvement_over_BASELINE`.
+    Columns besides those of `about`: METRIC, `steady_METRIC`, `full_trajectory_METRIC` and, of the
+    recorded driver, `real_METRIC`; `improvement` over `fixed` and `improvement_over_BASELINE`.
     """
     parameters = [name for name in about if str(name).startswith("parameter_")]
     columns: dict[str, pd.Series] = {}
@@ -91,7 +93,7 @@ def wide_table(
 def summaries(
     values: pd.DataFrame, metrics: Sequence[MetricInfo], scope: str, methods: Sequence[str]
 ) -> dict[str, float]:
-    """Returns the metrics of one scope as one number for each method, under their names in `metrics.json`.
+    """Returns one number for each metric and method, under their names in `metrics.json`.
 
     Pairs whose value is not defined do not count.
     """

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from cfx.evaluation.result import Evaluation, Improvement
@@ -16,8 +17,8 @@ from cfx.metrics.base import MetricInfo, key_of
 if TYPE_CHECKING:
     from cfx.tracking.tracker import Tracker
 
-_TITLES = {"full_trajectory": "full trajectory: "}
-"""What stands before the heading of a metric outside of the test part."""
+_SCOPES = {"test": "test part", "full_trajectory": "full trajectories"}
+"""The scopes that have a table of their own, in words."""
 
 
 def report(
@@ -38,6 +39,8 @@ def report(
         has_constant_baseline: as `DrivingModel.has_constant_baseline`.
     """
     console.print(methods_table(evaluation, result.metrics))
+    if evaluation.full_trajectory_improvements:
+        console.print(methods_table(evaluation, result.metrics, "full_trajectory"))
     if has_constant_baseline:
         _print_improvements(evaluation, console)
     else:
@@ -55,35 +58,27 @@ def report(
         console.print(line, soft_wrap=True, highlight=False)
 
 
-def methods_table(evaluation: Evaluation, metrics: Mapping[str, float]) -> Table:
-    """Returns a row per method with the metrics that are headlines, of the test part and of full trajectories."""
+def methods_table(
+    evaluation: Evaluation, metrics: Mapping[str, float], scope: str = "test"
+) -> Table:
+    """Returns the metrics of one scope that are headlines: a row per method that has any."""
     count = len(evaluation.trajectories)
     plural = "" if count == 1 else "s"
-    title = f"{count} pair{plural}, test part in closed loop"
+    title = f"{count} pair{plural}, {_SCOPES[scope]} in closed loop"
     table = Table(title=title, title_justify="left")
     table.add_column("method")
-    shown = _headlines(evaluation)
-    for metric, scope in shown:
-        table.add_column(_TITLES.get(scope, "") + metric.title, justify="right")
+    shown = [one for one in evaluation.measured if one.headline and scope in one.scopes]
+    for metric in shown:
+        table.add_column(escape(metric.title), justify="right")
     for method in evaluation.methods:
+        values = [metrics.get(key_of(metric.name, method, scope)) for metric in shown]
+        if all(value is None for value in values):
+            continue
         cells = []
-        for metric, scope in shown:
-            cells.append(_cell(metric, metrics.get(key_of(metric.name, method, scope))))
+        for metric, value in zip(shown, values, strict=True):
+            cells.append(_cell(metric, value))
         table.add_row(method, *cells)
     return table
-
-
-def _headlines(evaluation: Evaluation) -> list[tuple[MetricInfo, str]]:
-    """Returns the columns of the table: metrics and scopes."""
-    scopes = ["test"]
-    if evaluation.full_trajectory_improvements:
-        scopes.append("full_trajectory")
-    found = []
-    for scope in scopes:
-        for metric in evaluation.measured:
-            if metric.headline and scope in metric.scopes:
-                found.append((metric, scope))
-    return found
 
 
 def _cell(metric: MetricInfo, value: float | None) -> str:
@@ -130,7 +125,7 @@ def _print_improvement(i: Improvement, baseline: str, console: Console) -> None:
 
 
 def _print_safety(evaluation: Evaluation, metrics: Mapping[str, float], console: Console) -> None:
-    """Prints a line about hard braking and about parameters at their bounds; nothing if there is nothing."""
+    """Prints a line about hard braking and parameters at their bounds, if there are any."""
     sentences = []
     braking = _methods_above(evaluation, metrics, "hard_braking", 1, ".0f")
     if braking:

@@ -1,7 +1,7 @@
 """What a metric is, and what it is given.
 
-Shapes: P pairs, K + 1 frames (frame 0 is the measured state that the simulation starts from), n tuned
-parameters. SI units.
+Shapes: P pairs, K + 1 frames, n tuned parameters. Frame 0 is the measured state that the simulation
+starts from. SI units.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ SCOPES: tuple[Scope, ...] = ("test", "steady", "full_trajectory")
 """Which frames count, in the order in which they are shown.
 
 `test`: the test part. `steady`: the test part after the transient (`cfx.evaluation.evaluate`).
-`full_trajectory`: everything from the first frame on, by methods that nothing of these drivers went into.
+`full_trajectory`: everything from the first frame on, by methods that nothing of these drivers went
+into.
 """
 
 RECORDED = "real"
@@ -47,7 +48,8 @@ class Trajectories:
         speed, gap: `(P, K + 1)`, m/s and m, simulated; the gap is bumper to bumper.
         measured_speed, measured_gap: `(P, K + 1)`, the same as recorded.
         leader_speed: `(P, K + 1)`, m/s, recorded.
-        parameters: `(P, K + 1, n)`, SI units, what held on the way to each frame; NaN for recorded drivers.
+        parameters: `(P, K + 1, n)`, SI units, what held on the way to each frame; NaN for recorded
+            drivers.
         counted: `(P, K + 1)` bool, which frames count; frame 0 never does.
         dt: time step, s.
         space: the tuned parameters, in the bounds within which they were chosen.
@@ -74,20 +76,22 @@ class Trajectories:
 class Metric(Component):
     """Base of every metric: one number for each pair, and what it means.
 
-    Life cycle: a job makes every metric that is installed (or those that `metrics` names) before any
-    work begins, and calls `compute` for each method and scope when all methods have been simulated.
-    A metric has no settings, so that its name means the same number in every job.
+    Life cycle: a job makes every metric that is installed (or those that `metrics` names) before
+    any work begins, and calls `compute` for each method and scope when all methods have been
+    simulated. A metric has no settings, so that its name means the same number in every job.
 
     Attributes:
         unit: of the number, "" for a ratio.
         direction: whether "lower" or "higher" numbers are better; "none" where neither is.
-        summary: how the pairs become one number: "mean", "sum", "min" or "max" of those that are defined.
+        summary: how the pairs become one number: "mean", "sum", "min" or "max" of those that are
+            defined.
         heading: of a column, short and without the unit.
         meaning: one sentence for a reader who knows no other document.
-        scopes: frames for which the summary is told in `metrics.json`, `pairs.csv` and MLflow. The table of
-            all values, `pair_metrics.parquet`, holds every scope.
+        scopes: frames for which the summary is told in `metrics.json`, `pairs.csv` and MLflow. The
+            table of all values, `pair_metrics.parquet`, holds every scope.
         is_error: it is a distance from the recording, and 0 for a simulation without error.
-        is_of_recording: it says something of a recorded driver too, who then stands beside the methods.
+        is_of_recording: it says something of a recorded driver too, who then stands beside the
+            methods.
         headline: it is shown in the tables that a job and a sweep print.
         order: its place in tables; smaller numbers come first.
     """
@@ -160,7 +164,10 @@ def column_of(metric: str, scope: str = "test") -> str:
 
 
 def declared_wrongly(cls: type[Metric]) -> str:
-    """Returns what is wrong with what a metric's class says of itself, as the end of a sentence; "" if nothing is."""
+    """Returns what is wrong with the declarations of a metric's class; "" if nothing is.
+
+    It is the end of a sentence whose subject is the metric.
+    """
     for name in ("unit", "direction", "heading", "meaning", "summary"):
         if not isinstance(getattr(cls, name, None), str):
             return f"must say its `{name}`, a text"

@@ -11,14 +11,14 @@ from cfx.metrics.masked import root_mean_square
 class Jerk(Metric):
     """Root mean square jerk; NaN where fewer than two frames count.
 
-    The jerk is the difference of successive accelerations over the time step. The acceleration at the
-    start is the recorded driver's own and does not count: nobody caused the jump from it.
+    The jerk is the difference of successive accelerations over the time step. The acceleration at
+    the start is the recorded driver's own and does not count: nobody caused the jump from it.
     """
 
     unit = "m/s3"
     direction = "none"
     heading = "RMS jerk"
-    meaning = "root mean square of the simulated jerk; the recorded drivers' is the measure of what is usual"
+    meaning = "root mean square jerk; that of the recorded drivers says what is usual"
     is_of_recording = True
     headline = False
     order = 24

@@ -1,10 +1,11 @@
 """How far a simulated trajectory is from the recorded one.
 
-The measures of goodness of fit that the calibration literature uses: V. Punzo, Z. Zheng, M. Montanino
-(2021), About calibration of car-following dynamics of automated and human-driven vehicles: methodology,
-guidelines and codes, Transportation Research Part C 128, 103165.
+The measures of goodness of fit that the calibration literature uses: V. Punzo, Z. Zheng, M.
+Montanino (2021), About calibration of car-following dynamics of automated and human-driven
+vehicles: methodology, guidelines and codes, Transportation Research Part C 128, 103165.
 
-Shapes: P pairs, K + 1 frames. e = simulated - measured; sums run over the K' frames that count.
+Shapes: P pairs, K + 1 frames. e = simulated - measured; v and s are the measured speed and gap;
+sums run over the K' frames that count.
 """
 
 from __future__ import annotations
@@ -83,7 +84,7 @@ class MaeGap(Metric):
 
 
 class NrmseSpeed(Metric):
-    """Normalised RMSE of speed: sqrt(sum e^2) / sqrt(sum v^2), v the measured speed (Punzo et al. 2021)."""
+    """Normalised RMSE of speed (Punzo et al. 2021): RMSE / sqrt(sum v^2 / K')."""
 
     unit = ""
     direction = "lower"
@@ -98,7 +99,7 @@ class NrmseSpeed(Metric):
 
 
 class NrmseGap(Metric):
-    """Normalised RMSE of the gap: sqrt(sum e^2) / sqrt(sum s^2), s the measured gap (Punzo et al. 2021)."""
+    """Normalised RMSE of the gap (Punzo et al. 2021): RMSE / sqrt(sum s^2 / K')."""
 
     unit = ""
     direction = "lower"
@@ -115,8 +116,8 @@ class NrmseGap(Metric):
 class RmseAcceleration(Metric):
     """Root mean square error of acceleration: sqrt(sum e^2 / K').
 
-    Both accelerations are differences of successive speeds over the time step, so that the recording's own
-    column of accelerations, often smoothed in its own way, plays no part.
+    Both accelerations are differences of successive speeds over the time step, so that the
+    recording's own column of accelerations, often smoothed in its own way, plays no part.
     """
 
     unit = "m/s2"
@@ -135,16 +136,16 @@ class RmseAcceleration(Metric):
 class TheilU(Metric):
     """Theil's inequality coefficient of speed.
 
-    U = sqrt(sum e^2 / K') / (sqrt(sum v_sim^2 / K') + sqrt(sum v^2 / K')): 0 for no error, at most 1.
+    U = sqrt(sum e^2 / K') / (sqrt(sum v_sim^2 / K') + sqrt(sum v^2 / K')): from 0, no error, to 1.
     This is the bounded form (H. Theil 1961, Economic Forecasts and Policy) that calibrations of
-    traffic models use (J. Hourdakis, P. Michalopoulos, J. Kottommannil 2003, Transportation Research
-    Record 1852), not his later U2, which compares with a naive forecast.
+    traffic models use (J. Hourdakis, P. Michalopoulos, J. Kottommannil 2003, Transportation
+    Research Record 1852), not his later U2, which compares with a naive forecast.
     """
 
     unit = ""
     direction = "lower"
     heading = "Theil's U"
-    meaning = "RMSE of speed over the sum of the root mean squares of both speeds; 0 is no error, 1 the most"
+    meaning = "RMSE of speed over the sum of both root mean square speeds, from 0 to 1"
     is_error = True
     headline = False
     order = 16
@@ -159,8 +160,8 @@ class TheilU(Metric):
 class FinalPositionError(Metric):
     """|x_sim - x| at the last frame that counts.
 
-    Speed errors of opposite signs cancel in it and lasting ones add up. As both follow the same leader, it
-    is the absolute difference of the gaps.
+    Speed errors of opposite signs cancel in it and lasting ones add up. As both follow the same
+    leader, it is the absolute difference of the gaps.
     """
 
     unit = "m"

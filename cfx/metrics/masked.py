@@ -12,5 +12,5 @@ def masked_mean(values: Tensor, counted: Tensor) -> Tensor:
 
 
 def root_mean_square(values: Tensor, counted: Tensor) -> Tensor:
-    """Returns the root mean square of `(P, K)` over the counted frames, `(P,)`; NaN where none counts."""
+    """Returns the root mean square of `(P, K)` over them, `(P,)`; NaN where none counts."""
     return (torch.where(counted, values, 0.0).square().sum(1) / counted.sum(1)).sqrt()

@@ -8,7 +8,7 @@ from torch import Tensor
 from cfx.metrics.base import Metric, Trajectories
 
 HARD_BRAKING = -8.0
-"""m/s2: an acceleration below it is hard braking. On a dry road a passenger car's tyres give little more."""
+"""m/s2: an acceleration below it is hard braking; tyres on a dry road give little more."""
 
 
 class Collisions(Metric):
@@ -66,9 +66,9 @@ class MinTtc(Metric):
     """Minimum time to collision: the least s / (v - v_leader) over the frames with v > v_leader.
 
     s is the gap, bumper to bumper. The time to collision is how long it would take both to meet at
-    their present speeds (J. C. Hayward 1972, Near-miss determination through use of a scale of danger,
-    Highway Research Record 384). It is 0 once the gap is closed, and not defined for a follower
-    who is never faster than the leader.
+    their present speeds (J. C. Hayward 1972, Near-miss determination through use of a scale of
+    danger, Highway Research Record 384). It is 0 once the gap is closed, and not defined for a
+    follower who is never faster than the leader.
     """
 
     unit = "s"
@@ -95,7 +95,8 @@ def hard_braking_frames(speed: Tensor, counted: Tensor, dt: float) -> Tensor:
 
     Args:
         speed: `(*batch, K + 1)`, m/s.
-        counted: bool, broadcasting to it; the acceleration at a frame is the one on the way to it, so frame 0 has none.
+        counted: bool, broadcasting to it; the acceleration at a frame is the one on the way to it,
+            so frame 0 has none.
         dt: time step, s.
 
     Returns:

@@ -1,13 +1,15 @@
 """Driving style by the objective entropy weight method.
 
-An indicator weighs the more, the more unevenly it is spread over the drivers: its weight comes from the Shannon entropy of its
-normalised column (C. E. Shannon, 1948; as used for driving style by the paper's reference on entropy weights).
+The more unevenly an indicator is distributed over the drivers, the more it weighs: its weight comes
+from the Shannon entropy of its normalised column (C. E. Shannon, 1948; as used for driving style by
+the paper's reference on entropy weights).
 
 Shapes: m drivers, n = 6 indicators.
 
-Differences from the paper: the normalisation prints `Min = max(...)` and chooses its case by the sign of the value; here Min is
-the minimum, and the case goes by the indicator (`direction=signed`) or, as printed, by the value's sign (`direction=printed`).
-The weights' leading minus sign, with which they would all be negative, is left out.
+Differences from the paper: the normalisation prints `Min = max(...)` and chooses its case by the
+sign of the value; here Min is the minimum, and the case follows from the indicator
+(`direction=signed`) or, as printed, from the value's sign (`direction=printed`). The weights'
+leading minus sign, with which they would all be negative, is left out.
 """
 
 from __future__ import annotations
@@ -49,13 +51,14 @@ STANDING_MPS = 0.5
 def measure_style(pairs: PairSet, settings: StyleSettings) -> StyleResult:
     """Scores every driver (`Pair.driver`) and sorts the drivers into three clusters.
 
-    The frames of all pairs of a driver count together. Scores lie in [0, 1]; the more aggressive, the higher. A driver
-    whose score is below the lower percentile is conservative, above the upper one aggressive, and normal otherwise, so that
-    equal scores always share a cluster. A single driver is normal, with score 0.
+    The frames of all pairs of a driver count together. Scores lie in [0, 1]; the more aggressive,
+    the higher. A driver whose score is below the lower percentile is conservative, above the upper
+    one aggressive, and normal otherwise, so that equal scores always share a cluster. A single
+    driver is normal, with score 0.
 
     Returns:
-        The drivers in the order in which they first appear. The table also has `frames` and `standing_frames`, the latter the
-        number of frames that did not count for the time headway.
+        The drivers in the order in which they first appear. The table also has `frames` and
+        `standing_frames`, the number of frames that did not count for the time headway.
 
     Raises:
         DataError: there are no pairs.
@@ -63,19 +66,18 @@ def measure_style(pairs: PairSet, settings: StyleSettings) -> StyleResult:
     if not len(pairs):
         raise DataError(f"{pairs.source}: no pairs, so no driving style to measure")
     table = indicators(pairs)
-    normalised = normalise(
-        table[[i.name for i in INDICATORS]].to_numpy(dtype=np.float64), settings.direction
-    )
+    names = [indicator.name for indicator in INDICATORS]
+    raw = table[names].to_numpy(dtype=np.float64)
+    normalised = normalise(raw, settings.direction)
     weights = entropy_weights(normalised)
     score = (normalised * weights).sum(axis=1)
-    low, high = (float(cut) for cut in np.percentile(score, settings.percentiles))
+    low, high = np.percentile(score, settings.percentiles)
     cluster = np.where(score < low, 0, np.where(score > high, 2, 1))
     table.insert(1, "score", score)
     table.insert(2, "cluster", cluster)
-    table.insert(3, "cluster_name", [CLUSTERS[c] for c in cluster])
-    return StyleResult(
-        table, {i.name: float(w) for i, w in zip(INDICATORS, weights, strict=True)}, (low, high)
-    )
+    table.insert(3, "cluster_name", [CLUSTERS[number] for number in cluster])
+    by_name = dict(zip(names, weights.tolist(), strict=True))
+    return StyleResult(table, by_name, (float(low), float(high)))
 
 
 def select_cluster(pairs: PairSet, style: StyleResult, cluster: str) -> PairSet:
@@ -92,8 +94,9 @@ def select_cluster(pairs: PairSet, style: StyleResult, cluster: str) -> PairSet:
         sizes = style.table["cluster_name"].value_counts()
         counted = ", ".join(f"{sizes.get(name, 0)} {name}" for name in CLUSTERS)
         raise DataError(
-            f"style.cluster={cluster}: none of the {len(style.table)} drivers is in this cluster ({counted}); give more pairs,"
-            " another style.cluster, or style.percentiles further apart from 0 and 100"
+            f"style.cluster={cluster}: none of the {len(style.table)} drivers is in this cluster"
+            f" ({counted}); give more pairs, another style.cluster, or"
+            " style.percentiles further apart from 0 and 100"
         )
     return chosen
 
@@ -101,9 +104,10 @@ def select_cluster(pairs: PairSet, style: StyleResult, cluster: str) -> PairSet:
 def indicators(pairs: PairSet) -> pd.DataFrame:
     """Returns a row per driver with the six indicators, in SI units.
 
-    The space headway is front bumper to front bumper, `x_l - x_s`, as NGSIM's Space_Headway. The time headway is that over the
-    follower's speed, averaged over the frames at which the follower drives at 0.5 m/s or more; of a driver who never does, it is
-    the mean space headway over 0.5 m/s. Variances are those of the population (divided by the number of frames).
+    The space headway is front bumper to front bumper, `x_l - x_s`, as NGSIM's Space_Headway. The
+    time headway is that over the follower's speed, averaged over the frames with a speed of 0.5 m/s
+    or more; for a driver who is never that fast, it is the mean space headway over 0.5 m/s.
+    Variances are those of the population (divided by the number of frames).
     """
     sizes = [len(pair) for pair in pairs]
     code, drivers = pd.factorize(np.array([pair.driver for pair in pairs], dtype=object))
@@ -119,8 +123,11 @@ def indicators(pairs: PairSet) -> pd.DataFrame:
 
     frames = np.bincount(code, minlength=len(drivers))
     counted = np.bincount(code[moving], minlength=len(drivers))
-    mean_speed, mean_acceleration, mean_space = (
-        total(x) / frames for x in (speed, acceleration, space)
+    mean_speed = total(speed) / frames
+    mean_acceleration = total(acceleration) / frames
+    mean_space = total(space) / frames
+    mean_time = np.where(
+        counted > 0, total(time) / np.maximum(counted, 1), mean_space / STANDING_MPS
     )
     return pd.DataFrame(
         {
@@ -130,9 +137,7 @@ def indicators(pairs: PairSet) -> pd.DataFrame:
             "mean_acceleration": mean_acceleration,
             "variance_acceleration": total((acceleration - mean_acceleration[code]) ** 2) / frames,
             "mean_space_headway": mean_space,
-            "mean_time_headway": np.where(
-                counted > 0, total(time) / np.maximum(counted, 1), mean_space / STANDING_MPS
-            ),
+            "mean_time_headway": mean_time,
             "frames": frames,
             "standing_frames": frames - counted,
         }
@@ -140,21 +145,23 @@ def indicators(pairs: PairSet) -> pd.DataFrame:
 
 
 def normalise(raw: Floats, direction: Literal["signed", "printed"] = "signed") -> Floats:
-    """Maps each column of `raw` `(m, n)` to [0, 1]; 1 is the most aggressive. A constant column becomes 0.
+    """Maps each column of `raw` `(m, n)` to [0, 1], 1 being the most aggressive.
 
-    With `printed`, (max - e) / (max - min) where e < 0 and (e - min) / (max - min) elsewhere, as the paper prints it: a
-    column with both signs is then not monotonic.
+    A constant column becomes 0.
+
+    With `printed`, (max - e) / (max - min) where e < 0 and (e - min) / (max - min) elsewhere, as
+    the paper prints it: a column with both signs is then not monotonic.
     """
     low, high = raw.min(axis=0), raw.max(axis=0)
-    sensitivity = high - low
-    # What rounding alone can cause is no spread.
-    varies = sensitivity > 1e-9 * np.maximum(np.abs(low), np.abs(high)) + 1e-12
-    backwards = (
-        raw < 0
-        if direction == "printed"
-        else np.array([i.sign for i in INDICATORS])[: raw.shape[1]] < 0
-    )
-    rise = np.where(backwards, high - raw, raw - low) / np.where(varies, sensitivity, 1.0)
+    extent = high - low
+    # An extent that rounding alone can cause is none.
+    varies = extent > 1e-9 * np.maximum(np.abs(low), np.abs(high)) + 1e-12
+    if direction == "printed":
+        backwards = raw < 0
+    else:
+        signs = np.array([indicator.sign for indicator in INDICATORS])
+        backwards = signs[: raw.shape[1]] < 0
+    rise = np.where(backwards, high - raw, raw - low) / np.where(varies, extent, 1.0)
     scaled: Floats = np.where(varies, np.clip(rise, 0.0, 1.0), 0.0)
     return scaled
 
@@ -162,8 +169,8 @@ def normalise(raw: Floats, direction: Literal["signed", "printed"] = "signed") -
 def entropies(normalised: Floats) -> Floats:
     """Returns the entropy of each column of `(m, n)`, in [0, 1]: 1 is evenly spread.
 
-    ent_j = -(1 / ln m) sum_i p_ij ln p_ij with p_ij = e_ij / sum_i e_ij and 0 ln 0 = 0. A column of zeros (a constant
-    indicator) and a single driver carry no information: 1.
+    ent_j = -(1 / ln m) sum_i p_ij ln p_ij with p_ij = e_ij / sum_i e_ij and 0 ln 0 = 0. A column of
+    zeros (a constant indicator) and a single driver carry no information: 1.
     """
     drivers = len(normalised)
     sums = normalised.sum(axis=0)
@@ -178,7 +185,8 @@ def entropies(normalised: Floats) -> Floats:
 def entropy_weights(normalised: Floats) -> Floats:
     """Returns the weight of each column `(n,)`: not negative, sum 1; 0 for a constant column.
 
-    w_j = (1 - ent_j) / (n - sum_j ent_j). If no indicator varies, as with a single driver, all weigh the same.
+    w_j = (1 - ent_j) / (n - sum_j ent_j). If no indicator varies, as with a single driver, all
+    weigh the same.
     """
     information = 1.0 - entropies(normalised)
     total = float(information.sum())

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import pandas as pd
 
 CLUSTERS = ("conservative", "normal", "aggressive")
-"""Names of the clusters 0, 1, 2: the bottom quarter, the middle half and the top quarter of the scores."""
+"""Names of the clusters 0, 1, 2: the bottom quarter, the middle half, the top quarter of scores."""
 
 
 @dataclass(frozen=True)
@@ -16,8 +16,9 @@ class StyleResult:
     """Driving style of every driver.
 
     Attributes:
-        table: a row per driver: driver, score, cluster (0, 1, 2), cluster_name, and the six raw indicators `mean_speed`,
-            `variance_speed`, `mean_acceleration`, `variance_acceleration`, `mean_space_headway`, `mean_time_headway` (SI units).
+        table: a row per driver: driver, score, cluster (0, 1, 2), cluster_name, and the six raw
+            indicators `mean_speed`, `variance_speed`, `mean_acceleration`, `variance_acceleration`,
+            `mean_space_headway`, `mean_time_headway` (SI units).
         weights: entropy weight of each indicator; they are not negative and sum to 1.
         cuts: the two scores that separate the clusters.
     """

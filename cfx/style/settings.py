@@ -17,7 +17,8 @@ class StyleSettings(Settings):
     )
     direction: Literal["signed", "printed"] = Field(
         "signed",
-        description="signed: headways count against aggressiveness; printed: the rule as the paper prints it",
+        description="signed: headways count against aggressiveness; printed: the rule as the paper"
+        " prints it",
     )
     percentiles: tuple[float, float] = Field(
         (25.0, 75.0), description="cuts between the three clusters, percent of the drivers"

@@ -20,7 +20,7 @@ SUMMARY = "summary.csv"
 """Says in a sweep's folder what came of it."""
 
 _BASELINES = ("population", "fixed")
-"""What a policy is compared with, the first that was measured: one set for all training drivers if drivers are unseen."""
+"""What a policy is compared with: the first that was measured."""
 
 _STATISTICS = ("mean", "ci95_low", "ci95_high")
 _METHODS = ("default", "fixed", "population", "policy")
@@ -49,7 +49,7 @@ class MetricColumn:
 
 
 def metric_columns(folders: Sequence[Path]) -> list[MetricColumn]:
-    """Returns the metrics that any of these jobs has measured, besides the RMSE of speed, in their order."""
+    """Returns the metrics that any of these jobs has measured, besides the RMSE of speed."""
     found: dict[str, MetricColumn] = {}
     for folder in folders:
         for info in _metrics_said(folder):
@@ -65,8 +65,8 @@ def metric_columns(folders: Sequence[Path]) -> list[MetricColumn]:
 def rows(statuses: Mapping[Path, JobStatus]) -> list[dict[str, Any]]:
     """Returns a row per job of the summary.
 
-    Columns: folder, the overrides that differ, the improvement, the RMSE of speed, other metrics of the
-    policy, seconds and state.
+    Columns: folder, the overrides that differ, the improvement, the RMSE of speed, other metrics of
+        the policy, seconds and state.
     """
     given = [_as_mapping(status.overrides) for status in statuses.values()]
     differing = _differing(given)

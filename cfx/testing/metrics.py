@@ -1,4 +1,4 @@
-"""The contract of a metric, as tests: subclass `MetricContract`, fill in the fixture `metric`, and pytest does the rest."""
+"""The contract of a metric, as tests: subclass `MetricContract`, fill in its fixture `metric`."""
 
 from __future__ import annotations
 

@@ -22,15 +22,18 @@ def version() -> str:
 
 
 def git_state(folder: Path) -> dict[str, str]:
-    """Returns commit and cleanliness of the git checkout that `folder` lies in; empty if it lies in none.
+    """Returns commit and cleanliness of the git checkout around `folder`; empty if there is none.
 
-    `cfx.git_dirty` counts changes of tracked files only: a new output folder does not make a commit dirty.
+    `cfx.git_dirty` counts changes of tracked files only: a new output folder does not make a commit
+    dirty.
     """
     commit = _git(folder, "rev-parse", "HEAD")
     if not commit:
         return {}
     changed = _git(folder, "status", "--porcelain", "--untracked-files=no")
-    dirty = "unknown" if changed is None else str(bool(changed)).lower()
+    dirty = "unknown"
+    if changed is not None:
+        dirty = str(bool(changed)).lower()
     return {"cfx.git_commit": commit, "cfx.git_dirty": dirty, "mlflow.source.git.commit": commit}
 
 
@@ -43,19 +46,25 @@ def _git(folder: Path, *arguments: str) -> str | None:
         )
     except (OSError, subprocess.TimeoutExpired):
         return None
-    return done.stdout.strip() if done.returncode == 0 else None
+    if done.returncode != 0:
+        return None
+    return done.stdout.strip()
 
 
 def plugin_tags(distributions: Mapping[str, str]) -> dict[str, str]:
-    """Returns a tag per plugin distribution, and all of them in one, by which runs can be grouped."""
-    listed = ", ".join(f"{name} {found}" for name, found in sorted(distributions.items()))
-    return {"cfx.plugins": listed or "none"} | {
-        f"cfx.plugin.{name}": found for name, found in sorted(distributions.items())
-    }
+    """Returns a tag per plugin distribution, and one of them all, by which runs can be grouped."""
+    tags = {}
+    listed = []
+    for name, found in sorted(distributions.items()):
+        tags[f"cfx.plugin.{name}"] = found
+        listed.append(f"{name} {found}")
+    return {"cfx.plugins": ", ".join(listed) or "none", **tags}
 
 
 def distributions(values: Mapping[str, Any]) -> dict[str, str]:
-    """Returns the plugin distributions, and their versions, that the named components come from; cfx's own is none.
+    """Returns the plugin distributions of the chosen components, and their versions.
+
+    cfx's own distribution is no plugin.
 
     Args:
         values: a job's configuration.
@@ -76,7 +85,7 @@ def distributions(values: Mapping[str, Any]) -> dict[str, str]:
 
 
 def metric_distributions(values: Mapping[str, Any]) -> dict[str, str]:
-    """Returns the plugin distributions, and their versions, of the metrics that a job measures.
+    """Returns the plugin distributions of the metrics that a job measures, and their versions.
 
     Args:
         values: a job's configuration.
@@ -104,15 +113,17 @@ def process_tags() -> dict[str, str]:
 
 
 def is_alive(tags: Mapping[str, str]) -> bool:
-    """Says whether the process with these `process_tags` runs. One on another machine, or unknown, is taken to."""
+    """Says whether the process with these `process_tags` runs.
+
+    One that is unknown or on another machine counts as running.
+    """
     if tags.get("cfx.host") != socket.gethostname() or "@" not in tags.get("cfx.process", ""):
         return True
     pid, started = tags["cfx.process"].split("@")
     try:
         process = psutil.Process(int(pid))
-        if (
-            process.status() == psutil.STATUS_ZOMBIE
-        ):  # killed, and its parent has not asked how it ended
+        # A zombie was killed, and its parent has not asked how it ended.
+        if process.status() == psutil.STATUS_ZOMBIE:
             return False
         return bool(abs(process.create_time() - float(started)) < 2.0)
     except psutil.NoSuchProcess:
@@ -130,16 +141,18 @@ def user() -> str:
 
 
 def flatten(config: Mapping[str, Any]) -> dict[str, str]:
-    """Flattens a nested configuration: `{"model": {"name": "w99"}}` -> `{"model.name": "w99"}`; empty ones are kept."""
+    """Flattens a nested configuration: `{"model": {"name": "w99"}}` -> `{"model.name": "w99"}`.
+
+    Empty mappings and lists are kept.
+    """
     flat: dict[str, str] = {}
     for path, value in _leaves(config, ""):
-        flat[path] = (
-            "null"
-            if value is None
-            else str(value).lower()
-            if isinstance(value, bool)
-            else str(value)
-        )
+        if value is None:
+            flat[path] = "null"
+        elif isinstance(value, bool):
+            flat[path] = str(value).lower()
+        else:
+            flat[path] = str(value)
     return flat
 
 
@@ -147,12 +160,17 @@ def _leaves(value: Any, path: str) -> Iterable[tuple[str, Any]]:
     items: Iterable[tuple[Any, Any]]
     if isinstance(value, Mapping) and value:
         items = value.items()
-    elif isinstance(value, list | tuple) and any(
-        isinstance(part, Mapping | list | tuple) for part in value
-    ):
+    elif isinstance(value, list | tuple) and _has_nested(value):
         items = enumerate(value)
     else:
         yield path, value
         return
     for key, part in items:
-        yield from _leaves(part, f"{path}.{key}" if path else str(key))
+        below = str(key)
+        if path:
+            below = f"{path}.{key}"
+        yield from _leaves(part, below)
+
+
+def _has_nested(values: Iterable[Any]) -> bool:
+    return any(isinstance(value, Mapping | list | tuple) for value in values)

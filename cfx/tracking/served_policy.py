@@ -1,4 +1,7 @@
-"""The code that MLflow keeps beside a policy's weights ("models from code"): loading it runs this file, never a pickle."""
+"""The code that MLflow keeps beside a policy's weights ("models from code").
+
+Loading such a model runs this file, never a pickle.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,11 @@ from mlflow.pyfunc.model import PythonModel, PythonModelContext
 
 
 class ServedPolicy(PythonModel):
-    """Measured history in the tidy pair layout in; `pair_id` and the parameters of the next window out, a row per pair."""
+    """Predicts the parameters of the next window.
+
+    In: measured history in the tidy pair layout. Out: a row per pair with `pair_id` and the
+        parameters.
+    """
 
     def load_context(self, context: PythonModelContext) -> None:
         from cfx.agents import checkpoint

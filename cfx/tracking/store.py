@@ -1,7 +1,8 @@
-"""The MLflow store: where it is, whether it is one of ours, and how to open it without harm.
+"""The MLflow store: where it is, whether it is an MLflow store, and how to open it without harm.
 
-MLflow itself waits minutes for a database that cannot be opened, adds its tables to any SQLite file that it is pointed at, and
-crashes when several processes make a new database at once. So the file is looked at first, and made under a lock.
+MLflow itself waits minutes for a database that cannot be opened, adds its tables to any SQLite file
+that it is pointed at, and crashes when several processes make a new database at once. So the file
+is examined first, and made under a lock.
 """
 
 from __future__ import annotations
@@ -27,7 +28,10 @@ if TYPE_CHECKING:
     from mlflow import MlflowClient
 
 LOCK_SECONDS = 15.0
-"""How long a job waits at its start for a database that another process holds. Jobs of a sweep hold it for milliseconds."""
+"""How long a job waits at its start for a database that another process holds.
+
+Jobs of a sweep hold it for milliseconds.
+"""
 
 _PATIENCE_S = 60
 """How long a later write waits: the work is done by then, and worth the wait."""
@@ -40,7 +44,7 @@ _HOW = "set tracking.uri=sqlite:///FILE to use another"
 
 @dataclass(frozen=True)
 class Store:
-    """An MLflow store that has been looked at and opened.
+    """An MLflow store that has been examined and opened.
 
     Attributes:
         uri: absolute, as `mlflow ui --backend-store-uri` takes it.
@@ -66,23 +70,23 @@ class Store:
 
 
 def default_store() -> Path:
-    """Returns where the database is if nobody says otherwise: beside the outputs."""
+    """Returns where the database is by default: beside the outputs."""
     return Path("outputs/mlflow.db").absolute()
 
 
 def tracking_uri(configured: str | None, default: Path | None = None) -> str:
-    """Returns the tracking URI, always absolute: `MLFLOW_TRACKING_URI`, else the config's, else SQLite at `default`.
+    """Returns the tracking URI, always absolute.
+
+    It is `MLFLOW_TRACKING_URI`, else the config's, else SQLite at `default`.
 
     Raises:
         TrackingError: it is neither a database nor a server.
     """
-    said_by = "MLFLOW_TRACKING_URI" if os.environ.get("MLFLOW_TRACKING_URI") else "tracking.uri"
-    return absolute_uri(
-        os.environ.get("MLFLOW_TRACKING_URI")
-        or configured
-        or f"sqlite:///{default or default_store()}",
-        said_by,
-    )
+    of_environment = os.environ.get("MLFLOW_TRACKING_URI")
+    if of_environment:
+        return absolute_uri(of_environment, "MLFLOW_TRACKING_URI")
+    uri = configured or f"sqlite:///{default or default_store()}"
+    return absolute_uri(uri, "tracking.uri")
 
 
 def absolute_uri(uri: str, said_by: str) -> str:
@@ -94,7 +98,9 @@ def absolute_uri(uri: str, said_by: str) -> str:
     Raises:
         TrackingError: it is neither a database nor a server.
     """
-    scheme = uri.split("://", 1)[0].split("+", 1)[0] if "://" in uri else uri
+    scheme = uri
+    if "://" in uri:
+        scheme = uri.split("://", 1)[0].split("+", 1)[0]
     if scheme == "sqlite":
         name = uri.removeprefix("sqlite:///")
         if name == uri or name in {"", ":memory:"}:
@@ -102,21 +108,26 @@ def absolute_uri(uri: str, said_by: str) -> str:
         return f"sqlite:///{Path(name).expanduser().absolute()}"
     if scheme not in _DATABASES + _SERVERS:
         raise TrackingError(
-            f"{said_by}={uri}: MLflow needs a database or a server; write sqlite:///FILE or http://HOST:PORT"
+            f"{said_by}={uri}: MLflow needs a database or a server;"
+            " write sqlite:///FILE or http://HOST:PORT"
         )
     return uri
 
 
 def open_store(uri: str, experiment: str, default: Path | None = None) -> Store:
-    """Opens a store, making database and experiment where they are not there yet; safe from many processes at once.
+    """Opens a store; makes database and experiment where they are not there yet.
+
+    Many processes may do so at once.
 
     Args:
         uri: as `tracking_uri` returns it.
         experiment: the experiment's name.
-        default: path whose folder takes the lock and the artifacts where the store itself is not a file.
+        default: path whose folder takes the lock and the artifacts where the store itself is not a
+            file.
 
     Raises:
-        TrackingError: the store is locked, foreign, of another MLflow version, unreachable, or cannot be written.
+        TrackingError: the store is locked, foreign, of another MLflow version, unreachable, or
+            cannot be written.
     """
     file = sqlite_file(uri)
     home = (file or default or default_store()).parent
@@ -128,7 +139,10 @@ def open_store(uri: str, experiment: str, default: Path | None = None) -> Store:
         ) from error
     if not os.access(home, os.W_OK | os.X_OK):
         raise TrackingError(f"{home}: the folder of the MLflow store cannot be written; {_HOW}")
-    lock = FileLock(home / f"{file.name if file else 'mlflow'}.lock", timeout=4 * LOCK_SECONDS)
+    name = "mlflow"
+    if file is not None:
+        name = file.name
+    lock = FileLock(home / f"{name}.lock", timeout=4 * LOCK_SECONDS)
     with _held(lock):
         if file is not None:
             if _is_new(file):
@@ -140,19 +154,21 @@ def open_store(uri: str, experiment: str, default: Path | None = None) -> Store:
         with translate_errors(f"open {uri}"):
             from mlflow import MlflowClient
 
-            client = MlflowClient(tracking_uri=f"{uri}?timeout={_PATIENCE_S}" if file else uri)
-            experiment_id = _experiment(
-                client,
-                uri,
-                experiment,
-                None if uri.split("://", maxsplit=1)[0] in _SERVERS else home,
-            )
+            address = uri
+            if file is not None:
+                address = f"{uri}?timeout={_PATIENCE_S}"
+            client = MlflowClient(tracking_uri=address)
+            # A server has a place for artifacts of its own.
+            is_server = uri.split("://", maxsplit=1)[0] in _SERVERS
+            experiment_id = _experiment(client, uri, experiment, None if is_server else home)
     return Store(uri, client, experiment_id, lock)
 
 
 def sqlite_file(uri: str) -> Path | None:
     """Returns the file of an SQLite URI, None for any other store."""
-    return Path(uri.removeprefix("sqlite:///")) if uri.startswith("sqlite:///") else None
+    if not uri.startswith("sqlite:///"):
+        return None
+    return Path(uri.removeprefix("sqlite:///"))
 
 
 def artifact_folder(home: Path) -> Path:
@@ -170,11 +186,8 @@ def quiet() -> Iterator[None]:
         os.environ[_BAR] = "false"
         loggers = [logging.getLogger(name) for name in ("mlflow", "alembic")]
         root = logging.getLogger()
-        levels, handlers, root_level = (
-            [logger.level for logger in loggers],
-            root.handlers[:],
-            root.level,
-        )
+        levels = [logger.level for logger in loggers]
+        handlers, root_level = root.handlers[:], root.level
         for logger in loggers:
             logger.setLevel(logging.CRITICAL)
         try:
@@ -203,15 +216,20 @@ def translate_errors(doing: str) -> Iterator[None]:
         try:
             yield
         except (MlflowException, SQLAlchemyError, sqlite3.Error, OSError) as error:
-            reason = next(
-                (line.strip() for line in str(error).splitlines() if line.strip()),
-                type(error).__name__,
-            )
+            reason = _first_line(error)
             if "database is locked" in str(error):
                 reason = (
                     "the database is locked by another process; close what holds it and run again"
                 )
             raise TrackingError(f"MLflow could not {doing}: {reason[:300]}") from error
+
+
+def _first_line(error: Exception) -> str:
+    """Returns the first line of an error's text that is not empty; its type if it has none."""
+    for line in str(error).splitlines():
+        if line.strip():
+            return line.strip()
+    return type(error).__name__
 
 
 def is_run_id(text: str) -> bool:
@@ -220,7 +238,9 @@ def is_run_id(text: str) -> bool:
 
 
 def download_run(run_id: str, uri: str | None = None) -> Path:
-    """Returns a folder with the files of a tracked job: `metrics.json`, `pairs.csv`, `config.yaml`, `figures/`, `policy/`.
+    """Returns a folder with the files of a tracked job.
+
+    They are those that a job's folder has, such as `metrics.json`, `pairs.csv` and `policy/`.
 
     Args:
         run_id: MLflow's id of the run.
@@ -233,11 +253,13 @@ def download_run(run_id: str, uri: str | None = None) -> Path:
     file = sqlite_file(address)
     if file is not None and not file.is_file():
         raise TrackingError(
-            f"'{run_id}' is no folder, and there is no MLflow database at {file} in which it could be a run"
+            f"'{run_id}' is no folder, and there is no MLflow database at {file} in which it"
+            " could be a run"
         )
     if not is_run_id(run_id):
         raise TrackingError(
-            f"'{run_id}' is neither a job's output folder nor the id of an MLflow run (32 digits and letters a to f)"
+            f"'{run_id}' is neither a job's output folder nor the id of an MLflow run"
+            " (32 digits and letters a to f)"
         )
     store = open_store(address, "cfx")
     with translate_errors(f"read run {run_id} from {address}"):
@@ -255,7 +277,9 @@ def folder_of(folder_or_run: str | Path, uri: str | None = None) -> Path:
         TrackingError: it is no folder, and there is no such run, or its files are gone.
     """
     folder = Path(folder_or_run).expanduser()
-    return folder if folder.is_dir() else download_run(str(folder_or_run), uri)
+    if folder.is_dir():
+        return folder
+    return download_run(str(folder_or_run), uri)
 
 
 def _import_mlflow() -> Any:
@@ -271,11 +295,13 @@ def _held(lock: FileLock) -> Iterator[None]:
         lock.acquire()
     except Timeout as error:
         raise TrackingError(
-            f"{lock.lock_file}: another process holds the lock of the MLflow store; end it, or {_HOW}"
+            f"{lock.lock_file}: another process holds the lock of the MLflow store;"
+            f" end it, or {_HOW}"
         ) from error
     except OSError as error:
         raise TrackingError(
-            f"{lock.lock_file}: the lock of the MLflow store cannot be made ({error.strerror}); {_HOW}"
+            f"{lock.lock_file}: the lock of the MLflow store cannot be made ({error.strerror});"
+            f" {_HOW}"
         ) from error
     try:
         yield
@@ -290,14 +316,19 @@ def _is_new(file: Path) -> bool:
 
 
 def _create(file: Path, home: Path) -> None:
-    """Makes a new database under a name of its own and moves it into place: nobody ever meets a half-made one."""
+    """Makes a new database under a name of its own and moves it into place.
+
+    So no other process ever sees half of one.
+    """
     partial = file.with_name(f".{file.name}.{os.getpid()}.part")
     partial.unlink(missing_ok=True)
     try:
         with translate_errors(f"make the database {file}"), _unsynchronised():
             from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
 
-            store = SqlAlchemyStore(f"sqlite:///{partial}", artifact_folder(home).as_uri())  # type: ignore[no-untyped-call]  # MLflow's
+            store = SqlAlchemyStore(  # type: ignore[no-untyped-call]  # MLflow's
+                f"sqlite:///{partial}", artifact_folder(home).as_uri()
+            )
             store.engine.dispose()
             with partial.open("rb+") as made:
                 os.fsync(made.fileno())
@@ -308,9 +339,10 @@ def _create(file: Path, home: Path) -> None:
 
 @contextmanager
 def _unsynchronised() -> Iterator[None]:
-    """Lets SQLite not wait for the disk after each of MLflow's hundreds of migrations: 1 s instead of 6.
+    """Lets SQLite not wait for the disk after each of MLflow's migrations: 1 s instead of 6.
 
-    Only for a file that nobody else has: if the machine fails meanwhile, it is lost, and made again.
+    Only for a file that nobody else has: if the machine fails meanwhile, it is lost, and made
+    again.
     """
     from sqlalchemy import event
     from sqlalchemy.engine import Engine
@@ -326,38 +358,25 @@ def _unsynchronised() -> Iterator[None]:
 
 
 def check_database(file: Path, uri: str) -> None:
-    """Looks at an existing SQLite file before MLflow does: is it free, and is it a database of this MLflow?"""
+    """Examines an existing SQLite file before MLflow does.
+
+    Raises:
+        TrackingError: it is locked, or no database of this version of MLflow.
+    """
     try:
-        # Autocommit mode: the transaction is this function's own.
-        connection = sqlite3.connect(
-            file.as_uri() + "?mode=rw", uri=True, timeout=LOCK_SECONDS, isolation_level=None
-        )
-        try:
-            connection.execute("BEGIN IMMEDIATE")
-            tables = {
-                row[0]
-                for row in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
-            }
-            ours = {"alembic_version", "experiments", "runs"} <= tables
-            versions = (
-                [row[0] for row in connection.execute("SELECT version_num FROM alembic_version")]
-                if ours
-                else []
-            )
-            connection.execute("ROLLBACK")
-        finally:
-            connection.close()
+        versions = _schema_versions(file)
     except sqlite3.OperationalError as error:
         if "locked" in str(error):
             raise TrackingError(
-                f"{file}: the MLflow database is locked by another process; close what holds it and run again, or {_HOW}"
+                f"{file}: the MLflow database is locked by another process;"
+                f" close what holds it and run again, or {_HOW}"
             ) from error
         raise TrackingError(
             f"{file}: the MLflow database cannot be opened for writing ({error}); {_HOW}"
         ) from error
     except sqlite3.DatabaseError as error:
         raise TrackingError(f"{file} is not an SQLite database ({error}); {_HOW}") from error
-    if not ours:
+    if versions is None:
         raise TrackingError(f"{file} is an SQLite database, but not MLflow's; {_HOW}")
     with quiet():
         import mlflow
@@ -366,9 +385,32 @@ def check_database(file: Path, uri: str) -> None:
         wanted = _get_latest_schema_revision()  # type: ignore[no-untyped-call]  # MLflow's
     if versions != [wanted]:
         raise TrackingError(
-            f"{file} was written by another version of MLflow (schema {versions[0] if versions else 'unknown'}, MLflow"
-            f" {mlflow.__version__} needs {wanted}); make a copy and run `mlflow db upgrade {uri}`, or {_HOW}"
+            f"{file} was written by another version of MLflow"
+            f" (schema {', '.join(versions) or 'unknown'},"
+            f" MLflow {mlflow.__version__} needs {wanted}); make a copy and run"
+            f" `mlflow db upgrade {uri}`, or {_HOW}"
         )
+
+
+def _schema_versions(file: Path) -> list[str] | None:
+    """Returns the versions of the schema that an SQLite file names; None if it is not MLflow's.
+
+    Raises:
+        sqlite3.Error: the file is locked, or no database.
+    """
+    # Autocommit mode: the transaction is this function's own.
+    connection = sqlite3.connect(
+        file.as_uri() + "?mode=rw", uri=True, timeout=LOCK_SECONDS, isolation_level=None
+    )
+    try:
+        connection.execute("BEGIN IMMEDIATE")
+        names = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
+        if not {("alembic_version",), ("experiments",), ("runs",)} <= set(names):
+            return None
+        rows = connection.execute("SELECT version_num FROM alembic_version").fetchall()
+        return [str(row[0]) for row in rows]
+    finally:
+        connection.close()
 
 
 def _answers(uri: str) -> None:
@@ -376,10 +418,11 @@ def _answers(uri: str) -> None:
     if not uri.startswith(("http://", "https://")):
         return
     try:
-        with urllib.request.urlopen(f"{uri.rstrip('/')}/health", timeout=LOCK_SECONDS):  # noqa: S310 - http or https, the user's own
+        health = f"{uri.rstrip('/')}/health"
+        with urllib.request.urlopen(health, timeout=LOCK_SECONDS):  # noqa: S310 - http or https, the user's own
             pass
     except urllib.error.HTTPError:
-        pass  # it answers; whether it lets us in shows at the first call
+        pass  # it answers; whether it grants access shows at the first call
     except (OSError, ValueError) as error:
         reason = getattr(error, "reason", error)
         raise TrackingError(
@@ -390,10 +433,13 @@ def _answers(uri: str) -> None:
 def _experiment(client: MlflowClient, uri: str, name: str, home: Path | None) -> str:
     found = client.get_experiment_by_name(name)
     if found is None:
-        location = artifact_folder(home).as_uri() if home is not None else None
+        location = None
+        if home is not None:
+            location = artifact_folder(home).as_uri()
         return str(client.create_experiment(name, artifact_location=location))
     if found.lifecycle_stage != "active":
         raise TrackingError(
-            f"the experiment '{name}' is deleted in {uri}; restore it there, or set tracking.experiment to another name"
+            f"the experiment '{name}' is deleted in {uri}; restore it there, or set"
+            " tracking.experiment to another name"
         )
     return str(found.experiment_id)

@@ -40,7 +40,10 @@ _SERVED = Path(__file__).with_name("served_policy.py")
 
 
 class Tracker:
-    """Keeps nothing: what a job talks to if tracking is off. `Tracker.open` gives the one that fits the configuration."""
+    """Tracks nothing: what a job uses if tracking is off.
+
+    `Tracker.open` gives the one that fits the configuration.
+    """
 
     run_id: str = ""
     link: str = ""
@@ -50,7 +53,8 @@ class Tracker:
     def open(cls, config: JobConfig, folder: Path) -> Iterator[Tracker]:
         """Opens the run of a job, for as long as the job lasts.
 
-        A job that was broken off and starts again with the same configuration in the same folder goes on in its old run.
+        A job that was broken off and starts again with the same configuration in the same folder
+        goes on in its old run.
 
         Args:
             config: the job's configuration; logged whole, flattened.
@@ -105,14 +109,20 @@ class Tracker:
         """Logs `Evaluation.metrics()` and the table of all pairs."""
 
     def log_curves(self, curves: pd.DataFrame) -> None:
-        """Logs `train_loss` and `validation_loss`, means over the networks, by epoch; at most `CURVE_POINTS` of each.
+        """Logs `train_loss` and `validation_loss`, means over the networks, by epoch.
+
+        At most `CURVE_POINTS` of each are logged.
 
         Args:
             curves: columns `network`, `epoch`, `train_loss`, `validation_loss`; may be empty.
         """
 
     def log_table(self, table: pd.DataFrame, name: str) -> None:
-        """Logs a table that MLflow's pages show as one; `name` ends in `.json`. One of the same name is replaced."""
+        """Logs a table that MLflow's pages show as one; one of the same name is replaced.
+
+        Args:
+            name: ends in `.json`.
+        """
 
     def log_figures(self, paths: Sequence[Path]) -> None:
         """Logs image files under `figures/`."""
@@ -121,7 +131,9 @@ class Tracker:
         """Logs files at the top of the run's artifacts."""
 
     def log_policy(self, folder: Path) -> None:
-        """Logs a saved policy as a model: `mlflow.pyfunc.load_model(tracker.model_uri).predict(frame)`.
+        """Logs a saved policy as a model.
+
+        `mlflow.pyfunc.load_model(tracker.model_uri).predict(frame)` uses it.
 
         Args:
             folder: what `Agent.save` wrote.
@@ -175,7 +187,9 @@ class MlflowTracker(Tracker):
         plugins: Mapping[str, str] | None = None,
         sweep: str | None = None,
     ) -> Iterator[Self]:
-        """Opens a run and closes it however its body ends: FINISHED, KILLED on Ctrl-C or exit, else FAILED; the reason is a tag.
+        """Opens a run and closes it however its body ends.
+
+        Its status is FINISHED, KILLED on Ctrl-C or exit, else FAILED; the reason is a tag.
 
         Args:
             uri: of the store, absolute.
@@ -222,7 +236,10 @@ class MlflowTracker(Tracker):
             self.store.client.log_batch(self.run_id, tags=_tags(tags))
 
     def log_metrics(self, metrics: Mapping[str, float]) -> None:
-        self._log_metrics([(name, value, 0) for name, value in metrics.items()])
+        points = []
+        for name, value in metrics.items():
+            points.append((name, value, 0))
+        self._log_metrics(points)
 
     def log_evaluation(self, evaluation: Evaluation) -> None:
         self.log_metrics(evaluation.metrics())
@@ -235,11 +252,13 @@ class MlflowTracker(Tracker):
             kept = np.unique(
                 np.linspace(0, len(means) - 1, min(CURVE_POINTS, len(means))).round().astype(int)
             )
-            points += [(column, float(means.iloc[k]), int(means.index[k])) for k in kept]
+            for k in kept:
+                points.append((column, float(means.iloc[k]), int(means.index[k])))
         self._log_metrics(points)
 
     def log_table(self, table: pd.DataFrame, name: str) -> None:
-        # MLflow's own log_table reads back and appends to a table that is there, and stumbles over pandas 3's strings.
+        # MLflow's own log_table reads back and appends to a table that is there, and stumbles over
+        # pandas 3's strings.
         text = table.to_json(orient="split", index=False, date_format="iso")
         entry = {"path": name, "type": "table"}
         if entry not in self._tables:
@@ -300,9 +319,8 @@ class MlflowTracker(Tracker):
         address, first = _address(self.store.uri)
         lines = [*first, f"MLflow: {address}/{self.link}"]
         if self._sweep is not None:
-            lines.append(
-                f"All jobs of this sweep: {address}/{sweep_link(self.store.experiment_id, self._sweep)}"
-            )
+            link = sweep_link(self.store.experiment_id, self._sweep)
+            lines.append(f"All jobs of this sweep: {address}/{link}")
         return tuple(lines)
 
     def _log_metrics(self, points: Sequence[tuple[str, float, int]]) -> None:
@@ -320,11 +338,15 @@ class MlflowTracker(Tracker):
                 self.store.client.log_artifact(self.run_id, str(path), place)
 
     def _end_badly(self, error: BaseException) -> None:
-        """Closes the run after an error; that one is what the user must see, so a failure to close is only logged."""
+        """Closes the run after an error.
+
+        The user must see that error, so a failure to close the run is only logged.
+        """
         killed = not isinstance(error, Exception)  # Ctrl-C, SIGTERM, exit
+        status = "KILLED" if killed else "FAILED"
         text = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
         try:
-            self._end("KILLED" if killed else "FAILED", text)
+            self._end(status, text)
         except TrackingError as second:
             log.warning("%s", second)
 
@@ -339,10 +361,14 @@ class MlflowTracker(Tracker):
 
 
 def sweep_link(experiment_id: str, sweep: str) -> str:
-    """Returns the part of the address after the server's that shows the jobs of a sweep side by side, the best first."""
+    """Returns the part of the address behind the server's that shows the jobs of a sweep.
+
+    They stand side by side, the best first.
+    """
     asked = {
         "searchFilter": f"tags.`cfx.sweep` = '{_safe(sweep)}'",
-        # Sorted by date, MLflow's page would fold the jobs away under their parent, and draw no charts.
+        # Sorted by date, MLflow's page would fold the jobs away under their parent, and draw no
+        # charts.
         "orderByKey": "metrics.`rmse_improvement/mean`",
         "orderByAsc": "false",
         "compareRunsMode": "CHART",
@@ -352,7 +378,7 @@ def sweep_link(experiment_id: str, sweep: str) -> str:
 
 
 def end_sweep(uri: str, experiment: str, sweep: str) -> tuple[str, ...]:
-    """Closes the runs that killed jobs left open, and gives the sweep's parent run the status of its jobs.
+    """Closes the runs that killed jobs left open, and settles the status of the sweep's parent run.
 
     Args:
         uri: of the store, absolute.
@@ -411,7 +437,7 @@ def _begin(store: Store, name: str, parameters: Mapping[str, str], tags: Mapping
 
 
 def _replace_earlier(store: Store, run_id: str, tags: Mapping[str, str]) -> None:
-    """Takes earlier runs of the same job out of its sweep: a job that runs again overwrites their folder.
+    """Takes earlier runs of the same job out of its sweep: the job overwrites their folder.
 
     They stay where they are, with the tag `cfx.replaced_by`.
     """
@@ -432,8 +458,12 @@ def _is_running(run: Any) -> bool:
 
 
 def close_abandoned(store: Store) -> None:
-    """Marks an experiment's runs KILLED whose process on this machine is gone: a killed one cannot do it; call under the lock."""
-    mine = f"attributes.status = 'RUNNING' and tags.`cfx.host` = '{_safe(provenance.process_tags()['cfx.host'])}'"
+    """Marks an experiment's runs KILLED whose process on this machine is gone.
+
+    A killed process cannot do it itself. Call under the lock.
+    """
+    host = _safe(provenance.process_tags()["cfx.host"])
+    mine = f"attributes.status = 'RUNNING' and tags.`cfx.host` = '{host}'"
     for run in store.client.search_runs([store.experiment_id], mine, max_results=1000):
         if not provenance.is_alive(run.data.tags):
             store.client.set_tag(
@@ -445,9 +475,10 @@ def close_abandoned(store: Store) -> None:
 
 
 def _sweep_parent(store: Store, sweep: str) -> str:
-    """Returns the id of the sweep's parent run, made by whichever job comes first; call under the lock."""
+    """Returns the id of the sweep's parent run; the first job makes it. Call under the lock."""
     client, name = store.client, _safe(sweep)
-    # The parent has not the children's tag: a table filtered by `cfx.sweep` shows the jobs alone, flat, and so do its charts.
+    # The parent has not the children's tag: a table filtered by `cfx.sweep` shows the jobs alone,
+    # flat, and so do its charts.
     found = client.search_runs(
         [store.experiment_id], f"tags.`cfx.sweep_parent` = '{name}'", max_results=1
     )
@@ -467,7 +498,10 @@ def _sweep_parent(store: Store, sweep: str) -> str:
 
 
 def _settle(store: Store, parent_id: str, sweep: str) -> None:
-    """Gives a sweep's parent the status of its jobs: RUNNING while one runs, else the worst; call under the lock."""
+    """Gives a sweep's parent the status of its jobs: RUNNING while one runs, else the worst.
+
+    Call under the lock.
+    """
     for status in ("RUNNING", "FAILED", "KILLED", "FINISHED"):
         jobs = f"tags.`cfx.sweep` = '{sweep}' and attributes.status = '{status}'"
         if store.client.search_runs([store.experiment_id], jobs, max_results=1):
@@ -479,26 +513,31 @@ def _settle(store: Store, parent_id: str, sweep: str) -> None:
 
 
 def _clean_parameters(parameters: Mapping[str, str]) -> dict[str, str]:
-    """Returns parameters that MLflow takes: other signs in a key become `_`, too long values end in an ellipsis."""
+    """Returns parameters that MLflow takes.
+
+    Other signs in a key become `_`; values that are too long end in an ellipsis.
+    """
     clean = {}
     for key, value in parameters.items():
         name = re.sub(r"[^\w\-. :/]", "_", key)[:_KEY_LENGTH]
-        clean[name] = (
-            value if len(value) <= _PARAMETER_LENGTH else value[: _PARAMETER_LENGTH - 1] + "…"
-        )
+        clean[name] = _shortened(value, _PARAMETER_LENGTH)
     return clean
 
 
 def _tags(tags: Mapping[str, str]) -> list[Any]:
     from mlflow.entities import RunTag
 
-    return [
-        RunTag(
-            key[:_KEY_LENGTH],
-            value if len(value) <= _TAG_LENGTH else value[: _TAG_LENGTH - 1] + "…",
-        )
-        for key, value in tags.items()
-    ]
+    found = []
+    for key, value in tags.items():
+        found.append(RunTag(key[:_KEY_LENGTH], _shortened(value, _TAG_LENGTH)))
+    return found
+
+
+def _shortened(text: str, length: int) -> str:
+    """Returns a text of at most `length` signs; a longer one ends in an ellipsis."""
+    if len(text) <= length:
+        return text
+    return text[: length - 1] + "…"
 
 
 def _fingerprint(parameters: Mapping[str, str], tags: Mapping[str, str]) -> str:
@@ -516,7 +555,9 @@ def _local(artifact_uri: str) -> Path | None:
     from mlflow.utils.file_utils import local_file_uri_to_path
 
     path: str = local_file_uri_to_path(artifact_uri)  # type: ignore[no-untyped-call]  # MLflow's
-    return Path(path) if artifact_uri.startswith(("file:", "/")) else None
+    if not artifact_uri.startswith(("file:", "/")):
+        return None
+    return Path(path)
 
 
 def _address(uri: str) -> tuple[str, tuple[str, ...]]:

@@ -54,7 +54,8 @@ def test_pairs_of_one_driver_are_drawn_together() -> None:
     gain = rng.normal(0.1, 0.2, 12)
     fixed = np.ones(12)
     alone = improvement_statistics(fixed, 1 - gain, seed=0)
-    # Ten copies of every pair tell nothing new about the drivers; taken for independent pairs, they would narrow the interval.
+    # Ten copies of every pair tell nothing new about the drivers; taken for independent pairs, they
+    # would narrow the interval.
     drivers = [f"d{k}" for k in range(12)] * 10
     copied = improvement_statistics(np.tile(fixed, 10), np.tile(1 - gain, 10), drivers, seed=0)
     naive = improvement_statistics(np.tile(fixed, 10), np.tile(1 - gain, 10), seed=0)

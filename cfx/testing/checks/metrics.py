@@ -16,7 +16,10 @@ PAIRS, FRAMES, DT = 5, 80, 0.1
 
 
 def trajectories() -> Trajectories:
-    """Returns followers that swing around the recorded ones: one brakes hard, one collides, one has few frames."""
+    """Returns followers that swing around the recorded ones.
+
+    One brakes hard, one collides, one has few frames.
+    """
     time = DT * torch.arange(FRAMES, dtype=torch.float64)
     phase = torch.arange(PAIRS, dtype=torch.float64)[:, None]
     measured_speed = 12.0 + 2.0 * torch.sin(0.5 * time + phase)
@@ -79,8 +82,8 @@ def frames_that_do_not_count_do_not_matter(metric: Metric) -> None:
         _same(
             metric.compute(other),
             metric.compute(given),
-            "frames that do not count were changed, and the numbers with them: beyond its end a pair"
-            " is padded, and the padding is nobody's",
+            "frames that do not count were changed, and the numbers with them: beyond its end a"
+            " pair is padded, and the padding is nobody's",
         )
 
 
@@ -111,7 +114,8 @@ def a_simulation_without_error_has_none(metric: Metric) -> None:
     perfect = replace(given, speed=given.measured_speed, gap=given.measured_gap)
     values = metric.compute(perfect)
     assert bool((values.abs() < 1e-12).all()), (
-        "`is_error` says that the number is a distance from the recording, so it must be 0 for the recording itself"
+        "`is_error` says that the number is a distance from the recording, so it must be 0 for the"
+        " recording itself"
     )
     assert bool((metric.compute(given) > 0).all()), (
         "the number must be positive where the simulation differs from the recording"
