@@ -14,10 +14,12 @@ import pytest
 import torch
 
 import cfx
+from cfx import registry, renamed
 from cfx.hydra_source import composed
 from cfx.models.base import DrivingModel
 from tests.conftest import ROOT
 from tests.drives import straight_pairs
+from tests.test_imports import FLOORS
 
 DOCUMENTS = [
     "README.md",
@@ -151,14 +153,7 @@ def test_the_table_of_kinds_names_what_is_there() -> None:
 
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (\w+) \| `cfx\.(\w+)` \| .* \| `(\w+)` \|$", text, flags=re.MULTILINE)
-    assert [kind for kind, _, _ in rows] == [
-        "dataset",
-        "model",
-        "optimizer",
-        "policy",
-        "learner",
-        "protocol",
-    ]
+    assert {kind for kind, _, _ in rows} == set(registry.KINDS)
     for kind, base, suite in rows:
         assert getattr(cfx, base).kind == kind
         assert hasattr(getattr(cfx.testing, suite), kind)
@@ -167,6 +162,37 @@ def test_the_table_of_kinds_names_what_is_there() -> None:
         r'^\[project\.entry-points\."cfx\.api"\]\n(\d+) = ', text, flags=re.MULTILINE
     )
     assert int(declared) == cfx.API_VERSION
+
+
+def test_the_map_names_every_room() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    area = text.partition("\ncfx/\n")[2].partition("\nconf/ ")[0]
+    for path in (ROOT / "cfx").iterdir():
+        if path.is_dir() and path.name not in {"__pycache__", "conf"}:
+            assert f"  {path.name}/ " in area, path.name
+        elif path.suffix == ".py" and not path.name.startswith("__"):
+            assert path.name in area, path.name
+    for room in re.findall(r"^  (\w+)/", area, flags=re.MULTILINE):
+        assert (ROOT / "cfx" / room).is_dir(), f"{room} is not there any more"
+
+
+def test_the_floors_are_those_of_the_test_of_imports() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| \d+ \| ([\w, ]+) \|$", text, flags=re.MULTILINE)
+    assert [tuple(row.split(", ")) for row in rows] == list(FLOORS)
+
+
+def test_the_changelog_names_everything_that_was_renamed_or_removed() -> None:
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    pairs = [*renamed.SETTINGS.items(), *renamed.ATTRIBUTES.items()]
+    for (group, old), new in renamed.OPTIONS.items():
+        pairs.append((f"{group}={old}", f"{group}={new}"))
+    for old, new in renamed.PUBLIC.items():
+        pairs.append((f"cfx.{old}", f"cfx.{new}"))
+    for old, new in pairs:
+        assert f"| `{old}` | `{new}` |" in text, old
+    for old in renamed.REMOVED:
+        assert f"| `{old}` | " in text, old
 
 
 def guide() -> list[tuple[str, str]]:
