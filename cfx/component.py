@@ -1,4 +1,4 @@
-"""What every component is: a class with typed settings, found by kind and name through an entry point."""
+"""What every component is: a class with typed settings that an entry point names."""
 
 from __future__ import annotations
 
@@ -19,14 +19,17 @@ from cfx.errors import ConfigError, nearest
 Schema = TypeVar("Schema", bound=BaseModel)
 
 API_VERSION = 1
-"""Version of what plugins may use. It rises only when a plugin that keeps to the public API would have to change."""
+"""Version of what plugins may use.
+
+It rises only when a plugin that keeps to the public API would have to change.
+"""
 
 
 class Settings(BaseModel):
     """Base of every component's settings: frozen, no unknown keys, no NaN or infinity.
 
-    Give each field a `Field(description=...)` with its unit: the text becomes the comment in the config
-    node and the line in `python -m cfx plugins show`.
+    Give each field a `Field(description=...)` with its unit: the text becomes the comment in the
+    config node and the line in `python -m cfx plugins show`.
     """
 
     model_config = ConfigDict(
@@ -35,15 +38,19 @@ class Settings(BaseModel):
 
 
 class Component(ABC):
-    """Base of every dataset, model, optimizer, policy, learner and protocol.
+    """Base of every dataset, model, policy, optimizer and whatever else has a kind.
 
-    Life cycle: the registry imports the class when a config names it, validates the config node against
-    its `schema`, and calls the class with the result. Nothing else happens at construction: reading files,
-    compiling and training wait for the first method call.
+    Life cycle: the registry imports the class when a config names it, validates the config node
+    against its `schema`, and calls the class with the result. Nothing else happens at construction:
+    reading files, compiling and training wait for the first method call.
 
     Attributes:
-        deprecated: what to use instead, where a component is on its way out; jobs that name it log a warning.
-        trial: settings with which `plugins check` tries the component, where trying it with the default ones takes long.
+        kind: as in `cfx.get(kind, name)`; the base class of each kind sets it.
+        deprecated: what to use instead of a component that goes; jobs that name it log a warning.
+        trial: settings with which `plugins check` tries the component, where trying it with the
+            default ones takes long.
+        schema: class of its settings.
+        settings: the validated settings.
     """
 
     kind: ClassVar[str]
@@ -60,11 +67,12 @@ class Component(ABC):
         """
         if settings is not None and options:
             raise TypeError("give either a Settings object or keyword options, not both")
-        # A dataset's config group is `data`, as Hydra users expect; every other kind's is its own name.
-        group = "data" if self.kind == "dataset" else self.kind
-        self.settings = (
-            settings if settings is not None else validate(self.schema, options, where=group)
-        )
+        if settings is None:
+            # A dataset's config group is `data`, as Hydra users expect; every other kind's is its
+            # own name.
+            group = "data" if self.kind == "dataset" else self.kind
+            settings = validate(self.schema, options, where=group)
+        self.settings = settings
 
     def __init_subclass__(cls, **options: Any) -> None:
         """Gives attributes that a class sets under an earlier name their name of today."""
@@ -84,8 +92,8 @@ class Component(ABC):
     def identity(self) -> dict[str, Any]:
         """Returns what results of this component depend on: its class, its settings and its code.
 
-        Cached results carry it. The code is every source file beside the one that defines the class, so that a changed equation
-        is never answered from the cache.
+        Cached results carry it. The code is every source file beside the one that defines the
+        class, so that a changed equation is never answered from the cache.
         """
         return {
             "class": f"{type(self).__module__}.{type(self).__qualname__}",
@@ -95,8 +103,12 @@ class Component(ABC):
 
 
 def content_key(description: Any) -> str:
-    """Returns the SHA-256 of a description that JSON can say; other values count as what `str` makes of them."""
-    return hashlib.sha256(json.dumps(description, sort_keys=True, default=str).encode()).hexdigest()
+    """Returns the SHA-256 of a description as JSON.
+
+    Values that JSON does not know count as what `str` makes of them.
+    """
+    text = json.dumps(description, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 @functools.cache
@@ -121,31 +133,37 @@ def validate(schema: type[Schema], values: Any, *, where: str) -> Schema:
     try:
         return schema.model_validate(values)
     except ValidationError as error:
-        raise ConfigError(
-            "\n".join(_sentence(schema, problem, where) for problem in error.errors())
-        ) from None
+        sentences = [_sentence(schema, problem, where) for problem in error.errors()]
+        raise ConfigError("\n".join(sentences)) from None
 
 
 def _sentence(schema: type[BaseModel], problem: Any, where: str) -> str:
+    """Returns what one of pydantic's errors says, with the full path of the key."""
     location = [str(part) for part in problem["loc"]]
     path = ".".join(part for part in [where, *location] if part)
     if problem["type"] == "extra_forbidden":
         known = sorted(_fields_at(schema, location[:-1]))
-        listed = f" Known keys: {', '.join(known)}." if known else ""
-        return f"{path}: unknown key.{nearest(location[-1], known)}{listed}"
+        text = f"{path}: unknown key.{nearest(location[-1], known)}"
+        if known:
+            text += f" Known keys: {', '.join(known)}."
+        return text
     if problem["type"] == "missing":
         return f"{path}: a value is required; give one as {path}=..."
     message = str(problem["msg"]).removeprefix("Value error, ").removeprefix("Input ")
-    if isinstance(
-        problem["input"], Mapping
-    ):  # several settings contradict each other; the message names them
-        return f"{message if message.startswith(path) else f'{path}: {message}'}."
+    if isinstance(problem["input"], Mapping):
+        # Several settings contradict each other; the message names them.
+        if message.startswith(path):
+            return f"{message}."
+        return f"{path}: {message}."
     return f"{path}={problem['input']!r}: {message}."
 
 
 def _fields_at(schema: type[BaseModel], location: list[str]) -> list[str]:
+    """Returns the names of the settings at a path; nothing where no settings are."""
     current: Any = schema
     for part in location:
         field = getattr(current, "model_fields", {}).get(part)
-        current = field.annotation if field is not None else None
+        if field is None:
+            return []
+        current = field.annotation
     return list(getattr(current, "model_fields", {}))

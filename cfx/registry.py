@@ -1,11 +1,13 @@
-"""One lazy registry for every kind of component; built-in and third-party components come in by the same entry points.
+"""One lazy registry for every kind of component, of cfx itself and of third parties.
 
-`names` and `entries` read the metadata of installed distributions and import nothing. `get` imports the one component that is
-asked for, checks it, and only then keeps it; `create` probes it for some milliseconds before a job relies on it. A broken plugin
-therefore never harms a run that does not name it, and stops one that does with a sentence that names its distribution.
+All components come in by entry points. `names` and `entries` read the metadata of installed
+distributions and import nothing. `get` imports the one component that is asked for, checks it, and
+only then keeps it. `create` tries it for some milliseconds before a job relies on it. A broken
+plugin therefore never harms a run that does not name it, and stops one that does with a sentence
+that names its distribution.
 
-A distribution says which version of the plugin API it was built for by an entry point of the group `cfx.api` whose name is the
-version, so that this is known without importing it:
+A distribution says which version of the plugin API it was built for by an entry point of the group
+`cfx.api` whose name is the version, so that this is known without importing it:
 
     [project.entry-points."cfx.api"]
     1 = "my_package"
@@ -38,7 +40,7 @@ OWN = "cfx-driving"
 """The distribution whose components nobody else's can replace."""
 
 API_GROUP = "cfx.api"
-"""Entry-point group in which a distribution says what version of the plugin API it was built for."""
+"""Entry-point group in which a distribution says which version of the plugin API it needs."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +52,8 @@ class Kind:
         group: its config group, the folder in `conf/` and the key in configs.
         entry_points: its entry-point group.
         base: module and class that its components extend.
-        smoke_check: module and function that tries a new component for some milliseconds; "" where its base
-            class checks what it gives.
+        smoke_check: module and function that tries a new component for some milliseconds; "" where
+            its base class checks what it gives.
         chosen: a job chooses one of this kind, by a config group; metrics are all measured.
     """
 
@@ -145,11 +147,17 @@ class Entry:
         return self.target.partition(":")[0].partition(".")[0]
 
     def __str__(self) -> str:
-        return f"{self.kind} '{self.name}' ({self.target}) of the distribution {self.distribution} {self.version}"
+        return (
+            f"{self.kind} '{self.name}' ({self.target})"
+            f" of the distribution {self.distribution} {self.version}"
+        )
 
 
 _loaded: dict[Entry, type[Component]] = {}
+"""Classes that were imported and passed their checks."""
+
 _smoke_checked: set[tuple[Entry, str]] = set()
+"""Components that were tried, with their settings as JSON."""
 
 
 def kind_of(kind: str) -> Kind:
@@ -167,7 +175,9 @@ def kind_of(kind: str) -> Kind:
 
 
 def entries(kind: str) -> tuple[Entry, ...]:
-    """Returns what the installed distributions announce, sorted by name; two entries may share a name. Imports nothing.
+    """Returns what the installed distributions announce, sorted by name. Imports nothing.
+
+    Two entries may share a name.
 
     Raises:
         PluginError: there is no such kind.
@@ -184,24 +194,32 @@ def entry(kind: str, name: str) -> Entry:
     """Returns the one entry of that name. Imports nothing.
 
     Raises:
-        PluginError: the name is unknown, or two third parties claim it. A name of cfx's own always means cfx's own.
+        PluginError: the name is unknown, or two third parties claim it. A name of cfx's own always
+            means cfx's own.
     """
     group, what = kind_of(kind).group, kind_of(kind).name
-    found = [candidate for candidate in entries(kind) if candidate.name == name]
-    found = [candidate for candidate in found if candidate.distribution == OWN] or found
+    found = []
+    for candidate in entries(kind):
+        if candidate.name == name:
+            if candidate.distribution == OWN:
+                return candidate
+            found.append(candidate)
     if not found:
         known = names(kind)
         if not known:
             raise PluginError(
-                f"{group}={name}: no {what} is installed, not even cfx's own; run make run, or pip install -e ."
+                f"{group}={name}: no {what} is installed, not even cfx's own;"
+                " run make run, or pip install -e ."
             )
         raise PluginError(
-            f"{group}={name}: there is no {what} '{name}'.{nearest(name, known)} Known: {', '.join(known)}."
+            f"{group}={name}: there is no {what} '{name}'.{nearest(name, known)}"
+            f" Known: {', '.join(known)}."
         )
     if len(found) > 1:
         claims = " and ".join(f"{one.distribution} {one.version} ({one.target})" for one in found)
         raise PluginError(
-            f"{group}={name}: two distributions bring a {what} '{name}': {claims}; uninstall one of them"
+            f"{group}={name}: two distributions bring a {what} '{name}': {claims};"
+            " uninstall one of them"
         )
     return found[0]
 
@@ -210,8 +228,8 @@ def get(kind: str, name: str) -> type[Component]:
     """Imports, checks and returns a component's class.
 
     Raises:
-        PluginError: the name is unknown or claimed twice; or the component was built for another version of the plugin API,
-            cannot be imported, or breaks the contract of its kind.
+        PluginError: the name is unknown or claimed twice; or the component was built for another
+            version of the plugin API, cannot be imported, or breaks the contract of its kind.
     """
     found = entry(kind, name)
     if found not in _loaded:
@@ -228,7 +246,8 @@ def create(kind: str, node: Mapping[str, Any]) -> Component:
     """Creates a component from its config node: `name` and its settings.
 
     Raises:
-        PluginError: as `get`; or it cannot be created, or breaks its contract when it is tried for a moment.
+        PluginError: as `get`; or it cannot be created, or breaks its contract when it is tried for
+            a moment.
         ConfigError: the node has no name, an unknown key or a wrong value.
         ParameterError: a model's parameters contradict each other.
     """
@@ -287,33 +306,50 @@ def is_loaded(found: Entry) -> bool:
 
 
 def rivals(found: Entry) -> tuple[Entry, ...]:
-    """Returns the entries of other distributions that keep this one from being used; empty for most. Imports nothing."""
+    """Returns the entries of other distributions that keep this one from being used.
+
+    It is empty for most. Imports nothing.
+    """
     if found.distribution == OWN:
         return ()
-    others = [one for one in entries(found.kind) if one.name == found.name and one != found]
-    return tuple(one for one in others if one.distribution == OWN) or tuple(others)
+    others = []
+    for other in entries(found.kind):
+        if other.name == found.name and other != found:
+            if other.distribution == OWN:
+                return (other,)
+            others.append(other)
+    return tuple(others)
 
 
 def other_api(found: Entry) -> str:
-    """Returns a sentence if the distribution was built for other versions of the plugin API only, "" if not. Imports nothing."""
+    """Returns a sentence if the distribution was built for other versions of the plugin API only.
+
+    Returns "" if it was not. Imports nothing.
+    """
     if found.distribution == OWN or not found.api or str(API_VERSION) in found.api:
         return ""
     versions = [int(one) for one in found.api if one.isdecimal()]
     if not versions:
         return (
-            f"{found} declares '{found.api[0]}' as its version of cfx's plugin API, which is no number; its author must name the"
-            f" entry point of the group {API_GROUP} by one, such as {API_VERSION}"
+            f"{found} declares '{found.api[0]}' as its version of cfx's plugin API, which is no"
+            f" number; its author must name the entry point of the group {API_GROUP} by one,"
+            f" such as {API_VERSION}"
         )
-    newer = min(versions) > API_VERSION
-    advice = f"pip install --upgrade {OWN if newer else found.distribution}"
+    outdated = found.distribution
+    if min(versions) > API_VERSION:
+        outdated = OWN
     return (
-        f"{found} was built for version {' and '.join(found.api)} of cfx's plugin API, this cfx has version {API_VERSION};"
-        f" {advice}, or pip uninstall {found.distribution}"
+        f"{found} was built for version {' and '.join(found.api)} of cfx's plugin API, this cfx has"
+        f" version {API_VERSION}; pip install --upgrade {outdated}, or pip uninstall"
+        f" {found.distribution}"
     )
 
 
 def origin(component: Component | type[Component]) -> str:
-    """Returns whose a component is, for messages: kind, name, class and distribution; the class alone if it is no plugin's."""
+    """Returns whose a component is, for messages: kind, name, class and distribution.
+
+    A class that no distribution announces is named alone.
+    """
     cls = component if isinstance(component, type) else type(component)
     for found, loaded in _loaded.items():
         if loaded is cls:
@@ -357,69 +393,84 @@ def _smoke_check(found: Entry, component: Component, settings: BaseModel) -> Non
 
 
 def _remedy(found: Entry) -> str:
-    return f"; repair that distribution (cfx plugins check {found.kind} {found.name}), or pip uninstall {found.distribution}"
+    return (
+        f"; repair that distribution (cfx plugins check {found.kind} {found.name}),"
+        f" or pip uninstall {found.distribution}"
+    )
 
 
 def _warn_of_deprecated(found: Entry, cls: type[Component], settings: BaseModel) -> None:
-    """Logs a warning for a component that its class calls deprecated, and for each changed setting that its field calls so."""
+    """Logs a warning for a deprecated component, and for each deprecated setting that is set."""
     if cls.deprecated:
         log.warning("%s is deprecated: %s", found, cls.deprecated)
     for name, field in cls.schema.model_fields.items():
-        if field.deprecated and settings.__dict__[name] != field.get_default(
-            call_default_factory=True, validated_data={}
-        ):
+        if not field.deprecated:
+            continue
+        default = field.get_default(call_default_factory=True, validated_data={})
+        if settings.__dict__[name] != default:  # getattr would raise pydantic's own warning
             path = f"{kind_of(found.kind).group}.{name}"
             log.warning("%s of %s is deprecated: %s", path, found, field.deprecation_message)
 
 
 def _search_path() -> tuple[tuple[str, float], ...]:
-    """Returns what changes when a distribution is installed, so that a new plugin is seen without a restart."""
-    return tuple(
-        (folder, Path(folder).stat().st_mtime)
-        for folder in sys.path
-        if folder and Path(folder).exists()
-    )
+    """Returns what changes when a distribution is installed.
+
+    With it as a key of a cache, a new plugin is seen without a restart.
+    """
+    changed = []
+    for folder in sys.path:
+        if folder and Path(folder).exists():
+            changed.append((folder, Path(folder).stat().st_mtime))
+    return tuple(changed)
 
 
 @functools.lru_cache(maxsize=1)
-def _announced(search_path: tuple[tuple[str, float], ...]) -> dict[str, tuple[Entry, ...]]:  # noqa: ARG001 - the cache's key
+def _announced(
+    search_path: tuple[tuple[str, float], ...],  # noqa: ARG001 - the cache's key
+) -> dict[str, tuple[Entry, ...]]:
+    """Returns the entries of every kind, sorted."""
     found: dict[str, list[Entry]] = {name: [] for name in KINDS}
     seen = set()
     for distribution in importlib.metadata.distributions():
         try:
             announced = list(_entries(distribution))
-        except Exception:  # noqa: S112 - metadata that cannot be read, whoever's it is, announces nothing and harms nobody
+        except Exception:  # noqa: S112 - metadata that cannot be read announces nothing
             continue
-        if (
-            announced and announced[0].distribution not in seen
-        ):  # the first on the search path is the one that is imported
+        # The first of a name on the search path is the one that is imported.
+        if announced and announced[0].distribution not in seen:
             seen.add(announced[0].distribution)
             for one in announced:
                 found[one.kind].append(one)
-    return {
-        name: tuple(sorted(ones, key=attrgetter("name", "distribution")))
-        for name, ones in found.items()
-    }
+    ordered = {}
+    for name, ones in found.items():
+        ordered[name] = tuple(sorted(ones, key=attrgetter("name", "distribution")))
+    return ordered
 
 
 def _entries(distribution: importlib.metadata.Distribution) -> Iterator[Entry]:
+    """Yields what one distribution announces.
+
+    Raises:
+        ValueError: its metadata are damaged.
+    """
     kinds = {kind.entry_points: kind.name for kind in KINDS.values()}
-    points = [point for point in distribution.entry_points if point.group in {*kinds, API_GROUP}]
+    points = list(distribution.entry_points)
     api = tuple(sorted(point.name for point in points if point.group == API_GROUP))
     for point in points:
-        if point.group != API_GROUP:
-            name, version = distribution.metadata["Name"], distribution.version
-            if not isinstance(name, str) or not isinstance(version, str):
-                raise ValueError("the metadata name no distribution, or no version")
-            yield Entry(
-                kinds[point.group],
-                point.name,
-                point.value,
-                name,
-                version,
-                str(distribution.locate_file("")),
-                api,
-            )
+        if point.group not in kinds:
+            continue
+        name, version = distribution.metadata["Name"], distribution.version
+        if not isinstance(name, str) or not isinstance(version, str):
+            raise ValueError("the metadata name no distribution, or no version")
+        yield Entry(
+            kind=kinds[point.group],
+            name=point.name,
+            target=point.value,
+            distribution=name,
+            version=version,
+            location=str(distribution.locate_file("")),
+            api=api,
+        )
 
 
 def _import(found: Entry) -> Any:
@@ -430,7 +481,8 @@ def _import(found: Entry) -> Any:
         raise
     except BaseException as error:  # a plugin may raise anything, even SystemExit
         raise PluginError(
-            f"{found} cannot be imported: {in_words(error)}; repair that distribution, or pip uninstall {found.distribution}"
+            f"{found} cannot be imported: {in_words(error)};"
+            f" repair that distribution, or pip uninstall {found.distribution}"
         ) from error
 
 
@@ -439,13 +491,15 @@ def _check(found: Entry, cls: Any) -> None:
     base = _resolve(KINDS[found.kind].base)
     if not inspect.isclass(cls):
         raise PluginError(
-            f"{found} is no class but {type(cls).__name__}; point its entry point at a subclass of {base.__name__}"
+            f"{found} is no class but {type(cls).__name__};"
+            f" point its entry point at a subclass of {base.__name__}"
         )
     if not issubclass(cls, Component) or not issubclass(cls, base):
         raise PluginError(f"{found} does not extend {base.__module__}.{base.__name__}")
     if cls.kind != base.kind:
         raise PluginError(
-            f"{found} says kind='{cls.kind}', but a {found.kind} keeps kind='{base.kind}' of its base class"
+            f"{found} says kind='{cls.kind}',"
+            f" but a {found.kind} keeps kind='{base.kind}' of its base class"
         )
     missing = sorted(cls.__abstractmethods__)
     if missing:
@@ -455,7 +509,8 @@ def _check(found: Entry, cls: Any) -> None:
         raise PluginError(f"{found}: its schema must be a subclass of cfx.Settings, not {schema!r}")
     if "name" in schema.model_fields:
         raise PluginError(
-            f"{found}: its settings must not have a field 'name', which chooses the component itself"
+            f"{found}: its settings must not have a field 'name',"
+            " which chooses the component itself"
         )
     if found.kind == "model":
         _check_model(found, cls)
@@ -475,7 +530,8 @@ def _check_model(found: Entry, cls: Any) -> None:
     space = getattr(cls, "parameters", None)
     if not isinstance(space, ParameterSpace):
         raise PluginError(
-            f"{found}: its attribute 'parameters' must be a cfx.ParameterSpace, not {type(space).__name__}"
+            f"{found}: its attribute 'parameters' must be a cfx.ParameterSpace,"
+            f" not {type(space).__name__}"
         )
     if not space.tuned and not space.open:
         raise PluginError(f"{found}: at least one of its parameters must be tuned")
@@ -487,20 +543,26 @@ def _resolve(target: str) -> Any:
 
 
 def _without_blanks(schema: type[BaseModel], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Leaves out null for settings that are required and cannot be null, so that the error asks for a value."""
-    kept = {}
+    """Leaves out null for settings that are required and cannot be null.
+
+    The error then asks for a value.
+    """
+    kept: dict[str, Any] = {}
     for key, value in values.items():
+        kept[key] = value
         field = schema.model_fields.get(key)
-        if value is None and field is not None and is_blank(field):
+        if field is None:
             continue
-        nested: Any = field.annotation if field is not None else None
-        is_settings = (
-            inspect.isclass(nested) and issubclass(nested, BaseModel) and isinstance(value, Mapping)
-        )
-        kept[key] = _without_blanks(nested, value) if is_settings else value
+        nested: Any = field.annotation
+        if value is None and is_blank(field):
+            del kept[key]
+        elif (
+            isinstance(value, Mapping) and inspect.isclass(nested) and issubclass(nested, BaseModel)
+        ):
+            kept[key] = _without_blanks(nested, value)
     return kept
 
 
 def is_blank(field: FieldInfo) -> bool:
-    """Says whether a config node holds null for this setting only because the user must give a value."""
+    """Says whether null in a config node means that the user must give a value."""
     return field.is_required() and type(None) not in get_args(field.annotation)

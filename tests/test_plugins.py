@@ -209,7 +209,7 @@ PROTOCOL = """
     import cfx
 
     class Mine(cfx.Protocol):
-        def run(self, study):
+        def run(self, context):
             return cfx.get("protocol", "within_driver")().run(context)
 """
 
