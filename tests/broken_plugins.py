@@ -84,6 +84,22 @@ class Bad(Dataset):
         {}
 """
 
+_SIMULATOR = """
+from cfx import Simulator
+from cfx.simulation.rollout import MemoryStepper
+
+class Bad(Simulator):
+    differentiable = True
+
+    def stepper(self, model, dt):
+        return {}
+
+class Single(MemoryStepper):
+    def advance(self, *inputs):
+        end, position, speed = super().advance(*inputs)
+        return end, position.float(), speed.float()
+"""
+
 
 @dataclass(frozen=True)
 class Broken:
@@ -266,6 +282,18 @@ BROKEN = (
         "optimizers",
         _OPTIMIZER.format("return None").replace("return 4", "return 4.5"),
         r"evaluations\(\) gives 4\.5; it must give a whole number",
+    ),
+    Broken(
+        "no_stepper",
+        "simulators",
+        _SIMULATOR.format("None"),
+        "stepper returns a NoneType and no Stepper",
+    ),
+    Broken(
+        "single_steps",
+        "simulators",
+        _SIMULATOR.format("Single(model, dt)"),
+        r"advance's positions gives torch\.float32 for torch\.float64",
     ),
     Broken(
         "no_pairs",

@@ -9,7 +9,8 @@ import torch
 
 from cfx.models.base import DrivingModel, Leader
 from cfx.pairs import Pair, PairSet
-from cfx.simulation.rollout import Start, simulate
+from cfx.simulation.rollout import simulate
+from cfx.simulation.trajectory import Start
 
 
 def straight_pairs(frames: Sequence[int], speed: float = 10.0) -> PairSet:

@@ -120,7 +120,9 @@ def test_all_broken_plugins_at_once_harm_nobody_else(
     assert list(tmp_path.rglob("metrics.json"))
 
 
-@pytest.mark.parametrize("kind", ["model", "policy", "optimizer", "dataset", "learner", "protocol"])
+@pytest.mark.parametrize(
+    "kind", ["model", "simulator", "policy", "optimizer", "dataset", "learner", "protocol"]
+)
 def test_check_finds_every_broken_plugin_and_says_one_sentence_each(
     install: Installer, twins: None, kind: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -129,7 +131,7 @@ def test_check_finds_every_broken_plugin_and_says_one_sentence_each(
         put(install, broken)
         if registry.KINDS[kind].entry_points == f"cfx.{broken.kind}":
             expected[broken.distribution] = broken.name
-    own = {"optimizer": "random", "model": "krauss"}.get(kind)
+    own = {"optimizer": "random", "model": "krauss", "simulator": "memory"}.get(kind)
     for name in [*expected.values(), *([own] if own else [])]:
         cli.main(["plugins", "check", kind, name])
     printed = capsys.readouterr()
@@ -346,6 +348,7 @@ def test_the_shell_completes_a_plugins_name_and_its_parameters(install: Installe
 
 GENERATED = [
     pytest.param("model"),
+    pytest.param("simulator", marks=pytest.mark.slow),
     pytest.param("dataset", marks=pytest.mark.slow),
     pytest.param("optimizer", marks=pytest.mark.slow),
     pytest.param("policy", marks=pytest.mark.slow),

@@ -12,7 +12,7 @@ from cfx.models.base import Leader
 from cfx.objectives.base import FrameValues, Objective
 from cfx.pairs import PairBatch
 from cfx.simulation.base import Stepper
-from cfx.simulation.rollout import Start
+from cfx.simulation.trajectory import Start
 
 _NOT_BATCHED = ("simulator", "objective")
 """Fields of `SegmentLosses` that all its segments share."""

@@ -131,7 +131,8 @@ def _simulate(s: SyntheticSettings, platoons: int, rng: np.random.Generator) -> 
     import torch
 
     from cfx.models.base import Leader
-    from cfx.simulation.rollout import Start, simulate
+    from cfx.simulation.rollout import simulate
+    from cfx.simulation.trajectory import Start
 
     model = _model(s.model)
     hold = max(1, round(HOLD_S / s.dt))

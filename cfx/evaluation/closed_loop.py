@@ -19,9 +19,9 @@ from cfx.agents.context import DriverContext
 from cfx.models.base import Leader
 from cfx.pairs import PairBatch
 from cfx.policies.features import History
-from cfx.simulation.base import BaseSimulator
-from cfx.simulation.rollout import Start
+from cfx.simulation.base import Stepper
 from cfx.simulation.threads import one_thread
+from cfx.simulation.trajectory import Start
 
 
 class ClosedLoop(NamedTuple):
@@ -42,7 +42,7 @@ class ClosedLoop(NamedTuple):
 @torch.no_grad()
 @one_thread()
 def simulate_closed_loop(
-    simulator: BaseSimulator,
+    simulator: Stepper,
     agent: Agent,
     batch: PairBatch,
     first: Tensor,

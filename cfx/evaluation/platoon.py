@@ -23,8 +23,9 @@ from cfx.evaluation.result import METHODS, Array, Platoon
 from cfx.metrics.safety import hard_braking_frames
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.policies.features import History
-from cfx.simulation.rollout import Simulator, Start
+from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.threads import one_thread
+from cfx.simulation.trajectory import Start
 
 VEHICLES = 10
 """Followers of a platoon."""
@@ -189,7 +190,7 @@ def drive_platoons(
     sizes = [len(policy.names) for policy in policies]
     parts = [slice(sum(sizes[:k]), sum(sizes[: k + 1])) for k in range(len(sizes))]
     road = _Road(torch.as_tensor(manoeuvre.speed(dt), device=device), sum(sizes), dt)
-    simulator = Simulator(model, dt, compile="never")
+    simulator = MemoryStepper(model, dt, compile="never")
     states = [
         policy.begin(torch.arange(n, device=device).repeat(VEHICLES))
         for policy, n in zip(policies, sizes, strict=True)

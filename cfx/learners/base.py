@@ -23,7 +23,7 @@ from cfx.objectives.base import Objective
 from cfx.objectives.rmse import SpeedRmse
 from cfx.pairs import PairBatch
 from cfx.policies.base import Policy, PolicyNetwork
-from cfx.simulation.base import BaseSimulator
+from cfx.simulation.base import Stepper
 
 CURVE_COLUMNS = ["network", "epoch", "train_loss", "validation_loss"]
 
@@ -50,7 +50,7 @@ class TrainingData:
         objective: what training that simulates in closed loop minimises; calibration has minimised it too.
     """
 
-    simulator: BaseSimulator
+    simulator: Stepper
     batch: PairBatch
     split: Split
     windows: WindowSettings

@@ -31,7 +31,7 @@ from cfx.pairs import PairBatch, PairSet
 from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy
 from cfx.policies.features import token_width
-from cfx.simulation.base import BaseSimulator
+from cfx.simulation.base import Stepper
 from cfx.style.result import StyleResult
 
 log = logging.getLogger(__name__)
@@ -57,7 +57,7 @@ class ProtocolContext:
     pairs: PairSet
     batch: PairBatch
     style: StyleResult
-    simulator: BaseSimulator
+    simulator: Stepper
     model_node: Mapping[str, Any]
     policy_node: Mapping[str, Any]
     calibrator: Calibrator

@@ -25,7 +25,8 @@ from cfx.models.w99 import W99
 from cfx.objectives.rmse import SpeedRmse
 from cfx.optimizers.botorch import BotorchOptimizer
 from cfx.optimizers.random import RandomSearch
-from cfx.simulation.rollout import MemoryStepper, Start
+from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.trajectory import Start
 
 WINDOWS, STEPS, DT, LOOPED = 128, 5, 0.1, 2
 

@@ -22,7 +22,8 @@ from cfx.models.base import DrivingModel, Leader
 from cfx.models.krauss import Krauss
 from cfx.models.w74 import W74
 from cfx.models.w99 import W99
-from cfx.simulation.rollout import Compile, Simulator, Start, can_compile
+from cfx.simulation.rollout import Compile, MemoryStepper, can_compile
+from cfx.simulation.trajectory import Start
 
 numba = pytest.importorskip("numba")
 
@@ -124,7 +125,7 @@ class Case:
         self.start = Start(zero, zero + 9 + uniform(PROBLEMS, 1), zero)
 
     def torch(self, compile: Compile) -> Tensor:
-        simulator = Simulator(self.model, DT, compile=compile)
+        simulator = MemoryStepper(self.model, DT, compile=compile)
         with torch.inference_mode():
             return simulator.advance(simulator.begin(self.start), self.leader, self.p)[2]
 

@@ -25,7 +25,7 @@ from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.pairs import PairBatch
 from cfx.policies.gru import GruPolicy
-from cfx.simulation.rollout import Simulator
+from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.threads import one_thread
 from tests.drives import wavy_pairs
 
@@ -45,7 +45,7 @@ def _lesson(model: DrivingModel, networks: int) -> TrainingData:
     names, windows = tuple(f"fold {k}" for k in range(networks)), WindowSettings()
     batch, split = PairBatch.of(pairs)[index], Split.none(pairs, windows)[index]
     return TrainingData(
-        Simulator(model, 0.1),
+        MemoryStepper(model, 0.1),
         batch,
         split,
         windows,

@@ -16,7 +16,7 @@ from cfx.learners.imitation import ImitationLearner
 from cfx.models.krauss import Krauss
 from cfx.pairs import PairBatch
 from cfx.policies.gru import GruPolicy
-from cfx.simulation.rollout import Simulator
+from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.threads import one_thread
 from tests.drives import straight_pairs
 
@@ -42,7 +42,7 @@ def _lesson() -> TrainingData:
     fixed = model.space.defaults().expand(PAIRS, 2)
     names = tuple(f"p{i}" for i in range(PAIRS))
     return TrainingData(
-        Simulator(model, 0.1),
+        MemoryStepper(model, 0.1),
         PairBatch.of(pairs),
         split,
         settings,

@@ -13,7 +13,8 @@ from cfx.objectives.mixed import Mixed
 from cfx.objectives.rmse import GapRmse, SpeedRmse
 from cfx.objectives.theil import TheilU
 from cfx.pairs import PairBatch
-from cfx.simulation.rollout import MemoryStepper, Start, simulate
+from cfx.simulation.rollout import MemoryStepper, simulate
+from cfx.simulation.trajectory import Start
 from tests.drives import wavy_pairs
 
 TRUE = torch.tensor([[1.2, 0.1], [2.0, 0.4], [3.0, 0.8]], dtype=torch.float64)

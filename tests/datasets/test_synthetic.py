@@ -12,7 +12,8 @@ from cfx.models.base import DrivingModel, Leader
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.pairs import Pair, PairSet
-from cfx.simulation.rollout import Start, Trajectory, simulate
+from cfx.simulation.rollout import simulate
+from cfx.simulation.trajectory import Start, Trajectory
 
 MODELS: dict[str, type[DrivingModel]] = {"krauss": Krauss, "w99": W99}
 

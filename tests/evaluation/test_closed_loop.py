@@ -22,7 +22,8 @@ from cfx.pairs import PairBatch
 from cfx.policies.base import ConstantNetwork, Policy
 from cfx.policies.fixed import FixedPolicy
 from cfx.policies.gru import GruPolicy
-from cfx.simulation.rollout import Simulator, Start, simulate
+from cfx.simulation.rollout import MemoryStepper, simulate
+from cfx.simulation.trajectory import Start
 from cfx.style.result import StyleResult
 from tests.drives import wavy_pairs
 
@@ -68,7 +69,7 @@ def test_true_parameters_drive_exactly_like_the_driver(model: DrivingModel) -> N
     pairs = wavy_pairs(model, true)
     batch = PairBatch.of(pairs)
     loop = simulate_closed_loop(
-        Simulator(model, 0.1),
+        MemoryStepper(model, 0.1),
         constant(model, true),
         batch,
         torch.tensor([200, 215, 100]),
@@ -89,7 +90,7 @@ def test_constant_parameters_are_the_plain_rollout() -> None:
     )
     first = torch.tensor([150, 150])
     loop = simulate_closed_loop(
-        Simulator(model, 0.1), constant(model, parameters), batch, first, torch.arange(2)
+        MemoryStepper(model, 0.1), constant(model, parameters), batch, first, torch.arange(2)
     )
     leader = Leader(
         batch.leader_position[:, 150:],
@@ -116,7 +117,7 @@ def closed_loop_of(batch: PairBatch, model: DrivingModel, first: Tensor) -> Clos
         15,
     )
     return simulate_closed_loop(
-        Simulator(model, 0.1), policy, batch, first, torch.arange(len(batch))
+        MemoryStepper(model, 0.1), policy, batch, first, torch.arange(len(batch))
     )
 
 
@@ -163,10 +164,10 @@ def test_a_pair_drives_the_same_whatever_drives_beside_it() -> None:
     batch = PairBatch.of(wavy_pairs(model, true))
     policy = adaptive(model, GruPolicy(start="middle"), 3, 10)
     together = simulate_closed_loop(
-        Simulator(model, 0.1), policy, batch, torch.tensor([150, 200, 100]), torch.arange(3)
+        MemoryStepper(model, 0.1), policy, batch, torch.tensor([150, 200, 100]), torch.arange(3)
     )
     alone = simulate_closed_loop(
-        Simulator(model, 0.1), policy, batch[1:2], torch.tensor([200]), torch.tensor([1])
+        MemoryStepper(model, 0.1), policy, batch[1:2], torch.tensor([200]), torch.tensor([1])
     )
     steps = alone.speed.shape[1]
     torch.testing.assert_close(together.speed[1:2, :steps], alone.speed, atol=1e-5, rtol=1e-5)
@@ -179,10 +180,10 @@ def test_several_drivers_share_one_network() -> None:
     )
     shared = adaptive(model, GruPolicy(start="middle"), 1, 10)
     both = simulate_closed_loop(
-        Simulator(model, 0.1), shared, batch, torch.tensor([150, 150]), torch.tensor([0, 0])
+        MemoryStepper(model, 0.1), shared, batch, torch.tensor([150, 150]), torch.tensor([0, 0])
     )
     second = simulate_closed_loop(
-        Simulator(model, 0.1), shared, batch[1:2], torch.tensor([150]), torch.tensor([0])
+        MemoryStepper(model, 0.1), shared, batch[1:2], torch.tensor([150]), torch.tensor([0])
     )
     torch.testing.assert_close(both.parameters[1:2], second.parameters, atol=1e-5, rtol=1e-5)
 
@@ -193,7 +194,7 @@ def test_the_table_says_what_the_loops_did() -> None:
     pairs = wavy_pairs(model, true)
     batch = PairBatch.of(pairs)
     first = torch.tensor([150, 200])
-    simulator = Simulator(model, 0.1)
+    simulator = MemoryStepper(model, 0.1)
     loops = {
         "default": simulate_closed_loop(
             simulator,
@@ -240,7 +241,7 @@ def test_a_collision_is_counted() -> None:
     batch = PairBatch.of(pairs)
     first = torch.tensor([150])
     loop = simulate_closed_loop(
-        Simulator(model, 0.1),
+        MemoryStepper(model, 0.1),
         constant(model, torch.tensor([[1.5, 0.1]]).double()),
         batch,
         first,

@@ -25,7 +25,7 @@ from cfx.models.sumo_vtype import SumoVType
 from cfx.pairs import PairBatch
 from cfx.parameters import Parameter, ParameterSpace
 from cfx.policies.gru import GruPolicy
-from cfx.simulation.rollout import Simulator
+from cfx.simulation.rollout import MemoryStepper
 from tests.evaluation.test_closed_loop import adaptive, constant
 
 
@@ -134,7 +134,7 @@ def test_each_vehicle_drives_as_it_would_alone_behind_the_one_before() -> None:
             0.1,
         )
         alone = simulate_closed_loop(
-            Simulator(model, 0.1), policy, batch, torch.zeros(2).long(), torch.arange(2)
+            MemoryStepper(model, 0.1), policy, batch, torch.zeros(2).long(), torch.arange(2)
         )
         torch.testing.assert_close(alone.speed, own, atol=1e-5, rtol=0)
         torch.testing.assert_close(alone.gap, gap[vehicle - 1], atol=1e-4, rtol=0)

@@ -14,7 +14,7 @@ from cfx.learners.imitation import ImitationLearner
 from cfx.models.krauss import Krauss
 from cfx.pairs import PairBatch
 from cfx.policies.gru import GruPolicy
-from cfx.simulation.rollout import Simulator
+from cfx.simulation.rollout import MemoryStepper
 from tests.drives import wavy_pairs
 
 SETTINGS = WindowSettings()
@@ -48,7 +48,7 @@ def training_data(
     network, groups = group_by(names)
     fixed = model.space.defaults().expand(pairs, 2)
     return TrainingData(
-        Simulator(model, 0.1), batch, split, SETTINGS, fixed, labels, network, groups, seed=0
+        MemoryStepper(model, 0.1), batch, split, SETTINGS, fixed, labels, network, groups, seed=0
     )
 
 

@@ -31,7 +31,7 @@ from cfx.policies.driver_features import measure
 from cfx.policies.ensemble import Ensemble
 from cfx.policies.gru import GruPolicy
 from cfx.policies.lstm import LstmPolicy
-from cfx.simulation.rollout import Simulator
+from cfx.simulation.rollout import MemoryStepper
 from tests.drives import wavy_pairs
 
 WINDOWS = WindowSettings()
@@ -68,7 +68,7 @@ def training_data(
         start[:] = torch.tensor([4.0, 0.8])
     return replace(
         TrainingData(
-            Simulator(model, 0.1),
+            MemoryStepper(model, 0.1),
             batch[index],
             split[index],
             WINDOWS,
@@ -588,7 +588,7 @@ def test_compiled_training_is_eager_training() -> None:
 
 
 def test_a_simulator_without_gradients_is_refused() -> None:
-    class Blind(Simulator):
+    class Blind(MemoryStepper):
         differentiable = False
 
     dataset = training_data(networks=1)

@@ -6,7 +6,8 @@ import torch
 import cfx
 from cfx.models.base import Leader
 from cfx.models.direct import Direct
-from cfx.simulation.rollout import Start, simulate
+from cfx.simulation.rollout import simulate
+from cfx.simulation.trajectory import Start
 from cfx.testing.models import ModelContract
 
 

@@ -30,7 +30,8 @@ class TestIdmSumo(ModelContract):
 
 def test_krauss_sumo_keeps_its_time_gap_behind_a_steady_leader() -> None:
     from cfx.models.base import Leader
-    from cfx.simulation.rollout import Start, simulate
+    from cfx.simulation.rollout import simulate
+    from cfx.simulation.trajectory import Start
 
     time = torch.arange(3000, dtype=torch.float64) * 0.1
     speed = torch.full_like(time, 15.0)

@@ -29,7 +29,8 @@ from cfx.models.krauss_sumo import KraussSumo
 from cfx.models.vtype import InSumo, VType
 from cfx.models.w74 import W74
 from cfx.models.w99 import W99
-from cfx.simulation.rollout import Start, Trajectory, simulate
+from cfx.simulation.rollout import simulate
+from cfx.simulation.trajectory import Start, Trajectory
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("libsumo") is None,

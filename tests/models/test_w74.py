@@ -6,7 +6,8 @@ from torch import Tensor
 
 from cfx.models.base import Follower, Leader
 from cfx.models.w74 import W74
-from cfx.simulation.rollout import Start, simulate
+from cfx.simulation.rollout import simulate
+from cfx.simulation.trajectory import Start
 from cfx.testing.models import ModelContract
 
 L, V = 5.0, 10.0

@@ -27,7 +27,7 @@ from cfx.policies.ensemble import Ensemble
 from cfx.policies.features import History
 from cfx.progress import Task
 from cfx.protocols.across_drivers import AcrossDrivers
-from cfx.simulation.rollout import Simulator
+from cfx.simulation.rollout import MemoryStepper
 from tests.drives import straight_pairs, wavy_pairs
 
 QUICK = [
@@ -131,7 +131,7 @@ def test_too_few_drivers_are_told() -> None:
 
 def calibrator(memory: int = 1 << 28, samples: int = 256) -> Calibrator:
     return Calibrator(
-        Simulator(Krauss(), 0.1),
+        MemoryStepper(Krauss(), 0.1),
         RandomSearch(samples=samples),
         seed=0,
         cache=Cache(None),

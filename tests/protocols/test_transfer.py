@@ -21,7 +21,7 @@ from cfx.evaluation.closed_loop import simulate_closed_loop
 from cfx.pairs import PairBatch, PairSet
 from cfx.protocols.base import Protocol
 from cfx.protocols.transfer import Transfer
-from cfx.simulation.rollout import Simulator
+from cfx.simulation.rollout import MemoryStepper
 from cfx.testing import ProtocolContract
 
 QUICK = [
@@ -102,7 +102,7 @@ def test_it_drives_with_the_network_of_all_from_the_populations_parameters(
     number = torch.full((3,), policy.names.index(ALL))
     model = cfx.get("model", "krauss")()
     loop = simulate_closed_loop(
-        Simulator(model, 0.1), policy, batch, torch.zeros(3, dtype=torch.int64), number
+        MemoryStepper(model, 0.1), policy, batch, torch.zeros(3, dtype=torch.int64), number
     )
     error = loop.speed - batch.follower_speed[:, : loop.speed.shape[1]]
     rows = result.pairs[result.pairs.method == "policy"]

@@ -15,7 +15,8 @@ from cfx.models.w74 import W74
 from cfx.models.w99 import W99
 from cfx.pairs import Pair, PairBatch, PairSet
 from cfx.simulation import rollout
-from cfx.simulation.rollout import Simulator, Start, Trajectory, can_compile, simulate
+from cfx.simulation.rollout import MemoryStepper, can_compile, simulate
+from cfx.simulation.trajectory import Start, Trajectory
 
 DT = 0.1
 MODELS = [Krauss(), W99(), W74()]
@@ -97,7 +98,7 @@ def test_parameters_per_window(model: DrivingModel) -> None:
     leader, windows = wavy_leader(2, 24), 4
     p = candidates(model, 2, windows)
     out = simulate(model, p, leader, start_of((2,)), DT, window=5)
-    simulator = Simulator(model, DT, compile="never")
+    simulator = MemoryStepper(model, DT, compile="never")
     follower, speeds = simulator.begin(start_of((2,))), []
     for k in range(23):  # the last window's parameters are kept for the rest
         at = Leader(*(x.T[k : k + 1] for x in leader[:3]), leader.length)
@@ -289,7 +290,7 @@ class Remembers(Krauss):
 
 
 def test_memory_is_carried_through_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
-    simulator, leader = Simulator(Remembers(), DT), wavy_leader(3, 8)
+    simulator, leader = MemoryStepper(Remembers(), DT), wavy_leader(3, 8)
     monkeypatch.setattr(rollout, "tile_size", lambda like: 4)
     in_time = Leader(*(x.T[:, :, None] for x in leader[:3]), leader.length[:, None])
     p = Krauss().space.unpack(candidates(Krauss(), 3, 5))

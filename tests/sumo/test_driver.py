@@ -27,7 +27,7 @@ from cfx.pairs import PairBatch
 from cfx.policies.base import ConstantNetwork
 from cfx.policies.default import DefaultPolicy
 from cfx.policies.fixed import FixedPolicy
-from cfx.simulation.rollout import Simulator
+from cfx.simulation.rollout import MemoryStepper
 from cfx.style.entropy import measure_style
 from cfx.style.result import StyleResult
 from cfx.style.settings import StyleSettings
@@ -456,7 +456,7 @@ def test_in_sumo_a_policy_drives_as_in_memory(
     )
     checkpoint.save(policy, tmp_path / "policy")
     first, own = torch.tensor([0, 215, 100, frames - 100]), torch.arange(4)
-    simulator, base = Simulator(model, 0.1), model.space.defaults().expand(4, -1)
+    simulator, base = MemoryStepper(model, 0.1), model.space.defaults().expand(4, -1)
     loops = {
         "policy": simulate_closed_loop(
             simulator, policy, batch, first, own, base=base, history=history

@@ -23,7 +23,7 @@ from cfx.pairs import PairBatch
 from cfx.policies.base import Policy
 from cfx.policies.driver_features import measure
 from cfx.policies.features import measured_history, tokens
-from cfx.simulation.rollout import Start
+from cfx.simulation.trajectory import Start
 
 _FEW_DRIVERS = 5
 """A network with fewer drivers holds out the end of each drive for validation, not drivers."""

@@ -45,7 +45,7 @@ from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.ensemble import Ensemble
 from cfx.progress import Task
-from cfx.simulation.rollout import Compile, Simulator, can_compile
+from cfx.simulation.rollout import Compile, MemoryStepper, can_compile
 
 log = logging.getLogger(__name__)
 
@@ -283,7 +283,7 @@ class RolloutLearner(Learner):
         kept: Path | None,
     ) -> Expert:
         """Returns networks that set the acceleration and have learned from the same drives; from `kept` if they had before."""
-        s, simulator = self.settings, Simulator(Direct(), training_data.simulator.dt)
+        s, simulator = self.settings, MemoryStepper(Direct(), training_data.simulator.dt)
         space = simulator.model.adaptation_space
         default = space.defaults(dtype=training_data.fixed.dtype, device=training_data.fixed.device)
         fixed = default.expand(len(training_data.fixed), -1)

@@ -28,7 +28,7 @@ from cfx.pairs import SIGNALS, PairBatch, PairSet
 from cfx.policies.ensemble import Ensemble
 from cfx.policies.features import measured_history, token_width
 from cfx.policies.gru import GruPolicy
-from cfx.simulation.rollout import Simulator
+from cfx.simulation.rollout import MemoryStepper
 from cfx.testing.contract import contract_of
 
 PAIRS, FRAMES = 3, 126
@@ -65,7 +65,7 @@ def training_data(
         diverged=torch.zeros(count, dtype=torch.int64),
     )
     return TrainingData(
-        simulator=Simulator(model, pairs.dt),
+        simulator=MemoryStepper(model, pairs.dt),
         batch=batch,
         split=split,
         windows=WINDOWS,

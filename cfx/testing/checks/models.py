@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from cfx.models.base import DrivingModel, Follower, Leader
-from cfx.simulation.rollout import Start, simulate
+from cfx.simulation.rollout import simulate
+from cfx.simulation.trajectory import Start
 from cfx.testing.contract import NotApplicable, contract_of
 
 Equilibrium = Callable[[Tensor, Mapping[str, Tensor]], Tensor]

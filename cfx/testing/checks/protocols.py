@@ -29,7 +29,7 @@ from cfx.policies.fixed import FixedPolicy
 from cfx.policies.gru import GruPolicy
 from cfx.progress import Task
 from cfx.protocols.base import Protocol, ProtocolContext, ProtocolResult
-from cfx.simulation.rollout import Simulator
+from cfx.simulation.rollout import MemoryStepper
 from cfx.style.entropy import measure_style
 from cfx.style.settings import StyleSettings
 from cfx.testing.contract import NotApplicable, contract_of
@@ -54,7 +54,7 @@ def context(
     """Returns a study of some drives; its policy is a small recurrent network unless given."""
     model = Krauss()
     batch = PairBatch.of(pairs)
-    simulator = Simulator(model, pairs.dt)
+    simulator = MemoryStepper(model, pairs.dt)
     return ProtocolContext(
         pairs=pairs,
         batch=batch,
