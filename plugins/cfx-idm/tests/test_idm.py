@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -157,66 +158,90 @@ def test_steps_converge_to_the_differential_equation_with_order_one(model, book,
     assert order(model, book, PAPER | changes, gap=30.0, speed=12.0) == pytest.approx(1.0, abs=0.15)
 
 
-@pytest.mark.skipif(
-    importlib.util.find_spec("libsumo") is None,
-    reason="SUMO is not here; pip install 'cfx-idm[test]'",
-)
-def test_idm_is_sumos() -> None:
+SUMO_NAMES = {
+    "v0": "maxSpeed",
+    "T": "tau",
+    "s0": "minGap",
+    "a": "accel",
+    "b": "decel",
+    "delta": "delta",
+}
+
+
+def random_leader(rng: np.random.Generator, frames: int) -> list[float]:
+    """Returns speeds, m/s, of a leader who now and then wants another one, or to stop."""
+    speeds = [float(rng.uniform(3, 20))]
+    target = speeds[0]
+    while len(speeds) < frames:
+        if rng.random() < 0.02:
+            target = float(rng.choice([0.0, rng.uniform(0, 20)]))
+        change = float(np.clip(target - speeds[-1], -0.25, 0.2))
+        speeds.append(max(0.0, speeds[-1] + change))
+    return speeds
+
+
+def random_runs(count: int, frames: int) -> list[dict[str, Any]]:
+    """Returns runs for `sumo_reference.py`, with the parameters under their own names as `p`."""
     rng = np.random.default_rng(3)
     runs = []
-    for _ in range(40):
-        v_l = [float(rng.uniform(3, 20))]
-        target = v_l[0]
-        while len(v_l) < 400:
-            target = float(rng.choice([0.0, rng.uniform(0, 20)])) if rng.random() < 0.02 else target
-            v_l.append(max(0.0, v_l[-1] + float(np.clip(target - v_l[-1], -0.25, 0.2))))
+    for _ in range(count):
+        leader_speed = random_leader(rng, frames)
         p = {
-            "v0": rng.uniform(21, 40),
-            "T": rng.uniform(0.5, 4),
-            "s0": rng.uniform(1, 5),
-            "a": rng.uniform(0.4, 4),
-        }
-        p = {name: float(value) for name, value in p.items()} | {
+            "v0": float(rng.uniform(21, 40)),
+            "T": float(rng.uniform(0.5, 4)),
+            "s0": float(rng.uniform(1, 5)),
+            "a": float(rng.uniform(0.4, 4)),
             "b": float(rng.uniform(0.5, 5)),
             "delta": 4.0,
         }
+        # SUMO's own brake cap and rounding lie around every model; the cap is lifted here.
+        parameters = {"emergencyDecel": 1000.0}
+        for name, value in p.items():
+            parameters[SUMO_NAMES[name]] = value
+        gap = float(rng.uniform(20, 60))
         runs.append(
-            {"p": p, "leader_speed": v_l, "gap": float(rng.uniform(20, 60)), "speed": v_l[0]}
+            {
+                "p": p,
+                "parameters": parameters,
+                "leader_speed": leader_speed,
+                "gap": gap,
+                "speed": leader_speed[0],
+            }
         )
-    names = {
-        "v0": "maxSpeed",
-        "T": "tau",
-        "s0": "minGap",
-        "a": "accel",
-        "b": "decel",
-        "delta": "delta",
-    }
-    # SUMO's own brake cap and rounding lie around every model; the cap is lifted here.
-    job = [
-        run
-        | {"parameters": {names[k]: v for k, v in run["p"].items()} | {"emergencyDecel": 1000.0}}
-        for run in runs
-    ]
+    return runs
+
+
+def sumos(runs: list[dict[str, Any]]) -> tuple[Tensor, Tensor]:
+    """Returns the leaders' positions and the followers' speeds in SUMO, `(runs, frames)` each."""
     script = Path(__file__).with_name("sumo_reference.py")
     done = subprocess.run(
         [sys.executable, str(script)],
-        input=json.dumps({"runs": job}),
+        input=json.dumps({"runs": runs}),
         capture_output=True,
         text=True,
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    ahead, _, speed = (
-        torch.tensor(rows, dtype=torch.float64)
-        for rows in zip(*json.loads(done.stdout), strict=True)
-    )
+    answer = torch.tensor(json.loads(done.stdout), dtype=torch.float64)
+    return answer[:, 0], answer[:, 2]
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("libsumo") is None,
+    reason="SUMO is not here; pip install 'cfx-idm[test]'",
+)
+def test_idm_is_sumos() -> None:
+    runs = random_runs(40, 400)
+    ahead, speed = sumos(runs)
     v_l = torch.tensor([run["leader_speed"] for run in runs], dtype=torch.float64)
-    column = {k: torch.tensor([run["p"][k] for run in runs], dtype=torch.float64) for k in PAPER}
     gap = torch.tensor([run["gap"] for run in runs], dtype=torch.float64)
+    column = {}
+    for name in PAPER:
+        values = [run["p"][name] for run in runs]
+        column[name] = torch.tensor(values, dtype=torch.float64)
     leader = Leader(ahead, v_l, torch.zeros_like(v_l), torch.full_like(gap, 5.0))
-    mine = simulate(
-        IDM(), column, leader, Start(ahead[:, 0] - 5.0 - gap, v_l[:, 0], torch.zeros_like(gap)), 0.1
-    )
+    start = Start(ahead[:, 0] - 5.0 - gap, v_l[:, 0], torch.zeros_like(gap))
+    mine = simulate(IDM(), column, leader, start, 0.1)
     assert not bool(mine.collided.any())
     assert (mine.speed.diff(dim=1) < -0.3).any(), "the leaders must make it brake"
     difference = (mine.speed - speed).abs()
