@@ -1,4 +1,4 @@
-"""Results of a job that never ran: made up, but shaped like the real thing. For tests of figures and tracking."""
+"""Results of a job that never ran: made up, but shaped like real ones."""
 
 from __future__ import annotations
 
@@ -45,17 +45,19 @@ def make_results(
     networks: int | None = None,
     methods: tuple[str, ...] = ("default", "fixed", "policy"),
 ) -> MadeUp:
-    """Makes up an evaluation, a style and learning curves (one network per pair unless told)."""
+    """Makes up an evaluation, a style and learning curves (one network per pair by default)."""
     rng = np.random.default_rng(seed)
-    drives = tuple(make_drive(k, frames, space, rng, methods) for k in range(pairs))
-    about = pd.DataFrame([row for k, one in enumerate(drives) for row in about_of(k, one, space)])
-    values = make_values(drives)
+    trajectories = tuple(make_trajectory(k, frames, space, rng, methods) for k in range(pairs))
+    about = []
+    for k, one in enumerate(trajectories):
+        about += about_of(k, one, space)
+    values = make_values(trajectories)
     evaluation = Evaluation(
-        about=about,
+        about=pd.DataFrame(about),
         values=values,
         measured=MEASURED,
         improvements={},
-        trajectories=drives,
+        trajectories=trajectories,
         names=space.names,
         units=tuple(p.unit for p in space.tuned),
         bounds=np.array([[p.low for p in space.tuned], [p.high for p in space.tuned]]),
@@ -66,10 +68,10 @@ def make_results(
             improvements[baseline] = summarize(evaluation.table)
     evaluation = dataclasses.replace(evaluation, improvements=improvements)
     curves = make_curves(pairs if networks is None else networks, epochs, seed)
-    return MadeUp(evaluation, make_style([drive.driver for drive in drives], rng), curves)
+    return MadeUp(evaluation, make_style([one.driver for one in trajectories], rng), curves)
 
 
-def make_drive(
+def make_trajectory(
     k: int,
     frames: int,
     space: ParameterSpace,
@@ -117,7 +119,9 @@ def make_drive(
 
 
 def make_platoon(networks: dict[str, int], seconds: float = 40.0) -> Platoon:
-    """Ten followers each that answer the leader's braking later and later, those of later networks more and more strongly.
+    """Ten followers each that answer the leader's braking one after the other.
+
+    Those of later networks answer more strongly.
 
     Args:
         networks: by method, how many.
@@ -156,13 +160,13 @@ def make_platoon(networks: dict[str, int], seconds: float = 40.0) -> Platoon:
 
 
 def make_history(
-    drives: tuple[PairTrajectory, ...], gains: dict[tuple[str, str], float]
+    trajectories: tuple[PairTrajectory, ...], gains: dict[tuple[str, str], float]
 ) -> pd.DataFrame:
     """What a policy gained, by base and amount of history."""
     rows = [
         {
-            "pair_id": drive.pair_id,
-            "driver": drive.driver,
+            "pair_id": one.pair_id,
+            "driver": one.driver,
             "base": base,
             "history_s": 50.0 + k if amount.endswith("%") else float(amount.split()[0]),
             "amount": amount,
@@ -171,7 +175,7 @@ def make_history(
             "improvement": gain + 0.01 * (-1) ** k,
         }
         for (base, amount), gain in gains.items()
-        for k, drive in enumerate(drives)
+        for k, one in enumerate(trajectories)
     ]
     return pd.DataFrame(rows)
 
@@ -184,25 +188,25 @@ GAINS = {
 }
 
 
-def about_of(k: int, drive: PairTrajectory, space: ParameterSpace) -> list[dict[str, object]]:
+def about_of(k: int, one: PairTrajectory, space: ParameterSpace) -> list[dict[str, object]]:
     """What is known of a pair, a row per method."""
-    follower, leader = drive.pair_id.split("-")[-2:]
+    follower, leader = one.pair_id.split("-")[-2:]
     rows = []
-    for method in drive.speed:
+    for method in one.speed:
         row: dict[str, object] = {
-            "pair_id": drive.pair_id,
+            "pair_id": one.pair_id,
             "recording": "i80-0400",
             "leader_id": leader,
             "follower_id": follower,
-            "driver": drive.driver,
+            "driver": one.driver,
             "cluster": k % 3,
             "style_score": 0.2 + 0.005 * k,
             "fold": 0,
             "method": method,
-            "frames": len(drive.time) - 1,
+            "frames": len(one.time) - 1,
         }
         for j, p in enumerate(space.tuned):
-            row[f"parameter_{p.name}"] = float(drive.parameters[method][:, j].mean())
+            row[f"parameter_{p.name}"] = float(one.parameters[method][:, j].mean())
         rows.append(row)
     return rows
 
@@ -230,19 +234,19 @@ MEASURED = (
 )
 
 
-def make_values(drives: tuple[PairTrajectory, ...]) -> pd.DataFrame:
+def make_values(trajectories: tuple[PairTrajectory, ...]) -> pd.DataFrame:
     """The long table of `MEASURED` for the test part."""
     rows = []
-    for drive in drives:
-        for method in drive.speed:
-            speed, gap = drive.speed[method], drive.gap[method]
+    for one in trajectories:
+        for method in one.speed:
+            speed, gap = one.speed[method], one.gap[method]
             found = {
-                "rmse_speed": float(np.sqrt(np.mean((speed - drive.real_speed) ** 2))),
-                "rmse_gap": float(np.sqrt(np.mean((gap - drive.real_gap) ** 2))),
+                "rmse_speed": float(np.sqrt(np.mean((speed - one.real_speed) ** 2))),
+                "rmse_gap": float(np.sqrt(np.mean((gap - one.real_gap) ** 2))),
                 "collisions": float((gap < 0).any()),
             }
             for metric, value in found.items():
-                rows.append((drive.pair_id, drive.driver, method, "test", metric, value))
+                rows.append((one.pair_id, one.driver, method, "test", metric, value))
     return pd.DataFrame(rows, columns=list(VALUE_COLUMNS))
 
 
@@ -256,9 +260,9 @@ def with_metric(
 ) -> Evaluation:
     """Adds a metric whose value is the same for all pairs of a method."""
     rows = []
-    for drive in evaluation.trajectories:
+    for one in evaluation.trajectories:
         for method, value in by_method.items():
-            rows.append((drive.pair_id, drive.driver, method, scope, metric, float(value)))
+            rows.append((one.pair_id, one.driver, method, scope, metric, float(value)))
     added = pd.DataFrame(rows, columns=list(VALUE_COLUMNS))
     infos = {one.name: one for one in evaluation.measured}
     scopes = (*infos[metric].scopes, scope) if metric in infos else (scope,)

@@ -87,7 +87,7 @@ class Metric(Component):
             defined.
         heading: of a column, short and without the unit.
         meaning: one sentence for a reader who knows no other document.
-        scopes: frames for which the summary is told in `metrics.json`, `pairs.csv` and MLflow. The
+        scopes: frames for which the summary stands in `metrics.json`, `pairs.csv` and MLflow. The
             table of all values, `pair_metrics.parquet`, holds every scope.
         is_error: it is a distance from the recording, and 0 for a simulation without error.
         is_of_recording: it says something of a recorded driver too, who then stands beside the

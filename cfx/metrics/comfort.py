@@ -12,7 +12,8 @@ class Jerk(Metric):
     """Root mean square jerk; NaN where fewer than two frames count.
 
     The jerk is the difference of successive accelerations over the time step. The acceleration at
-    the start is the recorded driver's own and does not count: nobody caused the jump from it.
+    the start is the recorded driver's own and does not count: the jump from it is no act of the
+    model.
     """
 
     unit = "m/s3"

@@ -60,8 +60,8 @@ class MetricSet:
         """Makes the metrics that are chosen, and those that every job measures.
 
         Args:
-            chosen: names, or all that are installed. A broken one of those that nobody asked for by
-                name is left out with a warning.
+            chosen: names, or all that are installed. Of all, a broken one of a plugin is left out
+                with a warning.
 
         Raises:
             PluginError: there is no metric of a name, or one that is named is broken.

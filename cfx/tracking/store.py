@@ -341,7 +341,7 @@ def _create(file: Path, home: Path) -> None:
 def _unsynchronised() -> Iterator[None]:
     """Lets SQLite not wait for the disk after each of MLflow's migrations: 1 s instead of 6.
 
-    Only for a file that nobody else has: if the machine fails meanwhile, it is lost, and made
+    Only for a file of this process: if the machine fails meanwhile, it is lost, and made
     again.
     """
     from sqlalchemy import event

@@ -28,9 +28,7 @@ def test_the_table_and_the_metrics_tell_what_was_driven() -> None:
     middle = model.space.from_unit(torch.full((2, 21, 2), 0.5).double())
     calm = ClosedLoop(steady, steady + 10, middle, counted)
     braked = steady.clone()
-    braked[0, 5:] = (
-        9.0  # one frame at -10 m/s2; the second pair brakes after its end has been reached by nobody
-    )
+    braked[0, 5:] = 9.0  # one frame at -10 m/s2
     braked[0, 15:] = 1.0  # the first pair has ended by then
     hard = calm._replace(
         speed=braked, parameters=torch.where(torch.arange(2) == 0, model.space.bounds()[0], middle)
@@ -104,7 +102,10 @@ def test_the_gain_from_history_has_metrics_under_names_without_spaces() -> None:
 
 
 def test_what_comes_after_the_start_is_measured_on_its_own() -> None:
-    """Errors of 1 m/s in the first five seconds, and of 0.5 (fixed) and 0.2 m/s (policy) from there on; one pair ends before."""
+    """Errors are 1 m/s in the first five seconds, then 0.5 (fixed) and 0.2 m/s (policy).
+
+    One pair is shorter than that.
+    """
     pairs = straight_pairs([100, 45])
     batch, first = PairBatch.of(pairs), torch.tensor([9, 4])
     frames = torch.arange(91)

@@ -131,7 +131,8 @@ BROKEN = {
     "of_frames": broken("return gap"),
     "settled": GOOD.replace(
         "class Good(Metric):",
-        "from cfx import Settings\nclass Own(Settings):\n    x: int = 1\nclass Good(Metric):\n    schema = Own",
+        "from cfx import Settings\nclass Own(Settings):\n    x: int = 1\n"
+        "class Good(Metric):\n    schema = Own",
     ),
     "improvement": GOOD,
     # The two that only a job's own trajectories bring out.

@@ -122,7 +122,10 @@ def test_entropy_is_shannons(raw: np.ndarray) -> None:
 
 
 def test_a_case_computed_by_hand() -> None:
-    """Three drivers, two columns that vary: speed 0, 1, 2 and, against aggressiveness, space headway 10, 30, 20."""
+    """Three drivers, two columns that vary: speed 0, 1, 2 and space headway 10, 30, 20.
+
+    The headway counts against aggressiveness.
+    """
     raw = np.array([[0, 5, 0, 0, 10, 1], [1, 5, 0, 0, 30, 1], [2, 5, 0, 0, 20, 1]], dtype=float)
     normalised = normalise(raw)
     np.testing.assert_allclose(normalised[:, 0], [0, 0.5, 1])
@@ -246,7 +249,8 @@ def test_an_empty_cluster_says_so() -> None:
     pairs = some_pairs(1)
     with pytest.raises(
         DataError,
-        match=r"style.cluster=aggressive: none of the 1 drivers .*0 conservative, 1 normal, 0 aggressive",
+        match=r"style.cluster=aggressive: none of the 1 drivers .*"
+        r"0 conservative, 1 normal, 0 aggressive",
     ):
         select_cluster(pairs, measure_style(pairs, StyleSettings()), "aggressive")
     with pytest.raises(DataError, match="no pairs"):

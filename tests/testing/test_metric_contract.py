@@ -62,7 +62,7 @@ class Careless(MaeSpeed):
     [
         (checks.a_metric_gives_one_number_for_each_pair, OfFrames, "a number for each pair"),
         (checks.a_metric_gives_one_number_for_each_pair, Infinite, "is NaN, not infinite"),
-        (checks.frames_that_do_not_count_do_not_matter, Unmasked, "the padding is nobody's"),
+        (checks.frames_that_do_not_count_do_not_matter, Unmasked, "the padding was not simulated"),
         (checks.a_batch_equals_the_loop_over_it, Relative, "the pairs that are measured beside it"),
         (checks.the_order_of_the_pairs_does_not_matter, Ranked, "its place among the others"),
         (checks.a_simulation_without_error_has_none, Offset, "must be 0 for the recording"),

@@ -1,4 +1,4 @@
-"""A store that cannot be used is found at once, and told in one sentence that names the file and the way out."""
+"""A store that cannot be used is found at once; one sentence names the file and the remedy."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def database(tmp_path: Path, template: bytes) -> Path:
 
 
 def refused(file: Path | str, message: str) -> None:
-    """Opening raises one sentence with the file, the reason and what to do; the file stays as it was."""
+    """Opening raises one sentence with file, reason and what to do; the file stays as it was."""
     path = Path(file)
     before = path.read_bytes() if path.is_file() else None
     with pytest.raises(TrackingError, match=message) as caught:
@@ -75,7 +75,8 @@ def test_a_database_of_another_mlflow(database: Path) -> None:
         other.commit()
     refused(
         database,
-        r"another version of MLflow \(schema abc123, MLflow .* needs .*\); make a copy and run `mlflow db upgrade",
+        r"another version of MLflow \(schema abc123, MLflow .* needs .*\);"
+        r" make a copy and run `mlflow db upgrade",
     )
 
 
@@ -110,7 +111,7 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.Mon
         open_store(f"sqlite:///{tmp_path}/mlflow.db", "cfx")
 
 
-def test_a_lock_that_nobody_lets_go_of(tmp_path: Path, database: Path) -> None:
+def test_a_lock_that_is_never_released(tmp_path: Path, database: Path) -> None:
     from filelock import FileLock
 
     with FileLock(tmp_path / "mlflow.db.lock"):

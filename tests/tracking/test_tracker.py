@@ -264,7 +264,8 @@ JOB = """
 import sys
 from cfx.tracking.tracker import MlflowTracker
 uri, seed = sys.argv[1:]
-with MlflowTracker.run(uri, run_name=f"job {seed}", parameters={"seed": seed}, sweep="a sweep'of/many") as run:
+sweep = "a sweep'of/many"
+with MlflowTracker.run(uri, run_name=f"job {seed}", parameters={"seed": seed}, sweep=sweep) as run:
     run.set_tags({"seed": seed})
 """
 
@@ -435,7 +436,7 @@ def test_a_job_comes_back_from_its_run(
 def test_nothing_is_printed_and_nothing_global_changes(
     tmp_path: Path, saved_policy: SimpleNamespace, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """From a database that has to be made to a policy that has to be copied: MLflow has much to say in between."""
+    """From a database that is made to a policy that is copied, MLflow prints nothing."""
     with quiet():
         import mlflow
     root, ours, before = logging.getLogger(), logging.getLogger("mlflow"), mlflow.get_tracking_uri()

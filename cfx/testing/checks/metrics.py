@@ -83,7 +83,7 @@ def frames_that_do_not_count_do_not_matter(metric: Metric) -> None:
             metric.compute(other),
             metric.compute(given),
             "frames that do not count were changed, and the numbers with them: beyond its end a"
-            " pair is padded, and the padding is nobody's",
+            " pair is padded, and the padding was not simulated",
         )
 
 
