@@ -28,7 +28,7 @@ FLOORS = (
     ("learners",),
     ("evaluation", "smoke_checks"),
     ("protocols",),
-    ("tracking", "figures"),
+    ("tracking", "plots"),
     ("config", "nodes", "ui", "testing", "report"),
     ("job", "hydra_source", "user_errors", "sweep", "application", "plugins", "cli", "sumo"),
 )

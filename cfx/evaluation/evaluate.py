@@ -19,18 +19,12 @@ from cfx.evaluation.closed_loop import ClosedLoop
 from cfx.evaluation.result import METHODS, Array, Evaluation, Improvement, PairTrajectory, Platoon
 from cfx.evaluation.statistics import improvement_statistics
 from cfx.evaluation.tables import long_table, values_of
-from cfx.metrics.base import RECORDED, MetricInfo, Trajectories
+from cfx.metrics.base import RECORDED, TRANSIENT_S, MetricInfo, Trajectories
 from cfx.metrics.errors import RmseGap, RmseSpeed
 from cfx.metrics.installed import LeftOut, MeasuredMetric, MetricSet, leave_out
 from cfx.pairs import PairBatch, PairSet
 from cfx.parameters import ParameterSpace
 from cfx.style.result import CLUSTERS, StyleResult
-
-TRANSIENT_S = 5.0
-"""`transient_s`, how long the transient of a test part is.
-
-Within some such time constant parameters lead from the measured state to a steady one of their own.
-"""
 
 Measured = dict[tuple[str, str, str], NDArray[np.float64]]
 """By metric, scope and method the value of each pair, `(P,)`."""

@@ -18,6 +18,7 @@ from cfx.datasets.tidy import write_tidy
 from cfx.errors import OutputError
 from cfx.evaluation.result import Evaluation
 from cfx.files import atomic_write
+from cfx.metrics.base import TRANSIENT_S
 from cfx.pairs import PairSet
 from cfx.protocols.base import ProtocolResult
 from cfx.style.result import StyleResult
@@ -176,7 +177,7 @@ def write_figures(
     """
     paths: list[Path] = []
     if config.figures.enabled:
-        from cfx.figures import write
+        from cfx.plots.matplotlib import write
 
         folder = output.folder / "figures"
 
@@ -254,6 +255,7 @@ def write_provenance(
         "parameters": parameters,
         "has_constant_baseline": has_constant_baseline,
         "objective": dict(objective),
+        "transient_s": TRANSIENT_S,
         "metrics": [metric.to_json() for metric in evaluation.measured],
         "metrics_left_out": [asdict(one) for one in evaluation.left_out],
         "cfx": version(),

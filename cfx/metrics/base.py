@@ -23,9 +23,15 @@ Scope = Literal["test", "steady", "full_trajectory"]
 SCOPES: tuple[Scope, ...] = ("test", "steady", "full_trajectory")
 """Which frames count, in the order in which they are shown.
 
-`test`: the test part. `steady`: the test part after the transient (`cfx.evaluation.evaluate`).
+`test`: the test part. `steady`: the test part after the transient (`TRANSIENT_S`).
 `full_trajectory`: everything from the first frame on, by methods that nothing of these drivers went
 into.
+"""
+
+TRANSIENT_S = 5.0
+"""How long the transient of a test part is, s (`transient_s` in `data.json`).
+
+Within some such time constant parameters lead from the measured state to a steady one of their own.
 """
 
 RECORDED = "real"

@@ -1,1 +1,1 @@
-"""One HTML page about finished jobs: complete in itself, without any network, to be sent to a colleague."""
+"""One HTML page about finished jobs, complete in itself, to be sent to a colleague."""

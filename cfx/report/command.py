@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from cfx.plots.words import plural
 from cfx.report.page import write_report
 from cfx.report.runs import read_runs
 
@@ -16,7 +17,8 @@ def report(runs: Sequence[str], output: str | None = None, title: str | None = N
 
     Args:
         runs: as `read_runs` takes them.
-        output: the file; None for `report.html` in the only folder that was given, else in the current one.
+        output: the file; None for `report.html` in the only folder that was given, else in the
+            current one.
         title: of the page; None for one that names the driving models.
 
     Raises:
@@ -27,9 +29,7 @@ def report(runs: Sequence[str], output: str | None = None, title: str | None = N
     folder = Path(runs[0]).expanduser()
     home = folder if len(runs) == 1 and folder.is_dir() else Path()
     path = write_report(found, Path(output).expanduser() if output else home / NAME, title)
-    left_out = (
-        f"; {len(found.unfinished)} unfinished ones are named in it" if found.unfinished else ""
-    )
-    return [
-        f"Report of {len(found.jobs)} job{'' if len(found.jobs) == 1 else 's'}{left_out}: {path.absolute()}"
-    ]
+    left_out = ""
+    if found.unfinished:
+        left_out = f"; {len(found.unfinished)} unfinished ones are named in it"
+    return [f"Report of {plural(len(found.jobs), 'job')}{left_out}: {path.absolute()}"]

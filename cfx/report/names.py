@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from cfx.report.read import Job
+from cfx.report.job import Job
 from cfx.tracking.provenance import flatten
 
 GROUPS = ("model", "policy", "learner", "protocol", "objective", "optimizer", "data")
@@ -31,46 +31,61 @@ SEPARATOR = " · "
 
 def named(jobs: Sequence[Job]) -> tuple[Job, ...]:
     """Gives every job a short name: its driving model, and what else differs between the jobs."""
-    parts = differences(jobs)
-    names = [
-        SEPARATOR.join(part if len(part) <= _MOST else [*part[: _MOST - 1], "…"]) for part in parts
-    ]
-    unique = []
-    for k, name in enumerate(names):
-        same = [i for i, other in enumerate(names) if other == name]
-        unique.append(name if len(same) == 1 else f"{name} ({same.index(k) + 1})")
-    return tuple(replace(job, name=name) for job, name in zip(jobs, unique, strict=True))
+    names = []
+    for parts in differences(jobs):
+        shown = parts if len(parts) <= _MOST else [*parts[: _MOST - 1], "…"]
+        names.append(SEPARATOR.join(shown))
+    renamed = []
+    for k, job in enumerate(jobs):
+        name = names[k]
+        if names.count(name) > 1:
+            name += f" ({names[: k + 1].count(name)})"
+        renamed.append(replace(job, name=name))
+    return tuple(renamed)
 
 
 def differences(jobs: Sequence[Job], ignored: Sequence[str] = ()) -> list[list[str]]:
-    """Returns for every job its driving model and every other component and setting in which the jobs differ.
+    """Returns for every job its driving model and every other component and setting that differs.
 
-    A setting of a component counts only between jobs that share the component: that of another one is another setting.
+    A setting of a component counts only between jobs that share the component: that of another one
+    is another setting.
 
     Args:
+        jobs: that are compared.
         ignored: full names of settings that do not count.
     """
     parts = [[job.component("model") or "model"] for job in jobs]
     for group in GROUPS[1:]:
         _add(parts, [job.component(group) for job in jobs])
     flat = [flatten(dict(job.config)) for job in jobs]
-    for key in dict.fromkeys(key for values in flat for key in values):
-        if key in ignored or key.startswith(_NO_DIFFERENCE) or key.endswith(".name"):
-            continue
-        group = key.partition(".")[0]
-        peers = [job.component(group) if group in GROUPS else "" for job in jobs]
-        if any(
-            len({v.get(key, "") for v, p in zip(flat, peers, strict=True) if p == peer}) > 1
-            for peer in set(peers)
-        ):
+    keys: dict[str, None] = {}
+    for values in flat:
+        keys |= dict.fromkeys(values)
+    for key in keys:
+        counts = key not in ignored and not key.startswith(_NO_DIFFERENCE)
+        if counts and not key.endswith(".name") and _differs(key, jobs, flat):
             _add(parts, [_said(key, values) for values in flat])
     return parts
 
 
+def _differs(key: str, jobs: Sequence[Job], flat: Sequence[Mapping[str, Any]]) -> bool:
+    """Says whether a setting differs between jobs that share the component it belongs to."""
+    group = key.partition(".")[0]
+    found: dict[str, set[Any]] = {}
+    for job, values in zip(jobs, flat, strict=True):
+        peer = job.component(group) if group in GROUPS else ""
+        found.setdefault(peer, set()).add(values.get(key, ""))
+    return any(len(values) > 1 for values in found.values())
+
+
 def _said(key: str, values: Mapping[str, Any]) -> str:
-    setting = (key.partition(".")[2] or key).replace("{", "").replace("}", "")
-    short = {"style.cluster": "{}", "seed": "seed {}"}.get(key, setting + "={}")
-    return short.format(values[key]) if key in values else ""
+    if key not in values:
+        return ""
+    if key == "style.cluster":
+        return str(values[key])
+    if key == "seed":
+        return f"seed {values[key]}"
+    return f"{key.partition('.')[2] or key}={values[key]}"
 
 
 def _add(parts: list[list[str]], values: Sequence[str]) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from cfx.errors import TrackingError
-from cfx.report.read import Origin, Unfinished
+from cfx.report.job import Origin, Unfinished
 from cfx.tracking.store import (
     download_run,
     is_run_id,
@@ -22,7 +22,7 @@ _MOST = 1000
 
 
 def tracked_runs(run_id: str) -> list[tuple[Path, Origin] | Unfinished]:
-    """Returns folder and origin of a tracked job, or of each job of a sweep if the run is the sweep's parent.
+    """Returns folder and origin of a tracked job; of a sweep's parent, those of each of its jobs.
 
     Raises:
         TrackingError: there is no such run, or its files are gone.

@@ -14,11 +14,12 @@ import numpy as np
 
 from cfx.agents.agent import Agent
 from cfx.evaluation.result import Evaluation
-from cfx.figures.look import COLOURS, LABELS
 from cfx.files import atomic_write
-from cfx.report.drive_plots import drive
-from cfx.report.figure import Plot
-from cfx.report.read import Job
+from cfx.plots.choice.trajectories import pair_panels, parameter_axes
+from cfx.plots.look import COLOURS
+from cfx.plots.plotly.figure import Plot
+from cfx.plots.plotly.trajectories import pair_plot
+from cfx.plots.words import LABELS
 from cfx.sumo.motorway import Motorway
 from cfx.sumo.replay import CAR_LENGTH, FOLLOWERS
 from cfx.sumo.shown import Array, Shown
@@ -118,23 +119,11 @@ def _security(scripts: Sequence[str]) -> str:
 def _content(road: Motorway, shown: Sequence[Shown], evaluation: Evaluation) -> dict[str, Any]:
     """Returns what the script draws: positions in centimetres from a corner of the road, so that they are short integers."""
     corner = np.concatenate([lane.shape for lane in road.lanes]).min(axis=0)
-    job = Job(
-        place="",
-        config={},
-        data={
-            "parameters": [
-                {"name": name, "unit": unit, "low": float(low), "high": float(high)}
-                for name, unit, low, high in zip(
-                    evaluation.names, evaluation.units, *evaluation.bounds, strict=True
-                )
-            ]
-        },
-        metrics={},
-        pairs=evaluation.table,
-        style=None,
-        drives=evaluation.trajectories_table(),
-        curves=None,
-    )
+    axes = parameter_axes(evaluation.names, evaluation.units, evaluation.bounds)
+    pairs = []
+    for one, trajectory in zip(shown, evaluation.trajectories, strict=True):
+        plot = pair_plot(pair_panels(trajectory, evaluation.methods, axes))
+        pairs.append(_pair(one, corner) | {"plot": _plot(plot)})
     return {
         "colours": {kind: COLOURS[kind] for kind in ("leader", *FOLLOWERS)},
         "labels": {kind: LABELS[kind] for kind in FOLLOWERS},
@@ -148,9 +137,7 @@ def _content(road: Motorway, shown: Sequence[Shown], evaluation: Evaluation) -> 
             }
             for lane in road.lanes
         ],
-        "pairs": [
-            _pair(one, corner) | {"plot": _plot(drive(job, one.pair.pair_id))} for one in shown
-        ],
+        "pairs": pairs,
     }
 
 

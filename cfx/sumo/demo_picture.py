@@ -13,9 +13,11 @@ from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
 from cfx.evaluation.result import Evaluation
-from cfx.figures.drives import drives
-from cfx.figures.look import COLOURS, INK, LABELS, canvas, short, styled
-from cfx.figures.write import write_figure
+from cfx.plots.look import COLOURS, INK
+from cfx.plots.matplotlib import figures
+from cfx.plots.matplotlib.canvas import canvas, styled
+from cfx.plots.matplotlib.write import write_figure
+from cfx.plots.words import LABELS, short
 from cfx.sumo.motorway import Motorway
 from cfx.sumo.replay import FOLLOWERS
 from cfx.sumo.shown import CAR_LENGTH, Shown
@@ -46,7 +48,7 @@ def write_pictures(
     return [
         write_figure(snapshots(road, middle, together), folder / "demo.png"),
         write_figure(
-            drives(evaluation, [one.pair.pair_id for one in shown]), folder / "demo_drives.png"
+            figures.pairs(evaluation, [one.pair.pair_id for one in shown]), folder / "demo_drives.png"
         ),
     ]
 

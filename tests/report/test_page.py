@@ -13,12 +13,16 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from cfx.report import paper
-from cfx.report.comparison import absolute
-from cfx.report.drive_plots import chosen_trajectories, drive
-from cfx.report.improvement_plots import overview, per_driver
-from cfx.report.page import cluster_series, duration, render, summary
+from cfx.report.page import render
 from cfx.report.runs import read_runs
+from cfx.report.sections import paper
+from cfx.report.sections.clusters import cluster_series
+from cfx.report.sections.comparison import absolute
+from cfx.report.sections.drivers import per_driver
+from cfx.report.sections.results import overview
+from cfx.report.sections.run import duration
+from cfx.report.sections.trajectories import chosen_pairs, pair_of
+from cfx.report.summary import summary
 from tests.report.folders import ACROSS, write_job
 
 HOSTILE = "</script><img src=x onerror=alert(1)>&\"'"
@@ -28,10 +32,12 @@ SECTIONS = (
     "run",
     "results",
     "safety",
+    "metrics",
     "drivers",
     "clusters",
     "style",
-    "drives",
+    "trajectories",
+    "errors",
     "learning",
     "configs",
 )
@@ -155,8 +161,8 @@ def test_the_tables_hold_the_numbers_of_metrics_json(clusters: Clusters) -> None
     for name, values in metrics.items():
         for method, shown in (
             ("default", "default"),
-            ("population", "population"),
-            ("fixed", "own fixed"),
+            ("population", "pooled"),
+            ("fixed", "driver-specific"),
             ("policy", "policy"),
         ):
             (row,) = (row for row in errors if row[:2] == [name, shown])
@@ -167,11 +173,11 @@ def test_the_tables_hold_the_numbers_of_metrics_json(clusters: Clusters) -> None
             whole = values.get(f"full_trajectory/rmse_speed/{method}")
             assert row[6] == ("" if whole is None else repr(whole))
         for prefix, shown, frames in (
-            ("rmse_improvement", "own fixed", "test part"),
+            ("rmse_improvement", "driver-specific", "test part"),
             ("rmse_improvement/default", "default", "test part"),
-            ("rmse_improvement/population", "population", "test part"),
-            ("full_trajectory/rmse_improvement/default", "default", "whole drive"),
-            ("full_trajectory/rmse_improvement/population", "population", "whole drive"),
+            ("rmse_improvement/population", "pooled", "test part"),
+            ("full_trajectory/rmse_improvement/default", "default", "full trajectory"),
+            ("full_trajectory/rmse_improvement/population", "pooled", "full trajectory"),
         ):
             (row,) = (
                 row
@@ -222,7 +228,7 @@ def test_few_very_bad_pairs_do_not_shrink_the_others(tmp_path: Path) -> None:
     table.loc[worst, "improvement"] = -40.0
     table.to_csv(tmp_path / "job" / "pairs.csv", index=False)
     runs = read_runs([str(tmp_path)])
-    view = per_driver(runs.jobs).views["against own fixed parameters"]
+    view = per_driver(runs.jobs).views["against driver-specific calibration"]
     assert view["layout"]["yaxis"]["range"][0] > -5
     assert "1 of 12 improvements are lower" in view["note"]
     assert "\N{MINUS SIGN}4000 %" in view["note"]
@@ -237,7 +243,7 @@ def test_the_pairs_can_be_ordered_by_driver_and_by_each_job(tmp_path: Path) -> N
     orders = per_driver(runs.jobs).orders
     for job in runs.jobs:
         gain = job.by_pair.set_index("pair_id")["improvement/fixed"]
-        assert orders[f"improvement over fixed, {job.name}"] == list(
+        assert orders[f"improvement over driver-specific, {job.name}"] == list(
             gain.sort_values(ascending=False).index
         )
     assert orders["driver"] == sorted(runs.jobs[0].by_pair["pair_id"])
@@ -259,17 +265,15 @@ def test_best_median_and_worst_drives_alone_are_shown(tmp_path: Path) -> None:
     write_job(tmp_path / "job", pairs=9)
     (job,) = read_runs([str(tmp_path)]).jobs
     gain = job.by_pair.set_index("pair_id")["improvement/fixed"].sort_values(ascending=False)
-    chosen = chosen_trajectories(job)
+    chosen = chosen_pairs(job)
     assert [(one.rank, one.pair_id) for one in chosen] == [
         ("best", gain.index[0]),
         ("median", gain.index[4]),
         ("worst", gain.index[8]),
     ]
-    view = drive(job, chosen[0].pair_id).views[""]
-    assert [note["text"] for note in view["layout"]["annotations"][:2]] == [
-        "<b>t_r (s)</b>",
-        "<b>t_i (s)</b>",
-    ]
+    view = pair_of(job, chosen[0].pair_id).views[""]
+    written = [note["text"] for note in view["layout"]["annotations"]]
+    assert [text for text in written if "<b>" in text] == ["<b>t_r (s)</b>", "<b>t_i (s)</b>"]
     bottom, top = view["layout"]["yaxis3"]["range"]
     assert top - bottom >= 0.2 * (10.0 - 0.1)
     assert len(view["data"]) == 2 + 3 + 1 + 3 + 2 * 3
@@ -312,8 +316,10 @@ def test_what_is_gained_after_the_start_has_a_view_of_its_own(tmp_path: Path) ->
     errors = {f"steady/rmse_speed/{method}": 0.5 for method in ("default", "fixed", "policy")}
     (tmp_path / "a" / "metrics.json").write_text(json.dumps(metrics | steady | errors))
     jobs = read_runs([tmp_path / "a"]).jobs
-    assert "against own fixed parameters, beyond the first 5 s" in overview(jobs).views
-    assert "speed, test part beyond the first 5 s" in absolute(jobs).views
+    assert (
+        "against driver-specific calibration, test part after the first 5 s" in overview(jobs).views
+    )
+    assert "speed, test part after the first 5 s" in absolute(jobs).views
 
 
 def test_the_page_says_who_was_trained_on_whom(tmp_path: Path) -> None:
@@ -322,7 +328,10 @@ def test_the_page_says_who_was_trained_on_whom(tmp_path: Path) -> None:
         methods=ACROSS,
         settings={"protocol": {"name": "across_drivers", "folds": 2, "together": "recording"}},
     )
-    assert "2 folds of whole recordings; the driver's own" in page_of(tmp_path / "a").words
+    assert (
+        "2 folds of whole recordings; driver-specific calibration uses"
+        in page_of(tmp_path / "a").words
+    )
     write_job(
         tmp_path / "b",
         methods=ACROSS,

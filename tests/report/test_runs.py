@@ -78,7 +78,7 @@ def test_what_a_job_says_of_itself(tmp_path: Path) -> None:
     (job,) = read_runs([str(tmp_path / "job")]).jobs
     assert job.methods == ACROSS
     assert job.baselines() == ("fixed", "default", "population")
-    assert job.baselines("whole/") == ("default", "population")
+    assert job.baselines("full_trajectory") == ("default", "population")
     assert (job.experiment, job.overrides, job.seconds) == (
         "paper/clusters",
         ("model=krauss",),

@@ -1,0 +1,151 @@
+"""String stability: what becomes of a leader's braking along a platoon of ten followers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from cfx.plots.choice.common import Array
+from cfx.plots.look import COLOURS, vehicle_colour
+from cfx.plots.words import label, number
+
+TIME_TITLE = "time from the braking of the leader (s)"
+
+_SHOWN_BEFORE = 10.0
+"""Seconds before the leader brakes from which on the platoon is shown; before that it settles."""
+
+_MOST_POINTS = 400
+
+
+@dataclass(frozen=True)
+class VehicleLine:
+    """A vehicle's speed.
+
+    Attributes:
+        vehicle: 0 is the leader.
+        colour: from dark to light along the platoon.
+        time: `(T,)` s since the leader began to brake.
+        speed: `(T,)` m/s.
+        collision: time and speed at which its gap became negative; None if it never did.
+    """
+
+    vehicle: int
+    colour: str
+    time: Array
+    speed: Array
+    collision: tuple[float, float] | None
+
+    @property
+    def name(self) -> str:
+        """Which vehicle."""
+        return "leader" if self.vehicle == 0 else f"follower {self.vehicle}"
+
+
+@dataclass(frozen=True)
+class PlatoonPanel:
+    """The platoon of one method.
+
+    Attributes:
+        method: who drives all followers.
+        network: whose platoon it is: of several that with the slowest last follower.
+        title: the method.
+        verdicts: whether it is string stable, and by how much the last follower slows down.
+        lines: the leader first.
+    """
+
+    method: str
+    network: str
+    title: str
+    verdicts: tuple[str, ...]
+    lines: tuple[VehicleLine, ...]
+
+
+def platoon_panels(
+    table: pd.DataFrame, methods: Sequence[str], stable: Mapping[str, float]
+) -> tuple[PlatoonPanel, ...]:
+    """Chooses a panel per method.
+
+    Args:
+        table: as `Platoon.table`.
+        methods: those to show, in their order.
+        stable: by method the share of its platoons that are string stable; one that is not known
+            is left out of the verdicts.
+    """
+    panels = []
+    for method in methods:
+        of_method = table[table["method"] == method]
+        rows, network = worst_platoon(of_method)
+        verdicts = []
+        if method in stable:
+            verdicts.append(_stability(stable[method], int(of_method["network"].nunique())))
+        verdicts.append(f"last follower: {_slowing(rows)}")
+        panels.append(PlatoonPanel(method, network, label(method), tuple(verdicts), _lines(rows)))
+    return tuple(panels)
+
+
+def worst_platoon(table: pd.DataFrame) -> tuple[pd.DataFrame, str]:
+    """Returns the rows of the network whose last follower becomes slowest, and the network's name.
+
+    Args:
+        table: one method's rows of a platoon's table.
+    """
+    is_last = table["vehicle"] == table["vehicle"].max()
+    last = table[is_last & (table["time_s"] >= braking_time(table))]
+    network = last.loc[last["speed"].idxmin(), "network"]
+    return table[table["network"] == network], str(network)
+
+
+def braking_time(table: pd.DataFrame) -> float:
+    """Returns when the leader of a platoon's table begins to brake, s."""
+    leader = table[table["vehicle"] == 0].drop_duplicates("time_s").sort_values("time_s")
+    speed = leader["speed"].to_numpy()
+    first_slower = int(np.argmax(speed < speed[0]))
+    return float(leader["time_s"].iloc[max(first_slower - 1, 0)])
+
+
+def _lines(rows: pd.DataFrame) -> tuple[VehicleLine, ...]:
+    begin = braking_time(rows)
+    shown = rows[rows["time_s"] >= begin - _SHOWN_BEFORE]
+    last = int(shown["vehicle"].max())
+    lines = []
+    for key, of_vehicle in shown.groupby("vehicle", sort=True):
+        vehicle = int(float(str(key)))
+        colour = COLOURS["real"] if vehicle == 0 else vehicle_colour(vehicle, last)
+        hit = of_vehicle[of_vehicle["gap"] < 0]
+        collision = None
+        if len(hit):
+            collision = (float(hit["time_s"].iloc[0]) - begin, float(hit["speed"].iloc[0]))
+        kept = of_vehicle.iloc[:: -(-len(of_vehicle) // _MOST_POINTS)]
+        time = kept["time_s"].to_numpy(dtype=float) - begin
+        speed = kept["speed"].to_numpy(dtype=float)
+        lines.append(VehicleLine(vehicle, colour, time, speed, collision))
+    return tuple(lines)
+
+
+def _stability(share: float, networks: int) -> str:
+    stable = round(share * networks)
+    if networks > 1:
+        return f"{stable} of {networks} platoons are string stable"
+    return "string stable" if stable else "not string stable"
+
+
+def _slowing(rows: pd.DataFrame) -> str:
+    """Says by how many times as much as the leader the last follower slows down."""
+    if bool((rows["gap"] < 0).any()):
+        return "not defined, as vehicles collide"
+    after = rows[rows["time_s"] >= braking_time(rows)].sort_values("time_s")
+    leader = _drop(after[after["vehicle"] == 0])
+    last = _drop(after[after["vehicle"] == after["vehicle"].max()])
+    if not (leader > 0 and np.isfinite(last)):
+        return "not defined"
+    return f"{number(last / leader)} times the leader's drop"
+
+
+def _drop(rows: pd.DataFrame) -> float:
+    """Returns from the highest speed before it to the lowest speed, m/s."""
+    speed = rows["speed"].to_numpy(dtype=float)
+    when = int(speed.argmin())
+    return float(speed[: when + 1].max() - speed[when])

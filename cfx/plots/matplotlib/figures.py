@@ -1,0 +1,172 @@
+"""Figures of an evaluation: what `choice` chose of it, drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from cfx.errors import ConfigError, nearest
+from cfx.evaluation.result import Evaluation, PairTrajectory, Platoon
+from cfx.metrics.base import TRANSIENT_S
+from cfx.plots.choice.errors import error_panels
+from cfx.plots.choice.history import amounts_of, history_curves
+from cfx.plots.choice.improvements import improvement_bars
+from cfx.plots.choice.learning import learning_curves
+from cfx.plots.choice.pairs import RankedPair, rank_pairs
+from cfx.plots.choice.platoon import platoon_panels
+from cfx.plots.choice.style import style_histogram
+from cfx.plots.choice.trajectories import (
+    HIDDEN,
+    PairPanels,
+    errors_text,
+    method_panels,
+    pair_panels,
+    parameter_axes,
+)
+from cfx.plots.matplotlib.errors import draw_errors
+from cfx.plots.matplotlib.history import draw_history
+from cfx.plots.matplotlib.improvements import draw_improvements
+from cfx.plots.matplotlib.learning import draw_learning
+from cfx.plots.matplotlib.platoon import draw_platoons
+from cfx.plots.matplotlib.style import draw_style
+from cfx.plots.matplotlib.trajectories import draw_pairs, draw_parameters, draw_speeds
+from cfx.plots.words import percent, short
+from cfx.style.result import StyleResult
+
+
+def improvements(evaluation: Evaluation) -> Figure:
+    """Improvement of every pair over driver-specific calibration."""
+    rows = evaluation.table[evaluation.table["method"] == "policy"]
+    summary = evaluation.improvement
+    bars = improvement_bars(
+        [""],
+        [rows["pair_id"].astype(str).tolist()],
+        [rows["improvement"].to_numpy(dtype=float)],
+        marks=(summary.mean, summary.ci95_low, summary.ci95_high),
+    )
+    return draw_improvements(bars, summary)
+
+
+def pairs(
+    evaluation: Evaluation, pair_id: str | Sequence[str] | None = None, count: int = 3
+) -> Figure:
+    """Speed and gap over the test part, a row per pair.
+
+    Args:
+        evaluation: of a job.
+        pair_id: the pairs to show; None for `count` pairs from the best to the worst improvement.
+        count: how many.
+
+    Raises:
+        ConfigError: a pair id is not in the evaluation.
+    """
+    titles, panels = [], []
+    for ranked, trajectory in _chosen(evaluation, pair_id, count):
+        name = RankedPair(short(ranked.pair_id), ranked.rank, ranked.improvement).title
+        if np.isfinite(ranked.improvement):
+            name += f":  {percent(ranked.improvement)}"
+        elif "fixed" in evaluation.methods:
+            name += ":  improvement undefined"
+        rmse = errors_text("speed", "m/s", _errors(evaluation, trajectory.pair_id, "rmse_speed"))
+        rmse_gap = errors_text("gap", "m", _errors(evaluation, trajectory.pair_id, "rmse_gap"))
+        titles.append((name, rmse, rmse_gap))
+        panels.append(_panels(evaluation, trajectory))
+    return draw_pairs(titles, panels, evaluation.methods)
+
+
+def speeds(evaluation: Evaluation, pair_id: str | None = None) -> Figure:
+    """The simulated speed of each method against the real driver's: the paper's speed plots.
+
+    Args:
+        evaluation: of a job.
+        pair_id: the pair to show; None for the one with the median improvement.
+
+    Raises:
+        ConfigError: the pair id is not in the evaluation.
+    """
+    ((_, trajectory),) = _chosen(evaluation, pair_id, 1)
+    errors = _errors(evaluation, trajectory.pair_id, "rmse_speed")
+    panels = method_panels(trajectory, evaluation.methods, errors)
+    return draw_speeds(trajectory.pair_id, panels, evaluation.methods)
+
+
+def parameters(evaluation: Evaluation, pair_id: str | None = None) -> Figure:
+    """The parameters of each method over time.
+
+    Args:
+        evaluation: of a job.
+        pair_id: the pair to show; None for the one with the median improvement.
+
+    Raises:
+        ConfigError: the pair id is not in the evaluation.
+    """
+    ((_, trajectory),) = _chosen(evaluation, pair_id, 1)
+    return draw_parameters(_panels(evaluation, trajectory), evaluation.methods)
+
+
+def errors(evaluation: Evaluation) -> Figure:
+    """RMSE of speed and of gap over all pairs at each moment since the test part began."""
+    methods = [method for method in evaluation.methods if method not in HIDDEN]
+    return draw_errors(error_panels(evaluation.trajectories, methods, TRANSIENT_S), methods)
+
+
+def style(result: StyleResult) -> Figure:
+    """Style scores with the cuts, and the entropy weights."""
+    scores = result.table["score"].to_numpy(dtype=float)
+    clusters = result.table["cluster"].to_numpy(dtype=int)
+    return draw_style(style_histogram(scores, clusters, result.cuts), result.weights)
+
+
+def learning(curves: pd.DataFrame) -> Figure:
+    """Loss by epoch; `curves` as `choice.learning.learning_curves` takes them."""
+    return draw_learning(learning_curves(curves))
+
+
+def platoons(platoon: Platoon) -> Figure:
+    """Speeds of the platoons behind a braking leader, a panel per method."""
+    shares = platoon.measures.groupby("method")["string_stable"].mean()
+    stable = {method: float(shares[method]) for method in platoon.methods}
+    return draw_platoons(platoon_panels(platoon.table, platoon.methods, stable))
+
+
+def history(table: pd.DataFrame) -> Figure:
+    """Improvement by the amount of burn-in; `table` as `Evaluation.history`."""
+    return draw_history(history_curves(table), amounts_of(table))
+
+
+def _chosen(
+    evaluation: Evaluation, pair_id: str | Sequence[str] | None, count: int
+) -> list[tuple[RankedPair, PairTrajectory]]:
+    by_id = {trajectory.pair_id: trajectory for trajectory in evaluation.trajectories}
+    rows = evaluation.table[evaluation.table["method"] == "policy"]
+    rows = rows[rows["pair_id"].isin(list(by_id))]
+    gains = pd.Series(np.nan, index=rows["pair_id"].astype(str))
+    # Without driver-specific calibration there is nothing to be better than.
+    if "improvement" in rows:
+        gains[:] = rows["improvement"].to_numpy(dtype=float)
+    if pair_id is None:
+        ranked = rank_pairs(list(gains.index), gains.to_numpy(dtype=float), count)
+        return [(pair, by_id[pair.pair_id]) for pair in ranked]
+    wanted = [pair_id] if isinstance(pair_id, str) else list(pair_id)
+    chosen = []
+    for name in wanted:
+        if name not in by_id:
+            hint = nearest(name, by_id)
+            raise ConfigError(f"pair '{name}' is not in this evaluation.{hint}")
+        chosen.append((RankedPair(name, "", float(gains[name])), by_id[name]))
+    return chosen
+
+
+def _errors(evaluation: Evaluation, pair_id: str, column: str) -> dict[str, float]:
+    """Returns the errors of one pair by method, in the methods' order."""
+    rows = evaluation.table[evaluation.table["pair_id"] == pair_id].drop_duplicates("method")
+    errors = rows.set_index("method")[column]
+    return {method: float(errors[method]) for method in evaluation.methods if method in errors}
+
+
+def _panels(evaluation: Evaluation, trajectory: PairTrajectory) -> PairPanels:
+    axes = parameter_axes(evaluation.names, evaluation.units, evaluation.bounds)
+    return pair_panels(trajectory, evaluation.methods, axes)

@@ -1,0 +1,55 @@
+"""Learning curves."""
+
+from __future__ import annotations
+
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+
+from cfx.plots.choice.learning import LOSS_TITLE, LearningCurves
+from cfx.plots.matplotlib.canvas import canvas, say, styled
+
+
+@styled
+def draw_learning(curves: LearningCurves) -> Figure:
+    """Draws training and validation loss per epoch: median over the networks, and quartiles."""
+    figure = canvas(3.9)
+    axes = figure.subplots()
+    for curve in curves.curves:
+        axes.plot(
+            curve.epochs,
+            curve.median,
+            color=curve.colour,
+            linestyle=(0, (5.0, 1.8)) if curve.dashed else "solid",
+            linewidth=2.0,
+            marker="o" if len(curve.epochs) < 3 else None,
+            label=curve.label,
+            zorder=3,
+        )
+        if curves.networks > 1:
+            axes.fill_between(
+                curve.epochs, curve.low, curve.high, color=curve.colour, alpha=0.25, linewidth=0
+            )
+    if curves.logarithmic:
+        axes.set_yscale("log")
+        marks = (1.0, 2.0, 5.0) if _has_digits(curves.ticks) else (1.0,)
+        axes.yaxis.set_major_locator(LogLocator(base=10, subs=marks, numticks=12))
+        axes.yaxis.set_major_formatter(FuncFormatter(_plain))
+        axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_xlabel("epoch")
+    axes.set_ylabel(LOSS_TITLE)
+    axes.margins(x=0.01)
+    if not curves.curves:
+        say(axes, "no loss was measured")
+    elif len(curves.curves[0].epochs) == 1:
+        axes.set_xticks([int(curves.curves[0].epochs[0])])
+    figure.legend(loc="outside upper center", ncols=2, title=curves.title, title_fontsize=10.5)
+    return figure
+
+
+def _has_digits(ticks: tuple[float, ...]) -> bool:
+    return len(ticks) > 1 and ticks[1] / ticks[0] < 5
+
+
+def _plain(value: float, _position: int) -> str:
+    return f"{value:g}"

@@ -1,0 +1,72 @@
+"""Writes a job's figures."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from cfx.errors import OutputError
+from cfx.evaluation.result import Evaluation
+from cfx.files import atomic_write
+from cfx.plots.matplotlib import figures
+from cfx.plots.matplotlib.canvas import DPI, look
+from cfx.style.result import StyleResult
+
+
+def write_figures(
+    folder: Path, evaluation: Evaluation, style: StyleResult, curves: pd.DataFrame
+) -> list[Path]:
+    """Draws and writes all figures of a job as PNG; returns their paths.
+
+    Args:
+        folder: made if it is not there.
+        evaluation: of the job; without a platoon or a history there is no `platoon.png` or
+            `history.png`.
+        style: of its drivers.
+        curves: columns `network`, `epoch`, `train_loss`, `validation_loss`; if it is empty there is
+            no `learning_curve.png`.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    draw: dict[str, Callable[[], Figure]] = {
+        "improvement_per_driver": partial(figures.improvements, evaluation),
+        "drives": partial(figures.pairs, evaluation),
+        "speeds": partial(figures.speeds, evaluation),
+        "error_over_time": partial(figures.errors, evaluation),
+        "chosen_parameters": partial(figures.parameters, evaluation),
+        "style_distribution": partial(figures.style, style),
+    }
+    if len(curves):
+        draw["learning_curve"] = partial(figures.learning, curves)
+    if evaluation.platoon is not None:
+        draw["platoon"] = partial(figures.platoons, evaluation.platoon)
+    if evaluation.history is not None:
+        draw["history"] = partial(figures.history, evaluation.history)
+    # One after the other, so that only one figure is in memory.
+    return [write_figure(make(), folder / f"{name}.png") for name, make in draw.items()]
+
+
+def write_figure(figure: Figure, path: Path) -> Path:
+    """Writes one figure under its final name only once it is complete; returns the path.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(path) as unfinished, look(), warnings.catch_warnings():
+            # A name in a script that the font lacks shows boxes; the names are in pairs.csv.
+            warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
+            figure.savefig(unfinished, format="png", dpi=DPI, metadata={"Software": None})
+    except OSError as error:
+        raise OutputError(
+            f"{path}: this figure cannot be written ({error.strerror or error});"
+            " free the path or choose another folder"
+        ) from error
+    return path

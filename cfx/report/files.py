@@ -1,0 +1,177 @@
+"""Reads the files of a job's folder; what is damaged is told in one sentence."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import pandas as pd
+import yaml
+
+from cfx import renamed
+from cfx.errors import DataError
+from cfx.style.result import CLUSTERS
+
+T = TypeVar("T")
+
+TEXT_COLUMNS = frozenset(
+    {
+        "pair_id",
+        "recording",
+        "leader_id",
+        "follower_id",
+        "driver",
+        "method",
+        "network",
+        "base",
+        "amount",
+        "scope",
+        "metric",
+    }
+)
+_NAMES = TEXT_COLUMNS | {"cluster", "cluster_name"}
+_PASSWORD = re.compile(r"(://[^/@\s:]*):[^/@\s]+@")
+
+
+def optional(path: Path, read: Callable[[Path], T]) -> T | None:
+    """Returns what a file holds; None if there is no such file."""
+    return read(path) if path.exists() else None
+
+
+def read_metrics(path: Path) -> dict[str, float]:
+    """Reads `metrics.json`; NaN where a metric is not defined.
+
+    Raises:
+        DataError: the file cannot be read, or holds something else.
+    """
+    values = {}
+    try:
+        for name, value in read_json(path).items():
+            values[str(name)] = math.nan if value is None else float(value)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{path} is damaged: a metric is no number ({error})") from error
+    return renamed.metrics(values)
+
+
+def read_pairs(path: Path, columns: Iterable[str]) -> pd.DataFrame:
+    """Reads `pairs.csv`, with clusters by name.
+
+    Raises:
+        DataError: the file cannot be read, or lacks a column or the policy.
+    """
+    table = read_table(path, columns)
+    names = {str(number): name for number, name in enumerate(CLUSTERS)}
+    clusters = [str(value) for value in table["cluster"]]
+    table["cluster"] = [names.get(cluster, cluster) for cluster in clusters]
+    if "policy" not in set(table["method"]):
+        raise DataError(f"{path} is damaged: it has no row of the method 'policy'")
+    return table
+
+
+def read_table(path: Path, columns: Iterable[str]) -> pd.DataFrame:
+    """Reads a table under today's names; all columns but names hold numbers.
+
+    Args:
+        path: of a CSV or Parquet file.
+        columns: those that it must have.
+
+    Raises:
+        DataError: the file cannot be read, or holds something else.
+    """
+    table = renamed.results(_load(path))
+    for column in columns:
+        if column not in table:
+            raise DataError(f"{path} is damaged: it has no column '{column}'")
+    for column in table.columns.astype(str):
+        if column in TEXT_COLUMNS:
+            table[column] = table[column].astype(str).astype(object)
+        elif column not in _NAMES:
+            try:
+                table[column] = table[column].astype(float)
+            except (TypeError, ValueError) as error:
+                raise DataError(
+                    f"{path} is damaged: column '{column}' holds something else than numbers"
+                    f" ({error})"
+                ) from error
+    return table
+
+
+def _load(path: Path) -> pd.DataFrame:
+    # pyarrow's and pandas' errors are ValueErrors or OSErrors.
+    try:
+        if path.suffix == ".parquet":
+            return pd.read_parquet(path)
+        # An id such as "NA" is an id, and "007" is no number.
+        header = pd.read_csv(path, nrows=0)
+        empty = {str(column): ["", "nan"] for column in header if column not in _NAMES}
+        types: Any = dict.fromkeys(TEXT_COLUMNS, str)
+        return pd.read_csv(path, dtype=types, keep_default_na=False, na_values=empty)
+    except (OSError, ValueError, ArithmeticError) as error:
+        raise _unreadable(path, error) from error
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Reads a mapping.
+
+    Raises:
+        DataError: the file cannot be read, or holds something else.
+    """
+    return _mapping(path, json.loads)
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Reads a mapping; errors as of `read_json`."""
+    return _mapping(path, yaml.safe_load)
+
+
+def read_yaml_list(path: Path) -> list[Any]:
+    """Reads a list; what is none is an empty one. Errors as of `read_json`."""
+    content = _parsed(path, yaml.safe_load)
+    return list(content) if isinstance(content, list) else []
+
+
+def _mapping(path: Path, parse: Callable[[str], Any]) -> dict[str, Any]:
+    content = _parsed(path, parse)
+    if not isinstance(content, dict):
+        raise DataError(f"{path} is damaged: it holds no mapping of names to values")
+    return content
+
+
+def _parsed(path: Path, parse: Callable[[str], Any]) -> Any:
+    try:
+        return parse(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> DataError:
+    reason = type(error).__name__
+    for line in str(error).splitlines():
+        if line.strip():
+            reason = line.strip()
+            break
+    return DataError(f"{path} cannot be read ({reason}); run the job again, or leave it out")
+
+
+def public(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns values without passwords of database addresses, as they may be passed on."""
+    return {key: _clean(value) for key, value in values.items()}
+
+
+def _clean(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return public(value)
+    if isinstance(value, list):
+        return [_clean(part) for part in value]
+    if isinstance(value, str):
+        return without_password(value)
+    return value
+
+
+def without_password(text: str) -> str:
+    """Returns a text with three stars for passwords in `postgresql://name:password@host`."""
+    return _PASSWORD.sub(r"\1:***@", text)

@@ -1,0 +1,301 @@
+"""A finished job as a report knows it: what its files hold, nothing else."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from cfx import renamed
+from cfx.evaluation.result import METHODS, PairTrajectory
+from cfx.metrics.base import TRANSIENT_S, MetricInfo, key_of
+from cfx.plots.choice.trajectories import ParameterAxis
+from cfx.plots.words import TEST, scope_label
+from cfx.report.metrics import known_metrics
+
+
+@dataclass(frozen=True)
+class Job:
+    """One finished job.
+
+    Attributes:
+        place: where it was read: its folder, or its MLflow run.
+        config: the resolved configuration.
+        data: where the pairs came from, what was left out, what was measured (`data.json`).
+        metrics: under their MLflow names; NaN where a metric is not defined.
+        pairs: a row per pair and method; SI units; `cluster` by name.
+        style: a row per driver; None if the job left none.
+        trajectories: the closed loops of the test part, a row per frame; SI units; None if the job
+            left none.
+        curves: the losses by network and epoch; None if the job left none.
+        platoon: `Platoon.table`; None if no platoon was simulated.
+        history: as `Evaluation.history`; None if that was not tried.
+        values: every metric of every pair, method and part of the trajectories (columns pair_id,
+            driver, method, scope, metric, value); None if the job left none.
+        overrides: what was typed; None if that is not known.
+        experiment: the preset that was chosen, "" for none; None if that is not known.
+        started: when it began; None if that is not known.
+        seconds: how long it took; None if that is not known.
+        version: of cfx; "" if that is not known.
+        missing: files that jobs have and this one has not.
+        name: what tells it from the others of one report.
+    """
+
+    place: str
+    config: Mapping[str, Any]
+    data: Mapping[str, Any]
+    metrics: Mapping[str, float]
+    pairs: pd.DataFrame
+    style: pd.DataFrame | None
+    trajectories: pd.DataFrame | None
+    curves: pd.DataFrame | None
+    platoon: pd.DataFrame | None = None
+    history: pd.DataFrame | None = None
+    values: pd.DataFrame | None = None
+    overrides: tuple[str, ...] | None = None
+    experiment: str | None = None
+    started: datetime | None = None
+    seconds: float | None = None
+    version: str = ""
+    missing: tuple[str, ...] = ()
+    name: str = ""
+
+    def component(self, group: str) -> str:
+        """Returns the name of a component: of the group "model" for instance "w99".
+
+        It is "" for the learner of a job that trains nothing, whatever its configuration says.
+        """
+        if group == "learner" and self.component("protocol") == "transfer":
+            return ""
+        node = self.config.get(group)
+        return str(node.get("name", "")) if isinstance(node, Mapping) else ""
+
+    def setting(self, path: str) -> Any:
+        """Returns a setting such as "style.cluster"; None if the job has none of that name."""
+        value: Any = self.config
+        for key in path.split("."):
+            value = value.get(key) if isinstance(value, Mapping) else None
+        return value
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """The methods that were compared, in the order in which they are shown."""
+        present = [str(method) for method in self.pairs["method"].unique()]
+        known = [method for method in METHODS if method in present]
+        return (*known, *(method for method in present if method not in METHODS))
+
+    @property
+    def meaningful_methods(self) -> tuple[str, ...]:
+        """The methods whose numbers say something: without a constant baseline only the policy."""
+        return self.methods if self.has_constant_baseline else ("policy",)
+
+    @property
+    def has_constant_baseline(self) -> bool:
+        """Whether the model follows its leader with constant parameters: those are baselines."""
+        return renamed.data(self.data).get("has_constant_baseline") is not False
+
+    def metric(self, name: str, method: str, scope: str = TEST) -> float:
+        """Returns a metric of a method over a part of the trajectories; NaN if it is not known."""
+        key = key_of(name, method, scope)
+        if key in self.metrics:
+            return self.metrics[key]
+        return self._summaries.get((name, method, scope), math.nan)
+
+    def has_metric(self, name: str, method: str, scope: str = TEST) -> bool:
+        """Says whether a metric was measured, for a method whose numbers say something."""
+        return method in self.meaningful_methods and (key_of(name, method, scope) in self.metrics)
+
+    @cached_property
+    def known_metrics(self) -> tuple[MetricInfo, ...]:
+        """What the job measured, in the order in which it is shown."""
+        return known_metrics(renamed.data(self.data), self.metrics)
+
+    @cached_property
+    def _summaries(self) -> dict[tuple[str, str, str], float]:
+        """Metrics by name, method and scope, summarised from the values of the pairs."""
+        found: dict[tuple[str, str, str], float] = {}
+        if self.values is None:
+            return found
+        kinds = {metric.name: metric.summary for metric in self.known_metrics}
+        for key, rows in self.values.groupby(["metric", "method", "scope"]):
+            name, method, scope = (str(part) for part in key)
+            summary = rows["value"].dropna().agg(kinds.get(name, "mean"))
+            found[name, method, scope] = float(summary)
+        return found
+
+    def improvement(self, statistic: str, baseline: str = "fixed", scope: str = TEST) -> float:
+        """Returns a statistic of the improvement over a baseline, a fraction; NaN if unknown."""
+        return self.metrics.get(f"{improvement_key(baseline, scope)}/{statistic}", math.nan)
+
+    def baselines(self, scope: str = TEST) -> tuple[str, ...]:
+        """Returns what the policy was compared with, driver-specific calibration first.
+
+        It is empty if `has_constant_baseline` is false.
+
+        Args:
+            scope: the part of the trajectories.
+        """
+        if not self.has_constant_baseline:
+            return ()
+        found: list[str] = []
+        for method in ("fixed", *self.methods):
+            known = f"{improvement_key(method, scope)}/mean" in self.metrics
+            if known and method in self.methods and method not in {*found, "policy"}:
+                found.append(method)
+        return tuple(found)
+
+    @property
+    def split(self) -> float:
+        """Share of each pair that was calibrated on; NaN if that is not known."""
+        split = self.config.get("split")
+        return float(split) if isinstance(split, int | float) else math.nan
+
+    @property
+    def transient_s(self) -> float:
+        """Length of the transient at the beginning of the test part, s."""
+        return float(self.data.get("transient_s", TRANSIENT_S))
+
+    def scope_label(self, scope: str) -> str:
+        """Returns how a part of the trajectories is named."""
+        return scope_label(scope, self.transient_s)
+
+    @cached_property
+    def by_pair(self) -> pd.DataFrame:
+        """A row per pair.
+
+        Columns: pair_id, driver, cluster, style_score, `rmse_speed/METHOD`, `rmse_gap/METHOD`,
+        `improvement/BASELINE`.
+        """
+        first = self.pairs.drop_duplicates("pair_id").set_index("pair_id")
+        known = [name for name in ("driver", "cluster", "style_score") if name in first]
+        table = first[known].copy()
+        for method in self.methods:
+            rows = self.pairs[self.pairs["method"] == method]
+            of_method = rows.drop_duplicates("pair_id").set_index("pair_id")
+            for column in ("rmse_speed", "rmse_gap"):
+                table[f"{column}/{method}"] = of_method[column]
+        rows = self.pairs[self.pairs["method"] == "policy"]
+        of_policy = rows.drop_duplicates("pair_id").set_index("pair_id")
+        for baseline in self.methods:
+            column = improvement_column(baseline)
+            if column in of_policy:
+                table[f"improvement/{baseline}"] = of_policy[column]
+        return table.reset_index()
+
+    @property
+    def parameters(self) -> tuple[ParameterAxis, ...]:
+        """The tuned parameters of the trajectories, with units and bounds where they are known."""
+        if self.trajectories is None:
+            return ()
+        known = {}
+        for one in self.data.get("parameters") or ():
+            if isinstance(one, Mapping):
+                known[str(one.get("name"))] = one
+        axes = []
+        for name in _parameter_names(self.trajectories, self._simulated):
+            about = known.get(name, {})
+            low, high = _number(about.get("low")), _number(about.get("high"))
+            axes.append(ParameterAxis(name, str(about.get("unit", "")), low, high))
+        return tuple(axes)
+
+    @cached_property
+    def pair_trajectories(self) -> tuple[PairTrajectory, ...]:
+        """The test parts of all pairs; empty if the job left none."""
+        if self.trajectories is None:
+            return ()
+        found = []
+        for pair_id, frames in self.trajectories.groupby("pair_id", sort=False):
+            found.append(self._trajectory(str(pair_id), frames))
+        return tuple(found)
+
+    @property
+    def _simulated(self) -> list[str]:
+        """The methods that the trajectories hold."""
+        table = self.trajectories
+        if table is None:
+            return []
+        return [method for method in self.methods if f"speed_{method}" in table]
+
+    def _trajectory(self, pair_id: str, frames: pd.DataFrame) -> PairTrajectory:
+        def column(name: str) -> np.ndarray:
+            return frames[name].to_numpy(dtype=float)
+
+        names = [axis.name for axis in self.parameters]
+        parameters = {}
+        for method in self._simulated:
+            columns = [f"{name}_{method}" for name in names]
+            parameters[method] = frames[columns].to_numpy(dtype=float)
+        return PairTrajectory(
+            pair_id=pair_id,
+            driver="",
+            time=column("time_s"),
+            leader_speed=column("leader_speed"),
+            real_speed=column("real_speed"),
+            real_gap=column("real_gap"),
+            speed={method: column(f"speed_{method}") for method in self._simulated},
+            gap={method: column(f"gap_{method}") for method in self._simulated},
+            parameters=parameters,
+        )
+
+
+@dataclass(frozen=True)
+class Unfinished:
+    """A job that cannot be reported: where it is, and why."""
+
+    place: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Runs:
+    """What was found: finished jobs, each with a name of its own, and the others."""
+
+    jobs: tuple[Job, ...]
+    unfinished: tuple[Unfinished, ...] = ()
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What is known of a job besides its files: of a tracked one, from MLflow."""
+
+    place: str
+    started: datetime | None = None
+    seconds: float | None = None
+    version: str = ""
+    hydra: Path | None = field(default=None)
+
+
+def improvement_key(baseline: str, scope: str = TEST) -> str:
+    """Returns how the metrics of the improvement over a baseline begin."""
+    if scope != TEST:
+        return f"{scope}/rmse_improvement/{baseline}"
+    return "rmse_improvement" if baseline == "fixed" else f"rmse_improvement/{baseline}"
+
+
+def improvement_column(baseline: str) -> str:
+    """Returns the column of `pairs.csv` with the improvement over a baseline."""
+    return "improvement" if baseline == "fixed" else f"improvement_over_{baseline}"
+
+
+def _parameter_names(trajectories: pd.DataFrame, methods: list[str]) -> list[str]:
+    """Returns what has a column for every method, besides speed and gap."""
+    names = []
+    suffix = f"_{methods[-1]}"
+    for column in trajectories:
+        name = str(column).removesuffix(suffix)
+        if not str(column).endswith(suffix) or name in {"speed", "gap"}:
+            continue
+        if all(f"{name}_{method}" in trajectories for method in methods):
+            names.append(name)
+    return names
+
+
+def _number(value: object) -> float | None:
+    return float(value) if isinstance(value, int | float) else None

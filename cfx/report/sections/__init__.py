@@ -1,0 +1,38 @@
+"""The sections of the page, in their order: a new one is a module and its line in `SECTIONS`."""
+
+from __future__ import annotations
+
+from cfx.report.blocks import Section
+from cfx.report.sections import (
+    clusters,
+    comparison,
+    configurations,
+    drivers,
+    errors,
+    history,
+    learning,
+    metrics,
+    paper,
+    results,
+    run,
+    safety,
+    style,
+    trajectories,
+)
+
+SECTIONS: tuple[Section, ...] = (
+    comparison.SECTION,
+    run.SECTION,
+    results.SECTION,
+    safety.SECTION,
+    metrics.SECTION,
+    history.SECTION,
+    paper.SECTION,
+    drivers.SECTION,
+    clusters.SECTION,
+    style.SECTION,
+    trajectories.SECTION,
+    errors.SECTION,
+    learning.SECTION,
+    configurations.SECTION,
+)

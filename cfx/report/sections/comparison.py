@@ -1,0 +1,354 @@
+"""All jobs side by side: how close each is to the real drivers, and how safely it drives."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from cfx.evaluation.result import METHODS
+from cfx.metrics.base import MetricInfo
+from cfx.plots.choice.jobs import error_dots
+from cfx.plots.plotly.figure import Plot
+from cfx.plots.plotly.jobs import errors_view
+from cfx.plots.words import (
+    FULL_TRAJECTORY,
+    STEADY,
+    TEST,
+    explained,
+    percent,
+    short_label,
+)
+from cfx.report.blocks import Block, Figure, Fold, Heading, Section, Table, Text
+from cfx.report.job import Job, Runs
+from cfx.report.metrics import lists_metrics, metric_title
+from cfx.report.tables import Cell, Column, Sheet, formatted, job_names, number, tested, text
+
+_RECORDED = "Behind recorded leaders"
+_IN_PLATOON = "Platoon behind a braking leader"
+_PLATOON = (
+    "Ten followers in a row, all driven by the policy, behind a leader that brakes from 15 to"
+    " 7 m/s and recovers."
+)
+
+
+@dataclass(frozen=True)
+class _SafetyColumn:
+    """A column on safety: a metric over a part of the trajectories, and the baseline below it."""
+
+    metric: str
+    scope: str
+    baseline: str
+    heading: str
+    meaning: str
+    form: str
+
+    @property
+    def platoon(self) -> bool:
+        """Whether it is of a platoon."""
+        return self.metric.startswith("platoon/")
+
+
+_SAFETY = (
+    _SafetyColumn(
+        "collisions",
+        TEST,
+        "fixed",
+        "Collisions",
+        "Pairs in which the simulated gap becomes negative, on the test part.",
+        ".0f",
+    ),
+    _SafetyColumn(
+        "collisions",
+        FULL_TRAJECTORY,
+        "population",
+        "full trajectory",
+        "The same over full trajectories.",
+        ".0f",
+    ),
+    _SafetyColumn(
+        "hard_braking",
+        TEST,
+        "fixed",
+        "Hard braking",
+        "Frames with an acceleration below \N{MINUS SIGN}8 m/s², test part.",
+        ".0f",
+    ),
+    _SafetyColumn(
+        "hard_braking",
+        FULL_TRAJECTORY,
+        "population",
+        "full trajectory",
+        "The same over full trajectories.",
+        ".0f",
+    ),
+    _SafetyColumn(
+        "jerk",
+        TEST,
+        "fixed",
+        "Jerk (m/s³)",
+        "Root mean square jerk on the test part, mean over the pairs.",
+        ".2f",
+    ),
+    _SafetyColumn(
+        "at_bounds",
+        TEST,
+        "fixed",
+        "At bounds",
+        "Share of the tuned parameters' values within 1 % of a bound.",
+        ".0%",
+    ),
+    _SafetyColumn(
+        "platoon/head_to_tail",
+        TEST,
+        "population",
+        "Amplification",
+        f"{_PLATOON} By how many times as much as the leader the last follower slows down, mean"
+        " over the networks; above 1 the platoon amplifies.",
+        ".2f",
+    ),
+    _SafetyColumn(
+        "platoon/string_stable",
+        TEST,
+        "population",
+        "Stable",
+        f"{_PLATOON} Share of the networks with a string stable platoon: no vehicle slows down more"
+        " than the vehicle ahead (by over 0.1 m/s).",
+        ".0%",
+    ),
+    _SafetyColumn(
+        "platoon/min_gap",
+        TEST,
+        "population",
+        "Least gap (m)",
+        f"{_PLATOON} The least gap of all.",
+        ".1f",
+    ),
+    _SafetyColumn(
+        "platoon/collisions",
+        TEST,
+        "population",
+        "Collisions",
+        f"{_PLATOON} Followers that collide, of all platoons.",
+        ".0f",
+    ),
+)
+
+_ERRORS = (
+    ("rmse_speed", TEST),
+    ("rmse_gap", TEST),
+    ("rmse_speed", STEADY),
+    ("rmse_speed", FULL_TRAJECTORY),
+    ("rmse_gap", FULL_TRAJECTORY),
+)
+
+_GAINS = (
+    ("fixed", TEST),
+    ("shrunk", TEST),
+    ("population", TEST),
+    ("population", FULL_TRAJECTORY),
+)
+
+
+def blocks(runs: Runs) -> list[Block]:
+    """Returns the comparison of all jobs."""
+    jobs = runs.jobs
+    introduction = "Errors in m/s and m compare across driving models and learners."
+    if len(jobs) > 1:
+        introduction += " The best of a column is bold where all jobs are tested on the same pairs."
+    found: list[Block] = [
+        Text(introduction),
+        Table(closeness(jobs), compact=True, explain=True),
+    ]
+    unconditional = [job for job in jobs if not job.has_constant_baseline]
+    if unconditional:
+        found.append(
+            Text(
+                f"{job_names(unconditional)}: the policy sets the acceleration itself. With"
+                " constant parameters the model follows no leader, so that no calibration is a"
+                " baseline. Its errors are an upper reference for the models that follow.",
+                "note",
+            )
+        )
+    found += [
+        Figure(absolute(jobs)),
+        Heading("Is it safe, and smooth?"),
+        Text("The numbers are the policy's; the smaller line below is a baseline's."),
+        Table(safety(jobs), compact=True, explain=True),
+    ]
+    further = every_metric(jobs)
+    if further is not None:
+        words = "The numbers are the policy's; the smaller line: driver-specific calibration."
+        table = Table(further, compact=True, explain=True)
+        found.append(Fold("Every metric of every job, test part", (Text(words), table)))
+    return found
+
+
+def closeness(jobs: Sequence[Job]) -> Sheet:
+    """Returns a row per job: the errors of each method, and the policy's improvement."""
+    frames = {
+        TEST: tested(jobs),
+        FULL_TRAJECTORY: "the full trajectory of unseen drivers, from its first frame on",
+    }
+    columns = [Column("Job", number=False)]
+    rows = [[text(job.name)] for job in jobs]
+    groups = [("", 1)]
+    for scope, title in (
+        (TEST, "Test part: RMSE of speed in m/s, below it of gap in m"),
+        (FULL_TRAJECTORY, "Full trajectories: the same"),
+    ):
+        methods = _measured_methods(jobs, scope)
+        for method in methods:
+            meaning = f"RMSE over {frames[scope]}, with {explained(method)}."
+            columns.append(Column(short_label(method), meaning))
+            for row, job in zip(rows, jobs, strict=True):
+                row.append(_error(job, scope, method))
+        if methods:
+            groups.append((title, len(methods)))
+    gains = [one for one in _GAINS if any(one[0] in job.baselines(one[1]) for job in jobs)]
+    for baseline, scope in gains:
+        suffix = "" if scope == TEST else ", full"
+        meaning = (
+            f"Mean improvement of the RMSE of speed over {explained(baseline)}, on"
+            f" {frames[scope]}; below it the 95 % interval."
+        )
+        columns.append(Column(f"over {short_label(baseline)}{suffix}", meaning))
+        for row, job in zip(rows, jobs, strict=True):
+            row.append(_gain(job, baseline, scope))
+    if gains:
+        groups.append(("Improvement of the policy", len(gains)))
+    _mark_best(rows, jobs, columns)
+    return Sheet(tuple(columns), tuple(tuple(row) for row in rows), tuple(groups))
+
+
+def safety(jobs: Sequence[Job]) -> Sheet:
+    """Returns a row per job: the policy's measures of safety, and below them a baseline's."""
+    kept = []
+    for one in _SAFETY:
+        if any(job.has_metric(one.metric, "policy", one.scope) for job in jobs):
+            kept.append(one)
+    columns = [Column("Job", number=False)]
+    for one in kept:
+        meaning = f"{one.meaning} Below it the same for {explained(one.baseline)}."
+        columns.append(Column(one.heading, meaning))
+    rows = []
+    for job in jobs:
+        cells = [text(job.name)]
+        for one in kept:
+            cells.append(_with_baseline(job, one.metric, one.scope, one.baseline, one.form))
+        rows.append(tuple(cells))
+    platoon = sum(one.platoon for one in kept)
+    groups = [("", 1)]
+    for title, count in ((_RECORDED, len(kept) - platoon), (_IN_PLATOON, platoon)):
+        if count:
+            groups.append((title, count))
+    return Sheet(tuple(columns), tuple(rows), tuple(groups))
+
+
+def every_metric(jobs: Sequence[Job]) -> Sheet | None:
+    """Returns a row per job with all metrics of the test part; None if no job lists its metrics."""
+    known: dict[str, MetricInfo] = {}
+    for job in jobs:
+        if lists_metrics(job.data):
+            known |= {one.name: one for one in job.known_metrics if TEST in one.scopes}
+    if not known:
+        return None
+    columns = [Column("Job", number=False)]
+    for metric in known.values():
+        better = "" if metric.direction == "none" else f" The {metric.direction} the better."
+        columns.append(
+            Column(metric_title(metric), f"{metric.meaning}, {metric.summary} over pairs.{better}")
+        )
+    rows = []
+    for job in jobs:
+        cells = [text(job.name)]
+        for name in known:
+            cells.append(_with_baseline(job, name, TEST, "fixed", ".3g"))
+        rows.append(tuple(cells))
+    return Sheet(tuple(columns), tuple(rows))
+
+
+def absolute(jobs: Sequence[Job]) -> Plot:
+    """Errors of each method in m/s and m; a view for each error and part of the trajectories."""
+    views: dict[str, dict[str, Any]] = {}
+    for metric, scope in _ERRORS:
+        if not any(job.has_metric(metric, "policy", scope) for job in jobs):
+            continue
+        signal, unit = ("speed", "m/s") if metric == "rmse_speed" else ("gap", "m")
+        values = {}
+        for method in METHODS:
+            errors = np.array([_shown_error(job, metric, method, scope) for job in jobs])
+            if np.isfinite(errors).any():
+                values[method] = errors
+        names = [job.name for job in jobs]
+        what = f"RMSE of {signal}, mean over pairs; lower is closer to the real driver"
+        dots = error_dots(names, values, unit=unit, what=what)
+        views[f"{signal}, {jobs[0].scope_label(scope)}"] = errors_view(dots)
+    height = 110 + 30 * len(jobs)
+    return Plot(views, height, "Errors of every job and method", chooser="RMSE of")
+
+
+def _shown_error(job: Job, metric: str, method: str, scope: str) -> float:
+    return job.metric(metric, method, scope) if method in job.meaningful_methods else math.nan
+
+
+def _measured_methods(jobs: Sequence[Job], scope: str) -> list[str]:
+    found = []
+    for method in METHODS:
+        if any(job.has_metric("rmse_speed", method, scope) for job in jobs):
+            found.append(method)
+    return found
+
+
+def _error(job: Job, scope: str, method: str) -> Cell:
+    if not job.has_metric("rmse_speed", method, scope):
+        return number(math.nan, "")
+    speed, gap = job.metric("rmse_speed", method, scope), job.metric("rmse_gap", method, scope)
+    second = f"{gap:.2f}" if math.isfinite(gap) else ""
+    return replace(number(speed, f"{speed:.3f}"), second=second)
+
+
+def _gain(job: Job, baseline: str, scope: str) -> Cell:
+    if baseline not in job.baselines(scope):
+        return number(math.nan, "")
+    mean = job.improvement("mean", baseline, scope)
+    low = job.improvement("ci95_low", baseline, scope)
+    high = job.improvement("ci95_high", baseline, scope)
+    second = ""
+    if math.isfinite(low) and math.isfinite(high):
+        second = f"{percent(low, 1).removesuffix(' %')} to {percent(high, 1).removesuffix(' %')}"
+    return replace(number(mean, percent(mean, 1)), second=second)
+
+
+def _with_baseline(job: Job, metric: str, scope: str, baseline: str, form: str) -> Cell:
+    """Returns the policy's number, and below it the baseline's."""
+    value = job.metric(metric, "policy", scope)
+    cell = number(value, formatted(value, form))
+    if not job.has_metric(metric, baseline, scope):
+        return cell
+    return replace(cell, second=formatted(job.metric(metric, baseline, scope), form))
+
+
+def _mark_best(rows: list[list[Cell]], jobs: Sequence[Job], columns: Sequence[Column]) -> None:
+    """Marks the policy's smallest error and largest improvement, if all are tested on the same."""
+    tests = set()
+    for job in jobs:
+        fingerprint = str(job.data.get("fingerprint"))
+        tests.add((fingerprint, frozenset(job.pairs["pair_id"]), job.split))
+    if len(rows) < 2 or len(tests) > 1:
+        return
+    for k, column in enumerate(columns):
+        is_error = column.heading == "policy"
+        if not is_error and not column.heading.startswith("over "):
+            continue
+        known = [float(row[k].sort) for row in rows if row[k].sort]
+        if known:
+            best = min(known) if is_error else max(known)
+            for row in rows:
+                row[k] = replace(row[k], best=row[k].sort == repr(best))
+
+
+SECTION = Section("comparison", "Side by side", "Side by side", blocks)

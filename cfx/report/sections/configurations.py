@@ -1,0 +1,31 @@
+"""The whole configuration of each job."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import yaml
+
+from cfx.report.blocks import Block, Fold, Listing, Section, Text
+from cfx.report.job import Job, Runs
+
+
+def blocks(runs: Runs) -> list[Block]:
+    """Returns a fold for each job."""
+    found: list[Block] = [Text("The whole configuration of each job, as it ran.")]
+    for job in runs.jobs:
+        found.append(Fold(job.name, (Text(job.place, "fine"), Listing(_configuration(job)))))
+    return found
+
+
+def _configuration(job: Job) -> str:
+    """Returns the configuration as YAML, after what the protocol noted of its design."""
+    design = ""
+    notes = job.data.get("protocol")
+    if isinstance(notes, Mapping):
+        for name, value in notes.items():
+            design += f"# {str(name).replace('_', ' ')}: {value}\n"
+    return design + str(yaml.safe_dump(dict(job.config), sort_keys=False, allow_unicode=True))
+
+
+SECTION = Section("configs", "Configurations", "Configurations", blocks)

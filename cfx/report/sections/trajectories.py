@@ -1,0 +1,73 @@
+"""Speed, gap and parameters of the best, the median and the worst pair over time."""
+
+from __future__ import annotations
+
+import math
+
+from cfx.plots.choice.pairs import RankedPair, rank_pairs
+from cfx.plots.choice.trajectories import pair_panels
+from cfx.plots.plotly.figure import Plot
+from cfx.plots.plotly.trajectories import pair_plot
+from cfx.plots.words import percent_or_undefined, short_label
+from cfx.report.blocks import (
+    Block,
+    Figure,
+    Group,
+    Heading,
+    Section,
+    Text,
+    job_fold,
+    missing_file,
+)
+from cfx.report.job import Job, Runs
+
+_INTRODUCTION = (
+    "The pair that improves most over driver-specific calibration, the one in the middle and the"
+    " one that improves least, on the test part. A click on the legend hides a method in all"
+    " panels; drag to zoom, double-click to come back. Thin lines mark the bounds of a parameter."
+)
+
+
+def blocks(runs: Runs) -> list[Block]:
+    """Returns the chosen pairs of each job."""
+    found: list[Block] = [Text(_INTRODUCTION)]
+    jobs = [job for job in runs.jobs if job.trajectories is not None]
+    for k, job in enumerate(jobs):
+        groups = []
+        for pair in chosen_pairs(job):
+            parts = (Heading(_title(job, pair)), Figure(pair_of(job, pair.pair_id)))
+            groups.append(Group(parts))
+        found.append(job_fold(job.name, groups, first=k == 0))
+    what = "speed, gap and parameters over time"
+    return [*found, *missing_file(runs, "trajectories.parquet", what)]
+
+
+def chosen_pairs(job: Job) -> tuple[RankedPair, ...]:
+    """Returns the best, the median and the worst pair; fewer if there are fewer."""
+    present = [trajectory.pair_id for trajectory in job.pair_trajectories]
+    table = job.by_pair[job.by_pair["pair_id"].isin(present)]
+    gains = table["improvement/fixed"].to_numpy(dtype=float)
+    return rank_pairs(table["pair_id"].astype(str).tolist(), gains)
+
+
+def pair_of(job: Job, pair_id: str) -> Plot:
+    """Speed, gap and each tuned parameter of one pair of a job."""
+    for trajectory in job.pair_trajectories:
+        if trajectory.pair_id == pair_id:
+            return pair_plot(pair_panels(trajectory, job.methods, job.parameters))
+    raise KeyError(pair_id)
+
+
+def _title(job: Job, pair: RankedPair) -> str:
+    title = pair.title[:1].upper() + pair.title[1:]
+    if job.has_constant_baseline and math.isfinite(pair.improvement):
+        improvement = percent_or_undefined(pair.improvement, 1)
+        title += f": {improvement} over {short_label('fixed')} calibration"
+    row = job.by_pair.set_index("pair_id").loc[pair.pair_id]
+    errors = []
+    for method in job.methods:
+        errors.append(f"{short_label(method)} {row[f'rmse_speed/{method}']:.3f}")
+    return f"{title}; RMSE of speed (m/s): {', '.join(errors)}"
+
+
+SECTION = Section("trajectories", "Trajectories", "Trajectories", blocks)

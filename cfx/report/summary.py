@@ -1,0 +1,99 @@
+"""What came out, in a few sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from cfx.plots.words import explained, percent
+from cfx.report.job import Job
+
+_MOST = 3
+"""Up to so many jobs have a sentence each."""
+
+
+def summary(jobs: Sequence[Job]) -> list[str]:
+    """Returns sentences: against driver-specific calibration, and against pooled calibration."""
+    first = (
+        f"{_amount(jobs)}: is a policy that adapts the parameters closer to the real driver than"
+        f" {explained('fixed')}?"
+    )
+    compared = [job for job in jobs if job.has_constant_baseline]
+    references = [_reference(job) for job in jobs if not job.has_constant_baseline]
+    if len(compared) <= _MOST:
+        return [first, *(_verdict(job) for job in compared), *references]
+    best = max(compared, key=_mean_for_ranking)
+    counts = f"{_counts(compared)} (by the 95 % interval of the mean improvement)."
+    return [first, counts, f"The best mean: {_verdict(best)}", *references]
+
+
+def _counts(jobs: Sequence[Job]) -> str:
+    """Returns in how many jobs the policy is closer, over each of two baselines."""
+    said = []
+    for baseline, against in (
+        ("fixed", f"Of {len(jobs)} jobs"),
+        ("population", "against pooled calibration"),
+    ):
+        sides = [_side(job, baseline) for job in jobs if baseline in job.baselines()]
+        if sides:
+            counts = ", ".join(
+                f"{side} in {sides.count(side)}" for side in ("yes", "no", "undecided")
+            )
+            said.append(f"{against}: {counts}")
+    return "; ".join(said)
+
+
+def _mean_for_ranking(job: Job) -> float:
+    mean = job.improvement("mean")
+    return mean if np.isfinite(mean) else -np.inf
+
+
+def _reference(job: Job) -> str:
+    """Says what a policy reaches that sets the acceleration itself."""
+    speed, gap = job.metric("rmse_speed", "policy"), job.metric("rmse_gap", "policy")
+    return (
+        f"{job.name}: the policy sets the acceleration itself. RMSE of speed {speed:.3f} m/s, of"
+        f" gap {gap:.2f} m: an upper reference for the models that follow."
+    )
+
+
+def _amount(jobs: Sequence[Job]) -> str:
+    pairs: set[tuple[str, str]] = set()
+    sources: dict[str, None] = {}
+    for job in jobs:
+        source = str(job.data.get("source", ""))
+        if source:
+            sources[source] = None
+        for pair in job.pairs["pair_id"].unique():
+            pairs.add((source, pair))
+    where = f" from {Path(next(iter(sources))).name}" if len(sources) == 1 else ""
+    return f"{len(pairs)} pair{'' if len(pairs) == 1 else 's'} of leader and follower{where}"
+
+
+def _side(job: Job, baseline: str = "fixed") -> str:
+    if job.improvement("ci95_low", baseline) > 0:
+        return "yes"
+    return "no" if job.improvement("ci95_high", baseline) < 0 else "undecided"
+
+
+def _verdict(job: Job) -> str:
+    if not np.isfinite(job.improvement("mean")):
+        return f"{job.name}: no pair has a defined improvement."
+    pooled = ""
+    if "population" in job.baselines():
+        pooled = f"; over pooled calibration {_gain(job, 'population')}"
+    gain = _gain(job, "fixed")
+    return f"{job.name}: {_side(job)}. Improvement of the RMSE of speed: {gain}{pooled}."
+
+
+def _gain(job: Job, baseline: str) -> str:
+    mean = job.improvement("mean", baseline)
+    low, high = job.improvement("ci95_low", baseline), job.improvement("ci95_high", baseline)
+    if not np.isfinite(mean):
+        return "not defined"
+    sure = "no interval for a single driver"
+    if np.isfinite(low):
+        sure = f"95 % interval {percent(low, 1)} to {percent(high, 1)}"
+    return f"{percent(mean, 1)} on average ({sure})"
