@@ -71,6 +71,20 @@ class Bad(Optimizer):
         {}
 """
 
+_OBJECTIVE = """
+from cfx import Objective
+
+class Bad(Objective):
+    unit = "m/s"
+    signals = ("speed",)
+
+    def terms(self, frames):
+        return ((frames.speed - frames.measured_speed).square(),)
+
+    def finish(self, sums, count, epsilon=0.0):
+        return {}
+"""
+
 _DATASET = """
 import numpy as np
 from cfx import Dataset, Pair, PairSet
@@ -294,6 +308,30 @@ BROKEN = (
         "simulators",
         _SIMULATOR.format("Single(model, dt)"),
         r"advance's positions gives torch\.float32 for torch\.float64",
+    ),
+    Broken(
+        "loss_of_all",
+        "objectives",
+        _OBJECTIVE.format("(sums[0] / count).sum()"),
+        r"finish gives the shape \(\); it must give \(\*batch,\), here \(2,\)",
+    ),
+    Broken(
+        "negative_loss",
+        "objectives",
+        _OBJECTIVE.format("-sums[0] / count"),
+        "losses must be finite and not negative",
+    ),
+    Broken(
+        "reads_gaps",
+        "objectives",
+        _OBJECTIVE.format("sums[0] / count").replace("frames.speed", "frames.gap"),
+        "it says that it reads speed alone",
+    ),
+    Broken(
+        "unfinished",
+        "objectives",
+        _OBJECTIVE.format("0").replace("def finish", "def end"),
+        "does not implement finish",
     ),
     Broken(
         "no_pairs",

@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 import cfx
-from cfx import cli
+from cfx import cli, registry
 from cfx.datasets.synthetic import SyntheticDataset
 from cfx.datasets.tidy import write_tidy
 from cfx.errors import DataError
@@ -138,6 +138,21 @@ def test_every_window_has_its_label_and_spread(finished: cfx.JobResult) -> None:
     assert finished.metrics["labels/loss"] == pytest.approx(labels.loss.mean())
 
 
+def test_a_calibration_says_its_objective_and_reports_the_others(finished: cfx.JobResult) -> None:
+    described = json.loads((finished.folder / "data.json").read_text())
+    assert described["objective"] == {"name": "speed_rmse", "unit": "m/s"}
+    for name in registry.names("objective"):
+        assert finished.metrics[f"calibration/{name}/fixed"] >= 0, name
+
+
+def test_another_objective_calibrates_other_parameters() -> None:
+    speed = run("policy=fixed", "optimizer.samples=1024", "objective=speed_rmse")
+    gap = run("policy=fixed", "optimizer.samples=1024", "objective=gap_rmse")
+    for name, better, worse in (("speed_rmse", speed, gap), ("gap_rmse", gap, speed)):
+        metric = f"calibration/{name}/fixed"
+        assert better.metrics[metric] < worse.metrics[metric], name
+
+
 def test_synthetic_data_keeps_its_truth(finished: cfx.JobResult) -> None:
     table = pd.read_parquet(finished.folder / "data.parquet")
     assert {"true_t_r", "true_t_i", "true_model"} <= set(table.columns)
@@ -224,7 +239,7 @@ def test_two_policies_calibrate_once(caplog: pytest.LogCaptureFixture) -> None:
         first = [message for message in caplog.messages if "problems" in message]
         caplog.clear()
         run("policy=lstm")
-    assert any("Window labels" in message for message in first)
+    assert any("(labels)" in message for message in first)
     assert not [
         message
         for message in caplog.messages

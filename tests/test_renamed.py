@@ -10,6 +10,7 @@ from typing import Any
 
 import pandas as pd
 import pytest
+import torch
 from omegaconf import OmegaConf
 
 import cfx
@@ -19,6 +20,7 @@ from cfx.errors import ConfigError
 from cfx.job.output import Output, write_metrics
 from cfx.models.krauss import Krauss
 from cfx.policies.gru import GruPolicy
+from cfx.testing.checks.optimizers import Problems, bowl
 
 Warnings = Callable[[], list[str]]
 
@@ -288,6 +290,34 @@ def test_tables_get_todays_columns_and_methods() -> None:
     ]
     assert list(today["method"]) == ["policy", "shrunk"]
     assert list(table["method"]) == ["policy", "base"]
+
+
+def test_labels_have_columns_without_a_unit() -> None:
+    table = pd.DataFrame({"window": [0], "loss_mps": [0.1], "spread_mps": [0.2]})
+    assert list(renamed.results(table)) == ["window", "loss", "sensitivity"]
+
+
+def test_an_optimizer_that_is_annotated_with_the_earlier_objective_works() -> None:
+    """`cfx.Objective` was the protocol that is now `cfx.CandidateLosses`."""
+    code = """
+from cfx import Objective, Optimizer
+
+class Mine(Optimizer):
+    def evaluations(self):
+        return 1
+
+    def bytes_per_problem(self, n):
+        return 0
+
+    def solve(self, objective: Objective, guesses, *, seed):
+        candidates = guesses[:, :1]
+        return candidates, objective(candidates)
+"""
+    space: dict[str, Any] = {}
+    exec(code, space)  # noqa: S102 - the module of a plugin
+    guesses = torch.rand((3, 1, 2), dtype=torch.float64)
+    found = space["Mine"]().minimize(Problems(bowl, guesses[:, 0]), guesses, seed=0)
+    torch.testing.assert_close(found.best, guesses[:, 0])
 
 
 def test_a_file_is_found_under_its_earlier_name_if_only_that_is_there(tmp_path: Path) -> None:

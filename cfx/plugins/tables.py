@@ -58,6 +58,8 @@ def show(kind: str, name: str) -> None:
     print(f"{inspect.getdoc(cls) or '(its class has no docstring)'}\n")
     for line in _reference(cls):
         print(f"{line}\n")
+    if entry.kind == "objective":
+        print(f"Unit: {cls.unit or 'none'}\n")
     if entry.kind == "model":
         put(_parameters(cls))
     if entry.kind == "metric":
