@@ -74,6 +74,8 @@ class Job:
         """
         if group == "learner" and self.component("protocol") == "transfer":
             return ""
+        if group == "objective" and group not in self.config:
+            return "speed_rmse"  # a job of a version that had no other
         node = self.config.get(group)
         return str(node.get("name", "")) if isinstance(node, Mapping) else ""
 
