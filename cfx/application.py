@@ -1,8 +1,9 @@
-"""The Hydra application: composes, runs one job or many, and turns whatever happens into an exit code and one clear message.
+"""The Hydra application: composes, runs one job or many, and ends in an exit code and one message.
 
-Hydra's own error handling prints tracebacks and exits with 1, so `HYDRA_FULL_ERROR` is set for the time of the call: exceptions
-then reach this module. A job itself never raises into Hydra; it leaves an `ProtocolResult`, in a multirun as `outcome.json` in its
-folder, which is how worker processes and other machines report too. So one failed job stops no other, and a multirun that was
+Hydra's own error handling prints tracebacks and exits with 1. `HYDRA_FULL_ERROR` is therefore set
+for the time of the call, so that exceptions reach this module. A job itself never raises into
+Hydra; it leaves a `JobStatus`, in a multirun as `outcome.json` in its folder, which is how worker
+processes and other machines report too. So one failed job stops no other, and a multirun that was
 broken off goes on where it stopped: see `cfx.sweep`.
 """
 
@@ -21,7 +22,7 @@ from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeGuard, cast
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -57,7 +58,15 @@ INTERRUPTED, TERMINATED = 130, 143
 
 
 class JobFunction:
-    """The function that Hydra calls for each job; it is pickled into worker processes."""
+    """The function that Hydra calls for each job; it is pickled into worker processes.
+
+    Attributes:
+        target: module and function that runs a job, as `JOB`.
+        multirun: this start of a multirun.
+        process: the process that started it.
+        show_traceback: users' mistakes too are shown with their traceback.
+        status: how the job ended that ran last.
+    """
 
     def __init__(self, target: str, multirun: str, show_traceback: bool) -> None:
         self.target = target
@@ -74,41 +83,36 @@ class JobFunction:
         """
         hydra_config = HydraConfig.get()
         folder = Path(hydra_config.runtime.output_dir)
-        given: Any = OmegaConf.to_container(
-            hydra_config.overrides.task, resolve=False
-        )  # as typed, `${...}` included
+        # As typed, `${...}` included.
+        task: Any = OmegaConf.to_container(hydra_config.overrides.task, resolve=False)
+        blank = JobStatus(0, "", "", tuple(task))
         if hydra_config.mode == RunMode.MULTIRUN:
-            record = Record.read(Path(str(hydra_config.sweep.dir)))
-            blank = JobStatus(
-                0,
-                "",
-                "",
-                tuple(given),
-                self.multirun,
-                record.command_hash if record else "",
-                number=int(hydra_config.job.num),
-            )
-            with worker_of(self.process), only_one(folder):
-                metric, self.status = self._attempt(
-                    config, folder, blank, record.name if record else str(folder.parent)
-                )
-                self.status.write(folder)
-            where = f"{blank.number} ({' '.join(given)}) "
-        else:
-            metric, self.status = self._attempt(
-                config, folder, JobStatus(0, "", "", tuple(given)), ""
-            )
-            where = ""
+            return self._run_in_sweep(config, folder, blank)
+        metric, self.status = self._attempt(config, folder, blank, "")
         if self.status.code:
-            detail = f"\n{self.status.detail}" if self.status.detail else ""
-            # A single job's message is printed by `start`, once.
-            log.error(
-                "job %sfailed: %s%s",
-                where,
-                self.status.message,
-                detail,
-                extra={"file_only": not where},
-            )
+            # `start` prints the message of a single job, once.
+            text = "job failed: %s%s"
+            detail = _below(self.status.detail)
+            log.error(text, self.status.message, detail, extra={"file_only": True})
+        return metric
+
+    def _run_in_sweep(self, config: DictConfig, folder: Path, blank: JobStatus) -> float:
+        """Runs a job of a multirun, and leaves its status in its folder."""
+        hydra_config = HydraConfig.get()
+        record = Record.read(Path(str(hydra_config.sweep.dir)))
+        sweep = str(folder.parent)
+        blank = replace(blank, multirun=self.multirun, number=int(hydra_config.job.num))
+        if record is not None:
+            sweep = record.name
+            blank = replace(blank, command=record.command_hash)
+        with worker_of(self.process), only_one(folder):
+            metric, self.status = self._attempt(config, folder, blank, sweep)
+            self.status.write(folder)
+        if self.status.code:
+            text = "job %d (%s) failed: %s%s"
+            overrides = " ".join(blank.overrides)
+            detail = _below(self.status.detail)
+            log.error(text, blank.number, overrides, self.status.message, detail)
         return metric
 
     def _attempt(
@@ -117,18 +121,10 @@ class JobFunction:
         """Runs a job, or finds that it was done.
 
         Args:
-            blank: what is known of its outcome.
+            blank: what is known of its status.
             sweep: the multirun's name, "" for a single job.
         """
         began = time.monotonic()
-
-        def failed(code: int, message: str, *, show: bool = True) -> tuple[float, JobStatus]:
-            detail = traceback.format_exc().rstrip() if show else ""
-            seconds = time.monotonic() - began
-            return float("nan"), replace(
-                blank, code=code, message=message, detail=detail, seconds=seconds
-            )
-
         try:
             values: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
             if sweep:
@@ -136,29 +132,32 @@ class JobFunction:
                     values["tracking"]["sweep"] = sweep
                 blank = replace(blank, fingerprint=fingerprint(values))
                 earlier = JobStatus.read(folder)
-                if (
-                    earlier is not None
-                    and earlier.code == 0
-                    and earlier.fingerprint == blank.fingerprint
-                ):
+                if _is_done(earlier, blank):
                     log.info("job %d (%s) was done before", blank.number, " ".join(blank.overrides))
-                    return _metric(metrics_of(folder)), replace(
-                        blank, seconds=earlier.seconds, before=True
-                    )
+                    status = replace(blank, seconds=earlier.seconds, before=True)
+                    return _metric(metrics_of(folder)), status
                 (folder / STATUS).unlink(missing_ok=True)  # what it says is no longer so
             result = _call(self.target, values, folder)
         except (Exception, SystemExit) as error:
-            signalled = _signal_behind(error)
-            if signalled is not None:
-                raise signalled from None
-            if isinstance(error, CfxError | OmegaConfBaseException):
-                return failed(2, explain(error, ()), show=self.show_traceback)
-            if isinstance(error, SystemExit):
-                return failed(1, f"the job called sys.exit({error.code!r})")
-            return failed(
-                1, f"{type(error).__name__}: {error}"
-            )  # a bug: its traceback is printed, and the other jobs go on
+            status = self._failed(error, blank)
+            return float("nan"), replace(status, seconds=time.monotonic() - began)
         return _metric(result.metrics), replace(blank, seconds=time.monotonic() - began)
+
+    def _failed(self, error: BaseException, blank: JobStatus) -> JobStatus:
+        """Returns the status of a job that ended in an error; raises a signal that caused it."""
+        signalled = _signal_behind(error)
+        if signalled is not None:
+            raise signalled from None
+        detail = traceback.format_exc().rstrip()
+        if isinstance(error, CfxError | OmegaConfBaseException):
+            if not self.show_traceback:
+                detail = ""
+            return replace(blank, code=2, message=explain(error, ()), detail=detail)
+        # A bug: its traceback is printed, and the other jobs go on.
+        message = f"{type(error).__name__}: {error}"
+        if isinstance(error, SystemExit):
+            message = f"the job called sys.exit({error.code!r})"
+        return replace(blank, code=1, message=message, detail=detail)
 
 
 class Terminated(BaseException):
@@ -168,33 +167,9 @@ class Terminated(BaseException):
 def start(arguments: Sequence[str], *, target: str = JOB) -> int:
     """Runs the Hydra application and returns its exit code; prints each message once."""
     arguments = todays(arguments)
-    overrides = [one for one in arguments if not one.startswith("-")]
-    show_traceback = wants_traceback(arguments)
-    job = JobFunction(target, uuid.uuid4().hex, show_traceback)
+    job = JobFunction(target, uuid.uuid4().hex, wants_traceback(arguments))
     SweepFolder.take()
-    try:
-        with _process_state(arguments):
-            hydra_source.register()
-            hydra.main(config_path=str(nodes.conf_dir()), config_name="config", version_base="1.3")(
-                job
-            )()
-        code = 0
-    except SystemExit as error:
-        # Hydra exits with 0 after --help and the like, with 1 or argparse's 2 after a message about a wrong flag.
-        code = 0 if not error.code else 2
-    except Refused as error:
-        code = _report(error.__cause__, overrides, show_traceback)
-    except (KeyboardInterrupt, Terminated) as error:
-        code = _interrupted(error)
-    except BrokenPipeError:
-        raise  # the reader of stdout has gone; `cfx.cli.main` knows what that means
-    except Exception as error:  # everything ends as an exit code
-        signalled = _signal_behind(error)
-        code = (
-            _interrupted(signalled)
-            if signalled is not None
-            else _report(error, overrides, show_traceback)
-        )
+    code = _run_hydra(job, arguments)
     sweep = SweepFolder.take()
     if sweep is not None:
         return sweep.close(job.multirun, code, interrupted=code in {INTERRUPTED, TERMINATED})
@@ -204,8 +179,38 @@ def start(arguments: Sequence[str], *, target: str = JOB) -> int:
     return code
 
 
+def _run_hydra(job: JobFunction, arguments: Sequence[str]) -> int:
+    """Lets Hydra compose and call `job`; every way in which that ends becomes an exit code."""
+    overrides = [one for one in arguments if not one.startswith("-")]
+    application = hydra.main(
+        config_path=str(nodes.conf_dir()), config_name="config", version_base="1.3"
+    )
+    try:
+        with _process_state(arguments):
+            hydra_source.register()
+            application(job)()
+    except SystemExit as error:
+        # Hydra exits with 0 after --help and the like, with 1 or argparse's 2 after a message about
+        # a wrong flag.
+        return 2 if error.code else 0
+    except Refused as error:
+        return _report(error.__cause__, overrides, job.show_traceback)
+    except (KeyboardInterrupt, Terminated) as error:
+        return _interrupted(error)
+    except BrokenPipeError:
+        raise  # the reader of stdout has gone; `cfx.cli.main` knows what that means
+    except Exception as error:
+        signalled = _signal_behind(error)
+        if signalled is not None:
+            return _interrupted(signalled)
+        return _report(error, overrides, job.show_traceback)
+    return 0
+
+
 def run(overrides: Sequence[str] = (), *, target: str = JOB) -> JobResult:
-    """Runs the job that `python -m cfx OVERRIDES` runs, in this process and into a fresh output folder.
+    """Runs the job that `python -m cfx OVERRIDES` runs.
+
+    It runs in this process, and writes into a new output folder.
 
     Args:
         overrides: as on the command line: `["model=w99", "data.max_pairs=10"]`.
@@ -220,7 +225,7 @@ def run(overrides: Sequence[str] = (), *, target: str = JOB) -> JobResult:
         config = hydra_source.composed(overrides)
         values = hydra_source.plain(config)
         with hydra_source.resolving(config):
-            folder = _fresh(Path(str(config.hydra.run.dir)).absolute())
+            folder = _new_folder(Path(str(config.hydra.run.dir)).absolute())
     except Exception as error:
         if is_user_error(error) and not isinstance(error, CfxError):
             raise ConfigError(explain(error, overrides)) from None
@@ -231,12 +236,13 @@ def run(overrides: Sequence[str] = (), *, target: str = JOB) -> JobResult:
 
 def wants_traceback(arguments: Sequence[str]) -> bool:
     """Says whether the user asked for tracebacks even of their own mistakes."""
-    asked = any(
-        os.environ.get(name, "") not in {"", "0"} for name in ("CFX_TRACEBACK", "HYDRA_FULL_ERROR")
-    )
-    return asked or any(
-        one.startswith("hydra.verbose=") and not one.lower().endswith("=false") for one in arguments
-    )
+    for name in ("CFX_TRACEBACK", "HYDRA_FULL_ERROR"):
+        if os.environ.get(name, "") not in {"", "0"}:
+            return True
+    for argument in arguments:
+        if argument.startswith("hydra.verbose=") and not argument.lower().endswith("=false"):
+            return True
+    return False
 
 
 def todays(arguments: Sequence[str]) -> list[str]:
@@ -261,19 +267,32 @@ def _call(target: str, values: Any, folder: Path) -> Any:
     return getattr(import_module(module), function)(job_config, folder)
 
 
+def _is_done(earlier: JobStatus | None, status: JobStatus) -> TypeGuard[JobStatus]:
+    """Says whether a job ended well before, with all that its results depend on as it is now."""
+    return earlier is not None and earlier.code == 0 and earlier.fingerprint == status.fingerprint
+
+
+def _below(detail: str) -> str:
+    """Returns a traceback so that it follows a message on a line of its own."""
+    if not detail:
+        return ""
+    return f"\n{detail}"
+
+
 def _interrupted(signalled: BaseException) -> int:
-    terminated = isinstance(signalled, Terminated)
-    print(
-        f"{'terminated' if terminated else 'interrupted'}; what was finished is kept",
-        file=sys.stderr,
-    )
-    return TERMINATED if terminated else INTERRUPTED
+    """Says that a signal ended the program; returns its exit code."""
+    if isinstance(signalled, Terminated):
+        print("terminated; what was finished is kept", file=sys.stderr)
+        return TERMINATED
+    print("interrupted; what was finished is kept", file=sys.stderr)
+    return INTERRUPTED
 
 
 def _signal_behind(error: BaseException) -> BaseException | None:
     """Returns the Ctrl-C or SIGTERM that an error comes from.
 
-    Lightning answers Ctrl-C with sys.exit, and a library that a signal hits while it tidies up may raise an error of its own.
+    Lightning answers Ctrl-C with sys.exit, and a library that a signal hits while it tidies up may
+    raise an error of its own.
     """
     current: BaseException | None = error
     while current is not None:
@@ -288,25 +307,26 @@ def _metric(metrics: Mapping[str, float]) -> float:
 
 
 def _report(error: BaseException | None, overrides: Sequence[str], show_traceback: bool) -> int:
+    """Prints a user's mistake as a sentence, a bug as a traceback; returns the exit code."""
     assert error is not None
-    if type(error).__name__ in {
-        "TerminatedWorkerError",
-        "BrokenProcessPool",
-    }:  # joblib's; importing it takes a while
-        print(
-            "a worker process was killed, perhaps because memory ran out: hydra.launcher.n_jobs=N makes fewer at a time",
-            file=sys.stderr,
+    # Joblib's errors are known by their names, because importing it takes a while.
+    if type(error).__name__ in {"TerminatedWorkerError", "BrokenProcessPool"}:
+        text = (
+            "a worker process was killed, perhaps because memory ran out:"
+            " hydra.launcher.n_jobs=N makes fewer at a time"
         )
+        print(text, file=sys.stderr)
         return 1
     mistake = is_user_error(error)
     if show_traceback or not mistake:
         traceback.print_exception(error)
-    if mistake:
-        print(explain(error, overrides), file=sys.stderr)
-    return 2 if mistake else 1
+    if not mistake:
+        return 1
+    print(explain(error, overrides), file=sys.stderr)
+    return 2
 
 
-def _fresh(folder: Path) -> Path:
+def _new_folder(folder: Path) -> Path:
     """Creates an output folder that did not exist before.
 
     Raises:
@@ -331,9 +351,11 @@ def _fresh(folder: Path) -> Path:
 
 @contextlib.contextmanager
 def _process_state(arguments: Sequence[str]) -> Iterator[None]:
-    """Lends Hydra the process: arguments, environment, logging and SIGTERM are put back afterwards."""
+    """Lends Hydra the process: arguments, environment, logging and SIGTERM come back afterwards."""
     root = logging.getLogger()
-    argv, handlers, level = sys.argv, list(root.handlers), root.level
+    handlers = list(root.handlers)
+    level = root.level
+    argv = sys.argv
     before = os.environ.get("HYDRA_FULL_ERROR")
     sys.argv = ["cfx", *arguments]
     os.environ["HYDRA_FULL_ERROR"] = "1"
@@ -346,16 +368,20 @@ def _process_state(arguments: Sequence[str]) -> Iterator[None]:
             os.environ.pop("HYDRA_FULL_ERROR", None)
         else:
             os.environ["HYDRA_FULL_ERROR"] = before
-        for handler in [one for one in root.handlers if one not in handlers]:
-            root.removeHandler(handler)
-            handler.close()
-        for handler in [one for one in handlers if one not in root.handlers]:
-            root.addHandler(handler)
+        for handler in list(root.handlers):
+            if handler not in handlers:
+                root.removeHandler(handler)
+                handler.close()
+        for handler in handlers:
+            if handler not in root.handlers:
+                root.addHandler(handler)
         root.setLevel(level)
 
 
 @contextlib.contextmanager
 def _sigterm() -> Iterator[None]:
+    """Turns SIGTERM into `Terminated`."""
+
     def terminate(_number: int, _frame: FrameType | None) -> None:
         raise Terminated
 
@@ -372,6 +398,7 @@ def _sigterm() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _log_file(path: Path) -> Iterator[None]:
+    """Writes cfx's messages into a file."""
     logger = logging.getLogger("cfx")
     handler = logging.FileHandler(path, encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))

@@ -1,6 +1,6 @@
 """The command line: `cfx` and `python -m cfx`.
 
-`plugins`, `data`, `report`, `ui`, `drive` and `export` are plain sub-commands; everything else goes to the Hydra application.
+The sub-commands in `COMMANDS` are plain programs; everything else goes to the Hydra application.
 Nothing heavy is imported here.
 """
 
@@ -15,9 +15,17 @@ from cfx.errors import CfxError
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the program; returns its exit code: 0; 2 for a user's mistake; 1 for a bug; 130 after Ctrl-C; 143 after SIGTERM."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    command = COMMANDS.get(arguments[0]) if arguments else None
+    """Runs the program.
+
+    Returns:
+        The exit code: 0; 2 for a user's mistake; 1 for a bug; 130 after Ctrl-C; 143 after SIGTERM.
+    """
+    if argv is None:
+        argv = sys.argv[1:]
+    arguments = list(argv)
+    command = None
+    if arguments:
+        command = COMMANDS.get(arguments[0])
     try:
         if command is None:
             from cfx.application import start
@@ -135,7 +143,8 @@ def _drive(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(
         "cfx drive",
         description="Runs a SUMO scenario in which policies drive the vehicles of some vTypes.",
-        epilog="What follows -- goes to SUMO as it is: cfx drive city.sumocfg --drivers calm=RUN -- --step-length 0.1",
+        epilog="What follows -- goes to SUMO as it is:"
+        " cfx drive city.sumocfg --drivers calm=RUN -- --step-length 0.1",
     )
     parser.add_argument("scenario", help="SUMO's configuration, .sumocfg")
     parser.add_argument(
@@ -168,7 +177,9 @@ def _drive(arguments: Sequence[str]) -> int:
         help="SUMO's bit set; 0 (default): exact; 31: SUMO's own checks bound each speed",
     )
     given = list(arguments)
-    cut = given.index("--") if "--" in given else len(given)
+    cut = len(given)
+    if "--" in given:
+        cut = given.index("--")
     options = parser.parse_args(given[:cut])
     from cfx.sumo.command import drive_scenario
 

@@ -1,4 +1,4 @@
-"""What a person reads: plain messages while a job runs, coloured by weight on a terminal, and tables."""
+"""What a person reads: messages while a job runs, coloured by weight on a terminal, and tables."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ if TYPE_CHECKING:
 
 
 class ConsoleHandler(logging.Handler):
-    """Prints cfx's and Hydra's own messages, and warnings of everybody: warnings and errors on stderr, the rest on stdout.
+    """Prints cfx's and Hydra's own messages, and warnings of everybody.
 
-    The streams are looked up at each message, so that a progress bar or a notebook that replaces them is respected.
+    Warnings and errors go to stderr, the rest to stdout. The streams are looked up at each message,
+    so that a progress bar or a notebook that replaces them is respected.
     """
 
     def emit(self, record: logging.LogRecord) -> None:
@@ -37,7 +38,8 @@ class ConsoleHandler(logging.Handler):
 def console_logging() -> Iterator[None]:
     """Prints cfx's own messages while a sub-command runs; jobs have their logging from Hydra."""
     logger = logging.getLogger("cfx")
-    handler, level = ConsoleHandler(), logger.level
+    handler = ConsoleHandler()
+    level = logger.level
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)
     try:
@@ -48,13 +50,19 @@ def console_logging() -> Iterator[None]:
 
 
 def _say(message: str, level: int) -> None:
-    stream = sys.stderr if level >= logging.WARNING else sys.stdout
+    stream = sys.stdout
+    if level >= logging.WARNING:
+        stream = sys.stderr
     if not stream.isatty():
         print(message, file=stream, flush=True)
         return
     from rich.console import Console
 
-    style = "red" if level >= logging.ERROR else "yellow" if level >= logging.WARNING else None
+    style = None
+    if level >= logging.ERROR:
+        style = "red"
+    elif level >= logging.WARNING:
+        style = "yellow"
     Console(file=stream).print(message, style=style, markup=False, highlight=False, soft_wrap=True)
 
 
@@ -73,4 +81,7 @@ def put(table: Table) -> None:
     """Prints a table; in a file or a pipe nothing is folded, so that lines stay whole for grep."""
     from rich.console import Console
 
-    Console(width=None if sys.stdout.isatty() else 400, markup=False).print(table)
+    width = None
+    if not sys.stdout.isatty():
+        width = 400
+    Console(width=width, markup=False).print(table)

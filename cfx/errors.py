@@ -1,4 +1,4 @@
-"""What a user can mend: every error here is one sentence that says what is wrong, where, and what to write instead."""
+"""What a user can mend: one sentence that says what is wrong, where, and what to write instead."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ from collections.abc import Iterable
 
 
 class CfxError(Exception):
-    """A user's mistake. The command line prints its text alone, on stderr, and exits with `exit_code`."""
+    """A user's mistake.
+
+    The command line prints its text alone, on stderr, and exits with `exit_code`.
+    """
 
     exit_code = 2
 
@@ -43,4 +46,6 @@ class SumoError(CfxError):
 def nearest(name: str, choices: Iterable[str]) -> str:
     """Returns " Did you mean 'x'?" for the nearest of `choices`, or "" if none is near."""
     close = difflib.get_close_matches(name, list(choices), n=1, cutoff=0.5)
-    return f" Did you mean '{close[0]}'?" if close else ""
+    if not close:
+        return ""
+    return f" Did you mean '{close[0]}'?"

@@ -14,15 +14,15 @@ from pydantic_core import PydanticCustomError
 
 
 def absolute(value: Any) -> Path:
-    """Returns an absolute path, so that a later change of the working directory changes nothing; `~` is the user's home.
+    """Returns an absolute path; `~` is the user's home.
+
+    A later change of the working directory then changes nothing.
 
     Raises:
         PydanticCustomError: it is no path.
     """
-    if value is None or str(value).strip() in {
-        "",
-        "???",
-    }:  # "???" is how a config file says that a value is missing
+    # "???" is how a config file says that a value is missing.
+    if value is None or str(value).strip() in {"", "???"}:
         raise PydanticCustomError("missing", "a value is required")
     if not isinstance(value, str | Path):
         raise PydanticCustomError("path", "write a path")
@@ -35,9 +35,10 @@ FilePath = Annotated[Path, BeforeValidator(absolute)]
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Gives the block a name beside `path`, with the same suffixes, to write to; it takes its place if the block ends well.
+    """Gives the block a temporary file beside `path`, which takes its place if the block ends well.
 
-    If the block fails, nothing of it is left and an earlier file stays as it was.
+    The temporary file has the same suffixes. If the block fails, nothing of it is left and an
+    earlier file stays as it was.
 
     Raises:
         OSError: the place cannot be written.

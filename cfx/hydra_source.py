@@ -1,8 +1,9 @@
-"""How installed components become Hydra config options: the config source `cfx://` and the search path.
+"""How installed components become Hydra's config options: the source `cfx://` and the search path.
 
-The search path is: Hydra's own, `conf/` of cfx, the `conf/` folder in each plugin's package, and last `cfx://`, which lists every
-component by the metadata of its distribution and imports only the one that is chosen. So a plugin's own YAML wins over the node
-written from its class. That node stays available as `_NAME` in a defaults list:
+The search path is: Hydra's own, `conf/` of cfx, the `conf/` folder in each plugin's package, and
+last `cfx://`. That source lists every component by the metadata of its distribution and imports
+only the one that is chosen. So a plugin's own YAML wins over the node written from its class. That
+node stays available as `_NAME` in a defaults list:
 
     # my_package/conf/model/mine.yaml: the generated node with another default
     defaults: [_mine, _self_]
@@ -50,15 +51,11 @@ class ComponentSource(ConfigSource):
 
     def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
         path = config_path.strip("/")
-        groups = (
-            sorted(registry.GROUPS) if path == "" and results_filter != ObjectType.CONFIG else []
-        )
-        configs = (
-            list(registry.names(path))
-            if path in registry.GROUPS and results_filter != ObjectType.GROUP
-            else []
-        )
-        return groups + configs
+        if path == "" and results_filter != ObjectType.CONFIG:
+            return sorted(registry.GROUPS)
+        if path in registry.GROUPS and results_filter != ObjectType.GROUP:
+            return list(registry.names(path))
+        return []
 
     def load_config(self, config_path: str) -> ConfigResult:
         """Imports the chosen component and writes its node.
@@ -97,20 +94,23 @@ class ComponentSearchPath(SearchPathPlugin):
 
 
 def plugin_conf_dirs() -> dict[str, Path]:
-    """Returns the `conf/` folder of every third party's top-level package that has one. Runs no code of theirs."""
+    """Returns the `conf/` folder of every third party's top-level package that has one.
+
+    Runs no code of theirs.
+    """
+    packages = set()
+    for kind in registry.KINDS:
+        for entry in registry.entries(kind):
+            packages.add(entry.package)
     found: dict[str, Path] = {}
-    packages = sorted(
-        {entry.package for kind in registry.KINDS for entry in registry.entries(kind)} - {"cfx"}
-    )
-    for package in packages:
+    for package in sorted(packages - {"cfx"}):
         try:
             spec = importlib.util.find_spec(package)
-        except (
-            ImportError,
-            ValueError,
-        ):  # a broken distribution harms nobody who does not ask for it
+        except (ImportError, ValueError):  # a broken distribution harms nobody else
             continue
-        for location in (spec.submodule_search_locations or []) if spec is not None else []:
+        if spec is None or spec.submodule_search_locations is None:
+            continue
+        for location in spec.submodule_search_locations:
             folder = Path(location) / "conf"
             if folder.is_dir():
                 found.setdefault(package, folder)
@@ -118,14 +118,19 @@ def plugin_conf_dirs() -> dict[str, Path]:
 
 
 def register() -> None:
-    """Makes both known to Hydra; call it before Hydra composes anything. Doing it twice does no harm."""
+    """Makes both known to Hydra.
+
+    Call it before Hydra composes anything; doing it twice does no harm.
+    """
     plugins = Plugins.instance()
     plugins.register(ComponentSource)
     plugins.register(ComponentSearchPath)
 
 
 def composed(overrides: Sequence[str]) -> DictConfig:
-    """Composes a configuration as the command line does, Hydra's own node included. Leaves a running Hydra application alone.
+    """Composes a configuration as the command line does, Hydra's own node included.
+
+    A running Hydra application is left alone.
 
     Raises:
         HydraException: an override fits nothing.
@@ -150,7 +155,7 @@ def resolving(config: DictConfig) -> Iterator[None]:
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
-    """Returns the job's part of a composed configuration as plain data, every interpolation resolved.
+    """Returns the job's part of a composed configuration as plain data, interpolations resolved.
 
     Raises:
         OmegaConfBaseException: an interpolation leads nowhere.
@@ -165,4 +170,5 @@ def _split(config_path: str) -> tuple[str, str]:
     return group, name
 
 
-register()  # a worker process imports this module with the sources that it is sent, and needs them registered too
+# A worker process imports this module with the sources that it is sent, and needs them registered.
+register()

@@ -1,7 +1,8 @@
-"""A component's config node, written from its class: the name, its settings' defaults, and a model's parameters in full.
+"""A component's config node, written from its class: name, settings and a model's parameters.
 
-One function renders it for everybody: third parties' nodes on the fly (`cfx.hydra_source`), the built-in components' into
-`conf/<group>/<name>.yaml`, so that composing a config imports no torch. `make conf` (`python -m cfx.nodes`) writes these anew.
+One function renders it for everybody: third parties' nodes on the fly (`cfx.hydra_source`), the
+built-in components' into `conf/<group>/<name>.yaml`, so that composing a config imports no torch.
+`make conf` (`python -m cfx.nodes`) writes these anew.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import json
 import re
 import sys
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,15 +28,20 @@ from cfx.parameters import Parameter, ParameterSpace
 DISTRIBUTION = registry.OWN
 """The distribution whose components have their nodes as files."""
 
-_WIDTH = 130
+_WIDTH = 100
 """Longest line with a comment behind its value; a longer comment goes above."""
 
 
 def conf_dir() -> Path:
-    """Returns the folder of cfx's own config files: inside the package when installed, beside it in a checkout."""
+    """Returns the folder of cfx's own config files.
+
+    It lies inside the package when installed, and beside it in a checkout.
+    """
     package = Path(__file__).resolve().parent
-    inside, beside = package / "conf", package.parent / "conf"
-    return inside if inside.is_dir() else beside
+    inside = package / "conf"
+    if inside.is_dir():
+        return inside
+    return package.parent / "conf"
 
 
 def render(cls: type[Component], name: str) -> str:
@@ -45,17 +51,13 @@ def render(cls: type[Component], name: str) -> str:
     """
     space = getattr(cls, "parameters", None)
     lines = [*_comment(_summary(cls)), f"name: {_scalar(name)}"]
-    lines += _settings(
-        cls.schema, {}, skip={"parameters"} if isinstance(space, ParameterSpace) else set()
-    )
+    defaults = _defaults(cls.schema)
     if isinstance(space, ParameterSpace):
-        lines.append(
-            "parameters:"
-            if space.parameters
-            else "parameters: null  # required: {NAME: {low: , high: , default: }}"
-        )
-        for parameter in space:
-            lines += [f"  {line}" for line in _parameter(parameter)]
+        defaults.pop("parameters", None)
+        lines += _settings(cls.schema, defaults)
+        lines += _parameters(space)
+    else:
+        lines += _settings(cls.schema, defaults)
     return "\n".join(lines) + "\n"
 
 
@@ -66,7 +68,8 @@ def file_text(entry: registry.Entry) -> str:
         PluginError: the component cannot be loaded.
     """
     cls = registry.get(entry.kind, entry.name)
-    return f"# Written by `make conf` from {entry.target}; change the class, not this file.\n{render(cls, entry.name)}"
+    head = f"# Written by `make conf` from {entry.target}; change the class, not this file."
+    return f"{head}\n{render(cls, entry.name)}"
 
 
 def file_path(entry: registry.Entry) -> Path:
@@ -76,13 +79,14 @@ def file_path(entry: registry.Entry) -> Path:
 
 def built_in() -> list[registry.Entry]:
     """Returns the entries of cfx itself that have a config node."""
-    return [
-        entry
-        for kind, about in registry.KINDS.items()
-        if about.chosen
-        for entry in registry.entries(kind)
-        if entry.distribution == DISTRIBUTION
-    ]
+    found = []
+    for kind, about in registry.KINDS.items():
+        if not about.chosen:
+            continue
+        for entry in registry.entries(kind):
+            if entry.distribution == DISTRIBUTION:
+                found.append(entry)
+    return found
 
 
 def write_all() -> int:
@@ -103,80 +107,103 @@ def write_all() -> int:
     return failed
 
 
-def _settings(
-    schema: type[BaseModel], values: Mapping[str, Any], skip: set[str] | None = None
-) -> Iterator[str]:
+def _defaults(schema: type[BaseModel]) -> dict[str, Any]:
+    """Returns the settings' defaults; None for one that the user must give."""
+    values: dict[str, Any] = {}
     for name, field in schema.model_fields.items():
-        if name in (skip or set()):
-            continue
-        blank = field.is_required()
-        value = values.get(
-            name, None if blank else field.get_default(call_default_factory=True, validated_data={})
-        )
-        note = " ".join(
-            part for part in ("required:" if blank else "", field.description or "") if part
-        )
+        values[name] = None
+        if not field.is_required():
+            values[name] = field.get_default(call_default_factory=True, validated_data={})
+    return values
+
+
+def _settings(schema: type[BaseModel], values: Mapping[str, Any]) -> list[str]:
+    """Returns the lines of some settings: values with their descriptions as comments."""
+    lines: list[str] = []
+    for name, value in values.items():
+        field = schema.model_fields[name]
+        note = field.description or ""
+        if field.is_required():
+            note = f"required: {note}".strip()
         if isinstance(value, BaseModel):
-            yield from _comment(note)
-            yield f"{_scalar(name)}:"
-            yield from (
-                f"  {line}"
-                for line in _settings(
-                    type(value), {key: getattr(value, key) for key in type(value).model_fields}
-                )
-            )
+            nested = {key: getattr(value, key) for key in type(value).model_fields}
+            lines += _comment(note)
+            lines.append(f"{_scalar(name)}:")
+            lines += _indented(_settings(type(value), nested))
         else:
-            yield from _line(name, _value(to_jsonable_python(value)), note)
+            lines += _line(name, _value(to_jsonable_python(value)), note)
+    return lines
+
+
+def _parameters(space: ParameterSpace) -> list[str]:
+    """Returns the lines of a model's parameters."""
+    if not space.parameters:
+        return ["parameters: null  # required: {NAME: {low: , high: , default: }}"]
+    lines = ["parameters:"]
+    for parameter in space:
+        lines += _indented(_parameter(parameter))
+    return lines
 
 
 def _parameter(parameter: Parameter) -> list[str]:
-    source = f" ({parameter.source})" if parameter.source else ""
+    about = f"{parameter.name}, {parameter.unit}: {parameter.meaning}"
+    if parameter.source:
+        about += f" ({parameter.source})"
     node = {
         "low": parameter.low,
         "high": parameter.high,
         "default": parameter.default,
         "tuned": parameter.tuned,
     }
-    return [
-        *_comment(f"{parameter.name}, {parameter.unit}: {parameter.meaning}{source}"),
-        f"{_scalar(parameter.name)}: {_value(node)}",
-    ]
+    return [*_comment(about), f"{_scalar(parameter.name)}: {_value(node)}"]
 
 
 def _line(name: str, value: str, note: str) -> list[str]:
+    """Returns a key with its value, and its comment behind it or, if it is long, above."""
     line = f"{_scalar(name)}: {value}"
     if not note:
         return [line]
     short = f"{line}  # {note}"
-    return [short] if len(short) <= _WIDTH and "\n" not in note else [*_comment(note), line]
+    if len(short) <= _WIDTH and "\n" not in note:
+        return [short]
+    return [*_comment(note), line]
 
 
 def _comment(text: str) -> list[str]:
-    return [f"# {part}" for line in text.splitlines() for part in textwrap.wrap(line, _WIDTH - 2)]
+    lines = []
+    for paragraph in text.splitlines():
+        for part in textwrap.wrap(paragraph, _WIDTH - 2):
+            lines.append(f"# {part}")
+    return lines
+
+
+def _indented(lines: list[str]) -> list[str]:
+    return [f"  {line}" for line in lines]
 
 
 def _summary(cls: type[Component]) -> str:
+    """Returns the first paragraph of a class's docstring, and its reference."""
     first = (inspect.getdoc(cls) or "").partition("\n\n")[0]
     reference = str(getattr(cls, "reference", "") or "")
-    return "\n".join(part for part in (first, reference) if part)
+    return "\n".join([first, reference]).strip("\n")
 
 
 def _value(value: Any) -> str:
     """Returns plain data as one line of YAML."""
     if isinstance(value, Mapping):
-        return (
-            "{" + ", ".join(f"{_scalar(key)}: {_value(item)}" for key, item in value.items()) + "}"
-        )
+        items = [f"{_scalar(key)}: {_value(item)}" for key, item in value.items()]
+        return "{" + ", ".join(items) + "}"
     if isinstance(value, list):
         return "[" + ", ".join(_value(item) for item in value) + "]"
     return _scalar(value)
 
 
 def _scalar(value: Any) -> str:
-    if isinstance(value, str) and not (
-        re.fullmatch(r"[A-Za-z_]\w*", value, re.ASCII) and yaml.safe_load(value) == value
-    ):
-        return json.dumps(value.replace("${", r"\${"))  # quoted, and never an interpolation
+    """Returns one value; a text is quoted unless it is a plain word, and is no interpolation."""
+    if isinstance(value, str):
+        is_word = re.fullmatch(r"[A-Za-z_]\w*", value, re.ASCII) and yaml.safe_load(value) == value
+        if not is_word:
+            return json.dumps(value.replace("${", r"\${"))
     return str(yaml.safe_dump([value], default_flow_style=True).strip()[1:-1])
 
 

@@ -1,9 +1,10 @@
-"""What a new component must do before a job relies on it: a few steps on made-up input, some milliseconds, once.
+"""What a new component must do before a job relies on it: a few steps on made-up input, once.
 
-A probe catches what would otherwise end in a torch traceback, or in numbers that mean nothing, minutes later: the wrong shape or
-dtype, NaN, another number of parameters than declared. The whole contract of each kind is in `cfx.testing`; `cfx plugins check`
-runs its quick part. Datasets, learners and protocols have no probe: they do nothing before they are given something to work on,
-and their base classes check what they give.
+A smoke check takes some milliseconds. It catches what would otherwise end in a torch traceback, or
+in numbers that mean nothing, minutes later: the wrong shape or dtype, NaN, another number of
+parameters than declared. The whole contract of each kind is in `cfx.testing`; `cfx plugins check`
+runs its quick part. Datasets, learners and protocols have no smoke check: they do nothing before
+they are given something to work on, and their base classes check what they give.
 """
 
 from __future__ import annotations
@@ -28,18 +29,24 @@ from cfx.simulation.trajectory import Start
 from cfx.simulators.base import Simulator
 
 STATES = 24
+"""Vehicles whose step is tried."""
+
 DT = 0.1
+"""Time step, s."""
+
 NETWORKS, DRIVERS, WINDOWS, PARAMETERS, LENGTH = 3, 2, 4, 5, 5
 PAIRS, FRAMES = 4, 60
 
 
 @torch.no_grad()
 def smoke_check_model(model: DrivingModel) -> None:
-    """Takes one step from ordinary states, in double and in single precision, with parameters as the class declares them.
+    """Takes one step from ordinary states, with parameters as the class declares them.
+
+    The step is taken in double and in single precision.
 
     Raises:
-        PluginError: a speed or the memory has another shape or dtype than the states or is not finite, a speed is negative, or
-            the step reads other parameters than the class declares.
+        PluginError: a speed or the memory has another shape or dtype than the states or is not
+            finite, a speed is negative, or the step reads other parameters than the class declares.
     """
     if model.needs_simulator:  # it has no step to try
         return
@@ -52,8 +59,8 @@ def smoke_check_model(model: DrivingModel) -> None:
         if bool(wrong.any()):
             example = speed[wrong][0].item()
             raise PluginError(
-                f"next_speed gives {example:g} m/s in {int(wrong.sum())} of {STATES} ordinary states; it must give finite speeds,"
-                " not negative"
+                f"next_speed gives {example:g} m/s in {int(wrong.sum())} of {STATES} ordinary"
+                " states; it must give finite speeds, not negative"
             )
         memory = model.next_memory(follower, leader, p, DT, speed)
         _require_tensor(
@@ -69,11 +76,11 @@ def _states(model: DrivingModel, dtype: torch.dtype) -> tuple[Follower, Leader]:
     draw = torch.Generator().manual_seed(0)
 
     def uniform(low: float, high: float) -> Tensor:
-        return low + (high - low) * torch.rand(STATES, generator=draw, dtype=torch.float64).to(
-            dtype
-        )
+        unit = torch.rand(STATES, generator=draw, dtype=torch.float64)
+        return low + (high - low) * unit.to(dtype)
 
-    speed, leader_speed = uniform(0.0, 25.0), uniform(0.0, 25.0)
+    speed = uniform(0.0, 25.0)
+    leader_speed = uniform(0.0, 25.0)
     speed[:2] = 0.0
     leader_speed[1:3] = 0.0
     length = uniform(4.0, 6.0)
@@ -87,10 +94,9 @@ def _states(model: DrivingModel, dtype: torch.dtype) -> tuple[Follower, Leader]:
 
 
 def _values(space: ParameterSpace, dtype: torch.dtype) -> dict[str, Tensor]:
-    """Returns the defaults for the first half of the states, and values within the declared bounds for the others."""
-    unit = torch.rand(
-        (STATES, len(space)), generator=torch.Generator().manual_seed(1), dtype=torch.float64
-    )
+    """Returns parameters for each state: defaults, then values within the declared bounds."""
+    draw = torch.Generator().manual_seed(1)
+    unit = torch.rand((STATES, len(space)), generator=draw, dtype=torch.float64)
     unit[: STATES // 2] = space.to_unit(space.defaults())
     return space.unpack(space.from_unit(unit).to(dtype))
 
@@ -108,7 +114,8 @@ class _Noted(dict[str, Tensor]):
 
     def __missing__(self, name: str) -> NoReturn:
         raise PluginError(
-            f"next_speed reads the parameter '{name}', which is not in its `parameters` ({', '.join(self)})"
+            f"next_speed reads the parameter '{name}',"
+            f" which is not in its `parameters` ({', '.join(self)})"
         )
 
     def get(self, name: str, default: Any = None) -> Any:
@@ -137,34 +144,41 @@ class _Noted(dict[str, Tensor]):
 
 
 def _require_all_read(model: DrivingModel, p: _Noted) -> None:
-    """Holds a model in its default settings to the tuned parameters that it declares: each must matter."""
-    changed = [
-        name
-        for name, field in model.schema.model_fields.items()
-        if name != "parameters"
-        and (
-            field.is_required()
-            or model.settings.__dict__[name] != field.get_default(call_default_factory=True)
-        )
-    ]
-    if changed:  # a variant of a model may leave some out
+    """Checks that a model in its default settings reads each tuned parameter that it declares."""
+    if not _has_default_settings(model):  # a variant of a model may leave some out
         return
-    unread = [name for name in model.parameters.names if name not in p.read]
+    names = model.parameters.names
+    unread = [name for name in names if name not in p.read]
     if unread:
         raise PluginError(
-            f"it declares {len(model.parameters)} tuned parameters ({', '.join(model.parameters.names)}), but next_speed never"
-            f" reads {', '.join(unread)}"
+            f"it declares {len(names)} tuned parameters ({', '.join(names)}),"
+            f" but next_speed never reads {', '.join(unread)}"
         )
+
+
+def _has_default_settings(model: DrivingModel) -> bool:
+    """Says whether a model has the settings of its class, whatever its parameters' bounds are."""
+    for name, field in model.schema.model_fields.items():
+        if name == "parameters":
+            continue
+        if field.is_required():
+            return False
+        default = field.get_default(call_default_factory=True)
+        if model.settings.__dict__[name] != default:
+            return False
+    return True
 
 
 @torch.no_grad()
 def smoke_check_policy(policy: Policy) -> None:
-    """Builds a few networks and asks them about a few windows, in the precision in which a job uses them.
+    """Builds a few networks and asks them about a few windows, in the precision of a job.
 
     Raises:
-        PluginError: an answer or the state has another shape or dtype than it must have, or an answer is NaN or outside [0, 1].
+        PluginError: an answer or the state has another shape or dtype than it must have, or an
+            answer is NaN or outside [0, 1].
     """
-    # A learner trains in single precision; what needs no training drives in double, so that constants stay what they are.
+    # A learner trains in single precision; what needs no training computes in double precision, so
+    # that constants stay what they are.
     dtype = torch.float32 if policy.trainable else torch.float64
     draw = torch.Generator().manual_seed(0)
     features = token_width(policy.inputs, policy.summary, LENGTH)
@@ -199,9 +213,9 @@ def smoke_check_policy(policy: Policy) -> None:
 def smoke_check_simulator(simulator: Simulator) -> None:
     """Makes a stepper for Krauss's model; one that works in this process takes two steps.
 
-    Whether it works in this process is known by its gradients. Another one may take seconds to start,
-    so that its steps are left to `cfx plugins check`. A simulator that cannot drive this model, or
-    misses something that is not installed, says so itself when a job asks it.
+    Whether it works in this process is known by its gradients. Another one may take seconds to
+    start, so that its steps are left to `cfx plugins check`. A simulator that cannot simulate this
+    model, or misses something that is not installed, says so itself when a job asks it.
 
     Raises:
         PluginError: what `stepper` returns is no stepper, its identity is no text, or a step gives
@@ -253,7 +267,8 @@ def smoke_check_optimizer(optimizer: Optimizer) -> None:
     _whole(optimizer.bytes_per_problem(PARAMETERS), "bytes_per_problem(n)", least=0)
     if _whole(optimizer.space_filling(), "space_filling()", least=1) > evaluations:
         raise PluginError(
-            f"space_filling() gives more than the {evaluations} evaluations that evaluations() gives"
+            "space_filling() gives more than the"
+            f" {evaluations} evaluations that evaluations() gives"
         )
 
 
@@ -262,8 +277,9 @@ def smoke_check_objective(objective: Objective) -> None:
     """Asks for the loss of a few ordinary trajectories, in double and in single precision.
 
     Raises:
-        PluginError: it has no unit, or signals that do not exist; a loss has another shape or dtype than
-            the trajectories, is negative or not finite, or reads a signal that it does not name.
+        PluginError: it has no unit, or signals that do not exist; a loss has another shape or dtype
+            than the trajectories, is negative or not finite, or reads a signal that it does not
+            name.
     """
     if not isinstance(getattr(objective, "unit", None), str):
         raise PluginError("it has no `unit`; it must say the unit of its loss, '' if there is none")
@@ -277,13 +293,17 @@ def smoke_check_objective(objective: Objective) -> None:
         _require_tensor(loss, "finish", (DRIVERS,), dtype, "(*batch,)")
         if not bool((loss.isfinite() & (loss >= 0)).all()):
             raise PluginError(
-                f"it gives the losses {loss.tolist()} of ordinary trajectories; losses must be finite"
-                f" and not negative (it says that it reads {' and '.join(sorted(signals))} alone)"
+                f"it gives the losses {loss.tolist()} of ordinary trajectories; losses must be"
+                " finite and not negative"
+                f" (it says that it reads {' and '.join(sorted(signals))} alone)"
             )
 
 
 def _trajectories(objective: Objective, dtype: torch.dtype) -> FrameValues:
-    """Returns a few trajectories `(LENGTH, DRIVERS)`; a signal that the objective does not name is NaN."""
+    """Returns a few trajectories `(LENGTH, DRIVERS)`.
+
+    A signal that the objective does not name is NaN.
+    """
     draw = torch.Generator().manual_seed(0)
     values = {}
     for signal in ("speed", "gap"):
@@ -315,7 +335,7 @@ def smoke_check_metric(metric: Metric) -> None:
 
 
 def _metric_trajectories(dtype: torch.dtype) -> Trajectories:
-    """Returns followers that swing around the recorded ones; the last of them has a few frames only."""
+    """Returns followers that swing around the recorded ones; the last has a few frames only."""
     time = 0.1 * torch.arange(FRAMES, dtype=torch.float64)
     phase = torch.arange(PAIRS, dtype=torch.float64)[:, None]
     measured_speed = 12.0 + 2.0 * torch.sin(0.5 * time + phase)
@@ -350,19 +370,20 @@ def _whole(value: object, name: str, *, least: int) -> int:
 
 
 def _require_tensor(
-    value: object, name: str, shape: tuple[int, ...], dtype: torch.dtype, letters: str
+    value: object, name: str, shape: tuple[int, ...], dtype: torch.dtype, shape_in_words: str
 ) -> None:
     if not isinstance(value, Tensor) or value.shape != shape:
-        raise PluginError(f"{name} gives {_shown(value)}; it must give {letters}, here {shape}")
+        raise PluginError(
+            f"{name} gives {_shown(value)}; it must give {shape_in_words}, here {shape}"
+        )
     if value.dtype != dtype:
         raise PluginError(
-            f"{name} gives {value.dtype} for {dtype}; a component computes in the dtype of what it is given"
+            f"{name} gives {value.dtype} for {dtype};"
+            " a component computes in the dtype of what it is given"
         )
 
 
 def _shown(value: object) -> str:
-    return (
-        f"the shape {tuple(value.shape)}"
-        if isinstance(value, Tensor)
-        else f"a {type(value).__name__}"
-    )
+    if isinstance(value, Tensor):
+        return f"the shape {tuple(value.shape)}"
+    return f"a {type(value).__name__}"

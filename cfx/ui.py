@@ -33,24 +33,38 @@ COMPARED = 10
 """Most jobs on one page that compares them side by side; the best of a larger sweep."""
 
 IMPROVEMENT = "metrics.`rmse_improvement/mean`"
+"""What the tables of jobs are sorted by."""
+
 _COLUMNS = (
     IMPROVEMENT,
-    *(f"metrics.`rmse_improvement/{name}`" for name in ("ci95_low", "ci95_high", "win_rate")),
-    *(f"metrics.`rmse_speed/{method}`" for method in ("policy", "fixed", "default")),
+    "metrics.`rmse_improvement/ci95_low`",
+    "metrics.`rmse_improvement/ci95_high`",
+    "metrics.`rmse_improvement/win_rate`",
+    "metrics.`rmse_speed/policy`",
+    "metrics.`rmse_speed/fixed`",
+    "metrics.`rmse_speed/default`",
     "metrics.`collisions/policy`",
-    *(
-        f"tags.`{kind}`"
-        for kind in ("model", "policy", "optimizer", "data", "style.cluster", "seed")
-    ),
+    "tags.`model`",
+    "tags.`policy`",
+    "tags.`optimizer`",
+    "tags.`data`",
+    "tags.`style.cluster`",
+    "tags.`seed`",
 )
+"""Columns of those tables."""
+
 _CHARTS = "rmse_(improvement/mean|speed)"
+"""Metrics that MLflow's charts show, a regular expression."""
+
 _READY_S = 120.0
+"""How long the server may take to answer, s."""
 
 
 def serve(uri: str | None, port: int, *, open_browser: bool = False) -> None:
-    """Starts MLflow's server on a tracking store and prints the links; this process becomes the server until Ctrl-C.
+    """Starts MLflow's server on a tracking store and prints the links.
 
-    Runs that a killed process left RUNNING are closed first. The columns of the linked tables are kept in the store.
+    This process becomes the server until Ctrl-C. Runs that a killed process left RUNNING are closed
+    first. The columns of the linked tables are kept in the store.
 
     Args:
         uri: of the store; None for `MLFLOW_TRACKING_URI`, else the database beside the outputs.
@@ -71,34 +85,33 @@ def serve(uri: str | None, port: int, *, open_browser: bool = False) -> None:
     for line in lines:
         print(line, flush=True)
     if open_browser:
-        _open_later(
-            port,
-            next(word for line in lines for word in line.split() if word.startswith("http://")),
-        )
-    # MLflow's own libraries warn of each other; that is nothing to a user.
-    quietly = {
-        "PYTHONWARNINGS": "ignore",
+        _open_later(port, _first_link(lines))
+    _become_server(store, port)
+
+
+def _first_link(lines: Sequence[str]) -> str:
+    words = " ".join(lines).split()
+    return next(word for word in words if word.startswith("http://"))
+
+
+def _become_server(store: str, port: int) -> None:
+    """Puts MLflow's server in this process's place, so that signals and exit codes are its own."""
+    command = [sys.executable, "-m", "mlflow", "ui", "--host", HOST, "--port", str(port)]
+    command += ["--workers", "1", "--backend-store-uri", store]
+    environment = {
+        **os.environ,
+        "PYTHONWARNINGS": "ignore",  # MLflow's own libraries warn of each other
         "MLFLOW_DISABLE_TELEMETRY": "true",
         "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",
     }
-    command = [
-        "mlflow",
-        "ui",
-        "--host",
-        HOST,
-        "--port",
-        str(port),
-        "--workers",
-        "1",
-        "--backend-store-uri",
-        store,
-    ]
-    # The server takes this process's place, so that signals and exit codes are its own.
-    os.execve(sys.executable, [sys.executable, "-m", *command], {**os.environ, **quietly})  # noqa: S606 - no shell is wanted
+    os.execve(sys.executable, command, environment)  # noqa: S606 - no shell is wanted
 
 
 def open_when_ready(port: str, link: str) -> None:
-    """Opens a link in the user's browser once MLflow's server answers at `port`; gives up silently after two minutes."""
+    """Opens a link in the user's browser once MLflow's server answers at `port`.
+
+    Gives up silently after two minutes.
+    """
     end = time.monotonic() + _READY_S
     while time.monotonic() < end:
         try:
@@ -111,17 +124,21 @@ def open_when_ready(port: str, link: str) -> None:
 
 def _open_later(port: int, link: str) -> None:
     code = "import sys; from cfx.ui import open_when_ready; open_when_ready(*sys.argv[1:])"
-    subprocess.Popen([sys.executable, "-c", code, str(port), link])  # noqa: S603 - this interpreter, and what is written above
+    command = [sys.executable, "-c", code, str(port), link]
+    subprocess.Popen(command)  # noqa: S603 - this interpreter, and what is written above
 
 
 def _store(uri: str | None) -> str:
     from cfx.tracking.store import absolute_uri, check_database, sqlite_file, tracking_uri
 
-    store = absolute_uri(uri, "--uri") if uri else tracking_uri(None)
+    store = tracking_uri(None)
+    if uri:
+        store = absolute_uri(uri, "--uri")
     file = sqlite_file(store)
     if file is not None and not file.is_file():
         raise TrackingError(
-            f"{file} does not exist: no job has been tracked from here; run one, or name its store with --uri"
+            f"{file} does not exist: no job has been tracked from here;"
+            " run one, or name its store with --uri"
         )
     if file is not None:
         check_database(file, store)
@@ -129,10 +146,10 @@ def _store(uri: str | None) -> str:
 
 
 def _check_port(port: int) -> None:
-    with socket.socket() as smoke_check:
-        smoke_check.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            smoke_check.bind((HOST, port))
+            probe.bind((HOST, port))
         except (OSError, OverflowError) as error:
             raise ConfigError(f"--port {port} cannot be used ({error}); choose another") from None
 
@@ -157,12 +174,14 @@ def _close_abandoned(store: str) -> None:
 
 
 def _links(store: str, port: int) -> list[str]:
-    """Returns what to print: the newest sweeps and the newest single jobs with their pages, and a page per experiment."""
+    """Returns what to print: the newest sweeps and single jobs, and a page per experiment."""
     from cfx.tracking.store import translate_errors
 
     with translate_errors(f"read {store}"):
         client = _client(store)
-        names = {str(one.experiment_id): str(one.name) for one in client.search_experiments()}
+        names = {}
+        for experiment in client.search_experiments():
+            names[str(experiment.experiment_id)] = str(experiment.name)
         newest = ["attributes.start_time DESC"]
         sweeps = client.search_runs(
             list(names), "tags.`cfx.sweep_parent` LIKE '%'", order_by=newest, max_results=SWEEPS
@@ -170,14 +189,15 @@ def _links(store: str, port: int) -> list[str]:
         alone = "tags.`cfx.sweep` IS NULL and tags.`cfx.sweep_parent` IS NULL"
         jobs = client.search_runs(list(names), alone, order_by=newest, max_results=JOBS)
         address = f"http://{HOST}:{port}/"
-        lines = [line for sweep in sweeps for line in _sweep_lines(client, sweep, address)]
+        lines = []
+        for sweep in sweeps:
+            lines += _sweep_lines(client, sweep, address)
         for job in jobs:
-            page = f"#/experiments/{job.info.experiment_id}/runs/{job.info.run_id}?workflowType=machine_learning"
-            lines += [
-                f"job {job.info.run_name}, {_began(job)}{_improvement(job)}",
-                f"  page:    {address}{page}",
-            ]
-        return [*lines, *_experiment_lines(client, names, address)]
+            page = f"#/experiments/{job.info.experiment_id}/runs/{job.info.run_id}"
+            lines.append(f"job {job.info.run_name}, {_began(job)}{_improvement(job)}")
+            lines.append(f"  page:    {address}{page}?workflowType=machine_learning")
+        lines += _experiment_lines(client, names, address)
+        return lines
 
 
 def _sweep_lines(client: MlflowClient, parent: Any, address: str) -> list[str]:
@@ -187,50 +207,56 @@ def _sweep_lines(client: MlflowClient, parent: Any, address: str) -> list[str]:
         [experiment], chosen, order_by=[f"{IMPROVEMENT} DESC"], max_results=1000
     )
     table = _shared_view(client, experiment, chosen)
-    title = f"sweep {name}, {_began(parent)}: {len(found)} jobs" + (
-        _improvement(found[0], "best ") if found else ""
-    )
+    title = f"sweep {name}, {_began(parent)}: {len(found)} jobs"
+    if found:
+        title += _improvement(found[0], "best ")
     lines = [
         title,
         f"  table:   {address}{table}",
         f"  charts:  {address}{table}&compareRunsMode=CHART",
     ]
     if len(found) > 1:
-        best = "" if len(found) <= COMPARED else f" (the best {COMPARED})"
         ids = [str(run.info.run_id) for run in found[:COMPARED]]
-        lines.append(f"  compare: {address}{_compare_page(experiment, ids)}{best}")
+        line = f"  compare: {address}{_compare_page(experiment, ids)}"
+        if len(found) > COMPARED:
+            line += f" (the best {COMPARED})"
+        lines.append(line)
     return lines
 
 
 def _experiment_lines(client: MlflowClient, names: dict[str, str], address: str) -> list[str]:
     """Returns a page for each experiment that holds jobs, or for each if none does."""
     used = [one for one in names if client.search_runs([one], max_results=1)]
-    pages = {
-        one: _shared_view(client, one, "tags.`cfx.sweep_parent` IS NULL") for one in used or names
-    }
-    return [
-        f"all jobs of experiment {names[one]}, the best first\n  table:   {address}{page}"
-        for one, page in pages.items()
-    ]
+    lines = []
+    for experiment in used or names:
+        page = _shared_view(client, experiment, "tags.`cfx.sweep_parent` IS NULL")
+        lines.append(
+            f"all jobs of experiment {names[experiment]}, the best first\n"
+            f"  table:   {address}{page}"
+        )
+    return lines
 
 
 def _shared_view(client: MlflowClient, experiment: str, chosen: str) -> str:
-    """Keeps a view of the table of runs in the store, the best first, and returns its page without the server's address.
+    """Keeps a view of the table of runs in the store, the best run first, and returns its page.
 
-    MLflow hides metrics until a user picks columns; only a "shared view", a tag of the experiment, carries columns in a link.
+    MLflow hides metrics until a user picks columns; only a "shared view", a tag of the experiment,
+    carries columns in a link. The page comes without the server's address.
 
     Args:
         chosen: MLflow's search for the runs to show.
     """
+    widths = {}
+    for column in _COLUMNS:
+        if column.startswith("metrics"):
+            widths[column] = 8 * len(column) - 40
     view = {
         "searchFilter": chosen,
         "orderByKey": IMPROVEMENT,  # sorted by date, MLflow would fold jobs away under their sweep
         "orderByAsc": False,
         "selectedColumns": list(_COLUMNS),
         "columnOrder": list(_COLUMNS),
-        "columnWidths": {
-            column: 8 * len(column) - 40 for column in _COLUMNS if column.startswith("metrics")
-        },
+        "columnWidths": widths,
         "chartsSearchFilter": _CHARTS,
     }
     key = "cfx-" + hashlib.sha256(chosen.encode()).hexdigest()[:12]
@@ -239,9 +265,8 @@ def _shared_view(client: MlflowClient, experiment: str, chosen: str) -> str:
 
 
 def _compare_page(experiment: str, ids: Sequence[str]) -> str:
-    runs, experiments = (
-        quote(json.dumps(one, separators=(",", ":"))) for one in (list(ids), [experiment])
-    )
+    runs = quote(json.dumps(list(ids), separators=(",", ":")))
+    experiments = quote(json.dumps([experiment], separators=(",", ":")))
     return f"#/compare-runs?runs={runs}&experiments={experiments}"
 
 
@@ -250,9 +275,8 @@ def _began(run: Any) -> str:
 
 
 def _improvement(run: Any, which: str = "") -> str:
+    """Returns a run's improvement in words; how the run ended if it has none."""
     value = run.data.metrics.get("rmse_improvement/mean")
-    return (
-        f", {run.info.status}"
-        if value is None or math.isnan(value)
-        else f", {which}improvement {value:.1%}"
-    )
+    if value is None or math.isnan(value):
+        return f", {run.info.status}"
+    return f", {which}improvement {value:.1%}"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 import traceback
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, TypeGuard
 
 import yaml
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
@@ -23,21 +23,21 @@ def is_user_error(error: BaseException) -> bool:
     ):
         return True
     # Hydra raises plain errors for contradictory flags and for options of the wrong type.
-    return isinstance(
-        error, ValueError | AssertionError | RuntimeError | ImportError
-    ) and _raised_in(error).startswith(("hydra.", "hydra_plugins.", "omegaconf."))
+    if not isinstance(error, ValueError | AssertionError | RuntimeError | ImportError):
+        return False
+    return _raised_in(error).startswith(("hydra.", "hydra_plugins.", "omegaconf."))
 
 
 def explain(error: BaseException, overrides: Sequence[str]) -> str:
     """Returns one sentence (for several wrong keys, one each) that says what to write instead."""
     if isinstance(error, CfxError):
         return str(error)
-    file_error = next((cause for cause in _chain(error) if _is_about_a_file(cause)), None)
-    if isinstance(file_error, OSError):
-        return (
-            f"{file_error.filename}: {file_error.strerror}; choose an output folder that can be written with"
-            " hydra.run.dir=FOLDER (multiruns: hydra.sweep.dir=FOLDER)"
-        )
+    for cause in _chain(error):
+        if _is_about_a_file(cause):
+            return (
+                f"{cause.filename}: {cause.strerror}; choose an output folder that can be written"
+                " with hydra.run.dir=FOLDER (multiruns: hydra.sweep.dir=FOLDER)"
+            )
     if (
         isinstance(error, MissingConfigException)
         and error.missing_cfg_file
@@ -50,6 +50,7 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
 
 
 def _reworded(error: BaseException, overrides: Sequence[str]) -> str:
+    """Returns Hydra's more frequent messages in other words, and the rest as they are."""
     text = str(error).strip()
     unknown = re.search(r"Could not override '([^']+)'", text)
     if unknown:
@@ -68,8 +69,10 @@ def _reworded(error: BaseException, overrides: Sequence[str]) -> str:
 
 def _unknown_option(path: str, options: Sequence[str]) -> str:
     group, _, name = path.rpartition("/")
-    known = f" Known: {', '.join(options)}." if options else ""
-    return f"{group}={name}: there is no {group} '{name}'.{nearest(name, options)}{known}"
+    text = f"{group}={name}: there is no {group} '{name}'.{nearest(name, options)}"
+    if options:
+        text += f" Known: {', '.join(options)}."
+    return text
 
 
 def _unreadable(error: OverrideParseException) -> str:
@@ -79,61 +82,70 @@ def _unreadable(error: OverrideParseException) -> str:
 
         advice = nearest(word, COMMANDS)
         return f"{word}: neither key=value nor a sub-command.{advice} See cfx --help."
-    words = [
-        line
-        for line in error.message.splitlines()
-        if not line.startswith(("Error parsing", "See "))
-    ]
-    detail = re.sub(r" expecting \{.*\}", "", words[0]) if words else "syntax"
-    return f"{word}: cannot be read as key=value ({detail}); quote a value that holds special characters: key=\\'value\\'"
+    detail = "syntax"
+    for line in error.message.splitlines():
+        if not line.startswith(("Error parsing", "See ")):
+            detail = re.sub(r" expecting \{.*\}", "", line)
+            break
+    return (
+        f"{word}: cannot be read as key=value ({detail});"
+        " quote a value that holds special characters: key=\\'value\\'"
+    )
 
 
 def _unknown_key(key: str, overrides: Sequence[str]) -> str:
-    given = next((one for one in overrides if re.match(rf"\+*{re.escape(key)}\b", one)), key)
-    others = [one for one in overrides if one != given]
+    """Returns a sentence with the keys that there are where `key` was looked for."""
+    given = key
+    for override in overrides:
+        if re.match(rf"\+*{re.escape(key)}\b", override):
+            given = override
+            break
+    others = [override for override in overrides if override != given]
     try:
         config: Any = hydra_source.composed(others)
     except Exception:  # the other overrides may be wrong too; the sentence is then without advice
         return f"{given}: there is no key '{key}'; cfx --cfg job prints every key"
     parent, _, last = key.rpartition(".")
-    siblings = OmegaConf.select(config, parent) if parent else config
+    siblings = config
+    if parent:
+        siblings = OmegaConf.select(config, parent)
     if isinstance(siblings, DictConfig):
         names = sorted(str(name) for name in siblings if name != "hydra")
-        close = nearest(last, names)
-        if parent and close:
-            close = close.replace("'", f"'{parent}.", 1)
-        return f"{given}: there is no key '{key}'.{close} Known keys{f' of {parent}' if parent else ''}: {', '.join(names)}."
+        advice = nearest(last, names)
+        known = "Known keys"
+        if parent:
+            advice = advice.replace("'", f"'{parent}.", 1)
+            known = f"Known keys of {parent}"
+        return f"{given}: there is no key '{key}'.{advice} {known}: {', '.join(names)}."
     known = _keys(OmegaConf.to_container(config, resolve=False))
     return f"{given}: there is no key '{key}'.{nearest(key, known)} cfx --cfg job prints every key."
 
 
-def _keys(values: Any, path: str = "") -> Iterator[str]:
+def _keys(values: Mapping[Any, Any], prefix: str = "") -> Iterator[str]:
+    """Yields the path of every key of nested mappings."""
     for name, value in values.items():
-        full = f"{path}.{name}" if path else str(name)
-        yield full
-        if isinstance(value, dict):
-            yield from _keys(value, full)
+        path = f"{prefix}{name}"
+        yield path
+        if isinstance(value, Mapping):
+            yield from _keys(value, f"{path}.")
 
 
 def _plain(error: BaseException) -> str:
     """Returns Hydra's own words, and those of the error behind it, on one line."""
-    parts = []
+    noise = ("object_type=", "See https://", "Config search path", "provider=")
+    parts: list[str] = []
     for cause in _chain(error):
-        lines = [line.strip() for line in str(cause).splitlines()]
-        kept = [
-            line
-            for line in lines
-            if line
-            and not line.startswith(
-                ("object_type=", "See https://", "Config search path", "provider=")
-            )
-        ]
-        if kept:
-            parts.append(" ".join(kept))
-    return (
-        ": ".join(dict.fromkeys(parts))
-        or f"{type(error).__name__} while composing the configuration"
-    )
+        kept = []
+        for line in str(cause).splitlines():
+            words = line.strip()
+            if words and not words.startswith(noise):
+                kept.append(words)
+        part = " ".join(kept)
+        if part and part not in parts:
+            parts.append(part)
+    if not parts:
+        return f"{type(error).__name__} while composing the configuration"
+    return ": ".join(parts)
 
 
 def _chain(error: BaseException) -> Iterator[BaseException]:
@@ -143,7 +155,7 @@ def _chain(error: BaseException) -> Iterator[BaseException]:
         current = current.__cause__
 
 
-def _is_about_a_file(error: BaseException) -> bool:
+def _is_about_a_file(error: BaseException) -> TypeGuard[OSError]:
     return (
         isinstance(error, OSError)
         and not isinstance(error, HydraException)
@@ -153,5 +165,7 @@ def _is_about_a_file(error: BaseException) -> bool:
 
 def _raised_in(error: BaseException) -> str:
     """Returns the module of the innermost frame."""
-    frames = list(traceback.walk_tb(error.__traceback__))
-    return str(frames[-1][0].f_globals.get("__name__", "")) if frames else ""
+    module = ""
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        module = str(frame.f_globals.get("__name__", ""))
+    return module
