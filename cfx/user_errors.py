@@ -117,8 +117,9 @@ def _unknown_key(key: str, overrides: Sequence[str]) -> str:
             advice = advice.replace("'", f"'{parent}.", 1)
             known = f"Known keys of {parent}"
         return f"{given}: there is no key '{key}'.{advice} {known}: {', '.join(names)}."
-    known = _keys(OmegaConf.to_container(config, resolve=False))
-    return f"{given}: there is no key '{key}'.{nearest(key, known)} cfx --cfg job prints every key."
+    everything: Any = OmegaConf.to_container(config, resolve=False)
+    paths = _keys(everything)
+    return f"{given}: there is no key '{key}'.{nearest(key, paths)} cfx --cfg job prints every key."
 
 
 def _keys(values: Mapping[Any, Any], prefix: str = "") -> Iterator[str]:
