@@ -5,7 +5,8 @@
         connection.simulationStep()
         driver.step(connection, ["ego", "other"])
 
-`connection` is the module `libsumo`, the module `traci` or one of its connections. Importing this package imports neither.
+`connection` is the module `libsumo`, the module `traci` or one of its connections. Importing this
+package imports neither.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`cfx export --to sumo`: a job's fixed parameters as vTypes that SUMO loads as they are."""
+"""`cfx export --to sumo`: a job's driver-specific parameters as vTypes that SUMO loads."""
 
 from __future__ import annotations
 
@@ -27,16 +27,21 @@ _WITHOUT_LAG = {"variant": "sumo", "leader_deceleration": None}
 
 
 def export(run: str | Path, output: str | Path | None = None) -> list[str]:
-    """Writes a vTypeDistribution for each cluster, with a vType for each pair's fixed parameters; returns what to tell the user.
+    """Writes a vTypeDistribution for each cluster, with a vType for each pair's parameters.
+
+    The parameters are those of the method `fixed`: calibrated to the driver, constant.
 
     Args:
         run: a job's output folder, or the id of its MLflow run.
         output: the file; None for `drivers.add.xml` in that folder, or here for an MLflow run.
 
     Raises:
-        DataError: there is no finished job, or it has no fixed parameters.
+        DataError: there is no finished job, or it has no driver-specific parameters.
         ConfigError: SUMO has no model that drives as the job's.
         OutputError: the file cannot be written.
+
+    Returns:
+        Sentences for the user.
     """
     folder, home = _folder(run)
     node, table = _read(folder)
@@ -51,13 +56,15 @@ def export(run: str | Path, output: str | Path | None = None) -> list[str]:
             f"{path} cannot be written ({error.strerror or error}); name another --output"
         ) from error
     first = quoteattr(str(table["cluster"].iloc[0]))
-    counts = ", ".join(
-        f"{name} {count}" for name, count in table.groupby("cluster", sort=False).size().items()
-    )
+    counts = []
+    for name, count in table.groupby("cluster", sort=False).size().items():
+        counts.append(f"{name} {count}")
     return [
-        f"vTypes of SUMO's {kind.car_follow_model}, in one vTypeDistribution for each cluster: {counts}",
-        *(f"Note: {note}" for note in notes),
-        f"Use it: sumo --additional-files {path.absolute()}; then in a flow or vehicle: type={first}",
+        f"vTypes of SUMO's {kind.car_follow_model}, in one vTypeDistribution for each cluster:"
+        f" {', '.join(counts)}",
+        *[f"Note: {note}" for note in notes],
+        f"Use it: sumo --additional-files {path.absolute()}; then in a flow or vehicle:"
+        f" type={first}",
     ]
 
 
@@ -77,7 +84,8 @@ def vtypes(node: Mapping[str, Any], table: pd.DataFrame) -> tuple[VType, list[st
     missing = [column for column in columns if column not in table]
     if missing:
         raise DataError(
-            f"pairs.csv has no column {missing[0]}, which model={node['name']} here needs; run the job again"
+            f"pairs.csv has no column {missing[0]}, which model={node['name']} here needs; run the"
+            " job again"
         )
     p: dict[str, Tensor] = model.space.unpack(torch.tensor(table[columns].to_numpy(dtype=float)))
     notes: list[str] = []
@@ -85,8 +93,8 @@ def vtypes(node: Mapping[str, Any], table: pd.DataFrame) -> tuple[VType, list[st
         model, notes = _krauss(node, p)
     if not isinstance(model, InSumo):
         raise ConfigError(
-            f"SUMO has no car-following model that drives as model={node['name']}; export jobs with model=krauss, w99,"
-            " krauss_sumo, idm_sumo or sumo_vtype"
+            f"SUMO has no car-following model that drives as model={node['name']}; export jobs with"
+            " model=krauss, w99, krauss_sumo, idm_sumo or sumo_vtype"
         )
     return model.sumo_vtype(p), notes
 
@@ -96,35 +104,36 @@ def _krauss(node: Mapping[str, Any], p: Mapping[str, Tensor]) -> tuple[DrivingMo
     notes = []
     if bool((p["t_i"] > 0).any()):
         notes.append(
-            "SUMO's KraussOrig1 has no brake build-up time t_i; tau is t_r, with which the gap at constant speed is the same, and"
-            " braking begins a little later"
+            "SUMO's KraussOrig1 has no brake build-up time t_i; tau is t_r, with which the gap at"
+            " constant speed is the same, and braking begins a little later"
         )
     if node.get("leader_deceleration") is not None:
         notes.append(
-            "SUMO's KraussOrig1 expects of the leader the follower's own decel, not leader_deceleration"
+            "SUMO's KraussOrig1 expects of the leader the follower's own decel, not"
+            " leader_deceleration"
         )
     parameters = dict(node.get("parameters") or {})
     parameters["t_i"] = {"default": 0.0, "tuned": False}
-    return cast(
-        DrivingModel, registry.create("model", {**node, **_WITHOUT_LAG, "parameters": parameters})
-    ), notes
+    without_lag = {**node, **_WITHOUT_LAG, "parameters": parameters}
+    return cast(DrivingModel, registry.create("model", without_lag)), notes
 
 
 def _folder(run: str | Path) -> tuple[Path, Path]:
     """Returns the folder of a job, and where its export goes unless told otherwise."""
     folder = folder_of(run)
-    return folder, folder if Path(run).expanduser().is_dir() else Path()
+    if Path(run).expanduser().is_dir():
+        return folder, folder
+    return folder, Path()
 
 
 def _read(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
-    """Reads the model's node, and the rows of `fixed` from the calmest cluster to the most aggressive."""
+    """Reads the model's node, and the rows of `fixed`, calmest cluster first."""
     try:
         node = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))["model"]
         table = pd.read_csv(folder / "pairs.csv", dtype={"pair_id": str})
         fixed = table[table["method"] == "fixed"]
-        fixed = fixed[
-            np.isfinite(fixed.filter(like="parameter_").to_numpy(dtype=float)).all(axis=1)
-        ]
+        values = fixed.filter(like="parameter_").to_numpy(dtype=float)
+        fixed = fixed[np.isfinite(values).all(axis=1)]
         fixed = fixed.sort_values("style_score", kind="stable").reset_index(drop=True)
     except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError) as error:
         raise DataError(
@@ -132,39 +141,44 @@ def _read(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
         ) from error
     if fixed.empty:
         raise DataError(
-            f"{folder}/pairs.csv holds no driver with fixed parameters; give a job that calibrated some"
+            f"{folder}/pairs.csv holds no driver-specific parameters (method `fixed`); give a job"
+            " that calibrated some"
         )
     return node, fixed
 
 
 def _xml(table: pd.DataFrame, kind: VType, notes: list[str]) -> str:
-    columns = {
-        name: _texts(value, len(table)) for name, value in {"sigma": "0", **kind.attributes}.items()
-    }
+    columns: dict[str, list[str]] = {}
+    for name, value in {"sigma": "0", **kind.attributes}.items():
+        columns[name] = _texts(value, len(table))
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
-        "<!-- Fixed parameters of recorded drivers, calibrated by cfx.",
+        "<!-- Constant parameters of recorded drivers, each calibrated by cfx.",
     ]
-    lines += [*(f"     {note}." for note in notes), "-->", "<additional>"]
+    for note in notes:
+        lines.append(f"     {note}.")
+    lines += ["-->", "<additional>"]
     for cluster, rows in table.groupby("cluster", sort=False):
         lines.append(f"    <vTypeDistribution id={quoteattr(str(cluster))}>")
         for place, row in enumerate(rows.index):
-            attributes = " ".join(
-                f"{name}={quoteattr(values[row])}" for name, values in columns.items()
-            )
-            name = quoteattr(f"{cluster}_{place}")
-            lines.append(
-                f'        <vType id={name} carFollowModel="{kind.car_follow_model}" speedDev="0" {attributes}>'
-            )
-            lines.append(f'            <param key="pair" value={quoteattr(rows["pair_id"][row])}/>')
-            lines.append("        </vType>")
+            attributes = {name: values[row] for name, values in columns.items()}
+            lines += _vtype(f"{cluster}_{place}", kind, attributes, rows["pair_id"][row])
         lines.append("    </vTypeDistribution>")
     return "\n".join([*lines, "</additional>", ""])
 
 
+def _vtype(name: str, kind: VType, attributes: Mapping[str, str], pair_id: str) -> list[str]:
+    given = " ".join(f"{key}={quoteattr(value)}" for key, value in attributes.items())
+    return [
+        f"        <vType id={quoteattr(name)} carFollowModel={quoteattr(kind.car_follow_model)}"
+        f' speedDev="0" {given}>',
+        f'            <param key="pair" value={quoteattr(pair_id)}/>',
+        "        </vType>",
+    ]
+
+
 def _texts(value: Tensor | str, count: int) -> list[str]:
-    return (
-        [value] * count
-        if isinstance(value, str)
-        else [repr(float(one)) for one in value.expand(count)]
-    )
+    """Returns an attribute of each of `count` vehicles."""
+    if isinstance(value, str):
+        return [value] * count
+    return [repr(float(one)) for one in value.expand(count)]

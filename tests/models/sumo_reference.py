@@ -90,27 +90,31 @@ def _drive(sumo: Any, runs: list[Job]) -> list[Job]:
 
 
 def _network(runs: list[Job]) -> str:
-    """One straight road for each run, long enough for both vehicles; written by hand, as it needs no netconvert."""
+    """One straight road for each run, long enough for both vehicles; needs no netconvert."""
     length = 2000.0 + max(
         run["leader_position"] + len(run["leader_speed"]) * max(run["leader_speed"]) for run in runs
     )
     lines = [
         '<net version="1.20">',
-        f'<location netOffset="0,0" convBoundary="0,0,{length},{100 * len(runs)}" origBoundary="0,0,1,1" projParameter="!"/>',
+        f'<location netOffset="0,0" convBoundary="0,0,{length},{100 * len(runs)}"'
+        ' origBoundary="0,0,1,1" projParameter="!"/>',
     ]
     for i in range(len(runs)):
         y = 100 * i
         lines.append(
-            f'<edge id="road{i}" from="from{i}" to="to{i}" priority="1"><lane id="road{i}_0" index="0" speed="{_FAST}"'
+            f'<edge id="road{i}" from="from{i}" to="to{i}" priority="1">'
+            f'<lane id="road{i}_0" index="0" speed="{_FAST}"'
         )
         lines.append(f' length="{length}" shape="0,{y} {length},{y}"/></edge>')
     for i in range(len(runs)):
         y = 100 * i
         lines.append(
-            f'<junction id="from{i}" type="dead_end" x="0" y="{y}" incLanes="" intLanes="" shape="0,{y}"/>'
+            f'<junction id="from{i}" type="dead_end" x="0" y="{y}" incLanes="" intLanes=""'
+            f' shape="0,{y}"/>'
         )
         lines.append(
-            f'<junction id="to{i}" type="dead_end" x="{length}" y="{y}" incLanes="road{i}_0" intLanes="" shape="{length},{y}"/>'
+            f'<junction id="to{i}" type="dead_end" x="{length}" y="{y}" incLanes="road{i}_0"'
+            f' intLanes="" shape="{length},{y}"/>'
         )
     return "\n".join([*lines, "</net>"])
 
@@ -125,7 +129,8 @@ def _routes(runs: list[Job]) -> str:
         )
         lines.append(f' length="{run["leader_length"]!r}"/>')
         lines.append(
-            f'<vType id="drive{i}" carFollowModel="{run["model"]}" sigma="0" speedFactor="1" speedDev="0" {given}/>'
+            f'<vType id="drive{i}" carFollowModel="{run["model"]}" sigma="0" speedFactor="1"'
+            f' speedDev="0" {given}/>'
         )
         lines.append(f'<route id="route{i}" edges="road{i}"/>')
     for i, run in enumerate(runs):
@@ -134,7 +139,8 @@ def _routes(runs: list[Job]) -> str:
             ("follower", "drive", run["position"], run["speed"]),
         ):
             lines.append(
-                f'<vehicle id="{name}{i}" type="{kind}{i}" route="route{i}" depart="0" insertionChecks="none"'
+                f'<vehicle id="{name}{i}" type="{kind}{i}" route="route{i}" depart="0"'
+                ' insertionChecks="none"'
             )
             lines.append(f' departPos="{position!r}" departSpeed="{speed!r}"/>')
     return "\n".join([*lines, "</routes>"])

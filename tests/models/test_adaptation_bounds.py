@@ -1,4 +1,4 @@
-"""How far a policy of offsets may move a parameter: within the bounds of constant ones, beyond, or not at all."""
+"""How far a policy of offsets may move a parameter: within calibration's bounds, beyond, or not."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 
 
-def test_reach_moves_bounds_outwards_for_policies_alone() -> None:
+def test_adaptation_bounds_move_bounds_outwards_for_policies_alone() -> None:
     model = Krauss(adaptation_bounds={"t_r": (0.001, 50.0)})
     assert (model.adaptation_space["t_r"].low, model.adaptation_space["t_r"].high) == (0.001, 50.0)
     assert model.space == Krauss().space
     assert model.adaptation_space["b"] == model.space["b"]
 
 
-def test_reach_never_moves_bounds_inwards() -> None:
+def test_adaptation_bounds_never_move_bounds_inwards() -> None:
     model = W99(parameters={"cc8": {"high": 9.0}}, adaptation_bounds={"cc8": (0.05, 5.0)})
     assert (model.adaptation_space["cc8"].low, model.adaptation_space["cc8"].high) == (0.05, 9.0)
     assert W99().adaptation_space == W99().space
@@ -36,30 +36,30 @@ def test_reach_never_moves_bounds_inwards() -> None:
         ({"t_r": None, "t_i": None}, "could move none"),
     ],
 )
-def test_a_wrong_reach_is_named(
+def test_wrong_adaptation_bounds_are_named(
     adaptation_bounds: dict[str, tuple[float, float] | None], message: str
 ) -> None:
     with pytest.raises(ParameterError, match=message):
         Krauss(adaptation_bounds=adaptation_bounds)
 
 
-def test_a_reach_needs_both_ends() -> None:
+def test_adaptation_bounds_need_both_ends() -> None:
     with pytest.raises(ConfigError, match=r"model\.adaptation_bounds\.t_r"):
         Krauss(adaptation_bounds={"t_r": (1.0,)})  # type: ignore[dict-item]  # what a user may write
 
 
-def test_what_is_held_stays_at_its_base_whatever_a_network_answers() -> None:
+def test_what_is_frozen_stays_at_its_base_whatever_a_network_answers() -> None:
     adaptation_space = Krauss(adaptation_bounds={"t_i": None}).adaptation_space
     base = adaptation_space.to_unit(torch.tensor([[1.5, 0.2], [3.0, 2.0]]).double())
-    free = adaptation_space.adaptable()
-    assert free is not None
-    found = moved(base, torch.tensor([[0.9, 0.9], [0.1, 0.1]]).double(), free)
+    adaptable = adaptation_space.adaptable()
+    assert adaptable is not None
+    found = moved(base, torch.tensor([[0.9, 0.9], [0.1, 0.1]]).double(), adaptable)
     assert torch.equal(found[:, 1], base[:, 1])
     assert torch.equal(found[:, 0], moved(base, torch.tensor([[0.9], [0.1]]).double())[:, 0])
     assert Krauss().adaptation_space.adaptable() is None
 
 
-def test_the_preset_krauss_headway_holds_t_i() -> None:
+def test_the_preset_krauss_headway_freezes_t_i() -> None:
     model = registry.create(
         "model", hydra_source.plain(hydra_source.composed(["model=krauss_headway"]))["model"]
     )
@@ -70,7 +70,7 @@ def test_the_preset_krauss_headway_holds_t_i() -> None:
     ]
 
 
-def test_w99_reaching_calibrates_the_constants_of_w99() -> None:
+def test_w99_wide_calibrates_the_constants_of_w99() -> None:
     model = registry.create(
         "model", hydra_source.plain(hydra_source.composed(["model=w99_wide"]))["model"]
     )

@@ -62,7 +62,7 @@ def table() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Drive:
-    """One follower behind one leader; the leader's positions are Euler sums of its speeds, as SUMO replays them."""
+    """One follower behind one leader, whose positions are Euler sums of its speeds, as in SUMO."""
 
     leader_speed: Array
     leader_acceleration: float
@@ -147,7 +147,7 @@ def sumos_krauss(rng: np.random.Generator, count: int) -> list[Values]:
 
 
 def plugins_idm() -> Twin | None:
-    """The plugin's `idm`, which has no brake cap (lifted in SUMO here) and other gaps below 0.1 m."""
+    """The plugin's `idm`: no brake cap (lifted in SUMO here), and other gaps below 0.1 m."""
     if importlib.util.find_spec("cfx_idm") is None:
         return None
     from cfx_idm.idm import IDM
@@ -175,9 +175,9 @@ def plugins_idm() -> Twin | None:
 
 
 PLUGINS_IDM = plugins_idm()
+KRAUSS = Krauss(variant="sumo", parameters={"t_i": {"default": 0.0, "tuned": False}})
 TWINS = [
-    Twin("krauss, t_i = 0 / KraussOrig1", krauss := Krauss(variant="sumo", parameters={"t_i": {"default": 0.0, "tuned": False}}),
-         krauss_parameters, same=krauss_radicand),
+    Twin("krauss, t_i = 0 / KraussOrig1", KRAUSS, krauss_parameters, same=krauss_radicand),
     Twin("krauss_sumo / Krauss", KraussSumo(), sumos_krauss),
     Twin("idm_sumo / IDM", IdmSumo(), anywhere(IdmSumo())),
     Twin("w99 / W99", W99(), anywhere(W99(), b=4.5, b_max=9.0, v_max=55.0), draws=True),
@@ -187,7 +187,7 @@ every_twin = pytest.mark.parametrize("twin", TWINS, ids=[twin.name for twin in T
 
 
 def sumo(twin: Twin, drives: list[Drive]) -> list[dict[str, list[float]]]:
-    """Runs the drives in SUMO, in its own process and from its own files, and returns its trajectories."""
+    """Returns SUMO's own trajectories, from a process and files of its own."""
     runs = []
     for drive in drives:
         kind = twin.in_sumo(drive.parameters)
@@ -224,7 +224,7 @@ def column(values: Iterable[float]) -> Tensor:
 def ours(
     model: DrivingModel, cases: list[Drive], reference: list[dict[str, list[float]]]
 ) -> tuple[Trajectory, Leader]:
-    """Drives our model behind the leaders whom SUMO drove, at the very same positions; all at once, `(drives, time)`."""
+    """Simulates our model behind SUMO's leaders, at the very same positions, `(runs, time)`."""
     frames = max(len(drive.leader_speed) for drive in cases)
 
     def longest(rows: Iterable[Iterable[float]]) -> Tensor:
@@ -254,7 +254,10 @@ def parameters(cases: list[Drive]) -> dict[str, Tensor]:
 
 
 def undrawn(drive: Trajectory, leader: Leader) -> Tensor:
-    """Frames up to which W99 in SUMO draws no random number that matters: while closing in on a leader with a_l >= 1 it does."""
+    """Returns the frames up to which W99 in SUMO draws no random number that matters.
+
+    It does while closing in on a leader with a_l >= 1 m/s2.
+    """
     draws = (drive.speed > leader.speed) & (leader.acceleration >= 1.0 - 1e-9)
     return (draws.cumsum(dim=1) - draws.long()) == 0
 
@@ -265,7 +268,7 @@ def chaotic(
     reference: list[dict[str, list[float]]],
     mine: Trajectory,
 ) -> Tensor:
-    """Frames from which on a thousandth of a nanometre matters: rounding decides there, which nobody can restate."""
+    """Returns the frames from which on a thousandth of a nanometre, and so rounding, matters."""
     rng = np.random.default_rng(0)
     places = (
         [x + 1e-12 * float(rng.uniform(-1, 1)) for x in run["leader_position"]] for run in reference
@@ -288,7 +291,7 @@ def same_so_far(twin: Twin, cases: list[Drive], drive: Trajectory, leader: Leade
 
 
 def compare(twin: Twin, case: str, cases: list[Drive]) -> float:
-    """Compares free rollouts, notes the largest difference and returns the share of frames that could be compared."""
+    """Compares free rollouts; returns the share of frames that could be compared."""
     reference = sumo(twin, cases)
     mine, leader = ours(twin.model, cases, reference)
     there = leader.position.isfinite()
@@ -318,7 +321,7 @@ def note(model: str, case: str, difference: float) -> None:
 
 
 def synthetic(rng: np.random.Generator, count: int, gentle: float) -> Iterable[Array]:
-    """Leaders that cruise, brake to a full standstill, wait and drive off, with accelerations up to `gentle`."""
+    """Leaders that cruise, brake to a standstill, wait and drive off, as gently as `gentle`."""
     for _ in range(count):
         frames, speed = 500, float(rng.uniform(2, 25))
         v = [speed]
@@ -417,7 +420,7 @@ def one_step(twin: Twin, cases: list[Drive]) -> float:
 
 
 def sumos_wiedemann(p: Mapping[str, Tensor]) -> VType:
-    """SUMO's Wiedemann has two parameters, security and estimation, from which it makes Wiedemann's."""
+    """SUMO's Wiedemann makes Wiedemann's parameters from two: security and estimation."""
     security = 0.5 * (p["ax_add"] - 1.0)
     estimation = p["cx"] / 25.0 - 1.0 - security
     accel = 5.0 * p["b_null"]

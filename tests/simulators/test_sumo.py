@@ -1,4 +1,4 @@
-"""`SumoStepper` takes the steps that the models' own equations take, and says clearly where it cannot."""
+"""`SumoStepper` takes the steps of the models' own equations, and says where it cannot."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ EIDM = SumoVType(parameters={"tau": TAU})
 
 
 class Case:
-    """Followers behind leaders whose positions, speeds and accelerations do not quite agree, as those of recordings."""
+    """Followers behind leaders whose signals do not quite agree, as those of recordings."""
 
     def __init__(self) -> None:
         self.draw = torch.Generator().manual_seed(4)
@@ -229,7 +229,7 @@ def test_gradients_are_refused(eidm: object, case: Case) -> None:
     p = {"tau": torch.tensor(1.0, dtype=torch.float64, requires_grad=True)}
     with pytest.raises(
         SumoError,
-        match="SUMO gives no gradients: learn with learner=imitation, or drive with simulator=memory",
+        match="SUMO gives no gradients: learn with learner=imitation, or drive with simulator=mem",
     ):
         eidm.advance(eidm.begin(case.start), case.leader, p)
 
@@ -247,7 +247,8 @@ def test_nobody_or_no_time_is_no_drive(eidm: object, case: Case) -> None:
         (
             W74(),
             DT,
-            "SUMO has no car-following model W74; choose model=krauss_sumo, idm_sumo, w99, krauss or sumo_vtype",
+            "SUMO has no car-following model W74; choose model=krauss_sumo, idm_sumo, w99, krauss"
+            " or sumo_vtype",
         ),
         (Krauss(), DT, "only without a brake build-up time; add model.variant=sumo"),
         (

@@ -49,7 +49,10 @@ def test_the_table_is_the_same_with_sumo_in_the_loop(tmp_path: Path) -> None:
 
 @needs_sumo
 def test_any_model_of_sumo_is_calibrated_by_its_name(tmp_path: Path) -> None:
-    own = "model.parameters={tau: {low: 0.5, high: 3, default: 1}, accel: {low: 0.5, high: 4, default: 2}}"
+    own = (
+        "model.parameters={tau: {low: 0.5, high: 3, default: 1},"
+        " accel: {low: 0.5, high: 4, default: 2}}"
+    )
     result = job(
         tmp_path / "eidm",
         "model=sumo_vtype",

