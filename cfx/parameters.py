@@ -210,6 +210,7 @@ class ParameterSpace:
 
     def free(self, *, device: torch.device | str | None = None) -> Tensor | None:
         """The earlier name of `adaptable`."""
+        _warn("ParameterSpace.free", "adaptable")
         return self.adaptable(device=device)
 
     def bounds(

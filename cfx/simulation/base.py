@@ -73,6 +73,3 @@ class Stepper(ABC):
     @abstractmethod
     def identity(self) -> str:
         """Returns what results depend on besides the model and the time step; caches carry it."""
-
-
-BaseSimulator = Stepper

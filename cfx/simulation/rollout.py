@@ -346,6 +346,3 @@ def _named(model: DrivingModel, given: Mapping[str, Tensor | float], like: Tenso
 def _columns(parameters: Tensor) -> Tensor:
     """Returns the same tensor with each parameter contiguous in memory, as a step reads them."""
     return parameters.movedim(-1, 0).contiguous().movedim(0, -1)
-
-
-Simulator = MemoryStepper

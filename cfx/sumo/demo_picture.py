@@ -48,7 +48,8 @@ def write_pictures(
     return [
         write_figure(snapshots(road, middle, together), folder / "demo.png"),
         write_figure(
-            figures.pairs(evaluation, [one.pair.pair_id for one in shown]), folder / "demo_drives.png"
+            figures.pairs(evaluation, [one.pair.pair_id for one in shown]),
+            folder / "demo_drives.png",
         ),
     ]
 
