@@ -120,8 +120,12 @@ def _defaults(schema: type[BaseModel]) -> dict[str, Any]:
 def _settings(schema: type[BaseModel], values: Mapping[str, Any]) -> list[str]:
     """Returns the lines of some settings: values with their descriptions as comments."""
     lines: list[str] = []
+    group = None
     for name, value in values.items():
         field = schema.model_fields[name]
+        if _group(schema, name) != group:
+            group = _group(schema, name)
+            lines += _comment(f"-- {group}")
         note = field.description or ""
         if field.is_required():
             note = f"required: {note}".strip()
@@ -133,6 +137,16 @@ def _settings(schema: type[BaseModel], values: Mapping[str, Any]) -> list[str]:
         else:
             lines += _line(name, _value(to_jsonable_python(value)), note)
     return lines
+
+
+def _group(schema: type[BaseModel], name: str) -> str | None:
+    """Returns the heading of a setting, where settings are put together from several classes."""
+    if len(schema.__bases__) < 2:
+        return None
+    for base in schema.__mro__:
+        if name in base.__annotations__:
+            return (inspect.getdoc(base) or "").partition("\n")[0].rstrip(".")
+    return None
 
 
 def _parameters(space: ParameterSpace) -> list[str]:

@@ -38,7 +38,11 @@ SETTINGS: dict[str, str] = {
 }
 """Paths in the configuration: the old one and the new one."""
 
-REMOVED: dict[str, str] = {}
+REMOVED: dict[str, str] = {
+    "learner.error": "the loss is the job's objective; choose objective=speed_rmse or speed_huber",
+    "learner.huber_delta": "write objective=speed_huber objective.delta=...",
+    "learner.normalise": "losses are always divided by those of the base parameters",
+}
 """Paths in the configuration that are gone: the old one, and a sentence that says what to do.
 
 A setting that is given all the same is left out, with a warning.

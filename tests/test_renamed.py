@@ -148,6 +148,18 @@ def test_a_setting_that_is_gone_is_left_out_with_its_sentence(
     assert warnings() == ["learner.huber is gone and was left out: write learner.objective=huber"]
 
 
+def test_settings_of_rollout_that_are_gone_say_what_to_write(warnings: Warnings) -> None:
+    given = {"name": "rollout", "error": "huber", "huber_delta": 0.4, "normalise": True}
+    assert renamed.node("learner", given | {"gradient_clip": None}) == {
+        "name": "rollout",
+        "gradient_clip": None,
+    }
+    said = " ".join(warnings())
+    assert "objective=speed_huber objective.delta=..." in said
+    assert "learner.normalise is gone" in said
+    assert renamed.overrides(["learner.error=rmse", "learner.epochs=2"]) == ["learner.epochs=2"]
+
+
 # ---- configuration files
 
 

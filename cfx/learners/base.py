@@ -33,21 +33,25 @@ class TrainingData:
     """What a learner may see: the training part of some pairs.
 
     Attributes:
-        simulator: the driving model and its time step.
-        batch: P pairs, whole; only frames up to `split.frame` may be read.
+        simulator: simulates the driving model, with its time step.
+        batch: P pairs, full trajectories; only frames up to `split.frame` may be read.
         split: where each pair's training part ends.
-        windows: how drives are cut.
-        fixed: the parameters that each pair's network starts from, `(P, n)`, SI units: the driver's own fixed set, or the
-            population's where networks are for drivers never seen.
-        labels: window labels of the training parts; None if the learner does not need them.
+        windows: how trajectories are cut.
+        fixed: the parameters that each pair's network starts from, `(P, n)`, SI units: the driver's
+            own calibrated set, or the pooled one where networks are for unseen drivers.
+        labels: per-window calibrated parameters of the training parts; None if the learner needs
+            none.
         network: which network learns from each pair, `(P,)` int64.
         names: what each network is for, N of them.
         seed: for initial weights and everything random.
-        base: the parameters that each driver is driven by once his history was read, `(P, n)`, SI units: his own set, while
-            `fixed` is the population's; None where nobody drives without. Only learners of offsets read them.
-        drivers: whose pair each is; None if each is another's.
-        workspace: a folder for what training needs to go on after an interruption; None: nothing is kept.
-        objective: what training that simulates in closed loop minimises; calibration has minimised it too.
+        base: the parameters that answers refer to for each driver whose history was observed, `(P,
+            n)`, SI units, while those in `fixed` serve unseen drivers; None where there are no
+            unseen drivers. Only learners of offsets read them.
+        drivers: whose pair each is; None if each is another driver's.
+        workspace: a folder for what training needs to go on after an interruption; None: nothing is
+            kept.
+        objective: what training that simulates in closed loop minimises; calibration has minimised
+            it too.
     """
 
     simulator: Stepper
@@ -75,8 +79,8 @@ class TrainingResult:
         curves: columns network, epoch, train_loss, validation_loss (NaN where not measured).
         base: parameters that answers refer to for drivers without a base of their own, `(N, n)`, SI
             units; None where the head needs none.
-        head: what makes parameters of answers (`cfx.agents.heads.HEADS`); None: `offset` where there
-            is a base, otherwise `direct`.
+        head: what makes parameters of answers (`cfx.agents.heads.HEADS`); None: `offset` where
+            there is a base, otherwise `direct`.
     """
 
     network: PolicyNetwork
@@ -89,13 +93,15 @@ class TrainingResult:
 class Learner(Component):
     """Base of every learner.
 
-    Life cycle: a protocol makes a `TrainingData` (with window labels if `needs_labels`) and calls `fit` once. Networks are
-    independent: what one learns does not depend on which others are trained beside it.
+    Life cycle: a protocol makes a `TrainingData` (with labels if `needs_labels`) and calls `fit`
+        once.
+    Networks are independent: what one learns does not depend on which others are trained beside it.
 
     Attributes:
-        needs_labels: whether the protocol must find window labels first.
+        needs_labels: whether the protocol must find per-window calibrated parameters first.
         needs_gradients: whether it differentiates through the simulation.
-        uses_driver_features: whether its networks are told drivers' driver features (`policy.driver_features`), and know what unseen drivers are.
+        uses_driver_features: whether its networks read driver features (`policy.driver_features`),
+            and are trained for unseen drivers without them too.
     """
 
     kind = "learner"
@@ -105,7 +111,7 @@ class Learner(Component):
 
     @property
     def reads_history(self) -> bool:
-        """Whether its networks learn from drives before which they read a driver's measured history."""
+        """Whether its networks learn from trajectories with observed history before them."""
         return True
 
     def require_gradients(self, model: DrivingModel, differentiable: bool) -> None:
@@ -118,25 +124,28 @@ class Learner(Component):
         Raises:
             ConfigError: there are none.
         """
-        if self.needs_gradients and not (differentiable and model.differentiable):
-            who = "the driving model" if differentiable else "the simulator"
-            raise ConfigError(
-                f"this learner needs gradients, and {who} has none; choose a differentiable model and simulator=memory, or"
-                " learner=imitation"
-            )
+        if not self.needs_gradients or (differentiable and model.differentiable):
+            return
+        which = "the simulator"
+        if differentiable:
+            which = "the driving model"
+        raise ConfigError(
+            f"this learner needs gradients, and {which} has none; choose a differentiable model and"
+            " simulator=memory, or learner=imitation"
+        )
 
     def require_no_driver_features(self, policy: Policy) -> None:
-        """Checks that a policy is not to be told what this learner cannot tell it; a job asks before any work begins.
+        """Checks that a policy reads no driver features; a job asks before any work begins.
 
         Raises:
-            ConfigError: the policy has driver features.
+            ConfigError: it reads some, and this learner does not provide them.
         """
         if policy.driver_features and not self.uses_driver_features:
             raise ConfigError(
-                f"policy.driver_features={list(policy.driver_features)}: this learner tells its networks nothing of drivers; choose"
-                " learner=rollout, or policy.driver_features=none"
+                f"policy.driver_features={list(policy.driver_features)}: this learner provides no"
+                " driver features; choose learner=rollout, or policy.driver_features=none"
             )
 
     @abstractmethod
     def fit(self, policy: Policy, training_data: TrainingData) -> TrainingResult:
-        """Trains the networks of `policy` on `training data`."""
+        """Trains the networks of `policy` on `training_data`."""

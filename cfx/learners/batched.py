@@ -1,7 +1,9 @@
-"""What learners of many networks share: N networks train as one batched network, and each as if it were alone.
+"""What learners of many networks share: N networks train as one batched network, each as if alone.
 
-The sum of N losses trains every network by its own loss; gradients are clipped, the best epoch is chosen and training stops for
-each on its own.
+The sum of N losses trains every network by its own loss. Gradients are clipped, the best epoch is
+chosen and training stops for each network on its own.
+
+Shapes: P pairs, N networks, B drivers of the network that has most, n tuned parameters.
 """
 
 from __future__ import annotations
@@ -46,10 +48,10 @@ class Grid:
 
     def mean(self, values: Tensor) -> Tensor:
         """Returns the mean of `(P, n)` over each network's pairs, `(N, n)`."""
-        total = values.new_zeros((self.shape[0], values.shape[1])).index_add_(
-            0, self.network, values
-        )
-        return total / torch.bincount(self.network, minlength=self.shape[0])[:, None]
+        networks = self.shape[0]
+        total = values.new_zeros((networks, values.shape[1]))
+        total = total.index_add_(0, self.network, values)
+        return total / torch.bincount(self.network, minlength=networks)[:, None]
 
 
 class Training(Protocol):
@@ -66,7 +68,15 @@ class Training(Protocol):
 
 
 class BatchedModule(pl.LightningModule):
-    """Trains N networks and keeps the weights of each one's best epoch; `members` of them, behind one another, share a name."""
+    """Trains N networks and keeps the weights of each one's best epoch.
+
+    Args:
+        network: the networks; `ensemble_size` of them, behind one another, share a name.
+        names: of the networks, or of their ensembles.
+        settings: of the learner.
+        on_epoch: called after each epoch.
+        ensemble_size: networks of an ensemble.
+    """
 
     def __init__(
         self,
@@ -78,21 +88,23 @@ class BatchedModule(pl.LightningModule):
         ensemble_size: int = 1,
     ) -> None:
         super().__init__()
+        networks = len(names) * ensemble_size
         self.network = network
         self.names = names
         self.ensemble_size = ensemble_size
         self.training_settings = settings
         self.on_epoch = on_epoch
-        self.best = {key: value.detach().clone() for key, value in network.named_parameters()}
-        self.best_loss = torch.full((len(names) * ensemble_size,), math.inf)
-        self.stale = torch.zeros(len(names) * ensemble_size, dtype=torch.int64)
+        self.best: dict[str, Tensor] = {}
+        for key, value in network.named_parameters():
+            self.best[key] = value.detach().clone()
+        self.best_loss = torch.full((networks,), math.inf)
+        self.stale = torch.zeros(networks, dtype=torch.int64)
         self.rows: list[tuple[Tensor, Tensor]] = []
 
     def configure_optimizers(self) -> Any:
         s = self.training_settings
-        return torch.optim.AdamW(
-            self.network.parameters(), lr=s.learning_rate, weight_decay=s.weight_decay
-        )
+        parameters = self.network.parameters()
+        return torch.optim.AdamW(parameters, lr=s.learning_rate, weight_decay=s.weight_decay)
 
     def configure_gradient_clipping(self, optimizer: Any, *args: Any, **kwargs: Any) -> None:
         """Clips each network's gradient on its own: a norm over all would couple them."""
@@ -100,20 +112,22 @@ class BatchedModule(pl.LightningModule):
             clip_each(self.network, self.training_settings.gradient_clip)
 
     def judge(self, train: Tensor, validation: Tensor, *, hopeful: bool = False) -> None:
-        """Ends an epoch: keeps the weights of each network's best one, and stops when no network has hope left.
+        """Ends an epoch.
+
+        Keeps the weights of each network whose loss is the best so far, and stops the training when
+        every network has gone without a better one for `patience` epochs.
 
         Args:
-            train, validation: losses `(N,)` on the CPU; a network whose validation loss is NaN is judged by its training loss.
-            hopeful: no network loses patience in this epoch.
+            train: training losses, `(N,)` on the CPU.
+            validation: validation losses, `(N,)` on the CPU; where NaN, the training loss counts.
+            hopeful: this epoch does not count towards the patience.
         """
         self.rows.append((train, validation))
         loss = torch.where(validation.isnan(), train, validation)
         patience = self.training_settings.patience
-        active = (
-            torch.ones_like(self.stale, dtype=torch.bool)
-            if patience is None
-            else self.stale < patience
-        )
+        active = torch.ones_like(self.stale, dtype=torch.bool)
+        if patience is not None:
+            active = self.stale < patience
         better = (loss < self.best_loss) & active
         self.best_loss = torch.where(better, loss, self.best_loss)
         self.stale = torch.where(better, 0, self.stale + (active & (not hopeful)).long())
@@ -131,51 +145,52 @@ class BatchedModule(pl.LightningModule):
                 value.copy_(self.best[key])
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        kept = {
+        checkpoint["batched"] = {
             "best": self.best,
             "best_loss": self.best_loss,
             "stale": self.stale,
             "rows": self.rows,
         }
-        checkpoint["batched"] = kept
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         kept = checkpoint["batched"]
         self.best, self.best_loss, self.stale = dict(kept["best"]), kept["best_loss"], kept["stale"]
-        self.rows = [(train, validation) for train, validation in kept["rows"]]
-        for _ in self.rows:
+        self.rows.clear()
+        for train, validation in kept["rows"]:
+            self.rows.append((train, validation))
             self.on_epoch()
 
     def curves(self) -> pd.DataFrame:
-        """Returns the learning curves in long form; those who share a name, on average."""
-        frames = [
-            pd.DataFrame(
-                {
-                    "network": self.names,
-                    "epoch": epoch,
-                    "train_loss": self._mean(train),
-                    "validation_loss": self._mean(validation),
-                }
-            )
-            for epoch, (train, validation) in enumerate(self.rows)
-        ]
-        return (
-            pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=CURVE_COLUMNS)
-        )
+        """Returns the learning curves in long form; networks that share a name are averaged."""
+        frames = []
+        for epoch, (train, validation) in enumerate(self.rows):
+            columns = {
+                "network": self.names,
+                "epoch": epoch,
+                "train_loss": self._mean(train),
+                "validation_loss": self._mean(validation),
+            }
+            frames.append(pd.DataFrame(columns))
+        if not frames:
+            return pd.DataFrame(columns=CURVE_COLUMNS)
+        return pd.concat(frames, ignore_index=True)
 
     def _mean(self, losses: Tensor) -> list[float]:
         return losses.view(-1, self.ensemble_size).mean(1).tolist()
 
 
 def clip_each(network: PolicyNetwork, largest: float) -> None:
-    """Scales each network's gradient to a norm of at most `largest`; a gradient that is not finite becomes 0."""
-    gradients = [parameter.grad for parameter in network.parameters() if parameter.grad is not None]
-    norm = (
-        torch.stack([gradient.square().flatten(1).sum(1) for gradient in gradients]).sum(0).sqrt()
-    )
+    """Scales each network's gradient to a norm of at most `largest`; where not finite, to 0."""
+    gradients, squares = [], []
+    for parameter in network.parameters():
+        if parameter.grad is not None:
+            gradients.append(parameter.grad)
+            squares.append(parameter.grad.square().flatten(1).sum(1))
+    norm = torch.stack(squares).sum(0).sqrt()
     scale = torch.where(norm.isfinite(), (largest / norm.clamp(min=1e-12)).clamp(max=1.0), 0.0)
     for gradient in gradients:
-        gradient.nan_to_num_(0.0, 0.0, 0.0).mul_(scale.view(-1, *[1] * (gradient.dim() - 1)))
+        of_network = scale.view(-1, *[1] * (gradient.dim() - 1))
+        gradient.nan_to_num_(0.0, 0.0, 0.0).mul_(of_network)
 
 
 def fit(
@@ -191,19 +206,30 @@ def fit(
     """Trains with Lightning, quietly, and puts the best weights back.
 
     Args:
-        checkpoint: written after every epoch, so that interrupted training goes on there, and one that ended gives the same at
-            once. None: no such file.
+        module: what is trained.
+        data: its batches.
+        epochs: at most.
+        seed: of the global generator, from which dropout draws.
+        device: where.
+        task: its progress.
+        checkpoint: written after every epoch, so that interrupted training goes on there, and
+            training that ended gives the same at once. None: no such file.
     """
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.ERROR)
-    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
-        torch.manual_seed(seed)  # dropout draws from the global generator
+    is_gpu = device.type == "cuda"
+    devices = [device] if is_gpu else []
+    callbacks: list[pl.Callback] = []
+    if checkpoint is not None:
+        callbacks.append(EveryEpoch(checkpoint))
+    with torch.random.fork_rng(devices=devices):
+        torch.manual_seed(seed)
         trainer = pl.Trainer(
             max_epochs=epochs,
-            accelerator="gpu" if device.type == "cuda" else "cpu",
+            accelerator="gpu" if is_gpu else "cpu",
             devices=1,
             logger=False,
-            callbacks=[EveryEpoch(checkpoint)] if checkpoint is not None else [],
+            callbacks=callbacks,
             enable_checkpointing=checkpoint is not None,
             enable_model_summary=False,
             enable_progress_bar=False,
@@ -214,16 +240,15 @@ def fit(
         with warnings.catch_warnings(), one_thread(), task:
             warnings.filterwarnings("ignore", module=r"lightning\.")
             # torch's compiler looks at everything that it is given.
-            warnings.filterwarnings(
-                "ignore", message=r"The \.grad attribute of a Tensor that is not a leaf"
-            )
+            of_compiler = r"The \.grad attribute of a Tensor that is not a leaf"
+            warnings.filterwarnings("ignore", message=of_compiler)
             _run(trainer, module, data, checkpoint)
     module.restore_best()
     module.network.to(device).eval()
 
 
 class EveryEpoch(ModelCheckpoint):
-    """Writes one checkpoint, whole, after every epoch."""
+    """Writes one checkpoint atomically after every epoch."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(save_top_k=0)
@@ -244,14 +269,16 @@ def _run(
     data: pl.LightningDataModule,
     checkpoint: Path | None,
 ) -> None:
-    """Fits, from the checkpoint if there is one; Ctrl-C, which Lightning turns into an exit, stays what it is."""
-    started = checkpoint is not None and checkpoint.is_file()
-    if started:
+    """Fits, from the checkpoint if there is one.
+
+    Lightning turns Ctrl-C into an exit; here it stays a KeyboardInterrupt.
+    """
+    start = None
+    if checkpoint is not None and checkpoint.is_file():
+        start = checkpoint
         log.info("Training goes on from %s", checkpoint)
     try:
-        trainer.fit(
-            module, datamodule=data, ckpt_path=checkpoint if started else None, weights_only=True
-        )
+        trainer.fit(module, datamodule=data, ckpt_path=start, weights_only=True)
     except SystemExit as error:
         if isinstance(error.__context__, KeyboardInterrupt):
             raise KeyboardInterrupt from None

@@ -9,7 +9,8 @@ import pandas as pd
 def over_networks(curves: pd.DataFrame, column: str) -> pd.DataFrame:
     """Returns one column per network and one row per epoch at which any was measured.
 
-    A network that was stopped early keeps its last loss: otherwise the average would jump whenever one leaves it.
+    A network that was stopped early keeps its last loss: otherwise the average would jump whenever
+        one leaves it.
 
     Args:
         curves: columns `network`, `epoch`, `train_loss`, `validation_loss`; NaN where not measured.
@@ -25,9 +26,12 @@ def over_networks(curves: pd.DataFrame, column: str) -> pd.DataFrame:
 
 
 def best_losses(curves: pd.DataFrame) -> dict[str, float]:
-    """Returns the metric `validation_loss/best`: the mean over the networks of each one's lowest validation loss.
+    """Returns the metric `validation_loss/best`.
 
-    Hyper-parameters are chosen by it, never by what was tested. Empty if nothing was validated.
+    It is the mean over the networks of each one's lowest validation loss. Hyper-parameters are
+    chosen by it, never by what was tested. Empty if nothing was validated.
     """
     lowest = curves.groupby("network")["validation_loss"].min().astype(float).dropna()
-    return {"validation_loss/best": float(lowest.mean())} if len(lowest) else {}
+    if lowest.empty:
+        return {}
+    return {"validation_loss/best": float(lowest.mean())}

@@ -1,14 +1,18 @@
-"""Imitation of window labels: the paper's way to train a policy.
+"""Imitation of per-window calibrated parameters (labels): the paper's way to train a policy.
 
-The policy reads the measured drive window by window and learns to answer the parameters that calibration found for each. All
-networks are trained at once as one batched network; the sum of their losses trains each as if it were alone.
+The policy reads the measured trajectory window by window and learns to answer the parameters that
+calibration found for each. All networks are trained at once as one batched network; the sum of
+their losses trains each as if it were alone.
+
+Shapes: P pairs, N networks, B trajectories of the network that has most, W windows, f features of a
+token, c features of conditioning, n tuned parameters.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import lightning.pytorch as pl
 import pandas as pd
@@ -17,27 +21,34 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
+from cfx.agents.heads import HEADS
+from cfx.agents.heads.base import ParameterHead
 from cfx.agents.scaler import Scaler
 from cfx.component import Settings
 from cfx.errors import DataError
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.learners.batched import BatchedModule, Grid, fit
 from cfx.policies.base import Policy, PolicyNetwork
-from cfx.policies.features import measured_history, token_width, tokens
+from cfx.policies.features import measured_history, tokens
 from cfx.progress import Task
 
 
 class ImitationSettings(Settings):
     """Settings of `imitation`."""
 
+    head: Literal["direct", "offset"] = Field(
+        "direct",
+        description="what networks answer: direct: the parameters themselves (paper); offset:"
+        " offsets from each driver's base parameters",
+    )
     epochs: int = Field(
         200, ge=1, description="passes over the training windows at most; 500 in the paper"
     )
     batch_size: int | None = Field(
         16,
         ge=1,
-        description="consecutive windows per gradient step, the recurrent state carried on; null: the whole drive; 1 in the"
-        " paper",
+        description="consecutive windows per gradient step, the recurrent state carried on; null:"
+        " the whole trajectory; 1 in the paper",
     )
     learning_rate: float = Field(3e-3, gt=0, description="of Adam")
     weight_decay: float = Field(0.0, ge=0, description="of AdamW, decoupled")
@@ -50,11 +61,13 @@ class ImitationSettings(Settings):
     patience: int | None = Field(
         30,
         ge=1,
-        description="epochs without a better validation loss after which a network stops; null: never",
+        description="epochs without a better validation loss after which a network stops; null:"
+        " never",
     )
     weight_by_sensitivity: bool = Field(
         True,
-        description="weight each window by how much the choice of parameters matters in it; false in the paper",
+        description="weight each window by how much its loss depends on the parameters; false in"
+        " the paper",
     )
     gradient_clip: float | None = Field(
         1.0, gt=0, description="largest gradient norm of a network; null: none"
@@ -62,11 +75,16 @@ class ImitationSettings(Settings):
 
 
 class ImitationLearner(Learner):
-    """Learns window labels by mean squared error in unit space.
+    """Learns labels by mean squared error in unit space.
 
-    Differences from the paper: windows can be weighted by their loss spread, because the labels of windows that do not
-    determine the parameters are arbitrary (`weight_by_sensitivity=false` gives the paper's plain error); the weights of the epoch
-    with the smallest validation loss are kept, for each network on its own.
+    With `head=offset` the error is that of the parameters that an offset means. Each trajectory is
+    then learned from with the driver's own base and, where unseen drivers start from the pooled
+    parameters, with these as well.
+
+    Differences from the paper: windows can be weighted by the sensitivity of their loss, because
+    the labels of windows that do not determine the parameters are arbitrary
+    (`weight_by_sensitivity=false` gives the paper's plain error); the weights of the epoch with the
+    smallest validation loss are kept, for each network on its own; answers can be offsets.
     """
 
     schema: ClassVar[type[Settings]] = ImitationSettings
@@ -74,143 +92,204 @@ class ImitationLearner(Learner):
     needs_labels = True
 
     def fit(self, policy: Policy, training_data: TrainingData) -> TrainingResult:
-        if training_data.labels is None:
-            raise TypeError("imitation needs window labels")
+        """As `Learner.fit`.
+
+        Raises:
+            ConfigError: the policy reads driver features.
+            DataError: a pair has too few windows to keep some for validation.
+        """
         self.require_no_driver_features(policy)
-        dataset = _ImitationDataset.of(policy, training_data, self.settings)
+        s, device = self.settings, training_data.batch.lengths.device
+        head = HEADS[s.head].for_model(training_data.simulator.model, device)
+        space, names = head.space, training_data.names
+        dataset = _ImitationDataset.of(policy, training_data, s, head)
         generator = torch.Generator().manual_seed(training_data.seed)
-        space = training_data.simulator.model.space
-        unit_default = space.to_unit(space.defaults()).float()
-        grid = Grid(training_data.network.to(training_data.fixed.device), len(training_data.names))
-        unit_fixed = grid.mean(space.to_unit(training_data.fixed)).float()
-        network = policy.build(dataset.tokens.shape[-1], unit_default, unit_fixed.cpu(), generator)
+        default = space.to_unit(space.defaults()).float()
+        grid = Grid(training_data.network.to(device), len(names))
+        fixed = grid.mean(space.to_unit(training_data.fixed)).float()
+        start = head.untrained_answer(fixed.cpu())
+        network = policy.build(dataset.features.shape[-1], default, start, generator)
+        base = None
+        if head.needs_base:
+            base = space.from_unit(fixed.to(training_data.fixed.dtype))
         if not any(parameter.requires_grad for parameter in network.parameters()):
-            return TrainingResult(
-                network.eval(), dataset.scaler, pd.DataFrame(columns=CURVE_COLUMNS)
-            )
-        task = Task(
-            f"Training ({len(training_data.names)} networks, at most {self.settings.epochs} epochs)",
-            self.settings.epochs,
-        )
-        module = ImitationModule(
-            network, dataset, self.settings, training_data.names, on_epoch=task.advance
-        )
-        data = SegmentData(dataset.windows, self.settings.batch_size)
-        device = dataset.tokens.device
+            curves = pd.DataFrame(columns=CURVE_COLUMNS)
+            return TrainingResult(network.eval(), dataset.scaler, curves, base, head.name)
+        task = Task(f"Training ({len(names)} networks, at most {s.epochs} epochs)", s.epochs)
+        module = ImitationModule(network, dataset, head, s, names, on_epoch=task.advance)
         fit(
             module,
-            data,
-            epochs=self.settings.epochs,
+            SegmentData(dataset.windows, s.batch_size),
+            epochs=s.epochs,
             seed=training_data.seed,
             device=device,
             task=task,
         )
-        return TrainingResult(module.network, dataset.scaler.to(device), module.curves())
+        scaler = dataset.scaler.to(device)
+        return TrainingResult(module.network, scaler, module.curves(), base, head.name)
+
+
+class _Rows(NamedTuple):
+    """The trajectories that networks learn from, R of them: a pair is there once for each base.
+
+    Attributes:
+        pair: `(R,)`.
+        network: `(R,)`.
+        base: in unit space, `(R, n)`, single precision.
+    """
+
+    pair: Tensor
+    network: Tensor
+    base: Tensor
+
+
+def _rows(training_data: TrainingData, head: ParameterHead) -> _Rows:
+    """Returns each pair with its base, and with the pooled one where that is another."""
+    device = training_data.batch.lengths.device
+    pair = torch.arange(len(training_data.batch), device=device)
+    network = training_data.network.to(device)
+    pooled, own = training_data.fixed, training_data.base
+    unit_pooled = head.space.to_unit(pooled).float()
+    if own is None or not head.needs_base or torch.equal(own, pooled):
+        return _Rows(pair, network, unit_pooled)
+    unit_own = head.space.to_unit(own).float()
+    return _Rows(pair.repeat(2), network.repeat(2), torch.cat([unit_own, unit_pooled]))
 
 
 class _ImitationDataset(nn.Module):
-    """Training tensors as N networks by B drivers by W windows; buffers, so that Lightning moves them with the module."""
+    """Training tensors as N networks by B trajectories by W windows.
 
-    tokens: Tensor
+    They are buffers, so that Lightning moves them with the module.
+
+    Attributes:
+        features: token and conditioning, normalised, `(N, B, W, f + c)`.
+        labels: in the head's unit space, `(N, B, W, n)`.
+        base: in unit space, `(N, B, n)`.
+        train_weight, validation_weight: `(N, B, W)`.
+    """
+
+    features: Tensor
     labels: Tensor
+    base: Tensor
     train_weight: Tensor
     validation_weight: Tensor
 
     def __init__(
         self,
         scaler: Scaler,
-        tokens: Tensor,
+        features: Tensor,
         labels: Tensor,
+        base: Tensor,
         train_weight: Tensor,
         validation_weight: Tensor,
     ) -> None:
         super().__init__()
         self.scaler = scaler
-        self.register_buffer("tokens", tokens)
+        self.register_buffer("features", features)
         self.register_buffer("labels", labels)
+        self.register_buffer("base", base)
         self.register_buffer("train_weight", train_weight)
         self.register_buffer("validation_weight", validation_weight)
 
     @property
     def windows(self) -> int:
-        return self.tokens.shape[2]
+        return self.features.shape[2]
 
     @classmethod
     def of(
-        cls, policy: Policy, training_data: TrainingData, settings: ImitationSettings
+        cls,
+        policy: Policy,
+        training_data: TrainingData,
+        settings: ImitationSettings,
+        head: ParameterHead,
     ) -> _ImitationDataset:
-        assert training_data.labels is not None
+        """Places training data.
+
+        Raises:
+            DataError: a pair has too few windows to keep some for validation.
+        """
         labels, batch = training_data.labels, training_data.batch
-        device = batch.lengths.device
-        pairs = len(batch)
-        where = labels.windows
-        history = measured_history(
-            batch, where.pair.to(device), where.first.to(device), training_data.windows.length
-        )
+        if labels is None:
+            raise TypeError("imitation needs labels: the parameters calibrated for each window")
+        windows, device = labels.windows, batch.lengths.device
+        pair, first = windows.pair.to(device), windows.first.to(device)
+        history = measured_history(batch, pair, first, training_data.windows.length)
         seen = tokens(history, policy.inputs, policy.summary).float()
-        assert seen.shape[-1] == token_width(
-            policy.inputs, policy.summary, training_data.windows.length
-        )
-        unit = training_data.simulator.model.space.to_unit(labels.parameters).float()
-        token_grid, mask = where.to_grid(seen, pairs)
-        label_grid, _ = where.to_grid(unit, pairs)
-        sensitivity_grid, _ = where.to_grid(labels.sensitivity.float(), pairs)
-        number = torch.arange(mask.shape[1], device=device)
-        counts = mask.sum(1)
-        kept = (counts * settings.validation).round().long()
-        if settings.validation > 0:
-            kept = kept.clamp(min=1)
-        if bool((counts - kept < 1).any()):
-            raise DataError(
-                f"a pair has only {int(counts.min())} training windows, too few to keep {settings.validation:g} of them for"
-                f" validation;"
-                " raise data.min_frames or set learner.validation=0"
-            )
-        train = mask & (number < (counts - kept)[:, None])
-        validation = mask & ~train
-        weight = (
-            _sensitivity_weight(sensitivity_grid, train)
-            if settings.weight_by_sensitivity
-            else torch.ones_like(sensitivity_grid)
-        )
-        grid = Grid(training_data.network.to(device), len(training_data.names))
-        train_grid = grid.scatter(train)
-        scaler = Scaler.of(grid.scatter(token_grid), train_grid)
+        unit = head.space.to_unit(labels.parameters).float()
+        tokens_of_pairs, mask = windows.to_grid(seen, len(batch))
+        labels_of_pairs, _ = windows.to_grid(unit, len(batch))
+        sensitivity, _ = windows.to_grid(labels.sensitivity.float(), len(batch))
+        train = _training_windows(mask, settings.validation)
+        weight = torch.ones_like(sensitivity)
+        if settings.weight_by_sensitivity:
+            weight = _sensitivity_weight(sensitivity, train)
+        rows = _rows(training_data, head)
+        grid = Grid(rows.network, len(training_data.names))
+        conditioning = head.condition(rows.base)[:, None].expand(-1, mask.shape[1], -1)
+        features = grid.scatter(torch.cat([tokens_of_pairs[rows.pair], conditioning], -1))
+        scaler = Scaler.of(features, grid.scatter(train[rows.pair]))
         return cls(
-            scaler,
-            scaler(grid.scatter(token_grid)),
-            grid.scatter(label_grid),
-            grid.scatter(weight * train),
-            grid.scatter(weight * validation),
+            scaler=scaler,
+            features=scaler(features),
+            labels=grid.scatter(labels_of_pairs[rows.pair]),
+            base=grid.scatter(rows.base),
+            train_weight=grid.scatter((weight * train)[rows.pair]),
+            validation_weight=grid.scatter((weight * (mask & ~train))[rows.pair]),
         )
+
+
+def _training_windows(mask: Tensor, validation: float) -> Tensor:
+    """Returns the windows that are trained on: all but each pair's last ones, bool `(P, W)`.
+
+    Args:
+        mask: windows that there are, bool `(P, W)`.
+        validation: share that is kept for validation; above 0 at least one window is.
+
+    Raises:
+        DataError: nothing is left of a pair.
+    """
+    counts = mask.sum(1)
+    kept = (counts * validation).round().long()
+    if validation > 0:
+        kept = kept.clamp(min=1)
+    if bool((counts - kept < 1).any()):
+        raise DataError(
+            f"a pair has only {int(counts.min())} training windows, too few to keep {validation:g}"
+            " of them for validation; raise data.min_frames or set learner.validation=0"
+        )
+    number = torch.arange(mask.shape[1], device=mask.device)
+    return mask & (number < (counts - kept)[:, None])
 
 
 def _sensitivity_weight(sensitivity: Tensor, train: Tensor) -> Tensor:
-    """Returns weights `(P, W)` in proportion to the loss spread.
+    """Returns weights `(P, W)` in proportion to the sensitivity of each window's loss.
 
-    Their mean is 1 over each pair's training windows; they are ones if all spreads are 0.
+    Their mean is 1 over each pair's training windows; they are ones if all sensitivities are 0.
     """
     count = train.sum(1, keepdim=True)
     mean = (sensitivity * train).sum(1, keepdim=True) / count
-    return torch.where(
-        mean > 0, sensitivity / mean.clamp(min=torch.finfo(sensitivity.dtype).tiny), 1.0
-    )
+    tiny = torch.finfo(sensitivity.dtype).tiny
+    return torch.where(mean > 0, sensitivity / mean.clamp(min=tiny), 1.0)
 
 
 class SegmentData(pl.LightningDataModule):
-    """Segments of consecutive windows, in order: a batch is (first window, last window, whether the drive begins)."""
+    """Segments of consecutive windows, in order: pairs of first window and end."""
 
     def __init__(self, windows: int, batch_size: int | None) -> None:
         super().__init__()
         size = batch_size or windows
-        self.segments = [(first, min(first + size, windows)) for first in range(0, windows, size)]
         self.windows = windows
+        self.segments: list[tuple[int, int]] = []
+        for first in range(0, windows, size):
+            self.segments.append((first, min(first + size, windows)))
 
     def train_dataloader(self) -> DataLoader[Any]:
-        return DataLoader(self.segments, batch_size=None, shuffle=False)  # type: ignore[arg-type]  # a list is a dataset
+        segments: Any = self.segments
+        return DataLoader(segments, batch_size=None, shuffle=False)
 
     def val_dataloader(self) -> DataLoader[Any]:
-        return DataLoader([(0, self.windows)], batch_size=None)  # type: ignore[arg-type]  # a list is a dataset
+        whole: Any = [(0, self.windows)]
+        return DataLoader(whole, batch_size=None)
 
 
 class ImitationModule(BatchedModule):
@@ -220,44 +299,46 @@ class ImitationModule(BatchedModule):
         self,
         network: PolicyNetwork,
         dataset: _ImitationDataset,
+        head: ParameterHead,
         settings: ImitationSettings,
         names: tuple[str, ...],
         on_epoch: Callable[[], None] = lambda: None,
     ) -> None:
         super().__init__(network, names, settings, on_epoch)
         self.dataset = dataset
+        self.head = head
         self.state: Tensor | None = None
         self.train_sum = torch.zeros(len(names))
         self.train_weight = torch.zeros(len(names))
 
     def training_step(self, segment: tuple[int, int], index: int) -> Tensor:
         first, last = segment
-        networks, drivers = self.dataset.tokens.shape[:2]
+        networks, drivers = self.dataset.features.shape[:2]
         if first == 0 or self.state is None:
             self.state = self.network.initial_state(networks, drivers)
-        out, state = self.network(self.dataset.tokens[:, :, first:last], self.state)
+        windows = slice(first, last)
+        answer, state = self.network(self.dataset.features[:, :, windows], self.state)
         self.state = state.detach()
-        weight = self.dataset.train_weight[:, :, first:last]
-        error = _weighted_error(out, self.dataset.labels[:, :, first:last], weight)
+        weight = self.dataset.train_weight[:, :, windows]
+        error = self._weighted_error(answer, self.dataset.labels[:, :, windows], weight)
         total = weight.sum((1, 2))
         self.train_sum += error.detach().cpu()
         self.train_weight += total.detach().cpu()
         return (error / total.clamp(min=1e-9)).sum()
 
     def validation_step(self, segment: tuple[int, int], index: int) -> None:
-        networks, drivers = self.dataset.tokens.shape[:2]
-        out, _ = self.network(self.dataset.tokens, self.network.initial_state(networks, drivers))
+        networks, drivers = self.dataset.features.shape[:2]
+        state = self.network.initial_state(networks, drivers)
+        answer, _ = self.network(self.dataset.features, state)
         weight = self.dataset.validation_weight
         total = weight.sum((1, 2))
-        loss = _weighted_error(out, self.dataset.labels, weight) / total.clamp(min=1e-9)
-        self.judge(
-            self.train_sum / self.train_weight.clamp(min=1e-9),
-            torch.where(total > 0, loss, math.nan).cpu(),
-        )
+        error = self._weighted_error(answer, self.dataset.labels, weight)
+        validation = torch.where(total > 0, error / total.clamp(min=1e-9), math.nan)
+        self.judge(self.train_sum / self.train_weight.clamp(min=1e-9), validation.cpu())
         self.train_sum.zero_()
         self.train_weight.zero_()
 
-
-def _weighted_error(out: Tensor, labels: Tensor, weight: Tensor) -> Tensor:
-    """Returns the weighted sum of squared errors of each network, `(N,)`; the mean over parameters."""
-    return ((out - labels).square().mean(-1) * weight).sum((1, 2))
+    def _weighted_error(self, answer: Tensor, labels: Tensor, weight: Tensor) -> Tensor:
+        """Returns each network's weighted sum of squared errors, `(N,)`; mean over parameters."""
+        unit = self.head.unit_parameters(answer, self.dataset.base[:, :, None])
+        return ((unit - labels).square().mean(-1) * weight).sum((1, 2))

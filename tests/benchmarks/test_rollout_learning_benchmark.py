@@ -1,9 +1,10 @@
-"""A gradient step of learning by rollout, beside the same step in plain eager PyTorch in the same run.
+"""A gradient step of closed-loop training, beside the same step in plain eager PyTorch.
 
-The case has I-80's size: six networks (five folds and one for everybody), or ensembles of four, of 57 drivers, two drives of
-15 s for each, the policy having read 20 s of history. All ways run the same code: through `torch.compile`, as cfx does;
-eagerly, all networks in one batch; and eagerly a network at a time, as a training loop without batched networks would have to.
-`extra_info` holds the ratios of their times; nothing passes or fails by the clock.
+The case has I-80's size: six networks (five folds and one for everybody), or ensembles of four, of
+57 drivers, two trajectories of 15 s for each after a burn-in of 20 s. All ways run the same code in
+the same process: through `torch.compile`, as cfx does; eagerly, all networks in one batch; and
+eagerly a network at a time, as a training loop without batched networks would have to. `extra_info`
+holds the ratios of their times; nothing passes or fails by the clock.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ POLICY = GruPolicy(
 )
 
 
-def _lesson(model: DrivingModel, networks: int) -> TrainingData:
+def _training_data(model: DrivingModel, networks: int) -> TrainingData:
     driven = Krauss()
     unit = torch.rand((DRIVERS, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     pairs = wavy_pairs(driven, driven.space.from_unit(0.1 + 0.2 * unit), frames=FRAMES)
@@ -59,12 +60,12 @@ def _lesson(model: DrivingModel, networks: int) -> TrainingData:
 
 
 class Step:
-    """What `RolloutModule.training_step` computes, with the optimizer that it uses and without Lightning around it."""
+    """What `RolloutModule.training_step` computes, without Lightning around it."""
 
     def __init__(
         self, model: DrivingModel, settings: RolloutSettings, networks: int = NETWORKS
     ) -> None:
-        training_data = _lesson(model, networks)
+        training_data = _training_data(model, networks)
         dataset = RolloutDataset.of(
             training_data,
             POLICY,
@@ -84,7 +85,7 @@ class Step:
     @one_thread()
     def __call__(self) -> None:
         self.optimizer.zero_grad()
-        for loss in self.module.losses_of(self.number):
+        for loss in self.module.step_losses(self.number):
             loss.sum().backward()
         self.optimizer.step()
         self.number += 1

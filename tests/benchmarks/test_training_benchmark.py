@@ -1,4 +1,4 @@
-"""An epoch of training: one network per pair, all as one batch, beside `torch.nn.GRU`s trained one by one in the same run."""
+"""An epoch of imitation: one network per pair as one batch, beside `torch.nn.GRU`s one by one."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.drives import straight_pairs
 PAIRS, FRAMES, EPOCHS, BATCH = 94, 700, 5, 16
 
 
-def _lesson() -> TrainingData:
+def _training_data() -> TrainingData:
     model, settings = Krauss(), WindowSettings()
     pairs = straight_pairs([FRAMES] * PAIRS)
     split = Split.of(pairs, settings, 0.8)
@@ -76,7 +76,7 @@ def _one_by_one(networks: int) -> float:
 
 @pytest.mark.benchmark(group="training")
 def test_epoch_of_94_networks(benchmark: Any) -> None:
-    training_data = _lesson()
+    training_data = _training_data()
     learner = ImitationLearner(epochs=EPOCHS, batch_size=BATCH, patience=None)
     learner.fit(GruPolicy(), training_data)  # imports and first-call costs
     benchmark.pedantic(learner.fit, args=(GruPolicy(), training_data), rounds=3)

@@ -1,10 +1,16 @@
+"""Imitation of labels: what networks learn, with direct answers and with offsets."""
+
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
+from cfx.agents.checkpoint import load, save
+from cfx.agents.context import DriverContext
 from cfx.agents.placement import group_by
 from cfx.calibration.calibrator import Labels
 from cfx.calibration.windows import Split, Windows, WindowSettings
@@ -13,103 +19,174 @@ from cfx.learners.base import TrainingData, TrainingResult
 from cfx.learners.imitation import ImitationLearner
 from cfx.models.krauss import Krauss
 from cfx.pairs import PairBatch
+from cfx.policies.features import measured_history
 from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
 from tests.drives import wavy_pairs
+from tests.learners.made import ready
 
 SETTINGS = WindowSettings()
 QUICK = {"epochs": 30, "learning_rate": 0.02}
+TRUE = torch.tensor([[1.5, 0.1], [2.0, 0.3], [2.5, 0.5], [1.0, 0.0]]).double()
 
 
 def training_data(
-    pairs: int = 3, *, scope: str = "pair", frames: int = 200, sensitivity: float = 1.0
+    pairs: int = 3, *, together: bool = False, frames: int = 200, sensitivity: float = 1.0
 ) -> TrainingData:
     """Labels that follow the leader's speed, so that there is something to learn."""
     model = Krauss()
-    drives = wavy_pairs(
-        model,
-        torch.tensor([[1.5, 0.1], [2.0, 0.3], [2.5, 0.5], [1.0, 0.0]]).double()[:pairs],
-        frames=frames,
-    )
-    batch = PairBatch.of(drives)
-    split = Split.of(drives, SETTINGS, 0.8)
+    recorded = wavy_pairs(model, TRUE[:pairs], frames=frames)
+    batch = PairBatch.of(recorded)
+    split = Split.of(recorded, SETTINGS, 0.8)
     windows = Windows.of(split.windows, SETTINGS)
     speed = batch.leader_speed[windows.pair, windows.first]
     unit = torch.stack([speed / 20, 1 - speed / 20], dim=-1).clamp(0.05, 0.95)
     even = torch.full((len(windows),), sensitivity).double()
     labels = Labels(
-        windows,
-        model.space.from_unit(unit),
-        even,
-        even,
-        torch.zeros(len(windows), dtype=torch.int64),
+        windows=windows,
+        parameters=model.space.from_unit(unit),
+        loss=even,
+        sensitivity=even,
+        diverged=torch.zeros(len(windows), dtype=torch.int64),
     )
-    names = ["all"] * pairs if scope == "all" else [f"p{i}" for i in range(pairs)]
+    names = [f"p{i}" for i in range(pairs)]
+    if together:
+        names = ["all"] * pairs
     network, groups = group_by(names)
-    fixed = model.space.defaults().expand(pairs, 2)
     return TrainingData(
-        MemoryStepper(model, 0.1), batch, split, SETTINGS, fixed, labels, network, groups, seed=0
+        simulator=MemoryStepper(model, 0.1),
+        batch=batch,
+        split=split,
+        windows=SETTINGS,
+        fixed=model.space.defaults().expand(pairs, 2),
+        labels=labels,
+        network=network,
+        names=groups,
+        seed=0,
     )
 
 
-def parts(training_result: TrainingResult, network: int) -> list[torch.Tensor]:
-    return [value[network] for value in training_result.network.parameters()]
+def own_bases(data: TrainingData) -> torch.Tensor:
+    """Returns a base for each driver, `(P, n)`, all different."""
+    shift = torch.linspace(-0.2, 0.2, len(data.fixed)).double()[:, None]
+    space = data.simulator.model.space
+    return space.from_unit(space.to_unit(data.fixed) + shift)
 
 
-def test_it_learns_what_can_be_learned() -> None:
-    training_result = ImitationLearner(epochs=80, learning_rate=0.02, patience=None).fit(
-        GruPolicy(), training_data()
-    )
-    curve = training_result.curves.groupby("epoch")[["train_loss", "validation_loss"]].mean()
+def same_weights(one: TrainingResult, two: TrainingResult) -> bool:
+    others = dict(two.network.named_parameters())
+    return all(torch.equal(value, others[name]) for name, value in one.network.named_parameters())
+
+
+@pytest.mark.parametrize("head", ["direct", "offset"])
+def test_it_learns_what_can_be_learned(head: str) -> None:
+    learner = ImitationLearner(epochs=80, learning_rate=0.02, patience=None, head=head)
+    result = learner.fit(GruPolicy(), training_data())
+    curve = result.curves.groupby("epoch")[["train_loss", "validation_loss"]].mean()
     assert curve.train_loss.iloc[-1] < 0.05 * curve.train_loss.iloc[0]
     assert curve.validation_loss.min() < 0.2 * curve.validation_loss.iloc[0]
-    assert set(training_result.curves.network) == {"p0", "p1", "p2"}
+    assert set(result.curves.network) == {"p0", "p1", "p2"}
+    assert result.head == head
+
+
+def test_answers_as_offsets_begin_at_the_base_of_each_driver() -> None:
+    """Hardly trained, every driver gets their own base, and unseen drivers the pooled one."""
+    data = training_data(together=True)
+    own = own_bases(data)
+    learner = ImitationLearner(epochs=1, learning_rate=1e-12, head="offset")
+    result = learner.fit(GruPolicy(), replace(data, base=own))
+    assert result.base is not None
+    torch.testing.assert_close(result.base, data.fixed[:1], rtol=1e-6, atol=0)
+    agent = ready(result, data, GruPolicy())
+    history = measured_history(data.batch, torch.arange(3), torch.full((3,), 50), SETTINGS.length)
+    for base, expected in ((own, own), (None, data.fixed)):
+        state = agent.begin(data.network, DriverContext(base=base))
+        chosen, _ = agent.act(history, state)
+        torch.testing.assert_close(chosen, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_offsets_are_learned_from_each_drivers_base_and_from_the_pooled_one() -> None:
+    """Labels are the drivers' own parameters: no offset from these, one from the pooled base."""
+    data = training_data(together=True)
+    assert data.labels is not None
+    own = own_bases(data)
+    labels = replace(data.labels, parameters=own[data.labels.windows.pair])
+    data = replace(data, labels=labels, base=own)
+    learner = ImitationLearner(epochs=60, learning_rate=0.02, patience=None, head="offset")
+    result = learner.fit(GruPolicy(), data)
+    agent, space = ready(result, data, GruPolicy()), data.simulator.model.space
+    truth = space.to_unit(own)
+    errors = {}
+    for name, base in (("own", own), ("pooled", None)):
+        frames = torch.full_like(data.network, 100)
+        state = agent.begin(data.network, DriverContext(base=base))
+        state = agent.burn_in(data.batch, frames, state)
+        history = measured_history(data.batch, torch.arange(3), frames, SETTINGS.length)
+        chosen, _ = agent.act(history, state)
+        errors[name] = float((space.to_unit(chosen) - truth).abs().mean())
+    untrained = float((space.to_unit(data.fixed) - truth).abs().mean())
+    assert errors["own"] < 0.3 * untrained
+    assert errors["pooled"] < 0.7 * untrained
+
+
+def test_a_saved_policy_of_offsets_answers_the_same(tmp_path: Path) -> None:
+    data = training_data(together=True)
+    own = own_bases(data)
+    policy = GruPolicy()
+    learner = ImitationLearner(epochs=3, learning_rate=0.05, head="offset")
+    agent = ready(learner.fit(policy, replace(data, base=own)), data, policy)
+    agent = replace(agent, model_node={"name": "krauss"}, policy_node={"name": "gru"})
+    save(agent, tmp_path)
+    again = load(tmp_path)
+    assert again.head.name == "offset"
+    history = measured_history(data.batch, torch.arange(3), torch.full((3,), 50), SETTINGS.length)
+    answers = []
+    for one in (agent, again):
+        state = one.begin(data.network, DriverContext(base=own))
+        answers.append(one.act(history, state)[0])
+    assert torch.equal(*answers)
+
+
+def test_direct_answers_do_not_depend_on_bases() -> None:
+    learner, data = ImitationLearner(**QUICK), training_data(together=True)
+    one = learner.fit(GruPolicy(), data)
+    two = learner.fit(GruPolicy(), replace(data, base=own_bases(data)))
+    assert same_weights(one, two)
+    assert one.base is None
+    assert two.base is None
 
 
 def test_networks_do_not_depend_on_their_companions() -> None:
-    """Trained alone or beside others, a network gets the same weights."""
+    """Initial weights are drawn for all networks together: only the curves show which there are."""
     learner = ImitationLearner(**QUICK)
-    three, two = (
-        learner.fit(GruPolicy(), training_data(3)),
-        learner.fit(GruPolicy(), training_data(2)),
-    )
-    # Initial weights are drawn for all networks together, so only the losses can be compared across sizes.
+    three = learner.fit(GruPolicy(), training_data(3))
     again = learner.fit(GruPolicy(), training_data(3))
-    assert all(torch.equal(a, b) for a, b in zip(parts(three, 1), parts(again, 1), strict=True))
+    assert same_weights(three, again)
     assert len(three.curves) // 3 <= 30
-    assert set(two.curves.network) == {"p0", "p1"}
+    assert set(learner.fit(GruPolicy(), training_data(2)).curves.network) == {"p0", "p1"}
 
 
 def test_the_same_seed_gives_the_same_weights_and_another_does_not() -> None:
-    from dataclasses import replace
-
-    learner = ImitationLearner(**QUICK)
-    one, two = (
-        learner.fit(GruPolicy(dropout=0.1), training_data()),
-        learner.fit(GruPolicy(dropout=0.1), training_data()),
-    )
-    other = learner.fit(GruPolicy(dropout=0.1), replace(training_data(), seed=1))
-    assert all(
-        torch.equal(a, b)
-        for a, b in zip(one.network.parameters(), two.network.parameters(), strict=True)
-    )
-    assert not all(
-        torch.equal(a, b)
-        for a, b in zip(one.network.parameters(), other.network.parameters(), strict=True)
-    )
+    learner, policy = ImitationLearner(**QUICK), GruPolicy(dropout=0.1)
+    one = learner.fit(policy, training_data())
+    two = learner.fit(policy, training_data())
+    other = learner.fit(policy, replace(training_data(), seed=1))
+    assert same_weights(one, two)
+    assert not same_weights(one, other)
 
 
 def test_the_best_epoch_is_kept() -> None:
-    dataset = training_data(1)
-    training_result = ImitationLearner(
+    data = training_data(1)
+    learner = ImitationLearner(
         epochs=60, learning_rate=0.05, patience=None, gradient_clip=None, batch_size=4
-    ).fit(GruPolicy(), dataset)
-    best = training_result.curves.validation_loss.min()
+    )
+    result = learner.fit(GruPolicy(), data)
+    best = result.curves.validation_loss.min()
     # One epoch without learning measures the weights that were kept.
     kept = ImitationLearner(epochs=1, learning_rate=1e-12)
-    again = kept.fit(_Fixed(training_result.network), dataset)
+    again = kept.fit(_Fixed(result.network), data)
     assert again.curves.validation_loss.iloc[0] == pytest.approx(best, rel=1e-4)
-    assert training_result.curves.validation_loss.iloc[-1] > best
+    assert result.curves.validation_loss.iloc[-1] > best
 
 
 class _Fixed(GruPolicy):
@@ -119,76 +196,64 @@ class _Fixed(GruPolicy):
         super().__init__()
         self.network = network
 
-    def build(self, *_: object) -> torch.nn.Module:  # type: ignore[override]  # it does not need what a builder needs
+    def build(self, *_: object) -> torch.nn.Module:  # type: ignore[override]  # needs nothing of it
         return self.network
 
 
 def test_patience_ends_the_training() -> None:
-    training_result = ImitationLearner(epochs=500, learning_rate=0.2, patience=3).fit(
-        GruPolicy(), training_data(1)
-    )
-    assert training_result.curves.epoch.max() < 499
+    learner = ImitationLearner(epochs=500, learning_rate=0.2, patience=3)
+    assert learner.fit(GruPolicy(), training_data(1)).curves.epoch.max() < 499
 
 
 def test_without_validation_the_training_loss_decides() -> None:
-    training_result = ImitationLearner(validation=0.0, **QUICK).fit(GruPolicy(), training_data(2))
-    assert training_result.curves.validation_loss.isna().all()
-    assert training_result.curves.train_loss.iloc[-1] < training_result.curves.train_loss.iloc[0]
+    result = ImitationLearner(validation=0.0, **QUICK).fit(GruPolicy(), training_data(2))
+    assert result.curves.validation_loss.isna().all()
+    assert result.curves.train_loss.iloc[-1] < result.curves.train_loss.iloc[0]
 
 
 def test_one_network_for_all_pairs() -> None:
-    training_result = ImitationLearner(**QUICK).fit(GruPolicy(), training_data(3, scope="all"))
-    assert {value.shape[0] for value in training_result.network.parameters()} == {1}
-    assert set(training_result.curves.network) == {"all"}
+    result = ImitationLearner(**QUICK).fit(GruPolicy(), training_data(together=True))
+    for value in result.network.parameters():
+        assert value.shape[0] == 1
+    assert set(result.curves.network) == {"all"}
 
 
-def test_windows_that_tell_nothing_weigh_nothing() -> None:
-    """Labels of windows without spread are replaced by noise; weighting by spread must not notice."""
-    from dataclasses import replace
-
-    dataset = training_data(1)
-    assert dataset.labels is not None
-    count = len(dataset.labels.windows)
-    mute = torch.arange(count) % 2 == 0
+def test_windows_without_sensitivity_weigh_nothing() -> None:
+    """Labels of such windows are replaced by noise; only an unweighted error notices."""
+    data = training_data(1)
+    assert data.labels is not None
+    mute = torch.arange(len(data.labels.windows)) % 2 == 0
     sensitivity = torch.where(mute, 0.0, 1.0).double()
-    silent = replace(dataset.labels, sensitivity=sensitivity)
-    scrambled = replace(
-        silent, parameters=torch.where(mute[:, None], silent.parameters.flip(0), silent.parameters)
-    )
-    learner = ImitationLearner(weight_by_sensitivity=True, **QUICK)
-    one = learner.fit(GruPolicy(), replace(dataset, labels=silent))
-    two = learner.fit(GruPolicy(), replace(dataset, labels=scrambled))
-    assert all(
-        torch.equal(a, b)
-        for a, b in zip(one.network.parameters(), two.network.parameters(), strict=True)
-    )
-    plain = ImitationLearner(weight_by_sensitivity=False, **QUICK)
-    three = plain.fit(GruPolicy(), replace(dataset, labels=scrambled))
-    assert not all(
-        torch.equal(a, b)
-        for a, b in zip(one.network.parameters(), three.network.parameters(), strict=True)
-    )
+    silent = replace(data.labels, sensitivity=sensitivity)
+    noise = torch.where(mute[:, None], silent.parameters.flip(0), silent.parameters)
+    scrambled = replace(silent, parameters=noise)
+    results = {}
+    for weighted in (True, False):
+        learner = ImitationLearner(weight_by_sensitivity=weighted, **QUICK)
+        one = learner.fit(GruPolicy(), replace(data, labels=silent))
+        two = learner.fit(GruPolicy(), replace(data, labels=scrambled))
+        results[weighted] = same_weights(one, two)
+    assert results == {True: True, False: False}
 
 
-def test_labels_without_any_spread_still_train() -> None:
-    training_result = ImitationLearner(**QUICK).fit(GruPolicy(), training_data(2, sensitivity=0.0))
-    assert all(math.isfinite(loss) for loss in training_result.curves.train_loss)
+def test_labels_without_any_sensitivity_still_train() -> None:
+    result = ImitationLearner(**QUICK).fit(GruPolicy(), training_data(2, sensitivity=0.0))
+    for loss in result.curves.train_loss:
+        assert math.isfinite(loss)
 
 
-def test_only_the_training_part_is_read() -> None:
-    """NaN after the split would poison every weight."""
-    from dataclasses import replace
-
-    dataset = training_data(2)
-    after = torch.arange(dataset.batch.mask.shape[1]) > dataset.split.frame[:, None]
-    hidden = {
-        name: torch.where(after, torch.nan, getattr(dataset.batch, name))
-        for name in ("leader_speed", "follower_speed", "follower_position", "leader_position")
-    }
-    training_result = ImitationLearner(**QUICK).fit(
-        GruPolicy(), replace(dataset, batch=replace(dataset.batch, **hidden))
-    )
-    assert all(bool(value.isfinite().all()) for value in training_result.network.parameters())
+@pytest.mark.parametrize("head", ["direct", "offset"])
+def test_only_the_training_part_is_read(head: str) -> None:
+    """NaN after the split would reach every weight."""
+    data = training_data(2)
+    after = torch.arange(data.batch.mask.shape[1]) > data.split.frame[:, None]
+    hidden = {}
+    for name in ("leader_speed", "follower_speed", "follower_position", "leader_position"):
+        hidden[name] = torch.where(after, torch.nan, getattr(data.batch, name))
+    other = replace(data, batch=replace(data.batch, **hidden))
+    result = ImitationLearner(head=head, **QUICK).fit(GruPolicy(), other)
+    for value in result.network.parameters():
+        assert bool(value.isfinite().all())
 
 
 def test_too_few_windows_for_validation_is_said() -> None:

@@ -10,21 +10,23 @@ from cfx.learners.rollout import RolloutLearner
 from cfx.testing import LearnerContract
 
 # Kept for all tests, which then share a training.
-IMITATION = ImitationLearner(epochs=30, learning_rate=0.03)
+IMITATION = {
+    "direct": ImitationLearner(epochs=30, learning_rate=0.03),
+    "offset": ImitationLearner(epochs=30, learning_rate=0.03, head="offset"),
+}
+_TRIAL = dict(RolloutLearner.trial)
 ROLLOUT = {
-    name: RolloutLearner(**{**RolloutLearner.trial, **options})
-    for name, options in {
-        "one": {"ensemble_size": 1},
-        "ensemble": {"ensemble_size": 2},
-        "distillation_epochs": {"ensemble_size": 1, "distillation_epochs": 2},
-    }.items()
+    "one": RolloutLearner(**(_TRIAL | {"ensemble_size": 1})),
+    "ensemble": RolloutLearner(**(_TRIAL | {"ensemble_size": 2})),
+    "distillation": RolloutLearner(**(_TRIAL | {"ensemble_size": 1, "distillation_epochs": 2})),
 }
 
 
+@pytest.mark.parametrize("name", IMITATION, scope="class")
 class TestImitation(LearnerContract):
     @pytest.fixture
-    def learner(self) -> Learner:
-        return IMITATION
+    def learner(self, name: str) -> Learner:
+        return IMITATION[name]
 
 
 @pytest.mark.parametrize("name", ROLLOUT, scope="class")

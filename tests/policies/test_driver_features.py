@@ -218,7 +218,7 @@ def test_a_trait_that_is_none_is_refused() -> None:
 def test_a_learner_that_tells_its_networks_nothing_refuses_traits(tmp_path: Path) -> None:
     with pytest.raises(
         ConfigError,
-        match=r"policy.driver_features=\['time_gap'\]: this learner tells its networks nothing of drivers",
+        match=r"policy.driver_features=\['time_gap'\]: this learner provides no driver features",
     ):
         cfx.run(
             [

@@ -134,6 +134,15 @@ class Training(Plain):
         return training_result
 
 
+class Baseless(Plain):
+    """Answers offsets, and does not say from what."""
+
+    def finish(
+        self, training_result: TrainingResult, training_data: TrainingData
+    ) -> TrainingResult:
+        return replace(training_result, head="offset")
+
+
 class Undone(Plain):
     def finish(
         self, training_result: TrainingResult, training_data: TrainingData
@@ -182,12 +191,13 @@ READY = checks.delivers_networks_that_are_ready_to_drive
 BROKEN: dict[str, tuple[Learner, Any, str]] = {
     "separate": (Separate(), READY, "how many there are"),
     "training": (Training(), READY, "evaluation mode"),
+    "baseless": (Baseless(), READY, "`base` and `head` of the result disagree"),
     "undone": (Undone(), READY, "nothing outside the model's bounds"),
     "lazy": (Lazy(), checks.learns_something, "at least 30 % nearer"),
     "global": (
         Global(),
         checks.the_same_seed_gives_the_same_networks,
-        "left as it was|from `training data.seed` alone",
+        "left as it was|from `seed` of the training data",
     ),
     "seeding": (Seeding(), checks.the_same_seed_gives_the_same_networks, "left as it was"),
     "seedless": (
@@ -195,9 +205,9 @@ BROKEN: dict[str, tuple[Learner, Any, str]] = {
         checks.another_seed_gives_other_networks,
         "must reach the initial weights",
     ),
-    "ahead": (Ahead(), checks.reads_no_frame_after_the_training_part, "proves nothing"),
+    "ahead": (Ahead(), checks.reads_no_frame_after_the_training_part, "prove nothing"),
     "together": (Together(), checks.networks_are_independent, "drivers of another network"),
-    "meddling": (Meddling(), checks.the_lesson_stays_as_it_is, "not be changed in place"),
+    "meddling": (Meddling(), checks.the_training_data_stays_as_it_is, "not be changed in place"),
     "renaming": (Renaming(), checks.curves_tell_how_it_went, "figures and MLflow read them"),
     "skipping": (Skipping(), checks.curves_tell_how_it_went, "counted 0, 1, 2"),
 }

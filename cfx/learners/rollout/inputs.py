@@ -1,0 +1,150 @@
+"""What was measured around the trajectories of a gradient step, gathered window by window.
+
+Shapes: P pairs, N networks, D trajectories of each, H windows of a trajectory, L frames of a token,
+S steps of a window, m width of the model's memory.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from cfx.learners.rollout.batch import RolloutBatch
+from cfx.learners.rollout.state import LeaderWindow, LoopState
+from cfx.learners.rollout.step import WindowStep
+from cfx.pairs import PairBatch
+
+
+class Measured(NamedTuple):
+    """What was measured at simulated frames, `(N, D, frames)` each.
+
+    Attributes:
+        speed: m/s.
+        gap: m.
+        counted: 1 for a frame within the training part, else 0.
+    """
+
+    speed: Tensor
+    gap: Tensor
+    counted: Tensor
+
+
+@dataclass(frozen=True)
+class RolloutInputs:
+    """What is measured around trajectories.
+
+    Positions are relative to the follower's at the start of its trajectory.
+
+    Attributes:
+        leader: position, speed, acceleration, window by window, `(3, H, N, D, L + S)`, SI units.
+        leader_length: `(N, D)`, m.
+        follower: position, speed, acceleration of the last L frames before the policy takes over,
+            `(3, N, D, L)`, SI units.
+        memory: of the model at that moment, `(N, D, m)`.
+        measured: at the `H S` frames that are simulated.
+    """
+
+    leader: Tensor
+    leader_length: Tensor
+    follower: Tensor
+    memory: Tensor
+    measured: Measured
+
+    @classmethod
+    def of(
+        cls, pairs: PairBatch, pair: Tensor, batch: RolloutBatch, step: WindowStep, windows: int
+    ) -> RolloutInputs:
+        """Gathers them.
+
+        Args:
+            pairs: the P pairs.
+            pair: which pair each trajectory is of, `(N, D)`.
+            batch: where the trajectories begin.
+            step: knows L, S and the model.
+            windows: H.
+        """
+        length, stride, device = step.length, step.stride, pair.device
+        now = (batch.start * stride)[..., None]
+        past = now + torch.arange(1 - length, 1, device=device)
+        window_starts = torch.arange(windows, device=device)[:, None] * stride
+        offsets = window_starts + torch.arange(1 - length, stride + 1, device=device)
+        around = now + offsets[:, None, None]
+        simulated = now + torch.arange(1, windows * stride + 1, device=device)
+        origin = _at(pairs.follower_position, pair, now)
+        follower = torch.stack(
+            [
+                _at(pairs.follower_position, pair, past) - origin,
+                _at(pairs.follower_speed, pair, past),
+                _at(pairs.follower_acceleration, pair, past),
+            ]
+        )
+        leader = torch.stack(
+            [
+                _at(pairs.leader_position, pair, around) - origin,
+                _at(pairs.leader_speed, pair, around),
+                _at(pairs.leader_acceleration, pair, around),
+            ]
+        )
+        speed = _at(pairs.follower_speed, pair, simulated)
+        gap = _at(pairs.gap, pair, simulated)
+        leader_length = pairs.leader_length[pair]
+        if batch.scale is not None:
+            scale = batch.scale[..., None]
+            follower, speed, gap = follower * scale, speed * scale, gap * scale
+            # The gap is scaled, the vehicle's length is not.
+            zero = torch.zeros_like(scale)
+            rear = torch.stack([leader_length[..., None], zero, zero])[:, None]
+            leader = (leader - rear) * scale + rear
+        counted = (simulated <= batch.last[..., None]).to(follower.dtype)
+        memory = step.model.initial_memory(follower[1, ..., -1])
+        return cls(leader, leader_length, follower, memory, Measured(speed, gap, counted))
+
+    def initial(self, state: Tensor) -> LoopState:
+        """Returns where the trajectories begin; `state` is the policy's, `(N, D, s)`.
+
+        Where gradients are recorded they flow through the first state too, as through all later
+        ones: otherwise the window step would be compiled once more for it.
+        """
+        position, speed, acceleration = self.follower.unbind(0)
+        begin = LoopState(position, speed, acceleration, self.memory, state)
+        if not torch.is_grad_enabled():
+            return begin
+        return LoopState(
+            _with_gradient(begin.position),
+            _with_gradient(begin.speed),
+            _with_gradient(begin.acceleration),
+            _with_gradient(begin.memory),
+            _with_gradient(begin.state),
+        )
+
+    def measured_at(self, frames: slice) -> Measured:
+        """Returns what was measured at some of the simulated frames."""
+        speed, gap, counted = self.measured
+        return Measured(speed[..., frames], gap[..., frames], counted[..., frames])
+
+    def leader_window(self, window: int) -> LeaderWindow:
+        """Returns the leader around a window."""
+        position, speed, acceleration = self.leader[:, window].unbind(0)
+        return LeaderWindow(position, speed, acceleration)
+
+
+def _at(signal: Tensor, pair: Tensor, frames: Tensor) -> Tensor:
+    """Returns a signal `(P, T)` at frames; beyond a recording, its first or last frame.
+
+    Args:
+        signal: of all pairs.
+        pair: `(N, D)`.
+        frames: `(*dims, N, D, K)`.
+    """
+    end = signal.shape[1] - 1
+    return signal[pair[..., None], frames.clamp(min=0, max=end)]
+
+
+def _with_gradient(value: Tensor) -> Tensor:
+    """Returns the value as a tensor whose gradient is recorded."""
+    if value.requires_grad:
+        return value
+    return value.clone().requires_grad_()

@@ -1,0 +1,127 @@
+"""The closed loop of training: burn-in on measured history, then windows one after the other.
+
+Shapes: N networks, D trajectories of each, H windows of a trajectory, S steps of a window, s width
+of the policy's state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from cfx.learners.rollout.batch import RolloutBatch
+from cfx.learners.rollout.dataset import Conditioning, RolloutDataset
+from cfx.learners.rollout.gradients import GradientPath
+from cfx.learners.rollout.inputs import Measured, RolloutInputs
+from cfx.learners.rollout.step import WindowStep
+
+if TYPE_CHECKING:
+    from cfx.learners.rollout.distillation import Expert, ExpertState
+
+
+class Segment(NamedTuple):
+    """What was simulated between two cuts of the gradients, `(N, D, frames)` each.
+
+    Attributes:
+        speed: m/s.
+        gap: m.
+        measured: at the same frames.
+        expert_speed: the speeds at which experts would have driven each window, m/s; None without
+            experts.
+    """
+
+    speed: Tensor
+    gap: Tensor
+    measured: Measured
+    expert_speed: Tensor | None
+
+
+def burn_in(
+    step: WindowStep,
+    dataset: RolloutDataset,
+    batch: RolloutBatch,
+    conditioning: Conditioning,
+    most: int | None = None,
+) -> Tensor:
+    """Lets networks observe what was measured before each trajectory; nothing before a cold start.
+
+    Args:
+        step: observes one window.
+        dataset: holds what was measured.
+        batch: where the trajectories begin.
+        conditioning: of these trajectories.
+        most: windows that are observed at most, the last ones before the start; None: all.
+
+    Returns:
+        The policy's state at the start of each trajectory, `(N, D, s)`.
+    """
+    start = torch.where(batch.cold_start, 0, batch.start)
+    count = int(start.max())
+    if most is not None:
+        count = min(count, most)
+    windows = start - count + torch.arange(count, device=start.device)[:, None, None]
+    tokens = dataset.tokens[conditioning.pair, windows.clamp(min=0)]
+    state = step.core.network.initial_state(*conditioning.pair.shape)
+    if state.is_floating_point() and torch.is_grad_enabled():
+        # As all later states, so that one compiled function serves all windows.
+        state = state.detach().requires_grad_()
+    for number in range(count):
+        state = step.observe(tokens[number], conditioning.features, state, windows[number] >= 0)
+    return state
+
+
+def simulate(
+    step: WindowStep,
+    dataset: RolloutDataset,
+    batch: RolloutBatch,
+    windows: int,
+    path: GradientPath,
+    *,
+    burn_in_windows: int | None = None,
+    expert: Expert | None = None,
+) -> Iterator[Segment]:
+    """Simulates trajectories in closed loop.
+
+    Args:
+        step: simulates one window.
+        dataset: what was measured.
+        batch: the trajectories.
+        windows: H.
+        path: the way that gradients take back.
+        burn_in_windows: windows of history that are observed at most; None: all.
+        expert: says how it would have driven each window; None: nothing is asked.
+
+    Yields:
+        What was simulated between two cuts of the gradients.
+    """
+    conditioning = dataset.condition(batch)
+    state = burn_in(step, dataset, batch, conditioning, burn_in_windows)
+    inputs = RolloutInputs.of(dataset.batch, conditioning.pair, batch, step, windows)
+    now = inputs.initial(state)
+    expert_state: ExpertState | None = None
+    if expert is not None:
+        expert_state = expert.begin(batch, inputs.leader_length, burn_in_windows)
+    length = path.segment_length(windows)
+    for first in range(0, windows, length):
+        speeds, gaps, wanted = [], [], []
+        for window in range(first, min(first + length, windows)):
+            leader = inputs.leader_window(window)
+            if expert is not None and expert_state is not None:
+                label, expert_state = expert.label(expert_state, now, leader)
+                wanted.append(label)
+            now, speed, gap = step.drive_window(
+                now, leader, inputs.leader_length, conditioning.base, conditioning.features
+            )
+            now = path.after_window(now)
+            speeds.append(speed)
+            gaps.append(gap)
+        frames = slice(first * step.stride, (first + len(speeds)) * step.stride)
+        expert_speed = None
+        if wanted:
+            expert_speed = torch.cat(wanted, -1)
+        measured = inputs.measured_at(frames)
+        yield Segment(torch.cat(speeds, -1), torch.cat(gaps, -1), measured, expert_speed)
+        now = path.after_segment(now)

@@ -1,0 +1,260 @@
+"""The Lightning module of closed-loop training: gradient steps, their schedules, and validation.
+
+Shapes: N networks (each member of an ensemble counts), D trajectories of each.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import lightning.pytorch as pl
+import torch
+from lightning.pytorch.core.optimizer import LightningOptimizer
+from torch import Tensor
+from torch.utils.data import DataLoader
+
+from cfx.agents.core import AgentCore
+from cfx.agents.heads.offset import OffsetHead
+from cfx.learners.base import TrainingData
+from cfx.learners.batched import BatchedModule
+from cfx.learners.rollout.base_errors import BaseErrors, Divisors
+from cfx.learners.rollout.batch import RolloutBatch
+from cfx.learners.rollout.dataset import RolloutDataset
+from cfx.learners.rollout.distillation import Expert
+from cfx.learners.rollout.gradients import GradientPath, NoGradients, ThroughMemory, ThroughTime
+from cfx.learners.rollout.loop import simulate
+from cfx.learners.rollout.loss import TrajectoryLoss
+from cfx.learners.rollout.sampling import TrajectorySampler
+from cfx.learners.rollout.settings import RolloutSettings
+from cfx.learners.rollout.step import WindowStep
+from cfx.policies.base import Policy, PolicyNetwork
+from cfx.simulation.rollout import can_compile
+
+_WORTH_COMPILING = 5_000
+"""Windows simulated in training, one after the other, from which compiling pays: some ten seconds
+of
+eager work."""
+
+_LEAST_TEMPERATURE = 0.02
+"""Below this a smoothed switch has no gradient that single precision resolves."""
+
+_WARM_UP = 20
+"""Gradient steps over which the learning rate rises."""
+
+
+class StepNumbers(pl.LightningDataModule):
+    """The numbers of an epoch's gradient steps; what a step samples follows from its number."""
+
+    def __init__(self, steps: int) -> None:
+        super().__init__()
+        self.steps = steps
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        numbers: Any = range(self.steps)
+        return DataLoader(numbers, batch_size=None, shuffle=False)
+
+    def val_dataloader(self) -> DataLoader[Any]:
+        once: Any = [0]
+        return DataLoader(once, batch_size=None)
+
+
+class RolloutModule(BatchedModule):
+    """Trains N networks on random trajectories in closed loop.
+
+    Args:
+        network: what is trained.
+        dataset: what it learns from.
+        policy: the component that built the network.
+        training_data: simulator, objective and seed.
+        settings: how it is trained.
+        errors: of the bases of these trajectories; None: they are simulated.
+        expert: networks to imitate in the first `settings.distillation_epochs` epochs.
+        on_epoch: called after each epoch.
+    """
+
+    def __init__(
+        self,
+        network: PolicyNetwork,
+        dataset: RolloutDataset,
+        policy: Policy,
+        training_data: TrainingData,
+        settings: RolloutSettings,
+        errors: BaseErrors | None = None,
+        expert: Expert | None = None,
+        on_epoch: Callable[[], None] = lambda: None,
+    ) -> None:
+        ensemble_size = dataset.ensemble_size
+        super().__init__(
+            network, training_data.names, settings, on_epoch, ensemble_size=ensemble_size
+        )
+        self.automatic_optimization = False
+        self.dataset = dataset
+        self.settings = settings
+        self.expert = expert
+        device = dataset.base.device
+        model, dt = training_data.simulator.model, training_data.simulator.dt
+        windows = training_data.windows
+        head = OffsetHead.for_model(model, device)
+        core = AgentCore(policy, network, dataset.scaler, head)
+        self.temperature = torch.tensor(settings.temperature, device=device)
+        self.exact_step = WindowStep(core, model, windows, dt)
+        if settings.temperature > 0:
+            model = model.at_temperature(self.temperature)
+        self.training_window = WindowStep(core, model, windows, dt)
+        if self._is_worth_compiling():
+            self.training_window.compile()
+        if errors is None:
+            errors = BaseErrors.of(training_data, dataset, settings.horizon)
+        self.errors = errors
+        self.loss = TrajectoryLoss(training_data.objective, settings, dt)
+        self.sampler = TrajectorySampler(
+            dataset,
+            settings,
+            windows.stride,
+            has_cold_starts=training_data.base is not None,
+            seed=training_data.seed,
+        )
+        clip = settings.gradient_clip_state / self.sampler.trajectories
+        bounds = (settings.gradient_decay, clip, settings.tbptt_windows)
+        self.through_time = ThroughTime(*bounds)
+        self.through_memory = ThroughMemory(*bounds)
+        self.losses: list[Tensor] = []
+
+    def configure_optimizers(self) -> Any:
+        optimizer = super().configure_optimizers()
+        return [optimizer], [torch.optim.lr_scheduler.LambdaLR(optimizer, self._rate)]
+
+    def on_train_epoch_start(self) -> None:
+        s = self.settings
+        done = self.current_epoch / max(1, s.epochs - 1)
+        temperature = s.temperature + done * (s.temperature_end - s.temperature)
+        self.temperature.fill_(max(temperature, _LEAST_TEMPERATURE))
+
+    def training_step(self, number: int, index: int) -> None:
+        optimizer, schedule = self.optimizers(), self.lr_schedulers()
+        assert isinstance(optimizer, LightningOptimizer)
+        assert isinstance(schedule, torch.optim.lr_scheduler.LambdaLR)
+        step = self.current_epoch * self.settings.steps + int(number)
+        # Dropout draws from the global generator.
+        torch.manual_seed(self.sampler.step_seed(step))
+        optimizer.zero_grad()
+        total = torch.zeros(len(self.dataset.pair), device=self.dataset.pair.device)
+        for loss in self.step_losses(step):
+            self.manual_backward(loss.sum())
+            total += loss.detach()
+        self.configure_gradient_clipping(optimizer)
+        optimizer.step()
+        schedule.step()
+        self.losses.append(total.cpu())
+
+    def step_losses(self, step: int) -> Iterator[Tensor]:
+        """Yields each network's loss in a gradient step, `(N,)`, of each segment."""
+        batch = self.sampler.training(step)
+        count = batch.weight.sum(1).clamp(min=1.0)
+        divisors = self.errors.over_horizon(batch)
+        expert, path = None, self.through_time
+        if self.expert is not None and self.current_epoch < self.settings.distillation_epochs:
+            expert, path = self.expert, self.through_memory
+        losses = self.trajectory_losses(
+            self.training_window, batch, self.settings.horizon, divisors, path, expert
+        )
+        for loss in losses:
+            yield (loss * batch.weight).sum(1) / count
+
+    def trajectory_losses(
+        self,
+        step: WindowStep,
+        batch: RolloutBatch,
+        windows: int,
+        divisors: Divisors,
+        path: GradientPath,
+        expert: Expert | None = None,
+    ) -> Iterator[Tensor]:
+        """Simulates trajectories; yields the loss of each, `(N, D)`, of each segment.
+
+        Args:
+            step: simulates one window.
+            batch: the trajectories.
+            windows: how many each lasts.
+            divisors: of their losses.
+            path: the way that gradients take back; with `NoGradients` all history is observed.
+            expert: whom to imitate; None: nobody.
+        """
+        most = None
+        if not isinstance(path, NoGradients):
+            most = self.burn_in_windows
+        segments = simulate(
+            step, self.dataset, batch, windows, path, burn_in_windows=most, expert=expert
+        )
+        for segment in segments:
+            yield self.loss(segment, divisors)
+
+    @property
+    def burn_in_windows(self) -> int | None:
+        """How many windows of history a policy observes at most in training; None: all."""
+        burn_in_s = self.settings.burn_in_s
+        if burn_in_s is None:
+            return None
+        step = self.training_window
+        return max(1, round(burn_in_s / (step.stride * step.dt)))
+
+    @torch.no_grad()
+    def validation_step(self, number: int, index: int) -> None:
+        train = torch.stack(self.losses).mean(0)
+        self.losses.clear()
+        is_distilling = self.current_epoch < self.settings.distillation_epochs
+        self.judge(train, self.validation_loss().cpu(), hopeful=is_distilling)
+
+    def validation_loss(self) -> Tensor:
+        """Returns the loss of validation trajectories with the exact model, `(N,)`.
+
+        NaN for a network that keeps no driver for validation. Cold starts count as much as they do
+        in training, where a network keeps whole trajectories.
+        """
+        sampler = self.sampler
+        if sampler.validation_places.shape[1] == 0:
+            return torch.full((len(sampler.validation_places),), torch.nan)
+        share = sampler.cold_start_fraction
+        if share == 0:
+            return self._loss_with_history()
+        cold = self._loss_of_cold_starts()
+        if share == 1 and not bool(cold.isnan().any()):
+            return cold
+        loss = self._loss_with_history()
+        return torch.where(cold.isnan(), loss, (1.0 - share) * loss + share * cold)
+
+    def _loss_with_history(self) -> Tensor:
+        """Returns the loss over the horizon, `(N,)`."""
+        batch = self.sampler.validation_with_history()
+        return self._exact_loss(batch, self.settings.horizon, self.errors.over_horizon(batch))
+
+    def _loss_of_cold_starts(self) -> Tensor:
+        """Returns the loss of full trajectories, `(N,)`; NaN for networks that keep none."""
+        batch = self.sampler.validation_cold_starts()
+        if not bool(batch.weight.any()):
+            return batch.weight.new_full((len(batch.weight),), torch.nan)
+        windows = -(-int(batch.last.max()) // self.exact_step.stride)
+        return self._exact_loss(batch, windows, self.errors.over_full_trajectory(batch))
+
+    def _exact_loss(self, batch: RolloutBatch, windows: int, divisors: Divisors) -> Tensor:
+        losses = self.trajectory_losses(self.exact_step, batch, windows, divisors, NoGradients())
+        return _weighted_mean(next(losses), batch.weight)
+
+    def _rate(self, step: int) -> float:
+        """Returns the factor on the learning rate in a gradient step: a warm-up, then a cosine."""
+        total = self.settings.epochs * self.settings.steps
+        warm_up = min(1.0, (step + 1) / _WARM_UP)
+        return warm_up * 0.5 * (1.0 + math.cos(math.pi * min(1.0, step / total)))
+
+    def _is_worth_compiling(self) -> bool:
+        s = self.settings
+        if s.compile == "never" or not can_compile(self.dataset.base.device):
+            return False
+        return s.compile == "always" or s.epochs * s.steps * s.horizon >= _WORTH_COMPILING
+
+
+def _weighted_mean(values: Tensor, weight: Tensor) -> Tensor:
+    """Returns the weighted mean over trajectories, `(N,)`; NaN where nothing has weight."""
+    return torch.where(weight > 0, values, 0.0).mul(weight).sum(1) / weight.sum(1)

@@ -1,0 +1,116 @@
+"""Which trajectories are simulated in a gradient step, and in validation.
+
+Shapes: N networks, D trajectories of each.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from cfx.learners.rollout.batch import RolloutBatch
+from cfx.learners.rollout.dataset import RolloutDataset
+from cfx.learners.rollout.settings import RolloutSettings
+
+_VALIDATION_STARTS = (0.2, 0.4, 0.6, 0.8)
+"""Shares of a validation trajectory at which the policy takes over."""
+
+
+class TrajectorySampler:
+    """Chooses trajectories.
+
+    Args:
+        dataset: the drivers and their recordings.
+        settings: how many, how long and how many cold starts.
+        stride: frames of a window.
+        has_cold_starts: whether cold starts differ from other trajectories.
+        seed: of the training; what is sampled in a gradient step follows from it and from the
+            step's number alone.
+    """
+
+    def __init__(
+        self,
+        dataset: RolloutDataset,
+        settings: RolloutSettings,
+        stride: int,
+        *,
+        has_cold_starts: bool,
+        seed: int,
+    ) -> None:
+        self.dataset = dataset
+        self.settings = settings
+        self.stride = stride
+        self.seed = seed
+        self.cold_start_fraction = 0.0
+        if has_cold_starts:
+            self.cold_start_fraction = settings.cold_start_fraction
+        generator = torch.Generator().manual_seed(seed)
+        self.validation_places = dataset.validation_places(settings.drivers, generator)
+
+    @property
+    def trajectories(self) -> int:
+        """How many trajectories are sampled of each network in a step, with weight or without."""
+        drivers = self.dataset.pair.shape[1]
+        if self.settings.drivers is not None:
+            drivers = min(drivers, self.settings.drivers)
+        return self.settings.draws * drivers
+
+    def step_seed(self, step: int) -> int:
+        """Returns the seed of everything random in a gradient step."""
+        return (self.seed * 1_000_003 + step) % 2**63
+
+    def training(self, step: int) -> RolloutBatch:
+        """Returns the trajectories of a gradient step."""
+        s, dataset = self.settings, self.dataset
+        generator = torch.Generator().manual_seed(self.step_seed(step))
+        place = dataset.training_places(s.drivers, generator).repeat(1, s.draws)
+        shape, device = place.shape, place.device
+        share = torch.rand(shape, generator=generator).to(device)
+        until = dataset.until.gather(1, place)
+        latest = (until // self.stride - s.horizon // 2).clamp(min=1)
+        lots = torch.rand(shape, generator=generator).to(device)
+        cold_start = lots < self.cold_start_fraction
+        scale = None
+        if self.cold_start_fraction > 0 and s.scaling > 0:
+            factor = torch.exp(s.scaling * torch.randn(shape, generator=generator)).to(device)
+            scale = torch.where(cold_start, factor, 1.0)
+        weight = dataset.trains.gather(1, place).float()
+        start = (share * latest).long()
+        return RolloutBatch(place, start, cold_start, until, weight, scale).without_unweighted()
+
+    def validation_with_history(self) -> RolloutBatch:
+        """Returns validation trajectories over the horizon, with observed history."""
+        dataset, place = self.dataset, self.validation_places
+        last, until = dataset.last.gather(1, place), dataset.until.gather(1, place)
+        begin = torch.where(until < last, until, 0)
+        starts = []
+        for share in _VALIDATION_STARTS:
+            starts.append(((begin + share * (last - begin)) / self.stride).long())
+        copies = len(starts)
+        places = place.repeat(1, copies)
+        return RolloutBatch(
+            place=places,
+            start=torch.cat(starts, 1),
+            cold_start=torch.zeros_like(places, dtype=torch.bool),
+            last=last.repeat(1, copies),
+            weight=self._validation_weight().repeat(1, copies),
+        )
+
+    def validation_cold_starts(self) -> RolloutBatch:
+        """Returns full validation trajectories of which nothing was observed.
+
+        Drivers of whom only the end is kept for validation have no weight.
+        """
+        dataset, place = self.dataset, self.validation_places
+        last = dataset.last.gather(1, place)
+        is_whole = dataset.until.gather(1, place) == last
+        return RolloutBatch(
+            place=place,
+            start=torch.zeros_like(place),
+            cold_start=torch.ones_like(place, dtype=torch.bool),
+            last=last,
+            weight=self._validation_weight() * is_whole,
+        )
+
+    def _validation_weight(self) -> Tensor:
+        return self.dataset.validates.gather(1, self.validation_places).float()

@@ -1,0 +1,187 @@
+"""Settings of the learner `rollout`, in groups; in a configuration their keys stand side by side.
+
+A driver's trajectory is one simulated drive of a gradient step; a window is the time for which one
+set of parameters holds (`windows.stride`).
+"""
+
+from __future__ import annotations
+
+from typing import Self
+
+from pydantic import Field, model_validator
+
+from cfx.component import Settings
+from cfx.simulation.rollout import Compile
+
+
+class EnsembleSettings(Settings):
+    """Ensemble."""
+
+    ensemble_size: int = Field(
+        4,
+        ge=1,
+        description="networks of an ensemble, which answer together; each keeps other drivers for"
+        " validation",
+    )
+
+
+class OptimisationSettings(Settings):
+    """Optimisation and validation."""
+
+    epochs: int = Field(
+        16, ge=1, description="epochs at most; after each, every network is validated"
+    )
+    steps: int = Field(25, ge=1, description="gradient steps of an epoch")
+    learning_rate: float = Field(
+        3e-3, gt=0, description="of Adam, at its highest; it falls to 0 along a cosine"
+    )
+    weight_decay: float = Field(1e-4, ge=0, description="of AdamW, decoupled")
+    gradient_clip: float | None = Field(
+        1.0, gt=0, description="largest gradient norm of a network; null: none"
+    )
+    validation: float = Field(
+        0.25,
+        ge=0,
+        lt=1,
+        description="share of the drivers kept for validation; of each trajectory's end where"
+        " drivers are few",
+    )
+    patience: int | None = Field(
+        6,
+        ge=1,
+        description="epochs without a better validation loss after which a network stops; null:"
+        " never",
+    )
+
+
+class SamplingSettings(Settings):
+    """Sampling of trajectories."""
+
+    draws: int = Field(
+        2,
+        ge=1,
+        description="trajectories of each driver and step, each from a random measured state",
+    )
+    drivers: int | None = Field(
+        256,
+        ge=1,
+        description="drivers of a network in one step, and in validation, at most; null: all",
+    )
+    horizon: int = Field(30, ge=1, description="windows that a trajectory lasts")
+    burn_in_s: float | None = Field(
+        20.0,
+        gt=0,
+        description="s of measured history that the policy observes before a trajectory in"
+        " training, at most; null: all",
+    )
+
+
+class ColdStartSettings(Settings):
+    """Cold starts, as of unseen drivers."""
+
+    cold_start_fraction: float = Field(
+        0.3,
+        ge=0,
+        le=1,
+        description="share of trajectories without history, from the pooled parameters, where"
+        " drivers have parameters of their own",
+    )
+    scaling: float = Field(
+        0.15,
+        ge=0,
+        description="augmentation: standard deviation of the logarithm of a factor on distances,"
+        " speeds and accelerations of a cold start",
+    )
+
+
+class LossSettings(Settings):
+    """Terms beside the job's objective."""
+
+    gap_weight: float = Field(
+        0.1, ge=0, description="weight of the gap's RMSE beside the job's objective"
+    )
+    jerk_weight: float = Field(
+        0.0,
+        ge=0,
+        description="weight of the RMS jerk (m/s3) beside the errors; 0.01 costs little accuracy"
+        " and makes the trajectories much smoother",
+    )
+
+
+class GradientSettings(Settings):
+    """Gradients through time."""
+
+    gradient_decay: float = Field(
+        0.8,
+        gt=0,
+        le=1,
+        description="factor on gradients that come back through one window; 1: none is forgotten",
+    )
+    gradient_clip_state: float = Field(
+        2.0,
+        gt=0,
+        description="largest gradient that one trajectory's error sends back through a window",
+    )
+    tbptt_windows: int | None = Field(
+        None,
+        ge=1,
+        description="windows after which gradients are cut and memory is freed; null: the whole"
+        " trajectory",
+    )
+
+
+class RegimeSettings(Settings):
+    """Regime switches of the driving model."""
+
+    temperature: float = Field(
+        1.0,
+        ge=0,
+        description="how gradually regimes switch in training, at first; 0: exactly. Evaluation is"
+        " always exact.",
+    )
+    temperature_end: float = Field(0.3, ge=0, description="the same in the last epoch")
+
+
+class DistillationSettings(Settings):
+    """Distillation."""
+
+    distillation_epochs: int = Field(
+        0,
+        ge=0,
+        description="the first epochs, in which networks imitate experts: networks that set the"
+        " acceleration (model=direct), trained before for the remaining number of epochs; for"
+        " models with regimes",
+    )
+
+
+class ComputeSettings(Settings):
+    """Computation."""
+
+    compile: Compile = Field(
+        "auto", description="the window that training repeats: auto: where it pays; always; never"
+    )
+
+
+# Pydantic lists the fields of the last base first.
+class RolloutSettings(
+    ComputeSettings,
+    DistillationSettings,
+    RegimeSettings,
+    GradientSettings,
+    LossSettings,
+    ColdStartSettings,
+    SamplingSettings,
+    OptimisationSettings,
+    EnsembleSettings,
+):
+    """Settings of `rollout`."""
+
+    @model_validator(mode="after")
+    def _some_epochs_in_closed_loop(self) -> Self:
+        if self.distillation_epochs >= self.epochs:
+            raise ValueError(
+                f"distillation_epochs={self.distillation_epochs} leaves none of"
+                f" epochs={self.epochs} for training in closed loop; lower"
+                " learner.distillation_epochs"
+            )
+        return self

@@ -1,0 +1,147 @@
+"""Small training data and what comes of it, for the tests of learners.
+
+Small trajectories, eager code: what is tested is what is learned from, not how fast.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from cfx.agents.agent import Agent
+from cfx.agents.core import AgentCore
+from cfx.agents.heads import HEADS, head_name
+from cfx.calibration.windows import Split, WindowSettings
+from cfx.evaluation.closed_loop import ClosedLoop, simulate_closed_loop
+from cfx.learners.base import TrainingData, TrainingResult
+from cfx.learners.rollout import RolloutLearner, RolloutModule, RolloutSettings
+from cfx.learners.rollout.batch import RolloutBatch
+from cfx.learners.rollout.dataset import RolloutDataset
+from cfx.models.krauss import Krauss
+from cfx.pairs import PairBatch
+from cfx.policies.base import Policy
+from cfx.policies.gru import GruPolicy
+from cfx.simulation.rollout import MemoryStepper
+from tests.drives import wavy_pairs
+
+WINDOWS = WindowSettings()
+INPUTS = ("leader_speed", "relative_speed", "gap")
+QUICK: dict[str, Any] = {
+    "ensemble_size": 1,
+    "epochs": 6,
+    "steps": 10,
+    "learning_rate": 0.01,
+    "horizon": 12,
+    "compile": "never",
+}
+TRUE = torch.tensor(
+    [[1.0, 0.1], [1.4, 0.3], [1.8, 0.5], [2.2, 0.0], [2.6, 0.2], [3.0, 0.4]]
+).double()
+
+
+def gru(**options: Any) -> Policy:
+    return GruPolicy(inputs=INPUTS, hidden_size=12, **options)
+
+
+def training_data(
+    *, model: Any = None, networks: int = 2, frames: int = 260, **changes: Any
+) -> TrainingData:
+    """Six Krauss drivers. Each network learns from all, from a set that fits none of them."""
+    driven = Krauss()
+    model = model or driven
+    pairs = wavy_pairs(driven, TRUE, frames=frames)
+    index = torch.arange(len(pairs)).repeat(networks)
+    fixed = model.space.defaults().expand(len(index), -1).clone()
+    if isinstance(model, Krauss):
+        fixed[:] = torch.tensor([4.0, 0.8])
+    data = TrainingData(
+        simulator=MemoryStepper(model, 0.1),
+        batch=PairBatch.of(pairs)[index],
+        split=Split.none(pairs, WINDOWS)[index],
+        windows=WINDOWS,
+        fixed=fixed,
+        labels=None,
+        network=torch.arange(networks).repeat_interleave(len(pairs)),
+        names=tuple(f"n{number}" for number in range(networks)),
+        seed=0,
+        drivers=tuple(pair.driver for pair in pairs) * networks,
+    )
+    return replace(data, **changes)
+
+
+def ready(result: TrainingResult, data: TrainingData, policy: Policy) -> Agent:
+    """Returns trained networks as an agent."""
+    name = result.head or head_name(has_base=result.base is not None)
+    head = HEADS[name].for_model(data.simulator.model)
+    return Agent(
+        core=AgentCore(policy, result.network, result.scaler, head),
+        model_node={},
+        policy_node={},
+        windows=WINDOWS,
+        dt=0.1,
+        names=data.names,
+        base=result.base,
+    )
+
+
+def loop(
+    result: TrainingResult,
+    data: TrainingData,
+    policy: Policy,
+    first: int = 0,
+    base: torch.Tensor | None = None,
+) -> ClosedLoop:
+    """Returns the closed loop of evaluation from a frame on."""
+    frames = torch.full_like(data.network, first)
+    agent = ready(result, data, policy)
+    return simulate_closed_loop(data.simulator, agent, data.batch, frames, data.network, base=base)
+
+
+def error(found: ClosedLoop, data: TrainingData, first: int = 0) -> float:
+    """Returns the RMSE of speed, m/s."""
+    measured = data.batch.follower_speed[:, first:]
+    return float((found.speed - measured)[found.counted].square().mean().sqrt())
+
+
+def untrained(data: TrainingData, policy: Policy) -> TrainingResult:
+    """Returns what one gradient step without a rate leaves."""
+    still = {"epochs": 1, "steps": 1, "learning_rate": 1e-12, "weight_decay": 0.0}
+    return RolloutLearner(**(QUICK | still)).fit(policy, data)
+
+
+def placed(
+    data: TrainingData, policy: Policy, share: float = 0.25, seed: int = 0
+) -> RolloutDataset:
+    """Returns the training data placed on networks."""
+    return RolloutDataset.of(data, policy, share, torch.Generator().manual_seed(seed))
+
+
+def module_of(data: TrainingData, **options: Any) -> RolloutModule:
+    """Returns a module whose networks answer at random, so that they do something."""
+    policy, settings = gru(), RolloutSettings(**(QUICK | options))
+    generator = torch.Generator().manual_seed(0)
+    dataset = RolloutDataset.of(
+        data, policy, settings.validation, generator, settings.ensemble_size
+    )
+    blank = torch.full((len(dataset.pair), 2), 0.5)
+    network = policy.build(dataset.scaler.mean.shape[-1], blank[0], blank, generator)
+    with torch.no_grad():
+        network.get_parameter("w_out").uniform_(-1.0, 1.0, generator=generator)
+    return RolloutModule(network, dataset, policy, data, settings)
+
+
+def batch_of(
+    dataset: RolloutDataset,
+    start: torch.Tensor,
+    cold_start: torch.Tensor | None = None,
+    last: torch.Tensor | None = None,
+) -> RolloutBatch:
+    """Returns a trajectory of each of one network's six drivers, `(1, 6)`; all have weight."""
+    place = torch.arange(6)[None]
+    if cold_start is None:
+        cold_start = torch.zeros_like(place).bool()
+    if last is None:
+        last = dataset.last
+    return RolloutBatch(place, start, cold_start, last, torch.ones_like(place).float())

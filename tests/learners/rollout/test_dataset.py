@@ -1,0 +1,75 @@
+"""Drivers placed on networks: who is kept for validation, and what is known of each."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from cfx.agents.heads.offset import coordinates
+from cfx.learners.rollout.base_errors import BaseErrors
+from cfx.learners.rollout.dataset import RolloutDataset
+from cfx.policies.driver_features import measure
+from tests.learners.made import TRUE, batch_of, gru, placed, training_data
+
+
+def test_networks_read_the_driver_features_of_each_of_their_drivers() -> None:
+    """The mean of the training drivers stands for those that are unknown, and for cold starts."""
+    data = training_data(networks=1, base=TRUE)
+    data.split.frame[1] = 120
+    policy = gru(driver_features=("time_gap", "time_headway"))
+    dataset = placed(data, policy)
+    cold_start = torch.tensor([[True, False, False, False, False, False]])
+    start = torch.zeros_like(cold_start).long()
+    features = dataset.condition(batch_of(dataset, start, cold_start)).features
+    frame = data.split.frame
+    expected = measure(data.batch, policy.driver_features, 0.1, 0 * frame, frame).float()
+    torch.testing.assert_close(features[0, 2:, 2:], expected[dataset.pair[0, 2:]])
+    usual = dataset.scaler.mean[:, -2:].expand(2, -1)
+    torch.testing.assert_close(features[0, :2, 2:], usual)
+    torch.testing.assert_close(features[0, 1:, :2], coordinates(dataset.base)[0, 1:])
+    trained_on = expected[dataset.pair[0, dataset.trains[0]]]
+    known = trained_on[~trained_on.isnan().any(-1)]
+    scaler, near = dataset.scaler, {"rtol": 1e-4, "atol": 1e-5}
+    torch.testing.assert_close(scaler.mean[0, -2:], known.mean(0), **near)
+    torch.testing.assert_close(scaler.scale[0, -2:], known.std(0, correction=0), **near)
+
+
+def test_networks_of_an_ensemble_keep_other_drivers_for_validation_and_read_alike() -> None:
+    data = training_data()
+    generator = torch.Generator().manual_seed(0)
+    dataset = RolloutDataset.of(data, gru(), 0.34, generator, ensemble_size=5)
+    assert len({tuple(row) for row in dataset.validates[:5].tolist()}) > 1
+    assert dataset.pair[:5].tolist() == [list(range(6))] * 5
+    assert dataset.pair[5:].tolist() == [list(range(6, 12))] * 5
+    mean = dataset.scaler.mean
+    assert torch.equal(mean[:5], mean[:1].expand(5, -1))
+    assert torch.equal(mean[5:], mean[5:6].expand(5, -1))
+    errors = BaseErrors.of(data, dataset, 12)
+    assert errors.with_history.shape[0] == errors.full_trajectory.shape[0] == 10
+
+
+def test_a_network_of_few_drivers_keeps_the_end_of_their_trajectories() -> None:
+    data = training_data(networks=1)
+    few = replace(
+        data,
+        batch=data.batch[:2],
+        split=data.split[torch.arange(2)],
+        fixed=data.fixed[:2],
+        network=data.network[:2],
+        drivers=("a", "b"),
+    )
+    dataset = placed(few, gru())
+    assert bool((dataset.trains & dataset.validates).all())
+    assert dataset.until.tolist() == [[int(0.75 * 259)] * 2]
+
+
+def test_one_driver_is_never_on_both_sides() -> None:
+    names = ("a", "a", "b", "c", "d", "e")
+    dataset = placed(training_data(drivers=names * 2), gru(), 0.4, seed=3)
+    for row in dataset.validates.tolist():
+        kept, others = set(), set()
+        for name, is_kept in zip(names, row, strict=True):
+            (kept if is_kept else others).add(name)
+        assert kept
+        assert not kept & others

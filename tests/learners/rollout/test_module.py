@@ -1,0 +1,123 @@
+"""Gradient steps and validation, beside evaluation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from cfx.agents.heads.offset import coordinates
+from cfx.learners.rollout import RolloutLearner, RolloutModule, RolloutSettings
+from cfx.learners.rollout.batch import RolloutBatch
+from cfx.learners.rollout.gradients import NoGradients
+from cfx.learners.rollout.loop import burn_in, simulate
+from cfx.models.krauss import Krauss
+from cfx.models.w99 import W99
+from cfx.policies.driver_features import measure
+from tests.learners.made import (
+    QUICK,
+    TRUE,
+    batch_of,
+    gru,
+    loop,
+    module_of,
+    placed,
+    training_data,
+)
+
+
+@pytest.mark.parametrize(
+    "driver_features", [(), ("time_headway", "acceleration")], ids=["", "driver_features"]
+)
+@pytest.mark.parametrize("model", [Krauss(), W99()], ids=["krauss", "w99"])
+def test_training_simulates_what_evaluation_simulates(
+    model: Any, driver_features: tuple[str, ...]
+) -> None:
+    """Training's closed loop and evaluation's give the same speeds and gaps after a burn-in."""
+    policy = gru(driver_features=driver_features)
+    data = training_data(model=model, networks=1)
+    options = QUICK | {"epochs": 1, "learning_rate": 0.05}
+    result = RolloutLearner(**options).fit(policy, data)
+    settings = RolloutSettings(**QUICK)
+    dataset = placed(data, policy, settings.validation)
+    dataset.scaler = result.scaler
+    module = RolloutModule(result.network, dataset, policy, data, settings)
+    if driver_features:  # training measures full trajectories, evaluation what was before
+        frame = torch.full_like(data.network, 200)
+        measured = measure(data.batch, driver_features, 0.1, 0 * frame, frame)
+        dataset.driver_features = measured.float()
+    batch = batch_of(dataset, torch.full((1, 6), 40))
+    with torch.no_grad():
+        segment = next(simulate(module.exact_step, dataset, batch, 11, NoGradients()))
+    found = loop(result, data, policy, first=200)
+    near = {"rtol": 0, "atol": 2e-3}
+    torch.testing.assert_close(segment.speed[0].double(), found.speed[:, 1:56], **near)
+    torch.testing.assert_close(segment.gap[0].double(), found.gap[:, 1:56], **near)
+
+
+def test_a_bounded_burn_in_forgets_what_was_before() -> None:
+    """It is the burn-in that began so many windows ago; cold starts have none."""
+    policy, data = gru(), training_data(networks=1)
+    dataset = placed(data, policy)
+    generator = torch.Generator().manual_seed(0)
+    features = dataset.scaler.mean.shape[-1]
+    blank = torch.full((1, 2), 0.5)
+    network = policy.build(features, blank[0], blank, generator)
+    step = RolloutModule(network, dataset, policy, data, RolloutSettings(**QUICK)).exact_step
+    cold_start = torch.tensor([[False, False, False, False, False, True]])
+    start = torch.tensor([[2, 4, 5, 9, 12, 12]])
+    batch = batch_of(dataset, start, cold_start)
+    conditioning = dataset.condition(batch)
+    everyone = torch.ones_like(cold_start)
+    with torch.no_grad():
+        full = burn_in(step, dataset, batch, conditioning)
+        assert torch.equal(burn_in(step, dataset, batch, conditioning, 100), full)
+        short = burn_in(step, dataset, batch, conditioning, 5)
+        for number, first in enumerate(start[0, :5].tolist()):
+            state = network.initial_state(1, 6)
+            for window in range(max(0, first - 5), first):
+                token = dataset.tokens[:, window][dataset.pair]
+                state = step.observe(token, coordinates(dataset.base), state, everyone)
+            torch.testing.assert_close(short[0, number], state[0, number])
+    assert not bool(short[0, 5].any())
+    assert not torch.allclose(short[0, 4], full[0, 4], atol=1e-6)
+
+
+def exact_losses(module: RolloutModule, batch: RolloutBatch, windows: int, full: bool) -> Any:
+    """Returns the loss of each trajectory with the exact model, `(N, D)`."""
+    divisors = module.errors.over_horizon(batch)
+    if full:
+        divisors = module.errors.over_full_trajectory(batch)
+    path = NoGradients()
+    return next(module.trajectory_losses(module.exact_step, batch, windows, divisors, path))
+
+
+@pytest.mark.parametrize("cold_start_fraction", [0.0, 0.4, 1.0])
+@pytest.mark.parametrize("second", ["aabcde", "aabbcc"], ids=["enough drivers", "few drivers"])
+def test_the_validation_loss_is_the_mean_over_validation_drivers(
+    cold_start_fraction: float, second: str
+) -> None:
+    """With history from fifths of what is kept; cold starts over full trajectories."""
+    data = training_data(base=TRUE.repeat(2, 1) * 1.3, drivers=tuple("abcdef" + second))
+    module = module_of(data, validation=0.3, cold_start_fraction=cold_start_fraction)
+    dataset, expected = module.dataset, torch.zeros(2)
+    counts = dataset.validates.sum(1).tolist()
+    assert counts[0] != counts[1]
+    one, no = torch.ones(2, 1), torch.zeros(2, 1).bool()
+    with torch.no_grad():
+        for network, count in enumerate(counts):
+            for place in dataset.validates[network].nonzero()[:, 0].tolist():
+                until, last = int(dataset.until[network, place]), int(dataset.last[network, place])
+                begin = until if until < last else 0
+                here, end = torch.full((2, 1), place), torch.full((2, 1), last)
+                share = cold_start_fraction if begin == 0 else 0.0
+                for fifth in (0.2, 0.4, 0.6, 0.8):
+                    start = ((begin + fifth * (end - begin)) / 5).long()
+                    known = RolloutBatch(here, start, no, end, one)
+                    loss = exact_losses(module, known, 12, full=False)
+                    expected[network] += (1 - share) * loss[network, 0] / (4 * count)
+                cold = RolloutBatch(here, end * 0, ~no, end, one)
+                loss = exact_losses(module, cold, 52, full=True)
+                expected[network] += share * loss[network, 0] / count
+        torch.testing.assert_close(module.validation_loss(), expected, rtol=1e-4, atol=1e-5)
