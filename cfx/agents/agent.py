@@ -1,8 +1,8 @@
 """The agent: what drives in evaluation, in platoons and in SUMO, and what a saved policy is.
 
-An agent is made of three things: a context of each driver (`cfx.agents.context`), networks with their
-scaler and inputs, and a parameter head (both in `cfx.agents.core`). Training through the simulation
-uses the same core on the same grid.
+An agent is made of three things: a context of each driver (`cfx.agents.context`), networks with
+their scaler and inputs, and a parameter head (both in `cfx.agents.core`). Training through the
+simulation uses the same core on the same grid.
 
 Life cycle for D drivers: `begin` once; `observe` (or `burn_in` over measured history) any number of
 times; then `act` once per window.
@@ -133,7 +133,8 @@ class Agent:
             since: `(D,)`, the frame from which on; None: the first.
 
         Returns:
-            `(D, k)`, NaN for drivers of whom too little was measured; None if the policy reads none.
+            `(D, k)`, NaN for drivers of whom too little was measured; None if the policy reads
+            none.
         """
         if not self.core.driver_features:
             return None
@@ -269,7 +270,7 @@ class Agent:
         return torch.tensor(numbers)
 
     def for_unseen_drivers(self) -> Agent:
-        """Returns the one network that drives anybody: the only one there is, or the one named `all`.
+        """Returns the one network that drives anybody: the only one, or the one named `all`.
 
         Raises:
             DataError: each network is for a pair of its own.
@@ -278,8 +279,8 @@ class Agent:
             return self
         if ALL not in self.names:
             raise DataError(
-                f"the policy has {len(self.names)} networks, one for each of its own pairs, and none"
-                " for others; train one with protocol.networks=all or protocol=across_drivers"
+                f"the policy has {len(self.names)} networks, one for each of its own pairs, and"
+                " none for others; train one with protocol.networks=all or protocol=across_drivers"
             )
         number = self.names.index(ALL)
         row = slice(number, number + 1)

@@ -1,8 +1,8 @@
 """Saved policies: an agent in a folder.
 
-`policy.json` holds everything that is text or a number, `policy.pt` the tensors (a state dict that is
-read with `weights_only=True`, so no code runs). Format 2 names the head; format 1 did not, and what
-it saved loads too.
+`policy.json` holds everything that is text or a number, `policy.pt` the tensors (a state dict that
+is read with `weights_only=True`, so no code runs). Format 2 names the head; format 1 did not, and
+what it saved loads too.
 """
 
 from __future__ import annotations
@@ -137,8 +137,8 @@ def _read(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         ) from error
     if description.get("format") not in _READABLE:
         raise DataError(
-            f"{folder}/policy.json has format {description.get('format')}; this version of cfx reads"
-            f" formats {_READABLE[0]} to {_READABLE[-1]}"
+            f"{folder}/policy.json has format {description.get('format')}; this version of cfx"
+            f" reads formats {_READABLE[0]} to {_READABLE[-1]}"
         )
     return description, weights
 

@@ -1,7 +1,8 @@
 """Networks on a grid: what training through the simulation, evaluation and live drivers share.
 
 Shapes: N networks, D drivers of each, L frames of a token, f features of a token, c features of
-conditioning, n tuned parameters, s width of the policy's state. `*batch` are any leading dimensions.
+conditioning, n tuned parameters, s width of the policy's state. `*batch` are any leading
+dimensions.
 """
 
 from __future__ import annotations

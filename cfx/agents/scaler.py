@@ -13,7 +13,7 @@ _LEAST_SCALE = 1e-6
 
 
 class Scaler(nn.Module):
-    """Brings each network's features to mean 0 and standard deviation 1 over its training windows."""
+    """Brings features to mean 0 and standard deviation 1 over each network's training windows."""
 
     def __init__(self, mean: Tensor, scale: Tensor) -> None:
         """Takes `(N, f)` each."""

@@ -1,4 +1,4 @@
-"""The closed loop: an agent chooses parameters, the model drives with them, and the agent sees the result.
+"""The closed loop: an agent chooses parameters, the model drives, the agent sees the result.
 
 From the last measured state before the test part on, the follower is simulated against the measured
 leader. The agent sees the *simulated* follower there, never the measured one. Before that it has
@@ -29,7 +29,8 @@ class ClosedLoop(NamedTuple):
 
     Attributes:
         speed, gap: `(P, K + 1)`.
-        parameters: `(P, K + 1, n)`, what held on the way to each frame (at frame 0: what holds next).
+        parameters: `(P, K + 1, n)`, what held on the way to each frame (at frame 0: what holds
+            next).
         counted: `(P, K + 1)` bool, frames within the recording; frame 0 does not count.
     """
 
@@ -60,8 +61,8 @@ def simulate_closed_loop(
         first: `(P,)`, the frame of the last measured state.
         network: `(P,)`, which of the agent's networks drives each pair.
         base: `(P, n)` in SI units, the drivers' base parameters; None: the agent's own base.
-        history: seconds of measured history before `first` that the agent observes, and in which driver
-            features are measured; None: all there is.
+        history: seconds of measured history before `first` that the agent observes, and in which
+            driver features are measured; None: all there is.
     """
     state = _burnt_in(agent, batch, first, network, base, history, simulator.dt)
     track = _Track(batch, first, agent.windows.length)
@@ -128,7 +129,7 @@ class _Track:
         self._gap = self._leader_position - batch.leader_length[:, None] - self._position
 
     def now(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns the last measured position, speed and acceleration of the followers, `(P,)` each."""
+        """Returns the followers' last measured position, speed and acceleration, `(P,)` each."""
         return (
             self._position[:, self._now],
             self.speed[:, self._now],

@@ -18,24 +18,28 @@ def drive_scenario(options: argparse.Namespace, sumos: Sequence[str]) -> None:
         sumos: SUMO's own options.
 
     Raises:
-        CfxError: whatever `cfx.sumo.drive.drive` raises.
+        CfxError: whatever `cfx.sumo.drive.run_scenario` raises.
     """
     require_sumo()
-    # libsumo does not get on with pyarrow, and pandas loads it where it finds it: this process does without.
-    sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]  # Python's own way to say that a module is not there
+    # libsumo does not get on with pyarrow, and pandas loads it where it finds it: this process does
+    # without.
+    # None is Python's own way to say that a module is not there.
+    sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]
     from cfx.console import console_logging
-    from cfx.sumo.drive import drive, parse_drivers, report
+    from cfx.sumo.drive import parse_drivers, report, run_scenario
 
+    output = None
+    if options.output:
+        output = Path(options.output).expanduser()
     with console_logging():
-        report(
-            drive(
-                Path(options.scenario).expanduser(),
-                parse_drivers(options.drivers),
-                end=options.end,
-                seed=options.seed,
-                output=Path(options.output).expanduser() if options.output else None,
-                look_ahead=options.look_ahead,
-                speed_mode=options.speed_mode,
-                options=sumos,
-            )
+        run = run_scenario(
+            Path(options.scenario).expanduser(),
+            parse_drivers(options.drivers),
+            end=options.end,
+            seed=options.seed,
+            output=output,
+            look_ahead=options.look_ahead,
+            speed_mode=options.speed_mode,
+            options=sumos,
         )
+        report(run)

@@ -1,11 +1,13 @@
-"""`cfx drive`: runs somebody's SUMO scenario with live drivers for some of its vTypes, and says what happened.
+"""`cfx drive`: runs a user's SUMO scenario with live drivers for some of its vTypes.
 
-SUMO runs in this process (libsumo), so nothing here may load pyarrow, with which it does not get on.
+SUMO runs in this process (libsumo), so nothing here may load pyarrow, with which it does not get
+on.
 """
 
 from __future__ import annotations
 
 import csv
+import math
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -28,8 +30,8 @@ class Tally:
     Attributes:
         vehicles: ids of all that were on the road.
         steps: vehicle steps.
-        driven: those of them that the model drove; in the others nobody was ahead.
-        metres: driven by all together.
+        driven: those of them that the model drove; in the others no vehicle was ahead.
+        metres: the distance that all covered together.
         lane_changes: on the same edge.
         hard_brakings: times that a vehicle began to brake harder than its vType's `decel`.
         collisions, teleports: vehicles that SUMO reported; a vehicle may do so more than once.
@@ -46,8 +48,8 @@ class Tally:
 
 
 @dataclass(frozen=True)
-class Driven:
-    """What `drive` reports.
+class ScenarioRun:
+    """What `run_scenario` reports.
 
     Attributes:
         tallies: for each vType that was driven.
@@ -68,10 +70,12 @@ class Driven:
     @property
     def real_time(self) -> float:
         """Simulated seconds per second."""
-        return self.steps * self.dt / self.seconds if self.seconds > 0 else float("inf")
+        if self.seconds <= 0:
+            return float("inf")
+        return self.steps * self.dt / self.seconds
 
 
-def drive(
+def run_scenario(
     scenario: Path,
     runs: Mapping[str, str | Path],
     *,
@@ -81,12 +85,12 @@ def drive(
     look_ahead: float = 200.0,
     speed_mode: int = 0,
     options: Sequence[str] = (),
-) -> Driven:
+) -> ScenarioRun:
     """Runs a scenario in libsumo until it is over.
 
-    It is over when no vehicle is on the road or still to come, at the end that the scenario gives, or at `end`. A vehicle that
-    arrives, teleports, collides or changes lanes ends nothing: it is counted, and goes on with what SUMO makes of it (one that
-    teleported begins anew).
+    It is over when no vehicle is on the road or still to come, at the end that the scenario gives,
+    or at `end`. A vehicle that arrives, teleports, collides or changes lanes ends nothing: it is
+    counted, and goes on with what SUMO makes of it (one that teleported begins anew).
 
     Args:
         scenario: SUMO's configuration (`.sumocfg`).
@@ -98,7 +102,8 @@ def drive(
         options: more of SUMO's own options.
 
     Raises:
-        SumoError: SUMO is missing, refuses the scenario or stops; a vType is not in it or never on the road; the steps differ.
+        SumoError: SUMO is missing, refuses the scenario or stops; a vType is not in it or never on
+            the road; the steps differ.
         DataError: a run has no policy that drives unseen drivers, or the scenario is not there.
         OutputError: the output cannot be written.
     """
@@ -108,15 +113,11 @@ def drive(
             f"{scenario} is not there; name SUMO's configuration of the scenario (.sumocfg)"
         )
     fleet = Fleet.load(runs, look_ahead=look_ahead, speed_mode=speed_mode)
-    os.environ.setdefault(
-        "LIBSUMO_AS_TRACI", "quiet"
-    )  # no word about pyarrow, which is not loaded here
+    # No word about pyarrow, which is not loaded here.
+    os.environ.setdefault("LIBSUMO_AS_TRACI", "quiet")
     import libsumo
 
-    command = ["sumo", "-c", str(scenario)]
-    for name in ("--no-step-log", "--duration-log.disable", "--no-warnings"):
-        command += [name, "true"] * (name not in options)
-    command += ["--seed", str(seed)] * (seed is not None) + list(options)
+    command = _command(scenario, seed, options)
     try:
         libsumo.start(command)
     except libsumo.TraCIException as error:
@@ -135,22 +136,43 @@ def drive(
         libsumo.close()
 
 
+def _command(scenario: Path, seed: int | None, options: Sequence[str]) -> list[str]:
+    """Returns SUMO's command line; the user's own options come last and win."""
+    command = ["sumo", "-c", str(scenario)]
+    for name in ("--no-step-log", "--duration-log.disable", "--no-warnings"):
+        if name not in options:
+            command += [name, "true"]
+    if seed is not None:
+        command += ["--seed", str(seed)]
+    return command + list(options)
+
+
 def _reason(error: Exception) -> str:
     """Returns SUMO's words on one line; some of them it prints on stderr alone."""
     said = " ".join(str(error).split()).rstrip(".")
-    return "its own message stands above" if said in {"", "Process Error"} else said
+    if said in {"", "Process Error"}:
+        return "its own message stands above"
+    return said
 
 
 class _Run:
     """One run of a scenario."""
 
     def __init__(self, sumo: Any, fleet: Fleet, scenario: Path, rows: _Rows | None) -> None:
-        self._sumo, self._fleet, self._scenario, self._rows = sumo, fleet, scenario, rows
+        self._sumo = sumo
+        self._fleet = fleet
+        self._scenario = scenario
+        self._rows = rows
         self._tallies = {name: Tally() for name in fleet.drivers}
         self._type_of: dict[str, str] = {}
         self._lanes: dict[str, tuple[str, int]] = {}
         self._braking: set[str] = set()
-        self._decel = {name: float(sumo.vehicletype.getDecel(name)) for name in self._checked()}
+        self._decel: dict[str, float] = {}
+        self._steps = 0
+        self._others = 0
+        self._most = 0
+        for name in self._checked():
+            self._decel[name] = float(sumo.vehicletype.getDecel(name))
 
     def _checked(self) -> Sequence[str]:
         """Returns the vTypes, all of which are in the scenario."""
@@ -159,69 +181,86 @@ class _Run:
             if name not in known:
                 own = [one for one in known if not one.startswith("DEFAULT_")]
                 raise SumoError(
-                    f"{self._scenario} has no vType '{name}'.{nearest(name, own)} It has: {', '.join(own) or 'none of its own'}."
-                    " (A vTypeDistribution has members: name them. A vType must stand ahead of the first vehicle.)"
+                    f"{self._scenario} has no vType '{name}'.{nearest(name, own)} It has:"
+                    f" {', '.join(own) or 'none of its own'}. (A vTypeDistribution has members:"
+                    " name them. A vType must stand ahead of the first vehicle.)"
                 )
         return list(self._fleet.drivers)
 
-    def go(self, end: float | None) -> Driven:
-        """Drives to the end."""
+    def go(self, end: float | None) -> ScenarioRun:
+        """Runs the scenario to its end."""
         simulation = self._sumo.simulation
-        dt, start = simulation.getDeltaT(), simulation.getTime()
-        given = simulation.getEndTime()
-        last = min(
-            [one for one in (end, given if given >= 0 else None) if one is not None], default=None
-        )
-        total = max(0, round((last - start) / dt)) if last is not None else 0
-        steps = others = most = 0
+        dt = simulation.getDeltaT()
+        last = self._last(end)
+        total = 0
+        if last < math.inf:
+            total = max(0, round((last - simulation.getTime()) / dt))
         began = time.perf_counter()
         with Task(f"Driving {self._scenario.name}", total) as task:
-            while simulation.getMinExpectedNumber() > 0 and (
-                last is None or simulation.getTime() < last - 1e-9
-            ):
+            while simulation.getMinExpectedNumber() > 0 and simulation.getTime() < last - 1e-9:
                 self._sumo.simulationStep()
                 self._fleet.step(self._sumo)
-                steps += 1
-                self._type_of |= self._fleet.vehicles
-                self._count()
-                if self._rows is not None:
-                    self._rows.write(self._sumo, self._fleet)
-                own = len(self._fleet.vehicles)
-                others, most = max(others, self._sumo.vehicle.getIDCount() - own), max(most, own)
+                self._after_step(dt)
                 task.advance()
         seconds = time.perf_counter() - began
-        never = [name for name, tally in self._tallies.items() if not tally.vehicles]
-        if never:
-            raise SumoError(
-                f"no vehicle of vType '{never[0]}' was ever on the road in {self._scenario} ({steps * dt:g} s); give it a flow,"
-                " or a later --end"
-            )
-        return Driven(self._tallies, steps, dt, seconds, others, most)
+        for name, tally in self._tallies.items():
+            if not tally.vehicles:
+                raise SumoError(
+                    f"no vehicle of vType '{name}' was ever on the road in {self._scenario}"
+                    f" ({self._steps * dt:g} s); give it a flow, or a later --end"
+                )
+        return ScenarioRun(self._tallies, self._steps, dt, seconds, self._others, self._most)
 
-    def _count(self) -> None:
-        """Notes what the last step did to the fleet's vehicles."""
-        vehicle, dt = self._sumo.vehicle, self._sumo.simulation.getDeltaT()
-        for name, kind in self._fleet.vehicles.items():
-            tally = self._tallies[kind]
-            tally.vehicles.add(name)
-            tally.steps += 1
-            tally.driven += self._fleet.drivers[kind].drives(name)
-            tally.metres += vehicle.getSpeed(name) * dt
-            lane = vehicle.getRoadID(name), vehicle.getLaneIndex(name)
-            before = self._lanes.get(name, lane)
-            tally.lane_changes += before[0] == lane[0] and before[1] != lane[1]
-            self._lanes[name] = lane
-            hard = vehicle.getAcceleration(name) < -self._decel[kind] - 1e-6
-            tally.hard_brakings += hard and name not in self._braking
-            (self._braking.add if hard else self._braking.discard)(name)
-        for counted, names in (
-            ("collisions", self._sumo.simulation.getCollidingVehiclesIDList()),
-            ("teleports", self._sumo.simulation.getStartingTeleportIDList()),
-        ):
-            for name in names:
-                if name in self._type_of:
-                    tally = self._tallies[self._type_of[name]]
-                    setattr(tally, counted, getattr(tally, counted) + 1)
+    def _last(self, end: float | None) -> float:
+        """Returns the simulated time at which the run ends at the latest, s."""
+        last = math.inf
+        if end is not None:
+            last = end
+        given = self._sumo.simulation.getEndTime()
+        if given >= 0:
+            last = min(last, given)
+        return last
+
+    def _after_step(self, dt: float) -> None:
+        """Notes what the last step did, and writes it down."""
+        self._steps += 1
+        vehicles = self._fleet.vehicles
+        self._type_of |= vehicles
+        for name, kind in vehicles.items():
+            self._count(name, kind, dt)
+        self._count_events()
+        if self._rows is not None:
+            self._rows.write(self._sumo, self._fleet)
+        self._others = max(self._others, self._sumo.vehicle.getIDCount() - len(vehicles))
+        self._most = max(self._most, len(vehicles))
+
+    def _count(self, name: str, kind: str, dt: float) -> None:
+        """Notes what the last step did to a vehicle of the fleet."""
+        vehicle, tally = self._sumo.vehicle, self._tallies[kind]
+        tally.vehicles.add(name)
+        tally.steps += 1
+        tally.metres += vehicle.getSpeed(name) * dt
+        if self._fleet.drivers[kind].drives(name):
+            tally.driven += 1
+        lane = vehicle.getRoadID(name), vehicle.getLaneIndex(name)
+        before = self._lanes.get(name, lane)
+        if before[0] == lane[0] and before[1] != lane[1]:
+            tally.lane_changes += 1
+        self._lanes[name] = lane
+        if vehicle.getAcceleration(name) >= -self._decel[kind] - 1e-6:
+            self._braking.discard(name)
+        elif name not in self._braking:
+            self._braking.add(name)
+            tally.hard_brakings += 1
+
+    def _count_events(self) -> None:
+        """Notes which vehicles SUMO reports as collided or teleported."""
+        for name in self._sumo.simulation.getCollidingVehiclesIDList():
+            if name in self._type_of:
+                self._tallies[self._type_of[name]].collisions += 1
+        for name in self._sumo.simulation.getStartingTeleportIDList():
+            if name in self._type_of:
+                self._tallies[self._type_of[name]].teleports += 1
 
 
 class _Rows:
@@ -258,31 +297,28 @@ class _Rows:
             raise OutputError(
                 f"{path} cannot be written ({error.strerror}); name another --output"
             ) from error
-        names = dict.fromkeys(
-            name for driver in fleet.drivers.values() for name in driver.policy.space.names
-        )
+        names: dict[str, None] = {}
+        for driver in fleet.drivers.values():
+            names |= dict.fromkeys(driver.policy.space.names)
         return cls(file, list(names))
 
     def write(self, sumo: Any, fleet: Fleet) -> None:
-        """Writes where everybody of the fleet is, and with which parameters he drives on."""
-        now, vehicle = f"{sumo.simulation.getTime():.10g}", sumo.vehicle
+        """Writes where the fleet's vehicles are, and the parameters with which they drive on."""
         for name, kind in fleet.vehicles.items():
-            x, y = vehicle.getPosition(name)
-            chosen = fleet.drivers[kind].parameters(name)
-            signals = (
-                vehicle.getLanePosition(name),
-                x,
-                y,
-                vehicle.getSpeed(name),
-                vehicle.getAcceleration(name),
-            )
-            self._writer.writerow(
-                [
-                    *(now, name, kind, vehicle.getRoadID(name), vehicle.getLaneIndex(name)),
-                    *(f"{value:.6g}" for value in signals),
-                    *(f"{chosen[one]:.6g}" if one in chosen else "" for one in self._parameters),
-                ]
-            )
+            self._writer.writerow(self._row(sumo, name, kind, fleet.drivers[kind].parameters(name)))
+
+    def _row(self, sumo: Any, name: str, kind: str, parameters: Mapping[str, float]) -> list[str]:
+        vehicle = sumo.vehicle
+        lane = [vehicle.getRoadID(name), str(vehicle.getLaneIndex(name))]
+        x, y = vehicle.getPosition(name)
+        speed, acceleration = vehicle.getSpeed(name), vehicle.getAcceleration(name)
+        row = [f"{sumo.simulation.getTime():.10g}", name, kind, *lane]
+        for value in (vehicle.getLanePosition(name), x, y, speed, acceleration):
+            row.append(f"{value:.6g}")
+        for parameter in self._parameters:
+            value = parameters.get(parameter)
+            row.append("" if value is None else f"{value:.6g}")
+        return row
 
 
 def parse_drivers(given: Sequence[str]) -> dict[str, str]:
@@ -296,7 +332,8 @@ def parse_drivers(given: Sequence[str]) -> dict[str, str]:
         name, equals, run = one.partition("=")
         if not (name and equals and run):
             raise ConfigError(
-                f"--drivers {one}: write TYPE=RUN, a vType of the scenario and a job's output folder"
+                f"--drivers {one}: write TYPE=RUN, a vType of the scenario and a job's output"
+                " folder"
             )
         if name in runs:
             raise ConfigError(f"--drivers: vType '{name}' stands twice")
@@ -304,7 +341,7 @@ def parse_drivers(given: Sequence[str]) -> dict[str, str]:
     return runs
 
 
-def report(driven: Driven) -> None:
+def report(run: ScenarioRun) -> None:
     """Prints what happened: one table, and one line about speed."""
     from cfx.console import blank_table, put
 
@@ -321,14 +358,19 @@ def report(driven: Driven) -> None:
     table = blank_table(*columns)
     for column in table.columns[1:]:
         column.justify = "right"
-    for name, tally in driven.tallies.items():
-        share, speed = tally.driven / tally.steps, tally.metres / (tally.steps * driven.dt)
-        counts = (tally.lane_changes, tally.hard_brakings, tally.collisions, tally.teleports)
+    for name, tally in run.tallies.items():
         table.add_row(
-            name, str(len(tally.vehicles)), f"{share:.0%}", f"{speed:.2f}", *map(str, counts)
+            name,
+            str(len(tally.vehicles)),
+            f"{tally.driven / tally.steps:.0%}",
+            f"{tally.metres / (tally.steps * run.dt):.2f}",
+            str(tally.lane_changes),
+            str(tally.hard_brakings),
+            str(tally.collisions),
+            str(tally.teleports),
         )
     put(table)
     print(
-        f"{driven.steps} steps of {driven.dt:g} s in {driven.seconds:.1f} s, {driven.real_time:.1f} times real time; at most"
-        f" {driven.most} of these vehicles at once, {driven.others} others"
+        f"{run.steps} steps of {run.dt:g} s in {run.seconds:.1f} s, {run.real_time:.1f} times real"
+        f" time; at most {run.most} of these vehicles at once, {run.others} others"
     )

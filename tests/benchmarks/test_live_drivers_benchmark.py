@@ -25,8 +25,8 @@ SCRIPT = """
 import json, sys
 sys.modules["pyarrow"] = None
 from pathlib import Path
-from cfx.sumo.drive import drive
-driven = drive(Path("motorway.sumocfg"), {"calm": "krauss", "hasty": "w99"}, end=float(sys.argv[1]))
+from cfx.sumo.drive import run_scenario
+driven = run_scenario(Path("motorway.sumocfg"), {"calm": "krauss", "hasty": "w99"}, end=float(sys.argv[1]))
 share = sum(tally.driven for tally in driven.tallies.values()) / sum(tally.steps for tally in driven.tallies.values())
 print(json.dumps([driven.steps, driven.seconds, driven.real_time, driven.most, share]))
 """

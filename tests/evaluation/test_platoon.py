@@ -14,7 +14,7 @@ from cfx.evaluation.platoon import (
     LENGTH,
     VEHICLES,
     Manoeuvre,
-    drive_platoons,
+    simulate_platoons,
     measure_platoons,
     slowing,
 )
@@ -113,7 +113,7 @@ def test_each_vehicle_drives_as_it_would_alone_behind_the_one_before() -> None:
     policy = adaptive(
         model, GruPolicy(start="middle", inputs=("leader_speed", "follower_speed", "gap")), 2, 15
     )
-    ((speed, gap),) = drive_platoons(model, [policy], short)
+    ((speed, gap),) = simulate_platoons(model, [policy], short)
     frames = speed.shape[-1]
     for vehicle in (1, 7, VEHICLES):
         ahead, own = speed[vehicle - 1], speed[vehicle]
@@ -143,9 +143,9 @@ def test_each_vehicle_drives_as_it_would_alone_behind_the_one_before() -> None:
 def test_platoons_of_several_methods_do_not_touch_each_other() -> None:
     model, short = Linear(), Manoeuvre(settle=5, after=5, hold=2)
     one, other = (constant(model, torch.tensor([values]).double()) for values in (STABLE, UNSTABLE))
-    together = drive_platoons(model, [one, other], short)
+    together = simulate_platoons(model, [one, other], short)
     for (speed, _), policy in zip(together, (one, other), strict=True):
-        ((alone, _),) = drive_platoons(model, [policy], short)
+        ((alone, _),) = simulate_platoons(model, [policy], short)
         assert torch.equal(speed, alone)
 
 

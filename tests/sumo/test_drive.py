@@ -15,7 +15,7 @@ from cfx import cli
 from cfx.agents import checkpoint
 from cfx.console import ConsoleHandler
 from cfx.errors import ConfigError
-from cfx.sumo.drive import Driven, Tally, parse_drivers, report
+from cfx.sumo.drive import ScenarioRun, Tally, parse_drivers, report
 from cfx.sumo.motorway import SHIPPED
 from tests.sumo.policies import adaptive
 
@@ -116,16 +116,16 @@ def test_what_cannot_be_driven_is_one_sentence_and_leaves_no_file(scenario: Path
         import json
         from pathlib import Path
         from cfx.errors import CfxError
-        from cfx.sumo.drive import drive
+        from cfx.sumo.drive import run_scenario
         said = []
         for name, kinds in (("motorway", ["clam"]), ("motorway", ["calm", "ghost"]), ("slow", ["calm"]), ("lost", ["calm"]),
                             ("torn", ["calm"])):
             try:
-                drive(Path(name + ".sumocfg"), {kind: "calm" for kind in kinds}, output=Path("never.csv"), end=2.0)
+                run_scenario(Path(name + ".sumocfg"), {kind: "calm" for kind in kinds}, output=Path("never.csv"), end=2.0)
             except CfxError as error:
                 said.append(str(error))
         # And the process still drives afterwards.
-        driven = drive(Path("motorway.sumocfg"), {"calm": "calm"}, end=2.0)
+        driven = run_scenario(Path("motorway.sumocfg"), {"calm": "calm"}, end=2.0)
         print(json.dumps([said, driven.steps, "pyarrow.lib" in sys.modules]))
         """,
         scenario,
@@ -240,7 +240,7 @@ def test_the_table_says_it_all(capsys: pytest.CaptureFixture[str]) -> None:
         collisions=1,
         teleports=4,
     )
-    report(Driven({"calm": tally}, steps=100, dt=0.1, seconds=2.0, others=5, most=2))
+    report(ScenarioRun({"calm": tally}, steps=100, dt=0.1, seconds=2.0, others=5, most=2))
     out = capsys.readouterr().out
     assert next(line for line in out.splitlines() if "calm" in line).split() == [
         "calm",

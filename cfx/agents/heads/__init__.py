@@ -1,4 +1,7 @@
-"""Parameter heads: how answers of networks become parameters. A new head is a file here and a line below."""
+"""Parameter heads: how answers of networks become parameters.
+
+A new head is a file here and a line below.
+"""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """The offset head: answers are offsets from base parameters.
 
 A network that answers offsets starts, for each driver, from parameters that already fit them: the
-driver-specific set, or the pooled one. Its answer in unit space, where 1/2 means no offset, is added
-to the base in the squashed space (on logits). So an untrained network *is* the base, and no answer
-leaves the bounds.
+driver-specific set, or the pooled one. Its answer in unit space, where 1/2 means no offset, is
+added to the base in the squashed space (on logits). So an untrained network *is* the base, and no
+answer leaves the bounds.
 
 Shapes: `*batch` any leading dimensions, n tuned parameters.
 """
@@ -30,9 +30,9 @@ _SMALLEST = 1e-6
 """Answers within this of 0 or 1 count as being that far away, so that their logits are finite."""
 
 _GAIN = 3.0
-"""Factor on an answer's logit. Networks begin with small outputs, and models with parameters far from
-the middle of their bounds (Wiedemann 99) need large offsets: without the factor they train three times
-as long to reach them."""
+"""Factor on an answer's logit. Networks begin with small outputs, and models with parameters far
+from the middle of their bounds (Wiedemann 99) need large offsets: without the factor they train
+three times as long to reach them."""
 
 
 class OffsetHead(ParameterHead):
@@ -81,9 +81,9 @@ def shrunk(space: ParameterSpace, parameters: Tensor, shrinkage: float) -> Tenso
     """Shrinks driver-specific parameters towards the model's default in the squashed space.
 
     Ten parameters fitted to one minute of driving hold much that is chance. As a starting point for
-    offsets they do better when they are shrunk towards what is known beforehand, as estimates of many
-    small groups do (W. James and C. Stein, 1961, *Estimation with quadratic loss*, Proc. 4th Berkeley
-    Symposium).
+    offsets they do better when they are shrunk towards what is known beforehand, as estimates of
+    many small groups do (W. James and C. Stein, 1961, *Estimation with quadratic loss*, Proc. 4th
+    Berkeley Symposium).
 
     Args:
         space: the model's parameters.
@@ -104,7 +104,8 @@ def shrunk(space: ParameterSpace, parameters: Tensor, shrinkage: float) -> Tenso
 def moved(base: Tensor, answer: Tensor, adaptable: Tensor | None = None) -> Tensor:
     """Returns the base moved by an answer; exactly the base where the answer is 1/2.
 
-    A base within 0.5 % of a bound is moved as if it were that far from it, and the difference is kept.
+    A base within 0.5 % of a bound is moved as if it were that far from it, and the difference is
+    kept.
 
     Args:
         base: where offsets start, `(*batch, n)` in unit space.
