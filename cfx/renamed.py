@@ -318,6 +318,12 @@ def attribute(owner: type, name: str) -> str | None:
     return new
 
 
+def argument(old: str, new: str) -> None:
+    """Warns that a function's argument has a new name."""
+    text = f"the argument {old} is now called {new}; {_GONE}"
+    warnings.warn(text, DeprecationWarning, stacklevel=3)
+
+
 # ---- helpers
 
 

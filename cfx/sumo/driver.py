@@ -1,10 +1,13 @@
-"""Live drivers: a trained policy drives vehicles of somebody else's SUMO simulation, through TraCI or libsumo.
+"""Live drivers: a trained policy drives vehicles of a user's SUMO simulation.
 
-W99's parameters cannot be changed in SUMO while a vehicle drives. So cfx computes each vehicle's next speed with its own model,
-which is SUMO's model, and tells SUMO that speed: what SUMO then drives is exact. All vehicles of a step are one batch, through
-one call of the policy and one call of the model.
+The simulation is reached through TraCI or libsumo.
 
-Shapes: D vehicles, n tuned parameters, m width of the model's memory, s width of the policy's state, L frames of a token.
+W99's parameters cannot be changed in SUMO while a vehicle drives. So cfx computes each vehicle's
+next speed with its own model, which is SUMO's model, and gives SUMO that speed: what SUMO then
+drives is exact. All vehicles of a step are one batch, through one call of the policy and one call
+of the model.
+
+Shapes: D vehicles, n tuned parameters, L frames of a token.
 """
 
 from __future__ import annotations
@@ -12,14 +15,13 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import cast
 
 import torch
 from torch import Tensor
 
-from cfx import registry
+from cfx import registry, renamed
 from cfx.agents import checkpoint
 from cfx.agents.agent import Agent, AgentState
 from cfx.agents.context import DriverContext
@@ -35,29 +37,9 @@ from cfx.policies.features import History
 from cfx.policies.fixed import FixedPolicy
 from cfx.simulation.step import advance_vehicle
 from cfx.simulation.threads import one_thread
+from cfx.sumo.surroundings import Connection, Seen, look
+from cfx.sumo.vehicles import VehicleTable
 from cfx.tracking.store import folder_of
-
-Connection = Any
-"""The module `libsumo`, the module `traci`, or a connection that `traci.getConnection` gives."""
-
-
-class Seen(NamedTuple):
-    """What D vehicles and their leaders do at one instant; `(D,)` each, SI units.
-
-    Attributes:
-        speed, acceleration: the follower's.
-        gap: bumper to bumper.
-        leader_speed, leader_acceleration, leader_length: of the vehicle ahead.
-        allowed: the speed limit that holds for the follower.
-    """
-
-    speed: Tensor
-    acceleration: Tensor
-    gap: Tensor
-    leader_speed: Tensor
-    leader_acceleration: Tensor
-    leader_length: Tensor
-    allowed: Tensor
 
 
 class Driver:
@@ -67,19 +49,23 @@ class Driver:
         connection.simulationStep()
         driver.step(connection, vehicle_ids)
 
-    Life cycle of a vehicle: it is driven from the first `step` that names it and finds a leader. The policy sees the last L
-    frames of that vehicle and whoever was ahead of it, the first frame standing for those before, and chooses parameters every
-    `windows.stride` steps *of that vehicle*; vehicles whose turn it is are one batch. That is the closed loop in which cfx
-    evaluates a policy, to the last bits. A vehicle that was not stepped one time step ago, or had no leader, begins anew.
+    Life cycle of a vehicle: it is driven from the first `step` that names it and finds a leader.
+    The policy sees the last L frames of that vehicle and of its leader, the first frame standing
+    for those before, and chooses parameters every `windows.stride` steps *of that vehicle*.
+    Vehicles whose window begins are one batch. That is the closed loop in which cfx evaluates a
+    policy, to the last bits. A vehicle that was not stepped one time step ago, or had no leader,
+    begins anew.
 
-    No leader within `look_ahead`: SUMO's own model drives the vehicle (the vType's `carFollowModel`, to the lane's limit), since
-    a car-following policy has never seen a free road. A change of leader begins nothing: the policy sees the new one from then.
+    Without a leader within `look_ahead`, SUMO's own model drives the vehicle (the vType's
+    `carFollowModel`, to the lane's limit), since a car-following policy has never seen a free road.
+    After a change of leader the vehicle goes on: the policy sees the new leader from then on.
 
-    The lane's limit and the vehicle's `maxSpeed` hold as they do around SUMO's own models. With the default `speed_mode` 0
-    nothing else of SUMO's changes the speed, so junctions, red lights and stops are not obeyed behind a leader: exact, and meant
-    for motorways. `speed_mode=31` lets SUMO's checks bound the speed, its own safe gap among them. Lane changes are SUMO's.
+    The lane's limit and the vehicle's `maxSpeed` hold as they do around SUMO's own models. With the
+    default `speed_mode` 0 nothing else of SUMO's changes the speed, so junctions, red lights and
+    stops are not obeyed behind a leader: exact, and meant for motorways. `speed_mode=31` lets
+    SUMO's checks bound the speed, its own safe gap among them. Lane changes are SUMO's.
 
-    A driver holds the state of one simulation; use another for another.
+    A driver holds the state of one simulation; make another for another simulation.
     """
 
     def __init__(
@@ -96,14 +82,16 @@ class Driver:
 
         Args:
             policy: chooses parameters.
-            network: which of its networks drives vehicles that `assign` does not name; None: `assign` must name each.
+            network: which of its networks drives vehicles that `assign` does not name; None:
+                `assign` must name each.
             look_ahead: m; a vehicle farther ahead (bumper to bumper) is no leader.
             speed_mode: SUMO's bit set of `vehicle.setSpeedMode` while a vehicle is driven.
             model: the driving model; None for the one that the policy was trained for.
             source: where the policy comes from, for messages.
 
         Raises:
-            DataError: the policy has no such network, or its driving model has no equations but in SUMO.
+            DataError: the policy has no such network, or its driving model has equations in SUMO
+                only.
         """
         self.policy = policy
         self.look_ahead = look_ahead
@@ -112,17 +100,20 @@ class Driver:
         self.model = model or cast(DrivingModel, registry.create("model", policy.model_node))
         if self.model.needs_simulator:
             raise DataError(
-                f"{source} chooses parameters of model={policy.model_node['name']}, which SUMO alone drives: nobody can change"
-                " them on the way; a live driver needs a model that cfx has, such as krauss or w99"
+                f"{source} chooses parameters of model={policy.model_node['name']}, which SUMO"
+                " alone drives: they cannot be changed on the way; a live driver needs a model that"
+                " cfx has, such as krauss or w99"
             )
-        self._network = None if network is None else self._number(network)
+        self._network = None
+        if network is not None:
+            self._network = self._number(network)
         self._assigned: dict[str, int] = {}
         self._bases: dict[str, list[float]] = {}
         self._driver_features: dict[str, list[float]] = {}
         self._speed_modes: dict[str, int] = {}
         self._slots: dict[str, int] = {}
         self._free: list[int] = []
-        self._store = _Store.of(policy, self.model, 0)
+        self._store = VehicleTable.empty(policy, self.model, 0)
         self._swept = math.nan
 
     @classmethod
@@ -139,19 +130,22 @@ class Driver:
 
         Args:
             run: a job's output folder (or its `policy` folder), or the id of its MLflow run.
-            network: which of the policy's networks drives: `all`, which drives anybody, or the id of a pair, to drive like him.
+            network: which of the policy's networks drives: `all`, which drives anybody, or the id
+                of a pair, to drive like its driver.
             model: refuse a policy of another driving model than this.
             look_ahead: m; a vehicle farther ahead is no leader.
             speed_mode: SUMO's bit set of `vehicle.setSpeedMode` while a vehicle is driven.
 
         Raises:
-            DataError: there is no such policy, it has no such network, or it is one of another model.
+            DataError: there is no such policy, it has no such network, or it is one of another
+                model.
         """
-        policy = _trained(run)
+        policy = _load_policy(run)
         name = policy.model_node["name"]
         if model is not None and name != model:
             raise DataError(
-                f"{run} was trained for model={name}, not for model={model}; name a run with model={model}"
+                f"{run} was trained for model={name}, not for model={model}; name a run with"
+                f" model={model}"
             )
         return cls(
             policy, network=network, look_ahead=look_ahead, speed_mode=speed_mode, source=str(run)
@@ -167,7 +161,7 @@ class Driver:
         look_ahead: float = 200.0,
         speed_mode: int = 0,
     ) -> Driver:
-        """Makes a driver who keeps the same parameters: what a policy is compared with.
+        """Makes a driver with constant parameters: what a policy is compared with.
 
         Args:
             model: the driving model.
@@ -217,45 +211,60 @@ class Driver:
         *,
         base: Mapping[str, float] | None = None,
         driver_features: Mapping[str, float] | None = None,
+        traits: Mapping[str, float] | None = None,
     ) -> None:
         """Says how a vehicle is driven from when it begins.
 
         Args:
             vehicle: its id.
             network: which of the policy's networks drives it; None for this driver's.
-            base: a driver's own parameters, name -> SI value, that a policy of offsets (`learner=rollout`) starts from, drawn
-                towards the default as in training; None: what it has for unseen drivers. Policies that answer parameters themselves
-                have no use for it.
-            driver features: a driver's driver features, name -> value, where the policy was trained to know some (`policy.driver_features`;
-                `Agent.traits_of` measures them); None: those of an unseen driver. What a vehicle does while it is watched
-                changes nothing of them.
+            base: calibrated parameters of a driver, name -> SI value, from which the offsets of a
+                policy of offsets (`learner=rollout`) start, shrunk towards the default as in
+                training;
+                None: the policy's base for unseen drivers. Policies that answer parameters
+                    themselves
+                ignore it.
+            driver_features: name -> value, where the policy was trained to read some
+                (`policy.driver_features`; `Agent.driver_features_of` measures them); None: those of
+                an unseen driver. What a vehicle does while it is watched does not change them.
+            traits: the earlier name of `driver_features`.
 
         Raises:
             DataError: the policy has no such network.
-            ParameterError: `base` is not a value for each tuned parameter, or `driver features` not one for each driver feature of the policy.
+            ParameterError: `base` is not a value for each tuned parameter, or `driver_features` not
+                one for each driver feature of the policy.
         """
+        if traits is not None:
+            renamed.argument("traits", "driver_features")
+            driver_features = traits
         if network is not None:
             self._assigned[vehicle] = self._number(network)
         if base is not None:
-            if set(base) != set(self.policy.space.names):
-                raise ParameterError(
-                    f"base: give a value for each of {', '.join(self.policy.space.names)}, and nothing else"
-                )
-            own = torch.tensor(
-                [[base[name] for name in self.policy.space.names]], dtype=torch.float64
-            )
-            self._bases[vehicle] = self.policy.base_of(own)[0].tolist()
+            self._bases[vehicle] = self._shrunk_base(base)
         if driver_features is not None:
-            known = self.policy.policy.driver_features
-            if not known:
-                raise ParameterError(
-                    "driver features: there are none that this policy was trained to know; leave them out"
-                )
-            if set(driver_features) != set(known):
-                raise ParameterError(
-                    f"driver features: give a value for each of {', '.join(known)}, and nothing else"
-                )
-            self._driver_features[vehicle] = [driver_features[name] for name in known]
+            self._driver_features[vehicle] = self._ordered_features(driver_features)
+
+    def _shrunk_base(self, base: Mapping[str, float]) -> list[float]:
+        names = self.policy.space.names
+        if set(base) != set(names):
+            raise ParameterError(
+                f"base: give a value for each of {', '.join(names)}, and nothing else"
+            )
+        own = torch.tensor([[base[name] for name in names]], dtype=torch.float64)
+        shrunk: list[float] = self.policy.base_of(own)[0].tolist()
+        return shrunk
+
+    def _ordered_features(self, driver_features: Mapping[str, float]) -> list[float]:
+        known = self.policy.core.driver_features
+        if not known:
+            raise ParameterError(
+                "driver_features: this policy was trained to read none; leave them out"
+            )
+        if set(driver_features) != set(known):
+            raise ParameterError(
+                f"driver_features: give a value for each of {', '.join(known)}, and nothing else"
+            )
+        return [driver_features[name] for name in known]
 
     def renew(self, vehicle: str) -> None:
         """Lets the policy's memory of a vehicle begin anew; the frames of its last window stay."""
@@ -265,62 +274,67 @@ class Driver:
             self._store.state[slot] = begun.state[begun.network, begun.place][0]
 
     def drives(self, vehicle: str) -> bool:
-        """Says whether the model drives a vehicle now; it does not where nobody is ahead, or the vehicle is only watched."""
+        """Says whether the model drives a vehicle now; a watched vehicle is not driven."""
         return vehicle in self._speed_modes
 
     def parameters(self, vehicle: str) -> dict[str, float]:
-        """Returns the parameters with which a vehicle drives now, SI units; empty if no leader is ahead of it."""
+        """Returns the parameters of a vehicle now, SI units; empty if it has no leader."""
         slot = self._slots.get(vehicle)
-        return (
-            {}
-            if slot is None
-            else dict(
-                zip(self.policy.space.names, self._store.parameters[slot].tolist(), strict=True)
-            )
-        )
+        if slot is None:
+            return {}
+        values = self._store.parameters[slot].tolist()
+        return dict(zip(self.policy.space.names, values, strict=True))
 
     @torch.no_grad()
     @one_thread()
     def step(
         self, connection: Connection, vehicles: str | Iterable[str], *, drive: bool = True
     ) -> None:
-        """Sets the speeds that vehicles will drive in the next `simulationStep`; call it after each.
+        """Sets the speeds of vehicles in the next `simulationStep`; call it after each.
 
         Args:
             connection: `libsumo`, `traci` or one of its connections.
             vehicles: one id or many.
-            drive: False only watches, so that the policy knows the history of a vehicle when it takes over from somebody else.
+            drive: False only watches, so that the policy knows the history of a vehicle when it
+                takes over from another driver.
 
         Raises:
-            SumoError: a vehicle is not in the simulation, or the simulation's step is not the policy's.
+            SumoError: a vehicle is not in the simulation, or the simulation's step is not the
+                policy's.
         """
         names = [vehicles] if isinstance(vehicles, str) else list(vehicles)
         now = connection.simulation.getTime()
         self._check_step(connection)
         self._forget_gone(connection, names, now)
-        times = self._store.time.tolist()
-        names = [
-            name for name in names if name not in self._slots or times[self._slots[name]] != now
-        ]  # once an instant
-        following, seen = self._look(connection, names)
+        following, seen, alone = look(connection, self._not_yet(names, now), self.look_ahead)
+        for name in alone:
+            self.release(connection, name)
         if not following:
             return
         slots = torch.tensor([self._slot(name) for name in following])
+        self._remember(slots, following, seen, now)
+        if drive:
+            self._take_over(connection, following, slots)
         store = self._store
-        for index in (
-            self._remember(slots, following, seen, now, drive=drive).nonzero().flatten().tolist()
-        ):
-            self._take_over(connection, following[index], int(slots[index]))
         self._choose(slots[store.steps[slots] % self.policy.windows.stride == 0])
         store.steps[slots] += 1
         if drive:
-            for name, speed in zip(
-                following, self._speeds(connection, following, slots, seen).tolist(), strict=True
-            ):
+            speeds = self._speeds(connection, following, slots, seen).tolist()
+            for name, speed in zip(following, speeds, strict=True):
                 connection.vehicle.setSpeed(name, speed)
 
+    def _not_yet(self, names: list[str], now: float) -> list[str]:
+        """Returns the vehicles that were not stepped at this instant before."""
+        times = self._store.time.tolist()
+        wanted = []
+        for name in names:
+            slot = self._slots.get(name)
+            if slot is None or times[slot] != now:
+                wanted.append(name)
+        return wanted
+
     def forget(self, vehicle: str) -> None:
-        """Drops all that is known of a vehicle; SUMO keeps the last speed that it was told."""
+        """Drops all that is known of a vehicle; SUMO keeps the last speed that it was given."""
         self._speed_modes.pop(vehicle, None)
         slot = self._slots.pop(vehicle, None)
         if slot is not None:
@@ -341,19 +355,22 @@ class Driver:
             return 0
         if network == ALL:
             raise DataError(
-                f"{self.source} has {len(names)} networks, each for one driver ({names[0]}, ...), and none for unseen drivers; train"
-                " with protocol.networks=all or protocol=across_drivers, or name one of them: Driver.load(..., network=...)"
+                f"{self.source} has {len(names)} networks, each for one driver ({names[0]}, ...),"
+                " and none for unseen drivers; train with protocol.networks=all or"
+                " protocol=across_drivers, or name one of them: Driver.load(..., network=...)"
             )
-        raise DataError(
-            f"{self.source} has no network '{network}'; it has {', '.join(names[:5])}{', ...' if len(names) > 5 else ''}"
-        )
+        listed = ", ".join(names[:5])
+        if len(names) > 5:
+            listed += ", ..."
+        raise DataError(f"{self.source} has no network '{network}'; it has {listed}")
 
-    def _drives(self, vehicle: str) -> int:
+    def _network_of(self, vehicle: str) -> int:
         """Returns the number of the network that drives a vehicle."""
         number = self._assigned.get(vehicle, self._network)
         if number is None:
             raise DataError(
-                f"no network of {self.source} was assigned to vehicle '{vehicle}'; call assign(vehicle, network) first"
+                f"no network of {self.source} was assigned to vehicle '{vehicle}'; call"
+                " assign(vehicle, network) first"
             )
         return number
 
@@ -361,109 +378,56 @@ class Driver:
         dt = connection.simulation.getDeltaT()
         if abs(dt - self.policy.dt) > 1e-6:
             raise SumoError(
-                f"the simulation steps by {dt:g} s, the policy of {self.source} was trained at {self.policy.dt:g} s; start SUMO"
-                f" with --step-length {self.policy.dt:g}"
+                f"the simulation steps by {dt:g} s, the policy of {self.source} was trained at"
+                f" {self.policy.dt:g} s; start SUMO with --step-length {self.policy.dt:g}"
             )
 
     def _forget_gone(self, connection: Connection, names: list[str], now: float) -> None:
-        """Drops vehicles that have left, once an instant and only if those that are asked for leave some unaccounted for."""
-        if self._swept != now and not self._slots.keys() <= set(names):
-            self._swept = now
-            for gone in self._slots.keys() - set(connection.vehicle.getIDList()):
-                self.forget(gone)
-                self._assigned.pop(gone, None)
-                self._bases.pop(gone, None)
-                self._driver_features.pop(gone, None)
+        """Drops vehicles that have left.
 
-    def _look(self, connection: Connection, names: list[str]) -> tuple[list[str], Seen]:
-        """Reads vehicles and leaders; one without a leader goes back to SUMO."""
-        vehicle = connection.vehicle
-        following, rows = [], []
-        motions: dict[
-            str, tuple[float, float]
-        ] = {}  # a follower is the next one's leader, and TraCI is slow
-
-        def motion(one: str) -> tuple[float, float]:
-            if one not in motions:
-                motions[one] = vehicle.getSpeed(one), vehicle.getAcceleration(one)
-            return motions[one]
-
-        for name in names:
-            leader = self._leader(connection, name)
-            if leader is None:
-                self.release(connection, name)
-                continue
-            ahead, gap = leader
-            following.append(name)
-            rows.append(
-                (
-                    *motion(name),
-                    gap,
-                    *motion(ahead),
-                    vehicle.getLength(ahead),
-                    vehicle.getAllowedSpeed(name),
-                )
-            )
-        return following, Seen(
-            *torch.tensor(rows, dtype=torch.float64).reshape(-1, len(Seen._fields)).unbind(1)
-        )
-
-    def _leader(self, connection: Connection, name: str) -> tuple[str, float] | None:
-        """Returns who is ahead of a vehicle and the gap from bumper to bumper, m; None if nobody is within `look_ahead`."""
-        try:
-            leader = connection.vehicle.getLeader(name, self.look_ahead)
-        except Exception as error:
-            if (
-                type(error).__name__ != "TraCIException"
-            ):  # libsumo's and traci's are two classes of this name
-                raise
-            raise SumoError(
-                f"vehicle '{name}' cannot be driven ({error}); step only vehicles of connection.vehicle.getIDList()"
-            ) from error
-        if not leader or not leader[0]:
-            return None
-        gap = leader[1] + connection.vehicle.getMinGap(name)  # SUMO's own gap leaves minGap out
-        return (leader[0], gap) if gap <= self.look_ahead else None
+        That is looked for once an instant, and only if `names` leaves some vehicles unaccounted
+        for.
+        """
+        if self._swept == now or self._slots.keys() <= set(names):
+            return
+        self._swept = now
+        for gone in self._slots.keys() - set(connection.vehicle.getIDList()):
+            self.forget(gone)
+            self._assigned.pop(gone, None)
+            self._bases.pop(gone, None)
+            self._driver_features.pop(gone, None)
 
     def _slot(self, name: str) -> int:
-        """Returns where a vehicle's state stands; a new vehicle gets a place."""
+        """Returns the row of a vehicle; a new vehicle gets one."""
         if name not in self._slots:
             if not self._free:
                 taken = len(self._slots)
-                self._store = self._store.grown(_Store.of(self.policy, self.model, max(16, taken)))
+                more = VehicleTable.empty(self.policy, self.model, max(16, taken))
+                self._store = self._store.with_rows(more)
                 self._free = list(range(taken, len(self._store.time)))
             self._slots[name] = slot = self._free.pop()
             self._store.time[slot] = torch.nan  # it has no frame yet
         return self._slots[name]
 
-    def _remember(
-        self, slots: Tensor, names: list[str], seen: Seen, now: float, *, drive: bool
-    ) -> Tensor:
-        """Puts this instant into the vehicles' histories and begins those that were not there one step ago.
-
-        Returns:
-            `(D,)` bool: the vehicles that are driven from now on.
-        """
-        store = self._store
-        frame = torch.stack(
-            [
-                getattr(seen, name)
-                for name in ("leader_speed", "leader_acceleration", "speed", "acceleration", "gap")
-            ],
-            1,
+    def _remember(self, slots: Tensor, names: list[str], seen: Seen, now: float) -> None:
+        """Puts this instant into the vehicles' histories; begins vehicles that are new."""
+        store, dt = self._store, self.policy.dt
+        history = History(
+            seen.leader_speed,
+            seen.leader_acceleration,
+            seen.speed,
+            seen.acceleration,
+            seen.gap,
         )
-        going = (now - store.time[slots] - self.policy.dt).abs() < 0.5 * self.policy.dt
-        store.history[slots[going]] = torch.cat(
-            [store.history[slots[going], :, 1:], frame[going, :, None]], -1
-        )
+        frame = torch.stack(list(history), 1)
+        going = (now - store.time[slots] - dt).abs() < 0.5 * dt
+        earlier = store.history[slots[going], :, 1:]
+        store.history[slots[going]] = torch.cat([earlier, frame[going, :, None]], -1)
         store.time[slots] = now
         if not bool(going.all()):
-            self._begin(
-                slots[~going],
-                [name for name, goes in zip(names, going.tolist(), strict=True) if not goes],
-                frame[~going],
-            )
-        return ~store.driven[slots] & drive
+            index = (~going).nonzero().flatten()
+            new = [names[number] for number in index.tolist()]
+            self._begin(slots[index], new, frame[index])
 
     def _begin(self, slots: Tensor, names: list[str], frame: Tensor) -> None:
         """Begins vehicles anew: the first frame `(D, 5)` stands for those before it."""
@@ -471,55 +435,55 @@ class Driver:
         store.history[slots] = frame[:, :, None]
         store.steps[slots] = 0
         store.driven[slots] = False
-        store.network[slots] = torch.tensor([self._drives(name) for name in names])
+        store.network[slots] = torch.tensor([self._network_of(name) for name in names])
         if self.policy.base is not None:
             store.base[slots] = self.policy.base[store.network[slots]].to(store.base)
         store.driver_features[slots] = torch.nan
         for slot, name in zip(slots.tolist(), names, strict=True):
-            for column, assigned in (
-                (store.base, self._bases),
-                (store.driver_features, self._driver_features),
-            ):
-                if name in assigned:
-                    column[slot] = torch.tensor(assigned[name], dtype=column.dtype)
+            if name in self._bases:
+                store.base[slot] = torch.tensor(self._bases[name], dtype=torch.float64)
+            if name in self._driver_features:
+                features = torch.tensor(self._driver_features[name], dtype=torch.float64)
+                store.driver_features[slot] = features
         begun = self._begun(slots)
         store.state[slots] = begun.state[begun.network, begun.place]
 
     def _begun(self, slots: Tensor) -> AgentState:
         """Returns the state of vehicles before their first window."""
-        base = None if self.policy.base is None else self._store.base[slots]
-        context = DriverContext(base, self._store.driver_features[slots])
-        return self.policy.begin(self._store.network[slots], context)
-
-    def _take_over(self, connection: Connection, name: str, slot: int) -> None:
-        """From here on this vehicle is driven: with a new window and a new memory, however long it was watched."""
         store = self._store
-        store.driven[slot] = True
-        store.steps[slot] = 0
-        store.memory[slot] = self.model.initial_memory(
-            store.history[slot, History._fields.index("follower_speed"), -1]
-        )
-        self._speed_modes.setdefault(name, connection.vehicle.getSpeedMode(name))
-        connection.vehicle.setSpeedMode(name, self.speed_mode)
+        base = None if self.policy.base is None else store.base[slots]
+        context = DriverContext(base, store.driver_features[slots])
+        return self.policy.begin(store.network[slots], context)
+
+    def _take_over(self, connection: Connection, names: list[str], slots: Tensor) -> None:
+        """Drives from here on the vehicles that were only watched, with a new window and memory."""
+        store = self._store
+        speed = History._fields.index("follower_speed")
+        for index in (~store.driven[slots]).nonzero().flatten().tolist():
+            name, slot = names[index], int(slots[index])
+            store.driven[slot] = True
+            store.steps[slot] = 0
+            store.memory[slot] = self.model.initial_memory(store.history[slot, speed, -1])
+            self._speed_modes.setdefault(name, connection.vehicle.getSpeedMode(name))
+            connection.vehicle.setSpeedMode(name, self.speed_mode)
 
     def _choose(self, slots: Tensor) -> None:
         """Lets the policy choose the parameters of vehicles whose window begins."""
-        if not len(slots):
+        if len(slots) == 0:
             return
         store = self._store
         begun = self._begun(slots)
         state = begun.state.clone()
         state[begun.network, begun.place] = store.state[slots]
-        chosen, after = self.policy.act(
-            History(*store.history[slots].unbind(1)), begun._replace(state=state)
-        )
+        history = History(*store.history[slots].unbind(1))
+        chosen, after = self.policy.act(history, begun._replace(state=state))
         store.parameters[slots] = chosen
         store.state[slots] = after.state[after.network, after.place]
 
     def _speeds(
         self, connection: Connection, names: list[str], slots: Tensor, seen: Seen
     ) -> Tensor:
-        """Returns the next speeds `(D,)` by the model, within the limits that SUMO puts around every model."""
+        """Returns the model's next speeds `(D,)`, within the limits that SUMO puts around it."""
         store, dt = self._store, self.policy.dt
         follower = Follower(
             torch.zeros_like(seen.speed), seen.speed, seen.acceleration, store.memory[slots]
@@ -534,80 +498,19 @@ class Driver:
         after = advance_vehicle(self.model, follower, leader, p, dt)
         store.memory[slots] = after.memory
         limit = seen.allowed.clone()
-        for index in (
-            (seen.speed > seen.allowed).nonzero().flatten().tolist()
-        ):  # nobody brakes harder than `decel` for a limit
-            limit[index] = max(
-                limit[index], seen.speed[index] - connection.vehicle.getDecel(names[index]) * dt
-            )
+        # For a limit no vehicle brakes harder than its `decel`.
+        for index in (seen.speed > seen.allowed).nonzero().flatten().tolist():
+            slowest = seen.speed[index] - connection.vehicle.getDecel(names[index]) * dt
+            limit[index] = max(limit[index], slowest)
         return torch.minimum(after.speed, limit)
 
 
-@dataclass(frozen=True)
-class _Store:
-    """What is known of C vehicles.
-
-    Attributes:
-        history: `(C, 5, L)`, the signals of `History`.
-        parameters: `(C, n)`, SI units.
-        memory: `(C, m)`, the model's.
-        state: `(C, s)`, the policy's.
-        network: `(C,)` int64, which of the policy's networks drives.
-        base: `(C, n)`, SI units, what a policy of offsets starts from.
-        driver features: `(C, k)`, of the drivers; NaN for unseen drivers.
-        steps: `(C,)` int64, since the vehicle's first window.
-        time: `(C,)` s, of the last frame; NaN before the first.
-        driven: `(C,)` bool; the others are watched.
-    """
-
-    history: Tensor
-    parameters: Tensor
-    memory: Tensor
-    state: Tensor
-    network: Tensor
-    base: Tensor
-    driver_features: Tensor
-    steps: Tensor
-    time: Tensor
-    driven: Tensor
-
-    @classmethod
-    def of(cls, policy: Agent, model: DrivingModel, count: int) -> _Store:
-        """Makes place for `count` vehicles."""
-        state = policy.begin(torch.zeros(1, dtype=torch.int64)).state
-        real = torch.float64
-        return cls(
-            history=torch.full(
-                (count, len(History._fields), policy.windows.length), torch.nan, dtype=real
-            ),
-            parameters=torch.full((count, len(policy.space)), torch.nan, dtype=real),
-            memory=torch.zeros((count, model.memory_size), dtype=real),
-            state=state.new_zeros((count, state.shape[-1])),
-            network=torch.zeros(count, dtype=torch.int64),
-            base=torch.full((count, len(policy.space)), torch.nan, dtype=real),
-            driver_features=torch.full(
-                (count, len(policy.policy.driver_features)), torch.nan, dtype=real
-            ),
-            steps=torch.zeros(count, dtype=torch.int64),
-            time=torch.full((count,), torch.nan, dtype=real),
-            driven=torch.zeros(count, dtype=torch.bool),
-        )
-
-    def grown(self, more: _Store) -> _Store:
-        """Returns both."""
-        return _Store(
-            **{
-                one.name: torch.cat([getattr(self, one.name), getattr(more, one.name)])
-                for one in fields(self)
-            }
-        )
-
-
-def _trained(run: str | Path) -> Agent:
+def _load_policy(run: str | Path) -> Agent:
     """Reads the policy of a run.
 
     Raises:
-        DataError: there is none, or the installed driving model has other parameters than it was trained for.
+        DataError: there is none, or the installed driving model has other parameters than it was
+            trained for.
     """
     folder = folder_of(run)
     if not (folder / "policy.json").is_file():
@@ -616,7 +519,8 @@ def _trained(run: str | Path) -> Agent:
     trained = json.loads((folder / "policy.json").read_text(encoding="utf-8"))["parameters"]
     if tuple(trained) != policy.space.names:
         raise DataError(
-            f"the policy of {run} was trained for a model with the parameters {', '.join(trained)}, but"
-            f" model={policy.model_node['name']} here has {', '.join(policy.space.names)}; train it again"
+            f"the policy of {run} was trained for a model with the parameters {', '.join(trained)},"
+            f" but model={policy.model_node['name']} here has {', '.join(policy.space.names)};"
+            " train it again"
         )
     return policy

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from cfx.agents.placement import ALL
 from cfx.errors import DataError
-from cfx.sumo.driver import Connection, Driver
+from cfx.sumo.driver import Driver
+from cfx.sumo.surroundings import Connection
 
 
 class Fleet:
@@ -17,8 +18,9 @@ class Fleet:
         connection.simulationStep()
         fleet.step(connection)
 
-    Vehicles that come and go are found by themselves. A vehicle belongs to the vType with which it is first seen; a vType that
-    SUMO made of it for this one vehicle (`calm@vehicle`) counts as `calm`. Types that share a driver are one batch.
+    The fleet finds vehicles that come and go. A vehicle belongs to the vType with which it is first
+    seen; a vType that SUMO made of it for this one vehicle (`calm@vehicle`) counts as `calm`. Types
+    that share a driver are one batch.
     """
 
     def __init__(self, drivers: Mapping[str, Driver]) -> None:
@@ -33,7 +35,8 @@ class Fleet:
         if max(steps.values()) - min(steps.values()) > 1e-6:
             listed = ", ".join(f"{name} {dt:g} s" for name, dt in steps.items())
             raise DataError(
-                f"the policies were trained at different time steps ({listed}); a simulation has one"
+                f"the policies were trained at different time steps ({listed}); a simulation has"
+                " one"
             )
         self.drivers = dict(drivers)
         self._type_of: dict[str, str] = {}
@@ -47,11 +50,15 @@ class Fleet:
         look_ahead: float = 200.0,
         speed_mode: int = 0,
     ) -> Fleet:
-        """Reads the policy of a run for each vType; types with the same run share a driver. See `Driver.load`."""
-        loaded = {
-            run: Driver.load(run, network=network, look_ahead=look_ahead, speed_mode=speed_mode)
-            for run in dict.fromkeys(runs.values())
-        }
+        """Reads the policy of a run for each vType; types with the same run share a driver.
+
+        The other arguments are those of `Driver.load`.
+        """
+        loaded = {}
+        for run in dict.fromkeys(runs.values()):
+            loaded[run] = Driver.load(
+                run, network=network, look_ahead=look_ahead, speed_mode=speed_mode
+            )
         return cls({name: loaded[run] for name, run in runs.items()})
 
     @property
@@ -60,23 +67,28 @@ class Fleet:
         return {vehicle: name for vehicle, name in self._type_of.items() if name in self.drivers}
 
     def step(self, connection: Connection) -> None:
-        """Sets the speeds that the fleet's vehicles will drive in the next `simulationStep`; call it after each.
+        """Sets the speeds of the fleet's vehicles in the next `simulationStep`.
+
+        Call it after each.
 
         Raises:
             SumoError: the simulation's step is not the policies'.
         """
-        present = connection.vehicle.getIDList()
-        kind = connection.vehicle.getTypeID
-        self._type_of = {
-            one: self._type_of.get(one) or kind(one).partition("@")[0] for one in present
-        }
-        members: dict[int, list[str]] = {id(driver): [] for driver in self.drivers.values()}
-        for vehicle, name in self._type_of.items():
+        types: dict[str, str] = {}
+        for vehicle in connection.vehicle.getIDList():
+            known = self._type_of.get(vehicle)
+            if known is None:
+                known = connection.vehicle.getTypeID(vehicle).partition("@")[0]
+            types[vehicle] = known
+        self._type_of = types
+        drivers = {id(driver): driver for driver in self.drivers.values()}
+        vehicles: dict[int, list[str]] = {key: [] for key in drivers}
+        for vehicle, name in types.items():
             if name in self.drivers:
-                members[id(self.drivers[name])].append(vehicle)
-        for driver in {id(driver): driver for driver in self.drivers.values()}.values():
-            driver.step(connection, members[id(driver)])
+                vehicles[id(self.drivers[name])].append(vehicle)
+        for key, driver in drivers.items():
+            driver.step(connection, vehicles[key])
 
     def driver(self, vehicle: str) -> Driver:
-        """Returns who drives a vehicle of the fleet."""
+        """Returns the driver of a vehicle of the fleet."""
         return self.drivers[self._type_of[vehicle]]

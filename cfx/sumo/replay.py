@@ -1,17 +1,21 @@
-"""Recorded leaders in SUMO, and behind each a real follower and live drivers: `python -m cfx.sumo.replay`.
+"""Recorded leaders in SUMO with a real follower and live drivers behind each.
 
-It is a process of its own, because libsumo does not get on with pyarrow, which jobs load; it answers one request from standard
-input and ends. `cfx.sumo.demo` asks.
+`python -m cfx.sumo.replay` runs it. It is a process of its own, because libsumo does not get on
+with pyarrow, which jobs load. It answers one request from standard input and ends. `cfx.sumo.demo`
+asks.
 
-Request: header `dt`, `net`, `edges`, `tracks` (as in `Motorway`), `policy` (a folder), and `pairs`, each with its `scene`,
-`length` (of the leader, m), `first` (frame at which the drivers take over), `network`, `base` (parameters that offsets start
-from, or null), `driver features` (of the driver, or null), `renew` (frame at which the policy's memory begins), and for each of
-`FOLLOWERS` its `track` and `places` (edge and position on it of leader and follower at frame 0); arrays `I/leader` and
-`I/follower` `(3, T)` of pair I: position, speed, acceleration. Pairs of one scene are on the road together.
+Request: header `dt`, `net`, `edges`, `tracks` (as in `Motorway`), `policy` (a folder), and `pairs`,
+each with its `scene`, `length` (of the leader, m), `first` (frame at which the drivers take over),
+`network`, `base` (parameters that offsets start from, or null), `driver_features` (of the driver,
+or null), `renew` (frame at which the policy's memory begins), and for each of `FOLLOWERS` its
+`track` and `places` (edge and position on it of leader and follower at frame 0); arrays `I/leader`
+and `I/follower` `(3, T)` of pair I: position, speed, acceleration. Pairs of one scene are on the
+road together.
 
-Answer: for pair I and each F of `FOLLOWERS` the arrays `I/F/motion` `(T, 2)` (speed, gap to the leader ahead) and `I/F/place`
-`(T, 2, 3)` (x, y and heading in degrees of leader and follower); `I/parameters` `(T, n)` of the policy, NaN where it does not
-drive; or a header with `error`. SI units.
+Answer: for pair I and each F of `FOLLOWERS` the arrays `I/F/motion` `(T, 2)` (speed, gap to the
+leader ahead) and `I/F/place` `(T, 2, 3)` (x, y and heading in degrees of leader and follower);
+`I/parameters` `(T, n)` of the policy, NaN where it does not drive; or a header with `error`. SI
+units.
 """
 
 from __future__ import annotations
@@ -29,13 +33,14 @@ from cfx.errors import CfxError
 from cfx.simulators.sumo.channel import Array, Message, receive, send
 
 FOLLOWERS = ("real", "policy", "default")
-"""Who drives behind a copy of the same leader: the recording, the job's policy, the model's default parameters."""
+"""What drives behind a copy of the same leader: the recording, the job's policy, the model's
+default parameters."""
 
 CAR_LENGTH = 4.5
 """m: followers' lengths stand in no recording of pairs, and change nothing."""
 
 LOOK_AHEAD = 1e4
-"""m: whoever falls far behind still follows his leader, as in memory."""
+"""m: a vehicle that falls far behind still follows its leader, as in memory."""
 
 _OPTIONS = (
     *("--collision.action", "none"),
@@ -49,8 +54,9 @@ _OPTIONS = (
 class Recorded:
     """A vehicle that drives exactly as it was recorded.
 
-    SUMO moves it from where it is to its next position; then its speed and acceleration are put right, as recorded positions are
-    rarely the sums of recorded speeds. SUMO drives nobody backwards, so that is a jump.
+    SUMO moves it from where it is to its next position. Then its speed and acceleration are
+    corrected, as recorded positions are rarely the sums of recorded speeds. SUMO drives no vehicle
+    backwards, so that is a jump.
     """
 
     def __init__(self, name: str, signals: Array) -> None:
@@ -66,25 +72,21 @@ class Recorded:
 
     def aim(self, sumo: Any, frame: int) -> None:
         """Says before a step where to be after it."""
-        sumo.vehicle.setSpeed(
-            self.name,
-            max(0.0, (self.position[frame] - self.now(sumo)) / sumo.simulation.getDeltaT()),
-        )
+        ahead = self.position[frame] - self.now(sumo)
+        sumo.vehicle.setSpeed(self.name, max(0.0, ahead / sumo.simulation.getDeltaT()))
 
     def settle(self, sumo: Any, frame: int) -> None:
-        """Puts speed and acceleration right after a step."""
+        """Corrects speed and acceleration after a step."""
         back = self.position[frame] - self.now(sumo)
         if back < -1e-9:
-            sumo.vehicle.moveTo(
-                self.name,
-                sumo.vehicle.getLaneID(self.name),
-                max(0.0, sumo.vehicle.getLanePosition(self.name) + back),
-            )
+            lane = sumo.vehicle.getLaneID(self.name)
+            place = sumo.vehicle.getLanePosition(self.name) + back
+            sumo.vehicle.moveTo(self.name, lane, max(0.0, place))
             self._jumps += back
         sumo.vehicle.setPreviousSpeed(self.name, self.speed[frame], self.acceleration[frame])
 
 
-class Behind:
+class Road:
     """One follower of one pair behind its copy of the leader."""
 
     def __init__(
@@ -102,100 +104,100 @@ class Behind:
         return self.kind == "real" or frame <= self.pair["first"]
 
     def settle(self, sumo: Any, frame: int) -> None:
-        """After a step: puts what is replayed right, and notes where everybody is."""
+        """After a step: corrects what is replayed, and notes where both vehicles are."""
         self.leader.settle(sumo, frame)
         if self.replayed(frame):
             self.follower.settle(sumo, frame)
         speed = sumo.vehicle.getSpeed(self.follower.name)
-        self.motion[frame] = (
-            speed,
-            self.leader.now(sumo) - self.pair["length"] - self.follower.now(sumo),
-        )
+        gap = self.leader.now(sumo) - self.pair["length"] - self.follower.now(sumo)
+        self.motion[frame] = (speed, gap)
         for k, vehicle in enumerate((self.leader.name, self.follower.name)):
-            self.place[frame, k] = (
-                *sumo.vehicle.getPosition(vehicle),
-                sumo.vehicle.getAngle(vehicle),
-            )
+            x, y = sumo.vehicle.getPosition(vehicle)
+            self.place[frame, k] = (x, y, sumo.vehicle.getAngle(vehicle))
 
     def aim(self, sumo: Any, frame: int) -> None:
-        """Before a step: says where those who are replayed shall be at `frame`."""
+        """Before a step: says where replayed vehicles shall be at `frame`."""
         self.leader.aim(sumo, frame)
         if self.replayed(frame):
             self.follower.aim(sumo, frame)
 
 
-def drive(request: Message) -> dict[str, Array]:
-    """Drives all scenes, one after another.
+def replay(request: Message) -> dict[str, Array]:
+    """Simulates all scenes, one after another, and returns the answer's arrays.
 
     Raises:
         CfxError: the policy cannot drive, or SUMO lost a vehicle.
     """
     import libsumo
 
-    found: dict[str, Array] = {}
     header, arrays = request
-    for scene in sorted({pair["scene"] for pair in header["pairs"]}):
-        members = [(i, pair) for i, pair in enumerate(header["pairs"]) if pair["scene"] == scene]
-        found |= _scene(libsumo, header, members, arrays)
+    scenes: dict[int, list[int]] = {}
+    for number, pair in enumerate(header["pairs"]):
+        scenes.setdefault(pair["scene"], []).append(number)
+    found: dict[str, Array] = {}
+    for scene in sorted(scenes):
+        found |= _scene(libsumo, header, scenes[scene], arrays)
     return found
 
 
 def _scene(
-    sumo: Any,
-    header: Mapping[str, Any],
-    pairs: Sequence[tuple[int, Any]],
-    arrays: Mapping[str, Array],
+    sumo: Any, header: Mapping[str, Any], numbers: Sequence[int], arrays: Mapping[str, Array]
 ) -> dict[str, Array]:
+    """Simulates the pairs of one scene."""
     from cfx.sumo.driver import Driver
 
     policy = Driver.load(header["policy"], network=None, look_ahead=LOOK_AHEAD)
-    drivers = {
-        "policy": policy,
-        "default": Driver.constant(policy.model, dt=header["dt"], look_ahead=LOOK_AHEAD),
-    }
-    roads = [Behind(i, kind, pair, arrays) for i, pair in pairs for kind in FOLLOWERS]
-    chosen = {
-        i: np.full((len(arrays[f"{i}/leader"][0]), len(policy.policy.space)), np.nan)
-        for i, _ in pairs
-    }
-    for i, pair in pairs:
+    default = Driver.constant(policy.model, dt=header["dt"], look_ahead=LOOK_AHEAD)
+    drivers = {"policy": policy, "default": default}
+    roads = []
+    chosen = {}
+    for number in numbers:
+        pair = header["pairs"][number]
+        for kind in FOLLOWERS:
+            roads.append(Road(number, kind, pair, arrays))
+        frames = len(arrays[f"{number}/leader"][0])
+        chosen[number] = np.full((frames, len(policy.policy.space)), np.nan)
         policy.assign(
-            f"{i}/policy",
+            f"{number}/policy",
             pair["network"],
             base=pair["base"],
             driver_features=pair["driver_features"],
         )
+    _simulate(sumo, header, roads, drivers, chosen)
+    found: dict[str, Array] = {}
+    for road in roads:
+        found[f"{road.number}/{road.kind}/motion"] = road.motion
+        found[f"{road.number}/{road.kind}/place"] = road.place
+    for number, parameters in chosen.items():
+        found[f"{number}/parameters"] = parameters
+    return found
+
+
+def _simulate(
+    sumo: Any,
+    header: Mapping[str, Any],
+    roads: Sequence[Road],
+    drivers: Mapping[str, Any],
+    chosen: Mapping[int, Array],
+) -> None:
+    """Runs SUMO until the longest recording ends."""
     with tempfile.TemporaryDirectory(prefix="cfx-sumo-") as folder:
         routes = Path(folder, "scene.rou.xml")
         routes.write_text(_routes(header, roads), encoding="utf-8")
-        sumo.start(
-            [
-                "sumo",
-                "-n",
-                header["net"],
-                "-r",
-                str(routes),
-                "--step-length",
-                repr(header["dt"]),
-                *_OPTIONS,
-            ]
-        )
+        files = ("-n", header["net"], "-r", str(routes))
+        sumo.start(["sumo", *files, "--step-length", repr(header["dt"]), *_OPTIONS])
         try:
             for frame in range(max(road.frames for road in roads)):
                 sumo.simulationStep()
-                _frame(
-                    sumo, [road for road in roads if frame < road.frames], frame, drivers, chosen
-                )
+                present = [road for road in roads if frame < road.frames]
+                _frame(sumo, present, frame, drivers, chosen)
         finally:
             sumo.close()
-    found: dict[str, Array] = {f"{road.number}/{road.kind}/motion": road.motion for road in roads}
-    found |= {f"{road.number}/{road.kind}/place": road.place for road in roads}
-    return found | {f"{i}/parameters": parameters for i, parameters in chosen.items()}
 
 
 def _frame(
     sumo: Any,
-    roads: Sequence[Behind],
+    roads: Sequence[Road],
     frame: int,
     drivers: Mapping[str, Any],
     chosen: Mapping[int, Array],
@@ -208,45 +210,65 @@ def _frame(
                 sumo.vehicle.setSpeedMode(vehicle, 0)
         road.settle(sumo, frame)
     for kind, driver in drivers.items():
-        own = [road for road in roads if road.kind == kind]
-        for road in own:
-            if frame == road.pair["renew"] > 0:
-                driver.renew(road.follower.name)
-        driver.step(
-            sumo, [road.follower.name for road in own if frame < road.pair["first"]], drive=False
-        )
-        driver.step(sumo, [road.follower.name for road in own if frame >= road.pair["first"]])
+        _step_driver(sumo, driver, [road for road in roads if road.kind == kind], frame)
     for road in roads:
         if road.kind == "policy" and frame >= road.pair["first"]:
-            chosen[road.number][frame] = (
-                list(drivers["policy"].parameters(road.follower.name).values()) or np.nan
-            )
+            parameters = drivers["policy"].parameters(road.follower.name)
+            chosen[road.number][frame] = list(parameters.values()) or np.nan
         if frame + 1 < road.frames:
             road.aim(sumo, frame + 1)
         else:
-            for vehicle in (road.leader.name, road.follower.name):
-                sumo.vehicle.remove(vehicle)
+            sumo.vehicle.remove(road.leader.name)
+            sumo.vehicle.remove(road.follower.name)
 
 
-def _routes(header: Mapping[str, Any], roads: Sequence[Behind]) -> str:
+def _step_driver(sumo: Any, driver: Any, roads: Sequence[Road], frame: int) -> None:
+    """Lets a driver watch the vehicles that are still replayed, and drive the others."""
+    watched = []
+    driven = []
+    for road in roads:
+        name = road.follower.name
+        if frame == road.pair["renew"] > 0:
+            driver.renew(name)
+        if frame < road.pair["first"]:
+            watched.append(name)
+        else:
+            driven.append(name)
+    driver.step(sumo, watched, drive=False)
+    driver.step(sumo, driven)
+
+
+def _routes(header: Mapping[str, Any], roads: Sequence[Road]) -> str:
     """Returns SUMO's route file: all vehicles at frame 0, under no limit but what drives them."""
     free = 'minGap="0" maxSpeed="130" speedFactor="100" speedDev="0" sigma="0"'
     edges = header["edges"]
-    lines = [f'<route id="from{k}" edges="{" ".join(edges[k:])}"/>' for k in range(len(edges))]
+    lines = ["<routes>"]
+    for number in range(len(edges)):
+        lines.append(f'<route id="from{number}" edges="{" ".join(edges[number:])}"/>')
     for road in roads:
         lanes = header["tracks"][road.pair["track"][road.kind]]
-        for vehicle, length, (edge, at) in zip(
-            (road.leader, road.follower),
-            (road.pair["length"], CAR_LENGTH),
-            road.pair["places"][road.kind],
-            strict=True,
-        ):
+        lengths = (road.pair["length"], CAR_LENGTH)
+        places = road.pair["places"][road.kind]
+        vehicles = (road.leader, road.follower)
+        for vehicle, length, (edge, at) in zip(vehicles, lengths, places, strict=True):
+            speed = max(0.0, vehicle.speed[0])
             lines.append(f'<vType id="type/{vehicle.name}" length="{length!r}" {free}/>')
             lines.append(
-                f'<vehicle id="{vehicle.name}" type="type/{vehicle.name}" route="from{edge}" depart="0" insertionChecks="none"'
-                f' departLane="{lanes[edge]}" departPos="{at!r}" departSpeed="{max(0.0, vehicle.speed[0])!r}"/>'
+                f'<vehicle id="{vehicle.name}" type="type/{vehicle.name}" route="from{edge}"'
+                f' depart="0" insertionChecks="none" departLane="{lanes[edge]}"'
+                f' departPos="{at!r}" departSpeed="{speed!r}"/>'
             )
-    return "\n".join(["<routes>", *lines, "</routes>"])
+    lines.append("</routes>")
+    return "\n".join(lines)
+
+
+def _failure(error: Exception) -> dict[str, str]:
+    """Returns the header of an answer that says what failed; `bug` names an unexpected error."""
+    if type(error).__module__.partition(".")[0] in {"libsumo", "traci"}:
+        return {"error": f"SUMO lost a vehicle or refuses one ({error})", "bug": ""}
+    if isinstance(error, CfxError):
+        return {"error": str(error), "bug": ""}
+    return {"error": str(error), "bug": type(error).__name__}
 
 
 def main() -> None:
@@ -257,22 +279,14 @@ def main() -> None:
     if request is None:
         return
     try:
-        found = drive(request)
-    except Exception as error:  # whatever it is, the job tells it
-        lost = type(error).__module__.partition(".")[0] in {"libsumo", "traci"}
-        kind = type(error).__name__ if not isinstance(error, CfxError) and not lost else ""
-        send(
-            answers,
-            {
-                "error": f"SUMO lost a vehicle or refuses one ({error})" if lost else str(error),
-                "bug": kind,
-            },
-        )
+        found = replay(request)
+    except Exception as error:  # whatever it is, the job reports it
+        send(answers, _failure(error))
     else:
         send(answers, {}, found)
 
 
 if __name__ == "__main__":
-    # pandas loads pyarrow where it finds it.
-    sys.modules["pyarrow"] = None  # type: ignore[assignment]  # Python's own way to say that a module is not there
+    # pandas loads pyarrow where it finds it; None is Python's own way to say that it is not there.
+    sys.modules["pyarrow"] = None  # type: ignore[assignment]
     main()

@@ -1,0 +1,114 @@
+"""What vehicles of a running SUMO simulation and their leaders do at one instant.
+
+Shapes: D vehicles.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from cfx.errors import SumoError
+
+Connection = Any
+"""The module `libsumo`, the module `traci`, or a connection that `traci.getConnection` gives."""
+
+
+class Seen(NamedTuple):
+    """What D vehicles and their leaders do at one instant; `(D,)` each, SI units.
+
+    Attributes:
+        speed, acceleration: the follower's.
+        gap: bumper to bumper.
+        leader_speed, leader_acceleration, leader_length: of the vehicle ahead.
+        allowed: the speed limit that holds for the follower.
+    """
+
+    speed: Tensor
+    acceleration: Tensor
+    gap: Tensor
+    leader_speed: Tensor
+    leader_acceleration: Tensor
+    leader_length: Tensor
+    allowed: Tensor
+
+
+def look(
+    connection: Connection, names: list[str], look_ahead: float
+) -> tuple[list[str], Seen, list[str]]:
+    """Reads vehicles and their leaders.
+
+    Args:
+        connection: to the simulation.
+        names: the vehicles.
+        look_ahead: m; a vehicle farther ahead is no leader.
+
+    Returns:
+        The vehicles that have a leader, what they and their leaders do, and the vehicles without a
+        leader.
+
+    Raises:
+        SumoError: a vehicle is not in the simulation.
+    """
+    reader = _Reader(connection)
+    following, alone, rows = [], [], []
+    for name in names:
+        leader = leader_of(connection, name, look_ahead)
+        if leader is None:
+            alone.append(name)
+        else:
+            following.append(name)
+            rows.append(reader.row(name, *leader))
+    table = torch.tensor(rows, dtype=torch.float64).reshape(-1, len(Seen._fields))
+    return following, Seen(*table.unbind(1)), alone
+
+
+def leader_of(connection: Connection, name: str, look_ahead: float) -> tuple[str, float] | None:
+    """Returns the vehicle ahead and the gap from bumper to bumper, m.
+
+    Returns:
+        None if no vehicle is within `look_ahead`.
+
+    Raises:
+        SumoError: the vehicle is not in the simulation.
+    """
+    try:
+        leader = connection.vehicle.getLeader(name, look_ahead)
+    except Exception as error:
+        # libsumo's and traci's are two classes of this name.
+        if type(error).__name__ != "TraCIException":
+            raise
+        raise SumoError(
+            f"vehicle '{name}' cannot be driven ({error}); step only vehicles of"
+            " connection.vehicle.getIDList()"
+        ) from error
+    if not leader or not leader[0]:
+        return None
+    gap = leader[1] + connection.vehicle.getMinGap(name)  # SUMO's own gap leaves minGap out
+    if gap > look_ahead:
+        return None
+    return leader[0], gap
+
+
+class _Reader:
+    """Reads each vehicle's motion once: a follower is the next one's leader, and TraCI is slow."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._vehicle = connection.vehicle
+        self._motions: dict[str, tuple[float, float]] = {}
+
+    def row(self, name: str, leader: str, gap: float) -> tuple[float, ...]:
+        """Returns the fields of `Seen` for one vehicle."""
+        speed, acceleration = self._motion(name)
+        leader_speed, leader_acceleration = self._motion(leader)
+        length = self._vehicle.getLength(leader)
+        allowed = self._vehicle.getAllowedSpeed(name)
+        return speed, acceleration, gap, leader_speed, leader_acceleration, length, allowed
+
+    def _motion(self, name: str) -> tuple[float, float]:
+        if name not in self._motions:
+            speed = self._vehicle.getSpeed(name)
+            self._motions[name] = speed, self._vehicle.getAcceleration(name)
+        return self._motions[name]
