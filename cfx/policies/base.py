@@ -1,7 +1,8 @@
 """The contract of a policy: recent states in, parameters for the next window out.
 
-Shapes: N independent networks, B drivers of each, W windows, f features of a token, n tuned parameters, s width of the state. N
-networks are trained and driven as one batched network: 94 pairs with a network each cost about as much as one.
+Shapes: N independent networks, B drivers of each, W windows, f features of a token, n tuned
+parameters, s width of the state. N networks are trained and used as one batched network: 94 pairs
+with a network each cost about as much as one.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from cfx.policies.features import Summary, check_inputs, named_inputs
 class PolicyNetwork(nn.Module, ABC):
     """N independent networks in one module; state is passed in and returned, never kept on self.
 
-    Every parameter and buffer has N as its first dimension, and network i reads only slice i of everything: so the sum of N
-    losses trains N networks independently.
+    Every parameter and buffer has N as its first dimension, and network i reads only slice i of
+    everything: so the sum of N losses trains N networks independently.
     """
 
     @abstractmethod
@@ -38,8 +39,8 @@ class PolicyNetwork(nn.Module, ABC):
             state: `(N, B, s)`.
 
         Returns:
-            Parameters in unit space `(N, B, W, n)`, within [0, 1], and the state after the last window. Reading W windows at
-            once or one by one gives the same.
+            Parameters in unit space `(N, B, W, n)`, within [0, 1], and the state after the last
+            window. Reading W windows at once or one by one gives the same.
         """
 
 
@@ -48,8 +49,9 @@ class PolicySettings(Settings):
 
     inputs: Annotated[tuple[str, ...], BeforeValidator(named_inputs)] = Field(
         ("leader_speed", "follower_speed"),
-        description="signals that the policy sees; also: gap, relative_speed, time_headway, leader_acceleration,"
-        " follower_acceleration, inverse_time_to_collision; or situation: what learner=rollout drives best with",
+        description="signals that the policy sees; also: gap, relative_speed, time_headway,"
+        " leader_acceleration, follower_acceleration, inverse_time_to_collision; or situation: what"
+        " works best with learner=rollout",
     )
     summary: Summary = Field(
         "frames",
@@ -57,16 +59,18 @@ class PolicySettings(Settings):
     )
     driver_features: Annotated[tuple[str, ...], BeforeValidator(named_driver_features)] = Field(
         (),
-        description="what the policy is told of a driver from his measured past (learner=rollout): time_headway, time_gap,"
-        " standstill_gap, speed_difference, acceleration, response_time; or all. Unseen drivers have none.",
+        description="features of a driver, measured from their history, that condition the policy"
+        " (learner=rollout): time_headway, time_gap, standstill_gap, speed_difference,"
+        " acceleration, response_time; or all. Unseen drivers have none.",
     )
 
 
 class Policy(Component):
     """Base of every policy.
 
-    Life cycle: a protocol calls `build` once for N networks; if `trainable`, a learner then trains them; afterwards they drive in
-    closed loop, one window at a time. A subclass implements `build`.
+    Life cycle: a protocol calls `build` once for N networks; if `trainable`, a learner then trains
+    them; afterwards they choose parameters in closed loop, one window at a time. A subclass
+    implements `build`.
 
     Attributes:
         trainable: whether a learner must train what `build` returns.
@@ -86,21 +90,23 @@ class Policy(Component):
     @property
     def inputs(self) -> tuple[str, ...]:
         """The signals that the policy sees."""
-        return (
-            self.settings.inputs
-            if isinstance(self.settings, PolicySettings)
-            else ("follower_speed",)
-        )
+        if isinstance(self.settings, PolicySettings):
+            return self.settings.inputs
+        return ("follower_speed",)
 
     @property
     def driver_features(self) -> tuple[str, ...]:
-        """What the policy is told of a driver from his measured past (`cfx.policies.driver_features`)."""
-        return self.settings.driver_features if isinstance(self.settings, PolicySettings) else ()
+        """The features of drivers that condition the policy (`cfx.policies.driver_features`)."""
+        if isinstance(self.settings, PolicySettings):
+            return self.settings.driver_features
+        return ()
 
     @property
     def summary(self) -> Summary:
         """How a window's frames become features."""
-        return self.settings.summary if isinstance(self.settings, PolicySettings) else "last"
+        if isinstance(self.settings, PolicySettings):
+            return self.settings.summary
+        return "last"
 
     @abstractmethod
     def build(

@@ -1,9 +1,11 @@
-"""Driver features: what a driver's measured past tells of him, in a few numbers that a policy knows from its first window on.
+"""Driver features: a few numbers measured from a driver's history.
 
-A network that has to find out from its memory what sort of driver it imitates finds little in the end, and a driver's own fixed
-parameters tell it only as much as one minute determines them: of Wiedemann 99's ten hardly any. How far behind he keeps, how much
-his speed differs from his leader's, how hard he accelerates and how late he reacts can simply be measured. On the I-80 recordings
-his mean time headway of the first half of a drive correlates with that of the second by 0.76, the other driver features by 0.4 to 0.6.
+A policy knows them from its first window on. A network that has to find out from its memory how a
+driver drives finds little in the end. Driver-specific parameters say only as much as one minute of
+driving determines: of Wiedemann 99's ten hardly any. How far behind a driver stays, how much their
+speed differs from their leader's, how hard they accelerate and how late they react can be measured.
+On the I-80 recordings the mean time headway of the first half of a trajectory correlates with that
+of the second by 0.76, the other driver features by 0.4 to 0.6.
 
 Shapes: P pairs, T frames, k driver features.
 """
@@ -20,13 +22,17 @@ from cfx.pairs import PairBatch
 from cfx.policies.features import History, check_names, of_set
 
 MOVING = 2.0
-"""m/s: frames in which the follower is slower say nothing of his time headway."""
+"""m/s: frames in which the follower is slower say nothing of their time headway."""
 
 LEAST = 15.0
-"""s: who was measured for less while moving is unknown."""
+"""s: a driver who was measured for less while moving is unknown."""
+
+_LEAST_GAP = 0.5
+"""m: gaps below it count as this, so that the time headway has a logarithm."""
 
 _ACCURACY = 0.05
-"""m/s and m/s2: added to a spread before its logarithm, which would make much of differences below it."""
+"""m/s and m/s2: added to an RMS before its logarithm, so that differences below it do not
+matter."""
 
 _FLAT = 2.0
 """(m/s)2: weight of `_USUAL_GAP` in a regression of the gap on a speed that hardly varies."""
@@ -34,19 +40,20 @@ _FLAT = 2.0
 _USUAL_GAP = 1.2
 """s: by how much the gap grows with speed for a driver whose speed has not varied."""
 
-_DELAYS = 0.2, 4.0
-"""s: step and largest of the delays among which a driver's response time is sought."""
+_DELAY_STEP, _LONGEST_DELAY = 0.2, 4.0
+"""s: the delays among which a driver's response time is sought."""
 
-_CLEARLY = 0.05, 0.1
-"""(m/s)2, and as a share of the least variance: delays whose variance exceeds the least by as much weigh 1/e of it."""
+_CLEARLY, _CLEARLY_SHARE = 0.05, 0.1
+"""(m/s)2, and as a share of the least variance: a delay whose variance exceeds the least by as much
+weighs 1/e of it."""
 
 
 class Measured(NamedTuple):
-    """Stretches of P drives.
+    """Parts of P trajectories.
 
     Attributes:
         signals: `(P, T)` each, SI units.
-        counted: which frames belong to the stretch, bool `(P, T)`.
+        counted: which frames belong to the part, bool `(P, T)`.
         dt: time step, s.
     """
 
@@ -56,12 +63,12 @@ class Measured(NamedTuple):
 
     @property
     def moving(self) -> Tensor:
-        """The frames of the stretch in which the follower moves, `(P, T)`."""
+        """The frames of the part in which the follower moves, bool `(P, T)`."""
         return self.counted & (self.signals.follower_speed > MOVING)
 
 
 def _mean(values: Tensor, counted: Tensor) -> Tensor:
-    """Returns the mean of each pair `(P,)` over the frames that count, both `(P, T)`; 0 where none does."""
+    """Returns the mean of each pair `(P,)` over the frames that count; 0 where none does."""
     return torch.where(counted, values, 0.0).sum(1) / counted.sum(1).clamp(min=1)
 
 
@@ -71,26 +78,26 @@ def _log_rms(values: Tensor, counted: Tensor) -> Tensor:
 
 def _time_headway(m: Measured) -> Tensor:
     """The mean logarithm of gap (m) over speed (m/s)."""
-    headway = m.signals.gap.clamp(min=0.5) / m.signals.follower_speed.clamp(min=MOVING)
+    speed = m.signals.follower_speed.clamp(min=MOVING)
+    headway = m.signals.gap.clamp(min=_LEAST_GAP) / speed
     return _mean(headway.log(), m.moving)
 
 
 def _time_gap(m: Measured) -> Tensor:
-    """By how much the gap grows with speed, s: a ridge regression around what is usual, as speed may hardly have varied."""
-    speed, gap = (
-        values - _mean(values, m.counted)[:, None]
-        for values in (m.signals.follower_speed, m.signals.gap)
-    )
-    return (_mean(speed * gap, m.counted) + _FLAT * _USUAL_GAP) / (
-        _mean(speed.square(), m.counted) + _FLAT
-    )
+    """By how much the gap grows with speed, s: ridge regression, as speed may hardly vary."""
+    speed = m.signals.follower_speed
+    speed = speed - _mean(speed, m.counted)[:, None]
+    gap = m.signals.gap
+    gap = gap - _mean(gap, m.counted)[:, None]
+    covariance = _mean(speed * gap, m.counted)
+    variance = _mean(speed.square(), m.counted)
+    return (covariance + _FLAT * _USUAL_GAP) / (variance + _FLAT)
 
 
 def _standstill_gap(m: Measured) -> Tensor:
-    """What gap that regression leaves at standstill, m."""
-    return _mean(m.signals.gap, m.counted) - _time_gap(m) * _mean(
-        m.signals.follower_speed, m.counted
-    )
+    """The gap that this regression leaves at standstill, m."""
+    speed = _mean(m.signals.follower_speed, m.counted)
+    return _mean(m.signals.gap, m.counted) - _time_gap(m) * speed
 
 
 def _speed_difference(m: Measured) -> Tensor:
@@ -104,23 +111,25 @@ def _acceleration(m: Measured) -> Tensor:
 
 
 def _response_time(m: Measured) -> Tensor:
-    """How long after his leader he does the same, s: the mean of delays, weighted by how little their speeds then differ."""
-    first, most = (max(1, round(delay / m.dt)) for delay in _DELAYS)
-    delays = range(0, min(most, m.counted.shape[1] - 1) + 1, first)
+    """How long after their leader a driver does the same, s.
+
+    The mean of delays, weighted by how little the delayed speeds differ.
+    """
+    step = max(1, round(_DELAY_STEP / m.dt))
+    longest = max(1, round(_LONGEST_DELAY / m.dt))
+    frames = m.counted.shape[1]
+    delays = range(0, min(longest, frames - 1) + 1, step)
     variances = []
     for delay in delays:
-        both = m.counted[:, delay:] & m.counted[:, : m.counted.shape[1] - delay]
-        apart = (
-            m.signals.follower_speed[:, delay:]
-            - m.signals.leader_speed[:, : m.counted.shape[1] - delay]
-        )
+        both = m.counted[:, delay:] & m.counted[:, : frames - delay]
+        leader = m.signals.leader_speed[:, : frames - delay]
+        apart = m.signals.follower_speed[:, delay:] - leader
         variances.append(_mean((apart - _mean(apart, both)[:, None]).square(), both))
     variance = torch.stack(variances, 1)
     least = variance.min(1, keepdim=True).values
-    weight = torch.softmax(-(variance - least) / (_CLEARLY[0] + _CLEARLY[1] * least), 1)
-    return weight @ torch.tensor(
-        [delay * m.dt for delay in delays], dtype=weight.dtype, device=weight.device
-    )
+    weight = torch.softmax(-(variance - least) / (_CLEARLY + _CLEARLY_SHARE * least), 1)
+    seconds = [delay * m.dt for delay in delays]
+    return weight @ torch.tensor(seconds, dtype=weight.dtype, device=weight.device)
 
 
 DRIVER_FEATURES: dict[str, Callable[[Measured], Tensor]] = {
@@ -131,8 +140,9 @@ DRIVER_FEATURES: dict[str, Callable[[Measured], Tensor]] = {
     "acceleration": _acceleration,
     "response_time": _response_time,
 }
-"""Driver features that a policy may know, each `(P,)`. What does not hold from the first half of a drive to the second tells nothing of a
-driver: the spread of his headway, say, or how many times as hard as his leader he accelerates (correlations of 0.15 and 0.1)."""
+"""Driver features that a policy may know, each `(P,)`. A quantity that does not hold from the first
+half of a trajectory to the second says nothing of a driver: the standard deviation of the headway,
+for instance, or acceleration relative to the leader's (correlations of 0.15 and 0.1)."""
 
 DRIVER_FEATURE_SETS: dict[str, tuple[str, ...]] = {"all": tuple(DRIVER_FEATURES), "none": ()}
 """Driver features that go by one name: `policy.driver_features=all`."""
@@ -151,11 +161,11 @@ def check_driver_features(names: Sequence[str]) -> None:
 def measure(
     batch: PairBatch, names: Sequence[str], dt: float, since: Tensor, until: Tensor
 ) -> Tensor:
-    """Measures drivers' driver features.
+    """Measures driver features.
 
     Args:
         batch: P pairs.
-        names: the driver features, k of `TRAITS`.
+        names: the driver features, k of `DRIVER_FEATURES`.
         dt: the pairs' time step, s.
         since, until: `(P,)`, the frames from which on and before which each driver is measured.
 
@@ -164,10 +174,7 @@ def measure(
     """
     frame = torch.arange(batch.mask.shape[1], device=until.device)
     counted = batch.mask & (frame >= since[:, None]) & (frame < until[:, None])
-    measured = Measured(History(*(signal.double() for signal in History.of(batch))), counted, dt)
+    measured = Measured(History.of(batch).double(), counted, dt)
+    values = torch.stack([DRIVER_FEATURES[name](measured) for name in names], -1)
     known = measured.moving.sum(1) * dt >= LEAST
-    return torch.where(
-        known[:, None],
-        torch.stack([DRIVER_FEATURES[name](measured) for name in names], -1),
-        torch.nan,
-    )
+    return torch.where(known[:, None], values, torch.nan)

@@ -1,7 +1,11 @@
-"""Networks that answer together.
+"""Ensembles: networks that answer together.
 
-Networks that start from different weights and keep different drivers for validation make different mistakes, and together they
-make fewer (L. K. Hansen and P. Salamon, 1990, *Neural network ensembles*, IEEE PAMI 12).
+Networks that start from different weights and keep different drivers for validation make different
+errors, and together they make fewer (L. K. Hansen and P. Salamon, 1990, *Neural network ensembles*,
+IEEE PAMI 12).
+
+Shapes: N ensembles of M networks each, B drivers, W windows, f features, n parameters, s width of
+the state of one network.
 """
 
 from __future__ import annotations
@@ -15,15 +19,17 @@ _EDGE = 1e-6
 
 
 class Ensemble(PolicyNetwork):
-    """N ensembles of M networks. All members of an ensemble read the same; it answers, for each parameter, their median.
+    """N ensembles of M networks. All networks of an ensemble read the same tokens.
 
-    Not their mean: a member who answers far out drags it to where no member is, and a model with regimes (Wiedemann 74) then
-    drives worse than each of them. Of an even number the median is the mean of the middle two in the squashed space (logits). It
-    is put together of trained networks, not trained itself: its parameters' first dimension is N M.
+    An ensemble answers, for each parameter, the median of its networks' answers. Not the mean: one
+    answer far out pulls the mean to where no network is, and a model with regimes (Wiedemann 74)
+    then drives worse than with each of them. Of an even number the median is the mean of the middle
+    two in the squashed space (logits). An ensemble is put together of trained networks, not trained
+    itself: the first dimension of its parameters is N M.
     """
 
     def __init__(self, members: PolicyNetwork, size: int) -> None:
-        """Takes N times M networks, those of one ensemble behind one another, and M."""
+        """Takes N M networks, those of one ensemble behind one another, and M."""
         super().__init__()
         self.members = members
         self.size = size
@@ -33,19 +39,13 @@ class Ensemble(PolicyNetwork):
 
     def forward(self, tokens: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         networks, drivers, width = state.shape
-        apart = (
-            state.view(networks, drivers, self.size, width // self.size)
-            .transpose(1, 2)
-            .flatten(0, 1)
-        )
+        apart = state.view(networks, drivers, self.size, width // self.size)
+        apart = apart.transpose(1, 2).flatten(0, 1)
         answers, after = self.members(tokens.repeat_interleave(self.size, 0), apart)
         logits = torch.logit(answers, eps=_EDGE).view(networks, self.size, *answers.shape[1:])
         return logits.quantile(0.5, dim=1).sigmoid(), self._together(after)
 
     def _together(self, states: Tensor) -> Tensor:
-        """Arranges the members' states `(N M, B, s)` as `(N, B, M s)`."""
-        return (
-            states.view(len(states) // self.size, self.size, *states.shape[1:])
-            .transpose(1, 2)
-            .flatten(2)
-        )
+        """Arranges the networks' states `(N M, B, s)` as `(N, B, M s)`."""
+        apart = states.view(len(states) // self.size, self.size, *states.shape[1:])
+        return apart.transpose(1, 2).flatten(2)

@@ -1,7 +1,7 @@
 """What a policy sees: the recent states of leader and follower, one token per window.
 
-The token of a window holds the last `length` frames up to and including the window's first, so it never looks ahead.
-Shapes: f features of a token.
+The token of a window holds the last `length` frames up to and including the window's first, so it
+never looks ahead. Shapes: f features of a token.
 """
 
 from __future__ import annotations
@@ -30,29 +30,74 @@ class History(NamedTuple):
     @classmethod
     def of(cls, batch: PairBatch) -> History:
         """Returns all that was measured of P pairs, `(P, T)` each."""
-        signals = (
+        return cls(
             batch.leader_speed,
             batch.leader_acceleration,
             batch.follower_speed,
             batch.follower_acceleration,
+            batch.gap,
         )
-        return cls(*signals, batch.gap)
+
+    def double(self) -> History:
+        """Returns the same signals in double precision."""
+        return History(*(signal.double() for signal in self))
 
 
 _STANDING = 1.0
-"""Speed in m/s below which time headway and inverse time to collision are taken at this speed: they have poles at 0."""
+"""Speed in m/s below which time headway and inverse time to collision are taken at this speed: they
+have poles at 0."""
+
+
+def _leader_speed(history: History) -> Tensor:
+    """m/s."""
+    return history.leader_speed
+
+
+def _leader_acceleration(history: History) -> Tensor:
+    """m/s2."""
+    return history.leader_acceleration
+
+
+def _follower_speed(history: History) -> Tensor:
+    """m/s."""
+    return history.follower_speed
+
+
+def _follower_acceleration(history: History) -> Tensor:
+    """m/s2."""
+    return history.follower_acceleration
+
+
+def _gap(history: History) -> Tensor:
+    """Bumper to bumper, m."""
+    return history.gap
+
+
+def _relative_speed(history: History) -> Tensor:
+    """m/s; positive where the gap grows."""
+    return history.leader_speed - history.follower_speed
+
+
+def _time_headway(history: History) -> Tensor:
+    """Gap over speed, s."""
+    return history.gap / history.follower_speed.clamp(min=_STANDING)
+
+
+def _inverse_time_to_collision(history: History) -> Tensor:
+    """1/s; positive where the gap shrinks."""
+    approach = history.follower_speed - history.leader_speed
+    return approach / history.gap.clamp(min=_STANDING)
+
 
 INPUTS: dict[str, Callable[[History], Tensor]] = {
-    "leader_speed": lambda h: h.leader_speed,
-    "leader_acceleration": lambda h: h.leader_acceleration,
-    "follower_speed": lambda h: h.follower_speed,
-    "follower_acceleration": lambda h: h.follower_acceleration,
-    "gap": lambda h: h.gap,
-    "relative_speed": lambda h: h.leader_speed - h.follower_speed,
-    "time_headway": lambda h: h.gap / h.follower_speed.clamp(min=_STANDING),
-    "inverse_time_to_collision": lambda h: (
-        (h.follower_speed - h.leader_speed) / h.gap.clamp(min=_STANDING)
-    ),
+    "leader_speed": _leader_speed,
+    "leader_acceleration": _leader_acceleration,
+    "follower_speed": _follower_speed,
+    "follower_acceleration": _follower_acceleration,
+    "gap": _gap,
+    "relative_speed": _relative_speed,
+    "time_headway": _time_headway,
+    "inverse_time_to_collision": _inverse_time_to_collision,
 }
 """Signals that a policy may see, each `(*batch, length)`."""
 
@@ -68,12 +113,16 @@ INPUT_SETS: dict[str, tuple[str, ...]] = {
 }
 """Inputs that go by one name: `policy.inputs=situation`."""
 
-_SUMMARIES: dict[Summary, Callable[[Tensor], list[Tensor]]] = {
-    "frames": lambda x: list(x.unbind(-1)),
-    "last": lambda x: [x[..., -1]],
-    "mean": lambda x: [x.mean(-1)],
-    "mean_std": lambda x: [x.mean(-1), x.std(-1, correction=0)],
-}
+
+def _summarised(values: Tensor, summary: Summary) -> list[Tensor]:
+    """Returns what a token holds of one signal `(*batch, length)`, features `(*batch,)` each."""
+    if summary == "frames":
+        return list(values.unbind(-1))
+    if summary == "last":
+        return [values[..., -1]]
+    if summary == "mean":
+        return [values.mean(-1)]
+    return [values.mean(-1), values.std(-1, correction=0)]
 
 
 def of_set(
@@ -87,7 +136,9 @@ def of_set(
     if not isinstance(value, str):
         return value
     if value not in sets:
-        hint = f" Write [{value}]." if value in known else nearest(value, [*sets, *known])
+        hint = nearest(value, [*sets, *known])
+        if value in known:
+            hint = f" Write [{value}]."
         raise ValueError(
             f"not a set of {what}s.{hint} Give {', '.join(sets)}, or a list of {', '.join(known)}"
         )
@@ -130,19 +181,24 @@ def check_inputs(names: Sequence[str]) -> None:
 
 
 def token_width(names: tuple[str, ...], summary: Summary, length: int) -> int:
-    """Returns f."""
-    return len(names) * {"frames": length, "last": 1, "mean": 1, "mean_std": 2}[summary]
+    """Returns f where a token holds `length` frames."""
+    if summary == "frames":
+        return len(names) * length
+    if summary == "mean_std":
+        return len(names) * 2
+    return len(names)
 
 
 def tokens(history: History, names: tuple[str, ...], summary: Summary) -> Tensor:
-    """Returns tokens `(*batch, f)`."""
-    return torch.stack(
-        [value for name in names for value in _SUMMARIES[summary](INPUTS[name](history))], dim=-1
-    )
+    """Returns tokens `(*batch, f)` of recent frames `(*batch, length)`."""
+    features = []
+    for name in names:
+        features += _summarised(INPUTS[name](history), summary)
+    return torch.stack(features, dim=-1)
 
 
 def measured_history(batch: PairBatch, pair: Tensor, frame: Tensor, length: int) -> History:
-    """Returns the last measured frames up to a frame; a pair's first frame stands for those before it.
+    """Returns the last measured frames up to a frame; the first stands for those before it.
 
     Args:
         batch: P pairs.

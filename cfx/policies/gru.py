@@ -1,4 +1,7 @@
-"""Gated recurrent units: K. Cho et al. (2014), *Learning phrase representations using RNN encoder-decoder*, EMNLP."""
+"""Gated recurrent units.
+
+K. Cho et al. (2014), *Learning phrase representations using RNN encoder-decoder*, EMNLP.
+"""
 
 from __future__ import annotations
 
@@ -21,19 +24,18 @@ class GruNetwork(RecurrentNetwork):
     def cell(self, projected: Tensor, layer: RecurrentLayer, carried: Tensor) -> Tensor:
         recurrent = layer.recur(carried)
         h = self.hidden
-        reset, update = (
-            (projected[..., : 2 * h] + recurrent[..., : 2 * h]).sigmoid().chunk(2, dim=-1)
-        )
+        gates = (projected[..., : 2 * h] + recurrent[..., : 2 * h]).sigmoid()
+        reset, update = gates.chunk(2, dim=-1)
         new = torch.tanh(projected[..., 2 * h :] + reset * recurrent[..., 2 * h :])
         return torch.lerp(new, carried, update)
 
 
 class GruPolicy(Policy):
-    """The paper's policy: a recurrent network whose outputs are squashed into the parameters' bounds.
+    """The paper's policy: a recurrent network whose outputs stay in the parameters' bounds.
 
-    Differences from the paper: it does not say whether the network's memory outlives a window; here it does, for the whole
-    drive. Training starts from the fixed parameters (`start=middle` does not): a network that learns little then does little
-    harm.
+    Differences from the paper: it does not say whether the network's memory outlives a window; here
+    it does, for the whole trajectory. Training starts from the fixed parameters (`start=middle`
+    does not): a network that learns little then does little harm.
     """
 
     schema: ClassVar[type[Settings]] = RecurrentSettings

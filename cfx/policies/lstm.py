@@ -1,4 +1,7 @@
-"""Long short-term memory: S. Hochreiter and J. Schmidhuber (1997), Neural Computation 9(8); F. Gers et al. (2000)."""
+"""Long short-term memory.
+
+S. Hochreiter and J. Schmidhuber (1997), Neural Computation 9(8); F. Gers et al. (2000).
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from cfx.policies.recurrent import RecurrentLayer, RecurrentNetwork, RecurrentSe
 
 
 class LstmNetwork(RecurrentNetwork):
-    """N long short-term memories, in the form of `torch.nn.LSTM`; carries the output and the cell."""
+    """N long short-term memories as `torch.nn.LSTM`; carries the output and the cell."""
 
     gates = 4
     states = 2

@@ -1,7 +1,8 @@
 """N independent recurrent networks as one: batched matrix products instead of a loop over networks.
 
-The equations, gate order and initialisation are those of `torch.nn.GRU` and `torch.nn.LSTM` (which cannot be batched over their
-weights: `torch.func.vmap` has no rule for them); a test holds them equal.
+The equations, gate order and initialisation are those of `torch.nn.GRU` and `torch.nn.LSTM` (which
+cannot be batched over their weights: `torch.func.vmap` has no rule for them); a test holds them
+equal.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ class RecurrentSettings(PolicySettings):
     )
     start: Literal["fixed", "middle"] = Field(
         "fixed",
-        description="what an untrained network answers: the fixed parameters, or about the middle of the bounds (paper)",
+        description="what an untrained network answers: the fixed parameters, or about the middle"
+        " of the bounds (paper)",
     )
 
 
@@ -61,7 +63,10 @@ class RecurrentLayer(nn.Module):
 
 
 class RecurrentNetwork(PolicyNetwork):
-    """Stacked recurrent layers and a sigmoid output layer, N times; a subclass says what one cell does."""
+    """Stacked recurrent layers and a sigmoid output layer, N times.
+
+    A subclass says what one cell does.
+    """
 
     gates: int
     states: int
@@ -110,5 +115,5 @@ class RecurrentNetwork(PolicyNetwork):
         return logits.view(*x.shape[:3], -1).sigmoid(), torch.cat(last, dim=-1)
 
     def cell(self, projected: Tensor, layer: RecurrentLayer, carried: Tensor) -> Tensor:
-        """Returns what one layer carries after one window, `(N, B, states * hidden)`, its output first."""
+        """Returns what a layer carries after a window, `(N, B, states * hidden)`, output first."""
         raise NotImplementedError

@@ -1,6 +1,7 @@
 """Where saved policies were loaded before `cfx.agents` took them: for one version more.
 
-Policies that MLflow logged with the version before carry code that imports `TrainedPolicy` from here.
+Policies that MLflow logged with the version before carry code that imports `TrainedPolicy` from
+here.
 """
 
 from __future__ import annotations

@@ -42,16 +42,17 @@ class ProtocolContext:
     """Everything that a protocol composes.
 
     Attributes:
-        pairs, batch: the drives, as objects and as tensors on the job's device.
+        pairs, batch: the trajectories, as objects and as tensors on the job's device.
         style: score and cluster of each driver.
         simulator: the driving model and its time step.
         model_node, policy_node: config nodes, kept with the trained policy.
         calibrator, policy, learner: the components.
-        windows: how drives are cut.
+        windows: how trajectories are cut.
         split: share of each pair's windows for training.
         seed: for everything random.
         metrics: what is measured; None: cfx's own metrics.
-        workspace: a folder where interrupted training finds what it needs to go on; None: it begins again.
+        workspace: a folder where interrupted training finds what it needs to go on; None: training
+            begins again.
     """
 
     pairs: PairSet
@@ -80,11 +81,11 @@ class ProtocolContext:
         return self.calibrator.objective
 
     def labels(self, counts: Tensor, fixed: Tensor) -> Labels | None:
-        """Finds window labels, if the learner needs any.
+        """Calibrates parameters per window (labels), if the learner needs any.
 
         Args:
             counts: `(P,)`, how many windows of each pair, from its first.
-            fixed: `(P, n)`, each pair's own fixed parameters.
+            fixed: `(P, n)`, driver-specific parameters.
         """
         if not (self.policy.trainable and self.learner.needs_labels):
             return None
@@ -94,8 +95,8 @@ class ProtocolContext:
         tolerance = self.calibrator.tie_tolerance(self.windows)
         sensitive = float((labels.sensitivity > tolerance).double().mean())
         log.info(
-            "Per-window calibrated parameters (labels): %d windows; the choice of parameters changes"
-            " the loss by more than %s in %.0f %% of them",
+            "Per-window calibrated parameters (labels): %d windows; the choice of parameters"
+            " changes the loss by more than %s in %.0f %% of them",
             len(labels.windows),
             self.objective.worded(tolerance),
             100 * sensitive,
@@ -105,32 +106,36 @@ class ProtocolContext:
     def calibration_metrics(
         self, method: str, last: Tensor, parameters: Tensor, members: Tensor | None = None
     ) -> dict[str, float]:
-        """Returns `calibration/OBJECTIVE/METHOD`: mean losses of constant parameters where they were found.
+        """Returns mean losses of constant parameters on the data that they were calibrated on.
+
+        The metrics are called `calibration/OBJECTIVE/METHOD`.
 
         Args:
             method: what the parameters are called in metrics: `fixed` or `population`.
             last: `(P,)`, the last frame of each pair's calibrated part.
-            parameters: `(P, n)`, one set per pair; with `members` `(K, n)`, one per group. SI units.
+            parameters: `(P, n)`, one set per pair; with `members` `(K, n)`, one per group. SI
+                units.
             members: `(K, P)` bool, the pairs of each group.
         """
         losses = self.calibrator.losses(self.batch, last, parameters, members)
         return {f"calibration/{name}/{method}": loss for name, loss in losses.items()}
 
     def constant(self, policy: Policy, parameters: Tensor) -> Agent:
-        """Makes a policy drive as built, without training: the baselines.
+        """Returns an agent of a policy as built, without training: the baselines.
 
         Args:
             policy: the component.
-            parameters: `(N, n)`, SI units: what `fixed` answers, and recurrent networks start from; one network for each row.
+            parameters: `(N, n)`, SI units: what `fixed` answers, and recurrent networks start from;
+                one network for each row.
         """
-        return self.ready(
-            policy,
-            self.untrained(policy, parameters),
-            tuple(str(number) for number in range(len(parameters))),
-        )
+        names = tuple(str(number) for number in range(len(parameters)))
+        return self.ready(policy, self.untrained(policy, parameters), names)
 
     def untrained(self, policy: Policy, parameters: Tensor) -> TrainingResult:
-        """Returns a policy's networks as built, in float64, so that constants stay what calibration found; see `constant`."""
+        """Returns a policy's networks as built; see `constant`.
+
+        They are in double precision, so that constants stay what calibration found.
+        """
         space = self.simulator.model.space
         width = token_width(policy.inputs, policy.summary, self.windows.length)
         unit = space.to_unit(parameters.cpu())
@@ -146,7 +151,7 @@ class ProtocolContext:
     def ready(
         self, policy: Policy, training_result: TrainingResult, names: tuple[str, ...]
     ) -> Agent:
-        """Returns networks that are ready to drive; `names` says what each is for.
+        """Returns an agent of trained networks; `names` says what each is for.
 
         Raises:
             PluginError: the learner or the policy did not deliver such networks.
@@ -198,9 +203,11 @@ class ProtocolResult:
         evaluation: the comparison of all methods.
         policy: the policy that drove in it.
         curves: learning curves; empty if nothing was learned.
-        labels: window labels; None if none were needed.
-        calibration: further metrics, of the calibration itself: `ProtocolContext.calibration_metrics`.
-        notes: what a reader of the results should know of the design, name -> a number or text; kept in `data.json`.
+        labels: per-window calibrated parameters; None if none were needed.
+        calibration: further metrics, of the calibration itself:
+            `ProtocolContext.calibration_metrics`.
+        notes: what a reader of the results should know of the design, name -> a number or text;
+            kept in `data.json`.
     """
 
     evaluation: Evaluation
@@ -218,18 +225,21 @@ def _check_training_result(
     """Asks the networks about one window, so that a wrong shape or dtype ends in a sentence."""
     if not isinstance(training_result, TrainingResult):
         raise PluginError(
-            f"{who}: fit must return a cfx.TrainingResult, but returned a {type(training_result).__name__}"
+            f"{who}: fit must return a cfx.TrainingResult, but returned a"
+            f" {type(training_result).__name__}"
         )
     mean = training_result.scaler.mean
     expected = (networks, 1, 1, parameters)
     if mean.shape[0] == networks:
-        answer, _ = training_result.network(
-            mean.new_zeros((networks, 1, 1, mean.shape[1])),
-            training_result.network.initial_state(networks, 1),
-        )
+        tokens = mean.new_zeros((networks, 1, 1, mean.shape[1]))
+        state = training_result.network.initial_state(networks, 1)
+        answer, _ = training_result.network(tokens, state)
         if answer.shape == expected and answer.dtype == mean.dtype:
             return
-        got = f"its networks answer {tuple(answer.shape)} in {answer.dtype} where {expected} in {mean.dtype} are wanted"
+        got = (
+            f"its networks answer {tuple(answer.shape)} in {answer.dtype} where {expected} in"
+            f" {mean.dtype} are wanted"
+        )
     else:
         got = f"its scaler is for {mean.shape[0]} networks where {networks} are wanted"
     raise PluginError(f"{who} breaks its contract: {got}")
@@ -238,13 +248,13 @@ def _check_training_result(
 class Protocol(Component):
     """Base of every protocol.
 
-    Life cycle: a job calls `determines` and then `run`, once each. All methods are tested on the same frames from the same
-    measured state.
+    Life cycle: a job calls `determines` and then `run`, once each. All methods are tested on the
+    same frames from the same measured state.
 
     Attributes:
         trains: whether it has a `trainable` policy trained; not if it brings one.
-        jobs: settings that name the output folders of finished jobs. Where one is the id of an MLflow run, the job puts the
-            folder with that run's files in its place.
+        jobs: settings that name the output folders of finished jobs. Where one is the id of an
+            MLflow run, the job puts the folder with that run's files in its place.
     """
 
     kind = "protocol"
@@ -252,7 +262,9 @@ class Protocol(Component):
     jobs: ClassVar[tuple[str, ...]] = ()
 
     def determines(self) -> Mapping[str, Any]:
-        """Returns what this protocol determines of a job's configuration, whatever is chosen there: key -> value.
+        """Returns what this protocol determines of a job's configuration: key -> value.
+
+        It holds whatever else is chosen there.
 
         Raises:
             DataError: it depends on something that cannot be read.

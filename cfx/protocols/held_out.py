@@ -1,8 +1,11 @@
-"""The test of drivers that nothing was learned from: the same for all protocols that have some."""
+"""The test of unseen drivers, the same for all protocols that have some.
+
+Shapes: Q test pairs, N networks, n tuned parameters.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +17,7 @@ from cfx.agents.agent import Agent
 from cfx.evaluation.closed_loop import ClosedLoop, simulate_closed_loop
 from cfx.evaluation.evaluate import closed_loop_errors, evaluate
 from cfx.evaluation.platoon import measure_platoons
-from cfx.evaluation.result import Evaluation
+from cfx.evaluation.result import Evaluation, Platoon
 from cfx.pairs import PairBatch, PairSet
 from cfx.policies.default import DefaultPolicy
 from cfx.policies.fixed import FixedPolicy
@@ -23,16 +26,18 @@ from cfx.protocols.base import ProtocolContext
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Q pairs of drivers that nothing was learned from, and what drives them.
+    """Q pairs of drivers from whom nothing was learned, and the methods that are tested on them.
 
     Attributes:
-        pairs, batch: the drives.
-        network: which of the policy's N networks, and of the populations, drives each, `(Q,)`.
+        context: what the protocol composes.
+        pairs, batch: the trajectories.
+        network: which of the policy's N networks, and of the pooled sets, each pair is tested with,
+            `(Q,)`.
         first: the last measured frame before the test part, `(Q,)`.
-        fixed: each driver's own set, `(Q, n)`.
-        base: what offsets start from for him, if not from what they do for an unseen driver, `(Q, n)`.
-        strange: what offsets start from for a driver of whom nothing is known, `(Q, n)`.
-        population: of each network, `(N, n)`; None if there is none.
+        fixed: driver-specific parameters, `(Q, n)`, SI units.
+        base: driver-specific base parameters, `(Q, n)`; None: `unseen_base` for every driver.
+        unseen_base: base parameters of drivers of whom nothing is known, `(Q, n)`.
+        population: pooled parameters, `(N, n)`; None if there are none.
         policy: what was learned.
     """
 
@@ -43,122 +48,148 @@ class HeldOut:
     first: Tensor
     fixed: Tensor
     base: Tensor | None
-    strange: Tensor
+    unseen_base: Tensor
     population: Tensor | None
     policy: Agent
 
     def evaluation(
         self, histories: Sequence[float] = (), *, fold: Tensor | None = None
     ) -> Evaluation:
-        """Drives all methods and compares them.
+        """Simulates all methods and compares them.
 
         Args:
             histories: s, other amounts of history to compare, for policies of offsets.
             fold: in which fold each pair is tested, `(Q,)`; None: there are none.
         """
-        context, batch, first, network = self.context, self.batch, self.first, self.network
-        names, model = self.policy.names, context.simulator.model
-        defaults = context.space.defaults(dtype=self.fixed.dtype, device=self.fixed.device)
-        cold_start_fraction = {
-            "default": context.constant(DefaultPolicy(), defaults.expand(len(names), -1)),
-            "policy": self.policy,
-        }
-        platoons: dict[str, tuple[Agent, Sequence[str]]] = {
-            "default": (context.constant(DefaultPolicy(), defaults[None]), ("any",)),
-            "policy": (self.policy, names),
-        }
-        if self.population is not None:
-            cold_start_fraction["population"] = context.constant(FixedPolicy(), self.population)
-            platoons["population"] = (cold_start_fraction["population"], names)
-        base = self.strange if self.base is None else self.base
-        loops = {
-            name: simulate_closed_loop(
-                context.simulator,
-                one,
-                batch,
-                first,
-                network,
-                base=base,
-                history=self.policy.context_rule.history_s,
-            )
-            for name, one in cold_start_fraction.items()
-        }
-        each = torch.arange(len(first), device=first.device)
-        loops["fixed"] = simulate_closed_loop(
-            context.simulator, context.constant(FixedPolicy(), self.fixed), batch, first, each
-        )
-        if (
-            self.base is not None
-            and self.policy.base is not None
-            and self.policy.context_rule.shrinkage > 0
-        ):
-            loops["shrunk"] = simulate_closed_loop(
-                context.simulator, context.constant(FixedPolicy(), self.base), batch, first, each
-            )
-        full_trajectory = {
-            name: simulate_closed_loop(
-                context.simulator, one, batch, torch.zeros_like(first), network
-            )
-            for name, one in cold_start_fraction.items()
-        }
+        context = self.context
+        methods = self._methods_without_history()
+        loops = self._test_part(methods)
+        history = None
+        if self.policy.base is not None and histories:
+            history = self.history(histories, loops["fixed"])
         return evaluate(
             self.pairs,
-            batch,
-            first,
+            self.batch,
+            self.first,
             loops,
             context.space,
             context.style,
             adaptation_space=self.policy.space,
             seed=context.seed,
             fold=fold,
-            full_trajectory=full_trajectory,
+            full_trajectory=self._full_trajectory(methods),
             metrics=context.metrics,
-            platoon=measure_platoons(model, platoons),
-            history=self.history(histories, loops["fixed"])
-            if self.policy.base is not None and histories
-            else None,
+            platoon=self._platoons(methods),
+            history=history,
         )
 
+    def _methods_without_history(self) -> dict[str, Agent]:
+        """Returns the methods that need nothing of a test driver beforehand."""
+        context, networks = self.context, len(self.policy.names)
+        default = context.space.defaults(dtype=self.fixed.dtype, device=self.fixed.device)
+        methods = {
+            "default": context.constant(DefaultPolicy(), default.expand(networks, -1)),
+            "policy": self.policy,
+        }
+        if self.population is not None:
+            methods["population"] = context.constant(FixedPolicy(), self.population)
+        return methods
+
+    def _test_part(self, methods: Mapping[str, Agent]) -> dict[str, ClosedLoop]:
+        """Simulates the test part by all methods."""
+        context, rule = self.context, self.policy.context_rule
+        base = self.unseen_base if self.base is None else self.base
+        loops = {}
+        for name, agent in methods.items():
+            loops[name] = simulate_closed_loop(
+                context.simulator,
+                agent,
+                self.batch,
+                self.first,
+                self.network,
+                base=base,
+                history=rule.history_s,
+            )
+        loops["fixed"] = self._constant(self.fixed)
+        if self.base is not None and self.policy.base is not None and rule.shrinkage > 0:
+            loops["shrunk"] = self._constant(self.base)
+        return loops
+
+    def _constant(self, parameters: Tensor) -> ClosedLoop:
+        """Simulates the test part with constant parameters of each driver, `(Q, n)`."""
+        agent = self.context.constant(FixedPolicy(), parameters)
+        each = torch.arange(len(self.first), device=self.first.device)
+        return simulate_closed_loop(self.context.simulator, agent, self.batch, self.first, each)
+
+    def _full_trajectory(self, methods: Mapping[str, Agent]) -> dict[str, ClosedLoop]:
+        """Simulates the test trajectories from their first frame on."""
+        begin = torch.zeros_like(self.first)
+        loops = {}
+        for name, agent in methods.items():
+            loops[name] = simulate_closed_loop(
+                self.context.simulator, agent, self.batch, begin, self.network
+            )
+        return loops
+
+    def _platoons(self, methods: Mapping[str, Agent]) -> Platoon | None:
+        context, names = self.context, self.policy.names
+        default = context.space.defaults(dtype=self.fixed.dtype, device=self.fixed.device)
+        agents: dict[str, tuple[Agent, Sequence[str]]] = {}
+        for name, agent in methods.items():
+            agents[name] = (agent, names)
+        agents["default"] = (context.constant(DefaultPolicy(), default[None]), ("any",))
+        return measure_platoons(context.simulator.model, agents)
+
     def history(self, histories: Sequence[float], fixed: ClosedLoop) -> pd.DataFrame:
-        """Drives the test part after reading different amounts of history; see `Evaluation.history`.
+        """Simulates the test part after different amounts of history; see `Evaluation.history`.
 
         Args:
             histories: s; besides them, all there is.
-            fixed: what the drivers' own sets drove there.
+            fixed: the simulation with driver-specific parameters.
         """
-        context, batch, first, network = self.context, self.batch, self.first, self.network
-        own, _ = closed_loop_errors(batch, first, fixed)
-        bases = {"own": self.base} if self.base is not None else {}
-        rows = []
-        for base, values in {**bases, "population": self.strange}.items():
+        bases = {}
+        if self.base is not None:
+            bases["own"] = self.base
+        bases["population"] = self.unseen_base
+        error_of_fixed, _ = closed_loop_errors(self.batch, self.first, fixed)
+        tables = []
+        for name, values in bases.items():
             for amount in (*sorted(histories), None):
-                loop = simulate_closed_loop(
-                    context.simulator,
-                    self.policy,
-                    batch,
-                    first,
-                    network,
-                    base=values,
-                    history=amount,
-                )
-                speed, gap = closed_loop_errors(batch, first, loop)
-                read = first.cpu().numpy() * context.simulator.dt
-                rows.append(
-                    pd.DataFrame(
-                        {
-                            "pair_id": [pair.pair_id for pair in self.pairs],
-                            "driver": [pair.driver for pair in self.pairs],
-                            "base": base,
-                            "history_s": read if amount is None else np.minimum(read, amount),
-                            "amount": f"{context.split:.0%}".replace("%", " %")
-                            if amount is None
-                            else f"{amount:g} s",
-                            "rmse_speed": speed,
-                            "rmse_gap": gap,
-                            "improvement": np.divide(
-                                own - speed, own, out=np.full_like(own, np.nan), where=own > 0
-                            ),
-                        }
-                    )
-                )
-        return pd.concat(rows, ignore_index=True)
+                table = self._after_history(values, amount, error_of_fixed)
+                table.insert(2, "base", name)
+                tables.append(table)
+        return pd.concat(tables, ignore_index=True)
+
+    def _after_history(
+        self, base: Tensor, amount: float | None, error_of_fixed: np.ndarray
+    ) -> pd.DataFrame:
+        """Simulates the test part after one amount of history, s; None: all there is."""
+        context = self.context
+        loop = simulate_closed_loop(
+            context.simulator,
+            self.policy,
+            self.batch,
+            self.first,
+            self.network,
+            base=base,
+            history=amount,
+        )
+        speed, gap = closed_loop_errors(self.batch, self.first, loop)
+        observed = self.first.cpu().numpy() * context.simulator.dt
+        text = f"{100 * context.split:.0f} %"
+        if amount is not None:
+            observed = np.minimum(observed, amount)
+            text = f"{amount:g} s"
+        improvement = np.full_like(error_of_fixed, np.nan)
+        np.divide(error_of_fixed - speed, error_of_fixed, out=improvement, where=error_of_fixed > 0)
+        return pd.DataFrame(
+            {
+                "pair_id": [pair.pair_id for pair in self.pairs],
+                "driver": [pair.driver for pair in self.pairs],
+                "history_s": observed,
+                "amount": text,
+                "rmse_speed": speed,
+                "rmse_gap": gap,
+                "improvement": improvement,
+            }
+        )

@@ -1,4 +1,4 @@
-"""A policy that was trained elsewhere: does it hold on these recordings, from which nothing of it was learned?"""
+"""The test of a policy that was trained elsewhere, on recordings that it learned nothing from."""
 
 from __future__ import annotations
 
@@ -29,22 +29,24 @@ class TransferSettings(Settings):
     """Settings of `transfer`."""
 
     run: FilePath = Field(
-        description="output folder of the job whose policy drives, or the id of its MLflow run"
+        description="output folder of the job whose policy is tested, or the id of its MLflow run"
     )
 
 
 class Transfer(Protocol):
-    """A finished job's policy drives recordings that it has never seen; nothing is trained.
+    """A finished job's policy is tested on recordings that it has never seen; nothing is trained.
 
-    Model, policy and windows are that job's, whatever else is chosen. Its network for unseen drivers (`all`, or the only one) drives
-    as its protocol let it: from each driver's own parameters or from the population's, after as much history. The baselines are
-    the model's default parameters, `population`, the constant ones that were calibrated on those whom the policy learned from
-    (where there are any), and the driver's own fixed parameters, from the first 80 % of his drive here. All drive the last
-    20 %; default, population and policy also drive each pair whole.
+    Model, policy and windows are that job's, whatever else is chosen. Its network for unseen
+    drivers (`all`, or the only one) is tested as its protocol tested it: from driver-specific base
+    parameters or from the pooled ones, after as much history. The baselines are the model's default
+    parameters, `population` (constant parameters that were calibrated on the drivers that the
+    policy learned from, where there are any), and the driver-specific parameters, from the first 80
+    % of each trajectory here. All are tested on the last 20 %; default, population and policy also
+    on each full trajectory.
 
-    So all that `default`, `population` and `policy` know comes from elsewhere: what remains of their gains is what transfers to
-    another day, road or country. (To calibrate and train on some recordings and test on others of the same data, see
-    `across_drivers` with `together=recording`.)
+    So all that `default`, `population` and `policy` know comes from elsewhere: what remains of
+    their gains is what transfers to another day, road or country. (To calibrate and train on some
+    recordings and test on others of the same data, see `across_drivers` with `together=recording`.)
 
     Differences from the paper: it has no such experiment.
     """
@@ -59,7 +61,8 @@ class Transfer(Protocol):
         """The policy that is tested, on the CPU.
 
         Raises:
-            DataError: the folder holds none, or none for other drivers than those it was trained for.
+            DataError: the folder holds none, or none for other drivers than those it was trained
+                for.
         """
         try:
             return checkpoint.load(self.settings.run / "policy").for_unseen_drivers()
@@ -82,7 +85,15 @@ class Transfer(Protocol):
         split = Split.of(pairs, context.windows, context.split)
         fixed = context.calibrator.fixed(pairs, batch, split.frame)
         default = context.space.defaults(dtype=fixed.dtype, device=fixed.device)
-        start = default[None] if policy.base is None else policy.base.to(fixed.dtype)
+        start = default[None]
+        base = None
+        if policy.base is not None:
+            start = policy.base.to(fixed.dtype)
+            if policy.context_rule.driver_specific:
+                base = policy.base_of(fixed)
+        population = None
+        if policy.population is not None:
+            population = policy.population.to(fixed.dtype)
         test = HeldOut(
             context=context,
             pairs=pairs,
@@ -90,11 +101,9 @@ class Transfer(Protocol):
             network=torch.zeros(len(pairs), dtype=torch.int64, device=device),
             first=split.frame.to(device),
             fixed=fixed,
-            base=policy.base_of(fixed)
-            if policy.base is not None and policy.context_rule.driver_specific
-            else None,
-            strange=start.expand(len(pairs), -1),
-            population=policy.population.to(fixed.dtype) if policy.population is not None else None,
+            base=base,
+            unseen_base=start.expand(len(pairs), -1),
+            population=population,
             policy=policy,
         )
         notes = {
@@ -112,32 +121,40 @@ class Transfer(Protocol):
         )
 
     def _check(self, policy: Agent, pairs: PairSet) -> None:
-        """Raises DataError if the policy cannot drive these pairs, or has learned from some of them."""
+        """Checks that the policy can drive these pairs and has learned from none of them.
+
+        Raises:
+            DataError: it cannot, or it has.
+        """
         where = f"protocol.run={self.settings.run}"
         if abs(pairs.dt - policy.dt) > 1e-6:
             raise DataError(
-                f"{where}: this policy drives in steps of {policy.dt:g} s, {pairs.source} has {pairs.dt:g} s; set"
-                f" data.time_step={policy.dt:g}"
+                f"{where}: this policy drives in steps of {policy.dt:g} s, {pairs.source} has"
+                f" {pairs.dt:g} s; set data.time_step={policy.dt:g}"
             )
         known = [pair.pair_id for pair in pairs if pair.content in policy.learned_from]
         if known:
             raise DataError(
-                f"{where}: this policy has learned from {len(known)} of the {len(pairs)} pairs in {pairs.source}, the first of"
-                f" them '{known[0]}'; test it on others (data.recording, data.pair_ids)"
+                f"{where}: this policy has learned from {len(known)} of the {len(pairs)} pairs in"
+                f" {pairs.source}, the first of them '{known[0]}'; test it on others"
+                " (data.recording, data.pair_ids)"
             )
         if not policy.learned_from:
             log.info(
-                "%s does not say which pairs its policy has learned from; see to it yourself that these are others",
+                "%s does not say which pairs its policy has learned from; check yourself that these"
+                " are others",
                 where,
             )
-        if alike := _named_alike(policy, pairs):
+        alike = _named_alike(policy, pairs)
+        if alike:
             log.warning(
-                "%d drivers are called, recording and all, as some that the policy has learned from; if they are the same, as"
-                " another cut of their recording is, leave them out (data.recording, data.pair_ids)",
+                "%d drivers have the same names, including the recording, as some that the policy"
+                " has learned from; if they are the same drivers, as in another cut of one"
+                " recording, leave them out (data.recording, data.pair_ids)",
                 alike,
             )
 
 
 def _named_alike(policy: Agent, pairs: PairSet) -> int:
-    """Counts drivers here who have the name of one whom the policy learned from."""
+    """Counts drivers here who have the name of one that the policy learned from."""
     return len({pair.driver for pair in pairs} & set(policy.learned_from.values()))

@@ -1,4 +1,4 @@
-"""Each driver on his own: the first part of each pair to calibrate and train, the rest to test."""
+"""Each driver alone: the first part of each pair to calibrate and train, the rest to test."""
 
 from __future__ import annotations
 
@@ -6,13 +6,16 @@ from typing import ClassVar, Literal
 
 import torch
 from pydantic import Field
+from torch import Tensor
 
+from cfx.agents.agent import Agent
 from cfx.agents.placement import ALL, group_by
 from cfx.calibration.windows import Split
 from cfx.component import Settings
-from cfx.evaluation.closed_loop import simulate_closed_loop
+from cfx.evaluation.closed_loop import ClosedLoop, simulate_closed_loop
 from cfx.evaluation.evaluate import evaluate
 from cfx.evaluation.platoon import measure_platoons
+from cfx.evaluation.result import Platoon
 from cfx.learners.base import TrainingData
 from cfx.policies.default import DefaultPolicy
 from cfx.policies.fixed import FixedPolicy
@@ -24,15 +27,18 @@ class WithinDriverSettings(Settings):
 
     networks: Literal["pair", "all"] = Field(
         "pair",
-        description="pair: a network for each pair, as in the paper; all: one network for all pairs",
+        description="pair: a network for each pair, as in the paper; all: one network for all"
+        " pairs",
     )
 
 
 class WithinDriver(Protocol):
-    """The paper's first experiment: the first 80 % of each pair's windows to calibrate and train, the last 20 % to test.
+    """The paper's first experiment, on each driver alone.
 
-    The fixed parameters come from the training part as one closed-loop drive; the test starts from the last measured state
-    of the training part. No frame of the test part is read before the evaluation.
+    The first 80 % of each pair's windows serve to calibrate and train, the last 20 % to test. The
+    fixed parameters come from one closed-loop simulation of the training part. The test starts from
+    the last measured state of the training part. No frame of the test part is read before the
+    evaluation.
     """
 
     schema: ClassVar[type[Settings]] = WithinDriverSettings
@@ -43,13 +49,8 @@ class WithinDriver(Protocol):
         split = Split.of(pairs, context.windows, context.split)
         fixed = context.calibrator.fixed(pairs, batch, split.frame)
         labels = context.labels(split.windows, fixed)
-        device = batch.lengths.device
-        own = torch.arange(len(pairs), device=device)
-        network, groups = own, tuple(pair.pair_id for pair in pairs)
+        network, names = self._networks(context)
         if context.policy.trainable:
-            if self.settings.networks == "all":
-                network, groups = group_by([ALL] * len(pairs))
-                network = network.to(device)
             training_data = TrainingData(
                 simulator=context.simulator,
                 batch=batch,
@@ -58,7 +59,7 @@ class WithinDriver(Protocol):
                 fixed=fixed,
                 labels=labels,
                 network=network,
-                names=groups,
+                names=names,
                 seed=context.seed,
                 objective=context.objective,
                 base=fixed if self.settings.networks == "all" else None,
@@ -68,34 +69,18 @@ class WithinDriver(Protocol):
             training_result = context.learner.fit(context.policy, training_data)
         else:
             training_result = context.untrained(context.policy, fixed)
-        policy = context.ready(context.policy, training_result, groups)
-        first = split.frame.to(device)
-        loops = {
-            name: simulate_closed_loop(
-                context.simulator, context.constant(constant, fixed), batch, first, own
-            )
-            for name, constant in {"default": DefaultPolicy(), "fixed": FixedPolicy()}.items()
-        }
-        loops["policy"] = simulate_closed_loop(
-            context.simulator, policy, batch, first, network, base=fixed
-        )
-        platoon = None
-        if self.settings.networks == "all" and context.policy.trainable:
-            default = context.constant(DefaultPolicy(), fixed[:1])
-            platoon = measure_platoons(
-                context.simulator.model,
-                {"default": (default, ("any",)), "policy": (policy, policy.names)},
-            )
+        policy = context.ready(context.policy, training_result, names)
+        first = split.frame.to(batch.lengths.device)
         evaluation = evaluate(
             pairs,
             batch,
             first,
-            loops,
+            _test_part(context, policy, network, first, fixed),
             context.space,
             context.style,
             adaptation_space=policy.space,
             seed=context.seed,
-            platoon=platoon,
+            platoon=self._platoons(context, policy, fixed),
             metrics=context.metrics,
         )
         return ProtocolResult(
@@ -105,3 +90,43 @@ class WithinDriver(Protocol):
             labels,
             calibration=context.calibration_metrics("fixed", split.frame, fixed),
         )
+
+    def _networks(self, context: ProtocolContext) -> tuple[Tensor, tuple[str, ...]]:
+        """Returns which network learns from each pair `(P,)`, and the networks' names."""
+        pairs, device = context.pairs, context.batch.lengths.device
+        if context.policy.trainable and self.settings.networks == "all":
+            network, names = group_by([ALL] * len(pairs))
+            return network.to(device), names
+        network = torch.arange(len(pairs), device=device)
+        return network, tuple(pair.pair_id for pair in pairs)
+
+    def _platoons(self, context: ProtocolContext, policy: Agent, fixed: Tensor) -> Platoon | None:
+        """Simulates platoons where one network drives any driver; otherwise None."""
+        if self.settings.networks != "all" or not context.policy.trainable:
+            return None
+        default = context.constant(DefaultPolicy(), fixed[:1])
+        agents = {"default": (default, ("any",)), "policy": (policy, policy.names)}
+        return measure_platoons(context.simulator.model, agents)
+
+
+def _test_part(
+    context: ProtocolContext, policy: Agent, network: Tensor, first: Tensor, fixed: Tensor
+) -> dict[str, ClosedLoop]:
+    """Simulates the test part of P pairs by all methods.
+
+    Args:
+        context: what the protocol composes.
+        policy: what was learned.
+        network: which of its networks each pair is tested with, `(P,)`.
+        first: the last measured frame before the test part, `(P,)`.
+        fixed: driver-specific parameters, `(P, n)`.
+    """
+    simulator, batch = context.simulator, context.batch
+    default = context.constant(DefaultPolicy(), fixed)
+    constant = context.constant(FixedPolicy(), fixed)
+    each = torch.arange(len(first), device=first.device)
+    return {
+        "default": simulate_closed_loop(simulator, default, batch, first, each),
+        "fixed": simulate_closed_loop(simulator, constant, batch, first, each),
+        "policy": simulate_closed_loop(simulator, policy, batch, first, network, base=fixed),
+    }

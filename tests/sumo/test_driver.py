@@ -275,11 +275,12 @@ def test_traits_are_told_by_name_to_a_policy_that_knows_them() -> None:
     assert found[0] != pytest.approx(found[1], rel=1e-3)
     with pytest.raises(
         ParameterError,
-        match="driver features: give a value for each of acceleration, time_gap, and nothing else",
+        match="driver_features: give a value for each of acceleration, time_gap, and nothing else",
     ):
         driver.assign("v0", driver_features={"time_gap": 0.5})
     with pytest.raises(
-        ParameterError, match="driver features: there are none that this policy was trained to know"
+        ParameterError,
+        match="driver_features: this policy was trained to read none",
     ):
         Driver(adaptive({"name": "krauss"})).assign("v0", driver_features={"time_gap": 0.5})
 

@@ -133,7 +133,7 @@ class Labelling(WithinDriver):
 FRAMES = checks.all_methods_drive_the_same_frames
 TABLE = checks.the_table_has_a_row_for_each_pair_and_method
 BROKEN: dict[str, tuple[Protocol, Any, str]] = {
-    "shorter": (Shorter(), FRAMES, "drives the same frames"),
+    "shorter": (Shorter(), FRAMES, "simulated over the same frames"),
     "elsewhere": (Elsewhere(), FRAMES, "last measured state"),
     "narrow": (Narrow(), TABLE, "read these columns of the table: rmse_gap"),
     "double": (Double(), TABLE, "would count it twice"),
@@ -154,7 +154,7 @@ BROKEN: dict[str, tuple[Protocol, Any, str]] = {
         "method 'policy' begins",
     ),
     "told": (Telling(), checks.learners_get_only_what_they_may_use, "end within the training part"),
-    "drawing": (Drawing(), checks.the_same_seed_gives_the_same_outcome, "from `study.seed` alone"),
+    "drawing": (Drawing(), checks.the_same_seed_gives_the_same_result, "from `context.seed` alone"),
     "eager": (Eager(), checks.a_policy_without_training_is_not_trained, "nothing to train"),
     "labelling": (Labelling(), checks.a_policy_without_training_is_not_trained, "find none"),
 }

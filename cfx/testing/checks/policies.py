@@ -1,4 +1,4 @@
-"""The contract of a policy, statement by statement. Letters as in `cfx.policies.base`."""
+"""The contract of a policy, statement by statement. Shapes as in `cfx.policies.base`."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def outputs_lie_within_the_bounds(policy: Policy) -> None:
         "a policy answers one parameter vector per network, driver and window"
     )
     assert bool(((out >= 0) & (out <= 1)).all()), (
-        "a policy answers in unit space: nothing outside the model's bounds ever drives"
+        "a policy answers in unit space: no parameter is ever outside the model's bounds"
     )
 
 
@@ -52,7 +52,7 @@ def streaming_equals_the_whole_sequence(policy: Policy) -> None:
     for k in range(WINDOWS):
         piece, state = network(tokens[:, :, k : k + 1], state)
         pieces.append(piece)
-    message = "training reads whole sequences and driving reads one window at a time: both must give the same"
+    message = "training reads whole sequences and simulation one window at a time: both must agree"
     torch.testing.assert_close(torch.cat(pieces, dim=2), whole, msg=message)
     torch.testing.assert_close(state, last, msg=message)
 
@@ -84,7 +84,8 @@ def networks_are_independent(policy: Policy) -> None:
     )
     for name, value in [*network.named_parameters(), *network.named_buffers()]:
         assert value.shape[0] == NETWORKS, (
-            f"the first dimension of {name} must be the networks, so that the learner can treat each on its own"
+            f"the first dimension of {name} must be the networks, so that the learner can treat"
+            " each on its own"
         )
 
 
@@ -94,16 +95,15 @@ def state_is_passed_not_kept(policy: Policy) -> None:
     first, _ = network(tokens, network.initial_state(NETWORKS, DRIVERS))
     again, _ = network(tokens, network.initial_state(NETWORKS, DRIVERS))
     assert torch.equal(first, again), (
-        "two calls with the same tokens and state differ: the network keeps state on itself, and one drive would change the next"
+        "two calls with the same tokens and state differ: the network keeps state on itself, and"
+        " one simulation would change the next"
     )
 
 
 def the_same_generator_gives_the_same_weights(policy: Policy) -> None:
     features = _features(policy)
-    one, two = (
-        _build(policy, features, seed=3).state_dict(),
-        _build(policy, features, seed=3).state_dict(),
-    )
+    one = _build(policy, features, seed=3).state_dict()
+    two = _build(policy, features, seed=3).state_dict()
     assert all(torch.equal(one[key], two[key]) for key in one), (
         "initial weights must come from the generator alone, or no training can be repeated"
     )
@@ -118,7 +118,8 @@ def saved_equals_loaded(policy: Policy) -> None:
     mine, _ = network(tokens, network.initial_state(NETWORKS, DRIVERS))
     theirs, _ = other(tokens, other.initial_state(NETWORKS, DRIVERS))
     assert torch.equal(mine, theirs), (
-        "the state dict must hold everything that the answers depend on: it is all that a saved policy keeps"
+        "the state dict must hold everything that the answers depend on: it is all that a saved"
+        " policy keeps"
     )
 
 
@@ -127,7 +128,8 @@ def a_trainable_policy_has_gradients(policy: Policy) -> None:
     tokens = _tokens(policy)
     parameters = [parameter for parameter in network.parameters() if parameter.requires_grad]
     assert bool(parameters) == policy.trainable, (
-        "`trainable` must say whether there is anything to train: labels and training cost a job its time"
+        "`trainable` must say whether there is anything to train: labels and training cost a job"
+        " its time"
     )
     if policy.trainable:
         network(tokens, network.initial_state(NETWORKS, DRIVERS))[0].square().sum().backward()

@@ -1,7 +1,8 @@
 """The contract of a protocol, statement by statement.
 
-The study: six simulated drivers, each behind a leader of his own, a coarse search and a short training. Where frames of a test
-part are changed ("poisoned"), nothing that was found or learned before that part may change with them.
+The context: six simulated drivers, each behind their own leader, a coarse search and a short
+training. Where frames of a test part are changed ("poisoned"), nothing that was found or learned
+before that part may change with them.
 """
 
 from __future__ import annotations
@@ -37,21 +38,21 @@ from cfx.testing.contract import NotApplicable, contract_of
 PAIRS, FRAMES = 6, 111
 
 _COLUMNS = (
-    "pair_id", "recording", "leader_id", "follower_id", "driver", "cluster", "style_score", "fold", "method", "frames",
-    "rmse_speed", "rmse_gap", "improvement", "collisions",
+    "pair_id", "recording", "leader_id", "follower_id", "driver", "cluster", "style_score", "fold",
+    "method", "frames", "rmse_speed", "rmse_gap", "improvement", "collisions",
 )  # fmt: skip
 
 
 @cache
 def recording() -> PairSet:
-    """Returns the drives of the study."""
+    """Returns the trajectories of the context."""
     return SyntheticDataset(pairs=PAIRS, platoon_size=1, frames=FRAMES, heterogeneity=1.0).load()
 
 
 def context(
     pairs: PairSet, *, policy: Policy | None = None, learner: Learner | None = None, seed: int = 0
 ) -> ProtocolContext:
-    """Returns a study of some drives; its policy is a small recurrent network unless given."""
+    """Returns a context of some trajectories; a small recurrent network is its policy."""
     model = Krauss()
     batch = PairBatch.of(pairs)
     simulator = MemoryStepper(model, pairs.dt)
@@ -83,19 +84,20 @@ def all_methods_drive_the_same_frames(protocol: Protocol) -> None:
     assert isinstance(protocol_result, ProtocolResult), (
         f"`run` must return a cfx.ProtocolResult, not a {type(protocol_result).__name__}"
     )
-    for drive in protocol_result.evaluation.trajectories:
-        where = f"(pair {drive.pair_id})"
+    for one in protocol_result.evaluation.trajectories:
+        where = f"(pair {one.pair_id})"
         for method in protocol_result.evaluation.methods:
-            speed, gap = drive.speed[method], drive.gap[method]
-            assert len(speed) == len(gap) == len(drive.time) == len(drive.real_speed), (
-                f"every method drives the same frames, or their errors cannot be compared; {method} drives {len(speed)} of"
-                f" {len(drive.time)} {where}"
+            speed, gap = one.speed[method], one.gap[method]
+            assert len(speed) == len(gap) == len(one.time) == len(one.real_speed), (
+                "every method is simulated over the same frames, or their errors cannot be"
+                f" compared; {method} has {len(speed)} of {len(one.time)} {where}"
             )
-            assert speed[0] == drive.real_speed[0] and gap[0] == drive.real_gap[0], (  # noqa: PT018 - one statement
+            begin = (one.real_speed[0], one.real_gap[0])
+            assert (speed[0], gap[0]) == begin, (
                 f"every method starts from the last measured state; {method} does not {where}"
             )
             assert bool(np.isfinite(speed).all()), (
-                f"every frame of the test part is driven; {method} leaves some out {where}"
+                f"every frame of the test part is simulated; {method} leaves some out {where}"
             )
     frames = protocol_result.evaluation.table.groupby("pair_id")["frames"].nunique()
     assert bool((frames == 1).all()), (
@@ -105,23 +107,20 @@ def all_methods_drive_the_same_frames(protocol: Protocol) -> None:
 
 def the_table_has_a_row_for_each_pair_and_method(protocol: Protocol) -> None:
     evaluation = _protocol_result(protocol).evaluation
-    missing = [
-        name
-        for name in (*_COLUMNS, *(f"parameter_{name}" for name in evaluation.names))
-        if name not in evaluation.table
-    ]
+    parameters = [f"parameter_{name}" for name in evaluation.names]
+    missing = [name for name in (*_COLUMNS, *parameters) if name not in evaluation.table]
     assert not missing, (
         f"reports, figures and `cfx report` read these columns of the table: {', '.join(missing)}"
     )
     assert {"default", "fixed", "policy"} <= set(evaluation.methods), (
-        f"the policy is compared with the model's defaults and with the driver's own fixed parameters; there are only"
-        f" {', '.join(evaluation.methods)}"
+        "the policy is compared with the model's defaults and with driver-specific parameters;"
+        f" there are only {', '.join(evaluation.methods)}"
     )
     assert set(evaluation.table["method"]) <= set(METHODS), (
         f"methods are named {', '.join(METHODS)}"
     )
     assert set(evaluation.improvements) == set(evaluation.methods) - {"policy"}, (
-        "the improvement of the policy is told over every baseline that drove"
+        "the improvement of the policy is given over every baseline that was simulated"
     )
     counts = evaluation.table.groupby(["pair_id", "method"]).size()
     assert bool((counts == 1).all()), (
@@ -130,52 +129,56 @@ def the_table_has_a_row_for_each_pair_and_method(protocol: Protocol) -> None:
     assert len(counts) == len(evaluation.methods) * evaluation.table["pair_id"].nunique(), (
         "every method is tested on every pair"
     )
-    assert {drive.pair_id for drive in evaluation.trajectories} == set(
-        evaluation.table["pair_id"]
-    ), "the drives are those that the table measures"
+    simulated = {one.pair_id for one in evaluation.trajectories}
+    assert simulated == set(evaluation.table["pair_id"]), (
+        "the trajectories are those that the table measures"
+    )
 
 
 def no_method_sees_the_measured_follower_of_the_test_part(protocol: Protocol) -> None:
-    """The follower alone is changed: every method must drive exactly as before."""
+    """The follower alone is changed: every method must be simulated exactly as before."""
     pairs = recording()
-    before = _drives(_protocol_result(protocol))
+    before = _trajectories(_protocol_result(protocol))
     tested = next(iter(before.values()))
-    after = _drives(protocol.run(context(_poisoned(pairs, tested, leader=False))))[tested.pair_id]
+    after = _trajectories(protocol.run(context(_poisoned(pairs, tested, leader=False))))[
+        tested.pair_id
+    ]
     for method in tested.speed:
-        for what, one, two in (
-            ("parameters", tested.parameters[method], after.parameters[method]),
-            ("speeds", tested.speed[method], after.speed[method]),
-        ):
-            assert np.array_equal(one, two), (
-                f"the measured follower of a driver's test part was changed, and the {what} of method '{method}' in it changed:"
-                " it was calibrated on, learned from, or seen while driving, so the test proves nothing"
-            )
+        _same("parameters", method, tested.parameters[method], after.parameters[method])
+        _same("speeds", method, tested.speed[method], after.speed[method])
+
+
+def _same(what: str, method: str, before: np.ndarray, after: np.ndarray) -> None:
+    assert np.array_equal(before, after), (
+        f"the measured follower of a driver's test part was changed, and the {what} of method"
+        f" '{method}' in it changed: it was calibrated on, learned from, or seen in the simulation,"
+        " so the test proves nothing"
+    )
 
 
 def nothing_is_found_or_learned_from_the_test_part(protocol: Protocol) -> None:
     """Leader and follower are changed: what holds at the first test frame must be as before."""
     pairs = recording()
-    before = _drives(_protocol_result(protocol))
+    before = _trajectories(_protocol_result(protocol))
     tested = list(before.values())[-1]
-    after = _drives(protocol.run(context(_poisoned(pairs, tested, leader=True))))[tested.pair_id]
+    after = _trajectories(protocol.run(context(_poisoned(pairs, tested, leader=True))))[
+        tested.pair_id
+    ]
     for method in tested.parameters:
         assert np.array_equal(tested.parameters[method][0], after.parameters[method][0]), (
-            f"a driver's test part was changed, and with it the parameters that method '{method}' begins it with: frames that"
-            " calibration or learning has read are no test"
+            f"a driver's test part was changed, and with it the parameters that method '{method}'"
+            " begins it with: frames that calibration or learning has read are no test"
         )
 
 
-def the_same_seed_gives_the_same_outcome(protocol: Protocol) -> None:
+def the_same_seed_gives_the_same_result(protocol: Protocol) -> None:
     with torch.random.fork_rng(devices=[]):
-        tables = []
-        for attempt in (1, 2):
-            torch.manual_seed(attempt)
-            protocol_result = (
-                protocol.run(context(recording())) if attempt == 2 else _protocol_result(protocol)
-            )
-            tables.append(protocol_result.evaluation.table)
-    assert tables[0].equals(tables[1]), (
-        "the same study twice gave two results: randomness must come from `study.seed` alone"
+        torch.manual_seed(1)
+        one = _protocol_result(protocol)
+        torch.manual_seed(2)
+        two = protocol.run(context(recording()))
+    assert one.evaluation.table.equals(two.evaluation.table), (
+        "the same context twice gave two results: randomness must come from `context.seed` alone"
     )
 
 
@@ -184,15 +187,13 @@ def learners_get_only_what_they_may_use(protocol: Protocol) -> None:
         raise NotApplicable("this protocol trains nothing")
     watched = _Watched(ImitationLearner(epochs=1))
     protocol.run(context(recording(), learner=watched))
-    assert watched.training_data_seen, "a trainable policy must be trained by the study's learner"
+    assert watched.training_data_seen, "a trainable policy must be trained by the context's learner"
     for training_data in watched.training_data_seen:
         pairs = len(training_data.batch)
-        assert (
-            len(training_data.split.frame)
-            == len(training_data.network)
-            == len(training_data.fixed)
-            == pairs
-        ), "split, network and fixed of training data have an entry for each of its pairs"
+        per_pair = (training_data.split.frame, training_data.network, training_data.fixed)
+        assert all(len(values) == pairs for values in per_pair), (
+            "split, network and fixed of training data have an entry for each of its pairs"
+        )
         assert bool((training_data.split.frame < training_data.batch.lengths).all()), (
             "`split.frame` is a frame of the pair"
         )
@@ -200,12 +201,12 @@ def learners_get_only_what_they_may_use(protocol: Protocol) -> None:
             "every network of training data has a name and learns from at least one pair"
         )
         assert training_data.labels is not None, (
-            "the learner needs window labels: find them with `study.labels`"
+            "the learner needs labels: find them with `context.labels`"
         )
         windows = training_data.labels.windows
         ends = windows.first + windows.settings.length
         assert bool((ends <= training_data.split.frame[windows.pair]).all()), (
-            "a label's window must end within the training part: a label is a measurement like any other"
+            "a label's window must end within the training part: labels are found from measurements"
         )
 
 
@@ -222,18 +223,18 @@ def a_policy_without_training_is_not_trained(protocol: Protocol) -> None:
     )
 
 
-_outcomes: WeakKeyDictionary[Protocol, ProtocolResult] = WeakKeyDictionary()
+_results: WeakKeyDictionary[Protocol, ProtocolResult] = WeakKeyDictionary()
 
 
 def _protocol_result(protocol: Protocol) -> ProtocolResult:
-    """Runs the study as it is once for all checks of one protocol."""
-    if protocol not in _outcomes:
-        _outcomes[protocol] = protocol.run(context(recording()))
-    return _outcomes[protocol]
+    """Runs the context as it is once for all checks of one protocol."""
+    if protocol not in _results:
+        _results[protocol] = protocol.run(context(recording()))
+    return _results[protocol]
 
 
 class _Watched(Learner):
-    """A learner that remembers its lessons."""
+    """A learner that remembers what it was given."""
 
     schema = ImitationLearner.schema
     needs_labels = True
@@ -251,30 +252,29 @@ class _Watched(Learner):
 class _Refusing(ImitationLearner):
     def fit(self, policy: Policy, training_data: TrainingData) -> TrainingResult:
         raise AssertionError(
-            "a policy that is not `trainable` must not be handed to a learner: there is nothing to train"
+            "a policy that is not `trainable` must not go to a learner: there is nothing to train"
         )
 
 
-def _drives(protocol_result: ProtocolResult) -> dict[str, PairTrajectory]:
-    return {drive.pair_id: drive for drive in protocol_result.evaluation.trajectories}
+def _trajectories(protocol_result: ProtocolResult) -> dict[str, PairTrajectory]:
+    return {one.pair_id: one for one in protocol_result.evaluation.trajectories}
 
 
 def _poisoned(pairs: PairSet, tested: PairTrajectory, *, leader: bool) -> PairSet:
-    """Changes one driver's frames after the last measured state that his test part starts from."""
-    return PairSet(
-        tuple(
-            _changed(pair, tested, leader) if pair.pair_id == tested.pair_id else pair
-            for pair in pairs
-        ),
-        pairs.source,
-    )
+    """Changes a driver's frames after the last measured state, where the test part starts."""
+    changed = []
+    for pair in pairs:
+        is_tested = pair.pair_id == tested.pair_id
+        changed.append(_changed(pair, tested, leader) if is_tested else pair)
+    return PairSet(tuple(changed), pairs.source)
 
 
 def _changed(pair: Pair, tested: PairTrajectory, leader: bool) -> Pair:
     first = len(pair) - (len(tested.time) - 1)
     steady = np.arange(len(pair)) >= first
     ramp = np.where(steady, np.arange(len(pair)) - first + 1.0, 0.0)
-    # The follower falls far back and the leader pulls away: whoever calibrates on this finds another driver.
+    # The follower falls far back and the leader pulls away: calibration on this finds another
+    # driver.
     values: dict[str, Any] = {
         "follower_position": pair.follower_position - ramp,
         "follower_speed": np.where(steady, 0.3 * pair.follower_speed, pair.follower_speed),
@@ -293,7 +293,7 @@ CONTRACT = contract_of(
     __name__,
     "protocol",
     slow=[
-        the_same_seed_gives_the_same_outcome,
+        the_same_seed_gives_the_same_result,
         no_method_sees_the_measured_follower_of_the_test_part,
     ],
 )

@@ -1,9 +1,11 @@
 """A temporal convolutional network (TCN) as a policy.
 
-S. Bai, J. Z. Kolter and V. Koltun (2018), *An empirical evaluation of generic convolutional and recurrent networks for sequence
-modeling*, arXiv:1803.01271: residual blocks of two causal convolutions, whose dilation doubles from block to block.
+S. Bai, J. Z. Kolter and V. Koltun (2018), *An empirical evaluation of generic convolutional and
+recurrent networks for sequence modeling*, arXiv:1803.01271: residual blocks of two causal
+convolutions, whose dilation doubles from block to block.
 
-Letters as in cfx: N networks, B drivers of each, W windows, f features of a token, n parameters; c channels, k kernel width.
+Shapes: N networks, B drivers of each, W windows, f features of a token, n parameters; c channels, k
+kernel width.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ from torch import Tensor, nn
 from cfx import Policy, PolicyNetwork, PolicySettings, Settings
 
 _EDGE = 0.02
-"""How close to a bound an untrained network may start, in unit space: at the bound itself a sigmoid learns nothing."""
+"""How close to a bound an untrained network may start, in unit space: at the bound itself a sigmoid
+learns nothing."""
 
 
 class TcnSettings(PolicySettings):
@@ -31,14 +34,16 @@ class TcnSettings(PolicySettings):
     kernel: int = Field(
         3,
         ge=2,
-        description="taps of each convolution; the network sees 1 + 2 (kernel - 1) (2^levels - 1) windows back, its own too",
+        description="taps of each convolution; the network sees 1 + 2 (kernel - 1) (2^levels - 1)"
+        " windows back, its own too",
     )
     dropout: float = Field(
         0.0, ge=0, lt=1, description="dropout after each convolution while training"
     )
     start: Literal["fixed", "middle"] = Field(
         "fixed",
-        description="what an untrained network answers: the fixed parameters, or about the middle of the bounds",
+        description="what an untrained network answers: the fixed parameters, or about the middle"
+        " of the bounds",
     )
 
     @property
@@ -85,14 +90,12 @@ class CausalConvolution(nn.Module):
         """
         windows = x.shape[2]
         whole = torch.cat([past, x], dim=2)
-        taps = torch.cat(
-            [
-                whole[:, :, j * self.dilation : j * self.dilation + windows]
-                for j in range(self.kernel)
-            ],
-            dim=-1,
-        )
-        out = torch.baddbmm(self.bias, taps.flatten(1, 2), self.weight)
+        taps = []
+        for tap in range(self.kernel):
+            first = tap * self.dilation
+            taps.append(whole[:, :, first : first + windows])
+        read = torch.cat(taps, dim=-1)
+        out = torch.baddbmm(self.bias, read.flatten(1, 2), self.weight)
         return out.view(*x.shape[:3], -1), whole[:, :, whole.shape[2] - self.memory :]
 
 
@@ -112,26 +115,30 @@ class ResidualBlock(nn.Module):
         super().__init__()
         self.first = CausalConvolution(networks, inputs, channels, kernel, dilation, generator)
         self.second = CausalConvolution(networks, channels, channels, kernel, dilation, generator)
-        self.around = (
-            CausalConvolution(networks, inputs, channels, 1, 1, generator)
-            if inputs != channels
-            else None
-        )
+        self.around = None
+        if inputs != channels:
+            self.around = CausalConvolution(networks, inputs, channels, 1, 1, generator)
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, x: Tensor, past: list[Tensor]) -> tuple[Tensor, list[Tensor]]:
-        """Takes windows `(N, B, W, inputs)` and what the two convolutions read before; returns windows and the same for later."""
+        """Takes windows `(N, B, W, inputs)` and what the two convolutions read before them.
+
+        Returns:
+            Windows `(N, B, W, channels)`, and what they have read for the windows that follow.
+        """
         y, first = self.first(x, past[0])
         y, second = self.second(self.dropout(y.relu()), past[1])
-        beside = x if self.around is None else self.around(x, x[:, :, :0])[0]
+        beside = x
+        if self.around is not None:
+            beside, _ = self.around(x, x[:, :, :0])
         return (self.dropout(y.relu()) + beside).relu(), [first, second]
 
 
 class TcnNetwork(PolicyNetwork):
     """N temporal convolutional networks.
 
-    The state holds the last inputs of every convolution, so that one window at a time costs one window. Before the first window
-    they are 0: the zero padding of the paper.
+    The state holds the last inputs of every convolution, so that one window at a time costs one
+    window. Before the first window they are 0: the zero padding of the paper.
     """
 
     def __init__(
@@ -156,39 +163,42 @@ class TcnNetwork(PolicyNetwork):
 
     @property
     def _convolutions(self) -> list[CausalConvolution]:
-        return [
-            c
-            for block in self.blocks
-            if isinstance(block, ResidualBlock)
-            for c in (block.first, block.second)
-        ]
+        found = []
+        for block in self.blocks:
+            assert isinstance(block, ResidualBlock)
+            found += [block.first, block.second]
+        return found
 
     def initial_state(self, networks: int, drivers: int) -> Tensor:
-        return self.w_out.new_zeros(
-            (networks, drivers, sum(c.memory * c.inputs for c in self._convolutions))
-        )
+        width = sum(self._widths())
+        return self.w_out.new_zeros((networks, drivers, width))
+
+    def _widths(self) -> list[int]:
+        """Returns how much of the state each convolution takes."""
+        return [convolution.memory * convolution.inputs for convolution in self._convolutions]
 
     def forward(self, tokens: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        convolutions = self._convolutions
-        pieces = torch.split(state, [c.memory * c.inputs for c in convolutions], dim=-1)
-        past = [
-            piece.view(*state.shape[:2], c.memory, c.inputs)
-            for c, piece in zip(convolutions, pieces, strict=True)
-        ]
-        x, steady = tokens, []
+        pieces = torch.split(state, self._widths(), dim=-1)
+        past = []
+        for convolution, piece in zip(self._convolutions, pieces, strict=True):
+            past.append(piece.view(*state.shape[:2], convolution.memory, convolution.inputs))
+        x = tokens
+        after = []
         for level, block in enumerate(self.blocks):
             x, read = block(x, past[2 * level : 2 * level + 2])
-            steady += read
-        logits = torch.baddbmm(self.b_out, x.flatten(1, 2), self.w_out).view(*x.shape[:3], -1)
-        return logits.sigmoid(), torch.cat([piece.flatten(2) for piece in steady], dim=-1)
+            for inputs in read:
+                after.append(inputs.flatten(2))
+        logits = torch.baddbmm(self.b_out, x.flatten(1, 2), self.w_out)
+        return logits.view(*x.shape[:3], -1).sigmoid(), torch.cat(after, dim=-1)
 
 
 class TcnPolicy(Policy):
     """Answers from a fixed number of past windows, where a recurrent network has a memory of its own making.
 
-    Differences from the paper: no weight normalisation (it speeds up long trainings; these take seconds); weights are drawn as
-    PyTorch draws those of a convolution; a sigmoid keeps the answers within the parameters' bounds; training starts from the
-    fixed parameters (`start=middle` does not).
+    Differences from the paper: no weight normalisation (it speeds up long trainings; these take
+    seconds); weights are drawn as PyTorch draws those of a convolution; a sigmoid keeps the answers
+    within the parameters' bounds; training starts from the fixed parameters (`start=middle` does
+    not).
     """
 
     schema: ClassVar[type[Settings]] = TcnSettings
