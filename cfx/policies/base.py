@@ -78,7 +78,7 @@ class Policy(Component):
 
     kind = "policy"
     schema: ClassVar[type[Settings]] = PolicySettings
-    settings: PolicySettings
+    settings: Settings
     trainable: ClassVar[bool] = True
 
     def __init__(self, settings: Settings | None = None, **options: object) -> None:

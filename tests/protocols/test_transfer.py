@@ -223,7 +223,8 @@ def test_drivers_of_the_same_names_are_said(
             cold_start_fraction, tmp_path
         )  # all synthetic recordings are called synthetic
     assert any(
-        "3 drivers are called, recording and all, as some" in message for message in caplog.messages
+        "3 drivers have the same names, including the recording" in message
+        for message in caplog.messages
     )
     assert (
         json.loads((result.folder / "data.json").read_text())["protocol"][

@@ -52,7 +52,9 @@ def streaming_equals_the_whole_sequence(policy: Policy) -> None:
     for k in range(WINDOWS):
         piece, state = network(tokens[:, :, k : k + 1], state)
         pieces.append(piece)
-    message = "training reads whole sequences and simulation one window at a time: both must agree"
+    message = (
+        "training reads whole sequences, simulation one window at a time: both must give the same"
+    )
     torch.testing.assert_close(torch.cat(pieces, dim=2), whole, msg=message)
     torch.testing.assert_close(state, last, msg=message)
 
