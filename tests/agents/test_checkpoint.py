@@ -16,7 +16,7 @@ from cfx.errors import DataError
 from cfx.models.krauss import Krauss
 from cfx.pairs import PairBatch
 from cfx.policies.features import measured_history
-from cfx.agents.agent import Agent
+from cfx.policies.trained import TrainedPolicy
 from tests.drives import wavy_pairs
 from tests.sumo.policies import adaptive
 
@@ -73,7 +73,7 @@ def test_policies_that_mlflow_logged_before_find_what_they_import(tmp_path: Path
     agent = adaptive(NODE)
     checkpoint.save(agent, tmp_path)
     with pytest.warns(DeprecationWarning, match=r"is now cfx\.agents"):
-        loaded = checkpoint.load(str(tmp_path))
+        loaded = TrainedPolicy.load(str(tmp_path))
     assert torch.equal(chosen(loaded), chosen(agent))
 
 
