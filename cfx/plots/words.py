@@ -22,11 +22,12 @@ LABELS = {
 SHORT = {
     "population": "pooled",
     "fixed": "driver-specific",
-    "shrunk": "driver-specific, shrunk",
+    "shrunk": "shrunk",
 }
 """Methods as tables name them, where the key of the metrics says too little."""
 
 EXPLAINED = {
+    "real": "the recorded drivers",
     "default": "the model's default parameters",
     "population": "pooled calibration, which is one set of parameters for all drivers, calibrated"
     " jointly on the training drivers",

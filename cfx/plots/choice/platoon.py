@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from cfx.plots.choice.common import Array
+from cfx.plots.choice.common import Array, finite
 from cfx.plots.look import COLOURS, vehicle_colour
 from cfx.plots.words import label, number
 
@@ -84,6 +84,18 @@ def platoon_panels(
         verdicts.append(f"last follower: {_slowing(rows)}")
         panels.append(PlatoonPanel(method, network, label(method), tuple(verdicts), _lines(rows)))
     return tuple(panels)
+
+
+def speed_range(panels: Sequence[PlatoonPanel]) -> tuple[float, float]:
+    """Returns the ends of the panels' common axis of speed, m/s."""
+    speeds = [np.empty(0)]
+    for panel in panels:
+        speeds += [line.speed for line in panel.lines]
+    values = finite(np.concatenate(speeds))
+    if not len(values):
+        return 0.0, 1.0
+    margin = 0.04 * max(float(np.ptp(values)), 1.0)
+    return float(values.min()) - margin, float(values.max()) + margin
 
 
 def worst_platoon(table: pd.DataFrame) -> tuple[pd.DataFrame, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter
 
 from cfx.plots.choice.learning import LOSS_TITLE, LearningCurves
 from cfx.plots.matplotlib.canvas import canvas, say, styled
@@ -31,8 +31,7 @@ def draw_learning(curves: LearningCurves) -> Figure:
             )
     if curves.logarithmic:
         axes.set_yscale("log")
-        marks = (1.0, 2.0, 5.0) if _has_digits(curves.ticks) else (1.0,)
-        axes.yaxis.set_major_locator(LogLocator(base=10, subs=marks, numticks=12))
+        axes.yaxis.set_major_locator(FixedLocator(curves.ticks))
         axes.yaxis.set_major_formatter(FuncFormatter(_plain))
         axes.yaxis.set_minor_formatter(NullFormatter())
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -45,10 +44,6 @@ def draw_learning(curves: LearningCurves) -> Figure:
         axes.set_xticks([int(curves.curves[0].epochs[0])])
     figure.legend(loc="outside upper center", ncols=2, title=curves.title, title_fontsize=10.5)
     return figure
-
-
-def _has_digits(ticks: tuple[float, ...]) -> bool:
-    return len(ticks) > 1 and ticks[1] / ticks[0] < 5
 
 
 def _plain(value: float, _position: int) -> str:

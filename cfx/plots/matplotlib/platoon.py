@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from cfx.plots.choice.platoon import TIME_TITLE, PlatoonPanel
+from cfx.plots.choice.platoon import TIME_TITLE, PlatoonPanel, speed_range
 from cfx.plots.look import COLLISION_COLOUR, COLOURS, vehicle_colour
 from cfx.plots.matplotlib.canvas import canvas, styled
 
@@ -24,6 +24,7 @@ def draw_platoons(panels: Sequence[PlatoonPanel]) -> Figure:
         axes.margins(x=0.01)
     figure.supxlabel(TIME_TITLE, fontsize=10.5)
     grid[0].set_ylabel("speed (m/s)")
+    grid[0].set_ylim(*speed_range(panels))
     figure.legend(handles=_handles(), loc="outside upper center", ncols=4, columnspacing=1.8)
     return figure
 

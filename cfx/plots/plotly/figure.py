@@ -77,9 +77,12 @@ def axis(title: str = "", **more: Any) -> dict[str, Any]:
     return common | more
 
 
-def improvement_axis(chosen: ImprovementAxis) -> dict[str, Any]:
-    """Returns an axis of improvements, percent."""
-    return axis(chosen.title, range=[chosen.low, chosen.high], tickformat="+.0%")
+def improvement_axis(chosen: ImprovementAxis, *, upright: bool = True) -> dict[str, Any]:
+    """Returns an axis of improvements, percent; an upright one has its title in two lines."""
+    title = chosen.title
+    if upright:
+        title = title.replace(" over ", "<br>over ")
+    return axis(title, range=[chosen.low, chosen.high], tickformat=".0%")
 
 
 def job_style(k: int) -> tuple[str, str]:

@@ -27,7 +27,7 @@ def history_plot(curves: Sequence[HistoryCurve], amounts: Sequence[str]) -> Plot
         categoryarray=[safe(amount) for amount in amounts],
     )
     title = improvement_title("fixed").replace(" over ", "<br>over ")
-    y_axis = axis(title, tickformat="+.0%")
+    y_axis = axis(title, tickformat=".0%")
     layout = {"xaxis": x_axis, "yaxis": y_axis, "shapes": [zero_line("y")]}
     return Plot({"": view(data, layout)}, 360, "Improvement by the amount of burn-in")
 

@@ -53,7 +53,7 @@ def overview_view(chosen: Overview) -> dict[str, Any]:
         "marker": {"symbol": "line-ns-open", "size": 13, "color": "black"},
     }
     layout = {
-        "xaxis": improvement_axis(chosen.axis),
+        "xaxis": improvement_axis(chosen.axis, upright=False),
         "yaxis": _job_axis([row.job for row in rows], places, showgrid=False),
         "shapes": [zero_line("x")],
     }
@@ -81,6 +81,8 @@ def errors_view(chosen: ErrorDots) -> dict[str, Any]:
     layout = {
         "xaxis": axis(chosen.title, range=[0, chosen.high]),
         "yaxis": _job_axis(chosen.jobs, places, showgrid=True),
+        # Room for the tool bar above a legend of all methods.
+        "margin": {"l": 64, "r": 16, "t": 52, "b": 48},
     }
     return view(data, layout, chosen.note)
 

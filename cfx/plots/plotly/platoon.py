@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cfx.plots.choice.platoon import TIME_TITLE, PlatoonPanel, VehicleLine
+from cfx.plots.choice.platoon import TIME_TITLE, PlatoonPanel, VehicleLine, speed_range
 from cfx.plots.look import COLLISION_COLOUR
 from cfx.plots.plotly.figure import Plot, Trace, axis, heading, safe, view
 
@@ -20,6 +20,7 @@ def platoon_plot(panels: Sequence[PlatoonPanel]) -> Plot:
         "margin": {"l": 56, "r": 12, "t": 74, "b": 62},
         "showlegend": False,
     }
+    ends = list(speed_range(panels))
     for k, panel in enumerate(panels):
         number = str(k + 1) if k else ""
         shared_x, shared_y = ("x", "y") if k else (None, None)
@@ -27,7 +28,7 @@ def platoon_plot(panels: Sequence[PlatoonPanel]) -> Plot:
         domain = [left, (k + 0.96) / len(panels)]
         layout[f"xaxis{number}"] = axis(domain=domain, anchor=f"y{number}", matches=shared_x)
         title = "" if k else "speed (m/s)"
-        layout[f"yaxis{number}"] = axis(title, anchor=f"x{number}", matches=shared_y)
+        layout[f"yaxis{number}"] = axis(title, anchor=f"x{number}", matches=shared_y, range=ends)
         above = heading(safe(panel.title), left, 1.02, size=11)
         above["text"] = "<br>".join([above["text"], *map(safe, panel.verdicts)])
         layout["annotations"].append(above | {"align": "left"})

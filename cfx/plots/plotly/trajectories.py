@@ -29,7 +29,7 @@ def pair_plot(pair: PairPanels) -> Plot:
     layout: dict[str, Any] = {
         "annotations": [],
         "shapes": [],
-        "margin": {"l": 56, "r": 12, "t": 30, "b": 44},
+        "margin": {"l": 56, "r": 12, "t": 58, "b": 44},
         "hovermode": "x",
     }
     _add_panel(data, layout, pair.speed, "", grid.half(0), grid.top(), title=pair.speed.title)
@@ -158,7 +158,7 @@ class _Grid:
     def __init__(self, columns: int, rows: int) -> None:
         self.columns = columns
         self._inner = self._TOP + rows * (self._ROW + self._GAP)
-        self.height = self._inner + 80
+        self.height = self._inner + 102
 
     def top(self) -> list[float]:
         return [1 - self._TOP / self._inner, 1.0]

@@ -287,7 +287,7 @@ def absolute(jobs: Sequence[Job]) -> Plot:
         what = f"RMSE of {signal}, mean over pairs; lower is closer to the real driver"
         dots = error_dots(names, values, unit=unit, what=what)
         views[f"{signal}, {jobs[0].scope_label(scope)}"] = errors_view(dots)
-    height = 110 + 30 * len(jobs)
+    height = 134 + 30 * len(jobs)
     return Plot(views, height, "Errors of every job and method", chooser="RMSE of")
 
 
@@ -319,7 +319,9 @@ def _gain(job: Job, baseline: str, scope: str) -> Cell:
     high = job.improvement("ci95_high", baseline, scope)
     second = ""
     if math.isfinite(low) and math.isfinite(high):
-        second = f"{percent(low, 1).removesuffix(' %')} to {percent(high, 1).removesuffix(' %')}"
+        digits = 0 if max(abs(low), abs(high)) >= 1 else 1
+        ends = (percent(low, digits), percent(high, digits))
+        second = " to ".join(end.removesuffix(" %") for end in ends)
     return replace(number(mean, percent(mean, 1)), second=second)
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 from cfx.plots.words import explained, short_label
 from cfx.report.blocks import Block, Section, Table, Text, job_fold
@@ -21,9 +23,16 @@ def blocks(runs: Runs) -> list[Block]:
     """Returns a table for each job."""
     found: list[Block] = [Text(_INTRODUCTION)]
     for k, job in enumerate(runs.jobs):
-        table = Table(all_metrics(job), compact=True)
-        found.append(job_fold(job.name, [table], first=k == 0))
+        parts: list[Block] = [Table(all_metrics(job), compact=True)]
+        for one in job.data.get("metrics_left_out") or ():
+            parts.append(Text(_left_out(one), "lacking"))
+        found.append(job_fold(job.name, parts, first=k == 0))
     return found
+
+
+def _left_out(one: Mapping[str, Any]) -> str:
+    name, distribution = one.get("name"), one.get("distribution")
+    return f"{name} of {distribution} could not be measured: {one.get('reason')}"
 
 
 def all_metrics(job: Job) -> Sheet:

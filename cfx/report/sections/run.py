@@ -80,11 +80,19 @@ def _facts(job: Job, jobs: Sequence[Job]) -> dict[str, str]:
         "Protocol": _protocol(job),
         "Driving model": job.component("model") or NOTHING,
         "Policy": f"{job.component('policy')}, {_learned(job)}",
-        "Calibrated by": job.component("optimizer") or NOTHING,
+        "Calibrated by": _calibration(job),
         "Seed": str(job.config.get("seed", NOTHING)),
         "cfx": job.version or "version not recorded",
         "Read from": job.place,
     }
+
+
+def _calibration(job: Job) -> str:
+    said = job.component("optimizer") or NOTHING
+    objective = job.data.get("objective")
+    if isinstance(objective, Mapping):
+        said += f", which minimises {objective.get('name')} ({objective.get('unit')})"
+    return said
 
 
 def _left_out(job: Job) -> str:

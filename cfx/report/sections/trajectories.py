@@ -35,7 +35,8 @@ def blocks(runs: Runs) -> list[Block]:
     for k, job in enumerate(jobs):
         groups = []
         for pair in chosen_pairs(job):
-            parts = (Heading(_title(job, pair)), Figure(pair_of(job, pair.pair_id)))
+            heading = Heading(_title(job, pair), _errors(job, pair))
+            parts = (heading, Figure(pair_of(job, pair.pair_id)))
             groups.append(Group(parts))
         found.append(job_fold(job.name, groups, first=k == 0))
     what = "speed, gap and parameters over time"
@@ -63,11 +64,15 @@ def _title(job: Job, pair: RankedPair) -> str:
     if job.has_constant_baseline and math.isfinite(pair.improvement):
         improvement = percent_or_undefined(pair.improvement, 1)
         title += f": {improvement} over {short_label('fixed')} calibration"
+    return title
+
+
+def _errors(job: Job, pair: RankedPair) -> str:
     row = job.by_pair.set_index("pair_id").loc[pair.pair_id]
     errors = []
     for method in job.methods:
         errors.append(f"{short_label(method)} {row[f'rmse_speed/{method}']:.3f}")
-    return f"{title}; RMSE of speed (m/s): {', '.join(errors)}"
+    return f"RMSE of speed (m/s): {', '.join(errors)}"
 
 
 SECTION = Section("trajectories", "Trajectories", "Trajectories", blocks)
