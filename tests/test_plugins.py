@@ -1,4 +1,4 @@
-"""Third parties' plugins: tables, checks, new packages, and broken ones that harm nobody but who asks for them."""
+"""Third parties' plugins: tables, checks, new packages, and broken ones that harm nobody else."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MODEL = """
     class Mine(DrivingModel):
         '''Drives as I like.'''
 
-        parameters = ParameterSpace.of(Parameter("tau", "s", 0.5, 3.0, 1.0, "time headway", "made up"))
+        parameters = ParameterSpace.of(Parameter("tau", "s", 0.5, 3.0, 1.0, "time gap", "made up"))
         reference = "made up"
 
         def next_speed(self, follower, leader, p, dt):
@@ -72,7 +72,7 @@ def test_who_asks_for_a_broken_plugin_gets_one_sentence_that_names_its_distribut
 def test_all_broken_plugins_at_once_harm_nobody_else(
     install: Installer, twins: None, tmp_path: Path
 ) -> None:
-    """In a process of its own, where nothing was imported before: tables, help, completion, and a job that asks for none."""
+    """Tables, help, completion and a job that asks for none work, in a process of their own."""
     for broken in BROKEN:
         put(install, broken)
     for name, metadata in (("nameless", "Version: 1.0\n"), ("garbled", "\x00\xff")):
@@ -222,16 +222,25 @@ PROTOCOL = """
     [
         (["check", "modle"], "there is no kind of component 'modle'. Did you mean 'model'?"),
         (["check", "model", "w98"], "there is no model 'w98'. Did you mean 'w99'?"),
-        (["show", "policies", "gru"], "there is no kind of component 'policies'. Did you mean 'policy'?"),
+        (
+            ["show", "policies", "gru"],
+            "there is no kind of component 'policies'. Did you mean 'policy'?",
+        ),
         (["show", "data", "tdy"], "data=tdy: there is no dataset 'tdy'. Did you mean 'tidy'?"),
         (["new", "modle", "mine"], "there is no kind of component 'modle'. Did you mean 'model'?"),
         (["new", "model", "krauss"], "the name 'krauss' is taken by model 'krauss'"),
-        (["new", "model", "My-Model"], "'My-Model' cannot be a component's name: it must be an identifier in lower-case letters,"
-         " digits and _, such as my_model"),
+        (
+            ["new", "model", "My-Model"],
+            "'My-Model' cannot be a component's name: it must be an identifier in lower-case"
+            " letters, digits and _, such as my_model",
+        ),
         (["new", "model", "lambda"], "'lambda' cannot be a component's name"),
         (["new", "model", "null"], "'null' cannot be a component's name"),
         (["new", "model", "_mine"], "'_mine' cannot be a component's name"),
-        (["new", "model", "mine", "--folder", "here"], "here exists already; choose another folder with --folder, or remove it"),
+        (
+            ["new", "model", "mine", "--folder", "here"],
+            "here exists already; choose another folder with --folder, or remove it",
+        ),
         (["new", "model", "mine", "--folder", "file/below"], "file/below cannot be written"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
@@ -318,7 +327,8 @@ COMPLETE = """
 export PATH="$1:$PATH"; shift
 eval "$(cfx -sc install=bash)"
 for line in "$@"; do
-    COMP_LINE="$line"; COMP_POINT=${#line}; COMP_WORDS=($line); COMP_CWORD=$(( ${#COMP_WORDS[@]} - 1 )); COMPREPLY=()
+    COMP_LINE="$line"; COMP_POINT=${#line}; COMP_WORDS=($line)
+    COMP_CWORD=$(( ${#COMP_WORDS[@]} - 1 )); COMPREPLY=()
     hydra_bash_completion
     echo "${COMPREPLY[*]}"
 done
@@ -382,7 +392,10 @@ def test_a_new_package_installs_and_its_tests_pass(kind: str, tmp_path: Path, ca
     assert "failed" not in tests
     group = registry.kind_of(kind).group
     (preset,) = (folder / f"cfx_novel_{kind}" / "conf" / group).iterdir()
-    script = "import sys; from cfx.cli import main; sys.exit(max(main(words.split()) for words in sys.argv[1:]))"
+    script = (
+        "import sys; from cfx.cli import main;"
+        " sys.exit(max(main(words.split()) for words in sys.argv[1:]))"
+    )
     words = [f"plugins check {kind} novel_{kind}", f"--cfg job {group}={preset.stem}"]
     said = run([sys.executable, "-c", script, *words], environment)
     assert re.search(
@@ -393,7 +406,7 @@ def test_a_new_package_installs_and_its_tests_pass(kind: str, tmp_path: Path, ca
 
 
 def installed(folder: Path, site: Path) -> dict[str, str]:
-    """Installs a package as a user would, but without the network; returns an environment that has it."""
+    """Installs a package as a user would, but offline; returns an environment that has it."""
     pip = [
         sys.executable,
         "-m",
@@ -443,6 +456,17 @@ def test_a_new_package_declares_what_it_is(kind: str, tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "deep").iterdir()] == ["package"]
 
 
+@pytest.mark.parametrize("kind", registry.KINDS)
+def test_a_new_package_is_clean(kind: str, tmp_path: Path) -> None:
+    """Its Python passes ruff with the rules that cfx itself keeps, docstrings of tests apart."""
+    folder = create(kind, "novel", tmp_path / "package")
+    rules = "B,C4,E,F,I,N,PERF,PIE,RET,SIM,UP,W"
+    command = [sys.executable, "-m", "ruff", "check", "--isolated", "--no-cache", "--select", rules]
+    command += ["--line-length", "100", "--config", "lint.isort.known-third-party=['cfx']"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
 def test_the_templates_are_in_the_wheel(tmp_path: Path) -> None:
     import zipfile
 
@@ -473,7 +497,7 @@ DEPRECATED = """
 
     class Old(DrivingModel):
         schema = OldSettings
-        parameters = ParameterSpace.of(Parameter("tau", "s", 0.5, 3.0, 1.0, "time headway", "made up"))
+        parameters = ParameterSpace.of(Parameter("tau", "s", 0.5, 3.0, 1.0, "time gap", "made up"))
         {}
 
         def next_speed(self, follower, leader, p, dt):
@@ -497,7 +521,8 @@ def test_what_is_deprecated_still_works_and_is_named_with_its_distribution(
     registry.create("model", {"name": "old"})
     first, second = caplog.messages
     assert first.startswith(
-        "model.mood of model 'some' (some_models:Old) of the distribution some-models 1.0 is deprecated: use"
+        "model.mood of model 'some' (some_models:Old) of the distribution some-models 1.0"
+        " is deprecated: use"
     )
     assert second.endswith("of the distribution old-models 1.0 is deprecated: use model=new")
     assert cli.main(["plugins", "show", "model", "old"]) == 0

@@ -1,4 +1,4 @@
-"""`cfx plugins`: what is installed, whether it works, what a component is, and a new package to start from."""
+"""`cfx plugins`: what is installed, whether it works, and a new package to start from."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ _KINDS = (
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Runs the sub-command; returns its exit code: 1 if `check` found something broken, 0 otherwise.
+    """Runs the sub-command.
+
+    Returns:
+        The exit code: 1 if `check` found something broken, 0 otherwise.
 
     Raises:
         CfxError: the user's mistake.

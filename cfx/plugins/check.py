@@ -30,11 +30,14 @@ class Verdict:
 
 
 def check(kind: str | None = None, name: str | None = None) -> int:
-    """Tries components and prints a table, complaints on stderr and hints; returns 1 if one is broken or shadowed, else 0.
+    """Tries components and prints a table, hints, and complaints on stderr.
 
     Args:
         kind: one kind alone.
         name: one name of that kind alone.
+
+    Returns:
+        1 if a component is broken or shadowed, else 0.
 
     Raises:
         PluginError: there is no such kind or name.
@@ -42,7 +45,8 @@ def check(kind: str | None = None, name: str | None = None) -> int:
     """
     if not __debug__:
         raise ConfigError(
-            "cfx plugins check is made of assertions, which python -O removes; start python without -O"
+            "cfx plugins check is made of assertions, which python -O removes;"
+            " start python without -O"
         )
     chosen = _chosen(kind, name)
     verdicts = []
@@ -57,38 +61,55 @@ def check(kind: str | None = None, name: str | None = None) -> int:
             entry.kind, entry.name, entry.distribution, entry.version, entry.location, one.state
         )
     put(rows)
-    for hint in dict.fromkeys(one.hint for one in verdicts if one.hint):
+    for hint in _once([one.hint for one in verdicts]):
         print(f"Hint: {hint}")
-    complaints = list(dict.fromkeys(one.complaint for one in verdicts if one.complaint))
+    complaints = _once([one.complaint for one in verdicts])
     for complaint in complaints:
         print(complaint, file=sys.stderr)
-    return 1 if complaints else 0
+    if complaints:
+        return 1
+    return 0
+
+
+def _once(texts: list[str]) -> list[str]:
+    """Returns each text once, without empty ones."""
+    found: list[str] = []
+    for text in texts:
+        if text and text not in found:
+            found.append(text)
+    return found
 
 
 def _chosen(kind: str | None, name: str | None) -> list[registry.Entry]:
-    kinds = registry.KINDS if kind is None else [registry.kind_of(kind).name]
-    found = [
-        entry
-        for one in kinds
-        for entry in registry.entries(one)
-        if name is None or entry.name == name
-    ]
+    """Returns the entries of all kinds or one, of all names or one."""
+    kinds = list(registry.KINDS)
+    if kind is not None:
+        kinds = [registry.kind_of(kind).name]
+    found = []
+    for one in kinds:
+        for entry in registry.entries(one):
+            if name is None or entry.name == name:
+                found.append(entry)
     if not found and kind is not None and name is not None:
         registry.entry(kind, name)  # says which names there are
     return found
 
 
 def examine(entry: registry.Entry) -> Verdict:
-    """Tries one component with its default settings, or those of its `trial`; whatever it does, this returns."""
+    """Tries one component with its default settings, or those of its `trial`.
+
+    Whatever the component does, this returns.
+    """
     shadow = _shadow(entry)
     if shadow:
         return Verdict(entry, "shadowed", shadow)
     try:
         cls = registry.get(entry.kind, entry.name)
         nodes.render(cls, entry.name)
-        required = [
-            name for name, field in cls.schema.model_fields.items() if registry.is_blank(field)
-        ]
+        required = []
+        for name, field in cls.schema.model_fields.items():
+            if registry.is_blank(field):
+                required.append(name)
         if required:
             return Verdict(entry, "fine", hint=_not_tried(entry, required))
         component = registry.create(entry.kind, {"name": entry.name, **cls.trial})
@@ -99,37 +120,40 @@ def examine(entry: registry.Entry) -> Verdict:
             complaint = f"{entry}: {complaint}"
     except Exception as error:  # a plugin may raise anything
         complaint = f"{entry} cannot be used with its default settings: {registry.in_words(error)}"
-    return (
-        Verdict(entry, "broken", complaint)
-        if complaint
-        else Verdict(entry, "fine", hint=_undeclared(entry))
-    )
+    if complaint:
+        return Verdict(entry, "broken", complaint)
+    return Verdict(entry, "fine", hint=_undeclared(entry))
 
 
 def _shadow(entry: registry.Entry) -> str:
+    """Returns why another component of that name is used instead; "" if none is."""
     rivals = registry.rivals(entry)
     if not rivals:
         return ""
     if rivals[0].distribution == registry.OWN:
         return (
-            f"{entry} is never used, because cfx has a {entry.kind} '{entry.name}' of its own; its author must rename it, or pip"
-            f" uninstall {entry.distribution}"
+            f"{entry} is never used, because cfx has a {entry.kind} '{entry.name}' of its own;"
+            f" its author must rename it, or pip uninstall {entry.distribution}"
         )
     others = " and ".join(f"{one.distribution} {one.version}" for one in rivals)
-    return f"{entry} cannot be used, because {others} brings a {entry.kind} of that name too; uninstall one of them"
+    return (
+        f"{entry} cannot be used, because {others} brings a {entry.kind} of that name too;"
+        " uninstall one of them"
+    )
 
 
 def _broken_contract(entry: registry.Entry, component: object) -> str:
+    """Returns the first statement of the contract that does not hold; "" if all hold."""
     from cfx.testing import contract_for, violations
 
-    found = [
-        f"{' '.join(sentence.split())} ({check})"
-        for check, sentence in violations(contract_for(entry.kind), component)
-    ]
+    found = list(violations(contract_for(entry.kind), component))
     if not found:
         return ""
-    more = f"; and {len(found) - 1} more" if len(found) > 1 else ""
-    return f"{entry} breaks its contract: {found[0]}{more}; its own tests with cfx.testing's suite show all of it"
+    check, sentence = found[0]
+    text = f"{entry} breaks its contract: {' '.join(sentence.split())} ({check})"
+    if len(found) > 1:
+        text += f"; and {len(found) - 1} more"
+    return f"{text}; its own tests with cfx.testing's suite show all of it"
 
 
 def _not_tried(entry: registry.Entry, required: list[str]) -> str:
@@ -138,9 +162,11 @@ def _not_tried(entry: registry.Entry, required: list[str]) -> str:
 
 
 def _undeclared(entry: registry.Entry) -> str:
+    """Returns a hint for a distribution that declares no version of the plugin API."""
     if entry.distribution == registry.OWN or entry.api:
         return ""
     return (
-        f"{entry.distribution} declares no version of cfx's plugin API and counts as built for the current one; its author can"
-        f' add to pyproject.toml: [project.entry-points."{registry.API_GROUP}"] {API_VERSION} = "{entry.package}"'
+        f"{entry.distribution} declares no version of cfx's plugin API and counts as built for the"
+        " current one; its author can add to pyproject.toml:"
+        f' [project.entry-points."{registry.API_GROUP}"] {API_VERSION} = "{entry.package}"'
     )

@@ -1,7 +1,7 @@
 """`cfx plugins new`: a package for somebody's own component, complete and with tests that pass.
 
-The templates are files in `template/`: `common/` for every kind, and a folder for each. Copier renders them from there: no
-network, no git, no hooks.
+The templates are files in `template/`: `common/` for every kind, and a folder for each. Copier
+renders them from there: no network, no git, no hooks.
 """
 
 from __future__ import annotations
@@ -52,25 +52,24 @@ def create(kind: str, name: str, folder: Path | None = None) -> Path:
         _write(found, words, target)
     except OSError as error:
         raise OutputError(
-            f"{target} cannot be written ({error.strerror or error}); choose another folder with --folder"
+            f"{target} cannot be written ({error.strerror or error});"
+            " choose another folder with --folder"
         ) from error
     print(_next_steps(found, name, target))
     return target
 
 
 def _check_name(name: str) -> None:
-    if (
-        re.fullmatch(r"[a-z][a-z0-9_]*", name)
-        and not keyword.iskeyword(name)
-        and name not in _RESERVED
-    ):
+    is_taken = keyword.iskeyword(name) or name in _RESERVED
+    if re.fullmatch(r"[a-z][a-z0-9_]*", name) and not is_taken:
         return
+    advice = ""
     better = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_0123456789")
-    advice = (
-        f", such as {better}" if better and better != name and not keyword.iskeyword(better) else ""
-    )
+    if better and better != name and not keyword.iskeyword(better):
+        advice = f", such as {better}"
     raise ConfigError(
-        f"'{name}' cannot be a component's name: it must be an identifier in lower-case letters, digits and _{advice}"
+        f"'{name}' cannot be a component's name: it must be an identifier in lower-case letters,"
+        f" digits and _{advice}"
     )
 
 
@@ -78,24 +77,28 @@ def _check_free(kind: registry.Kind, name: str) -> None:
     taken = [entry for entry in registry.entries(kind.name) if entry.name == name]
     if taken:
         raise PluginError(
-            f"the name '{name}' is taken by {taken[0]}: a second {kind.name} of that name would be shadowed; choose another name"
+            f"the name '{name}' is taken by {taken[0]}: a second {kind.name} of that name would be"
+            " shadowed; choose another name"
         )
     package = f"cfx_{name}"
     if importlib.util.find_spec(package) is not None:
         raise PluginError(
-            f"a package {package} is installed already, so '{name}' would take its place; choose another name"
+            f"a package {package} is installed already, so '{name}' would take its place;"
+            " choose another name"
         )
 
 
 def _words(kind: registry.Kind, name: str) -> dict[str, Any]:
     """Returns what the templates call by name."""
+    base = kind.base.rpartition(":")[2]
+    class_name = "".join(part.capitalize() for part in name.split("_"))
     return {
         "kind": kind.name,
         "group": kind.group,
         "entry_points": kind.entry_points,
-        "suite": f"{kind.base.rpartition(':')[2].removeprefix('Driving')}Contract",
+        "suite": f"{base.removeprefix('Driving')}Contract",
         "name": name,
-        "class_name": "".join(part.capitalize() for part in name.split("_")),
+        "class_name": class_name,
         "package": f"cfx_{name}",
         "distribution": f"cfx-{name.replace('_', '-')}".rstrip("-"),
         "api": API_VERSION,
@@ -104,7 +107,10 @@ def _words(kind: registry.Kind, name: str) -> dict[str, Any]:
 
 
 def _requires() -> str:
-    """Returns a range of cfx's versions from this one on; which of them fit is also the plugin API's to say."""
+    """Returns a range of cfx's versions from this one on.
+
+    Which of them fit is also the plugin API's to say.
+    """
     from packaging.version import InvalidVersion, Version
 
     import cfx

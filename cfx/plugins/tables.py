@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from typing import Any, cast, get_args
 
 from pydantic import BaseModel
@@ -32,12 +32,17 @@ def overview() -> None:
 
 
 def state(entry: registry.Entry) -> str:
-    """Returns what is known of a component without importing it: shadowed, broken, fine (used already) or not loaded."""
+    """Returns what is known of a component without importing it.
+
+    It is shadowed, broken, fine (used already) or not loaded.
+    """
     if registry.rivals(entry):
         return "shadowed"
     if registry.other_api(entry):
         return "broken"
-    return "fine" if registry.is_loaded(entry) else "not loaded"
+    if registry.is_loaded(entry):
+        return "fine"
+    return "not loaded"
 
 
 def show(kind: str, name: str) -> None:
@@ -64,15 +69,11 @@ def show(kind: str, name: str) -> None:
         put(_parameters(cls))
     if entry.kind == "metric":
         put(_metric(cls))
-    settings = blank_table(
-        "setting",
-        "default",
-        "values",
-        "meaning",
-        title=f"Settings (set with {group}.SETTING=VALUE)",
-    )
-    for row in _settings(cls.schema, skip=["parameters"] if entry.kind == "model" else []):
-        settings.add_row(*row)
+    title = f"Settings (set with {group}.SETTING=VALUE)"
+    settings = blank_table("setting", "default", "values", "meaning", title=title)
+    for row in _settings(cls.schema):
+        if entry.kind != "model" or row[0] != "parameters":
+            settings.add_row(*row)
     if settings.row_count:
         put(settings)
     else:
@@ -80,7 +81,7 @@ def show(kind: str, name: str) -> None:
 
 
 def _reference(cls: type[Component]) -> Iterator[str]:
-    """Returns where a component comes from: a model says it itself, others in the docstring of their module."""
+    """Yields where a component comes from: its reference, or the docstring of its module."""
     reference = getattr(cls, "reference", "")
     if reference:
         yield f"Reference: {reference}"
@@ -99,73 +100,52 @@ def _metric(cls: Any) -> Table:
 
 
 def _parameters(cls: Any) -> Table:
-    rows = blank_table(
-        "parameter",
-        "unit",
-        "low",
-        "high",
-        "default",
-        "tuned",
-        "meaning",
-        "source",
-        title="Parameters",
-    )
+    """Returns a model's parameters as a table."""
+    headings = ("parameter", "unit", "low", "high", "default", "tuned", "meaning", "source")
+    rows = blank_table(*headings, title="Parameters")
     for p in cls.parameters:
-        tuned = "yes" if p.tuned else "constant"
-        rows.add_row(
-            p.name,
-            p.unit,
-            f"{p.low:g}",
-            f"{p.high:g}",
-            f"{p.default:g}",
-            tuned,
-            p.meaning,
-            p.source,
-        )
+        numbers = [f"{value:g}" for value in (p.low, p.high, p.default)]
+        tuned = "constant"
+        if p.tuned:
+            tuned = "yes"
+        rows.add_row(p.name, p.unit, *numbers, tuned, p.meaning, p.source)
     rows.caption = "Change one with model.parameters.NAME.{low,high,default,tuned}=VALUE"
     rows.caption_justify = "left"
     return rows
 
 
-def _settings(
-    schema: type[BaseModel], path: str = "", skip: Collection[str] = ()
-) -> Iterator[tuple[str, str, str, str]]:
+def _settings(schema: type[BaseModel], path: str = "") -> Iterator[tuple[str, str, str, str]]:
+    """Yields path, default, possible values and meaning of each setting."""
     for name, field in schema.model_fields.items():
-        if name in skip:
-            continue
-        default = (
-            None
-            if field.is_required()
-            else field.get_default(call_default_factory=True, validated_data={})
-        )
-        if isinstance(default, BaseModel):
-            yield from _settings(type(default), f"{path}{name}.")
-            continue
+        shown = "required"
+        if not field.is_required():
+            default = field.get_default(call_default_factory=True, validated_data={})
+            if isinstance(default, BaseModel):
+                yield from _settings(type(default), f"{path}{name}.")
+                continue
+            shown = json.dumps(to_jsonable_python(default))
         meaning = field.description or ""
         if field.deprecated:
             meaning = f"{meaning} (deprecated: {field.deprecation_message})".strip()
-        yield (
-            f"{path}{name}",
-            "required" if field.is_required() else json.dumps(to_jsonable_python(default)),
-            _values(field),
-            meaning,
-        )
+        yield f"{path}{name}", shown, _values(field), meaning
 
 
 def _values(field: FieldInfo) -> str:
     """Returns the type and the bounds that a setting must keep."""
     kind: Any = field.annotation
-    words = " or ".join(_type(one) for one in get_args(kind)) if _is_union(kind) else _type(kind)
-    bounds = [
-        f"{sign} {getattr(rule, key)}"
-        for rule in field.metadata
-        for key, sign in _SIGNS.items()
-        if hasattr(rule, key)
-    ]
-    return ", ".join([words, *bounds])
+    words = _type(kind)
+    if _is_union(kind):
+        words = " or ".join(_type(one) for one in get_args(kind))
+    parts = [words]
+    for rule in field.metadata:
+        for key, sign in _SIGNS.items():
+            if hasattr(rule, key):
+                parts.append(f"{sign} {getattr(rule, key)}")
+    return ", ".join(parts)
 
 
 _SIGNS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
+"""Bounds as pydantic calls them, and as they are written."""
 
 
 def _is_union(kind: Any) -> bool:
@@ -178,4 +158,6 @@ def _type(kind: Any) -> str:
     choices = get_args(kind)
     if choices and all(isinstance(choice, str) for choice in choices):
         return "|".join(cast("tuple[str, ...]", choices))
-    return str(getattr(kind, "__name__", kind)) if not choices else str(kind).replace("typing.", "")
+    if choices:
+        return str(kind).replace("typing.", "")
+    return str(getattr(kind, "__name__", kind))

@@ -1,7 +1,8 @@
 """The contracts that every component and every plugin holds.
 
-With pytest, a plugin's whole test is a subclass with one fixture (`ModelContract`, `OptimizerContract`, ...). Without pytest,
-`contract_for(kind)` gives the same statements as plain functions, and `violations` runs them:
+With pytest, a plugin's whole test is a subclass with one fixture (`ModelContract`,
+`OptimizerContract`, ...). Without pytest, `contract_for(kind)` gives the same statements as plain
+functions, and `violations` runs them:
 
     for name, sentence in violations(contract_for("model"), MyModel()):
         print(name, sentence)
@@ -75,7 +76,8 @@ def contract_for(kind: str) -> Contract:
     """
     if kind not in _CHECKS:
         raise PluginError(
-            f"there is no contract for '{kind}'.{nearest(kind, _CHECKS)} Known: {', '.join(_CHECKS)}."
+            f"there is no contract for '{kind}'.{nearest(kind, _CHECKS)}"
+            f" Known: {', '.join(_CHECKS)}."
         )
     found: Contract = import_module(_CHECKS[kind]).CONTRACT
     return found
@@ -90,8 +92,9 @@ def __getattr__(name: str) -> Any:
         if error.name != "pytest":
             raise
         raise ModuleNotFoundError(
-            f"cfx.testing.{name} is a pytest suite and pytest is not installed: pip install pytest; without it,"
-            " cfx.testing.contract_for(kind) and cfx.testing.violations check a component",
+            f"cfx.testing.{name} is a pytest suite and pytest is not installed: pip install pytest;"
+            " without it, cfx.testing.contract_for(kind) and cfx.testing.violations check a"
+            " component",
             name="pytest",
         ) from error
 

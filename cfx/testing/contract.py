@@ -1,8 +1,12 @@
-"""What the checks of every kind share. Nothing here or in `cfx.testing.checks` needs pytest."""
+"""What the checks of every kind share.
+
+Nothing here or in `cfx.testing.checks` needs pytest.
+"""
 
 from __future__ import annotations
 
 import inspect
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +14,10 @@ from typing import Any
 from cfx.errors import PluginError
 
 Check = Callable[..., None]
-"""Takes a component, holds one statement of its kind's contract, and raises AssertionError with the contract and the reason."""
+"""Takes a component and checks one statement of its kind's contract.
+
+It raises an AssertionError that says what the contract is and why.
+"""
 
 
 class NotApplicable(Exception):  # noqa: N818 - nothing is wrong: the check has nothing to verify
@@ -33,26 +40,29 @@ class Contract:
 
     @property
     def quick(self) -> tuple[Check, ...]:
-        """The statements that are checked in a second or two, with the component's default settings."""
+        """The statements that are checked in a second or two, with default settings."""
         return tuple(check for check in self.checks if check not in self.slow)
 
 
 def contract_of(module: str, kind: str, *, slow: Iterable[Check] = ()) -> Contract:
-    """Returns the contract that a module's public functions are: each takes the component first, named as its kind."""
-    import sys
+    """Returns the contract that a module's public functions are.
 
-    functions = [
-        function
-        for name, function in vars(sys.modules[module]).items()
-        if inspect.isfunction(function)
-        and function.__module__ == module
-        and not name.startswith("_")
-    ]
-    return Contract(
-        kind,
-        tuple(f for f in functions if next(iter(inspect.signature(f).parameters), "") == kind),
-        frozenset(slow),
-    )
+    Each takes the component first, under the name of its kind.
+
+    Args:
+        module: name of the module, which is imported already.
+        kind: as in `cfx.get(kind, name)`.
+        slow: see `Contract`.
+    """
+    checks = []
+    for name, function in vars(sys.modules[module]).items():
+        if name.startswith("_") or not inspect.isfunction(function):
+            continue
+        is_own = function.__module__ == module
+        parameters = list(inspect.signature(function).parameters)
+        if is_own and parameters and parameters[0] == kind:
+            checks.append(function)
+    return Contract(kind, tuple(checks), frozenset(slow))
 
 
 def violations(
@@ -61,17 +71,22 @@ def violations(
     """Checks a component without pytest.
 
     Yields:
-        For each statement that does not hold: the check's name, and what the contract is and why, in a sentence or two. A check
-        that ends in another error is reported with it: ordinary input must not make a component raise.
+        For each statement that does not hold: the check's name, and what the contract is and why,
+        in a sentence or two. A check that ends in another error is reported with it: ordinary input
+        must not make a component raise.
 
     Raises:
-        RuntimeError: Python was started with -O, which removes the assertions that checks are made of.
+        RuntimeError: Python was started with -O, which removes the assertions that make a check.
     """
     if not __debug__:
         raise RuntimeError(
-            "contract checks are made of assertions, which python -O removes; start python without -O"
+            "contract checks are made of assertions, which python -O removes;"
+            " start python without -O"
         )
-    for check in contract.quick if quick else contract.checks:
+    checks = contract.checks
+    if quick:
+        checks = contract.quick
+    for check in checks:
         try:
             check(component)
         except NotApplicable:
@@ -79,7 +94,5 @@ def violations(
         except (AssertionError, PluginError) as broken:
             yield check.__name__, str(broken)
         except Exception as error:  # a plugin may raise anything
-            yield (
-                check.__name__,
-                f"the component raised {type(error).__name__}: {error}".rstrip(": "),
-            )
+            sentence = f"the component raised {type(error).__name__}: {error}"
+            yield check.__name__, sentence.rstrip(": ")

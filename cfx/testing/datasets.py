@@ -1,4 +1,7 @@
-"""The contract of a dataset, as tests: subclass `DatasetContract`, fill in the fixture `dataset`, and pytest does the rest."""
+"""The contract of a dataset, as tests.
+
+Subclass `DatasetContract` and fill in the fixture `dataset`; pytest does the rest.
+"""
 
 from __future__ import annotations
 

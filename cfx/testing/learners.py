@@ -1,4 +1,7 @@
-"""The contract of a learner, as tests: subclass `LearnerContract`, fill in the fixture `learner`, and pytest does the rest."""
+"""The contract of a learner, as tests.
+
+Subclass `LearnerContract` and fill in the fixture `learner`; pytest does the rest.
+"""
 
 from __future__ import annotations
 

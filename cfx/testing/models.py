@@ -1,4 +1,6 @@
-"""The contract of a driving model, as tests: subclass `ModelContract`, fill in the fixture `model`, and pytest does the rest.
+"""The contract of a driving model, as tests.
+
+Subclass `ModelContract` and fill in the fixture `model`; pytest does the rest.
 
 Example, the whole test module of a plugin:
 
@@ -21,7 +23,7 @@ __all__ = ["Equilibrium", "ModelContract"]
 
 
 class ModelContract:
-    """What every driving model must hold: each statement of `cfx.testing.checks.models` is a test."""
+    """What every model must hold: each statement of `cfx.testing.checks.models` is a test."""
 
     @pytest.fixture
     def model(self) -> DrivingModel:
@@ -35,7 +37,7 @@ class ModelContract:
 
     @pytest.fixture
     def leader_deceleration(self) -> float:
-        """Returns how hard the leader brakes, m/s2, where the model claims to be free of collisions."""
+        """Returns how hard the leader brakes, m/s2, if the model claims to avoid collisions."""
         return 4.5
 
     @statements(CONTRACT)

@@ -1,4 +1,7 @@
-"""The contract of a policy, as tests: subclass `PolicyContract`, fill in the fixture `policy`, and pytest does the rest."""
+"""The contract of a policy, as tests.
+
+Subclass `PolicyContract` and fill in the fixture `policy`; pytest does the rest.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The contract of a protocol, as tests: subclass `ProtocolContract`, fill in the fixture `protocol`, and pytest does the rest."""
+"""The contract of a protocol, as tests.
+
+Subclass `ProtocolContract` and fill in the fixture `protocol`; pytest does the rest.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ class ProtocolContract:
 
     @pytest.fixture
     def protocol(self) -> Protocol:
-        """Returns the protocol under test; it gets six drivers, each behind a leader of his own."""
+        """Returns the protocol under test; it gets six drivers, each behind their own leader."""
         raise NotImplementedError(
             "the subclass of ProtocolContract must define the fixture `protocol`"
         )

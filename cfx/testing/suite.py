@@ -1,4 +1,7 @@
-"""How a contract becomes pytest's tests: one test per statement, skipped where the component claims nothing of the kind."""
+"""How a contract becomes pytest's tests: one test per statement.
+
+A test is skipped where the component claims nothing of the kind.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +18,17 @@ def statements(contract: Contract) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("check", contract.checks, ids=lambda check: check.__name__)
 
 
-def hold(check: Check, component: object, **dataset: Any) -> None:
-    """Checks one statement, with what it needs of `material`."""
+def hold(check: Check, component: object, **further: Any) -> None:
+    """Checks one statement.
+
+    Args:
+        check: the statement.
+        component: what must hold it.
+        further: other arguments by name; the check is given those that it takes.
+    """
     wanted = inspect.signature(check).parameters
+    given = {name: value for name, value in further.items() if name in wanted}
     try:
-        check(component, **{name: value for name, value in dataset.items() if name in wanted})
+        check(component, **given)
     except NotApplicable as reason:
         pytest.skip(str(reason))

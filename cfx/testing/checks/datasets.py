@@ -17,7 +17,8 @@ def every_number_is_finite(dataset: Dataset) -> None:
     for pair in pairs:
         for name in SIGNALS:
             assert bool(np.isfinite(getattr(pair, name)).all()), (
-                f"{name} of pair {pair.pair_id}: a gap in the data must split the pair, for a simulation cannot step over it"
+                f"{name} of pair {pair.pair_id}: missing data must split the pair,"
+                " for a simulation cannot step over them"
             )
 
 
@@ -25,7 +26,8 @@ def leaders_are_ahead_and_nobody_reverses(dataset: Dataset) -> None:
     pairs = dataset.load()
     for pair in pairs:
         assert float(pair.gap.min()) > 0, (
-            f"pair {pair.pair_id}: the gap is bumper to bumper, in m, and positive: nobody drives through another"
+            f"pair {pair.pair_id}: the gap is bumper to bumper, in m, and positive:"
+            " nobody drives through another"
         )
         lowest = min(float(pair.leader_speed.min()), float(pair.follower_speed.min()))
         assert lowest >= 0, (
@@ -36,10 +38,11 @@ def leaders_are_ahead_and_nobody_reverses(dataset: Dataset) -> None:
 def units_are_si(dataset: Dataset) -> None:
     pairs = dataset.load()
     for pair in pairs:
-        driven = float(pair.leader_position[-1] - pair.leader_position[0])
+        distance = float(pair.leader_position[-1] - pair.leader_position[0])
         integral = float(pair.leader_speed[1:].sum() * pair.dt)
-        assert math.isclose(driven, integral, rel_tol=0.2, abs_tol=10.0), (
-            f"pair {pair.pair_id}: the leader moves {driven:.1f} m, its speeds sum to {integral:.1f} m; give metres and m/s"
+        assert math.isclose(distance, integral, rel_tol=0.2, abs_tol=10.0), (
+            f"pair {pair.pair_id}: the leader moves {distance:.1f} m, its speeds sum to"
+            f" {integral:.1f} m; give metres and m/s"
         )
 
 
@@ -71,7 +74,8 @@ def max_pairs_keeps_the_first_and_counts_the_rest(dataset: Dataset) -> None:
         "max_pairs keeps the first pairs, in the same order, for users to try a job on"
     )
     assert sum(drop.count for drop in fewer.dropped if drop.unit == "pairs") >= len(pairs) - 1, (
-        "what is left out must be counted (PairSet.dropped): users must see on how many pairs a result stands"
+        "what is left out must be counted (PairSet.dropped):"
+        " users must see on how many pairs a result stands"
     )
 
 
@@ -87,7 +91,8 @@ def asking_for_too_much_is_an_error(dataset: Dataset) -> None:
         "where no pair is left `load` must raise DataError: no job can go on without pairs"
     )
     assert "min_frames" in said, (
-        f"where no pair is long enough the DataError must name min_frames, for users to change: {said}"
+        "where no pair is long enough the DataError must name min_frames, for users to change:"
+        f" {said}"
     )
 
 
