@@ -139,7 +139,7 @@ class TheilU(Metric):
     U = sqrt(sum e^2 / K') / (sqrt(sum v_sim^2 / K') + sqrt(sum v^2 / K')): from 0, no error, to 1.
     This is the bounded form (H. Theil 1961, Economic Forecasts and Policy) that calibrations of
     traffic models use (J. Hourdakis, P. Michalopoulos, J. Kottommannil 2003, Transportation
-    Research Record 1852), not his later U2, which compares with a naive forecast.
+    Research Record 1852), not the later U2, which compares with a naive forecast.
     """
 
     unit = ""

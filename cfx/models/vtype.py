@@ -19,7 +19,7 @@ class VType:
             differ, or a text for all.
         leader: the same for the vehicle ahead, as some models read what it could do.
         remembers: in SUMO the model may keep a state besides position, speed and acceleration, so
-            that a drive in parts is not the drive in one.
+            that a simulation in parts is not the simulation in one.
     """
 
     car_follow_model: str

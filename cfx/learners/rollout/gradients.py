@@ -52,22 +52,22 @@ class NoGradients(GradientPath):
 
 @dataclass(frozen=True)
 class ThroughTime(GradientPath):
-    """Back-propagation through time, with decay, clipping and truncation.
+    """Back-propagation through time, with decay, clipping and cuts.
 
     A decay of g per window makes gradients forget with a time constant of -1 / ln g windows.
 
     Attributes:
         decay: factor on gradients that come back through one window, 0 to 1.
         clip: largest absolute value of each of them.
-        truncation: windows after which they are cut; None: never.
+        cut_after: windows after which they are cut; None: never.
     """
 
     decay: float
     clip: float
-    truncation: int | None = None
+    cut_after: int | None = None
 
     def segment_length(self, windows: int) -> int:
-        return self.truncation or windows
+        return self.cut_after or windows
 
     def after_window(self, state: LoopState) -> LoopState:
         return LoopState(

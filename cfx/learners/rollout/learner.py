@@ -1,6 +1,6 @@
 """The learner `rollout`.
 
-Where window labels are not determined by the data, their average means little
+Where the data do not determine the labels of windows, their average means little
 (`cfx.learners.imitation`).
 Here nothing is labelled: from random measured states on, the policy drives in closed loop behind
 the measured leader, and the job's objective is propagated back through the simulation into the
@@ -57,7 +57,7 @@ class RolloutLearner(Learner):
     Training goes on where it was interrupted, and gives the same then, if the training data has a
     workspace.
 
-    Differences from the paper: it imitates window labels.
+    Differences from the paper: the paper imitates labels.
     """
 
     schema: ClassVar[type[Settings]] = RolloutSettings

@@ -22,7 +22,7 @@ from cfx.simulators.sumo.network import ROAD
 from cfx.simulators.sumo.worker import LOG
 
 _PATIENCE_S = 5.0
-"""How long a process that was told to end may take."""
+"""How long a process may take to end when it was asked to."""
 
 
 class Session:

@@ -110,7 +110,7 @@ def is_pure(model: DrivingModel) -> None:
     first = model.next_speed(follower, leader, p, DT)
     after = (*follower, *leader, *p.values())
     assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True)), (
-        "a step must not change its inputs in place: they are the recorded drives, or states that others read"
+        "a step must not change its inputs in place: they are recorded trajectories, or states that others read"
     )
     assert torch.equal(first, model.next_speed(follower, leader, p, DT)), (
         "the same state must give the same speed: a step draws no random numbers and keeps no state"

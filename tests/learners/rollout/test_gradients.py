@@ -45,7 +45,7 @@ def test_through_memory_no_gradient_comes_back_through_the_motion() -> None:
 
 
 def test_segments_are_cut_apart() -> None:
-    path = ThroughTime(0.5, 1.0, truncation=4)
+    path = ThroughTime(0.5, 1.0, cut_after=4)
     assert path.segment_length(30) == 4
     assert ThroughTime(0.5, 1.0).segment_length(30) == NoGradients().segment_length(30) == 30
     state = a_state()
