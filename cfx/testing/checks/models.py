@@ -23,6 +23,15 @@ DRIVES = 64  # random states and parameter sets of the ordinary kind
 _Step = tuple[Follower, Leader, dict[str, Tensor]]
 
 
+_EXTREMES = (
+    (-20, -0.1, 0, 0.01, 1, 30, 1e3),  # gap, m
+    (0, 1e-3, 5, 60),  # speed, m/s
+    (0, 1e-3, 15, 60),  # the leader's
+    (-9, 0, 5),  # the leader's acceleration, m/s2
+    (-9, 0, 3),  # acceleration, m/s2
+)
+
+
 def _ordinary(model: DrivingModel) -> _Step:
     """Returns states as traffic has them and parameters drawn within the bounds, float64."""
     draw = torch.Generator().manual_seed(0)
@@ -31,29 +40,18 @@ def _ordinary(model: DrivingModel) -> _Step:
 
 
 def _extreme(model: DrivingModel) -> _Step:
-    """Returns every combination of extreme states, at 200 corners of all parameters' bounds, float64."""
-    gap, v, v_l, a_l, a = (
-        torch.tensor(rows, dtype=torch.float64)
-        for rows in zip(
-            *itertools.product(
-                (-20, -0.1, 0, 0.01, 1, 30, 1e3),
-                (0, 1e-3, 5, 60),
-                (0, 1e-3, 15, 60),
-                (-9, 0, 5),
-                (-9, 0, 3),
-            ),
-            strict=True,
-        )
-    )
+    """Returns all combinations of extreme states at 200 corners of the bounds, float64."""
+    states = torch.tensor(list(itertools.product(*_EXTREMES)), dtype=torch.float64)
+    gap, v, v_l, a_l, a = states.unbind(dim=1)
     corner = torch.randint(
         0, 2, (200, 1, len(model.space.parameters)), generator=torch.Generator().manual_seed(1)
     ).bool()
-    p = {
-        parameter.name: torch.where(corner[..., i], parameter.high, parameter.low).double()
-        for i, parameter in enumerate(model.space)
-    }
+    p = {}
+    for i, parameter in enumerate(model.space):
+        p[parameter.name] = torch.where(corner[..., i], parameter.high, parameter.low).double()
     shape = (200, len(gap))
-    follower = _follower(model, *(x.expand(shape) for x in (-gap - LENGTH, v, a)))
+    position = (-gap - LENGTH).expand(shape)
+    follower = _follower(model, position, v.expand(shape), a.expand(shape))
     return follower, Leader(torch.zeros_like(gap), v_l, a_l, torch.full_like(gap, LENGTH)), p
 
 
@@ -61,10 +59,12 @@ def every_parameter_says_what_it_is(model: DrivingModel) -> None:
     for parameter in model.space:
         for field in ("unit", "meaning", "source"):
             assert getattr(parameter, field), (
-                f"parameter {parameter.name} has no {field}: the documentation, the config's comments and the figures show it"
+                f"parameter {parameter.name} has no {field}: the documentation, the config's"
+                " comments and the figures show it"
             )
     assert model.reference, (
-        "a model says where its equations come from (set `reference`): who reads a result must find them"
+        "a model says where its equations come from (set `reference`): who reads a result must"
+        " find them"
     )
 
 
@@ -72,12 +72,14 @@ def constants_can_be_tuned_and_tuned_parameters_fixed(model: DrivingModel) -> No
     constants = [parameter.name for parameter in model.space if not parameter.tuned]
     everything = _with_tuned(model, dict.fromkeys(constants, True))
     assert set(everything.space.names) == {parameter.name for parameter in model.space}, (
-        "`model.parameters.NAME.tuned=true` must turn a constant into a tuned parameter; build `space` in the base class"
+        "`model.parameters.NAME.tuned=true` must turn a constant into a tuned parameter; build"
+        " `space` in the base class"
     )
     for name in constants:
         value = model.space.unpack(model.space.defaults()[None])[name]
         assert value.dim() == 0, (
-            f"constant {name} must reach the step as one number for all followers, for it costs no memory so"
+            f"constant {name} must reach the step as one number for all followers, for it costs"
+            " no memory so"
         )
 
 
@@ -91,10 +93,12 @@ def keeps_shape_dtype_and_device(model: DrivingModel) -> None:
             f"next_speed must give (*batch,), got {tuple(speed.shape)}: one speed for each follower"
         )
         assert speed.dtype == dtype, (
-            f"{dtype} states must give {dtype} speeds, got {speed.dtype}: a step is no place to convert"
+            f"{dtype} states must give {dtype} speeds, got {speed.dtype}: a step is no place to"
+            " convert"
         )
         assert speed.device == follower.speed.device, (
-            "the speed must stay on the device of the states: a step on a GPU must not wait for a copy"
+            "the speed must stay on the device of the states: a step on a GPU must not wait for a"
+            " copy"
         )
         assert memory.shape == (DRIVES, model.memory_size), (
             "next_memory must give (*batch, memory_size), which the next step is given"
@@ -110,7 +114,8 @@ def is_pure(model: DrivingModel) -> None:
     first = model.next_speed(follower, leader, p, DT)
     after = (*follower, *leader, *p.values())
     assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True)), (
-        "a step must not change its inputs in place: they are recorded trajectories, or states that others read"
+        "a step must not change its inputs in place: they are recorded trajectories, or states"
+        " that others read"
     )
     assert torch.equal(first, model.next_speed(follower, leader, p, DT)), (
         "the same state must give the same speed: a step draws no random numbers and keeps no state"
@@ -126,7 +131,8 @@ def a_batch_equals_the_loop_over_it(model: DrivingModel) -> None:
         torch.testing.assert_close(
             alone,
             together[k],
-            msg=f"follower {k} drives differently alone than in a batch: results would depend on chunks",
+            msg=f"follower {k} moves differently alone than in a batch: results would depend on"
+            " chunks",
         )
 
 
@@ -137,13 +143,15 @@ def leaders_and_parameters_broadcast(model: DrivingModel) -> None:
     columns = {name: value[:, None] if value.dim() else value for name, value in p.items()}
     speed = model.next_speed(wide, narrow, columns, DT)
     assert speed.shape == (DRIVES, 3), (
-        "leaders (P, 1) and parameters (P, 1) must broadcast over followers (P, q): q candidates behind one leader"
+        "leaders (P, 1) and parameters (P, 1) must broadcast over followers (P, q): q candidates"
+        " behind one leader"
     )
     one = model.next_speed(follower, leader, p, DT)
     torch.testing.assert_close(
         speed,
         one[:, None].expand(DRIVES, 3),
-        msg="broadcasting changes the numbers: a candidate must drive the same beside others as alone",
+        msg="broadcasting changes the numbers: a candidate must move the same beside others as"
+        " alone",
     )
 
 
@@ -165,8 +173,10 @@ def speeds_are_finite_and_not_negative_at_every_extreme(model: DrivingModel) -> 
         speed = model.next_speed(*_to(extreme, dtype), DT)
         wrong = ~(speed.isfinite() & (speed >= 0))
         assert not bool(wrong.any()), (
-            f"{int(wrong.sum())} of {wrong.numel()} extreme states give a negative or infinite speed in {dtype}, such as "
-            f"{_describe(extreme, wrong)}: optimizers visit every corner of the bounds, and rollouts go on after collisions"
+            f"{int(wrong.sum())} of {wrong.numel()} extreme states give a negative or infinite"
+            f" speed in {dtype}, such as "
+            f"{_describe(extreme, wrong)}: optimizers visit every corner of the bounds, and"
+            " rollouts go on after collisions"
         )
 
 
@@ -179,7 +189,8 @@ def a_bad_neighbour_does_no_harm(model: DrivingModel) -> None:
     }
     speed = model.next_speed(follower, leader, broken, DT)
     assert torch.equal(speed[1:], clean[1:]), (
-        "NaN parameters of one follower must not reach the others: one diverged candidate would spoil all"
+        "NaN parameters of one follower must not reach the others: one diverged candidate would"
+        " spoil all"
     )
 
 
@@ -206,7 +217,8 @@ def gradients_are_right(model: DrivingModel) -> None:
     )
     inputs = tuple(x.clone().requires_grad_() for x in inputs)
     assert torch.autograd.gradcheck(step, inputs, eps=1e-7, atol=1e-4, raise_exception=False), (
-        "analytic and numeric gradients differ: the model claims `differentiable`, and learning relies on it"
+        "analytic and numeric gradients differ: the model claims `differentiable`, and learning"
+        " relies on it"
     )
 
 
@@ -228,8 +240,10 @@ def gradients_are_finite_at_every_extreme(model: DrivingModel) -> None:
     for name, gradient in zip(inputs, gradients, strict=True):
         wrong = ~gradient.isfinite()
         assert not bool(wrong.any()), (
-            f"the gradient with respect to {name} is not finite, for instance at {_describe(extreme, wrong)}: replace the "
-            "argument of a root or a division in the branch that is not taken (see cfx.models.guarded)"
+            f"the gradient with respect to {name} is not finite, for instance at"
+            f" {_describe(extreme, wrong)}: replace the "
+            "argument of a root or a division in the branch that is not taken (see"
+            " cfx.models.guarded)"
         )
 
 
@@ -243,8 +257,10 @@ def has_a_constant_baseline_as_claimed(model: DrivingModel) -> None:
     )
     reacts = (near - far).abs().gt(1e-6).double().mean().item()
     assert reacts >= 0.1, (
-        f"the model claims `has_constant_baseline`, but takes notice of its leader in {reacts:.0%} of ordinary states: fixed parameters would"
-        " be no baseline (set `has_constant_baseline = False` for a model whose parameters are the control itself)"
+        "the model claims `has_constant_baseline`, but takes notice of its leader in"
+        f" {reacts:.0%} of ordinary states: fixed parameters would"
+        " be no baseline (set `has_constant_baseline = False` for a model whose parameters are"
+        " the control itself)"
     )
 
 
@@ -256,10 +272,12 @@ def no_rollout_leaves_what_is_finite(model: DrivingModel) -> None:
     start = Start(zero - LENGTH - 60 * torch.rand(256, generator=draw).double(), zero + 25.0, zero)
     out = simulate(model, model.space.from_unit(corner), leader, start, DT)
     assert bool(out.speed.isfinite().all()), (
-        "a rollout at a corner of the bounds ends in infinity or NaN, and optimizers visit every corner"
+        "a rollout at a corner of the bounds ends in infinity or NaN, and optimizers visit every"
+        " corner"
     )
     assert out.speed.max() <= 200.0, (
-        "a rollout at a corner of the bounds reaches absurd speeds: bound the acceleration or the speed"
+        "a rollout at a corner of the bounds reaches absurd speeds: bound the acceleration or the"
+        " speed"
     )
 
 
@@ -291,8 +309,10 @@ def collision_free_as_claimed(model: DrivingModel, leader_deceleration: float = 
         out = simulate(model, None, leader, start, DT)
         hit = out.collided.any(dim=-1)
         assert not bool(hit.any()), (
-            f"the model claims `collision_free`, but with default parameters it hits a leader that brakes at "
-            f"{leader_deceleration} m/s2 from {speed[hit][0].item():g} m/s, starting {headway} s and 3 m behind"
+            "the model claims `collision_free`, but with default parameters it hits a leader"
+            " that brakes at "
+            f"{leader_deceleration} m/s2 from {speed[hit][0].item():g} m/s, starting {headway} s"
+            " and 3 m behind"
         )
 
 
@@ -311,8 +331,10 @@ def can_be_compiled_as_one_graph(model: DrivingModel) -> None:
             compiled = whole(follower, leader, p)
         except Exception as error:  # the compiler's errors have no common base
             raise AssertionError(
-                "long calibrations run the step compiled as one graph, so Python must not look at the values of tensors (write"
-                f" torch.where instead of if); the compiler says: {str(error).strip().partition(chr(10))[0]}"
+                "long calibrations run the step compiled as one graph, so Python must not look at"
+                " the values of tensors (write"
+                " torch.where instead of if); the compiler says:"
+                f" {str(error).strip().partition(chr(10))[0]}"
             ) from error
         eager = model.next_speed(follower, leader, p, DT)
     torch.testing.assert_close(
@@ -346,7 +368,10 @@ def _states(model: DrivingModel, draw: torch.Generator) -> tuple[Follower, Leade
 
 
 def _stop_and_go(speed: Tensor, deceleration: float) -> Leader:
-    """A leader that cruises for 3 s, brakes to a standstill, waits 5 s, and does it all again; `(*batch, time)`."""
+    """Returns a leader that cruises for 3 s, brakes to a standstill, waits 5 s, and starts again.
+
+    Shapes: `speed` `(*batch,)`, the leader's signals `(*batch, time)`.
+    """
     time = torch.arange(900, dtype=torch.float64) * DT
     period = time % 45.0
     top = speed[..., None]
@@ -390,8 +415,10 @@ def _describe(step: _Step, wrong: Tensor) -> str:
     gap = leader.position[column] - leader.length[column] - follower.position[row, column]
     values = ", ".join(f"{name}={value[row, 0].item():g}" for name, value in p.items())
     return (
-        f"gap {gap.item():g} m, v {follower.speed[row, column].item():g}, v_l {leader.speed[column].item():g} m/s, "
-        f"a {follower.acceleration[row, column].item():g}, a_l {leader.acceleration[column].item():g} m/s2, {values}"
+        f"gap {gap.item():g} m, v {follower.speed[row, column].item():g}, v_l"
+        f" {leader.speed[column].item():g} m/s, "
+        f"a {follower.acceleration[row, column].item():g}, a_l"
+        f" {leader.acceleration[column].item():g} m/s2, {values}"
     )
 
 
