@@ -1,10 +1,10 @@
-"""cfx: calibrate driving models to real drivers, train policies that adapt their parameters, and see whether it helps.
+"""cfx: calibrate car-following models to recorded drivers, train policies, measure whether it helps.
 
     result = cfx.run(["data=tidy", "data.path=pairs.parquet", "model=w99", "policy=gru"])
     result.metrics["rmse_improvement/mean"]
 
-The names below, `cfx.errors` and `cfx.testing` are the public API; everything else may change. Importing cfx imports nothing
-heavy: each name is loaded when it is first used.
+The names below, `cfx.errors` and `cfx.testing` are the public API; everything else may change.
+Importing cfx imports nothing heavy: each name is loaded when it is first used.
 """
 
 from __future__ import annotations

@@ -193,7 +193,7 @@ class TcnNetwork(PolicyNetwork):
 
 
 class TcnPolicy(Policy):
-    """Answers from a fixed number of past windows, where a recurrent network has a memory of its own making.
+    """Answers from a fixed number of past windows; a recurrent network learns what to remember.
 
     Differences from the paper: no weight normalisation (it speeds up long trainings; these take
     seconds); weights are drawn as PyTorch draws those of a convolution; a sigmoid keeps the answers

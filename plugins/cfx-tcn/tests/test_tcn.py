@@ -96,7 +96,7 @@ def test_an_untrained_network_is_the_fixed_model() -> None:
 
 
 def test_it_learns_what_happened_some_windows_ago() -> None:
-    """Each of two networks learns to answer what a signal was, one three and one six windows before."""
+    """Each of two networks learns what a signal was three, or six, windows before."""
     signal = torch.rand((2, 8, 60, 1), generator=torch.Generator().manual_seed(2))
     answer = torch.stack([signal[0].roll(3, dims=1), signal[1].roll(6, dims=1)])
     network = TcnPolicy(channels=8, levels=2).build(
