@@ -1,4 +1,4 @@
-"""cfx: calibrate car-following models to recorded drivers, train policies, measure whether it helps.
+"""cfx: calibrate car-following models, train policies that adapt them, measure whether it helps.
 
     result = cfx.run(["data=tidy", "data.path=pairs.parquet", "model=w99", "policy=gru"])
     result.metrics["rmse_improvement/mean"]

@@ -18,7 +18,7 @@ class LearnerContract:
 
     @pytest.fixture
     def learner(self) -> Learner:
-        """Returns the learner under test; with a short training; a module-level instance saves time."""
+        """Returns the learner under test, with a short training; a module-level one saves time."""
         raise NotImplementedError(
             "the subclass of LearnerContract must define the fixture `learner`"
         )
