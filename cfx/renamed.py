@@ -82,6 +82,9 @@ ATTRIBUTES: dict[str, str] = {
 }
 """Attributes of components and of a job's policy, which plugins read."""
 
+ARGUMENTS = {"traits": "driver_features"}
+"""Keyword arguments of `cfx.sumo.Driver.assign`."""
+
 DECLARED = ("follows", "reads_traits")
 """Those of them that plugins' classes set."""
 
@@ -318,10 +321,22 @@ def attribute(owner: type, name: str) -> str | None:
     return new
 
 
-def argument(old: str, new: str) -> None:
-    """Warns that a function's argument has a new name."""
-    text = f"the argument {old} is now called {new}; {_GONE}"
-    warnings.warn(text, DeprecationWarning, stacklevel=3)
+def arguments(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns keyword arguments that a function was given by their earlier names, under today's.
+
+    Warns that the old names go.
+
+    Raises:
+        TypeError: there never was such an argument.
+    """
+    found = {}
+    for old, value in given.items():
+        if old not in ARGUMENTS:
+            raise TypeError(f"unexpected keyword argument '{old}'")
+        text = f"the argument {old} is now called {ARGUMENTS[old]}; {_GONE}"
+        warnings.warn(text, DeprecationWarning, stacklevel=3)
+        found[ARGUMENTS[old]] = value
+    return found
 
 
 # ---- helpers

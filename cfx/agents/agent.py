@@ -270,7 +270,7 @@ class Agent:
         return torch.tensor(numbers)
 
     def for_unseen_drivers(self) -> Agent:
-        """Returns the one network that drives anybody: the only one, or the one named `all`.
+        """Returns the agent with one network for any driver: the only one, or the one named `all`.
 
         Raises:
             DataError: each network is for a pair of its own.

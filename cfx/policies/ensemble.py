@@ -31,7 +31,7 @@ class Ensemble(PolicyNetwork):
     def __init__(self, members: PolicyNetwork, size: int) -> None:
         """Takes N M networks, those of one ensemble behind one another, and M."""
         super().__init__()
-        self.members = members
+        self.members = members  # under this name the weights are saved
         self.size = size
 
     def initial_state(self, networks: int, drivers: int) -> Tensor:

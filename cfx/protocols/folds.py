@@ -140,22 +140,13 @@ def describe_folds(pairs: PairSet, fold: Tensor, *, apart: bool) -> dict[str, An
     """
     places = [int(number) for number in fold]
     fold_of_driver: dict[str, int] = {}
-    not_learned_in: dict[str, int] = {}
     for pair, place in zip(pairs, places, strict=True):
         if place >= 0:
             fold_of_driver[pair.driver] = place
-        not_learned_in[pair.driver] = place if place >= 0 else -2 - place
-    behind_trained = 0
-    leaders = set()
-    for pair, place in zip(pairs, places, strict=True):
-        leader = _leader(pair)
-        if place >= 0 and leader in not_learned_in and not_learned_in[leader] != place:
-            behind_trained += 1
-        leads_in = fold_of_driver.get(leader)
-        if leads_in is not None and place not in {leads_in, -2 - leads_in}:
-            leaders.add(leader)
+    behind_trained, leaders = _on_both_sides(pairs, places, fold_of_driver)
     folds = max(places) + 1
     tested = sum(place >= 0 for place in places)
+    recordings = _recordings_per_fold(pairs, places, folds)
     log.info(
         "%d folds over %d drivers; %d of %d test pairs follow a driver of the training part,"
         " %d test drivers lead one there",
@@ -167,7 +158,6 @@ def describe_folds(pairs: PairSet, fold: Tensor, *, apart: bool) -> dict[str, An
     )
     if tested < len(pairs):
         log.info("%d shorter pairs are only learned from", len(pairs) - tested)
-    recordings = _recordings_per_fold(pairs, places, folds)
     if apart:
         for number, names in enumerate(recordings):
             text = "Fold %d is tested on %s and learns nothing from there"
@@ -182,6 +172,25 @@ def describe_folds(pairs: PairSet, fold: Tensor, *, apart: bool) -> dict[str, An
         "test_drivers_who_lead_a_training_pair": len(leaders),
         "pairs_only_learned_from": len(pairs) - tested,
     }
+
+
+def _on_both_sides(
+    pairs: PairSet, places: Sequence[int], fold_of_driver: Mapping[str, int]
+) -> tuple[int, set[str]]:
+    """Returns how many test pairs follow a training driver, and the test drivers who lead one."""
+    not_learned_in: dict[str, int] = {}
+    for pair, place in zip(pairs, places, strict=True):
+        not_learned_in[pair.driver] = place if place >= 0 else -2 - place
+    behind_trained = 0
+    leaders = set()
+    for pair, place in zip(pairs, places, strict=True):
+        leader = _leader(pair)
+        if place >= 0 and leader in not_learned_in and not_learned_in[leader] != place:
+            behind_trained += 1
+        leads_in = fold_of_driver.get(leader)
+        if leads_in is not None and place not in {leads_in, -2 - leads_in}:
+            leaders.add(leader)
+    return behind_trained, leaders
 
 
 def _recordings_per_fold(pairs: PairSet, places: Sequence[int], folds: int) -> list[list[str]]:

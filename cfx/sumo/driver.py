@@ -130,8 +130,8 @@ class Driver:
 
         Args:
             run: a job's output folder (or its `policy` folder), or the id of its MLflow run.
-            network: which of the policy's networks drives: `all`, which drives anybody, or the id
-                of a pair, to drive like its driver.
+            network: which of the policy's networks drives: `all`, which drives any driver's
+                vehicle, or the id of a pair, to drive like its driver.
             model: refuse a policy of another driving model than this.
             look_ahead: m; a vehicle farther ahead is no leader.
             speed_mode: SUMO's bit set of `vehicle.setSpeedMode` while a vehicle is driven.
@@ -211,7 +211,7 @@ class Driver:
         *,
         base: Mapping[str, float] | None = None,
         driver_features: Mapping[str, float] | None = None,
-        traits: Mapping[str, float] | None = None,
+        **earlier: Mapping[str, float],
     ) -> None:
         """Says how a vehicle is driven from when it begins.
 
@@ -227,16 +227,15 @@ class Driver:
             driver_features: name -> value, where the policy was trained to read some
                 (`policy.driver_features`; `Agent.driver_features_of` measures them); None: those of
                 an unseen driver. What a vehicle does while it is watched does not change them.
-            traits: the earlier name of `driver_features`.
+            earlier: `driver_features` by its earlier name.
 
         Raises:
             DataError: the policy has no such network.
             ParameterError: `base` is not a value for each tuned parameter, or `driver_features` not
                 one for each driver feature of the policy.
         """
-        if traits is not None:
-            renamed.argument("traits", "driver_features")
-            driver_features = traits
+        if earlier:
+            driver_features = renamed.arguments(earlier)["driver_features"]
         if network is not None:
             self._assigned[vehicle] = self._number(network)
         if base is not None:

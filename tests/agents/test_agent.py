@@ -90,7 +90,7 @@ def test_one_network_of_many_drives_as_it_did_among_them() -> None:
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
 
 
-def test_networks_for_single_pairs_drive_nobody_else() -> None:
+def test_networks_for_single_pairs_are_for_no_other_driver() -> None:
     with pytest.raises(DataError, match="2 networks, one for each of its own pairs"):
         adaptive(NODE, ("one", "two")).for_unseen_drivers()
 

@@ -49,7 +49,7 @@ def krauss(unit: float) -> torch.Tensor:
 
 
 @given(unit)
-def test_a_set_that_is_not_drawn_stays_exactly_and_one_drawn_fully_is_the_default(
+def test_without_shrinkage_a_set_stays_exactly_and_with_all_of_it_is_the_default(
     own: float,
 ) -> None:
     values = krauss(own)
@@ -58,7 +58,9 @@ def test_a_set_that_is_not_drawn_stays_exactly_and_one_drawn_fully_is_the_defaul
 
 
 @given(unit, st.floats(0.001, 1.0), st.floats(0.001, 1.0))
-def test_the_more_a_set_is_drawn_the_nearer_it_comes(own: float, one: float, other: float) -> None:
+def test_more_shrinkage_brings_a_set_nearer_to_the_default(
+    own: float, one: float, other: float
+) -> None:
     less, more = sorted((one, other))
     far, near = ((shrunk(SPACE, krauss(own), s) - SPACE.defaults()).abs() for s in (less, more))
     assert bool((near <= far + 1e-9).all())

@@ -141,7 +141,7 @@ def test_the_policy_never_sees_the_measured_follower_of_the_test_part() -> None:
     torch.testing.assert_close(before, after)
 
 
-def test_the_policy_reads_the_history_first() -> None:
+def test_the_policy_observes_the_history_first() -> None:
     model = Krauss()
     batch = PairBatch.of(
         wavy_pairs(model, torch.tensor([[1.5, 0.1], [3.0, 0.5]], dtype=torch.float64))

@@ -14,8 +14,8 @@ from cfx.evaluation.platoon import (
     LENGTH,
     VEHICLES,
     Manoeuvre,
-    simulate_platoons,
     measure_platoons,
+    simulate_platoons,
     slowing,
 )
 from cfx.evaluation.result import Platoon
@@ -32,8 +32,8 @@ from tests.evaluation.test_closed_loop import adaptive, constant
 class Linear(DrivingModel):
     """a = k_gap (gap - h v) + k_speed (v_l - v).
 
-    Small disturbances of all wavelengths die out along a platoon if k_gap h^2 + 2 k_speed h > 2, to be found in textbooks such
-    as Treiber and Kesting (2013), Traffic Flow Dynamics, eq. 15.
+    Small disturbances of all wavelengths die out along a platoon if k_gap h^2 + 2 k_speed h > 2, to
+    be found in textbooks such as Treiber and Kesting (2013), Traffic Flow Dynamics, eq. 15.
     """
 
     parameters = ParameterSpace.of(
@@ -64,7 +64,7 @@ def measured(model: DrivingModel, *parameters: tuple[float, ...]) -> Platoon:
     return found
 
 
-def test_a_stable_model_is_told_from_an_unstable_one() -> None:
+def test_a_stable_model_is_distinguished_from_an_unstable_one() -> None:
     calm, wild = measured(Linear(), STABLE, UNSTABLE).measures.to_dict("records")
     assert (calm["string_stable"], calm["settled"], calm["collisions"]) == (1, 1, 0)
     assert calm["drop_leader"] == pytest.approx(8.0)
@@ -94,7 +94,7 @@ def test_krauss_settles_at_its_equilibrium_gap() -> None:
         assert rows["speed"].to_numpy() == pytest.approx(15.0, abs=0.1)
 
 
-def test_who_follows_too_closely_for_his_brakes_collides_and_is_not_stable() -> None:
+def test_a_vehicle_that_follows_too_closely_for_its_brakes_collides_and_is_not_stable() -> None:
     (row,) = measured(Linear(), (0.1, 0.02, 0.0)).measures.to_dict("records")
     assert row["collisions"] > 0
     assert row["min_gap"] < 0

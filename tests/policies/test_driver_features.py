@@ -1,4 +1,4 @@
-"""What a policy is told of a driver: measured from his past alone, or unknown."""
+"""Driver features: measured from a driver's history alone, or unknown."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def measured(
 
 
 def by_hand(pair: int, since: int, until: int) -> dict[str, float]:
-    """The same from the signals, with NumPy, and scikit-learn's ridge regression around a slope of 1.2 s."""
+    """The same with NumPy, and scikit-learn's ridge regression around a slope of 1.2 s."""
     speed, leader, acceleration, gap = (
         signal[pair, since:until].double().numpy()
         for signal in (
@@ -72,7 +72,7 @@ def by_hand(pair: int, since: int, until: int) -> dict[str, float]:
 
 @settings(deadline=None)
 @given(frame, frame, st.integers(0, 2))
-def test_any_stretch_has_the_traits_of_its_frames(one: int, other: int, pair: int) -> None:
+def test_any_part_has_the_features_of_its_frames(one: int, other: int, pair: int) -> None:
     since, until = sorted((one, other))
     found = dict(zip(ALL, measured(BATCH, since, until)[pair].tolist(), strict=True))
     expected = by_hand(pair, since, until)
@@ -82,7 +82,7 @@ def test_any_stretch_has_the_traits_of_its_frames(one: int, other: int, pair: in
 
 
 @pytest.mark.parametrize("delay", [0.0, 1.0, 2.4])
-def test_who_repeats_what_his_leader_did_responds_after_as_long(delay: float) -> None:
+def test_the_response_time_is_the_delay_with_which_the_leader_is_repeated(delay: float) -> None:
     frames = round(delay * 10)
     speed = BATCH.leader_speed.roll(frames, 1)
     speed[:, :frames] = BATCH.leader_speed[:, :1]
@@ -134,13 +134,13 @@ def first_answer(policy: Agent, driver_features: list[float] | None) -> list[flo
             for value in (8.0, 0.1, 9.0, -0.2, 15.0)
         )
     )
-    told = None if driver_features is None else torch.tensor([driver_features]).double()
+    features = None if driver_features is None else torch.tensor([driver_features]).double()
     return policy.act(
-        now, policy.begin(torch.ones(1, dtype=torch.long), DriverContext(None, told))
+        now, policy.begin(torch.ones(1, dtype=torch.long), DriverContext(None, features))
     )[0][0].tolist()
 
 
-def test_a_stranger_is_taken_for_the_mean_of_those_who_were_learned_from() -> None:
+def test_the_mean_of_the_training_drivers_stands_for_an_unseen_driver() -> None:
     policy = one_that_knows()
     cold_start = first_answer(policy, None)
     assert (
@@ -150,7 +150,7 @@ def test_a_stranger_is_taken_for_the_mean_of_those_who_were_learned_from() -> No
     assert first_answer(policy, [math.nan, -0.5]) == first_answer(policy, [6.0, -0.5])
 
 
-def test_a_saved_policy_knows_the_same_traits(tmp_path: Path) -> None:
+def test_a_saved_policy_uses_the_same_driver_features(tmp_path: Path) -> None:
     policy = one_that_knows()
     checkpoint.save(policy, tmp_path)
     for again in (checkpoint.load(tmp_path), checkpoint.load(tmp_path).for_unseen_drivers()):
@@ -164,7 +164,7 @@ def test_a_saved_policy_knows_the_same_traits(tmp_path: Path) -> None:
         assert answer[0].tolist() == pytest.approx(first_answer(policy, [0.7, -0.5]), rel=1e-6)
 
 
-def test_whoever_asks_with_a_table_is_answered_with_its_drivers_traits(tmp_path: Path) -> None:
+def test_a_table_is_answered_with_its_drivers_features(tmp_path: Path) -> None:
     write_tidy(wavy_pairs(Krauss(), PARAMETERS, frames=300), tmp_path / "pairs.parquet")
     table = pd.read_parquet(tmp_path / "pairs.parquet")
     policy = adaptive({"name": "krauss"}, driver_features=("time_headway", "response_time"))
@@ -181,7 +181,7 @@ def test_whoever_asks_with_a_table_is_answered_with_its_drivers_traits(tmp_path:
     assert found != pytest.approx(chosen[True], rel=1e-3)
 
 
-def test_how_much_history_is_read_says_how_much_is_measured() -> None:
+def test_the_history_that_is_observed_is_the_history_that_is_measured() -> None:
     policy, until = one_that_knows(), torch.tensor([290, 290, 290])
     names = ("time_headway", "acceleration")
     torch.testing.assert_close(
@@ -196,10 +196,11 @@ def test_how_much_history_is_read_says_how_much_is_measured() -> None:
     assert adaptive({"name": "krauss"}).driver_features_of(BATCH, until) is None
 
 
-def test_a_trait_that_is_none_is_refused() -> None:
+def test_an_unknown_driver_feature_is_refused() -> None:
     with pytest.raises(
         ConfigError,
-        match=r"policy.driver_features: unknown driver feature 'time_headwy'. Did you mean 'time_headway'",
+        match=r"policy.driver_features: unknown driver feature 'time_headwy'."
+        r" Did you mean 'time_headway'",
     ):
         GruPolicy(driver_features=("time_headwy",))
     with pytest.raises(
@@ -215,7 +216,7 @@ def test_a_trait_that_is_none_is_refused() -> None:
     assert GruPolicy(driver_features="none").driver_features == ()
 
 
-def test_a_learner_that_tells_its_networks_nothing_refuses_traits(tmp_path: Path) -> None:
+def test_a_learner_without_conditioning_refuses_driver_features(tmp_path: Path) -> None:
     with pytest.raises(
         ConfigError,
         match=r"policy.driver_features=\['time_gap'\]: this learner provides no driver features",

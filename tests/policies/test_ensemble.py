@@ -1,4 +1,4 @@
-"""An ensemble is a policy's network like any other, and answers the median of what its members answer."""
+"""An ensemble is a policy's network like any other; it answers its networks' median."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_it_keeps_what_the_contract_says_of_driving(statement: Callable[[Policy]
     statement(Three(hidden_size=8))
 
 
-def test_two_members_answer_the_mean_of_their_logits() -> None:
+def test_two_networks_answer_the_mean_of_their_logits() -> None:
     policy, generator = GruPolicy(hidden_size=6, start="middle"), torch.Generator().manual_seed(0)
     network = policy.build(5, torch.zeros(3), torch.zeros((4, 3)), generator).double()
     tokens = torch.randn((2, 3, 7, 5), generator=generator, dtype=torch.float64)
@@ -54,14 +54,14 @@ def test_two_members_answer_the_mean_of_their_logits() -> None:
     torch.testing.assert_close(state[1, 2], torch.cat([states[2, 2], states[3, 2]]))
 
 
-def test_members_who_all_leave_the_base_leave_it_exactly() -> None:
+def test_networks_that_all_leave_the_base_leave_it_exactly() -> None:
     blank = torch.full((4, 3), NONE)
     ensemble = Ensemble(GruPolicy().build(5, blank[0], blank, torch.Generator().manual_seed(0)), 2)
     answer, _ = ensemble(torch.randn((2, 3, 1, 5)), ensemble.initial_state(2, 3))
     assert bool((answer == NONE).all())
 
 
-def test_members_without_a_memory_answer_together_too() -> None:
+def test_networks_without_a_memory_answer_together_too() -> None:
     unit = torch.tensor([[0.2, 0.5], [0.8, 0.5], [0.1, 0.9], [0.1, 0.9]])
     ensemble = Ensemble(ConstantNetwork(unit), 2)
     answer, state = ensemble(torch.zeros((2, 3, 4, 5)), ensemble.initial_state(2, 3))
@@ -69,7 +69,7 @@ def test_members_without_a_memory_answer_together_too() -> None:
     torch.testing.assert_close(answer[:, 0, 0], torch.tensor([[0.5, 0.5], [0.1, 0.9]]))
 
 
-def test_a_member_who_is_far_out_is_not_followed() -> None:
+def test_an_answer_far_out_does_not_count() -> None:
     unit = torch.tensor([[0.4], [0.45], [0.55], [1e-5]])
     answer, _ = (ensemble := Ensemble(ConstantNetwork(unit), 4))(
         torch.zeros((1, 1, 1, 5)), ensemble.initial_state(1, 1)

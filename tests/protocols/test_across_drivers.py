@@ -1,4 +1,4 @@
-"""Cross-validation over drivers: who is in which fold, what is trained on whom, and on which frames methods are compared."""
+"""Cross-validation over drivers: folds, what each network learns from, and the test frames."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_a_platoon_stays_together_if_wanted() -> None:
 
 
 def in_recordings(*names: str, frames: int = 100) -> PairSet:
-    """A pair in each of these recordings, each of another driver, all of whom have the same number in their recording."""
+    """A pair of another driver in each of these recordings; their numbers there are the same."""
     pairs = straight_pairs([frames] * len(names))
     return PairSet(
         tuple(
@@ -93,7 +93,7 @@ def test_recordings_stay_whole_if_wanted() -> None:
     assert [of[pair.recording] for pair in pairs] == fold
 
 
-def test_short_pairs_of_a_tested_recording_teach_nobody_there_and_others_everybody() -> None:
+def test_short_pairs_of_a_tested_recording_are_learned_from_elsewhere_only() -> None:
     long, short = in_recordings("a", "b", "a", "b"), in_recordings("a", "c", frames=50)
     shorter = [
         replace(pair, pair_id=f"short {k}", follower_id=f"short {k}")
@@ -117,7 +117,7 @@ def test_folds_follow_the_seed() -> None:
     assert np.bincount(protocol.folds(pairs, seed=1).numpy()).tolist() == [4] * 5
 
 
-def test_too_few_drivers_are_told() -> None:
+def test_too_few_drivers_are_refused() -> None:
     with pytest.raises(DataError, match=r"protocol\.folds=5: test has only 3 drivers here; lower"):
         AcrossDrivers().folds(chained(("1", "2"), ("2", "3"), ("3", "4"), ("9", "4")), seed=0)
     with pytest.raises(DataError, match="only 1 platoon here"):
@@ -150,7 +150,7 @@ def test_the_populations_parameters_fit_all_their_drivers() -> None:
     assert found[:, 0].tolist() == pytest.approx([1.7, 4.0], abs=0.1)
 
 
-def test_whole_drives_belong_to_training() -> None:
+def test_full_trajectories_belong_to_training() -> None:
     pairs = straight_pairs([101, 83])
     split = Split.none(pairs, WindowSettings())
     assert split.frame.tolist() == [100, 82]
@@ -165,7 +165,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> cfx.JobResult:
         return cfx.run([*QUICK, "protocol=across_drivers", "protocol.folds=3", "learner.epochs=5"])
 
 
-def test_all_methods_drive_the_same_frames(result: cfx.JobResult) -> None:
+def test_all_methods_are_simulated_over_the_same_frames(result: cfx.JobResult) -> None:
     methods = ["default", "population", "fixed", "policy"]
     assert result.pairs.groupby("pair_id")["method"].apply(list).tolist() == [methods] * 6
     by_pair = result.pairs.groupby("pair_id")[["frames", "fold"]]
@@ -196,18 +196,20 @@ def test_every_baseline_has_its_improvement(result: cfx.JobResult) -> None:
                 "full_trajectory/rmse_improvement/population/mean"
             ] == pytest.approx(whole.mean())
         else:
-            assert whole.isna().all(), "his own parameters have seen the first part of the drive"
+            assert whole.isna().all(), (
+                "driver-specific parameters have seen the first part of the trajectory"
+            )
     assert result.metrics["full_trajectory/rmse_gap/default"] > 0
     assert "full_trajectory/rmse_speed/fixed" not in result.metrics
 
 
-def test_the_design_is_told(result: cfx.JobResult) -> None:
+def test_the_design_is_written_down(result: cfx.JobResult) -> None:
     notes = json.loads((result.folder / "data.json").read_text())["protocol"]
     assert (notes["folds"], notes["drivers"], notes["drivers_per_fold"]) == (3, 6, [2, 2, 2])
     assert 0 < notes["test_pairs_behind_a_training_driver"] <= 6
 
 
-def test_drives_and_curves_are_kept(result: cfx.JobResult) -> None:
+def test_trajectories_and_curves_are_kept(result: cfx.JobResult) -> None:
     drives = pd.read_parquet(result.folder / "trajectories.parquet")
     row = result.pairs[(result.pairs.method == "population")].iloc[0]
     own = drives[drives.pair_id == row.pair_id].iloc[1:]
@@ -225,16 +227,16 @@ def test_drives_and_curves_are_kept(result: cfx.JobResult) -> None:
     )
 
 
-def test_the_saved_policy_drives_strangers(result: cfx.JobResult) -> None:
+def test_the_saved_policy_drives_unseen_drivers(result: cfx.JobResult) -> None:
     policy = cfx.load(result.folder).policy
-    cold_start_fraction = SyntheticDataset(pairs=2, frames=100, seed=9).load()
-    assert policy.networks_for(cold_start_fraction).tolist() == [3, 3]
+    unseen = SyntheticDataset(pairs=2, frames=100, seed=9).load()
+    assert policy.networks_for(unseen).tolist() == [3, 3]
 
 
-def test_what_a_test_driver_does_changes_nothing_that_is_learned_for_him(
+def test_what_a_test_driver_does_changes_nothing_that_is_learned_for_them(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Another drive of one driver changes the networks of other folds, and never that of his own."""
+    """Another trajectory of a driver changes other folds' networks, never that of their own."""
     monkeypatch.chdir(tmp_path)
     overrides = [
         *QUICK,
@@ -280,7 +282,7 @@ def test_a_baseline_as_policy_equals_itself(
 
 
 def test_short_pairs_are_learned_from_but_not_tested() -> None:
-    """They change no fold of the others, and nobody learns from a short pair of a driver whom his fold tests."""
+    """They change no fold of the others; no fold learns from a short pair of a driver it tests."""
     long = chained(*((str(k), str(k + 100)) for k in range(10)))
     extra = straight_pairs([60, 60])
     # One of a driver who is tested too, one of somebody else.
@@ -296,7 +298,7 @@ def test_short_pairs_are_learned_from_but_not_tested() -> None:
     assert int(fold[11]) == -1
 
 
-def test_too_few_long_pairs_are_told() -> None:
+def test_too_few_long_pairs_are_refused() -> None:
     with pytest.raises(DataError, match=r"has only 0 drivers with 5000 frames or more here"):
         AcrossDrivers(min_test_frames=5000).folds(chained(("1", "2"), ("2", "3")), seed=0)
 
@@ -313,7 +315,7 @@ def rollout(folder: Path, *changes: str) -> cfx.JobResult:
     return cfx.run([*QUICK, "protocol=across_drivers", *small, f"hydra.run.dir={folder}", *changes])
 
 
-def test_a_job_learns_by_rollout_and_tells_how_much_history_matters(tmp_path: Path) -> None:
+def test_a_job_learns_by_rollout_and_measures_how_much_history_matters(tmp_path: Path) -> None:
     result = rollout(tmp_path / "one", "protocol.histories=[0,5]")
     history = pd.read_parquet(tmp_path / "one" / "history.parquet")
     assert set(history["base"]) == {"own", "population"}
@@ -380,7 +382,7 @@ def test_without_learning_the_policy_is_its_base(
 
 
 def test_a_policy_reaches_farther_than_constant_parameters(tmp_path: Path) -> None:
-    """Its base is as without reach, its answers may leave the bounds of constant ones, and what is saved answers the same."""
+    """Its base stays, its answers may leave the bounds of constant ones; saved equals loaded."""
     still = [
         "learner.epochs=1",
         "learner.steps=1",
@@ -437,7 +439,7 @@ def test_a_reach_without_offsets_is_said_to_change_nothing(
         (["learner.cold_start_fraction=0.9"], False),
     ],
 )
-def test_reading_what_was_never_learned_to_read_is_warned_of(
+def test_a_burn_in_without_history_in_training_is_warned_of(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, options: list[str], warned: bool
 ) -> None:
     short = [
@@ -459,7 +461,7 @@ def test_reading_what_was_never_learned_to_read_is_warned_of(
         ([], False),
     ],
 )
-def test_traits_of_which_nothing_is_known_are_warned_of(
+def test_driver_features_without_history_are_warned_of(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, options: list[str], warned: bool
 ) -> None:
     short = [
@@ -482,7 +484,7 @@ def test_traits_of_which_nothing_is_known_are_warned_of(
     assert len(cfx.load(result.folder).policy.policy.driver_features) == 6
 
 
-def test_drives_that_are_too_short_to_test_change_what_is_learned(tmp_path: Path) -> None:
+def test_trajectories_that_are_too_short_to_test_change_what_is_learned(tmp_path: Path) -> None:
     """All pairs are calibrated and learned from, the long ones alone stand in the results."""
     frames = [160, 200, 200, 200, 200]
     pairs = wavy_pairs(

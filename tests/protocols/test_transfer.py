@@ -56,10 +56,10 @@ def trained(folder: Path, *overrides: str) -> Path:
 
 
 @pytest.fixture(scope="module")
-def cold_start_fraction(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def unseen(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A job whose policy knows nothing of its drivers."""
     nothing = ["protocol.base=population", "protocol.history=0", "learner.cold_start_fraction=1"]
-    return trained(tmp_path_factory.mktemp("jobs") / "cold_start_fraction", *ROLLOUT, *nothing)
+    return trained(tmp_path_factory.mktemp("jobs") / "unseen", *ROLLOUT, *nothing)
 
 
 @pytest.fixture(scope="module")
@@ -75,8 +75,8 @@ def one_for_all(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def saved(cold_start_fraction: Path) -> Transfer:
-    return Transfer(run=cold_start_fraction)
+def saved(unseen: Path) -> Transfer:
+    return Transfer(run=unseen)
 
 
 class TestTransfer(ProtocolContract):
@@ -94,10 +94,10 @@ def transferred(run: Path, tmp_path: Path, *overrides: str) -> cfx.JobResult:
 
 
 def test_it_drives_with_the_network_of_all_from_the_populations_parameters(
-    cold_start_fraction: Path, tmp_path: Path
+    unseen: Path, tmp_path: Path
 ) -> None:
-    result = transferred(cold_start_fraction, tmp_path)
-    policy = checkpoint.load(cold_start_fraction / "policy")
+    result = transferred(unseen, tmp_path)
+    policy = checkpoint.load(unseen / "policy")
     batch = PairBatch.of(elsewhere())
     number = torch.full((3,), policy.names.index(ALL))
     model = cfx.get("model", "krauss")()
@@ -118,23 +118,16 @@ def test_it_drives_with_the_network_of_all_from_the_populations_parameters(
 
 
 def test_it_starts_from_drivers_own_parameters_where_it_learned_so(
-    known: Path, cold_start_fraction: Path, tmp_path: Path
+    known: Path, unseen: Path, tmp_path: Path
 ) -> None:
-    assert (
-        "rmse_speed/base" in transferred(known, tmp_path / "known").metrics
-    )  # own sets, drawn by 0.4, held
-    assert (
-        "rmse_speed/base"
-        not in transferred(cold_start_fraction, tmp_path / "cold_start_fraction").metrics
-    )
+    assert "rmse_speed/shrunk" in transferred(known, tmp_path / "known").metrics
+    assert "rmse_speed/shrunk" not in transferred(unseen, tmp_path / "unseen").metrics
 
 
 def test_model_policy_and_windows_are_those_it_was_trained_with(
-    cold_start_fraction: Path, tmp_path: Path
+    unseen: Path, tmp_path: Path
 ) -> None:
-    result = transferred(
-        cold_start_fraction, tmp_path, "model=w99", "policy=lstm", "windows.length=7"
-    )
+    result = transferred(unseen, tmp_path, "model=w99", "policy=lstm", "windows.length=7")
     config = yaml.safe_load((result.folder / "config.yaml").read_text())
     assert (config["model"]["name"], config["policy"]["name"], config["windows"]["length"]) == (
         "krauss",
@@ -167,7 +160,7 @@ def test_the_job_may_be_named_by_its_mlflow_run(tmp_path: Path) -> None:
         )
 
 
-def test_without_a_population_the_default_is_the_only_baseline_of_strangers(
+def test_without_a_population_the_default_is_the_only_baseline_for_unseen_drivers(
     one_for_all: Path, tmp_path: Path
 ) -> None:
     result = transferred(one_for_all, tmp_path)
@@ -176,18 +169,15 @@ def test_without_a_population_the_default_is_the_only_baseline_of_strangers(
 
 
 def test_what_it_has_learned_from_is_refused_whatever_it_is_called(
-    cold_start_fraction: Path, tmp_path: Path
+    unseen: Path, tmp_path: Path
 ) -> None:
     with pytest.raises(
         DataError, match=r"has learned from 3 of the 3 pairs in .*, the first of them 'synthetic-"
     ):
-        transferred(
-            cold_start_fraction, tmp_path, "data.seed=5", "data.pairs=6", "data.max_pairs=3"
-        )
-    training_result = SyntheticDataset(pairs=6, frames=200, seed=5).load()
+        transferred(unseen, tmp_path, "data.seed=5", "data.pairs=6", "data.max_pairs=3")
+    seen = SyntheticDataset(pairs=6, frames=200, seed=5).load()
     renamed = tuple(
-        replace(pair, recording="other", pair_id=f"x{pair.pair_id}", truth={})
-        for pair in training_result[:4]
+        replace(pair, recording="other", pair_id=f"x{pair.pair_id}", truth={}) for pair in seen[:4]
     )
     write_tidy(PairSet((*renamed, *elsewhere()), "both"), tmp_path / "renamed.csv")
     tidy = [
@@ -196,7 +186,7 @@ def test_what_it_has_learned_from_is_refused_whatever_it_is_called(
         "data=tidy",
         "data.min_frames=100",
         "protocol=transfer",
-        f"protocol.run={cold_start_fraction}",
+        f"protocol.run={unseen}",
     ]
     with pytest.raises(DataError, match="has learned from 4 of the 7 pairs"):
         cfx.run(
@@ -215,13 +205,11 @@ def test_constant_parameters_are_not_tested_on_whom_they_were_calibrated_on(tmp_
     assert gain == pytest.approx(0, abs=1e-9)
 
 
-def test_drivers_of_the_same_names_are_said(
-    cold_start_fraction: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+def test_drivers_of_the_same_names_are_counted(
+    unseen: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level("WARNING"):
-        result = transferred(
-            cold_start_fraction, tmp_path
-        )  # all synthetic recordings are called synthetic
+        result = transferred(unseen, tmp_path)  # all synthetic recordings are called synthetic
     assert any(
         "3 drivers have the same names, including the recording" in message
         for message in caplog.messages
@@ -234,13 +222,13 @@ def test_drivers_of_the_same_names_are_said(
     )
 
 
-def test_other_time_steps_are_refused(cold_start_fraction: Path, tmp_path: Path) -> None:
+def test_other_time_steps_are_refused(unseen: Path, tmp_path: Path) -> None:
     with pytest.raises(
         DataError, match=r"drives in steps of 0.1 s, .* has 0.05 s; set data.time_step=0.1"
     ):
-        transferred(cold_start_fraction, tmp_path, "data.dt=0.05")
+        transferred(unseen, tmp_path, "data.dt=0.05")
     assert transferred(
-        cold_start_fraction, tmp_path, "data.dt=0.05", "data.frames=400", "data.time_step=0.1"
+        unseen, tmp_path, "data.dt=0.05", "data.frames=400", "data.time_step=0.1"
     ).metrics
 
 
@@ -259,13 +247,11 @@ def test_runs_that_have_no_policy_for_others_are_refused(tmp_path: Path) -> None
         cfx.run([*HERE, f"hydra.run.dir={tmp_path / 'job'}"])
 
 
-def test_a_job_that_drives_a_saved_policy_hands_it_on(
-    cold_start_fraction: Path, tmp_path: Path
-) -> None:
-    once = transferred(cold_start_fraction, tmp_path / "once")
+def test_a_job_that_drives_a_saved_policy_hands_it_on(unseen: Path, tmp_path: Path) -> None:
+    once = transferred(unseen, tmp_path / "once")
     twice = transferred(once.folder, tmp_path / "twice")
     pd.testing.assert_frame_equal(twice.pairs, once.pairs)
     assert (
         checkpoint.load(twice.folder / "policy").learned_from
-        == checkpoint.load(cold_start_fraction / "policy").learned_from
+        == checkpoint.load(unseen / "policy").learned_from
     )

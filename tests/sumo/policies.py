@@ -1,4 +1,4 @@
-"""Policies that tests save and drive: untrained networks in double precision, so that two ways to compute them agree."""
+"""Policies for tests: untrained networks in double precision, so that two ways agree."""
 
 from __future__ import annotations
 

@@ -24,13 +24,17 @@ pytest.importorskip("traci", reason="needs the extra sumo")
 DEMAND = """<routes>
   <vType id="calm" minGap="1"/> <vType id="hasty"/> <vType id="other"/> <vType id="ghost"/>
   <route id="whole" edges="1001 1002 1003"/> <route id="ramp" edges="1004 1002 1003"/>
-  <flow id="c" type="calm" route="whole" begin="0" end="20" vehsPerHour="3000" departLane="random" departSpeed="12"/>
-  <flow id="h" type="hasty" route="whole" begin="0" end="20" vehsPerHour="3000" departLane="random" departSpeed="12"/>
-  <flow id="o" type="other" route="whole" begin="0" end="20" vehsPerHour="900" departLane="random" departSpeed="9"/>
+  <flow id="c" type="calm" route="whole" begin="0" end="20" vehsPerHour="3000"
+      departLane="random" departSpeed="12"/>
+  <flow id="h" type="hasty" route="whole" begin="0" end="20" vehsPerHour="3000"
+      departLane="random" departSpeed="12"/>
+  <flow id="o" type="other" route="whole" begin="0" end="20" vehsPerHour="900"
+      departLane="random" departSpeed="9"/>
   <flow id="r" type="calm" route="ramp" begin="0" end="20" vehsPerHour="600"/>
 </routes>"""
 
-CONFIGURATION = """<configuration><input><net-file value="{net}"/><route-files value="{demand}"/></input>
+CONFIGURATION = """<configuration><input><net-file value="{net}"/>
+  <route-files value="{demand}"/></input>
 <time><end value="30"/><step-length value="{step}"/></time></configuration>"""
 
 
@@ -53,7 +57,7 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def python(script: str, folder: Path) -> Any:
-    """Runs a script in a process of its own, as libsumo wants it; returns the JSON of its last line."""
+    """Runs a script in a process of its own; returns the JSON of its last line."""
     done = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(script)],
         cwd=folder,
@@ -118,10 +122,12 @@ def test_what_cannot_be_driven_is_one_sentence_and_leaves_no_file(scenario: Path
         from cfx.errors import CfxError
         from cfx.sumo.drive import run_scenario
         said = []
-        for name, kinds in (("motorway", ["clam"]), ("motorway", ["calm", "ghost"]), ("slow", ["calm"]), ("lost", ["calm"]),
+        for name, kinds in (("motorway", ["clam"]), ("motorway", ["calm", "ghost"]),
+                            ("slow", ["calm"]), ("lost", ["calm"]),
                             ("torn", ["calm"])):
             try:
-                run_scenario(Path(name + ".sumocfg"), {kind: "calm" for kind in kinds}, output=Path("never.csv"), end=2.0)
+                runs = {kind: "calm" for kind in kinds}
+                run_scenario(Path(name + ".sumocfg"), runs, output=Path("never.csv"), end=2.0)
             except CfxError as error:
                 said.append(str(error))
         # And the process still drives afterwards.
@@ -149,7 +155,7 @@ def test_what_cannot_be_driven_is_one_sentence_and_leaves_no_file(scenario: Path
     assert not list(scenario.glob("*never*"))
 
 
-def test_mistakes_are_told_before_sumo_starts(
+def test_mistakes_are_reported_before_sumo_starts(
     scenario: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(scenario)
@@ -193,15 +199,20 @@ def test_a_vehicle_that_collides_teleports_or_changes_lanes_is_counted_and_ends_
         from cfx.sumo.drive import _Run
         from cfx.sumo.driver import Driver
         from cfx.sumo.fleet import Fleet
-        Path("crash.rou.xml").write_text('''<routes><vType id="calm"/><route id="m" edges="1001 1002 1003"/>
-          <vehicle id="wall" type="DEFAULT_VEHTYPE" route="m" depart="0" departPos="200" departSpeed="0" departLane="2">
+        Path("crash.rou.xml").write_text('''<routes><vType id="calm"/>
+          <route id="m" edges="1001 1002 1003"/>
+          <vehicle id="wall" type="DEFAULT_VEHTYPE" route="m" depart="0" departPos="200"
+            departSpeed="0" departLane="2">
             <stop lane="1001_2" endPos="201" duration="100"/></vehicle>
-          <vehicle id="blind" type="calm" route="m" depart="0" departPos="150" departSpeed="25" departLane="2"
+          <vehicle id="blind" type="calm" route="m" depart="0" departPos="150" departSpeed="25"
+            departLane="2"
             insertionChecks="none"/>
-          <vehicle id="mover" type="calm" route="m" depart="0" departPos="100" departSpeed="10" departLane="4"/></routes>''')
+          <vehicle id="mover" type="calm" route="m" depart="0" departPos="100"
+            departSpeed="10" departLane="4"/></routes>''')
         from cfx.sumo.motorway import SHIPPED
         files = ["-n", str(SHIPPED), "-r", "crash.rou.xml"]
-        libsumo.start(["sumo", *files, "--step-length", "0.1", "--no-step-log", "--collision.action", "teleport"])
+        options = ["--step-length", "0.1", "--no-step-log", "--collision.action", "teleport"]
+        libsumo.start(["sumo", *files, *options])
         fleet = Fleet({"calm": Driver.load("calm")})
         run = _Run(libsumo, fleet, Path("crash"), None)
         step = fleet.step
@@ -217,7 +228,8 @@ def test_a_vehicle_that_collides_teleports_or_changes_lanes_is_counted_and_ends_
         fleet.step = careless
         driven = run.go(12.0)
         tally = driven.tallies["calm"]
-        print(json.dumps([sorted(tally.vehicles), tally.collisions > 0, tally.teleports, tally.lane_changes, driven.steps]))
+        counts = [tally.collisions > 0, tally.teleports, tally.lane_changes, driven.steps]
+        print(json.dumps([sorted(tally.vehicles), *counts]))
         """,
         scenario,
     )
@@ -253,6 +265,6 @@ def test_the_table_says_it_all(capsys: pytest.CaptureFixture[str]) -> None:
         "4",
     ]
     assert (
-        "100 steps of 0.1 s in 2.0 s, 5.0 times real time; at most 2 of these vehicles at once, 5 others"
-        in out
+        "100 steps of 0.1 s in 2.0 s, 5.0 times real time; at most 2 of these vehicles at once, 5"
+        " others" in out
     )

@@ -59,7 +59,7 @@ class TraCIException(Exception):  # noqa: N818 - SUMO's name
 
 
 class Road:
-    """Stands in for a simulation: what tests put on it is there, and what it is told it writes down."""
+    """Stands in for a simulation: vehicles are as tests put them; speeds that are set are kept."""
 
     def __init__(self, dt: float = 0.1, **cars: Car) -> None:
         self.cars = dict(cars)
@@ -265,7 +265,7 @@ def test_a_constant_driver_takes_parameters_by_name() -> None:
         Driver(adaptive({"name": "krauss"}, offsets=True)).assign("v0", base={"t_r": 1.0})
 
 
-def test_traits_are_told_by_name_to_a_policy_that_knows_them() -> None:
+def test_driver_features_are_given_by_name() -> None:
     found = []
     for driver_features in (None, {"time_gap": 0.5, "acceleration": -1.0}):
         driver = Driver(adaptive({"name": "krauss"}, driver_features=("acceleration", "time_gap")))
@@ -285,7 +285,20 @@ def test_traits_are_told_by_name_to_a_policy_that_knows_them() -> None:
         Driver(adaptive({"name": "krauss"})).assign("v0", driver_features={"time_gap": 0.5})
 
 
-def test_a_drivers_own_parameters_are_drawn_towards_the_default_as_in_training() -> None:
+def test_driver_features_may_be_given_by_their_earlier_name() -> None:
+    driver = Driver(adaptive({"name": "krauss"}, driver_features=("time_gap",)))
+    with pytest.warns(DeprecationWarning, match="traits is now called driver_features"):
+        driver.assign("v0", traits={"time_gap": 0.5})
+    driver.step(platoon(1), "v0")
+    today = Driver(adaptive({"name": "krauss"}, driver_features=("time_gap",)))
+    today.assign("v0", driver_features={"time_gap": 0.5})
+    today.step(platoon(1), "v0")
+    assert driver.parameters("v0") == today.parameters("v0")
+    with pytest.raises(TypeError, match="unexpected keyword argument 'feature'"):
+        driver.assign("v0", feature={})
+
+
+def test_a_drivers_own_parameters_are_shrunk_towards_the_default_as_in_training() -> None:
     plain = adaptive({"name": "krauss"}, offsets=True)
     own, found = torch.tensor([[4.0, 1.0]], dtype=torch.float64), []
     middle = shrunk(plain.space, own, 0.5)[0].tolist()
@@ -323,9 +336,9 @@ def test_what_cannot_be_driven_is_one_sentence(tmp_path: Path) -> None:
         "car_follow_model": "EIDM",
         "parameters": {"tau": {"low": 0.5, "high": 3, "default": 1}},
     }
-    untold = adaptive(node)
+    plain = adaptive(node)
     with pytest.raises(DataError, match="SUMO alone drives"):
-        Driver(untold)
+        Driver(plain)
     checkpoint.save(adaptive({"name": "krauss"}, ("p1", "p2")), tmp_path / "policy")
     with pytest.raises(
         DataError,
@@ -440,7 +453,7 @@ def test_in_sumo_a_policy_drives_as_in_memory(
     driver_features: tuple[str, ...],
     tmp_path: Path,
 ) -> None:
-    """Behind replayed leaders in libsumo, across edges and junctions of a road, after it has watched the first part: to 1e-9."""
+    """Behind replayed leaders in libsumo, across edges and junctions, to 1e-9."""
     model = {"krauss": Krauss, "w99": W99}[node["name"]]()
     low, high = model.space.bounds()
     true = (
