@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import json
-from collections.abc import Sequence
 from datetime import datetime
 from importlib import resources
 from pathlib import Path
@@ -15,6 +11,7 @@ from cfx.errors import OutputError
 from cfx.files import atomic_write
 from cfx.plots.look import CLUSTER_COLOURS, COLOURS
 from cfx.plots.plotly.figure import Plot
+from cfx.plots.plotly.html import embedded_json, inline_scripts, security_policy
 from cfx.report.job import Runs
 from cfx.report.sections import SECTIONS
 from cfx.report.summary import summary
@@ -66,7 +63,9 @@ def render(runs: Runs, title: str | None = None) -> str:
 
 
 def _content(runs: Runs, title: str | None) -> dict[str, Any]:
-    scripts = _scripts()
+    from markupsafe import Markup
+
+    scripts = inline_scripts([_asset(name) for name in _SCRIPTS])
     sections = []
     for section in SECTIONS:
         blocks = section.blocks(runs)
@@ -76,8 +75,9 @@ def _content(runs: Runs, title: str | None) -> dict[str, Any]:
     return {
         "title": title or f"Parameters that adapt: {models}",
         "written": f"{datetime.now():%d %B %Y}".lstrip("0"),
-        "scripts": scripts,
-        "security": _policy(scripts),
+        # Nothing of a job's data is in them.
+        "scripts": [Markup(script) for script in scripts],  # noqa: S704
+        "security": security_policy(scripts),
         "style": _asset("page.css") + _colours(),
         "summary": summary(runs.jobs),
         "jobs": len(runs.jobs),
@@ -90,37 +90,11 @@ def _asset(name: str) -> str:
 
 
 def _embedded(plot: Plot) -> Any:
-    """Returns a plot as JSON that can stand inside a script element, whatever names it holds."""
+    """Returns a plot as JSON for a script element."""
     from markupsafe import Markup
-    from plotly.utils import PlotlyJSONEncoder
 
     content = {"views": plot.views, "orders": plot.orders, "height": plot.height}
-    text = json.dumps(content, cls=PlotlyJSONEncoder, separators=(",", ":"))
-    for sign in "<>&":
-        text = text.replace(sign, f"\\u{ord(sign):04x}")
-    return Markup(text)  # noqa: S704 - JSON without any sign that HTML knows
-
-
-def _scripts() -> list[Any]:
-    """Returns the page's scripts: Plotly, the sorter, the page's own."""
-    from markupsafe import Markup
-    from plotly.offline import get_plotlyjs
-
-    sources = [get_plotlyjs(), *(_asset(name) for name in _SCRIPTS)]
-    # Nothing of cfx's own data is in them; an end tag inside a string would end the element.
-    return [Markup(source.replace("</script", "<\\/script")) for source in sources]  # noqa: S704
-
-
-def _policy(scripts: Sequence[str]) -> str:
-    """Returns the Content-Security-Policy: only these scripts run, and no network is asked."""
-    allowed = []
-    for script in scripts:
-        digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-        allowed.append(f"'sha256-{digest}'")
-    return (
-        f"default-src 'none'; script-src {' '.join(allowed)}; style-src 'unsafe-inline';"
-        " img-src data: blob:; base-uri 'none'; form-action 'none'"
-    )
+    return Markup(embedded_json(content))  # noqa: S704 - JSON without any sign that HTML knows
 
 
 def _colours() -> str:

@@ -1,10 +1,7 @@
-"""The animation: one HTML file with the road, the drives, their plots and scripts in it."""
+"""The animation: one HTML file with the road, the vehicles, their plots and scripts in it."""
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import json
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
@@ -18,6 +15,7 @@ from cfx.files import atomic_write
 from cfx.plots.choice.trajectories import pair_panels, parameter_axes
 from cfx.plots.look import COLOURS
 from cfx.plots.plotly.figure import Plot
+from cfx.plots.plotly.html import embedded_json, inline_scripts, security_policy
 from cfx.plots.plotly.trajectories import pair_plot
 from cfx.plots.words import LABELS
 from cfx.sumo.motorway import Motorway
@@ -39,10 +37,10 @@ def write_page(
 
     Args:
         path: the file; what was there is replaced once the new page is complete.
-        road: where they drove.
+        road: where the pairs were.
         shown: the pairs.
-        evaluation: of these pairs, as they drove in SUMO.
-        policy: who drove.
+        evaluation: of these pairs, as they were simulated in SUMO.
+        policy: what chose the parameters.
         source: where the recordings come from.
 
     Raises:
@@ -63,24 +61,24 @@ def render(
 ) -> str:
     """Returns the page as HTML."""
     import jinja2
-    from plotly.offline import get_plotlyjs
 
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    # An end tag inside a string of a script would end its element.
-    scripts = [
-        source.replace("</script", "<\\/script") for source in (get_plotlyjs(), _asset("demo.js"))
-    ]
+    scripts = inline_scripts([_asset("demo.js")])
+    rows: list[Any] = []
+    for one in shown:
+        rows += one.table.to_dict("records")
+    vehicles = ("leader", *FOLLOWERS)
     return environment.from_string(_asset("demo.html.j2")).render(
-        security=_security(scripts),
+        security=security_policy(scripts),
         scripts=scripts,
         style=_asset("demo.css"),
-        colours={kind: COLOURS[kind] for kind in ("leader", *FOLLOWERS)},
-        labels={kind: LABELS[kind] for kind in ("leader", *FOLLOWERS)},
-        content=_json(_content(road, shown, evaluation)),
+        colours={kind: COLOURS[kind] for kind in vehicles},
+        labels={kind: LABELS[kind] for kind in vehicles},
+        content=embedded_json(_content(road, shown, evaluation)),
         shown=shown,
-        rows=[row for one in shown for row in one.table.to_dict("records")],
+        rows=rows,
         model=policy.model_node["name"],
         policy=policy.policy_node["name"],
         windows=policy.windows,
@@ -94,71 +92,48 @@ def _asset(name: str) -> str:
     return (_ASSETS / name).read_text(encoding="utf-8")
 
 
-def _json(value: Any) -> str:
-    """Returns JSON that can stand inside a script element, whatever names it holds."""
-    from plotly.utils import PlotlyJSONEncoder
-
-    text = json.dumps(value, cls=PlotlyJSONEncoder, separators=(",", ":"))
-    for sign in "<>&":
-        text = text.replace(sign, f"\\u{ord(sign):04x}")
-    return text
-
-
-def _security(scripts: Sequence[str]) -> str:
-    """Returns the Content-Security-Policy: only these very scripts run, and nothing is ever asked from a network."""
-    allowed = " ".join(
-        f"'sha256-{base64.b64encode(hashlib.sha256(one.encode()).digest()).decode()}'"
-        for one in scripts
-    )
-    return (
-        f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none';"
-        " form-action 'none'"
-    )
-
-
 def _content(road: Motorway, shown: Sequence[Shown], evaluation: Evaluation) -> dict[str, Any]:
-    """Returns what the script draws: positions in centimetres from a corner of the road, so that they are short integers."""
+    """Returns what the script draws.
+
+    Positions are centimetres from a corner of the road, so that they are short integers.
+    """
     corner = np.concatenate([lane.shape for lane in road.lanes]).min(axis=0)
     axes = parameter_axes(evaluation.names, evaluation.units, evaluation.bounds)
     pairs = []
     for one, trajectory in zip(shown, evaluation.trajectories, strict=True):
         plot = pair_plot(pair_panels(trajectory, evaluation.methods, axes))
         pairs.append(_pair(one, corner) | {"plot": _plot(plot)})
+    lanes = []
+    for lane in road.lanes:
+        shape = _rounded(100 * (lane.shape - corner))
+        lanes.append({"width": lane.width, "inner": lane.inner, "shape": shape})
     return {
         "colours": {kind: COLOURS[kind] for kind in ("leader", *FOLLOWERS)},
         "labels": {kind: LABELS[kind] for kind in FOLLOWERS},
         "followers": FOLLOWERS,
         "carLength": CAR_LENGTH,
-        "lanes": [
-            {
-                "width": lane.width,
-                "inner": lane.inner,
-                "shape": _rounded(100 * (lane.shape - corner)),
-            }
-            for lane in road.lanes
-        ],
+        "lanes": lanes,
         "pairs": pairs,
     }
 
 
 def _pair(one: Shown, corner: Array) -> dict[str, Any]:
+    speed, gap, place = {}, {}, {}
+    for kind in FOLLOWERS:
+        speed[kind] = _rounded(100 * one.speed[kind])
+        gap[kind] = _rounded(100 * one.gap[kind])
+        # Centimetres and tenths of a degree.
+        position, heading = one.place[kind][..., :2], one.place[kind][..., 2:]
+        place[kind] = _rounded(np.concatenate([100 * (position - corner), 10 * heading], axis=-1))
     return {
         "id": one.pair.pair_id,
         "scene": one.scene,
         "dt": one.pair.dt,
         "first": one.first,
         "leaderLength": one.pair.leader_length,
-        "speed": {kind: _rounded(100 * one.speed[kind]) for kind in FOLLOWERS},
-        "gap": {kind: _rounded(100 * one.gap[kind]) for kind in FOLLOWERS},
-        "place": {
-            kind: _rounded(
-                np.concatenate(
-                    [100 * (one.place[kind][..., :2] - corner), 10 * one.place[kind][..., 2:]],
-                    axis=-1,
-                )
-            )
-            for kind in FOLLOWERS
-        },
+        "speed": speed,
+        "gap": gap,
+        "place": place,
     }
 
 
@@ -173,5 +148,5 @@ def _plot(plot: Plot) -> dict[str, Any]:
 
 
 def _rounded(values: Array) -> list[Any]:
-    whole_numbers: list[Any] = np.round(np.nan_to_num(values)).astype(int).tolist()
-    return whole_numbers
+    rounded: list[Any] = np.round(np.nan_to_num(values)).astype(int).tolist()
+    return rounded

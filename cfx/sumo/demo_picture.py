@@ -1,4 +1,4 @@
-"""Pictures of the demonstration: the road from above at three moments, and speeds and gaps over time."""
+"""Pictures of the demonstration: the road from above at three moments, speeds and gaps."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from cfx.plots.matplotlib.canvas import canvas, styled
 from cfx.plots.matplotlib.write import write_figure
 from cfx.plots.words import LABELS, short
 from cfx.sumo.motorway import Motorway
-from cfx.sumo.replay import FOLLOWERS
-from cfx.sumo.shown import CAR_LENGTH, Shown
+from cfx.sumo.replay import CAR_LENGTH, FOLLOWERS
+from cfx.sumo.shown import Shown
 
 Array = NDArray[np.float64]
 
@@ -36,30 +36,29 @@ def write_pictures(
 
     Args:
         folder: where to.
-        road: where they drove.
-        shown: the pairs, from the best to the worst improvement; the one in the middle is the picture's.
-        evaluation: of these pairs, as they drove in SUMO.
+        road: where the pairs were.
+        shown: the pairs, from the best to the worst improvement; the one in the middle is the
+            picture's.
+        evaluation: of these pairs, as they were simulated in SUMO.
 
     Raises:
         OutputError: a file cannot be written.
     """
     middle = shown[len(shown) // 2]
     together = [one for one in shown if one.scene == middle.scene]
-    return [
-        write_figure(snapshots(road, middle, together), folder / "demo.png"),
-        write_figure(
-            figures.pairs(evaluation, [one.pair.pair_id for one in shown]),
-            folder / "demo_drives.png",
-        ),
-    ]
+    picture = write_figure(snapshots(road, middle, together), folder / "demo.png")
+    trajectories = figures.pairs(evaluation, [one.pair.pair_id for one in shown])
+    return [picture, write_figure(trajectories, folder / "demo_drives.png")]
 
 
 @styled
 def snapshots(road: Motorway, main: Shown, together: Sequence[Shown]) -> Figure:
-    """The road from above, driving upwards, at three moments: a lane for each follower, each behind its copy of the leader.
+    """The road from above, driving upwards, at three moments.
+
+    Each follower has a lane, behind its own copy of the leader.
 
     Args:
-        road: where they drove.
+        road: where the pairs were.
         main: the pair in the middle of the picture.
         together: all pairs that were on the road with it, itself among them.
     """
@@ -72,21 +71,24 @@ def snapshots(road: Motorway, main: Shown, together: Sequence[Shown]) -> Figure:
         _draw_road(axes, road, view)
         for one in together:
             _draw_pair(axes, one, int(frame), view, named=one is main)
-        seconds = (frame - main.first) * main.pair.dt
-        axes.set_title(
-            f"{seconds:.0f} s after the drivers took over" if seconds else "the drivers take over",
-            fontsize=10.5,
-        )
+        title = "the models take over"
+        if frame > main.first:
+            title = f"{(frame - main.first) * main.pair.dt:.0f} s later"
+        axes.set_title(title, fontsize=10.5)
         axes.set(xlim=(-view.width / 2, view.width / 2), ylim=(-span / 2, span / 2), aspect="equal")
         axes.set_xticks([])
         axes.set_yticks([])
         axes.grid(visible=False)
         axes.spines[["left", "bottom"]].set_visible(False)
+    handles = []
+    for kind in ("leader", *FOLLOWERS):
+        handles.append(Patch(color=COLOURS[kind], label=LABELS[kind]))
+    name = short(main.pair.pair_id, 50)
     figure.legend(
-        handles=[Patch(color=COLOURS[kind], label=LABELS[kind]) for kind in ("leader", *FOLLOWERS)],
+        handles=handles,
         loc="outside upper center",
-        ncols=len(FOLLOWERS) + 1,
-        title=f"In SUMO: pair {short(main.pair.pair_id, 60)}, each follower behind its own copy of the leader",
+        ncols=len(handles),
+        title=f"In SUMO: pair {name}, each follower behind its own copy of the leader",
         title_fontsize=11,
     )
     return figure
@@ -115,14 +117,12 @@ class _View:
         leader = vehicles[:, 0].mean(axis=0)
         last = vehicles[np.argmax([one.gap[kind][frame] for kind in FOLLOWERS]), 1]
         along = cls((leader[:2] + last[:2]) / 2, float(leader[2]), width)
-        beside = np.stack(
-            [
-                other.place[kind][min(frame, len(other.pair) - 1), 0, :2]
-                for other in together
-                for kind in FOLLOWERS
-            ]
-        )
-        along._centre = along._centre + along._axes[0] * along(beside)[:, 0].mean()
+        beside = []
+        for other in together:
+            moment = min(frame, len(other.pair) - 1)
+            for kind in FOLLOWERS:
+                beside.append(other.place[kind][moment, 0, :2])
+        along._centre = along._centre + along._axes[0] * along(np.stack(beside))[:, 0].mean()
         return along
 
     def __call__(self, points: Array) -> Array:
@@ -135,29 +135,22 @@ def _draw_road(axes: Axes, road: Motorway, view: _View) -> None:
     axes.set_facecolor(_GRASS)
     for grow, colour in ((0.5, _PAINT), (0.05, _ASPHALT)):
         for lane in road.lanes:
-            left, right = (
-                _aside(view(lane.shape), side * (lane.width + grow) / 2) for side in (1, -1)
-            )
-            axes.fill(*np.concatenate([left, right[::-1]]).T, color=colour, linewidth=0, zorder=1)
+            middle, half = view(lane.shape), (lane.width + grow) / 2
+            left, right = _aside(middle, half), _aside(middle, -half)
+            x, y = np.concatenate([left, right[::-1]]).T
+            axes.fill(x, y, color=colour, linewidth=0, zorder=1)
     for lane in road.lanes:
         if lane.inner:
-            axes.plot(
-                *_aside(view(lane.shape), lane.width / 2).T,
-                color=_PAINT,
-                linewidth=1.0,
-                dashes=(6, 8),
-                zorder=2,
-            )
+            x, y = _aside(view(lane.shape), lane.width / 2).T
+            axes.plot(x, y, color=_PAINT, linewidth=1.0, dashes=(6, 8), zorder=2)
 
 
 def _aside(line: Array, distance: float) -> Array:
     """Returns a line shifted to its left, m."""
     along = np.gradient(line, axis=0)
-    normal = (
-        np.stack([-along[:, 1], along[:, 0]], 1)
-        / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
-    )
-    return np.asarray(line + distance * normal)
+    left = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    length = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    return np.asarray(line + distance * left / length)
 
 
 def _draw_pair(axes: Axes, one: Shown, frame: int, view: _View, *, named: bool) -> None:

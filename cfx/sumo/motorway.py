@@ -1,14 +1,14 @@
-"""Roads to show drives on: the longest stretch of three lanes or more in a network, which may come from an OpenStreetMap extract.
+"""Roads for the demonstration: the longest stretch of three lanes or more in a network.
 
-A *track* is a lane that goes on to the end of the stretch, whatever its number is on each edge: where a ramp joins, lanes are
-numbered anew.
+The network may come from an OpenStreetMap extract. A *track* is a lane that goes on to the end of
+the stretch, whatever its number is on each edge: where a ramp joins, lanes are numbered anew.
 """
 
 from __future__ import annotations
 
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,10 @@ from cfx.errors import DataError, SumoError
 Array = NDArray[np.float64]
 
 SHIPPED = Path(__file__).parent / "assets" / "motorway.net.xml"
-"""A six-lane one-way motorway of 3.2 km with an on-ramp, made by hand; netconvert made it of `motorway.osm.xml` beside it."""
+"""A six-lane one-way motorway of 3.2 km with an on-ramp, made by hand.
+
+netconvert made it of `motorway.osm.xml` beside it.
+"""
 
 ABREAST = 3
 """Tracks that one pair takes: its leader thrice, each ahead of another follower."""
@@ -59,7 +62,8 @@ class Motorway:
     Attributes:
         net: SUMO's network file.
         edges: names of its edges, in driving direction.
-        starts: `(tracks, edges)` m, where each edge begins along a track; between two edges lies the inside of a junction.
+        starts: `(tracks, edges)` m, where each edge begins along a track; between two edges lies
+            the inside of a junction.
         ends: `(tracks, edges)` m, where each ends.
         tracks: for each track, from right to left, its lane's number on each edge.
         lanes: all lanes of the network, to draw them.
@@ -78,17 +82,24 @@ class Motorway:
         return float(self.ends[:, -1].min())
 
     def place(self, track: int, at: float) -> tuple[int, float] | None:
-        """Returns the edge (its place among `edges`) and the position on it, m; None inside a junction or outside the road."""
+        """Returns the edge (its place among `edges`) and the position on it, m.
+
+        It is None inside a junction or outside the road.
+        """
         inside = np.flatnonzero((self.starts[track] <= at) & (at < self.ends[track]))
-        return (int(inside[0]), at - float(self.starts[track, inside[0]])) if len(inside) else None
+        if not len(inside):
+            return None
+        edge = int(inside[0])
+        return edge, at - float(self.starts[track, edge])
 
 
 def read_motorway(source: Path | None, folder: Path) -> Motorway:
     """Finds the stretch in a network.
 
     Args:
-        source: an OpenStreetMap extract (`.osm`, `.osm.xml`, also gzipped), which netconvert converts, or a network that it has
-            converted (`.net.xml`); None for the motorway that cfx ships.
+        source: an OpenStreetMap extract (`.osm`, `.osm.xml`, also gzipped), which netconvert
+            converts, or a network that it has converted (`.net.xml`); None for the motorway that
+            cfx ships.
         folder: where a converted network is written.
 
     Raises:
@@ -104,14 +115,13 @@ def read_motorway(source: Path | None, folder: Path) -> Motorway:
 
 
 def find_netconvert() -> str | None:
-    """Returns the path of netconvert: of the wheel `eclipse-sumo`, or on the search path; None if there is none."""
+    """Returns the path of netconvert, of the wheel eclipse-sumo or on the search path, or None."""
     try:
         import sumo  # of the wheel eclipse-sumo, which the extra leaves out for its size
     except ImportError:
         return shutil.which("netconvert")
-    return shutil.which("netconvert", path=str(Path(sumo.__file__).parent / "bin")) or shutil.which(
-        "netconvert"
-    )
+    of_wheel = shutil.which("netconvert", path=str(Path(sumo.__file__).parent / "bin"))
+    return of_wheel or shutil.which("netconvert")
 
 
 def _kind(source: Path) -> str:
@@ -119,7 +129,8 @@ def _kind(source: Path) -> str:
         opened = source.read_bytes()
     except OSError as error:
         raise DataError(
-            f"demo.osm={source} cannot be read ({error.strerror}); name an OpenStreetMap extract (.osm.xml)"
+            f"demo.osm={source} cannot be read ({error.strerror}); name an OpenStreetMap extract"
+            " (.osm.xml)"
         ) from error
     head = opened[:4096]
     if head.startswith(b"\x1f\x8b"):
@@ -128,8 +139,8 @@ def _kind(source: Path) -> str:
         if f"<{kind}".encode() in head:
             return kind
     raise DataError(
-        f"demo.osm={source} is no OpenStreetMap extract: it holds no <osm> element; export one in the format .osm"
-        " (openstreetmap.org, Export), or name a SUMO network (.net.xml)"
+        f"demo.osm={source} is no OpenStreetMap extract: it holds no <osm> element; export one"
+        " in the format .osm (openstreetmap.org, Export), or name a SUMO network (.net.xml)"
     )
 
 
@@ -137,18 +148,20 @@ def _convert(source: Path, net: Path) -> Path:
     program = find_netconvert()
     if program is None:
         raise SumoError(
-            f"demo.osm={source}: an OpenStreetMap extract needs SUMO's netconvert, which is not here: pip install eclipse-sumo"
+            f"demo.osm={source}: an OpenStreetMap extract needs SUMO's netconvert, which is not"
+            " here: pip install eclipse-sumo"
         )
     command = [program, "--osm-files", str(source.absolute()), "--output-file", str(net), *_FLAGS]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own command, no shell
+    # Our own command, no shell.
+    done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
     if done.returncode or not net.is_file():
-        said = [
-            line.removeprefix("Error:").strip()
-            for line in done.stderr.splitlines()
-            if line.startswith("Error:")
-        ]
+        reason = "no reason given"
+        for line in done.stderr.splitlines():
+            if line.startswith("Error:"):
+                reason = line.removeprefix("Error:").strip()
+                break
         raise DataError(
-            f"demo.osm={source} is no OpenStreetMap extract that netconvert can read: {(said or ['no reason given'])[0]}"
+            f"demo.osm={source} is no OpenStreetMap extract that netconvert can read: {reason}"
         )
     return net
 
@@ -165,31 +178,35 @@ def _stretch(net: Path, name: str) -> Motorway:
     best = max(_chains(network), key=lambda chain: _length(network, chain), default=None)
     if best is None:
         raise DataError(
-            f"{name} has no road of {ABREAST} lanes or more for cars: a pair needs {ABREAST}, one for each of its followers"
+            f"{name} has no road of {ABREAST} lanes or more for cars: a pair needs {ABREAST}, one"
+            " for each of its followers"
         )
-    tracks = tuple(zip(*(lanes for _, lanes in best), strict=True))
-    starts, ends = np.array([_extent(network, best, k) for k in range(len(tracks))]).swapaxes(0, 1)
-    drawn = [
-        lane
-        for edge in network.getEdges(withInternal=True)
-        for lane in edge.getLanes()
-        if lane.allows("passenger")
-    ]
+    starts, ends, tracks = [], [], []
+    for track in range(len(best[0][1])):
+        begins, stops = _extent(network, best, track)
+        starts.append(begins)
+        ends.append(stops)
+        tracks.append(tuple(lanes[track] for _, lanes in best))
     return Motorway(
         net=net.absolute(),
         edges=tuple(edge.getID() for edge, _ in best),
-        starts=starts,
-        ends=ends,
-        tracks=tracks,
-        lanes=tuple(
-            Lane(
-                shape=np.array([point[:2] for point in lane.getShape()]),
-                width=float(lane.getWidth()),
-                inner=lane.getIndex() + 1 < lane.getEdge().getLaneNumber(),
-            )
-            for lane in drawn
-        ),
+        starts=np.array(starts),
+        ends=np.array(ends),
+        tracks=tuple(tracks),
+        lanes=_lanes(network),
     )
+
+
+def _lanes(network: Any) -> tuple[Lane, ...]:
+    """Returns all lanes for cars."""
+    found = []
+    for edge in network.getEdges(withInternal=True):
+        for lane in edge.getLanes():
+            if lane.allows("passenger"):
+                shape = np.array([point[:2] for point in lane.getShape()])
+                inner = lane.getIndex() + 1 < edge.getLaneNumber()
+                found.append(Lane(shape, float(lane.getWidth()), inner))
+    return tuple(found)
 
 
 _Chain = list[tuple[Any, tuple[int, ...]]]
@@ -201,37 +218,45 @@ def _chains(network: Any) -> Iterator[_Chain]:
     for first in network.getEdges(withInternal=False):
         lanes = tuple(lane.getIndex() for lane in first.getLanes() if lane.allows("passenger"))
         if len(lanes) >= ABREAST:
-            chain, seen = [(first, lanes)], {first.getID()}
-            while (onward := _onward(*chain[-1])) is not None and onward[2].getID() not in seen:
-                kept, numbers, edge = onward
-                chain = [(one, tuple(earlier[k] for k in kept)) for one, earlier in chain] + [
-                    (edge, numbers)
-                ]
-                seen.add(edge.getID())
-            yield chain
+            yield _chain(first, lanes)
+
+
+def _chain(first: Any, lanes: tuple[int, ...]) -> _Chain:
+    chain, seen = [(first, lanes)], {first.getID()}
+    onward = _onward(first, lanes)
+    while onward is not None and onward[2].getID() not in seen:
+        kept, numbers, edge = onward
+        for k, (earlier, all_lanes) in enumerate(chain):
+            chain[k] = (earlier, tuple(all_lanes[place] for place in kept))
+        chain.append((edge, numbers))
+        seen.add(edge.getID())
+        onward = _onward(edge, numbers)
+    return chain
 
 
 def _onward(edge: Any, lanes: tuple[int, ...]) -> tuple[list[int], tuple[int, ...], Any] | None:
-    """Returns which of the lanes go on to the edge that most of them lead to, their numbers there, and that edge."""
+    """Returns which lanes go on to the edge most lead to, their numbers there, that edge."""
     best: tuple[list[int], tuple[int, ...], Any] | None = None
     for target in edge.getOutgoing():
         found: dict[int, int] = {}
         for place, number in enumerate(lanes):
-            leads = [
-                link.getToLane().getIndex()
-                for link in edge.getLane(number).getOutgoing()
-                if link.getTo() == target
-            ]
-            free = [
-                index
-                for index in leads
-                if index not in found.values() and target.getLane(index).allows("passenger")
-            ]
+            free = _free_lanes(edge.getLane(number), target, found.values())
             if free:
                 found[place] = min(free)
         if len(found) >= ABREAST and (best is None or len(found) > len(best[0])):
             best = (list(found), tuple(found.values()), target)
     return best
+
+
+def _free_lanes(lane: Any, target: Any, taken: Iterable[int]) -> list[int]:
+    """Returns the lanes of another edge that a lane leads to and no other one has taken."""
+    free = []
+    for link in lane.getOutgoing():
+        index = link.getToLane().getIndex()
+        allowed = target.getLane(index).allows("passenger") if link.getTo() == target else False
+        if allowed and index not in taken:
+            free.append(index)
+    return free
 
 
 def _extent(network: Any, chain: _Chain, track: int) -> tuple[list[float], list[float]]:
@@ -244,16 +269,23 @@ def _extent(network: Any, chain: _Chain, track: int) -> tuple[list[float], list[
         ends.append(at)
         if k + 1 < len(chain):
             onward, numbers = chain[k + 1]
-            target = onward.getLane(numbers[track])
-            inside = next(
-                link.getViaLaneID() for link in lane.getOutgoing() if link.getToLane() == target
-            )
-            while inside:  # a junction may hold several lanes in a row
-                at += network.getLane(inside).getLength()
-                inside = next(
-                    (link.getViaLaneID() for link in network.getLane(inside).getOutgoing()), ""
-                )
+            at += _inside(network, lane, onward.getLane(numbers[track]))
     return starts, ends
+
+
+def _inside(network: Any, lane: Any, target: Any) -> float:
+    """Returns the length of a junction between two lanes, m; it may hold lanes in a row."""
+    length, name = 0.0, ""
+    for link in lane.getOutgoing():
+        if link.getToLane() == target:
+            name = link.getViaLaneID()
+            break
+    while name:
+        inside = network.getLane(name)
+        length += inside.getLength()
+        links = inside.getOutgoing()
+        name = links[0].getViaLaneID() if links else ""
+    return length
 
 
 def _length(network: Any, chain: _Chain) -> float:

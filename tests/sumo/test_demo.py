@@ -14,7 +14,8 @@ from cfx.config import DemoSettings
 from cfx.errors import ConfigError, DataError, SumoError
 from cfx.simulators.sumo.channel import Message
 from cfx.sumo import motorway
-from cfx.sumo.demo import _ask, check_demo
+from cfx.sumo.demo import check_demo
+from cfx.sumo.demo_request import ask
 from cfx.sumo.motorway import SHIPPED, find_netconvert, read_motorway
 from cfx.sumo.replay import FOLLOWERS
 from tests.browser import Browser
@@ -64,7 +65,7 @@ def test_the_demonstration_has_the_errors_of_the_evaluation(demo: Path) -> None:
 def test_offsets_start_in_sumo_from_what_they_start_from_in_the_job(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """From the driver's own set, drawn as in training; that is not his fixed set."""
+    """From the driver's own set, shrunk as in training: not the calibrated set itself."""
     monkeypatch.chdir(tmp_path)
     learner = ["learner=rollout", "learner.ensemble_size=2", "learner.steps=2", "learner.horizon=6"]
     protocol = ["protocol=across_drivers", "protocol.folds=2", "protocol.histories=[]"]
@@ -107,7 +108,7 @@ def test_the_animation_is_complete_in_itself_and_plays(demo: Path, browser: Brow
         page.evaluate("document.getElementById('road').toDataURL()"),
     )
     assert before == "13.0 s of 14.9 s"
-    assert "the drivers drive" in page.inner_text("#state")
+    assert "the models have taken over" in page.inner_text("#state")
     page.locator("#play").click()
     expect(page.locator("#clock")).not_to_have_text(before)
     assert page.evaluate("document.getElementById('road').toDataURL()") != pictured
@@ -227,7 +228,7 @@ def test_what_sumo_refuses_is_one_sentence() -> None:
             SumoError,
             match=r"^SUMO lost a vehicle or refuses one \(The edge 'nowhere' within the route 'from0'",
         ) as error:
-            _ask(
+            ask(
                 Message(
                     header | {"policy": folder},
                     {"0/leader": np.add(signals, [[30], [0], [0]]), "0/follower": signals},

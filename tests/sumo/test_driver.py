@@ -31,7 +31,8 @@ from cfx.simulation.rollout import MemoryStepper
 from cfx.style.entropy import measure_style
 from cfx.style.result import StyleResult
 from cfx.style.settings import StyleSettings
-from cfx.sumo.demo import Known, drive_in_sumo
+from cfx.sumo.demo import simulate_in_sumo
+from cfx.sumo.demo_request import PolicyKnowledge
 from cfx.sumo.driver import Driver
 from cfx.sumo.fleet import Fleet
 from cfx.sumo.motorway import read_motorway
@@ -483,15 +484,15 @@ def test_in_sumo_a_policy_drives_as_in_memory(
         ),
     }
     evaluation = evaluate(pairs, batch, first, loops, model.space, style_of(pairs), seed=0)
-    known = Known("fixed", history)
-    shown = drive_in_sumo(
+    knowledge = PolicyKnowledge("fixed", history)
+    shown = simulate_in_sumo(
         tmp_path / "policy",
         pairs,
         policy,
         evaluation,
         read_motorway(None, tmp_path),
         4,
-        known=known,
+        knowledge=knowledge,
     )
     assert {one.pair.pair_id: one.first for one in shown} == {
         f"p{i}": int(first[i]) for i in range(4)
@@ -499,7 +500,7 @@ def test_in_sumo_a_policy_drives_as_in_memory(
     for one in shown:
         assert one.table["difference_speed"].max() < 1e-9
         assert one.table["difference_gap"].max() < 1e-9
-        memory = one.drive.parameters["policy"][1:]
+        memory = one.trajectory.parameters["policy"][1:]
         chosen = one.parameters[one.first : one.first + len(memory)]
         assert chosen == pytest.approx(memory, abs=1e-9)
         assert memory.std(axis=0).max() > 1e-3, "the policy changes what it chooses"

@@ -5,7 +5,7 @@
   const [canvas, chooser, slider, button, clock, rate, state, plot] = ["road", "pair", "time", "play", "clock", "rate", "state", "plot"].map(find);
   const pen = canvas.getContext("2d");
   const CAR_WIDTH = 1.9; // m
-  const LEAD_IN = 3; // seconds of the recording that are shown before the drivers take over
+  const LEAD_IN = 3; // seconds of the recording that are shown before the models take over
   const VIEW = { centre: [0, 0], forward: [1, 0], scale: 6, width: 0, height: 0 };
   let pair = content.pairs[0];
   let frame = 0; // may lie between two frames while it plays
@@ -166,7 +166,7 @@
     slider.value = String(Math.round(frame));
     clock.textContent = (frame * pair.dt).toFixed(1) + " s of " + (last(pair) * pair.dt).toFixed(1) + " s";
     const away = (pair.first - frame) * pair.dt;
-    state.textContent = away > 0 ? "all three are the recording; the drivers take over in " + away.toFixed(1) + " s" : "the drivers drive";
+    state.textContent = away > 0 ? "all three are the recording; the models take over in " + away.toFixed(1) + " s" : "the models have taken over";
   }
 
   function choose(number) {
