@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from functools import cached_property
@@ -89,9 +89,12 @@ class Job:
     @property
     def methods(self) -> tuple[str, ...]:
         """The methods that were compared, in the order in which they are shown."""
-        present = [str(method) for method in self.pairs["method"].unique()]
+        present = self.pairs["method"].astype(str).unique().tolist()
         known = [method for method in METHODS if method in present]
-        return (*known, *(method for method in present if method not in METHODS))
+        for method in present:
+            if method not in known:
+                known.append(method)
+        return tuple(known)
 
     @property
     def meaningful_methods(self) -> tuple[str, ...]:
@@ -127,7 +130,7 @@ class Job:
             return found
         kinds = {metric.name: metric.summary for metric in self.known_metrics}
         for key, rows in self.values.groupby(["metric", "method", "scope"]):
-            name, method, scope = (str(part) for part in key)
+            name, method, scope = map(str, key)
             summary = rows["value"].dropna().agg(kinds.get(name, "mean"))
             found[name, method, scope] = float(summary)
         return found
@@ -176,8 +179,7 @@ class Job:
         `improvement/BASELINE`.
         """
         first = self.pairs.drop_duplicates("pair_id").set_index("pair_id")
-        known = [name for name in ("driver", "cluster", "style_score") if name in first]
-        table = first[known].copy()
+        table = first.filter(items=["driver", "cluster", "style_score"])
         for method in self.methods:
             rows = self.pairs[self.pairs["method"] == method]
             of_method = rows.drop_duplicates("pair_id").set_index("pair_id")
@@ -229,10 +231,10 @@ class Job:
         def column(name: str) -> np.ndarray:
             return frames[name].to_numpy(dtype=float)
 
-        names = [axis.name for axis in self.parameters]
-        parameters = {}
+        speed, gap, parameters = {}, {}, {}
         for method in self._simulated:
-            columns = [f"{name}_{method}" for name in names]
+            speed[method], gap[method] = column(f"speed_{method}"), column(f"gap_{method}")
+            columns = [f"{axis.name}_{method}" for axis in self.parameters]
             parameters[method] = frames[columns].to_numpy(dtype=float)
         return PairTrajectory(
             pair_id=pair_id,
@@ -241,8 +243,8 @@ class Job:
             leader_speed=column("leader_speed"),
             real_speed=column("real_speed"),
             real_gap=column("real_gap"),
-            speed={method: column(f"speed_{method}") for method in self._simulated},
-            gap={method: column(f"gap_{method}") for method in self._simulated},
+            speed=speed,
+            gap=gap,
             parameters=parameters,
         )
 
@@ -272,6 +274,29 @@ class Origin:
     seconds: float | None = None
     version: str = ""
     hydra: Path | None = field(default=None)
+
+
+def with_baseline(jobs: Iterable[Job]) -> list[Job]:
+    """Returns the jobs whose policy is compared with constant parameters."""
+    return [job for job in jobs if job.has_constant_baseline]
+
+
+def without_baseline(jobs: Iterable[Job]) -> list[Job]:
+    """Returns the jobs whose model follows no leader with constant parameters."""
+    return [job for job in jobs if not job.has_constant_baseline]
+
+
+def any_baselines(jobs: Iterable[Job], scope: str = TEST) -> list[str]:
+    """Returns what the policy of any of the jobs is compared with, in the order of the jobs."""
+    found: dict[str, None] = {}
+    for job in jobs:
+        found |= dict.fromkeys(job.baselines(scope))
+    return list(found)
+
+
+def any_has_metric(jobs: Iterable[Job], name: str, method: str, scope: str = TEST) -> bool:
+    """Says whether any of the jobs has measured a metric."""
+    return any(job.has_metric(name, method, scope) for job in jobs)
 
 
 def improvement_key(baseline: str, scope: str = TEST) -> str:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cfx.plots.words import explained, percent
-from cfx.report.job import Job
+from cfx.plots.words import explained, percent, plural
+from cfx.report.job import Job, with_baseline, without_baseline
 
 _MOST = 3
 """Up to so many jobs have a sentence each."""
@@ -20,10 +20,10 @@ def summary(jobs: Sequence[Job]) -> list[str]:
         f"{_amount(jobs)}: is a policy that adapts the parameters closer to the real driver than"
         f" {explained('fixed')}?"
     )
-    compared = [job for job in jobs if job.has_constant_baseline]
-    references = [_reference(job) for job in jobs if not job.has_constant_baseline]
+    compared = with_baseline(jobs)
+    references = [_reference(job) for job in without_baseline(jobs)]
     if len(compared) <= _MOST:
-        return [first, *(_verdict(job) for job in compared), *references]
+        return [first, *map(_verdict, compared), *references]
     best = max(compared, key=_mean_for_ranking)
     counts = f"{_counts(compared)} (by the 95 % interval of the mean improvement)."
     return [first, counts, f"The best mean: {_verdict(best)}", *references]
@@ -69,7 +69,7 @@ def _amount(jobs: Sequence[Job]) -> str:
         for pair in job.pairs["pair_id"].unique():
             pairs.add((source, pair))
     where = f" from {Path(next(iter(sources))).name}" if len(sources) == 1 else ""
-    return f"{len(pairs)} pair{'' if len(pairs) == 1 else 's'} of leader and follower{where}"
+    return f"{plural(len(pairs), 'pair')} of leader and follower{where}"
 
 
 def _side(job: Job, baseline: str = "fixed") -> str:

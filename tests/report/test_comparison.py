@@ -77,10 +77,10 @@ def test_jobs_with_and_without_a_baseline_stand_in_one_report(tmp_path: Path) ->
         next(job for job in runs.jobs if ("shrunk" in job.methods) is there)
         for there in (True, False)
     )
-    assert cells(sheet, with_base.name)["driver-specific, shrunk"][0].startswith(
+    assert cells(sheet, with_base.name)["shrunk"][0].startswith(
         f"{with_base.metrics['rmse_speed/shrunk']:.3f}"
     )
-    assert set(cells(sheet, without.name)["driver-specific, shrunk"]) == {"\N{EN DASH}"}
+    assert set(cells(sheet, without.name)["shrunk"]) == {"\N{EN DASH}"}
     assert "shrunk towards the default" in page
 
 

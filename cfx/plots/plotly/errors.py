@@ -7,7 +7,7 @@ from typing import Any
 
 from cfx.plots.choice.errors import TIME_TITLE, ErrorPanel
 from cfx.plots.look import EDGE
-from cfx.plots.plotly.figure import Plot, Trace, axis, view
+from cfx.plots.plotly.figure import Plot, Trace, axes_number, axis, view
 from cfx.plots.plotly.trajectories import line_trace
 
 _HALVES = ([0.0, 0.455], [0.545, 1.0])
@@ -18,7 +18,7 @@ def errors_plot(panels: Sequence[ErrorPanel]) -> Plot:
     data: list[Trace] = []
     layout: dict[str, Any] = {"hovermode": "x", "shapes": []}
     for k, panel in enumerate(panels):
-        number = str(k + 1) if k else ""
+        number = axes_number(k)
         layout[f"xaxis{number}"] = axis(TIME_TITLE, domain=_HALVES[k], anchor=f"y{number}")
         layout[f"yaxis{number}"] = axis(panel.title, anchor=f"x{number}", rangemode="tozero")
         for line in panel.lines:

@@ -6,7 +6,7 @@ Every text from data is escaped: Plotly reads tags such as `<a href=...>` in nam
 from __future__ import annotations
 
 import html
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -42,6 +42,16 @@ class Plot:
 def safe(value: object) -> str:
     """Returns a text that Plotly shows as it is."""
     return html.escape(str(value), quote=False)
+
+
+def safe_all(values: Iterable[object]) -> list[str]:
+    """Returns texts that Plotly shows as they are."""
+    return [safe(value) for value in values]
+
+
+def axes_number(k: int) -> str:
+    """Returns how Plotly names the k-th pair of axes: "", "2", "3"."""
+    return str(k + 1) if k else ""
 
 
 def view(data: Sequence[Trace], layout: Mapping[str, Any], note: str = "") -> dict[str, Any]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from cfx.plots.choice.history import AMOUNT_TITLE, HistoryCurve
 from cfx.plots.choice.improvements import improvement_title
-from cfx.plots.plotly.figure import Plot, Trace, axis, safe, view, zero_line
+from cfx.plots.plotly.figure import Plot, Trace, axis, safe, safe_all, view, zero_line
 from cfx.plots.words import percent_or_undefined
 
 
@@ -24,7 +24,7 @@ def history_plot(curves: Sequence[HistoryCurve], amounts: Sequence[str]) -> Plot
         AMOUNT_TITLE,
         type="category",
         categoryorder="array",
-        categoryarray=[safe(amount) for amount in amounts],
+        categoryarray=safe_all(amounts),
     )
     title = improvement_title("fixed").replace(" over ", "<br>over ")
     y_axis = axis(title, tickformat=".0%")
@@ -45,7 +45,7 @@ def _trace(curve: HistoryCurve) -> Trace:
         "type": "scatter",
         "mode": "lines+markers",
         "name": name,
-        "x": [safe(amount) for amount in curve.amounts],
+        "x": safe_all(curve.amounts),
         "y": curve.mean,
         "error_y": interval,
         "marker": {"size": 9, "color": curve.colour},

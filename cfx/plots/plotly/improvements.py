@@ -8,7 +8,16 @@ from typing import Any
 import numpy as np
 
 from cfx.plots.choice.improvements import ImprovementBars, ImprovementSeries
-from cfx.plots.plotly.figure import Trace, axis, improvement_axis, job_style, safe, view, zero_line
+from cfx.plots.plotly.figure import (
+    Trace,
+    axis,
+    improvement_axis,
+    job_style,
+    safe,
+    safe_all,
+    view,
+    zero_line,
+)
 from cfx.plots.words import common_prefix, short
 
 _NAMED = 90
@@ -32,7 +41,9 @@ def improvements_view(
     data: list[Trace] = []
     for k, series in enumerate(bars.series):
         data += _traces(series, hover[k], k, as_bars=as_bars)
-    named = list(pair_ids) if len(pair_ids) <= _NAMED else []
+    named: list[str] = []
+    if len(pair_ids) <= _NAMED:
+        named = list(pair_ids)
     layout = {
         "barmode": "group",
         "scattermode": "group" if as_bars else "overlay",
@@ -41,9 +52,9 @@ def improvements_view(
             "pair of a leader and a follower",
             type="category",
             categoryorder="array",
-            categoryarray=[safe(pair) for pair in pair_ids],
+            categoryarray=safe_all(pair_ids),
             tickmode="array",
-            tickvals=[safe(pair) for pair in named],
+            tickvals=safe_all(named),
             ticktext=_tick_names(named),
             tickangle=-90,
             tickfont={"size": 10},
@@ -66,7 +77,7 @@ def _traces(
     series: ImprovementSeries, hover: Mapping[str, str], k: int, *, as_bars: bool
 ) -> list[Trace]:
     colour, symbol = job_style(k)
-    places = [safe(pair) for pair in series.pair_ids]
+    places = safe_all(series.pair_ids)
     texts = [hover[pair] for pair in series.pair_ids]
     common: Trace = {
         "name": safe(series.name),

@@ -11,7 +11,16 @@ from numpy.typing import NDArray
 from cfx.plots.choice.common import Array
 from cfx.plots.choice.jobs import ClusterBoxes, ClusterGroup, ErrorDots, Overview, Statistics
 from cfx.plots.look import colour_of
-from cfx.plots.plotly.figure import Trace, axis, improvement_axis, job_style, safe, view, zero_line
+from cfx.plots.plotly.figure import (
+    Trace,
+    axis,
+    improvement_axis,
+    job_style,
+    safe,
+    safe_all,
+    view,
+    zero_line,
+)
 from cfx.plots.words import label, percent_or_undefined
 from cfx.style.result import CLUSTERS
 
@@ -20,7 +29,8 @@ def overview_view(chosen: Overview) -> dict[str, Any]:
     """Mean improvement with its 95 % interval, trimmed mean and median: a line per job."""
     rows = chosen.rows
     places = np.arange(len(rows))[::-1]
-    mean = np.array([row.mean for row in rows])
+    statistics = [(row.mean, row.low, row.high, row.trimmed_mean, row.median) for row in rows]
+    mean, low, high, trimmed_mean, median = np.array(statistics).T
     common: Trace = {
         "type": "scatter",
         "mode": "markers",
@@ -31,8 +41,8 @@ def overview_view(chosen: Overview) -> dict[str, Any]:
     interval = {
         "type": "data",
         "symmetric": False,
-        "array": np.nan_to_num(np.array([row.high for row in rows]) - mean),
-        "arrayminus": np.nan_to_num(mean - np.array([row.low for row in rows])),
+        "array": np.nan_to_num(high - mean),
+        "arrayminus": np.nan_to_num(mean - low),
         "thickness": 2,
         "width": 5,
     }
@@ -43,12 +53,12 @@ def overview_view(chosen: Overview) -> dict[str, Any]:
         "marker": {"size": 12, "color": colour_of(chosen.baseline)},
     }
     trimmed: Trace = {
-        "x": np.array([row.trimmed_mean for row in rows]),
+        "x": trimmed_mean,
         "name": "trimmed mean",
         "marker": {"symbol": "diamond-open", "size": 11, "color": "black"},
     }
     medians: Trace = {
-        "x": np.array([row.median for row in rows]),
+        "x": median,
         "name": "median",
         "marker": {"symbol": "line-ns-open", "size": 13, "color": "black"},
     }
@@ -107,7 +117,7 @@ def clusters_view(chosen: ClusterBoxes) -> dict[str, Any]:
 def _job_axis(jobs: Sequence[str], places: NDArray[np.int64], *, showgrid: bool) -> dict[str, Any]:
     return axis(
         tickvals=places,
-        ticktext=[safe(job) for job in jobs],
+        ticktext=safe_all(jobs),
         range=[-0.6, len(jobs) - 0.4],
         showgrid=showgrid,
         ticks="",
@@ -142,7 +152,7 @@ def _box(group: ClusterGroup, k: int) -> Trace:
         texts.append(f"<b>pair {safe(pair)}</b><br>{percent_or_undefined(value, 1)}")
     return {
         "type": "box",
-        "x": [safe(cluster) for cluster in group.clusters],
+        "x": safe_all(group.clusters),
         "y": group.values,
         "name": safe(group.name),
         "offsetgroup": str(k),

@@ -9,7 +9,7 @@ import numpy as np
 
 from cfx.plots.choice.platoon import TIME_TITLE, PlatoonPanel, VehicleLine, speed_range
 from cfx.plots.look import COLLISION_COLOUR
-from cfx.plots.plotly.figure import Plot, Trace, axis, heading, safe, view
+from cfx.plots.plotly.figure import Plot, Trace, axes_number, axis, heading, safe, safe_all, view
 
 
 def platoon_plot(panels: Sequence[PlatoonPanel]) -> Plot:
@@ -22,15 +22,17 @@ def platoon_plot(panels: Sequence[PlatoonPanel]) -> Plot:
     }
     ends = list(speed_range(panels))
     for k, panel in enumerate(panels):
-        number = str(k + 1) if k else ""
-        shared_x, shared_y = ("x", "y") if k else (None, None)
-        left = (k + 0.06) / len(panels) if k else 0.0
+        number = axes_number(k)
+        left, title = 0.0, "speed (m/s)"
+        shared_x, shared_y = None, None
+        if k:
+            left, title = (k + 0.06) / len(panels), ""
+            shared_x, shared_y = "x", "y"
         domain = [left, (k + 0.96) / len(panels)]
         layout[f"xaxis{number}"] = axis(domain=domain, anchor=f"y{number}", matches=shared_x)
-        title = "" if k else "speed (m/s)"
         layout[f"yaxis{number}"] = axis(title, anchor=f"x{number}", matches=shared_y, range=ends)
         above = heading(safe(panel.title), left, 1.02, size=11)
-        above["text"] = "<br>".join([above["text"], *map(safe, panel.verdicts)])
+        above["text"] = "<br>".join([above["text"], *safe_all(panel.verdicts)])
         layout["annotations"].append(above | {"align": "left"})
         # The leader is drawn last, above its followers.
         for line in [*panel.lines[1:], panel.lines[0]]:

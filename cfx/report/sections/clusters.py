@@ -12,7 +12,7 @@ from cfx.plots.plotly.figure import Plot
 from cfx.plots.plotly.jobs import clusters_view
 from cfx.plots.words import explained, label
 from cfx.report.blocks import Block, Figure, Fold, Section, Table, Text
-from cfx.report.job import Job, Runs
+from cfx.report.job import Job, Runs, any_baselines, with_baseline
 from cfx.report.names import SEPARATOR, differences
 from cfx.report.tables import Cell, Column, Sheet, formatted, interval, number, share, text
 from cfx.style.result import CLUSTERS
@@ -28,13 +28,11 @@ _INTRODUCTION = (
 
 def blocks(runs: Runs) -> list[Block]:
     """Returns the plot and a table per baseline, if any job has a baseline."""
-    if not any(job.has_constant_baseline for job in runs.jobs):
+    if not with_baseline(runs.jobs):
         return []
-    baselines: dict[str, None] = {}
-    for job in runs.jobs:
-        baselines |= dict.fromkeys(job.baselines())
+    baselines = any_baselines(runs.jobs)
     series = cluster_series(runs.jobs)
-    found: list[Block] = [Text(_INTRODUCTION), Figure(per_cluster(series, list(baselines)))]
+    found: list[Block] = [Text(_INTRODUCTION), Figure(per_cluster(series, baselines))]
     for k, baseline in enumerate(baselines):
         first = k == 0
         table = Table(clusters(series, baseline), explain=first)

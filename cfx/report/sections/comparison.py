@@ -23,7 +23,7 @@ from cfx.plots.words import (
     short_label,
 )
 from cfx.report.blocks import Block, Figure, Fold, Heading, Section, Table, Text
-from cfx.report.job import Job, Runs
+from cfx.report.job import Job, Runs, any_baselines, any_has_metric, without_baseline
 from cfx.report.metrics import lists_metrics, metric_title
 from cfx.report.tables import Cell, Column, Sheet, formatted, job_names, number, tested, text
 
@@ -163,7 +163,7 @@ def blocks(runs: Runs) -> list[Block]:
         Text(introduction),
         Table(closeness(jobs), compact=True, explain=True),
     ]
-    unconditional = [job for job in jobs if not job.has_constant_baseline]
+    unconditional = without_baseline(jobs)
     if unconditional:
         found.append(
             Text(
@@ -208,8 +208,11 @@ def closeness(jobs: Sequence[Job]) -> Sheet:
                 row.append(_error(job, scope, method))
         if methods:
             groups.append((title, len(methods)))
-    gains = [one for one in _GAINS if any(one[0] in job.baselines(one[1]) for job in jobs)]
-    for baseline, scope in gains:
+    gains = 0
+    for baseline, scope in _GAINS:
+        if baseline not in any_baselines(jobs, scope):
+            continue
+        gains += 1
         suffix = "" if scope == TEST else ", full"
         meaning = (
             f"Mean improvement of the RMSE of speed over {explained(baseline)}, on"
@@ -219,7 +222,7 @@ def closeness(jobs: Sequence[Job]) -> Sheet:
         for row, job in zip(rows, jobs, strict=True):
             row.append(_gain(job, baseline, scope))
     if gains:
-        groups.append(("Improvement of the policy", len(gains)))
+        groups.append(("Improvement of the policy", gains))
     _mark_best(rows, jobs, columns)
     return Sheet(tuple(columns), tuple(tuple(row) for row in rows), tuple(groups))
 
@@ -228,7 +231,7 @@ def safety(jobs: Sequence[Job]) -> Sheet:
     """Returns a row per job: the policy's measures of safety, and below them a baseline's."""
     kept = []
     for one in _SAFETY:
-        if any(job.has_metric(one.metric, "policy", one.scope) for job in jobs):
+        if any_has_metric(jobs, one.metric, "policy", one.scope):
             kept.append(one)
     columns = [Column("Job", number=False)]
     for one in kept:
@@ -275,7 +278,7 @@ def absolute(jobs: Sequence[Job]) -> Plot:
     """Errors of each method in m/s and m; a view for each error and part of the trajectories."""
     views: dict[str, dict[str, Any]] = {}
     for metric, scope in _ERRORS:
-        if not any(job.has_metric(metric, "policy", scope) for job in jobs):
+        if not any_has_metric(jobs, metric, "policy", scope):
             continue
         signal, unit = ("speed", "m/s") if metric == "rmse_speed" else ("gap", "m")
         values = {}
@@ -296,11 +299,7 @@ def _shown_error(job: Job, metric: str, method: str, scope: str) -> float:
 
 
 def _measured_methods(jobs: Sequence[Job], scope: str) -> list[str]:
-    found = []
-    for method in METHODS:
-        if any(job.has_metric("rmse_speed", method, scope) for job in jobs):
-            found.append(method)
-    return found
+    return [m for m in METHODS if any_has_metric(jobs, "rmse_speed", m, scope)]
 
 
 def _error(job: Job, scope: str, method: str) -> Cell:

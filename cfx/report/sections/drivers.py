@@ -10,11 +10,11 @@ import pandas as pd
 
 from cfx.plots.choice.common import natural_order
 from cfx.plots.choice.improvements import improvement_bars
-from cfx.plots.plotly.figure import Plot, safe
+from cfx.plots.plotly.figure import Plot, safe, safe_all
 from cfx.plots.plotly.improvements import improvements_view
 from cfx.plots.words import label, percent_or_undefined, short_label
 from cfx.report.blocks import Block, Figure, Section, Text
-from cfx.report.job import Job, Runs
+from cfx.report.job import Job, Runs, any_baselines, with_baseline
 
 _INTRODUCTION = (
     "Improvement of every pair on its test part; above 0 the policy is closer to the real driver."
@@ -26,7 +26,7 @@ _STATISTICS = ("mean", "ci95_low", "ci95_high")
 
 def blocks(runs: Runs) -> list[Block]:
     """Returns the plot, if any job has a baseline."""
-    jobs = [job for job in runs.jobs if job.has_constant_baseline]
+    jobs = with_baseline(runs.jobs)
     if not jobs:
         return []
     return [Text(_INTRODUCTION), Figure(per_driver(jobs))]
@@ -38,15 +38,12 @@ def per_driver(jobs: Sequence[Job]) -> Plot:
     keys: dict[str, None] = {}
     for table in tables:
         keys |= dict.fromkeys(table["key"])
-    baselines: dict[str, None] = {}
-    for job in jobs:
-        baselines |= dict.fromkeys(job.baselines())
     views = {}
-    for baseline in baselines:
+    for baseline in any_baselines(jobs):
         views[f"against {label(baseline)}"] = _view(jobs, tables, list(keys), baseline)
     orders = {}
     for name, order in _orders(jobs, tables, list(keys)).items():
-        orders[name] = [safe(key) for key in order]
+        orders[name] = safe_all(order)
     return Plot(views, 460, "Improvement of every pair", orders)
 
 

@@ -253,29 +253,33 @@ def _count(job: Job) -> Cell:
 
 def _explanation(jobs: Sequence[Job], pairs: int) -> str:
     """Says what of the jobs' set-up is not the paper's; only what can be read off the jobs."""
-    sources = sorted({str(job.data.get("source", "")) for job in jobs} - {""})
-    optimizers = sorted({job.component("optimizer") for job in jobs})
-    learners = sorted({job.component("learner") for job in jobs})
-    epochs = sorted({str(job.setting("learner.epochs")) for job in jobs})
-    batches = sorted({str(job.setting("learner.batch_size")) for job in jobs})
-    counts = sorted({job.pairs["pair_id"].nunique() for job in jobs})
+    sources, counts = set(), set()
+    optimizers, learners, epochs, batches = set(), set(), set(), set()
+    for job in jobs:
+        sources.add(str(job.data.get("source", "")))
+        counts.add(job.pairs["pair_id"].nunique())
+        optimizers.add(job.component("optimizer"))
+        learners.add(job.component("learner"))
+        epochs.add(str(job.setting("learner.epochs")))
+        batches.add(str(job.setting("learner.batch_size")))
+    sources -= {""}
     parts = []
     if sources:
         there = "NGSIM I-80, 13 April 2005, 4:00 to 4:15 p.m."
-        parts.append(f"the recordings (here {', '.join(sources)}; there {there})")
-    if counts != [pairs] and pairs > 1:
-        here = " or ".join(map(str, counts))
+        parts.append(f"the recordings (here {', '.join(sorted(sources))}; there {there})")
+    if counts != {pairs} and pairs > 1:
+        here = " or ".join(map(str, sorted(counts)))
         parts.append(f"the number of pairs (here {here} in a job; there {pairs} in all)")
-    if optimizers != ["botorch"]:
-        here = ", ".join(optimizers)
+    if optimizers != {"botorch"}:
+        here = ", ".join(sorted(optimizers))
         parts.append(f"the search (here {here}; there Bayesian optimization)")
-    if learners != ["imitation"]:
-        here = ", ".join(learners)
+    if learners != {"imitation"}:
+        here = ", ".join(sorted(learners))
         parts.append(
             f"how the policy learns (here {here}; there from the windows' best parameters)"
         )
-    if epochs != ["500"] or batches != ["1"]:
-        here = f"{' or '.join(epochs)} epochs, batch size {' or '.join(batches)}"
+    if epochs != {"500"} or batches != {"1"}:
+        here = f"{' or '.join(sorted(epochs))} epochs, batch size {' or '.join(sorted(batches))}"
         parts.append(f"the training (here {here}; there 500, 1)")
     parts.append(
         "what the paper does not print, such as the parameters' bounds and the number of"

@@ -14,7 +14,7 @@ from cfx.plots.plotly.figure import Plot
 from cfx.plots.plotly.jobs import overview_view
 from cfx.plots.words import FULL_TRAJECTORY, MINUS, TEST, label
 from cfx.report.blocks import Block, Figure, Heading, Section, Table, Text
-from cfx.report.job import Job, Runs
+from cfx.report.job import Job, Runs, any_baselines, with_baseline
 from cfx.report.tables import (
     Cell,
     Column,
@@ -35,7 +35,7 @@ def blocks(runs: Runs) -> list[Block]:
     """Returns improvements over each baseline, and errors."""
     jobs = runs.jobs
     found: list[Block] = []
-    if any(job.has_constant_baseline for job in jobs):
+    if with_baseline(jobs):
         words = (
             "Mean improvement of the RMSE of speed over each baseline, with its 95 % interval."
             " Where the interval contains 0, the job does not tell whether the policy helps."
@@ -54,7 +54,7 @@ def overview(jobs: Sequence[Job]) -> Plot:
     views = {}
     for scope in SCOPES:
         suffix = "" if scope == TEST else f", {jobs[0].scope_label(scope)}"
-        for baseline in _baselines(jobs, scope):
+        for baseline in any_baselines(jobs, scope):
             rows = []
             for job in jobs:
                 if baseline in job.baselines(scope):
@@ -84,7 +84,7 @@ def errors(jobs: Sequence[Job]) -> Sheet:
         Column("RMSE of gap (m)", "The same for the gap, bumper to bumper."),
         Column("Collisions", "Pairs in which the simulated gap becomes negative on these frames."),
     ]
-    full = any(job.baselines(FULL_TRAJECTORY) for job in jobs)
+    full = bool(any_baselines(jobs, FULL_TRAJECTORY))
     if full:
         columns += [
             Column(
@@ -118,11 +118,11 @@ def _error_row(job: Job, method: str, *, full: bool) -> tuple[Cell, ...]:
 
 def improvements(jobs: Sequence[Job]) -> Sheet:
     """Returns the policy's improvement: a row per job, baseline and part of the trajectories."""
-    full = any(job.baselines(FULL_TRAJECTORY) for job in jobs)
+    full = bool(any_baselines(jobs, FULL_TRAJECTORY))
     scopes = (TEST, FULL_TRAJECTORY) if full else (TEST,)
     baselines: list[str] = []
     for scope in scopes:
-        baselines += _baselines(jobs, scope)
+        baselines += any_baselines(jobs, scope)
     rows = []
     for scope in scopes:
         for baseline in dict.fromkeys(baselines):
@@ -221,14 +221,6 @@ def _statistics(job: Job, baseline: str, scope: str) -> Statistics:
         trimmed_mean=job.improvement("trimmed_mean", baseline, scope),
         median=job.improvement("median", baseline, scope),
     )
-
-
-def _baselines(jobs: Sequence[Job], scope: str) -> list[str]:
-    """Returns what the policy of any job is compared with."""
-    found: dict[str, None] = {}
-    for job in jobs:
-        found |= dict.fromkeys(job.baselines(scope))
-    return list(found)
 
 
 SECTION = Section("results", "Results", "Results", blocks)
