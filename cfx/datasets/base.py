@@ -21,18 +21,27 @@ from cfx.pairs import SIGNALS, Dropped, Pair, PairSet
 
 
 def _files(value: Any) -> Path | tuple[Path, ...]:
+    """Returns one path, or several, as absolute ones."""
     several = isinstance(value, list | tuple)
-    if several and not value:
+    written = value if several else [value]
+    if not written:
         raise PydanticCustomError("path", "the list is empty; write at least one file")
-    if not all(isinstance(one, str | Path | None) for one in (value if several else [value])):
-        raise PydanticCustomError(
-            "path", "write a file, a list of files, or a pattern such as 'i-80/*.txt'"
-        )
-    return tuple(absolute(one) for one in value) if several else absolute(value)
+    for one in written:
+        if not isinstance(one, str | Path | None):
+            raise PydanticCustomError(
+                "path", "write a file, a list of files, or a pattern such as 'i-80/*.txt'"
+            )
+    paths = tuple(absolute(one) for one in written)
+    if several:
+        return paths
+    return paths[0]
 
 
 FilePaths = Annotated[Path | tuple[Path, ...], BeforeValidator(_files)]
-"""One or several paths that a user writes: `~` is their home, a relative one starts at the working directory."""
+"""One or several paths that a user writes.
+
+`~` is their home, and a relative path starts at the working directory.
+"""
 
 
 class DatasetSettings(Settings):
@@ -44,7 +53,8 @@ class DatasetSettings(Settings):
     time_step: float | None = Field(
         None,
         gt=0,
-        description="s: bring all pairs to this step, in which windows and policies count too; null: as recorded",
+        description="s: bring all pairs to this step, in which windows and policies count too;"
+        " null: as recorded",
     )
     recording: str | None = Field(None, description="keep this recording alone; null: all")
     lanes: list[int] | None = Field(None, description="keep pairs in these lanes alone; null: all")
@@ -58,34 +68,44 @@ class FileDatasetSettings(DatasetSettings):
     """What every dataset that reads a file has."""
 
     path: FilePaths = Field(
-        description="the file to read, a list of files, or a pattern such as 'i-80/*.txt'; ~ and relative paths work"
+        description="the file to read, a list of files, or a pattern such as 'i-80/*.txt';"
+        " ~ and relative paths work"
     )
 
     def files(self) -> list[Path]:
-        """Returns the files in the order in which they are written, those of a pattern sorted by name.
+        """Returns the files in the order in which they are written.
+
+        The files of a pattern are sorted by name.
 
         Raises:
             DataError: no file matches a pattern, or a file is named twice.
         """
-        written = self.path if isinstance(self.path, tuple) else (self.path,)
-        files = [file for path in written for file in _matching(path)]
-        twice = [file for number, file in enumerate(files) if file in files[:number]]
-        if twice:
-            raise DataError(f"data.path: {twice[0]} is named more than once; name each file once")
+        written = self.path
+        if isinstance(written, Path):
+            written = (written,)
+        files: list[Path] = []
+        for path in written:
+            for file in _matching(path):
+                if file in files:
+                    raise DataError(
+                        f"data.path: {file} is named more than once; name each file once"
+                    )
+                files.append(file)
         return files
 
 
 def _matching(path: Path) -> list[Path]:
-    if path.exists() or not any(mark in str(path) for mark in "*?["):
+    """Returns the files that a path or a pattern stands for, sorted by name."""
+    is_pattern = any(mark in str(path) for mark in "*?[")
+    if path.exists() or not is_pattern:
         return [path]
-    found = sorted(
-        file
-        for file in Path(path.anchor).glob(str(path.relative_to(path.anchor)))
-        if file.is_file()
-    )
+    found = []
+    for file in Path(path.anchor).glob(str(path.relative_to(path.anchor))):
+        if file.is_file():
+            found.append(file)
     if not found:
         raise DataError(f"data.path={path}: no file matches this pattern")
-    return found
+    return sorted(found)
 
 
 class Dataset(Component):
@@ -109,12 +129,14 @@ class Dataset(Component):
         """
 
     def load(self) -> PairSet:
-        """Returns the pairs that the settings select: by recording, lane, id and length, then the first `max_pairs` of them.
+        """Returns the pairs that the settings select.
 
-        Lengths count in steps of `time_step`.
+        They are selected by recording, lane, id and length; of those the first `max_pairs` are
+        kept. Lengths count in steps of `time_step`.
 
         Raises:
-            DataError: as `read`; or the recording or a pair id is unknown, the source has no lanes, or too few pairs remain.
+            DataError: as `read`; or the recording or a pair id is unknown, the source has no lanes,
+                or too few pairs remain.
             PluginError: `read` gives anything but pairs of finite numbers.
         """
         pairs = self.read()
@@ -132,107 +154,122 @@ class Dataset(Component):
         return _select_first(_select_long(pairs, self.settings.min_frames), self.settings)
 
     def _check(self, pairs: Any) -> None:
+        """Raises PluginError unless these are pairs of finite numbers."""
         if not isinstance(pairs, PairSet):
             raise PluginError(
-                f"{registry.origin(self)}: read must return a cfx.PairSet, but returned a {type(pairs).__name__}"
+                f"{registry.origin(self)}: read must return a cfx.PairSet,"
+                f" but returned a {type(pairs).__name__}"
             )
         for pair in pairs:
             for name in SIGNALS:
                 if not bool(np.isfinite(getattr(pair, name)).all()):
                     raise PluginError(
-                        f"{registry.origin(self)}: pair {pair.pair_id} has a {name} that is not finite; a dataset splits or"
-                        " leaves out what has gaps"
+                        f"{registry.origin(self)}: pair {pair.pair_id} has a {name} that is not"
+                        " finite; a dataset splits or leaves out what has gaps"
                     )
 
 
 def joined(parts: Sequence[PairSet]) -> PairSet:
-    """Returns the pairs of several files as one set, in their order, and counts together what was left out for the same reason.
+    """Returns the pairs of several files as one set, in their order.
+
+    What was left out for the same reason is counted together.
 
     Raises:
-        DataError: a pair stands in two of the files, by its id or by its content, however it is called: a driver who counts
-            twice would be learned from and tested.
+        DataError: a pair stands in two of the files, by its id or by its content, however it is
+            called: a driver who counts twice would be learned from and tested.
     """
     if len(parts) == 1:
         return parts[0]
+    _require_different(parts)
+    pairs: list[Pair] = []
+    counts: dict[tuple[str, str], int] = {}
+    for part in parts:
+        pairs += part
+        for drop in part.dropped:
+            key = (drop.reason, drop.unit)
+            counts[key] = counts.get(key, 0) + drop.count
+    dropped = []
+    for (reason, unit), count in counts.items():
+        dropped.append(Dropped(reason, count, unit))
+    sources = listed([part.source for part in parts], 3)
+    return PairSet(tuple(pairs), f"{len(parts)} files ({sources})", tuple(dropped))
+
+
+def _require_different(parts: Sequence[PairSet]) -> None:
+    """Raises DataError if a pair stands in two of the files."""
     seen: dict[str, tuple[str, str]] = {}
     for part in parts:
         here: dict[str, tuple[str, str]] = {}
         for pair in part:
             for key in (pair.pair_id, pair.content):
                 if key in seen:
-                    source, name = seen[key]
-                    which = (
-                        f"pair '{name}'"
-                        if name == pair.pair_id
-                        else f"pair '{name}', there '{pair.pair_id}',"
-                    )
-                    raise DataError(
-                        f"{source} and {part.source}: {which} stands in both files; leave it out of one of them"
-                    )
+                    raise DataError(_twice(*seen[key], part, pair))
                 here[key] = (part.source, pair.pair_id)
         seen |= here
-    counts: dict[tuple[str, str], int] = {}
-    for drop in (drop for part in parts for drop in part.dropped):
-        counts[drop.reason, drop.unit] = counts.get((drop.reason, drop.unit), 0) + drop.count
-    return PairSet(
-        tuple(pair for part in parts for pair in part),
-        f"{len(parts)} files ({listed((part.source for part in parts), 3)})",
-        tuple(Dropped(reason, count, unit) for (reason, unit), count in counts.items()),
-    )
+
+
+def _twice(source: str, name: str, part: PairSet, pair: Pair) -> str:
+    """Returns that a pair called `name` in one file stands in another one too."""
+    which = f"pair '{name}'"
+    if name != pair.pair_id:
+        which += f", there '{pair.pair_id}',"
+    return f"{source} and {part.source}: {which} stands in both files; leave it out of one of them"
 
 
 def _why(dropped: Sequence[Dropped]) -> str:
-    return (
-        f" (left out: {'; '.join(f'{d.count:,} {d.unit}: {d.reason}' for d in dropped)})"
-        if dropped
-        else ""
-    )
+    """Returns what was left out, in brackets; "" if nothing was."""
+    if not dropped:
+        return ""
+    reasons = [f"{drop.count:,} {drop.unit}: {drop.reason}" for drop in dropped]
+    return f" (left out: {'; '.join(reasons)})"
 
 
 def listed(values: Iterable[object], limit: int = 12) -> str:
     """Returns the values separated by commas, cut off after `limit` of them."""
     texts = [str(value) for value in values]
-    more = f", ... ({len(texts)} in all)" if len(texts) > limit else ""
-    return ", ".join(texts[:limit]) + more
+    text = ", ".join(texts[:limit])
+    if len(texts) > limit:
+        text += f", ... ({len(texts)} in all)"
+    return text
 
 
 def _select_recording(pairs: PairSet, recording: str) -> PairSet:
     known = list(dict.fromkeys(pair.recording for pair in pairs))
     if recording not in known:
         raise DataError(
-            f"data.recording={recording}: {pairs.source} has no such recording.{nearest(recording, known)}"
-            f" Known: {listed(known)}."
+            f"data.recording={recording}: {pairs.source} has no such recording."
+            f"{nearest(recording, known)} Known: {listed(known)}."
         )
-    return pairs.select(
-        [pair.recording == recording for pair in pairs], f"other recordings than '{recording}'"
-    )
+    kept = [pair.recording == recording for pair in pairs]
+    return pairs.select(kept, f"other recordings than '{recording}'")
 
 
 def _select_lanes(pairs: PairSet, lanes: Sequence[int]) -> PairSet:
     known = sorted({pair.lane for pair in pairs if pair.lane is not None})
     if not known:
         raise DataError(
-            f"data.lanes={list(lanes)}: {pairs.source} does not say in which lane its pairs are; leave data.lanes out"
+            f"data.lanes={list(lanes)}: {pairs.source} does not say in which lane its pairs are;"
+            " leave data.lanes out"
         )
-    strange = [lane for lane in lanes if lane not in known]
-    if strange or not lanes:
+    if not lanes or not set(lanes) <= set(known):
         raise DataError(
-            f"data.lanes={list(lanes)}: {pairs.source} has pairs in lanes {listed(known)} only; choose among these"
+            f"data.lanes={list(lanes)}: {pairs.source} has pairs in lanes {listed(known)} only;"
+            " choose among these"
         )
-    return pairs.select(
-        [pair.lane in lanes for pair in pairs], f"in other lanes than {listed(sorted(set(lanes)))}"
-    )
+    kept = [pair.lane in lanes for pair in pairs]
+    return pairs.select(kept, f"in other lanes than {listed(sorted(set(lanes)))}")
 
 
 def _select_ids(pairs: PairSet, wanted: Sequence[str]) -> PairSet:
     known = [pair.pair_id for pair in pairs]
-    strange = [name for name in wanted if name not in known]
-    if strange or not wanted:
-        what = (
-            f"there is no pair '{strange[0]}'.{nearest(strange[0], known)}"
-            if strange
-            else "the list is empty."
-        )
+    what = ""
+    if not wanted:
+        what = "the list is empty."
+    for name in wanted:
+        if name not in known:
+            what = f"there is no pair '{name}'.{nearest(name, known)}"
+            break
+    if what:
         raise DataError(
             f"data.pair_ids={list(wanted)}: {pairs.source}: {what} Known: {listed(known)}."
         )
@@ -240,14 +277,13 @@ def _select_ids(pairs: PairSet, wanted: Sequence[str]) -> PairSet:
 
 
 def _select_long(pairs: PairSet, min_frames: int) -> PairSet:
-    long = pairs.select(
-        [len(pair) >= min_frames for pair in pairs], f"shorter than {min_frames} frames"
-    )
+    kept = [len(pair) >= min_frames for pair in pairs]
+    long = pairs.select(kept, f"shorter than {min_frames} frames")
     if not len(long):
-        longest: Pair = max(pairs, key=len)
+        longest = max(len(pair) for pair in pairs)
         raise DataError(
-            f"{pairs.source}: none of its {len(pairs)} pairs has at least {min_frames} frames, the longest has {len(longest)};"
-            f" lower data.min_frames"
+            f"{pairs.source}: none of its {len(pairs)} pairs has at least {min_frames} frames, the"
+            f" longest has {longest}; lower data.min_frames"
         )
     return long
 
@@ -257,10 +293,12 @@ def _select_first(pairs: PairSet, settings: DatasetSettings) -> PairSet:
     if wanted is None or len(pairs) == wanted:
         return pairs
     if len(pairs) < wanted:
+        where = ""
+        if settings.recording or settings.lanes:
+            where = " in the selected recording and lanes"
         raise DataError(
-            f"{pairs.source}: asked for {wanted} pairs but only {len(pairs)} have at least {settings.min_frames} frames"
-            f"{' in the selected recording and lanes' if settings.recording or settings.lanes else ''};"
-            " lower data.max_pairs or data.min_frames"
+            f"{pairs.source}: asked for {wanted} pairs but only {len(pairs)} have at least"
+            f" {settings.min_frames} frames{where}; lower data.max_pairs or data.min_frames"
         )
     beyond = Dropped(f"beyond max_pairs ({wanted})", len(pairs) - wanted)
     return replace(pairs, pairs=pairs.pairs[:wanted], dropped=(*pairs.dropped, beyond))

@@ -1,9 +1,10 @@
-"""Downloads the I-80 recordings of NGSIM from the U.S. Department of Transportation's open-data service.
+"""Downloads NGSIM's recordings of I-80 from the U.S. Department of Transportation's open data.
 
-The service speaks SODA: https://dev.socrata.com/docs/queries. A query's rows come in pages, sorted by the service's own row id
-(`$order=:id`), so that a download that was broken off goes on with the pages that it lacks. `requests` with urllib3's `Retry`
-fits better than a downloader of whole files such as pooch: a page counts only if it holds the right number of rows, and a busy
-service (429, 503) says itself how long to wait.
+The service speaks SODA: https://dev.socrata.com/docs/queries. A query's rows come in pages, sorted
+by the service's own row id (`$order=:id`), so that a download that was broken off goes on with the
+pages that it lacks. `requests` with urllib3's `Retry` fits better than a downloader of whole files
+such as pooch: a page counts only if it holds the right number of rows, and a busy service (429,
+503) says itself how long to wait.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import csv
 import io
 import json
 import logging
+import math
 import os
 import re
 import shutil
@@ -24,6 +26,7 @@ from urllib.parse import urlsplit
 
 from filelock import FileLock, Timeout
 
+from cfx.datasets.ngsim_file import LAYOUTS
 from cfx.errors import ConfigError, DataError, OutputError
 from cfx.files import atomic_write
 from cfx.progress import Task
@@ -40,49 +43,36 @@ PAGE_ROWS = 50_000
 """Rows asked for at once: the most that every version of the service's interface gives."""
 
 TOKEN = "SOCRATA_APP_TOKEN"  # noqa: S105 - the name of the environment variable
-"""With an application token in this environment variable the service lets one ask more often; it is not needed."""
+"""Environment variable for an application token, with which the service lets one ask more often.
 
-COLUMNS = (
-    *(
-        "Vehicle_ID",
-        "Frame_ID",
-        "Total_Frames",
-        "Global_Time",
-        "Local_X",
-        "Local_Y",
-        "Global_X",
-        "Global_Y",
-    ),
-    *(
-        "v_Length",
-        "v_Width",
-        "v_Class",
-        "v_Vel",
-        "v_Acc",
-        "Lane_ID",
-        "Preceding",
-        "Following",
-        "Space_Headway",
-    ),
-    *("Time_Headway", "Location"),
-)
+It is not needed.
+"""
+
+COLUMNS = (*LAYOUTS[18], "Location")
 """NGSIM's columns for a highway; the service writes them in small letters."""
 
 _QUARTER_MS = 900_000
 _START_MS = {"0400": 1_113_433_200_000, "0500": 1_113_436_800_000, "0515": 1_113_437_700_000}
-"""When the recordings begin, as `Global_Time` counts: 4:00, 5:00 and 5:15 pm in California on 13 April 2005."""
+"""When the recordings begin, as `Global_Time` counts.
+
+It is 4:00, 5:00 and 5:15 pm in California on 13 April 2005.
+"""
 
 RECORDINGS = (*_START_MS, "all")
 
-_BEFORE_MS, _AFTER_MS = (
-    180_000,
-    300_000,
-)  # recordings start up to a minute early, and follow the last vehicles out of the picture
+_BEFORE_MS, _AFTER_MS = 180_000, 300_000
+"""Margins around a recording: it may start a minute early, and follows the last vehicles out."""
+
 _EDGE_MS = 1_000
+"""Rows so close to the margin's end mean that the recording may go on beyond it."""
+
 _TRIES = 3
 _TIMEOUTS = (15.0, 180.0)
+"""To connect and to wait for an answer, s."""
+
 _LONGEST_WAIT_S = 300
-_BUSY = (202, 429, 500, 502, 503, 504)  # 202: the service is still working on the answer
+_BUSY = (202, 429, 500, 502, 503, 504)
+"""Answers of a busy service; 202: it is still working on the answer."""
 
 
 @dataclass(frozen=True)
@@ -90,8 +80,11 @@ class Query:
     """What is asked of the service; a download goes on only where it is the same.
 
     Attributes:
+        url: of the data set.
         where: SoQL's filter of rows.
         rows: how many rows the service has for it.
+        page_rows: rows of a page.
+        columns: what is asked for.
     """
 
     url: str
@@ -102,10 +95,10 @@ class Query:
 
     def pages(self) -> list[tuple[int, int]]:
         """Returns `(offset, rows)` of each page."""
-        return [
-            (first, min(self.page_rows, self.rows - first))
-            for first in range(0, self.rows, self.page_rows)
-        ]
+        pages = []
+        for first in range(0, self.rows, self.page_rows):
+            pages.append((first, min(self.page_rows, self.rows - first)))
+        return pages
 
 
 class Service:
@@ -114,7 +107,8 @@ class Service:
     Args:
         url: address of the data set, ending in `.csv`.
         kept: where pages lie, for messages.
-        wait_s: seconds before the second attempt at a busy service that does not say how long to wait; doubled each time.
+        wait_s: seconds before the second attempt at a busy service that does not say how long to
+            wait; doubled each time.
     """
 
     def __init__(self, url: str, kept: Path, wait_s: float) -> None:
@@ -140,7 +134,8 @@ class Service:
         """Returns a page, a CSV of `rows` rows and a header.
 
         Raises:
-            DataError: the service cannot be reached, or has not sent the page whole after three attempts.
+            DataError: the service cannot be reached, or has not sent the page whole after three
+                attempts.
         """
         asked = {
             "$select": ",".join(query.columns).lower(),
@@ -159,8 +154,8 @@ class Service:
             if found == rows and all(len(row) == len(query.columns) for row in table):
                 return text
         raise DataError(
-            f"{self.name} sent {found} instead of {rows} rows from row {offset} on, {_TRIES} times; run the same command later:"
-            f" the pages in {self._kept} are kept"
+            f"{self.name} sent {found} instead of {rows} rows from row {offset} on, {_TRIES} times;"
+            f" run the same command later: the pages in {self._kept} are kept"
         )
 
     def close(self) -> None:
@@ -168,44 +163,51 @@ class Service:
         self._session.close()
 
     def _get(self, asked: dict[str, str]) -> str:
+        """Returns the service's answer to a query; raises DataError where it gives none."""
+        answer = self._answer(asked)
+        if answer.status_code in _BUSY:
+            raise self._unreachable(
+                f"it answers {answer.status_code} {answer.reason}, again and again"
+            )
+        if not answer.ok:
+            raise DataError(
+                f"{self.name} refuses the query ({_complaint(answer)});"
+                f" is {self.url} the data set's address?"
+            )
+        return answer.content.decode("utf-8-sig", errors="replace")
+
+    def _answer(self, asked: dict[str, str]) -> Response:
+        """Asks, and asks again if the connection breaks in the middle of a page."""
         from requests import RequestException
         from requests.exceptions import ChunkedEncodingError, ContentDecodingError
 
-        for attempt in range(_TRIES):
+        for attempt in range(1, _TRIES + 1):
             try:
-                answer = self._session.get(self.url, params=asked, timeout=_TIMEOUTS)
-            except (
-                ChunkedEncodingError,
-                ContentDecodingError,
-            ) as error:  # the connection broke in the middle of a page
-                if attempt == _TRIES - 1:
+                return self._session.get(self.url, params=asked, timeout=_TIMEOUTS)
+            except (ChunkedEncodingError, ContentDecodingError) as error:
+                if attempt == _TRIES:
                     raise self._unreachable(_reason(error)) from None
             except RequestException as error:
                 raise self._unreachable(_reason(error)) from None
-            else:
-                if answer.status_code in _BUSY:
-                    raise self._unreachable(
-                        f"it answers {answer.status_code} {answer.reason}, again and again"
-                    )
-                if not answer.ok:
-                    raise DataError(
-                        f"{self.name} refuses the query ({_complaint(answer)}); is {self.url} the data set's address?"
-                    )
-                return answer.content.decode("utf-8-sig", errors="replace")
         raise AssertionError("unreachable")
 
     def _unreachable(self, reason: str) -> DataError:
-        kept = f" (the pages in {self._kept} are kept)" if any(self._kept.glob("*.csv")) else ""
+        kept = ""
+        if any(self._kept.glob("*.csv")):
+            kept = f" (the pages in {self._kept} are kept)"
         return DataError(
-            f"{self.name} cannot be reached: {reason}; run the same command again when it can{kept}, or download {BY_HAND} by"
-            " hand and use data=ngsim data.path=FILE data.location=i-80"
+            f"{self.name} cannot be reached: {reason}; run the same command again when it"
+            f" can{kept}, or download {BY_HAND} by hand and use data=ngsim data.path=FILE data.location=i-80"
         )
 
     def _nonsense(self, wanted: str, table: Sequence[Sequence[str]]) -> DataError:
-        begins = ",".join(table[0])[:60] if table else "nothing"
+        begins = "nothing"
+        if table:
+            begins = ",".join(table[0])[:60]
         return DataError(
-            f"{self.name} answered with something else than {wanted}: '{begins}'; is {self.url} the data set's address, and does"
-            " a proxy or a log-in page stand between?"
+            f"{self.name} answered with something else than {wanted}: '{begins}';"
+            f" is {self.url} the data set's address, and does a proxy or a log-in page stand"
+            " between?"
         )
 
 
@@ -218,10 +220,13 @@ def fetch_ngsim_i80(
     page_rows: int = PAGE_ROWS,
     wait_s: float = 1.0,
 ) -> Path:
-    """Downloads a recording of I-80, or all three, into one CSV file in NGSIM's layout; a finished one is left alone.
+    """Downloads a recording of I-80, or all three, into one CSV file in NGSIM's layout.
+
+    A finished file is left alone.
 
     Args:
-        folder: where the file, and its pages until it is finished, are put; made if it is not there.
+        folder: where the file, and its pages until it is finished, are put; made if it is not
+            there.
         recording: one of `RECORDINGS`.
         url: of the data set, another one for a mirror.
         force: download again, and replace a finished file.
@@ -233,7 +238,8 @@ def fetch_ngsim_i80(
 
     Raises:
         ConfigError: `recording` or `url` is none.
-        DataError: the service cannot be reached, or sent something else; the pages that came are kept.
+        DataError: the service cannot be reached, or sent something else; the pages that came are
+            kept.
         OutputError: the folder cannot be written.
     """
     if recording not in RECORDINGS:
@@ -259,7 +265,10 @@ def fetch_ngsim_i80(
 
 
 def _where(recording: str) -> str:
-    """Returns the filter of a recording's rows, with margins: overlapping recordings are told apart afterwards."""
+    """Returns the filter of a recording's rows, with margins.
+
+    Overlapping recordings are told apart afterwards.
+    """
     if recording == "all":
         return "location='i-80'"
     first, last = _window(recording)
@@ -275,12 +284,17 @@ def _fetch_pages(service: Service, query: Query, kept: Path) -> None:
     """Downloads the pages that are not there yet."""
     _start_over_if_changed(query, kept)
     pages = query.pages()
-    missing = [
-        (offset, rows) for offset, rows in pages if not _is_whole(_page(kept, offset), query, rows)
-    ]
-    here = f", {len(pages) - len(missing)} are here already" if len(missing) < len(pages) else ""
+    missing = []
+    missing_rows = 0
+    for offset, rows in pages:
+        if not _is_whole(_page(kept, offset), query, rows):
+            missing.append((offset, rows))
+            missing_rows += rows
+    here = ""
+    if len(missing) < len(pages):
+        here = f", {len(pages) - len(missing)} are here already"
     log.info("%s: %s rows in %s pages%s", service.name, f"{query.rows:,}", len(pages), here)
-    with Task(f"downloading from {service.name}", sum(rows for _, rows in missing)) as task:
+    with Task(f"downloading from {service.name}", missing_rows) as task:
         for offset, rows in missing:
             text = service.page(query, offset, rows)
             with atomic_write(_page(kept, offset)) as partial:
@@ -292,15 +306,16 @@ def _check_unchanged(service: Service, query: Query) -> None:
     now = service.count(query.where)
     if now != query.rows:
         raise DataError(
-            f"{service.name} had {query.rows} rows when the download began and has {now} now; run the same command again"
+            f"{service.name} had {query.rows} rows when the download began and has {now} now;"
+            " run the same command again"
         )
 
 
 def _start_over_if_changed(query: Query, kept: Path) -> None:
     """Drops pages of another query, or of the same one when the service had other rows."""
-    note, now = kept / "query.json", json.dumps(asdict(query))
-    before = note.read_text(encoding="utf-8") if note.is_file() else ""
-    if before == now:
+    note = kept / "query.json"
+    now = json.dumps(asdict(query))
+    if note.is_file() and note.read_text(encoding="utf-8") == now:
         return
     old = list(kept.glob("*.csv"))
     if old:
@@ -324,39 +339,39 @@ def _is_whole(page: Path, query: Query, rows: int) -> bool:
 
 def _join(kept: Path, query: Query, path: Path, recording: str) -> int:
     """Writes the pages' rows that are of the recording to one file; returns their number."""
-    written, earliest, latest = 0, float("inf"), 0.0
+    written = 0
+    earliest, latest = math.inf, 0.0
     with atomic_write(path) as partial, partial.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
         for offset, _ in query.pages():
-            for row in _table(_page(kept, offset).read_text(encoding="utf-8"))[1:]:
+            rows = _table(_page(kept, offset).read_text(encoding="utf-8"))
+            for row in rows[1:]:
                 clock, of = _recording(row)
                 if recording in (of, "all"):
                     writer.writerow(row)
-                    written, earliest, latest = (
-                        written + 1,
-                        min(earliest, clock),
-                        max(latest, clock),
-                    )
+                    written += 1
+                    earliest = min(earliest, clock)
+                    latest = max(latest, clock)
         _check_margins(recording, written, earliest, latest)
     return written
 
 
 def _recording(row: Sequence[str]) -> tuple[float, str]:
-    """Returns a row's time, in ms, and its recording: the one whose beginning its frame 0 is next to.
+    """Returns a row's time, in ms, and its recording: the one that begins next to its frame 0.
 
-    The time alone would not do: vehicles of one recording are still followed when the next has begun.
+    The time alone would not do: vehicles of one recording are still followed when the next has
+    begun.
     """
     try:
-        frame, clock = (
-            float(row[COLUMNS.index("Frame_ID")]),
-            float(row[COLUMNS.index("Global_Time")]),
-        )
+        frame = float(row[COLUMNS.index("Frame_ID")])
+        clock = float(row[COLUMNS.index("Global_Time")])
     except ValueError:
         raise DataError(
             f"the service sent a row without a frame or a time: {','.join(row)}"
         ) from None
-    return clock, min(_START_MS, key=lambda name: abs(clock - 100 * frame - _START_MS[name]))
+    start = clock - 100 * frame
+    return clock, min(_START_MS, key=lambda name: abs(start - _START_MS[name]))
 
 
 def _check_margins(recording: str, rows: int, earliest: float, latest: float) -> None:
@@ -376,9 +391,10 @@ def _table(text: str) -> list[list[str]]:
 
 
 def _has_columns(table: Sequence[Sequence[str]], columns: Sequence[str]) -> bool:
-    return bool(table) and [name.strip().lower() for name in table[0]] == [
-        name.lower() for name in columns
-    ]
+    if not table:
+        return False
+    found = [name.strip().lower() for name in table[0]]
+    return found == [name.lower() for name in columns]
 
 
 def _session(wait_s: float) -> Session:
@@ -406,15 +422,25 @@ def _session(wait_s: float) -> Session:
 def _reason(error: BaseException) -> str:
     """Returns the innermost reason of an error of requests, without its objects' addresses."""
     inner: BaseException = error
-    while True:
-        deeper = getattr(inner, "reason", None) or next(
-            (one for one in inner.args if isinstance(one, BaseException)), None
-        )
-        if not isinstance(deeper, BaseException):
-            break
+    deeper: BaseException | None = error
+    while deeper is not None:
         inner = deeper
+        deeper = _cause(inner)
     text = " ".join(str(inner).split()) or type(inner).__name__
     return re.sub(r"^\w+\(.*?\): ", "", text)[:200]
+
+
+def _cause(error: BaseException) -> BaseException | None:
+    """Returns the error that another one carries; None if it carries none."""
+    reason = getattr(error, "reason", None)
+    if reason:
+        if isinstance(reason, BaseException):
+            return reason
+        return None
+    for argument in error.args:
+        if isinstance(argument, BaseException):
+            return argument
+    return None
 
 
 def _complaint(answer: Response) -> str:
@@ -434,7 +460,8 @@ def _writing(folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise OutputError(
-            f"{error.filename or folder} cannot be written ({error.strerror or error}); name another --folder"
+            f"{error.filename or folder} cannot be written ({error.strerror or error});"
+            " name another --folder"
         ) from error
 
 

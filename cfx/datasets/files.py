@@ -25,10 +25,22 @@ from cfx.errors import DataError
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_GZIP, _ZIP, PARQUET = b"\x1f\x8b", b"PK\x03\x04", b"PAR1"
+_GZIP = b"\x1f\x8b"
+_ZIP = b"PK\x03\x04"
+PARQUET = b"PAR1"
+"""First bytes of files."""
+
 _HEAD = 1 << 16
+"""Bytes that are looked at before a file is read."""
+
 _BLOCK = 1 << 22
+"""Bytes that are read at once."""
+
+_UTF16 = (b"\xff\xfe", b"\xfe\xff")
+_UTF8_MARK = b"\xef\xbb\xbf"
 _OTHER_SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "vertical bars"}
+_ABSENT = ("", "nan", "na", "null", "none", "n/a", "#n/a")
+"""Cells that stand for no number, in small letters."""
 
 
 class Labels(NamedTuple):
@@ -55,7 +67,9 @@ class TextTable:
 
     def row(self, index: int | np.integer[Any]) -> int:
         """Returns the row number that an editor shows for the data row `index` (from 0)."""
-        return int(index) + (1 if self.header is None else 2)
+        if self.header is None:
+            return int(index) + 1
+        return int(index) + 2
 
 
 def magic(path: Path) -> bytes:
@@ -65,7 +79,9 @@ def magic(path: Path) -> bytes:
         DataError: the file is missing, a folder, unreadable or empty.
     """
     if not path.exists():
-        where = "" if path.parent.is_dir() else f" (nor is there a folder {path.parent})"
+        where = ""
+        if not path.parent.is_dir():
+            where = f" (nor is there a folder {path.parent})"
         raise DataError(f"{path}: no such file{where}; set data.path to the file to read")
     if path.is_dir():
         raise DataError(f"{path}: is a folder; set data.path to one file in it")
@@ -86,62 +102,76 @@ def open_text(path: Path) -> BinaryIO:
     start = magic(path)
     if start.startswith(_ZIP):
         raise DataError(f"{path}: is a zip archive; unpack it and set data.path to the file inside")
-    return cast(BinaryIO, gzip.open(path, "rb")) if start.startswith(_GZIP) else path.open("rb")
+    if start.startswith(_GZIP):
+        return cast(BinaryIO, gzip.open(path, "rb"))
+    return path.open("rb")
 
 
 def sniff(path: Path) -> TextTable:
     """Looks at the beginning of a text file.
 
     Raises:
-        DataError: it is no text, not in UTF-8, or its columns are separated by neither commas nor white space.
+        DataError: it is no text, not in UTF-8, or its columns are separated by neither commas nor
+            white space.
     """
     with open_text(path) as file:
         head = _guarded(path, lambda: file.read(_HEAD))
-    if head.startswith((b"\xff\xfe", b"\xfe\xff")):
+    if head.startswith(_UTF16):
         raise DataError(f"{path}: is in UTF-16; save it as UTF-8")
-    text = _decoded(path, head)
-    first = next((line for line in text.splitlines() if line.strip()), "")
+    first = ""
+    for line in _decoded(path, head).splitlines():
+        if line.strip():
+            first = line
+            break
     if not first:
         raise DataError(f"{path}: the file holds no rows")
-    has_header = any(
-        character.isalpha() for character in first.lower().replace("e+", "").replace("e-", "")
-    )
+    exponents_removed = first.lower().replace("e+", "").replace("e-", "")
+    has_header = any(character.isalpha() for character in exponents_removed)
+    delimiter = " "
+    names = first.split()
+    if "," in first:
+        delimiter = ","
+        names = _comma_separated(first)
+    else:
+        _refuse_other_separators(path, first, has_header=has_header)
+    header = None
+    if has_header:
+        header = tuple(names)
+    return TextTable(path, delimiter, header, len(names))
+
+
+def _comma_separated(line: str) -> list[str]:
+    """Returns the cells of one line of CSV."""
+    options = pa.csv.ReadOptions(autogenerate_column_names=True)
+    table = pa.csv.read_csv(io.BytesIO(line.encode() + b"\n"), read_options=options)
+    (row,) = table.to_pylist()
+    return [str(cell).strip() for cell in row.values()]
+
+
+def _refuse_other_separators(path: Path, line: str, *, has_header: bool) -> None:
+    """Raises DataError for a line whose columns neither commas nor white space separate."""
     for separator, plural in _OTHER_SEPARATORS.items():
-        if "," not in first and separator in first and (has_header or separator != "\t"):
+        is_white_space = separator == "\t" and not has_header
+        if separator in line and not is_white_space:
             raise DataError(
                 f"{path}: the columns are separated by {plural}; write the file with commas"
             )
-    if "," in first:
-        cells = next(
-            iter(pa.csv.read_csv(_one_line(first), read_options=_no_names()).to_pylist())
-        ).values()
-        names = tuple(str(cell).strip() for cell in cells)
-        return TextTable(path, ",", names if has_header else None, len(names))
-    names = tuple(first.split())
-    return TextTable(path, " ", names if has_header else None, len(names))
-
-
-def _one_line(line: str) -> io.BytesIO:
-    return io.BytesIO(line.encode() + b"\n")
-
-
-def _no_names() -> Any:
-    return pa.csv.ReadOptions(autogenerate_column_names=True)
 
 
 def _decoded(path: Path, head: bytes) -> str:
-    control = sum(byte < 32 and byte not in b"\t\n\r\f" for byte in head)
+    """Returns the beginning of a file as text; raises DataError if it is none."""
+    is_binary = any(byte < 32 and byte not in b"\t\n\r\f" for byte in head)
     try:
         text = head.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        if (
-            error.start < len(head) - 4
-        ):  # a character cut in two at the end of the block is none of the file's faults
-            control = len(head)
+        # A character that the end of the block cuts in two is none of the file's faults.
+        if error.start < len(head) - 4:
+            is_binary = True
         text = head.decode("utf-8-sig", errors="ignore")
-    if control:
+    if is_binary:
         raise DataError(
-            f"{path}: is a binary file, not text; give a CSV or text file (gzip is fine), or parquet for data=tidy"
+            f"{path}: is a binary file, not text; give a CSV or text file (gzip is fine),"
+            " or parquet for data=tidy"
         )
     return text
 
@@ -157,7 +187,10 @@ def _guarded(path: Path, read: Callable[[], Any]) -> Any:
 
 
 class _Lines(io.RawIOBase):
-    """Feeds pyarrow: whole lines, white space turned into commas where that separates the columns."""
+    """Feeds pyarrow whole lines.
+
+    White space is turned into commas where it separates the columns.
+    """
 
     def __init__(self, table: TextTable) -> None:
         super().__init__()
@@ -165,7 +198,7 @@ class _Lines(io.RawIOBase):
         self._file = open_text(table.path)
         self._rest = b""
         self._ready = b""
-        self._fresh = True
+        self._is_first = True
 
     def readable(self) -> bool:
         return True
@@ -186,14 +219,16 @@ class _Lines(io.RawIOBase):
         return size
 
     def _take(self, block: bytes) -> None:
-        cut = block.rfind(b"\n") + 1 if block else 0
-        text, self._rest = (
-            (self._rest + block[:cut], block[cut:]) if cut else (self._rest + block, b"")
-        )
-        if block and not cut:  # no line ends in this block: wait for more
-            text, self._rest = b"", text
-        if text and self._fresh:
-            text, self._fresh = text.removeprefix(b"\xef\xbb\xbf"), False
+        """Makes the whole lines of what was read ready, and keeps the rest; b"" ends the file."""
+        everything = self._rest + block
+        end = len(everything)
+        if block:
+            end = everything.rfind(b"\n") + 1  # 0 where no line ends: wait for more
+        text = everything[:end]
+        self._rest = everything[end:]
+        if text and self._is_first:
+            text = text.removeprefix(_UTF8_MARK)
+            self._is_first = False
         if self._table.delimiter == " ":
             text = b"".join(b",".join(line.split()) + b"\n" for line in text.splitlines())
         self._ready = text
@@ -205,25 +240,28 @@ def read_columns(
     """Reads the columns wanted, and only these.
 
     Args:
-        numbers: name to report -> position of each column of numbers. Thousands separators ("1,113,433") are understood.
+        numbers: name to report -> position of each column of numbers. Thousands separators
+            ("1,113,433") are understood.
         labels: name -> position of each column of text.
 
     Returns:
-        Columns `(N,)`; an empty or NaN cell is NaN, or code -1. All have the same length, which may be 0.
+        Columns `(N,)`; an empty or NaN cell is NaN, or code -1. All have the same length, which may
+        be 0.
 
     Raises:
-        DataError: a row has another number of columns, or a cell that should be a number is none: with row and column.
+        DataError: a row has another number of columns, or a cell that should be a number is none:
+            with row and column.
     """
     try:
         batches = _batches(table, numbers, labels, pa.float64())
-    except (
-        pa.ArrowInvalid
-    ):  # some cell is no plain number: read these columns as text and look closer
+    except pa.ArrowInvalid:
+        # Some cell is no plain number: read these columns as text and look closer.
         batches = _batches(table, numbers, labels, pa.string())
-    columns = {name: batches.column(f"c{at}") for name, at in (*numbers.items(), *labels.items())}
-    return {name: _as_floats(table, name, columns[name]) for name in numbers}, {
-        name: as_labels(columns[name]) for name in labels
-    }
+    values = {}
+    for name, at in numbers.items():
+        values[name] = _as_floats(table, name, batches.column(f"c{at}"))
+    texts = {name: as_labels(batches.column(f"c{at}")) for name, at in labels.items()}
+    return values, texts
 
 
 def _batches(
@@ -236,32 +274,33 @@ def _batches(
         broken.append(row)
         return "error"
 
-    types = {f"c{at}": number_type for at in numbers.values()} | {
-        f"c{at}": pa.dictionary(pa.int32(), pa.string()) for at in labels.values()
-    }
+    types = {f"c{at}": number_type for at in numbers.values()}
+    for at in labels.values():
+        types[f"c{at}"] = pa.dictionary(pa.int32(), pa.string())
+    read_options = pa.csv.ReadOptions(
+        # One thread: only then does pyarrow know the number of a broken row.
+        use_threads=False,
+        block_size=_BLOCK,
+        column_names=[f"c{at}" for at in range(table.width)],
+        skip_rows=int(table.header is not None),
+    )
+    parse_options = pa.csv.ParseOptions(invalid_row_handler=note)
+    convert_options = pa.csv.ConvertOptions(column_types=types, include_columns=list(types))
     try:
         with _Lines(table) as lines, pa.PythonFile(lines, mode="r") as file:
             reader = pa.csv.open_csv(
                 file,
-                read_options=pa.csv.ReadOptions(
-                    # One thread: only then does pyarrow know the number of a broken row.
-                    use_threads=False,
-                    block_size=_BLOCK,
-                    column_names=[f"c{at}" for at in range(table.width)],
-                    skip_rows=0 if table.header is None else 1,
-                ),
-                parse_options=pa.csv.ParseOptions(invalid_row_handler=note),
-                convert_options=pa.csv.ConvertOptions(
-                    column_types=types, include_columns=list(types)
-                ),
+                read_options=read_options,
+                parse_options=parse_options,
+                convert_options=convert_options,
             )
             return reader.read_all()
     except pa.ArrowInvalid as error:
         if broken:
             row = broken[0]
             raise DataError(
-                f"{table.path}, row {row.number}: {row.actual_columns} columns instead of {table.width}; is the file cut off"
-                " there, or does a cell hold a separator?"
+                f"{table.path}, row {row.number}: {row.actual_columns} columns instead of"
+                f" {table.width}; is the file cut off there, or does a cell hold a separator?"
             ) from None
         if number_type == pa.string():
             raise DataError(f"{table.path}: cannot be read as a table ({error})") from None
@@ -269,18 +308,19 @@ def _batches(
 
 
 def _as_floats(table: TextTable, name: str, column: Any) -> Floats:
+    def complaint(index: int, cell: str) -> str:
+        where = f"{table.path}, row {table.row(index)}, column {name}"
+        return f"{where}: '{cell}' is not a number; correct it"
+
     if pa.types.is_floating(column.type):
         return cast(Floats, column.to_numpy().astype(np.float64, copy=False))
-    return parsed(
-        column,
-        lambda index, cell: (
-            f"{table.path}, row {table.row(index)}, column {name}: '{cell}' is not a number; correct it"
-        ),
-    )
+    return parsed(column, complaint)
 
 
 def parsed(column: Any, complaint: Callable[[int, str], str]) -> Floats:
-    """Turns a pyarrow column of text into numbers `(N,)`, reading "1,234" as 1234 and an empty cell as NaN.
+    """Turns a pyarrow column of text into numbers `(N,)`.
+
+    "1,234" is read as 1234, and an empty cell as NaN.
 
     Raises:
         DataError: a cell is no number; `complaint(index, cell)` is the message.
@@ -289,7 +329,7 @@ def parsed(column: Any, complaint: Callable[[int, str], str]) -> Floats:
     values: Floats = pd.to_numeric(text, errors="coerce").to_numpy(
         dtype=np.float64, na_value=np.nan
     )
-    absent = text.isna() | text.str.lower().isin(["", "nan", "na", "null", "none", "n/a", "#n/a"])
+    absent = text.isna() | text.str.lower().isin(_ABSENT)
     wrong = np.flatnonzero(np.isnan(values) & ~absent.to_numpy(dtype=bool))
     if len(wrong):
         raise DataError(complaint(int(wrong[0]), column[int(wrong[0])].as_py()))
@@ -297,30 +337,36 @@ def parsed(column: Any, complaint: Callable[[int, str], str]) -> Floats:
 
 
 def as_labels(column: Any) -> Labels:
-    """Turns a pyarrow column of text into codes and names; names keep the order in which they first appear."""
-    encoded = (
-        column
-        if pa.types.is_dictionary(column.type)
-        else pc.dictionary_encode(column.cast(pa.string()))
-    )
-    encoded = (
-        encoded.unify_dictionaries().combine_chunks()
-        if isinstance(encoded, pa.ChunkedArray)
-        else encoded
-    )
+    """Turns a pyarrow column of text into codes and names.
+
+    Names keep the order in which they first appear.
+    """
+    encoded = column
+    if not pa.types.is_dictionary(column.type):
+        encoded = pc.dictionary_encode(column.cast(pa.string()))
+    if isinstance(encoded, pa.ChunkedArray):
+        encoded = encoded.unify_dictionaries().combine_chunks()
     if isinstance(encoded, pa.ChunkedArray):  # no chunk at all
         return Labels(np.zeros(0, np.int64), [])
-    written = [str(name).strip() for name in encoded.dictionary.to_pylist()]
-    merged, names = pd.factorize(
-        np.array([name or None for name in written], dtype=object)
-    )  # an empty name has code -1
+    written: list[str | None] = []
+    for name in encoded.dictionary.to_pylist():
+        written.append(str(name).strip() or None)
+    merged, names = pd.factorize(np.array(written, dtype=object))  # an empty name has code -1
     codes = pc.fill_null(encoded.indices, len(written)).to_numpy(zero_copy_only=False)
     return Labels(np.append(merged, -1).astype(np.int64)[codes], list(names))
 
 
 def bad_cells(values: Floats) -> tuple[int, int, str] | None:
-    """Returns (index of the first cell that is no finite number, how many, what it is), or None if all are finite."""
+    """Returns what is wrong with a column of numbers.
+
+    Returns:
+        The index of the first cell that is no finite number, how many such cells there are, and
+        what that one is; None if all are finite.
+    """
     wrong = np.flatnonzero(~np.isfinite(values))
     if not len(wrong):
         return None
-    return int(wrong[0]), len(wrong), "empty or NaN" if np.isnan(values[wrong[0]]) else "infinite"
+    what = "infinite"
+    if np.isnan(values[wrong[0]]):
+        what = "empty or NaN"
+    return int(wrong[0]), len(wrong), what

@@ -19,7 +19,7 @@ import pytest
 
 from cfx import cli
 from cfx.datasets.fetch import COLUMNS, fetch_ngsim_i80
-from cfx.datasets.ngsim import read_ngsim
+from cfx.datasets.ngsim_file import read_ngsim
 from cfx.errors import CfxError, ConfigError, DataError, OutputError
 
 STARTS = {"0400": 1_113_433_200_000, "0500": 1_113_436_800_000, "0515": 1_113_437_700_000}

@@ -13,7 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cfx.datasets.describe import describe
-from cfx.datasets.ngsim import FOOT, NgsimDataset, read_ngsim
+from cfx.datasets.ngsim import NgsimDataset
+from cfx.datasets.ngsim_file import read_ngsim
+from cfx.datasets.ngsim_rows import FOOT
 from cfx.datasets.tidy import TidyDataset
 from cfx.errors import DataError
 from cfx.pairs import PairSet
@@ -350,7 +352,7 @@ def test_both_ends_of_every_vehicle_are_left_out_if_wanted(tmp_path: Path) -> No
     )
 
 
-def test_bent_ends_are_said_until_they_are_left_out(
+def test_boundary_artefacts_are_said_until_they_are_left_out(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     rows = pd.concat(
@@ -359,15 +361,15 @@ def test_bent_ends_are_said_until_they_are_left_out(
     )
     straight = save(rows, tmp_path / "straight.csv")
     rows.loc[rows.Frame_ID < 40, "v_Acc"] = 4.5
-    bent = save(rows, tmp_path / "bent.csv")
+    smoothed = save(rows, tmp_path / "smoothed.csv")
     with caplog.at_level("INFO"):
         NgsimDataset(path=straight, min_frames=2).load()
-        NgsimDataset(path=bent, min_frames=2, trim=3).load()
+        NgsimDataset(path=smoothed, min_frames=2, trim=3).load()
         assert not caplog.messages
-        NgsimDataset(path=bent, min_frames=2).load()
+        NgsimDataset(path=smoothed, min_frames=2).load()
     assert len(caplog.messages) == 1
     assert "accelerate by +1.4 and +0.2 m/s2 on average (+0.2 between)" in caplog.messages[0]
-    assert "data.trim=3" in describe(bent)
+    assert "data.trim=3" in describe(smoothed)
     assert "data.trim" not in describe(straight)
 
 
@@ -387,10 +389,10 @@ def test_raw_sample_has_142_pairs(raw: PairSet) -> None:
     assert {pair.recording for pair in raw} == {"i80_0400_raw_sample"}
 
 
-def test_raw_speeds_are_bent_for_three_seconds(shared_data: Path) -> None:
+def test_raw_speeds_have_artefacts_for_three_seconds(shared_data: Path) -> None:
     rows = read_ngsim(shared_data / "i80_0400_raw_sample.csv.gz")
-    assert "by +0.8 and -1.1 m/s2" in rows.bent()
-    assert rows.trimmed(3.0).bent() == ""
+    assert "by +0.8 and -1.1 m/s2" in rows.boundary_artefacts()
+    assert rows.trimmed(3.0).boundary_artefacts() == ""
 
 
 def test_raw_pairs_agree_with_their_reconstruction(raw: PairSet, shared_data: Path) -> None:
