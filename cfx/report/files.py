@@ -64,9 +64,10 @@ def read_pairs(path: Path, columns: Iterable[str]) -> pd.DataFrame:
         DataError: the file cannot be read, or lacks a column or the policy.
     """
     table = read_table(path, columns)
-    names = {str(number): name for number, name in enumerate(CLUSTERS)}
-    clusters = [str(value) for value in table["cluster"]]
-    table["cluster"] = [names.get(cluster, cluster) for cluster in clusters]
+    # Earlier versions wrote the clusters' numbers.
+    table["cluster"] = table["cluster"].astype(str)
+    for number, name in enumerate(CLUSTERS):
+        table["cluster"] = table["cluster"].replace(str(number), name)
     if "policy" not in set(table["method"]):
         raise DataError(f"{path} is damaged: it has no row of the method 'policy'")
     return table

@@ -40,7 +40,10 @@ def write_job(
     has_constant_baseline: bool = True,
     further: bool = False,
 ) -> dict[str, float | None]:
-    """Writes a job's folder; returns what its metrics.json holds. `further`: with safety, platoons and history."""
+    """Writes a job's folder; returns what its metrics.json holds.
+
+    `further`: with safety, platoons and history.
+    """
     made = make_results(
         pairs=pairs, frames=frames, space=space, seed=seed, epochs=12, methods=tuple(methods)
     )
@@ -162,7 +165,7 @@ def _completed(evaluation: Evaluation, methods: Sequence[str], cluster: str) -> 
 
 
 def _full_trajectory(values: pd.DataFrame) -> pd.DataFrame:
-    """Returns errors over full trajectories: those of the test part, some percent larger; none of `fixed`."""
+    """Returns errors over full trajectories: somewhat larger; none of `fixed`."""
     factors = {"default": 1.3, "population": 1.3, "policy": 1.1}
     errors = values["metric"].isin(["rmse_speed", "rmse_gap"]) & values["method"].isin(factors)
     found = values[errors].assign(scope="full_trajectory")

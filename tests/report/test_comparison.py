@@ -39,7 +39,7 @@ def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def cells(sheet: Sheet, job: str) -> dict[str, list[str]]:
-    """Returns the texts of a job's row by heading, the second lines with them; several columns of one name in one list."""
+    """Returns the texts of a job's row by heading, with the second lines."""
     (row,) = (row for row in sheet.rows if row[0].text == job)
     found: dict[str, list[str]] = {}
     for column, cell in zip(sheet.columns, row, strict=True):
@@ -52,10 +52,11 @@ def test_errors_of_all_jobs_stand_in_one_table_in_metres(sweep: Path) -> None:
     sheet = closeness(jobs)
     for job in jobs:
         row = cells(sheet, job.name)
-        expected = [
-            f"{job.metrics[f'{where}rmse_speed/policy']:.3f} {job.metrics[f'{where}rmse_gap/policy']:.2f}"
-            for where in ("", "full_trajectory/")
-        ]
+        expected = []
+        for where in ("", "full_trajectory/"):
+            speed = job.metrics[f"{where}rmse_speed/policy"]
+            gap = job.metrics[f"{where}rmse_gap/policy"]
+            expected.append(f"{speed:.3f} {gap:.2f}")
         assert row["policy"] == expected
         if job.has_constant_baseline:
             assert row["driver-specific"] == [
@@ -68,7 +69,7 @@ def test_errors_of_all_jobs_stand_in_one_table_in_metres(sweep: Path) -> None:
 
 
 def test_jobs_with_and_without_a_baseline_stand_in_one_report(tmp_path: Path) -> None:
-    """A shrunk set is a baseline of jobs that learn by rollout; those that imitate beside them have none."""
+    """A shrunk set is a baseline of jobs that learn by rollout alone."""
     write_job(tmp_path / "rollout", model="krauss", methods=(*ACROSS, "shrunk"), seed=0)
     write_job(tmp_path / "imitation", model="w99", methods=ACROSS, seed=1)
     runs = read_runs([str(tmp_path)])
@@ -184,7 +185,8 @@ def test_the_comparison_fits_a_laptop_and_sorts(
     page.set_viewport_size({"width": 1366, "height": 900})
     page.goto(path.as_uri())
     widths = page.evaluate(
-        "[...document.querySelectorAll('#comparison .scroll')].map(s => s.scrollWidth - s.clientWidth)"
+        "[...document.querySelectorAll('#comparison .scroll')]"
+        ".map(s => s.scrollWidth - s.clientWidth)"
     )
     assert set(widths) == {0}
     names = page.locator("#comparison .compact").first.locator("tbody td:first-child")

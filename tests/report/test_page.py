@@ -392,8 +392,8 @@ def test_the_papers_figures_stand_beside_those_of_its_experiments(
     )
     does = "fares better" if high > low else "fares no better"
     assert (
-        f"w99: the policy {does} with aggressive than conservative drivers here; better in the paper."
-        in page.words
+        f"w99: the policy {does} with aggressive than conservative drivers here;"
+        " better in the paper." in page.words
     )
 
 

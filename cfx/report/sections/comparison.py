@@ -243,7 +243,7 @@ def safety(jobs: Sequence[Job]) -> Sheet:
         for one in kept:
             cells.append(_with_baseline(job, one.metric, one.scope, one.baseline, one.form))
         rows.append(tuple(cells))
-    platoon = sum(one.platoon for one in kept)
+    platoon = len([one for one in kept if one.platoon])
     groups = [("", 1)]
     for title, count in ((_RECORDED, len(kept) - platoon), (_IN_PLATOON, platoon)):
         if count:

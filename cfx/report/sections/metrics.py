@@ -55,7 +55,9 @@ def all_metrics(job: Job) -> Sheet:
             frames = job.scope_label(scope)
             about = [text(metric_title(metric)), text(frames), text(metric.summary)]
             better = metric.direction if metric.direction != "none" else ""
-            cells = [_value(job.metric(metric.name, method, scope)) for method in methods]
+            cells = []
+            for method in methods:
+                cells.append(_value(job.metric(metric.name, method, scope)))
             meaning = metric.meaning
             if metric.distribution and not metric.distribution.startswith("cfx-driving"):
                 meaning += f" (of {metric.distribution})"

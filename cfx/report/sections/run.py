@@ -44,11 +44,16 @@ def facts(jobs: Sequence[Job]) -> tuple[list[tuple[str, str]], Sheet | None]:
             differing.append(name)
     if not differing:
         return common, None
-    columns = tuple(Column(name, number=False) for name in ("Job", *differing))
+    columns = [Column("Job", number=False)]
+    for name in differing:
+        columns.append(Column(name, number=False))
     rows = []
     for job, one in zip(jobs, every, strict=True):
-        rows.append((text(job.name), *(text(one.get(name, NOTHING)) for name in differing)))
-    return common, Sheet(columns, tuple(rows))
+        cells = [text(job.name)]
+        for name in differing:
+            cells.append(text(one.get(name, NOTHING)))
+        rows.append(tuple(cells))
+    return common, Sheet(tuple(columns), tuple(rows))
 
 
 def duration(seconds: float | None) -> str:
@@ -59,7 +64,9 @@ def duration(seconds: float | None) -> str:
     hours, minutes_left = divmod(minutes, 60)
     if hours:
         return f"{hours} h {minutes_left} min"
-    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
+    if minutes:
+        return f"{minutes} min {rest} s"
+    return f"{rest} s"
 
 
 def _facts(job: Job, jobs: Sequence[Job]) -> dict[str, str]:
@@ -110,7 +117,10 @@ def _typed(job: Job, jobs: Sequence[Job]) -> dict[str, str]:
     if len(jobs) == 1:
         return {"Command": shlex.join(["python", "-m", "cfx", *job.overrides])}
     shared = _shared_overrides(jobs)
-    own = [one for one in job.overrides if one not in shared]
+    own = []
+    for override in job.overrides:
+        if override not in shared:
+            own.append(override)
     return {
         "Command": f"{shlex.join(['python', '-m', 'cfx', *shared])} …",
         "Overrides of its own": shlex.join(own) or "none",

@@ -64,8 +64,10 @@ def safety_of_methods(jobs: Sequence[Job]) -> Sheet:
         Column("Job", number=False),
         Column("Driven by", "The method; real: the recorded drivers.", number=False),
     ]
-    columns += [Column(heading) for heading, _, _ in _COLUMNS]
-    platoon = sum(metric.startswith("platoon/") for _, metric, _ in _COLUMNS)
+    platoon = 0
+    for heading, metric, _ in _COLUMNS:
+        columns.append(Column(heading))
+        platoon += metric.startswith("platoon/")
     recorded = len(_COLUMNS) - platoon
     groups = (("", 2), ("Behind recorded leaders, test part", recorded), ("Platoon", platoon))
     rows = []
@@ -84,9 +86,11 @@ def platoon(job: Job) -> Plot:
     """Speeds of the platoons of a job that has them, a panel per method."""
     assert job.platoon is not None
     present = set(job.platoon["method"])
-    methods = [method for method in job.meaningful_methods if method in present]
-    stable = {}
-    for method in methods:
+    methods, stable = [], {}
+    for method in job.meaningful_methods:
+        if method not in present:
+            continue
+        methods.append(method)
         key = key_of("platoon/string_stable", method)
         if key in job.metrics:
             stable[method] = job.metrics[key]

@@ -1,0 +1,85 @@
+"""A section of the page is a list of blocks; the template draws every kind."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from cfx.plots.plotly.figure import Plot, view
+from cfx.report import blocks, page
+from cfx.report.blocks import (
+    Block,
+    Facts,
+    Figure,
+    Fold,
+    Grid,
+    Group,
+    Heading,
+    Items,
+    Listing,
+    Section,
+    Table,
+    Text,
+)
+from cfx.report.job import Runs
+from cfx.report.runs import read_runs
+from cfx.report.sections import SECTIONS
+from cfx.report.tables import Column, Sheet, text
+from tests.report.folders import write_job
+from tests.report.test_page import Page
+
+SHEET = Sheet((Column("a heading", "explained so"),), ((text("a cell"),),))
+PLOT = Plot({"": view([], {}, "a note")}, 100, "a plot")
+EVERY: tuple[Block, ...] = (
+    Text("a remark", "note"),
+    Heading("a title", "fine print"),
+    Items(("an item",)),
+    Facts((("a name", "a value"),)),
+    Listing("a: listing"),
+    Table(SHEET, compact=True, explain=True),
+    Figure(PLOT),
+    Grid((Group((Text("in a card"),), "card"),)),
+    Fold("a fold", (Fold("a fold inside", (Text("far inside"),)),), unfolded=True),
+)
+
+
+def of_some(runs: Runs) -> Sequence[Block]:
+    return EVERY
+
+
+def of_none(runs: Runs) -> Sequence[Block]:
+    return ()
+
+
+def test_a_further_section_needs_nothing_but_its_blocks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kinds = {block.kind for block in EVERY} | {"group"}
+    assert kinds == {one.__name__.lower() for one in blocks.Block.__subclasses__()}
+    further = Section("further", "A further section", "Further", of_some)
+    empty = Section("empty", "An empty section", "Empty", of_none)
+    monkeypatch.setattr(page, "SECTIONS", (*SECTIONS, further, empty))
+    write_job(tmp_path / "job", pairs=3)
+    found = Page(page.render(read_runs([str(tmp_path)])))
+    for words in (
+        "a remark",
+        "a title",
+        "fine print",
+        "an item",
+        "a value",
+        "a: listing",
+        "a heading",
+        "explained so",
+        "a cell",
+        "a note",
+        "in a card",
+        "a fold",
+        "far inside",
+        "A further section",
+    ):
+        assert words in found.words
+    assert "further" in found.having("id")
+    assert "#further" in found.having("href")
+    assert "empty" not in found.having("id")
