@@ -49,7 +49,10 @@ A setting that is given all the same is left out, with a warning.
 """
 
 ONLY_OF: dict[str, str] = {"simulator.compile": "memory"}
-"""New paths that one option of their group has alone; with another option, the old one is left out."""
+"""New paths that one option of their group has alone.
+
+With another option, the old path is left out.
+"""
 
 OPTIONS: dict[tuple[str, str], str] = {
     ("experiment", "known_drivers"): "with_history",

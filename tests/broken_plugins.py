@@ -1,4 +1,4 @@
-"""Third parties' distributions that are broken, one for each way in which a component can break its contract."""
+"""Third parties' distributions that are broken, one for each way to break a contract."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ from cfx import DrivingModel, Parameter, ParameterSpace
 
 class Bad(DrivingModel):
     parameters = ParameterSpace.of(
-        Parameter("tau", "s", 0.5, 3.0, 1.0, "time gap"), Parameter("a", "m/s2", 1.0, 3.0, 2.0, "maximum acceleration")
+        Parameter("tau", "s", 0.5, 3.0, 1.0, "time gap"),
+        Parameter("a", "m/s2", 1.0, 3.0, 2.0, "maximum acceleration"),
     )
 
     def next_speed(self, follower, leader, p, dt):
@@ -94,7 +95,9 @@ class Bad(Dataset):
         time = 0.1 * np.arange(800)
         speed = np.full(800, 10.0)
         leader = 30.0 + 10.0 * time
-        pair = Pair("p", "r", "1", "2", 0, 0.1, 5.0, leader, speed, 0 * speed, 10.0 * time, speed, 0 * speed)
+        still = 0 * speed
+        follower = 10.0 * time
+        pair = Pair("p", "r", "1", "2", 0, 0.1, 5.0, leader, speed, still, follower, speed, still)
         {}
 """
 
@@ -140,7 +143,8 @@ class Broken:
 
     @property
     def override(self) -> str:
-        return f"{'data' if self.kind == 'datasets' else self.kind[:-1].replace('policie', 'policy')}={self.name}"
+        group = {"datasets": "data", "policies": "policy"}.get(self.kind, self.kind[:-1])
+        return f"{group}={self.name}"
 
     @property
     def entry_points(self) -> dict[str, dict[str, str]]:
@@ -247,7 +251,8 @@ BROKEN = (
         "policy_more",
         "policies",
         _POLICY.format("torch.cat([answer, answer[..., :1]], -1)"),
-        r"forward gives the shape \(3, 2, 4, 6\); it must give \(networks, drivers, windows, parameters\), here \(3, 2, 4, 5\)",
+        r"forward gives the shape \(3, 2, 4, 6\); it must give"
+        r" \(networks, drivers, windows, parameters\), here \(3, 2, 4, 5\)",
     ),
     Broken(
         "policy_float",
@@ -265,7 +270,8 @@ BROKEN = (
         "miscounts",
         "optimizers",
         _OPTIMIZER.format("return candidates[:, :3], objective(candidates[:, :3])"),
-        r"solve must return candidates \(2, 4, 2\) and losses \(2, 4\) as evaluations\(\) says, but returned \(2, 3, 2\)",
+        r"solve must return candidates \(2, 4, 2\) and losses \(2, 4\) as evaluations\(\) says,"
+        r" but returned \(2, 3, 2\)",
     ),
     Broken(
         "floats",
@@ -277,7 +283,8 @@ BROKEN = (
         "asks_wide",
         "optimizers",
         _OPTIMIZER.format("return candidates, objective(torch.cat([candidates, candidates], -1))"),
-        r"it asked for candidates \(2, 4, 4\) in torch\.float64; it must ask for \(2, q, 2\) in float64",
+        r"it asked for candidates \(2, 4, 4\) in torch\.float64;"
+        r" it must ask for \(2, q, 2\) in float64",
     ),
     Broken(
         "asks_out",
@@ -348,13 +355,15 @@ BROKEN = (
     Broken(
         "learns_nothing",
         "learners",
-        "from cfx import Learner\nclass Bad(Learner):\n    def fit(self, policy, training_data):\n        return None\n",
+        "from cfx import Learner\n"
+        "class Bad(Learner):\n    def fit(self, policy, training_data):\n        return None\n",
         r"fit must return a cfx\.TrainingResult, but returned a NoneType",
     ),
     Broken(
         "no_outcome",
         "protocols",
-        "from cfx import Protocol\nclass Bad(Protocol):\n    def run(self, study):\n        return {}\n",
+        "from cfx import Protocol\n"
+        "class Bad(Protocol):\n    def run(self, context):\n        return {}\n",
         r"run must return a cfx\.ProtocolResult, but returned a dict",
     ),
 )

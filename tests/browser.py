@@ -1,7 +1,9 @@
-"""A real headless Chromium for tests of pages; it reaches this machine only, and every address it asks for is kept.
+"""A real headless Chromium for tests of pages.
 
-Debian's `chromium` does (`apt-get install chromium`), or the browser that `CFX_TEST_BROWSER` names. Without one the tests skip,
-unless `CFX_TEST_BROWSER_REQUIRED` is set, as `.ci/run` does. Playwright drives it, and downloads no browser of its own.
+It reaches this machine only, and every address it asks for is kept. Debian's `chromium` does
+(`apt-get install chromium`), or the browser that `CFX_TEST_BROWSER` names. Without one the tests
+skip, unless `CFX_TEST_BROWSER_REQUIRED` is set, as `.ci/run` does. Playwright controls it, and
+downloads no browser of its own.
 """
 
 from __future__ import annotations
@@ -46,8 +48,10 @@ class Browser:
 
     Attributes:
         page: Playwright's page; `page.goto(path.as_uri())` opens a file.
-        addresses: all that was asked for since the start, in order, by every page, frame and worker; WebSockets too.
-        errors: uncaught exceptions of the pages' scripts, and what they wrote to the console as an error.
+        addresses: all that was asked for since the start, in order, by every page, frame and
+            worker; WebSockets too.
+        errors: uncaught exceptions of the pages' scripts, and what they wrote to the console as an
+            error.
     """
 
     page: Page
@@ -55,7 +59,10 @@ class Browser:
     errors: list[str] = field(default_factory=list)
 
     def over_network(self) -> list[str]:
-        """Returns the addresses that need a network at all, 127.0.0.1 included; must be empty for a file that is complete."""
+        """Returns the addresses that need a network at all, 127.0.0.1 included.
+
+        It must be empty for a file that is complete.
+        """
         return [one for one in self.addresses if urlsplit(one).scheme not in WITHOUT_NETWORK]
 
     def outside(self) -> list[str]:
@@ -75,10 +82,16 @@ def find_chromium() -> str | None:
 
 @pytest.fixture
 def browser() -> Iterator[Browser]:
-    """Starts Chromium for one test (half a second): Playwright's event loop then never meets another test."""
+    """Starts Chromium for one test (half a second).
+
+    Playwright's event loop then never meets another test.
+    """
     path = find_chromium()
     if path is None:
-        complaint = "no Chromium on this machine (apt-get install chromium, or name one in CFX_TEST_BROWSER)"
+        complaint = (
+            "no Chromium on this machine"
+            " (apt-get install chromium, or name one in CFX_TEST_BROWSER)"
+        )
         if os.environ.get("CFX_TEST_BROWSER_REQUIRED"):
             pytest.fail(complaint, pytrace=False)
         pytest.skip(complaint)

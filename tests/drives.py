@@ -43,7 +43,7 @@ def _straight(name: str, frames: int, speed: float) -> Pair:
 def wavy_pairs(
     model: DrivingModel, parameters: torch.Tensor, frames: int = 300, seed: int = 0
 ) -> PairSet:
-    """Followers that drive `model` with `parameters` `(pairs, n)` behind leaders that brake and accelerate."""
+    """Followers with `parameters` `(pairs, n)`, behind leaders that brake and accelerate."""
     generator = np.random.default_rng(seed)
     count = len(parameters)
     time = np.arange(frames) * 0.1

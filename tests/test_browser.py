@@ -1,4 +1,4 @@
-"""The browser that tests of pages use: it must see what a page asks for, or those tests prove nothing."""
+"""The browser that tests of pages use must see what a page asks for."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ Run = Callable[..., int]
 
 @pytest.fixture
 def run(install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Returns the application with a job that does what its seed says, started in an empty folder."""
+    """Returns the application with a job that does what its seed says, in an empty folder."""
     install("jobs-stub", {}, {"jobs_stub.py": JOB})
     monkeypatch.chdir(tmp_path)
     return lambda *arguments: application.start(arguments, target="jobs_stub:run_job")
@@ -257,7 +257,10 @@ def test_a_multirun_in_worker_processes_composes_a_plugin_and_reports_failures(
     run: Run, install, tmp_path: Path
 ) -> None:
     install("mine-data", {"cfx.datasets": {"mine": "mine_data:Mine"}}, {"mine_data.py": PLUGIN})
-    script = "import sys; from cfx.application import start; sys.exit(start(sys.argv[1:], target='jobs_stub:run_job'))"
+    script = (
+        "import sys; from cfx.application import start;"
+        " sys.exit(start(sys.argv[1:], target='jobs_stub:run_job'))"
+    )
     arguments = [
         "-m",
         "hydra/launcher=joblib",

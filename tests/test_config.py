@@ -1,4 +1,4 @@
-"""The configuration: one frozen object; every file in conf/ composes; nodes are what the classes say."""
+"""The configuration: one frozen object; files in conf/ compose; nodes are what classes say."""
 
 from __future__ import annotations
 
@@ -217,7 +217,8 @@ def test_a_plugins_own_yaml_wins_and_may_extend_the_generated_node(install) -> N
     files = {
         "mine_models/__init__.py": PLUGIN,
         "mine_models/conf/model/mine.yaml": "defaults: [_mine, _self_]\nmood: wild\n",
-        "mine_models/conf/model/mine_far.yaml": "defaults: [mine, _self_]\nparameters: {tau: {high: 8.0}}\n",
+        "mine_models/conf/model/mine_far.yaml": "defaults: [mine, _self_]\n"
+        "parameters: {tau: {high: 8.0}}\n",
     }
     install("mine-models", {"cfx.models": {"mine": "mine_models:Mine"}}, files)
     assert values_of("model=mine")["model"]["mood"] == "wild"

@@ -1,4 +1,4 @@
-"""Whole jobs: what they leave behind, that they repeat, and what they say when something is wrong."""
+"""Whole jobs: what they leave behind, that they repeat, and what they say of mistakes."""
 
 from __future__ import annotations
 
@@ -77,8 +77,12 @@ def test_the_folder_holds_what_the_contract_says(finished: cfx.JobResult) -> Non
         "cfx.log",
     } <= names
     assert {path.name for path in finished.figures} >= {
-        "style_distribution.png", "drives.png", "chosen_parameters.png", "improvement_per_driver.png", "learning_curve.png"
-    }  # fmt: skip
+        "style_distribution.png",
+        "drives.png",
+        "chosen_parameters.png",
+        "improvement_per_driver.png",
+        "learning_curve.png",
+    }
     assert not [name for name in names if Path(name).name.startswith(".")]
     config = yaml.safe_load((folder / "config.yaml").read_text())
     assert config["model"]["name"] == "krauss"

@@ -139,19 +139,23 @@ def test_ctrl_c_while_a_plugin_is_imported_stays_ctrl_c(install) -> None:
             "does not implement next_speed",
         ),
         (
-            "from cfx import DrivingModel\nclass Bad(DrivingModel):\n  kind = 'optimizer'\n  def next_speed(self, *a): pass",
+            "from cfx import DrivingModel\n"
+            "class Bad(DrivingModel):\n  kind = 'optimizer'\n  def next_speed(self, *a): pass",
             "says kind='optimizer'",
         ),
         (
-            "from cfx import DrivingModel\nclass Bad(DrivingModel):\n  def next_speed(self, *a): pass",
+            "from cfx import DrivingModel\n"
+            "class Bad(DrivingModel):\n  def next_speed(self, *a): pass",
             "must be a cfx.ParameterSpace",
         ),
         (
-            "from cfx import DrivingModel\nclass Bad(DrivingModel):\n  parameters = ['tau']\n  def next_speed(self, *a): pass",
+            "from cfx import DrivingModel\n"
+            "class Bad(DrivingModel):\n  parameters = ['tau']\n  def next_speed(self, *a): pass",
             "must be a cfx.ParameterSpace, not list",
         ),
         (
-            "from cfx import DrivingModel, ParameterSpace\nclass Bad(DrivingModel):\n  parameters = ParameterSpace.of()\n"
+            "from cfx import DrivingModel, ParameterSpace\n"
+            "class Bad(DrivingModel):\n  parameters = ParameterSpace.of()\n"
             "  def next_speed(self, *a): pass",
             "at least one of its parameters must be tuned",
         ),
@@ -160,11 +164,13 @@ def test_ctrl_c_while_a_plugin_is_imported_stays_ctrl_c(install) -> None:
             "its schema must be a subclass of cfx.Settings",
         ),
         (
-            "from cfx.models.krauss import Krauss\nfrom cfx import Settings\nclass Bad(Krauss):\n  schema = Settings",
+            "from cfx.models.krauss import Krauss\nfrom cfx import Settings\n"
+            "class Bad(Krauss):\n  schema = Settings",
             "its schema must extend cfx.models.base.ModelSettings",
         ),
         (
-            "from cfx.models.krauss import Krauss, KraussSettings\nclass S(KraussSettings):\n  name: str = 'x'\n"
+            "from cfx.models.krauss import Krauss, KraussSettings\n"
+            "class S(KraussSettings):\n  name: str = 'x'\n"
             "class Bad(Krauss):\n  schema = S",
             "must not have a field 'name'",
         ),

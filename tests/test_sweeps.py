@@ -1,4 +1,4 @@
-"""Sweeps: broken off and started again they run what is missing, harm nothing that is done, and say what came of it all."""
+"""Sweeps: started again they run what is missing, harm nothing, and say what came of it all."""
 
 from __future__ import annotations
 
@@ -47,9 +47,11 @@ JOB = """
             time.sleep(0.02)
         metrics = {f"rmse_speed/{method}": value + config.seed for method, value in
                    (("default", 1.0), ("fixed", 0.5), ("policy", 0.25))}
-        metrics |= {"rmse_improvement/mean": 0.5, "rmse_improvement/ci95_low": 0.25, "rmse_improvement/ci95_high": None}
+        metrics |= {"rmse_improvement/mean": 0.5, "rmse_improvement/ci95_low": 0.25,
+                    "rmse_improvement/ci95_high": None}
         if config.model["name"] == "w99":
-            metrics |= {f"rmse_improvement/population/{name}": 0.125 for name in ("mean", "ci95_low", "ci95_high")}
+            for name in ("mean", "ci95_low", "ci95_high"):
+                metrics[f"rmse_improvement/population/{name}"] = 0.125
         (folder / "metrics.json").write_text(json.dumps(metrics))
         (folder / "told").write_text(f"{config.tracking.sweep} {os.environ.get('OMP_NUM_THREADS')}")
         return Result(metrics)
@@ -144,7 +146,8 @@ def test_other_commands_have_folders_of_their_own(run: Run) -> None:
 def test_a_sweep_that_an_experiment_file_asks_for_goes_on_too(run: Run) -> None:
     Path("mine/experiment").mkdir(parents=True)
     Path("mine/experiment/seeds.yaml").write_text(
-        "# @package _global_\nhydra:\n  mode: MULTIRUN\n  sweeper:\n    params:\n      seed: 0,1,2\n"
+        "# @package _global_\n"
+        "hydra:\n  mode: MULTIRUN\n  sweeper:\n    params:\n      seed: 0,1,2\n"
     )
     Path("interrupt-1").touch()
     command = ["--config-dir", "mine", "experiment=seeds"]
@@ -248,8 +251,8 @@ def test_a_sweep_that_runs_is_left_alone(run: Run, capsys) -> None:
     with FileLock(first / ".lock"), FileLock("s/.lock"):
         assert run("-m", "seed=0,1", "hydra.sweep.dir=s") == 2
         assert (
-            capsys.readouterr().err
-            == "s: another sweep runs in this folder; wait for it, or choose another hydra.sweep.dir\n"
+            capsys.readouterr().err == "s: another sweep runs in this folder;"
+            " wait for it, or choose another hydra.sweep.dir\n"
         )
         assert ran() == []
         assert run("-m", "seed=0,1") == 2
@@ -367,7 +370,10 @@ def processes() -> Iterator[list[subprocess.Popen[str]]]:
 def test_a_killed_sweep_of_worker_processes_is_made_up_for(
     run: Run, install, processes: list[Any], killed: str
 ) -> None:
-    script = "import sys; from cfx.application import start; sys.exit(start(sys.argv[1:], target='sweep_stub:run_job'))"
+    script = (
+        "import sys; from cfx.application import start;"
+        " sys.exit(start(sys.argv[1:], target='sweep_stub:run_job'))"
+    )
     command = [
         "-c",
         script,
@@ -449,7 +455,7 @@ def test_twelve_jobs_killed_half_way_end_as_twelve(
     assert len(summary(folder)) == 12
     assert statuses(folder) == ["FINISHED"] * 12
 
-    # A job whose marker was lost after its run was closed runs again, and is there once all the same.
+    # A job whose marker was lost after its run was closed runs again, and is there only once.
     (jobs(folder)[0] / sweep.STATUS).unlink()
     assert continued([*command, f"hydra.sweep.dir={folder}"], tmp_path, processes) == 0
     assert statuses(folder) == ["FINISHED"] * 12
@@ -464,7 +470,7 @@ def continued(command: list[str], folder: Path, processes: list[Any]) -> int:
 
 
 def statuses(folder: Path) -> list[str]:
-    """Returns how the runs of a sweep ended; fails if any run at all is still open or two are of one job."""
+    """Returns how the runs of a sweep ended; fails if any is open or two are of one job."""
     import mlflow
 
     client = mlflow.MlflowClient(f"sqlite:///{Path('outputs/mlflow.db').absolute()}")

@@ -1,4 +1,4 @@
-"""`python -m cfx ui` as a user meets it: its server, the links it prints, and what a real browser shows behind them."""
+"""`python -m cfx ui` as a user meets it: its server, its links, and what a browser shows."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Served:
 
 
 def fill(store: str) -> str:
-    """Tracks a sweep of three jobs, a single job, and one whose process was killed; returns the last one's id."""
+    """Tracks a sweep of three jobs, a single one, and a killed one; returns the last one's id."""
     for model, improvement in IMPROVEMENTS.items():
         tags = {"model": model, "cfx.folder": model}
         with MlflowTracker.run(

@@ -197,7 +197,8 @@ class Service:
             kept = f" (the pages in {self._kept} are kept)"
         return DataError(
             f"{self.name} cannot be reached: {reason}; run the same command again when it"
-            f" can{kept}, or download {BY_HAND} by hand and use data=ngsim data.path=FILE data.location=i-80"
+            f" can{kept}, or download {BY_HAND} by hand and use data=ngsim data.path=FILE"
+            " data.location=i-80"
         )
 
     def _nonsense(self, wanted: str, table: Sequence[Sequence[str]]) -> DataError:

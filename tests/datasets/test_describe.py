@@ -63,5 +63,8 @@ def test_a_file_that_cannot_be_used_says_why(tmp_path: Path) -> None:
 
 
 def test_needs_no_torch() -> None:
-    code = "import sys, cfx.datasets.describe, cfx.datasets.synthetic; sys.exit('torch' in sys.modules)"
+    code = (
+        "import sys, cfx.datasets.describe, cfx.datasets.synthetic;"
+        " sys.exit('torch' in sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

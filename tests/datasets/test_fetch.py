@@ -1,4 +1,4 @@
-"""Downloading I-80 from a service on this machine that speaks as the real one does, and fails as it may."""
+"""Downloading I-80 from a service on this machine that speaks and fails as the real one may."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Row = dict[str, str]
 def vehicle(
     number: int, leader: int, frames: range, recording: str, ahead: float, place: str = "i-80"
 ) -> list[Row]:
-    """A vehicle at a steady 30 ft/s; frame 0 of a recording lies half a minute before its nominal beginning."""
+    """A vehicle at 30 ft/s; frame 0 lies half a minute before the recording's nominal beginning."""
     known = {
         "Vehicle_ID": number,
         "Total_Frames": len(frames),
@@ -54,7 +54,8 @@ def vehicle(
 def recordings() -> list[Row]:
     """Three recordings, of which the last two overlap in time, and another place."""
     rows = [*vehicle(1, 0, range(10, 40), "0400", 100), *vehicle(2, 1, range(10, 40), "0400", 50)]
-    # At 5:15:05 pm a vehicle of the one recording is still, and the same id of the next already, in the picture.
+    # At 5:15:05 pm a vehicle of the one recording is still in the picture, and the same id of the
+    # next already.
     rows += vehicle(1, 0, range(9_300, 9_340), "0500", 200)
     rows += vehicle(1, 0, range(300, 340), "0515", 300)
     rows += vehicle(9, 0, range(10, 20), "0400", 0, place="us-101")
@@ -62,7 +63,9 @@ def recordings() -> list[Row]:
 
 
 class Soda:
-    """A data set behind SODA's interface: `$select`, `$where`, `$order`, `$limit`, `$offset`; CSV with every cell quoted.
+    """A data set behind SODA's interface, as CSV with every cell quoted.
+
+    It knows `$select`, `$where`, `$order`, `$limit` and `$offset`.
 
     Attributes:
         faults: what the next pages get instead of a right answer, in order; None is a right answer.
@@ -323,8 +326,8 @@ def test_without_a_connection_one_sentence_says_what_to_do(
     (line,) = said.err.splitlines()
     assert line.startswith(f"127.0.0.1:{port} cannot be reached: ")
     assert (
-        "download https://data.transportation.gov/api/views/8ect-6jqj/rows.csv?accessType=DOWNLOAD by hand"
-        in line
+        "download https://data.transportation.gov/api/views/8ect-6jqj/rows.csv?accessType=DOWNLOAD"
+        " by hand" in line
     )
     assert "data=ngsim data.path=FILE" in line
     assert names_in(tmp_path) == []

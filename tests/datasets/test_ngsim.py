@@ -124,7 +124,7 @@ def rows() -> pd.DataFrame:
     return traffic()
 
 
-# --- layouts ---------------------------------------------------------------------------------------------------------
+# --- layouts --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("layout", ["csv", "text"])
@@ -192,7 +192,7 @@ def test_thousands_separators_and_quotes(rows: pd.DataFrame, tmp_path: Path) -> 
     np.testing.assert_allclose(read_ngsim(path).pairs()[0].follower_position[0], 1150 * FOOT)
 
 
-# --- recordings ------------------------------------------------------------------------------------------------------
+# --- recordings -----------------------------------------------------------------------------------
 
 
 def test_recordings_are_told_apart_by_place_and_clock(tmp_path: Path) -> None:
@@ -256,7 +256,7 @@ def test_without_a_usable_clock_there_is_one_recording(
         found(save(pd.concat([rows, rows.assign(Local_Y=rows["Local_Y"] + 9)]), tmp_path / "f.csv"))
 
 
-# --- pairs -----------------------------------------------------------------------------------------------------------
+# --- pairs ----------------------------------------------------------------------------------------
 
 
 def reference(rows: pd.DataFrame) -> dict[tuple[int, int, int], int]:
@@ -373,7 +373,7 @@ def test_boundary_artefacts_are_said_until_they_are_left_out(
     assert "data.trim" not in describe(straight)
 
 
-# --- real recordings -------------------------------------------------------------------------------------------------
+# --- real recordings ------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -428,7 +428,7 @@ def test_raw_pairs_agree_with_their_reconstruction(raw: PairSet, shared_data: Pa
     assert median["follower_speed"] < 0.3
 
 
-# --- what is refused -------------------------------------------------------------------------------------------------
+# --- what is refused ------------------------------------------------------------------------------
 
 Change = Callable[[pd.DataFrame], pd.DataFrame | None]
 

@@ -17,7 +17,7 @@ from cfx.pairs import SIGNALS, Dropped, Pair, PairSet
 
 
 def swinging(frames: int, dt: float, name: str = "a") -> Pair:
-    """Two vehicles whose speeds swing by 2 m/s around 10 m/s with a period of 12 s, the follower 1.2 s later."""
+    """Two vehicles whose speeds swing by 2 m/s around 10 m/s in 12 s, the follower 1.2 s later."""
     time, turn = np.arange(frames) * dt, 2 * np.pi / 12
 
     def drive(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -44,7 +44,8 @@ def test_drives_stay_what_they_are(recorded: float, wanted: float) -> None:
     assert pair.dt == wanted
     assert (len(pair) - 1) * wanted == pytest.approx(999 * recorded, abs=wanted)
     for name in SIGNALS:
-        # A monotone cubic flattens a peak: by half its curvature times the square of half a step at most, and little elsewhere.
+        # A monotone cubic flattens a peak: by half its curvature times the square of half a step at
+        # most, and little elsewhere.
         np.testing.assert_allclose(
             getattr(pair, name),
             getattr(expected, name),

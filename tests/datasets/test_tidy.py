@@ -127,7 +127,7 @@ def test_real_pairs(shared_data: Path) -> None:
         TidyDataset(path=path, recording="i80-0400", max_pairs=50).load()
 
 
-# --- round trip ------------------------------------------------------------------------------------------------------
+# --- round trip -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["t.parquet", "t.csv", "t.csv.gz"])
@@ -202,7 +202,7 @@ def test_writing_says_what_is_wrong_and_leaves_what_was_there(
     assert [path.name for path in tmp_path.iterdir()] == ["taken.csv"]
 
 
-# --- what is refused -------------------------------------------------------------------------------------------------
+# --- what is refused ------------------------------------------------------------------------------
 
 Change = Callable[[pd.DataFrame], pd.DataFrame | None]
 

@@ -81,13 +81,33 @@ def two_time_steps(pair: Pair) -> Pair:
 AHEAD = checks.leaders_are_ahead_and_nobody_reverses
 BROKEN: dict[str, tuple[Dataset, Any, str]] = {
     "NaN": (spoiled(with_gap), checks.every_number_is_finite, "splits or leaves out what has gaps"),
-    "behind": (spoiled(lambda p: replace(p, leader_position=p.leader_position - 30)), AHEAD, "bumper to bumper"),
-    "reversing": (spoiled(lambda p: replace(p, leader_speed=-p.leader_speed)), AHEAD, "not negative"),
-    "km/h": (spoiled(lambda p: replace(p, leader_speed=3.6 * p.leader_speed)), checks.units_are_si, "give metres and m/s"),
+    "behind": (
+        spoiled(lambda p: replace(p, leader_position=p.leader_position - 30)),
+        AHEAD,
+        "bumper to bumper",
+    ),
+    "reversing": (
+        spoiled(lambda p: replace(p, leader_speed=-p.leader_speed)),
+        AHEAD,
+        "not negative",
+    ),
+    "km/h": (
+        spoiled(lambda p: replace(p, leader_speed=3.6 * p.leader_speed)),
+        checks.units_are_si,
+        "give metres and m/s",
+    ),
     "growing": (Growing(), checks.loading_again_gives_the_same, "results are cached by them"),
     "two time steps": (spoiled(two_time_steps), checks.pairs_stack, "simulated in one batch"),
-    "everything": (Everything(), checks.max_pairs_keeps_the_first_and_counts_the_rest, "keeps the first pairs"),
-    "selecting": (Selecting(), checks.max_pairs_keeps_the_first_and_counts_the_rest, "must be counted"),
+    "everything": (
+        Everything(),
+        checks.max_pairs_keeps_the_first_and_counts_the_rest,
+        "keeps the first pairs",
+    ),
+    "selecting": (
+        Selecting(),
+        checks.max_pairs_keeps_the_first_and_counts_the_rest,
+        "must be counted",
+    ),
     "too much": (Everything(), checks.asking_for_too_much_is_an_error, "must raise DataError"),
     "silent": (Silent(), checks.asking_for_too_much_is_an_error, "must name min_frames"),
 }  # fmt: skip

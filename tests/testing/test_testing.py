@@ -1,4 +1,4 @@
-"""The package `cfx.testing` itself: what it offers, and that it needs pytest for the suites alone."""
+"""The package `cfx.testing` itself: it offers contracts, and needs pytest for suites alone."""
 
 from __future__ import annotations
 
@@ -79,7 +79,8 @@ except ModuleNotFoundError as error:
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.startswith(
-        "[]\ncfx.testing.ModelContract is a pytest suite and pytest is not installed: pip install pytest"
+        "[]\ncfx.testing.ModelContract is a pytest suite and pytest is not installed:"
+        " pip install pytest"
     )
 
 
