@@ -1,4 +1,4 @@
-"""Reads the files of a job's folder; what is damaged is told in one sentence."""
+"""Reads the files of a job's folder; one sentence says what is damaged."""
 
 from __future__ import annotations
 

@@ -1,6 +1,8 @@
-"""Labels per second: all windows as one batch against the plain BoTorch loop of its tutorials, window by window, in the same run.
+"""Labels per second: all windows as one batch against the plain BoTorch loop of its tutorials,
+window by window, in the same run.
 
-`pytest tests/benchmarks --benchmark-only`. What counts are the ratios in `extra_info`: they compare runs on one machine.
+`pytest tests/benchmarks --benchmark-only`. What counts are the ratios in `extra_info`: they compare
+runs on one machine.
 """
 
 from __future__ import annotations
@@ -32,7 +34,9 @@ WINDOWS, STEPS, DT, LOOPED = 128, 5, 0.1, 2
 
 
 def windows(model: DrivingModel) -> SegmentLosses:
-    """Returns windows of drivers of this model whose parameters nobody knows, behind leaders that accelerate and brake."""
+    """Returns windows of drivers of this model whose parameters nobody knows, behind leaders that
+    accelerate and brake.
+    """
     draw = torch.Generator().manual_seed(0)
 
     def uniform(low: float, high: float) -> Tensor:

@@ -1,6 +1,7 @@
 """Live drivers: 300 vehicles on a motorway, of two kinds, each with a policy of its own.
 
-`pytest tests/benchmarks --benchmark-only`. What counts is `real_time` in `extra_info`: 1 is 10 steps of 0.1 s in a second.
+`pytest tests/benchmarks --benchmark-only`. What counts is `real_time` in `extra_info`: 1 is 10
+steps of 0.1 s in a second.
 SUMO has a process of its own; what is timed is its run, without the imports before it.
 """
 
@@ -27,7 +28,8 @@ sys.modules["pyarrow"] = None
 from pathlib import Path
 from cfx.sumo.drive import run_scenario
 driven = run_scenario(Path("motorway.sumocfg"), {"calm": "krauss", "hasty": "w99"}, end=float(sys.argv[1]))
-share = sum(tally.driven for tally in driven.tallies.values()) / sum(tally.steps for tally in driven.tallies.values())
+share = sum(tally.driven for tally in driven.tallies.values()) / sum(tally.steps for tally in
+driven.tallies.values())
 print(json.dumps([driven.steps, driven.seconds, driven.real_time, driven.most, share]))
 """
 

@@ -1,6 +1,8 @@
-"""The population's parameters: all folds together against fold by fold in eager PyTorch, in the same run.
+"""The population's parameters: all folds together against fold by fold in eager PyTorch, in the
+same run.
 
-`pytest tests/benchmarks --benchmark-only`. What counts are the ratios in `extra_info`: they compare runs on one machine.
+`pytest tests/benchmarks --benchmark-only`. What counts are the ratios in `extra_info`: they compare
+runs on one machine.
 """
 
 from __future__ import annotations

@@ -1,7 +1,10 @@
-"""Vehicle steps per second of the rollout, eager and compiled, beside hand-written numba kernels in the same run.
+"""Vehicle steps per second of the rollout, eager and compiled, beside hand-written numba kernels in
+the same run.
 
-The case is label search: 64 windows of 5 steps with 4,096 candidates each. `extra_info` holds million vehicle steps per second,
-and the ratio to the numba kernel (where there is one) on two threads and on one; nothing passes or fails by the clock. A rollout
+The case is label search: 64 windows of 5 steps with 4,096 candidates each. `extra_info` holds
+million vehicle steps per second,
+and the ratio to the numba kernel (where there is one) on two threads and on one; nothing passes or
+fails by the clock. A rollout
 uses one thread.
 """
 

@@ -1,4 +1,6 @@
-"""How long the program takes to answer where it does no work; both are meant to stay under a second."""
+"""How long the program takes to answer where it does no work; both are meant to stay under a
+second.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,11 @@
 """Pair-runs per second with SUMO in the loop, beside one SUMO process for each run in the same run.
 
-The case is a calibration: followers with parameters of their own behind real-looking leaders, 650 steps each. The other way is
-what scripts around SUMO do: write the input files, start a process, drive one pair, read the result; here with libsumo, which is
-faster than talking to the `sumo` program by TraCI. Both use every core. `extra_info` holds both rates and their ratio; nothing
+The case is a calibration: followers with parameters of their own behind real-looking leaders, 650
+steps each. The other way is
+what scripts around SUMO do: write the input files, start a process, drive one pair, read the
+result; here with libsumo, which is
+faster than talking to the `sumo` program by TraCI. Both use every core. `extra_info` holds both
+rates and their ratio; nothing
 passes or fails by the clock.
 """
 

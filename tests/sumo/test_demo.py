@@ -52,7 +52,8 @@ def test_the_demonstration_has_the_errors_of_the_evaluation(demo: Path) -> None:
         assert table[f"{column}_memory"].to_numpy() == pytest.approx(
             memory.loc[table.index, column].to_numpy(), abs=1e-12
         )
-        # The networks are in single precision, and are asked about other numbers of drivers at once.
+        # The networks are in single precision, and are asked about other numbers of drivers at
+        # once.
         assert table[f"{column}_sumo"].to_numpy() == pytest.approx(
             table[f"{column}_memory"].to_numpy(), abs=1e-4
         )

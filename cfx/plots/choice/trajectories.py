@@ -64,7 +64,7 @@ class Collision:
 
     @property
     def text(self) -> str:
-        """What stands beside the mark."""
+        """What stands beside the symbol."""
         return f"{short_label(self.method)} collides"
 
 
@@ -210,7 +210,7 @@ def _lines(
 def _signal_panel(
     name: str, unit: str, lines: tuple[Line, ...], collisions: tuple[Collision, ...] = ()
 ) -> Panel:
-    """Chooses the axis by the lines that matter; a default far off them is told by a note."""
+    """Chooses the axis by the lines that matter; a note says how far a default lies off them."""
     low, high = _range(tuple(line for line in lines if line.method != "default"))
     notes: list[Note] = []
     if low is not None and high is not None:
