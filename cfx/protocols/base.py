@@ -190,7 +190,7 @@ class ProtocolContext:
         if policy.trainable and head.space != model.adaptation_space:
             log.info(
                 "model.adaptation_bounds changes nothing here: this policy answers parameters,"
-                " not offsets (learner=rollout)"
+                " not offsets (learner=rollout, or learner.head=offset)"
             )
         return head
 

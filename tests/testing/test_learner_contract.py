@@ -78,11 +78,10 @@ class Plain(Learner):
         return rows
 
     def curves(self, rows: list[Tensor], names: tuple[str, ...]) -> pd.DataFrame:
-        table = [
-            (name, epoch, float(row[k]), float("nan"))
-            for epoch, row in enumerate(rows)
-            for k, name in enumerate(names)
-        ]
+        table = []
+        for epoch, row in enumerate(rows):
+            for k, name in enumerate(names):
+                table.append((name, epoch, float(row[k]), float("nan")))
         return pd.DataFrame(table, columns=CURVE_COLUMNS)
 
     def finish(

@@ -6,7 +6,8 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
-from cfx.component import content_key
+from cfx.component import content_key, folder_hash
+from cfx.learners import batched
 from cfx.learners.base import TrainingData
 from cfx.policies.base import Policy
 
@@ -29,7 +30,8 @@ def checkpoint_path(
         "model": training_data.simulator.model.identity(),
         "objective": training_data.objective.identity(),
         "windows": training_data.windows.model_dump(),
-        "drives": _digest(training_data),
+        "code": folder_hash(batched.__file__),
+        "trajectories": _digest(training_data),
         "names": training_data.names,
         "drivers": training_data.drivers,
         "seed": training_data.seed,

@@ -180,7 +180,7 @@ class RolloutModule(BatchedModule):
             windows: how many each lasts.
             divisors: of their losses.
             path: the way that gradients take back; with `NoGradients` all history is observed.
-            expert: whom to imitate; None: nobody.
+            expert: networks to imitate; None: none.
         """
         most = None
         if not isinstance(path, NoGradients):
