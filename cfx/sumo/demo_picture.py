@@ -73,7 +73,7 @@ def snapshots(road: Motorway, main: Shown, together: Sequence[Shown]) -> Figure:
             _draw_pair(axes, one, int(frame), view, named=one is main)
         title = "the models take over"
         if frame > main.first:
-            title = f"{(frame - main.first) * main.pair.dt:.0f} s later"
+            title = f"after {(frame - main.first) * main.pair.dt:.0f} s"
         axes.set_title(title, fontsize=10.5)
         axes.set(xlim=(-view.width / 2, view.width / 2), ylim=(-span / 2, span / 2), aspect="equal")
         axes.set_xticks([])
@@ -178,10 +178,10 @@ def _draw_pair(axes: Axes, one: Shown, frame: int, view: _View, *, named: bool) 
                 label,
                 ha="center",
                 va="top",
-                fontsize=7.5,
+                fontsize=6.5,
                 color=INK,
                 zorder=6,
-                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.2},
+                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 0.6},
                 clip_on=True,
             )
 
