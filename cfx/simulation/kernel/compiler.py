@@ -1,0 +1,114 @@
+"""Builds C++ source once and keeps the library, for this process and for later ones.
+
+Libraries lie in the user's own cache folder, which nobody else may write to: what is loaded from there
+runs. `CFX_KERNEL_CACHE` names another folder.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import logging
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+from cfx.files import atomic_write
+
+log = logging.getLogger(__name__)
+
+FLAGS = (
+    "-std=c++17",
+    "-O3",
+    "-march=native",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-ffp-contract=off",
+    "-shared",
+    "-fPIC",
+)
+"""None of them changes a result: operations are rounded as PyTorch rounds them, one by one."""
+
+_TIMEOUT_S = 120
+
+
+@functools.cache
+def find_compiler() -> str | None:
+    """Returns the C++ compiler of this machine; None where there is none."""
+    for name in ("g++", "c++", "clang++"):
+        found = shutil.which(name)
+        if found is not None:
+            return found
+    return None
+
+
+@functools.lru_cache(maxsize=64)
+def build(source: str) -> ctypes.CDLL | None:
+    """Returns the library built from C++ source; None where it cannot be built."""
+    compiler = find_compiler()
+    if compiler is None:
+        return None
+    path = _cache_folder() / f"{_key(source, compiler)}.so"
+    try:
+        if not path.is_file():
+            _compile(compiler, source, path)
+        return ctypes.CDLL(str(path))
+    except (OSError, subprocess.SubprocessError) as error:
+        log.info("The C++ compiler made no kernel (%s); PyTorch simulates instead", error)
+        return None
+
+
+def _compile(compiler: str, source: str, path: Path) -> None:
+    with tempfile.TemporaryDirectory() as folder, atomic_write(path) as temporary:
+        text = Path(folder, "kernel.cpp")
+        text.write_text(source, encoding="utf-8")
+        command = [compiler, *FLAGS, "-o", str(temporary), str(text)]
+        subprocess.run(  # noqa: S603 - the user's own compiler, and source that we wrote
+            command, capture_output=True, check=True, timeout=_TIMEOUT_S
+        )
+
+
+def _key(source: str, compiler: str) -> str:
+    """Returns what the library depends on, as a hash: source, compiler and processor."""
+    real = Path(compiler).resolve()
+    version = f"{real}:{real.stat().st_mtime_ns}"
+    parts = (source, " ".join(FLAGS), version, platform.machine(), _processor())
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+
+
+@functools.cache
+def _processor() -> str:
+    """Returns the processor's instruction sets, for which `-march=native` compiles."""
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    except OSError:
+        return platform.processor()
+    for line in text.splitlines():
+        if line.startswith(("flags", "Features")):
+            return line
+    return platform.processor()
+
+
+@functools.cache
+def _cache_folder() -> Path:
+    """Returns a folder that this user alone can write to."""
+    given = os.environ.get("CFX_KERNEL_CACHE")
+    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    folder = Path(given) if given else Path(base) / "cfx" / "kernels"
+    folder = folder.expanduser()
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        status = folder.stat()
+        if (
+            status.st_uid == os.getuid()
+            and not status.st_mode & 0o022
+            and os.access(folder, os.W_OK)
+        ):
+            return folder
+    except OSError:
+        pass
+    return Path(tempfile.mkdtemp(prefix="cfx-kernels-"))

@@ -1,0 +1,134 @@
+"""A recorded step as a C++ loop: units of work, then time, then candidates in vector registers.
+
+A unit is one problem with a block of its candidates. All their states stay in the first-level cache
+while the leader's frames pass by, and the compiler turns the loop over candidates into vector
+instructions: nothing in it depends on another candidate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from cfx.simulation.kernel.graph import INPUTS, StepProgram, parameter_names
+
+BLOCK = 32
+"""Candidates of a unit."""
+
+_TYPES = {torch.float64: "double", torch.float32: "float"}
+
+_HEAD = """\
+#include <algorithm>
+#include <cmath>
+using real = {type};
+constexpr long BLOCK = {block};
+static inline real smaller(real a, real b) {{ return (a < b || a != a) ? a : b; }}
+static inline real greater(real a, real b) {{ return (a > b || a != a) ? a : b; }}
+static inline real power(real a, real b) {{ return b == real(2) ? a * a : std::pow(a, b); }}
+struct View {{ const real* data; long problem; long other; }};
+extern "C" void accumulate(
+    const View* signals, const View* parameters, const View* counted, const long* ends,
+    real* sums, long problems, long candidates, long first, long last) {{
+  const long blocks = (candidates + BLOCK - 1) / BLOCK;
+  for (long unit = first; unit < last; ++unit) {{
+    const long i = unit / blocks, begin = (unit % blocks) * BLOCK;
+    const long width = std::min(BLOCK, candidates - begin);
+    real X[BLOCK], V[BLOCK], A[BLOCK];
+"""
+
+_SIGNALS = (
+    "leader_position",
+    "leader_speed",
+    "leader_acceleration",
+    "leader_rear",
+    "measured_speed",
+    "measured_gap",
+)
+"""Signals with a frame for each step, in the order of the kernel's views; then those without."""
+
+_CONSTANT_SIGNALS = ("leader_length", "position", "speed", "acceleration")
+
+SIGNALS = (*_SIGNALS, *_CONSTANT_SIGNALS)
+
+
+def write(program: StepProgram, varied: Sequence[bool], dtype: torch.dtype) -> str:
+    """Returns the C++ source of a kernel.
+
+    Args:
+        program: the step.
+        varied: for each parameter, whether candidates differ in it; the others are numbers.
+        dtype: float64 or float32.
+    """
+    lines = [_HEAD.format(type=_TYPES[dtype], block=BLOCK)]
+    lines += _begin(varied, len(program.terms))
+    lines += _loop(program, varied)
+    for k in range(len(program.terms)):
+        target = f"sums[({k} * problems + i) * candidates + begin + j]"
+        lines.append(f"    for (long j = 0; j < width; ++j) {target} = S{k}[j];")
+    lines += ["  }", "}"]
+    return "\n".join(lines) + "\n"
+
+
+def _begin(varied: Sequence[bool], terms: int) -> list[str]:
+    """Returns the declarations and first values of a unit's states, sums and parameters."""
+    lines = []
+    for k in range(terms):
+        lines.append(f"    real S{k}[BLOCK];")
+    for k, name in enumerate(parameter_names(len(varied))):
+        if varied[k]:
+            lines.append(f"    real {name}s[BLOCK];")
+        else:
+            lines.append(f"    const real {name} = parameters[{k}].data[0];")
+    at = len(_SIGNALS)
+    lines.append(f"    const real leader_length = {_at(at)};")
+    lines.append("    for (long j = 0; j < BLOCK; ++j) {")
+    lines.append("      const long c = begin + std::min(j, width - 1);")
+    for array, place in (("X", at + 1), ("V", at + 2), ("A", at + 3)):
+        lines.append(f"      {array}[j] = {_at(place)};")
+    for k in range(terms):
+        lines.append(f"      S{k}[j] = real(0);")
+    for k, name in enumerate(parameter_names(len(varied))):
+        if varied[k]:
+            view = f"parameters[{k}]"
+            lines.append(f"      {name}s[j] = {view}.data[i * {view}.problem + c * {view}.other];")
+    lines.append("    }")
+    return lines
+
+
+def _loop(program: StepProgram, varied: Sequence[bool]) -> list[str]:
+    """Returns the loop over time, with the loop over candidates inside."""
+    lines = ["    for (long t = 0; t < ends[i]; ++t) {"]
+    for k, name in enumerate(_SIGNALS):
+        lines.append(f"      const real {name} = {_at(k, time=True)};")
+    lines.append(
+        "      const real weight = counted->data[i * counted->problem + t * counted->other];"
+    )
+    lines.append("      #pragma GCC ivdep")
+    lines.append("      for (long j = 0; j < BLOCK; ++j) {")
+    lines.append("        const real position = X[j], speed = V[j], acceleration = A[j];")
+    for k, name in enumerate(parameter_names(len(varied))):
+        if varied[k]:
+            lines.append(f"        const real {name} = {name}s[j];")
+    for statement in program.statements:
+        kind = "bool" if statement.is_condition else "real"
+        lines.append(f"        const {kind} {statement.name} = {statement.expression};")
+    for k, term in enumerate(program.terms):
+        lines.append(f"        const real added{k} = {term};")
+    for array, value in zip(("next_x", "next_v", "next_a"), program.state, strict=True):
+        lines.append(f"        const real {array} = {value};")
+    lines.append("        X[j] = next_x; V[j] = next_v; A[j] = next_a;")
+    for k in range(len(program.terms)):
+        lines.append(f"        S{k}[j] += added{k} * weight;")
+    lines += ["      }", "    }"]
+    return lines
+
+
+def _at(view: int, *, time: bool = False) -> str:
+    place = f"i * signals[{view}].problem"
+    if time:
+        place += f" + t * signals[{view}].other"
+    return f"signals[{view}].data[{place}]"
+
+
+assert set(SIGNALS) == set(INPUTS)
