@@ -12,7 +12,7 @@ from cfx.models.base import Leader
 from cfx.objectives.base import FrameValues, Objective
 from cfx.pairs import PairBatch
 from cfx.simulation.base import Stepper
-from cfx.simulation.trajectory import Start
+from cfx.simulation.trajectory import Segments, Start
 
 _NOT_BATCHED = ("simulator", "objective")
 """Fields of `SegmentLosses` that all its segments share."""
@@ -130,8 +130,37 @@ class SegmentLosses:
     @torch.no_grad()
     def __call__(self, candidates: Tensor) -> Tensor:
         """Returns losses `(P, q)`, in the objective's unit, of candidates `(P, q, n)`."""
+        sums = self._accumulated(candidates)
+        if sums is not None:
+            count = self.counted.sum(0).clamp(min=1)[:, None]
+            return self.objective.finish(sums, count)
         frames = self.simulate(candidates, gap="gap" in self.objective.signals)
         return self.objective(frames, self.counted[..., None])
+
+    def _accumulated(self, candidates: Tensor) -> tuple[Tensor, ...] | None:
+        """Returns the objective's sums `(P, q)` without trajectories; None where those are needed."""
+        segments = Segments(
+            leader_position=self.leader_position,
+            leader_speed=self.leader_speed,
+            leader_acceleration=self.leader_acceleration,
+            leader_rear=self.leader_rear,
+            measured_speed=self.measured_speed,
+            measured_gap=self.measured_gap,
+            counted=self.counted,
+            leader_length=self.leader_length,
+            position=self.start_position,
+            speed=self.start_speed,
+            acceleration=self.start_acceleration,
+        )
+
+        def terms(
+            speed: Tensor, gap: Tensor, measured_speed: Tensor, measured_gap: Tensor
+        ) -> tuple[Tensor, ...]:
+            dt = self.simulator.dt
+            return self.objective.terms(FrameValues(speed, gap, measured_speed, measured_gap, dt))
+
+        key = (type(self.objective), self.objective.settings.model_dump_json())
+        return self.simulator.accumulate(segments, self._parameters(candidates), terms, key)
 
     def simulate(self, candidates: Tensor, *, gap: bool) -> FrameValues:
         """Returns frames 1 to K: simulated signals `(K, P, q)` and measured ones `(K, P, 1)`.

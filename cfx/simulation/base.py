@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from typing import ClassVar
 
 from torch import Tensor
 
 from cfx.models.base import DrivingModel, Follower, Leader
-from cfx.simulation.trajectory import Start
+from cfx.simulation.trajectory import Segments, Start, Terms
 
 
 class Stepper(ABC):
@@ -58,6 +58,23 @@ class Stepper(ABC):
         Raises:
             CfxError: an input wants gradients, and `differentiable` is False.
         """
+
+    def accumulate(
+        self, segments: Segments, p: Mapping[str, Tensor], terms: Terms, key: Hashable
+    ) -> tuple[Tensor, ...] | None:
+        """Simulates segments and sums up what their frames add, without keeping trajectories.
+
+        Args:
+            segments: P segments.
+            p: one tensor per parameter, `()` or broadcasting to `(P, q)`.
+            terms: what a frame adds to each sum; a pure elementwise function.
+            key: tells these terms from others.
+
+        Returns:
+            Each sum over the frames that count, `(P, q)`; None where trajectories have to be
+            simulated by `advance`.
+        """
+        return None
 
     def for_work(self, steps: int) -> Stepper:
         """Returns what takes a number of vehicle steps that belong together.

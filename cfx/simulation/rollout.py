@@ -13,9 +13,10 @@ from __future__ import annotations
 
 import importlib.util
 import itertools
+import math
 import shutil
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import ClassVar, Literal
 
 import torch
@@ -25,9 +26,11 @@ from cfx.component import folder_hash
 from cfx.errors import ParameterError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.simulation.base import Stepper
+from cfx.simulation.kernel.run import accumulate
 from cfx.simulation.step import advance_vehicle
 from cfx.simulation.threads import one_thread
 from cfx.simulation.tiles import Tile, tile_size, tiles
+from cfx.simulation.trajectory import Segments, Terms
 from cfx.simulation.trajectory import Start as Start  # noqa: PLC0414 - earlier home
 from cfx.simulation.trajectory import Trajectory as Trajectory  # noqa: PLC0414 - earlier home
 
@@ -45,6 +48,9 @@ _WORTH_COMPILING = 20_000_000
 pays: about a second of eager work. The rule looks at these alone, so that the same call gives the
 same bits whatever came before it.
 """
+
+_WORTH_A_KERNEL = 1_000_000
+"""Vehicle steps in one call, or in calls that belong together, from which a kernel pays."""
 
 
 class MemoryStepper(Stepper):
@@ -116,6 +122,17 @@ class MemoryStepper(Stepper):
                 tile.write(end, last)
         return end, position, speed
 
+    def accumulate(
+        self, segments: Segments, p: Mapping[str, Tensor], terms: Terms, key: Hashable
+    ) -> tuple[Tensor, ...] | None:
+        candidates = max(math.prod(value.shape[1:]) for value in p.values())
+        steps = segments.counted.numel() * candidates
+        worth_it = self._mode == "always" or (self._mode == "auto" and steps >= _WORTH_A_KERNEL)
+        if not worth_it or segments.speed.device.type != "cpu":
+            return None
+        whole_key = (_model_key(self.model), key)
+        return accumulate(self.model, self.dt, segments, p, terms, key=whole_key)
+
     def _compiles(self, steps: int, like: Tensor) -> bool:
         return self._pays(steps * like.numel()) and can_compile(like.device)
 
@@ -182,18 +199,19 @@ def _stepper(model: DrivingModel, dt: float) -> _Step:
     return take
 
 
-_COMPILED: dict[tuple[type[DrivingModel], str, float, float, int], _Step] = {}
+_ModelKey = tuple[type[DrivingModel], str, float]
+_COMPILED: dict[tuple[_ModelKey, float, int], _Step] = {}
+
+
+def _model_key(model: DrivingModel) -> _ModelKey:
+    """Returns what a model's equations depend on; its parameters are arguments of them."""
+    settings = model.settings.model_dump_json(exclude={"parameters"})
+    return type(model), settings, float(model.temperature)
 
 
 def _compiled_stepper(model: DrivingModel, dt: float, steps: int) -> _Step:
     """Returns `_stepper`, compiled for a number of steps; equal models share it."""
-    key = (
-        type(model),
-        model.settings.model_dump_json(exclude={"parameters"}),
-        float(model.temperature),
-        dt,
-        steps,
-    )
+    key = (_model_key(model), dt, steps)
     if key not in _COMPILED:
         # Each model and block has a cache of its own: torch counts recompilations per function, and
         # gives up after eight.

@@ -1,10 +1,14 @@
-"""Where a rollout begins, and what it gives."""
+"""Where a rollout begins, what it is compared with, and what it gives."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 from torch import Tensor
+
+Terms = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, ...]]
+"""Simulated speed and gap, measured speed and gap, to what one frame adds to each sum."""
 
 
 class Start(NamedTuple):
@@ -36,3 +40,28 @@ class Trajectory(NamedTuple):
     speed: Tensor
     gap: Tensor
     collided: Tensor
+
+
+class Segments(NamedTuple):
+    """P measured segments of trajectories; signals `(K, P)`, other values `(P,)`; SI units.
+
+    Attributes:
+        leader_position, leader_speed, leader_acceleration: at frames 0 to K - 1.
+        leader_rear: position of the leader's rear bumper at frames 1 to K.
+        measured_speed, measured_gap: of the follower, at frames 1 to K.
+        counted: 1 for each of the frames 1 to K that count, else 0.
+        leader_length: m.
+        position, speed, acceleration: of the follower at frame 0.
+    """
+
+    leader_position: Tensor
+    leader_speed: Tensor
+    leader_acceleration: Tensor
+    leader_rear: Tensor
+    measured_speed: Tensor
+    measured_gap: Tensor
+    counted: Tensor
+    leader_length: Tensor
+    position: Tensor
+    speed: Tensor
+    acceleration: Tensor

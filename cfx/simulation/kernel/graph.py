@@ -6,7 +6,7 @@ Shapes: everything recorded is elementwise over vehicles, `(V,)`, or a constant,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -14,9 +14,7 @@ from torch import Tensor, fx
 
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.simulation.step import advance_vehicle
-
-Terms = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, ...]]
-"""Simulated speed and gap, measured speed and gap, to what one frame adds to each sum."""
+from cfx.simulation.trajectory import Terms
 
 INPUTS = (
     "position",

@@ -8,7 +8,7 @@ from __future__ import annotations
 import ctypes
 import logging
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -17,38 +17,14 @@ from torch import Tensor
 
 from cfx.models.base import DrivingModel
 from cfx.simulation.kernel import compiler
-from cfx.simulation.kernel.graph import Terms, Unsupported, record
+from cfx.simulation.kernel.graph import Unsupported, record
 from cfx.simulation.kernel.source import BLOCK, SIGNALS, write
+from cfx.simulation.trajectory import Segments, Terms
 
 log = logging.getLogger(__name__)
 
 _UNITS_AT_ONCE = 64
 """Units of work that a thread takes at a time."""
-
-
-class Segments(NamedTuple):
-    """P measured segments; signals `(K, P)`, values at the start `(P,)`; SI units.
-
-    Attributes:
-        leader_position, leader_speed, leader_acceleration: at frames 0 to K - 1.
-        leader_rear: position of the leader's rear bumper at frames 1 to K.
-        measured_speed, measured_gap: of the follower, at frames 1 to K.
-        counted: 1 for each of the frames 1 to K that count, else 0.
-        leader_length: m.
-        position, speed, acceleration: of the follower at frame 0.
-    """
-
-    leader_position: Tensor
-    leader_speed: Tensor
-    leader_acceleration: Tensor
-    leader_rear: Tensor
-    measured_speed: Tensor
-    measured_gap: Tensor
-    counted: Tensor
-    leader_length: Tensor
-    position: Tensor
-    speed: Tensor
-    acceleration: Tensor
 
 
 class _View(ctypes.Structure):
@@ -57,7 +33,7 @@ class _View(ctypes.Structure):
     _fields_ = (("data", ctypes.c_void_p), ("problem", ctypes.c_long), ("other", ctypes.c_long))
 
 
-_KERNELS: dict[str, _Kernel | None] = {}
+_KERNELS: dict[Hashable, _Kernel | None] = {}
 
 
 class _Kernel(NamedTuple):
@@ -72,7 +48,7 @@ def accumulate(
     p: Mapping[str, Tensor],
     terms: Terms,
     *,
-    key: str,
+    key: Hashable,
     cores: int | None = None,
 ) -> tuple[Tensor, ...] | None:
     """Simulates segments in closed loop and sums up the terms of their frames that count.
@@ -105,14 +81,14 @@ def accumulate(
 def _kernel(
     model: DrivingModel,
     dt: float,
-    names: Sequence[str],
-    varied: Sequence[bool],
+    names: tuple[str, ...],
+    varied: tuple[bool, ...],
     terms: Terms,
     dtype: torch.dtype,
-    key: str,
+    key: Hashable,
 ) -> _Kernel | None:
     """Returns the kernel for a model and an objective, made at the first call."""
-    full_key = f"{key}:{dt}:{names}:{varied}:{dtype}"
+    full_key = (key, dt, names, varied, dtype)
     if full_key not in _KERNELS:
         _KERNELS[full_key] = _made(model, dt, names, varied, terms, dtype)
     return _KERNELS[full_key]
