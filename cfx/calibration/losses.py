@@ -138,7 +138,7 @@ class SegmentLosses:
         return self.objective(frames, self.counted[..., None])
 
     def _accumulated(self, candidates: Tensor) -> tuple[Tensor, ...] | None:
-        """Returns the objective's sums `(P, q)` without trajectories; None where those are needed."""
+        """Returns the objective's sums `(P, q)`; None where trajectories are needed."""
         segments = Segments(
             leader_position=self.leader_position,
             leader_speed=self.leader_speed,

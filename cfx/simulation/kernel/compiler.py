@@ -1,7 +1,7 @@
 """Builds C++ source once and keeps the library, for this process and for later ones.
 
-Libraries lie in the user's own cache folder, which nobody else may write to: what is loaded from there
-runs. `CFX_KERNEL_CACHE` names another folder.
+Libraries lie in the user's own cache folder, which nobody else may write to: what is loaded from
+there runs. `CFX_KERNEL_CACHE` names another folder.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def build(source: str) -> ctypes.CDLL | None:
     compiler = find_compiler()
     if compiler is None:
         return None
-    path = _cache_folder() / f"{_key(source, compiler)}.so"
+    path = cache_folder() / f"{_key(source, compiler)}.so"
     try:
         if not path.is_file():
             _compile(compiler, source, path)
@@ -94,7 +94,7 @@ def _processor() -> str:
 
 
 @functools.cache
-def _cache_folder() -> Path:
+def cache_folder() -> Path:
     """Returns a folder that this user alone can write to."""
     given = os.environ.get("CFX_KERNEL_CACHE")
     base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"

@@ -28,7 +28,7 @@ INPUTS = (
     "measured_speed",
     "measured_gap",
 )
-"""What a step reads, before the model's parameters. The last three are of the frame after the step."""
+"""What a step reads, before the model's parameters. The last three are of the next frame."""
 
 _VEHICLES = 7
 """Vehicles in the recording: a number that no other dimension has by chance."""
@@ -78,8 +78,8 @@ def record(
         dtype: of all values.
 
     Raises:
-        Unsupported: the step is not elementwise, branches on values, or uses an operation that has no
-            C++ counterpart here.
+        Unsupported: the step is not elementwise, branches on values, or uses an operation that has
+            no C++ counterpart here.
     """
     from torch.fx.experimental.proxy_tensor import make_fx
 
@@ -213,10 +213,13 @@ _TEMPLATES: dict[str, str] = {
     "bitwise_not": "(!{0})",
     "isnan": "({0} != {0})",
 }
-"""PyTorch's elementwise operations in C++. `smaller`, `greater` and `power` treat NaN as it does."""
+"""PyTorch's elementwise operations in C++; `smaller` and `greater` treat NaN as it does."""
 
 _UNCHANGED = {"alias", "clone", "detach", "expand", "lift_fresh_copy", "scalar_tensor", "view"}
 """Operations that return what they are given; a constant's shape does not matter here."""
+
+_HUBER_ARGUMENTS = 4
+"""Input, target, reduction and delta; PyTorch leaves a delta of 1 out."""
 
 _FILLED = {"zeros_like": 0.0, "ones_like": 1.0}
 
@@ -229,6 +232,8 @@ def _expression(node: fx.Node, known: dict[fx.Node, str]) -> str:
     arguments = [_argument(one, known) for one in node.args]
     if operation == "clamp":
         return _clamped(node, arguments, known)
+    if operation == "huber_loss":
+        return _huber(node, arguments)
     passed_on = _passed_on(operation, arguments)
     if passed_on:
         return passed_on
@@ -281,6 +286,16 @@ def _clamped(node: fx.Node, arguments: list[str], known: dict[fx.Node, str]) -> 
     if high:
         expression = f"(smaller({expression}, {high}))"
     return expression
+
+
+def _huber(node: fx.Node, arguments: list[str]) -> str:
+    """Returns Huber's loss of each element; one that is reduced over elements has no place here."""
+    if len(node.args) < _HUBER_ARGUMENTS - 1 or node.args[2] != 0:
+        raise Unsupported("a loss that is reduced over vehicles")
+    delta = literal(1.0)
+    if len(node.args) == _HUBER_ARGUMENTS:
+        delta = arguments[3]
+    return f"(huber({arguments[0]} - {arguments[1]}, {delta}))"
 
 
 def _power(base: str, exponent: float, given: str) -> str:

@@ -26,6 +26,10 @@ constexpr long BLOCK = {block};
 static inline real smaller(real a, real b) {{ return (a < b || a != a) ? a : b; }}
 static inline real greater(real a, real b) {{ return (a > b || a != a) ? a : b; }}
 static inline real power(real a, real b) {{ return b == real(2) ? a * a : std::pow(a, b); }}
+static inline real huber(real error, real delta) {{
+  const real size = std::fabs(error);
+  return size < delta ? real(0.5) * size * size : delta * (size - real(0.5) * delta);
+}}
 struct View {{ const real* data; long problem; long other; }};
 extern "C" void accumulate(
     const View* signals, const View* parameters, const View* counted, const long* ends,

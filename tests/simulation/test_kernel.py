@@ -1,0 +1,291 @@
+"""Kernels: losses summed up in compiled code are those of trajectories simulated by PyTorch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from cfx import registry
+from cfx.models.base import DrivingModel, Follower, Leader
+from cfx.models.krauss import Krauss
+from cfx.objectives.base import FrameValues, Objective
+from cfx.simulation.base import Stepper
+from cfx.simulation.kernel import compiler
+from cfx.simulation.kernel.graph import literal
+from cfx.simulation.kernel.run import accumulate
+from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.trajectory import Segments, Start
+
+DT = 0.1
+PROBLEMS, CANDIDATES, STEPS = 5, 70, 40
+
+pytestmark = pytest.mark.skipif(compiler.find_compiler() is None, reason="there is no C++ compiler")
+
+
+def with_equations() -> list[str]:
+    """Returns the names of all models that have equations and no memory of their own."""
+    names = []
+    for name in registry.names("model"):
+        model = registry.get("model", name)
+        assert issubclass(model, DrivingModel)
+        if not model.needs_simulator and model().memory_size == 0:
+            names.append(name)
+    return names
+
+
+def made_up_segments(dtype: torch.dtype = torch.float64) -> Segments:
+    """Returns segments of different lengths behind leaders who brake, stop and start again."""
+    generator = torch.Generator().manual_seed(1)
+    time = torch.arange(STEPS + 1, dtype=torch.float64)[:, None] * DT
+    phase = torch.rand(PROBLEMS, generator=generator, dtype=torch.float64) * 6.0
+    speed = (8.0 + 9.0 * torch.sin(time + phase)).clamp(min=0.0)
+    position = 40.0 + (speed * DT).cumsum(0)
+    acceleration = torch.diff(speed, dim=0, append=speed[-1:]) / DT
+    length = torch.full((PROBLEMS,), 4.5, dtype=torch.float64)
+    rear = position[1:] - length
+    measured = (speed[1:] - 0.5).clamp(min=0.0)
+    ends = torch.tensor([STEPS, STEPS - 1, 7, 1, 23])
+    counted = (torch.arange(STEPS)[:, None] < ends).double()
+    counted[3] = 0.0  # a frame in the middle that does not count
+    values = Segments(
+        leader_position=position[:-1],
+        leader_speed=speed[:-1],
+        leader_acceleration=acceleration[:-1],
+        leader_rear=rear,
+        measured_speed=measured,
+        measured_gap=rear - (measured * DT).cumsum(0),
+        counted=counted,
+        leader_length=length,
+        position=torch.zeros(PROBLEMS, dtype=torch.float64),
+        speed=measured[0],
+        acceleration=torch.zeros(PROBLEMS, dtype=torch.float64),
+    )
+    return Segments(*(value.to(dtype) for value in values))
+
+
+def candidates_of(model: DrivingModel, dtype: torch.dtype = torch.float64) -> dict[str, Tensor]:
+    """Returns random parameters of each problem within the bounds, and the model's constants."""
+    generator = torch.Generator().manual_seed(2)
+    shape = (PROBLEMS, CANDIDATES, len(model.space.names))
+    unit = torch.rand(shape, generator=generator, dtype=torch.float64)
+    return model.space.unpack(model.space.from_unit(unit.to(dtype)))
+
+
+def simulated(
+    stepper: Stepper, objective: Objective, segments: Segments, p: Mapping[str, Tensor]
+) -> Tensor:
+    """Returns losses `(P, q)` of trajectories."""
+    shape = (PROBLEMS, CANDIDATES)
+    start = Start(
+        segments.position[:, None].expand(shape),
+        segments.speed[:, None].expand(shape),
+        segments.acceleration[:, None].expand(shape),
+    )
+    leader = Leader(
+        segments.leader_position[..., None],
+        segments.leader_speed[..., None],
+        segments.leader_acceleration[..., None],
+        segments.leader_length[..., None],
+    )
+    _, position, speed = stepper.advance(stepper.begin(start), leader, p)
+    frames = FrameValues(
+        speed=speed,
+        gap=segments.leader_rear[..., None] - position,
+        measured_speed=segments.measured_speed[..., None],
+        measured_gap=segments.measured_gap[..., None],
+        dt=DT,
+    )
+    return objective(frames, segments.counted[..., None])
+
+
+def summed_up(
+    stepper: Stepper, objective: Objective, segments: Segments, p: Mapping[str, Tensor]
+) -> Tensor | None:
+    """Returns losses `(P, q)` from sums; None where the stepper has none."""
+    sums = stepper.accumulate(segments, p, terms_of(objective), type(objective))
+    if sums is None:
+        return None
+    return objective.finish(sums, segments.counted.sum(0).clamp(min=1)[:, None])
+
+
+def terms_of(objective: Objective) -> Callable[..., tuple[Tensor, ...]]:
+    def terms(*signals: Tensor) -> tuple[Tensor, ...]:
+        speed, gap, measured_speed, measured_gap = signals
+        return objective.terms(FrameValues(speed, gap, measured_speed, measured_gap, DT))
+
+    return terms
+
+
+@pytest.mark.parametrize("name", with_equations())
+def test_every_model_without_memory_has_a_kernel_with_the_losses_of_its_trajectories(
+    name: str,
+) -> None:
+    model = registry.create("model", {"name": name})
+    objective = registry.create("objective", {"name": "mixed"})
+    assert isinstance(model, DrivingModel)
+    assert isinstance(objective, Objective)
+    segments, p = made_up_segments(), candidates_of(model)
+    found = summed_up(MemoryStepper(model, DT, compile="always"), objective, segments, p)
+    wanted = simulated(MemoryStepper(model, DT, compile="never"), objective, segments, p)
+    assert found is not None
+    torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", registry.names("objective"))
+def test_every_objective_is_summed_up_as_it_is_computed(name: str) -> None:
+    model = Krauss()
+    objective = registry.create("objective", {"name": name})
+    assert isinstance(objective, Objective)
+    segments, p = made_up_segments(), candidates_of(model)
+    found = summed_up(MemoryStepper(model, DT, compile="always"), objective, segments, p)
+    wanted = simulated(MemoryStepper(model, DT, compile="never"), objective, segments, p)
+    assert found is not None
+    torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-9)
+
+
+def squares(speed: Tensor, gap: Tensor, measured: Tensor, measured_gap: Tensor) -> tuple[Tensor]:
+    return ((speed - measured).square(),)
+
+
+def test_single_precision_stays_single_and_close() -> None:
+    model = Krauss()
+    single = accumulate(
+        model,
+        DT,
+        made_up_segments(torch.float32),
+        candidates_of(model, torch.float32),
+        squares,
+        key="single",
+    )
+    double = accumulate(model, DT, made_up_segments(), candidates_of(model), squares, key="double")
+    assert single is not None
+    assert double is not None
+    assert single[0].dtype == torch.float32
+    torch.testing.assert_close(single[0].double(), double[0], rtol=1e-3, atol=1e-3)
+
+
+def test_the_number_of_cores_changes_no_bit() -> None:
+    model, segments = Krauss(), made_up_segments()
+    p = {}
+    for name, value in candidates_of(model).items():
+        p[name] = value if value.dim() == 0 else value.repeat(1, 100)
+    alone = accumulate(model, DT, segments, p, squares, key="cores", cores=1)
+    shared = accumulate(model, DT, segments, p, squares, key="cores", cores=4)
+    assert alone is not None
+    assert shared is not None
+    assert torch.equal(alone[0], shared[0])
+
+
+def test_candidates_that_all_problems_share_need_no_copy() -> None:
+    model, segments = Krauss(), made_up_segments()
+    shared, copied = {}, {}
+    for name, value in candidates_of(model).items():
+        shared[name] = value if value.dim() == 0 else value[:1]
+        copied[name] = value if value.dim() == 0 else value[:1].repeat(PROBLEMS, 1)
+    one = accumulate(model, DT, segments, shared, squares, key="shared")
+    other = accumulate(model, DT, segments, copied, squares, key="shared")
+    assert one is not None
+    assert other is not None
+    assert torch.equal(one[0], other[0])
+
+
+def test_nan_in_a_parameter_stays_nan_and_harms_no_other_candidate() -> None:
+    model, segments = Krauss(), made_up_segments()
+    p = candidates_of(model)
+    p["t_r"] = p["t_r"].clone()
+    healthy = accumulate(model, DT, segments, p, squares, key="nan")
+    p["t_r"][2, 5] = torch.nan
+    found = accumulate(model, DT, segments, p, squares, key="nan")
+    assert found is not None
+    assert healthy is not None
+    expected = healthy[0].clone()
+    expected[2, 5] = torch.nan
+    torch.testing.assert_close(found[0], expected, equal_nan=True, rtol=0, atol=0)
+
+
+class Branches(Krauss):
+    """Asks for a value, as no elementwise function can."""
+
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
+        if bool((follower.speed > 3.0).any()):
+            return follower.speed
+        return super().next_speed(follower, leader, p, dt)
+
+
+class MixesVehicles(Krauss):
+    """Lets each vehicle see all others: nothing that a loop over candidates can do."""
+
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
+        return follower.speed - follower.speed.mean()
+
+
+class Remembers(Krauss):
+    """Has a memory of its own."""
+
+    memory_size = 1
+
+
+@pytest.mark.parametrize("model", [Branches(), MixesVehicles(), Remembers()])
+def test_a_model_that_is_not_elementwise_is_left_to_pytorch(model: DrivingModel) -> None:
+    p = candidates_of(model)
+    assert accumulate(model, DT, made_up_segments(), p, squares, key=type(model)) is None
+
+
+def test_small_work_is_not_worth_a_kernel() -> None:
+    model = Krauss()
+    stepper = MemoryStepper(model, DT)
+    assert stepper.accumulate(made_up_segments(), candidates_of(model), squares, "small") is None
+
+
+def test_a_library_is_built_once_and_found_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CFX_KERNEL_CACHE", str(tmp_path / "kernels"))
+    compiler.cache_folder.cache_clear()
+    compiler.build.cache_clear()
+    source = 'extern "C" long answer() { return 42; }\n'
+    library = compiler.build(source)
+    assert library is not None
+    assert library.answer() == 42
+    files = list((tmp_path / "kernels").iterdir())
+    assert [path.suffix for path in files] == [".so"]
+    written = files[0].stat().st_mtime_ns
+    compiler.build.cache_clear()
+    assert compiler.build(source) is not None
+    assert files[0].stat().st_mtime_ns == written
+    compiler.cache_folder.cache_clear()
+
+
+def test_a_cache_that_others_may_write_to_is_not_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    shared.chmod(0o777)
+    monkeypatch.setenv("CFX_KERNEL_CACHE", str(shared))
+    compiler.cache_folder.cache_clear()
+    assert compiler.cache_folder() != shared
+    compiler.cache_folder.cache_clear()
+
+
+def test_source_that_does_not_compile_gives_no_library() -> None:
+    assert compiler.build("this is no C++") is None
+
+
+@pytest.mark.parametrize("value", [0.1, -1e-300, 3.0, float("inf"), True])
+def test_numbers_are_written_exactly(value: float) -> None:
+    text = literal(value)
+    if isinstance(value, bool):
+        assert text == "true"
+    elif value == float("inf"):
+        assert text == "real(INFINITY)"
+    else:
+        assert float.fromhex(text.removeprefix("real(").removesuffix(")")) == value
