@@ -293,7 +293,7 @@ class Calibrator:
         tolerance: float = 0.0,
     ) -> Arrays:
         solution = self.optimizer.minimize(
-            losses,
+            losses.for_work(self.optimizer.evaluations()),
             guesses,
             seed=self.seed,
             objective_bytes=losses.bytes_per_candidate,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -104,13 +105,29 @@ class SegmentLosses:
     def bytes_per_candidate(self) -> int:
         """Memory that one candidate of one problem needs.
 
-        Positions, speeds, a term, its masked copy and the intermediate values of one block; a gap
+        Without trajectories: its parameters, in unit space and not, the sums and the loss. Else
+        positions, speeds, a term, its masked copy and the intermediate values of one block; a gap
         is another value with another term.
         """
-        values = 4
-        if "gap" in self.objective.signals:
-            values = 6
-        return (values * self.steps + 32) * self.measured_speed.element_size()
+        parameters = len(self.simulator.model.space.names)
+        if self._accumulates:
+            values = 3 * parameters + 8
+        elif "gap" in self.objective.signals:
+            values = 6 * self.steps + 32
+        else:
+            values = 4 * self.steps + 32
+        return values * self.measured_speed.element_size()
+
+    @property
+    def _accumulates(self) -> bool:
+        space = self.simulator.model.space
+        p = self._parameters(space.to_unit(space.defaults()).to(self.counted.device)[None, None])
+        return self.simulator.accumulates(p, self._terms, self._terms_key)
+
+    def for_work(self, candidates: int) -> SegmentLosses:
+        """Returns the same losses, for a number of candidates of each problem in all calls."""
+        steps = self.problems * self.steps * candidates
+        return replace(self, simulator=self.simulator.for_work(steps))
 
     def select(self, first: int, last: int) -> SegmentLosses:
         """Returns problems `first` to `last - 1`."""
@@ -152,15 +169,21 @@ class SegmentLosses:
             speed=self.start_speed,
             acceleration=self.start_acceleration,
         )
+        # Candidates that all problems share, an expanded view, are converted once.
+        if candidates.stride(0) == 0:
+            candidates = candidates[:1]
+        p = self._parameters(candidates)
+        return self.simulator.accumulate(segments, p, self._terms, self._terms_key)
 
-        def terms(
-            speed: Tensor, gap: Tensor, measured_speed: Tensor, measured_gap: Tensor
-        ) -> tuple[Tensor, ...]:
-            dt = self.simulator.dt
-            return self.objective.terms(FrameValues(speed, gap, measured_speed, measured_gap, dt))
+    def _terms(
+        self, speed: Tensor, gap: Tensor, measured_speed: Tensor, measured_gap: Tensor
+    ) -> tuple[Tensor, ...]:
+        dt = self.simulator.dt
+        return self.objective.terms(FrameValues(speed, gap, measured_speed, measured_gap, dt))
 
-        key = (type(self.objective), self.objective.settings.model_dump_json())
-        return self.simulator.accumulate(segments, self._parameters(candidates), terms, key)
+    @property
+    def _terms_key(self) -> Hashable:
+        return type(self.objective), self.objective.settings.model_dump_json()
 
     def simulate(self, candidates: Tensor, *, gap: bool) -> FrameValues:
         """Returns frames 1 to K: simulated signals `(K, P, q)` and measured ones `(K, P, 1)`.
@@ -242,6 +265,12 @@ class PooledLosses:
         """Memory of one candidate of one problem besides the blocks: the segments' losses."""
         return 2 * self.members.shape[1] * self.segments.measured_speed.element_size()
 
+    def for_work(self, candidates: int) -> PooledLosses:
+        """Returns the same losses, for a number of candidates of each problem in all calls."""
+        simulated = int(self.members.sum()) * self.segments.steps
+        simulator = self.segments.simulator.for_work(simulated * candidates)
+        return replace(self, segments=replace(self.segments, simulator=simulator))
+
     def select(self, first: int, last: int) -> PooledLosses:
         """Returns problems `first` to `last - 1`."""
         return replace(self, members=self.members[first:last])
@@ -253,15 +282,15 @@ class PooledLosses:
         if bool((candidates == candidates[:1]).all()):
             used = self.members.any(0)
             simulated, place = used.nonzero()[:, 0], used.cumsum(0) - 1
-            once = self._simulated(simulated, torch.zeros_like(simulated), candidates)
-            losses = once[place[segment]]
+            shared = candidates[:1].expand(len(simulated), -1, -1)
+            losses = self._simulated(simulated, shared)[place[segment]]
         else:
-            losses = self._simulated(segment, problem, candidates)
+            losses = self._simulated(segment, candidates[problem])
         total = losses.new_zeros(candidates.shape[:2]).index_add_(0, problem, losses)
         return total / self.members.sum(1, keepdim=True)
 
-    def _simulated(self, segment: Tensor, problem: Tensor, candidates: Tensor) -> Tensor:
-        """Returns losses `(S, q)` of segments `(S,)` with the candidates of problems `(S,)`."""
+    def _simulated(self, segment: Tensor, candidates: Tensor) -> Tensor:
+        """Returns losses `(S, q)` of segments `(S,)` with candidates `(S, q, n)`."""
         segments, count = self.segments.take(segment), candidates.shape[1]
         # The blocks are small, but there are many: together they may be worth compiling for, which
         # none of them is alone.
@@ -271,5 +300,5 @@ class PooledLosses:
         block = max(1, bound // (segments.bytes_per_candidate * len(segment)))
         losses = []
         for part in torch.split(candidates, block, dim=1):
-            losses.append(segments(part[problem]))
+            losses.append(segments(part))
         return torch.cat(losses, dim=1)

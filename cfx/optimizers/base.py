@@ -22,9 +22,16 @@ from cfx.errors import PluginError
 Progress = Callable[[int], None]
 """Called with how many more evaluations are done; they sum to problems times evaluations."""
 
+Tried = Tensor | tuple[Tensor, ...]
+"""Candidates `(P, e, n)`, whole or in blocks along e."""
+
 TIE_RELATIVE, TIE_ABSOLUTE = 1e-6, 1e-9
 """Losses within `TIE_ABSOLUTE + TIE_RELATIVE * best` of the best count as equal: above rounding,
 below anything that matters."""
+
+
+_LOSSES_AT_ONCE = 1 << 19
+"""Losses of one chunk on a CPU, at most: 4 MB, which are written and read again in its cache."""
 
 
 class CandidateLosses(Protocol):
@@ -98,7 +105,7 @@ class Optimizer(Component):
     @abstractmethod
     def solve(
         self, objective: CandidateLosses, guesses: Tensor, *, seed: int
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tried, Tensor]:
         """Evaluates candidates of all problems of one chunk.
 
         Args:
@@ -109,8 +116,9 @@ class Optimizer(Component):
             seed: the same for every chunk; 0 is a seed like any other.
 
         Returns:
-            Candidates `(P, e, n)` and their losses `(P, e)` in the order of evaluation; may be
-            expanded views.
+            Candidates `(P, e, n)` and their losses `(P, e)` in the order of evaluation. Candidates
+            may be expanded views, and may come in blocks along e, a tuple of `(P, q, n)`: those
+            that all problems share then need no copy for each.
         """
 
     @abstractmethod
@@ -170,33 +178,40 @@ class Optimizer(Component):
         returned = 8 * self.evaluations() * (2 * n + 4)
         each = self.bytes_per_problem(n) + returned + objective_bytes * self.evaluations_at_once()
         chunk = max(1, min(problems, memory // each))
+        if guesses.device.type == "cpu":
+            chunk = min(chunk, max(1, _LOSSES_AT_ONCE // self.evaluations()))
         guesses = guesses.double().clamp(0.0, 1.0)
         pieces = []
         for first in range(0, problems, chunk):
             last = min(first + chunk, problems)
             guarded = _Guarded(objective.select(first, last), progress, n, registry.origin(self))
             own = guesses[first:last]
-            candidates, losses = self.solve(guarded, own, seed=seed)
-            self._check(candidates, losses, own)
-            pieces.append(_reduce(candidates, losses, own, self.space_filling(), tolerance))
+            tried, losses = self.solve(guarded, own, seed=seed)
+            blocks = tried if isinstance(tried, tuple) else (tried,)
+            self._check(blocks, losses, own)
+            pieces.append(_reduce(blocks, losses, own, self.space_filling(), tolerance))
         best, loss, filling, diverged = (torch.cat(parts) for parts in zip(*pieces, strict=True))
         return Solution(best, loss, filling, diverged)
 
-    def _check(self, candidates: Tensor, losses: Tensor, guesses: Tensor) -> None:
+    def _check(self, blocks: tuple[Tensor, ...], losses: Tensor, guesses: Tensor) -> None:
         problems, _, n = guesses.shape
         expected = (problems, self.evaluations())
-        if losses.shape != expected or candidates.shape != (*expected, n):
+        evaluations = sum(block.shape[1] for block in blocks)
+        shapes = {(block.shape[0], evaluations, *block.shape[2:]) for block in blocks}
+        if losses.shape != expected or shapes != {(*expected, n)}:
             raise PluginError(
                 f"{registry.origin(self)}: solve must return candidates {(*expected, n)} and losses"
-                f" {expected} as evaluations() says, but returned {tuple(candidates.shape)} and"
+                f" {expected} as evaluations() says, but returned"
+                f" {', '.join(str(tuple(block.shape)) for block in blocks)} and"
                 f" {tuple(losses.shape)}"
             )
-        if {candidates.dtype, losses.dtype} != {torch.float64}:
+        dtypes = {losses.dtype, *[block.dtype for block in blocks]}
+        if dtypes != {torch.float64}:
             raise PluginError(
                 f"{registry.origin(self)}: solve must return float64, but returned candidates in"
-                f" {candidates.dtype} and losses in {losses.dtype}"
+                f" {blocks[0].dtype} and losses in {losses.dtype}"
             )
-        if bool(losses.isnan().any()) or not bool(((candidates >= 0) & (candidates <= 1)).all()):
+        if bool(losses.isnan().any()) or not all(_in_unit_space(block) for block in blocks):
             raise PluginError(
                 f"{registry.origin(self)}: solve must return candidates within [0, 1] and losses"
                 " that are numbers or infinity, but returned NaN or a candidate outside"
@@ -204,32 +219,67 @@ class Optimizer(Component):
 
 
 def _reduce(
-    candidates: Tensor, losses: Tensor, guesses: Tensor, space_filling: int, tolerance: float
+    blocks: tuple[Tensor, ...],
+    losses: Tensor,
+    guesses: Tensor,
+    space_filling: int,
+    tolerance: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Reduces a chunk to best `(P, n)`, loss `(P,)`, filling `(P, 3)` and diverged `(P,)`."""
-    g, n = guesses.shape[1:]
+    g = guesses.shape[1]
     finite = losses.isfinite()
-    lowest = losses.min(dim=1, keepdim=True).values
+    lowest = losses.amin(dim=1, keepdim=True)
     ties = finite & (losses <= lowest + tolerance + TIE_ABSOLUTE + TIE_RELATIVE * lowest.abs())
-    distance = torch.linalg.vector_norm(candidates - guesses[:, :1], dim=-1)
-    index = distance.where(ties, torch.inf).argmin(dim=1, keepdim=True)
-    best = candidates.gather(1, index[..., None].expand(-1, 1, n)).squeeze(1)
+    distance = torch.cat([_squared_distance(block, guesses[:, 0]) for block in blocks], dim=1)
+    index = distance.where(ties, torch.inf).argmin(dim=1)
+    best = _at(blocks, index)
     some = finite.any(dim=1)
     best = best.where(some[:, None], guesses[:, 0])
-    loss = losses.gather(1, index).squeeze(1).where(some, torch.inf)
+    loss = losses.gather(1, index[:, None]).squeeze(1).where(some, torch.inf)
     # Where all space-filling evaluations are guesses, the guesses count.
     first = 0
     if space_filling > g:
         first = g
-    filled = losses[:, first:space_filling]
-    filled = filled.where(filled.isfinite(), torch.nan)
-    usable = filled.isnan().logical_not().any(dim=1)
-    low = filled.nan_to_num(nan=torch.inf).amin(dim=1)
-    high = filled.nan_to_num(nan=-torch.inf).amax(dim=1)
-    filling = torch.stack([low, filled.nanmedian(dim=1).values, high], dim=1).where(
-        usable[:, None], torch.nan
-    )
+    filling = _low_median_high(losses[:, first:space_filling], finite[:, first:space_filling])
     return best, loss, filling, (~finite).sum(dim=1)
+
+
+def _low_median_high(losses: Tensor, finite: Tensor) -> Tensor:
+    """Returns the lowest, median and highest finite loss of each row, `(P, 3)`; NaN if none is."""
+    if bool(finite.all()):
+        low, high = losses.aminmax(dim=1)
+        return torch.stack([low, losses.median(dim=1).values, high], dim=1)
+    usable = finite.any(dim=1)
+    low = losses.where(finite, torch.inf).amin(dim=1)
+    high = losses.where(finite, -torch.inf).amax(dim=1)
+    median = losses.where(finite, torch.nan).nanmedian(dim=1).values
+    return torch.stack([low, median, high], dim=1).where(usable[:, None], torch.nan)
+
+
+def _squared_distance(block: Tensor, guess: Tensor) -> Tensor:
+    """Returns squared distances `(P, q)` of candidates `(P, q, n)` to guesses `(P, n)`."""
+    total = guess.new_zeros(block.shape[:2])
+    for value, origin in zip(block.unbind(-1), guess.unbind(-1), strict=True):
+        total += (value - origin[:, None]).square_()
+    return total
+
+
+def _at(blocks: tuple[Tensor, ...], index: Tensor) -> Tensor:
+    """Returns the candidates `(P, n)` of numbers `(P,)`, counted through all blocks."""
+    best = blocks[0].new_empty((len(index), blocks[0].shape[2]))
+    first = 0
+    for block in blocks:
+        rows = ((index >= first) & (index < first + block.shape[1])).nonzero()[:, 0]
+        best[rows] = block[rows, index[rows] - first]
+        first += block.shape[1]
+    return best
+
+
+def _in_unit_space(candidates: Tensor) -> bool:
+    """Says whether all candidates lie within [0, 1]. Written so that NaN fails too."""
+    if candidates.stride(0) == 0:
+        candidates = candidates[:1]
+    return bool(((candidates >= 0) & (candidates <= 1)).all())
 
 
 class _Guarded:
@@ -261,14 +311,15 @@ class _Guarded:
                 f"{self._optimizer}: it asked for candidates {shape} in {candidates.dtype}; it must"
                 f" ask for ({self.problems}, q, {self._n}) in float64"
             )
-        # Written so that NaN fails too.
-        if not bool(((candidates >= 0) & (candidates <= 1)).all()):
+        if not _in_unit_space(candidates):
             raise PluginError(
                 f"{self._optimizer}: it asked for a candidate outside the bounds [0, 1] of unit"
                 " space"
             )
         losses = self._objective(candidates).to(torch.float64)
         self._progress(losses.numel())
+        if bool(losses.sum().isfinite()):
+            return losses
         return losses.nan_to_num(nan=torch.inf, posinf=torch.inf, neginf=torch.inf)
 
     def select(self, first: int, last: int) -> CandidateLosses:

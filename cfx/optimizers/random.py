@@ -16,7 +16,7 @@ from torch import Tensor
 
 from cfx.component import Settings
 from cfx.errors import ConfigError
-from cfx.optimizers.base import CandidateLosses, Optimizer
+from cfx.optimizers.base import CandidateLosses, Optimizer, Tried
 
 AT_ONCE = 512
 """Candidates of one problem in one call of the losses: intermediate values stay small whatever
@@ -50,19 +50,21 @@ class RandomSearch(Optimizer):
 
     def solve(
         self, objective: CandidateLosses, guesses: Tensor, *, seed: int
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tried, Tensor]:
         problems, g, n = guesses.shape
         check_room(self.settings.samples, g, key="samples")
         points = sobol(self.settings.samples - g, n, seed=seed, like=guesses)
-        candidates = torch.cat([guesses, points.expand(problems, -1, -1)], dim=1)
-        return candidates, evaluate_in_blocks(objective, candidates)
+        blocks = (guesses, points.expand(problems, -1, -1))
+        losses = [evaluate_in_blocks(objective, block) for block in blocks]
+        return blocks, torch.cat(losses, dim=1)
 
 
 def evaluate_in_blocks(objective: CandidateLosses, candidates: Tensor) -> Tensor:
     """Returns losses `(P, q)` of candidates `(P, q, n)`, asked for in blocks of `AT_ONCE`."""
-    losses = []
+    losses = [candidates.new_empty(candidates.shape[:2])[:, :0]]
     for block in torch.split(candidates, AT_ONCE, dim=1):
-        losses.append(objective(block))
+        if block.shape[1]:
+            losses.append(objective(block))
     return torch.cat(losses, dim=1)
 
 

@@ -59,6 +59,16 @@ class Stepper(ABC):
             CfxError: an input wants gradients, and `differentiable` is False.
         """
 
+    def accumulates(self, p: Mapping[str, Tensor], terms: Terms, key: Hashable) -> bool:
+        """Says whether `accumulate` sums up these terms, given enough work, without trajectories.
+
+        Args:
+            p: one tensor per parameter, as for `accumulate`; their number of candidates is nothing.
+            terms: what a frame adds to each sum.
+            key: tells these terms from others.
+        """
+        return False
+
     def accumulate(
         self, segments: Segments, p: Mapping[str, Tensor], terms: Terms, key: Hashable
     ) -> tuple[Tensor, ...] | None:

@@ -26,13 +26,11 @@ from cfx.component import folder_hash
 from cfx.errors import ParameterError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.simulation.base import Stepper
-from cfx.simulation.kernel.run import accumulate
+from cfx.simulation.kernel import run as kernel
 from cfx.simulation.step import advance_vehicle
 from cfx.simulation.threads import one_thread
 from cfx.simulation.tiles import Tile, tile_size, tiles
-from cfx.simulation.trajectory import Segments, Terms
-from cfx.simulation.trajectory import Start as Start  # noqa: PLC0414 - earlier home
-from cfx.simulation.trajectory import Trajectory as Trajectory  # noqa: PLC0414 - earlier home
+from cfx.simulation.trajectory import Segments, Start, Terms, Trajectory
 
 Compile = Literal["auto", "always", "never"]
 _Parameters = dict[str, Tensor]
@@ -64,15 +62,27 @@ class MemoryStepper(Stepper):
 
     differentiable: ClassVar[bool] = True
 
-    def __init__(self, model: DrivingModel, dt: float, *, compile: Compile = "auto") -> None:
+    def __init__(
+        self, model: DrivingModel, dt: float, *, compile: Compile = "auto", together: int = 0
+    ) -> None:
+        """Makes a stepper.
+
+        Args:
+            model: the driving model.
+            dt: time step, s.
+            compile: compile the model's step: `auto`: where it pays.
+            together: vehicle steps of calls that belong together.
+        """
         super().__init__(model, dt)
         self._mode: Compile = compile
+        self._together = together
 
     def identity(self) -> str:
-        return folder_hash(__file__)
+        return folder_hash(__file__) + folder_hash(kernel.__file__)
 
     def for_work(self, steps: int) -> MemoryStepper:
-        return MemoryStepper(self.model, self.dt, compile="always") if self._pays(steps) else self
+        together = max(steps, self._together)
+        return MemoryStepper(self.model, self.dt, compile=self._mode, together=together)
 
     def advance(
         self, follower: Follower, leader: Leader, p: Mapping[str, Tensor]
@@ -122,22 +132,30 @@ class MemoryStepper(Stepper):
                 tile.write(end, last)
         return end, position, speed
 
+    def accumulates(self, p: Mapping[str, Tensor], terms: Terms, key: Hashable) -> bool:
+        if self._mode == "never" or next(iter(p.values())).device.type != "cpu":
+            return False
+        return kernel.exists(self.model, self.dt, p, terms, key=self._kernel_key(key))
+
     def accumulate(
         self, segments: Segments, p: Mapping[str, Tensor], terms: Terms, key: Hashable
     ) -> tuple[Tensor, ...] | None:
         candidates = max(math.prod(value.shape[1:]) for value in p.values())
         steps = segments.counted.numel() * candidates
-        worth_it = self._mode == "always" or (self._mode == "auto" and steps >= _WORTH_A_KERNEL)
-        if not worth_it or segments.speed.device.type != "cpu":
+        if segments.speed.device.type != "cpu" or not self._pays(steps, _WORTH_A_KERNEL):
             return None
-        whole_key = (_model_key(self.model), key)
-        return accumulate(self.model, self.dt, segments, p, terms, key=whole_key)
+        key = self._kernel_key(key)
+        return kernel.accumulate(self.model, self.dt, segments, p, terms, key=key)
+
+    def _kernel_key(self, key: Hashable) -> Hashable:
+        return _model_key(self.model), key
 
     def _compiles(self, steps: int, like: Tensor) -> bool:
-        return self._pays(steps * like.numel()) and can_compile(like.device)
+        return self._pays(steps * like.numel(), _WORTH_COMPILING) and can_compile(like.device)
 
-    def _pays(self, steps: int) -> bool:
-        return self._mode == "always" or (self._mode == "auto" and steps >= _WORTH_COMPILING)
+    def _pays(self, steps: int, worth: int) -> bool:
+        work = max(steps, self._together)
+        return self._mode == "always" or (self._mode == "auto" and work >= worth)
 
     def _take_eager(
         self,

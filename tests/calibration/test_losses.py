@@ -13,6 +13,7 @@ from cfx.objectives.mixed import Mixed
 from cfx.objectives.rmse import GapRmse, SpeedRmse
 from cfx.objectives.theil import TheilU
 from cfx.pairs import PairBatch
+from cfx.simulation.kernel import run as kernel
 from cfx.simulation.rollout import MemoryStepper, simulate
 from cfx.simulation.trajectory import Start
 from tests.drives import wavy_pairs
@@ -133,7 +134,12 @@ def test_pooled_losses_are_the_same_where_their_work_is_worth_compiling_for(
     pooled = PooledLosses(segments, torch.tensor([[True, True]]), memory=1)
     expected = pooled(candidates)
     # 2 segments, 9 candidates and 23 steps are worth it together; a block of one candidate is not.
-    monkeypatch.setattr("cfx.simulation.rollout._WORTH_COMPILING", 2 * 9 * 23)
-    assert simulator.for_work(2 * 9 * 23) is not simulator
-    assert simulator.for_work(2 * 9 * 23 - 1) is simulator
+    monkeypatch.setattr("cfx.simulation.rollout._WORTH_A_KERNEL", 2 * 9 * 23)
+    made = []
+    monkeypatch.setattr(kernel, "accumulate", lambda *args, **_: made.append(args))
     torch.testing.assert_close(pooled(candidates), expected)
+    assert len(made) == 9
+    made.clear()
+    monkeypatch.setattr("cfx.simulation.rollout._WORTH_A_KERNEL", 2 * 9 * 23 + 1)
+    torch.testing.assert_close(pooled(candidates), expected)
+    assert not made

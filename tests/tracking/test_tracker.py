@@ -404,6 +404,7 @@ def test_a_logged_policy_loads_again_and_predicts_the_same(
             loaded = mlflow.pyfunc.load_model(run.model_uri)
         finally:
             mlflow.set_tracking_uri(before)
+            os.environ.pop("MLFLOW_TRACKING_URI", None)  # MLflow sets it too
         pd.testing.assert_frame_equal(loaded.predict(saved_policy.frame), expected)
     files = {path.name for path in (tmp_path / "store").rglob("*") if path.is_file()}
     assert {"served_policy.py", "policy.pt", "policy.json", "requirements.txt"} <= files

@@ -33,6 +33,10 @@ FLAGS = (
 )
 """None of them changes a result: operations are rounded as PyTorch rounds them, one by one."""
 
+_VECTOR_MATH = ("-DVECTOR_MATH", "-lmvec", "-lm", "-Wl,-z,defs")
+"""Exponentials, logarithms and powers of a whole vector register by glibc, to 4 units in the last
+place; tried first. Where it has none of them, linking fails, and they are computed one by one."""
+
 _TIMEOUT_S = 120
 
 
@@ -67,16 +71,22 @@ def _compile(compiler: str, source: str, path: Path) -> None:
         text = Path(folder, "kernel.cpp")
         text.write_text(source, encoding="utf-8")
         command = [compiler, *FLAGS, "-o", str(temporary), str(text)]
-        subprocess.run(  # noqa: S603 - the user's own compiler, and source that we wrote
-            command, capture_output=True, check=True, timeout=_TIMEOUT_S
-        )
+        try:
+            _run([*command, *_VECTOR_MATH])
+        except subprocess.CalledProcessError:
+            _run(command)
+
+
+def _run(command: list[str]) -> None:
+    # The user's own compiler, and source that we wrote.
+    subprocess.run(command, capture_output=True, check=True, timeout=_TIMEOUT_S)  # noqa: S603
 
 
 def _key(source: str, compiler: str) -> str:
     """Returns what the library depends on, as a hash: source, compiler and processor."""
     real = Path(compiler).resolve()
     version = f"{real}:{real.stat().st_mtime_ns}"
-    parts = (source, " ".join(FLAGS), version, platform.machine(), _processor())
+    parts = (source, " ".join((*FLAGS, *_VECTOR_MATH)), version, platform.machine(), _processor())
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 

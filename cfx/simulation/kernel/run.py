@@ -65,9 +65,7 @@ def accumulate(
     Returns:
         Each sum, `(P, q)`; None where no kernel can be made of this model.
     """
-    names = tuple(p)
-    varied = tuple(value.dim() > 0 for value in p.values())
-    kernel = _kernel(model, dt, names, varied, terms, segments.speed.dtype, key)
+    kernel = _kernel(model, dt, p, terms, key)
     if kernel is None:
         return None
     shape = torch.broadcast_shapes(  # type: ignore[no-untyped-call]  # torch leaves it untyped
@@ -78,16 +76,19 @@ def accumulate(
     return tuple(sums)
 
 
+def exists(
+    model: DrivingModel, dt: float, p: Mapping[str, Tensor], terms: Terms, *, key: Hashable
+) -> bool:
+    """Says whether `accumulate` has a kernel for these arguments; makes it at the first call."""
+    return _kernel(model, dt, p, terms, key) is not None
+
+
 def _kernel(
-    model: DrivingModel,
-    dt: float,
-    names: tuple[str, ...],
-    varied: tuple[bool, ...],
-    terms: Terms,
-    dtype: torch.dtype,
-    key: Hashable,
+    model: DrivingModel, dt: float, p: Mapping[str, Tensor], terms: Terms, key: Hashable
 ) -> _Kernel | None:
     """Returns the kernel for a model and an objective, made at the first call."""
+    names, varied = tuple(p), tuple(value.dim() > 0 for value in p.values())
+    dtype = next(iter(p.values())).dtype
     full_key = (key, dt, names, varied, dtype)
     if full_key not in _KERNELS:
         _KERNELS[full_key] = _made(model, dt, names, varied, terms, dtype)

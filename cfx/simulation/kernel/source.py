@@ -21,11 +21,32 @@ _TYPES = {torch.float64: "double", torch.float32: "float"}
 _HEAD = """\
 #include <algorithm>
 #include <cmath>
+#ifdef VECTOR_MATH
+// glibc computes these for a whole vector register; its headers say so under -ffast-math alone.
+extern "C" {{
+#define VECTOR __attribute__((simd("notinbranch")))
+VECTOR double pow(double, double) noexcept; VECTOR float powf(float, float) noexcept;
+VECTOR double exp(double) noexcept; VECTOR float expf(float) noexcept;
+VECTOR double log(double) noexcept; VECTOR float logf(float) noexcept;
+VECTOR double sin(double) noexcept; VECTOR float sinf(float) noexcept;
+VECTOR double cos(double) noexcept; VECTOR float cosf(float) noexcept;
+VECTOR double tanh(double) noexcept; VECTOR float tanhf(float) noexcept;
+VECTOR double atan(double) noexcept; VECTOR float atanf(float) noexcept;
+VECTOR double log1p(double) noexcept; VECTOR float log1pf(float) noexcept;
+VECTOR double expm1(double) noexcept; VECTOR float expm1f(float) noexcept;
+}}
+#endif
 using real = {type};
 constexpr long BLOCK = {block};
-static inline real smaller(real a, real b) {{ return (a < b || a != a) ? a : b; }}
-static inline real greater(real a, real b) {{ return (a > b || a != a) ? a : b; }}
-static inline real power(real a, real b) {{ return b == real(2) ? a * a : std::pow(a, b); }}
+// NaN goes on, as in PyTorch. Two selections and no `||`: a branch would end vector code.
+static inline real smaller(real a, real b) {{
+  const real least = a < b ? a : b;
+  return a != a ? a : least;
+}}
+static inline real greater(real a, real b) {{
+  const real most = a > b ? a : b;
+  return a != a ? a : most;
+}}
 static inline real huber(real error, real delta) {{
   const real size = std::fabs(error);
   return size < delta ? real(0.5) * size * size : delta * (size - real(0.5) * delta);
