@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from types import TracebackType
 from typing import Self
@@ -38,6 +39,7 @@ class Task:
         self.done = 0
         self._console = console or Console(stderr=True)
         self._bar: Progress | None = None
+        self._lock = threading.Lock()
         self._began = self._told = time.monotonic()
 
     def __enter__(self) -> Self:
@@ -55,7 +57,11 @@ class Task:
         return self
 
     def advance(self, units: int = 1) -> None:
-        """Says that `units` more are done."""
+        """Says that `units` more are done; threads may say so at once."""
+        with self._lock:
+            self._advance(units)
+
+    def _advance(self, units: int) -> None:
         self.done += units
         now = time.monotonic()
         if self._bar is not None:

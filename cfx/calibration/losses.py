@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -13,6 +12,7 @@ from cfx.models.base import Leader
 from cfx.objectives.base import FrameValues, Objective
 from cfx.pairs import PairBatch
 from cfx.simulation.base import Stepper
+from cfx.simulation.kernel.keys import ComponentKey
 from cfx.simulation.trajectory import Segments, Start
 
 _NOT_BATCHED = ("simulator", "objective")
@@ -182,8 +182,8 @@ class SegmentLosses:
         return self.objective.terms(FrameValues(speed, gap, measured_speed, measured_gap, dt))
 
     @property
-    def _terms_key(self) -> Hashable:
-        return type(self.objective), self.objective.settings.model_dump_json()
+    def _terms_key(self) -> ComponentKey:
+        return ComponentKey(type(self.objective), self.objective.settings.model_dump_json())
 
     def simulate(self, candidates: Tensor, *, gap: bool) -> FrameValues:
         """Returns frames 1 to K: simulated signals `(K, P, q)` and measured ones `(K, P, 1)`.

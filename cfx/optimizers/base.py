@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -18,6 +18,7 @@ from torch import Tensor
 from cfx import registry
 from cfx.component import Component
 from cfx.errors import PluginError
+from cfx.simulation.threads import cores, share
 
 Progress = Callable[[int], None]
 """Called with how many more evaluations are done; they sum to problems times evaluations."""
@@ -101,6 +102,8 @@ class Optimizer(Component):
     """
 
     kind = "optimizer"
+    in_threads: ClassVar[bool] = False
+    """`solve` may be called for several chunks at once, in threads of one process."""
 
     @abstractmethod
     def solve(
@@ -177,19 +180,26 @@ class Optimizer(Component):
         problems, _, n = guesses.shape
         returned = 8 * self.evaluations() * (2 * n + 4)
         each = self.bytes_per_problem(n) + returned + objective_bytes * self.evaluations_at_once()
-        chunk = max(1, min(problems, memory // each))
+        chunks_at_once = cores() if self.in_threads else 1
+        chunk = max(1, min(problems, memory // (each * chunks_at_once)))
         if guesses.device.type == "cpu":
             chunk = min(chunk, max(1, _LOSSES_AT_ONCE // self.evaluations()))
         guesses = guesses.double().clamp(0.0, 1.0)
-        pieces = []
-        for first in range(0, problems, chunk):
+
+        def solve(first: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
             last = min(first + chunk, problems)
             guarded = _Guarded(objective.select(first, last), progress, n, registry.origin(self))
             own = guesses[first:last]
             tried, losses = self.solve(guarded, own, seed=seed)
             blocks = tried if isinstance(tried, tuple) else (tried,)
             self._check(blocks, losses, own)
-            pieces.append(_reduce(blocks, losses, own, self.space_filling(), tolerance))
+            return _reduce(blocks, losses, own, self.space_filling(), tolerance)
+
+        starts = range(0, problems, chunk)
+        if self.in_threads and guesses.device.type == "cpu":
+            pieces = share(solve, starts, level="chunks")
+        else:
+            pieces = [solve(first) for first in starts]
         best, loss, filling, diverged = (torch.cat(parts) for parts in zip(*pieces, strict=True))
         return Solution(best, loss, filling, diverged)
 

@@ -18,7 +18,7 @@ from cfx.component import Settings
 from cfx.errors import ConfigError
 from cfx.optimizers.base import CandidateLosses, Optimizer, Tried
 
-AT_ONCE = 512
+AT_ONCE = 4096
 """Candidates of one problem in one call of the losses: intermediate values stay small whatever
 `samples` is."""
 
@@ -38,6 +38,7 @@ class RandomSearch(Optimizer):
 
     schema: ClassVar[type[Settings]] = RandomSettings
     settings: RandomSettings
+    in_threads = True
 
     def evaluations(self) -> int:
         return self.settings.samples

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from typing import ClassVar
 
 from torch import Tensor
 
 from cfx.models.base import DrivingModel, Follower, Leader
+from cfx.simulation.kernel.keys import ComponentKey
 from cfx.simulation.trajectory import Segments, Start, Terms
 
 
@@ -59,7 +60,7 @@ class Stepper(ABC):
             CfxError: an input wants gradients, and `differentiable` is False.
         """
 
-    def accumulates(self, p: Mapping[str, Tensor], terms: Terms, key: Hashable) -> bool:
+    def accumulates(self, p: Mapping[str, Tensor], terms: Terms, key: ComponentKey | str) -> bool:
         """Says whether `accumulate` sums up these terms, given enough work, without trajectories.
 
         Args:
@@ -70,7 +71,7 @@ class Stepper(ABC):
         return False
 
     def accumulate(
-        self, segments: Segments, p: Mapping[str, Tensor], terms: Terms, key: Hashable
+        self, segments: Segments, p: Mapping[str, Tensor], terms: Terms, key: ComponentKey | str
     ) -> tuple[Tensor, ...] | None:
         """Simulates segments and sums up what their frames add, without keeping trajectories.
 

@@ -16,7 +16,7 @@ import itertools
 import math
 import shutil
 import warnings
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar, Literal
 
 import torch
@@ -27,6 +27,7 @@ from cfx.errors import ParameterError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.simulation.base import Stepper
 from cfx.simulation.kernel import run as kernel
+from cfx.simulation.kernel.keys import ComponentKey
 from cfx.simulation.step import advance_vehicle
 from cfx.simulation.threads import one_thread
 from cfx.simulation.tiles import Tile, tile_size, tiles
@@ -132,23 +133,19 @@ class MemoryStepper(Stepper):
                 tile.write(end, last)
         return end, position, speed
 
-    def accumulates(self, p: Mapping[str, Tensor], terms: Terms, key: Hashable) -> bool:
+    def accumulates(self, p: Mapping[str, Tensor], terms: Terms, key: ComponentKey | str) -> bool:
         if self._mode == "never" or next(iter(p.values())).device.type != "cpu":
             return False
-        return kernel.exists(self.model, self.dt, p, terms, key=self._kernel_key(key))
+        return kernel.exists(self.model, self.dt, p, terms, key=key)
 
     def accumulate(
-        self, segments: Segments, p: Mapping[str, Tensor], terms: Terms, key: Hashable
+        self, segments: Segments, p: Mapping[str, Tensor], terms: Terms, key: ComponentKey | str
     ) -> tuple[Tensor, ...] | None:
         candidates = max(math.prod(value.shape[1:]) for value in p.values())
         steps = segments.counted.numel() * candidates
         if segments.speed.device.type != "cpu" or not self._pays(steps, _WORTH_A_KERNEL):
             return None
-        key = self._kernel_key(key)
         return kernel.accumulate(self.model, self.dt, segments, p, terms, key=key)
-
-    def _kernel_key(self, key: Hashable) -> Hashable:
-        return _model_key(self.model), key
 
     def _compiles(self, steps: int, like: Tensor) -> bool:
         return self._pays(steps * like.numel(), _WORTH_COMPILING) and can_compile(like.device)
@@ -217,19 +214,12 @@ def _stepper(model: DrivingModel, dt: float) -> _Step:
     return take
 
 
-_ModelKey = tuple[type[DrivingModel], str, float]
-_COMPILED: dict[tuple[_ModelKey, float, int], _Step] = {}
-
-
-def _model_key(model: DrivingModel) -> _ModelKey:
-    """Returns what a model's equations depend on; its parameters are arguments of them."""
-    settings = model.settings.model_dump_json(exclude={"parameters"})
-    return type(model), settings, float(model.temperature)
+_COMPILED: dict[tuple[ComponentKey, float, float, int], _Step] = {}
 
 
 def _compiled_stepper(model: DrivingModel, dt: float, steps: int) -> _Step:
     """Returns `_stepper`, compiled for a number of steps; equal models share it."""
-    key = (_model_key(model), dt, steps)
+    key = (kernel.model_key(model), float(model.temperature), dt, steps)
     if key not in _COMPILED:
         # Each model and block has a cache of its own: torch counts recompilations per function, and
         # gives up after eight.

@@ -1,11 +1,64 @@
-"""How many threads PyTorch uses for work of many small steps."""
+"""How work is shared among threads, and how many of them PyTorch uses.
+
+Threads of ours sleep while they have nothing to do. PyTorch's own spin, which slows down whatever
+else wants the core.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import functools
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from typing import TypeVar
 
 import torch
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+_LIMIT: list[int] = []
+
+
+def limit_cores(count: int | None) -> None:
+    """Bounds the cores that this process shares work among; None: all that it may use."""
+    _LIMIT[:] = [] if count is None else [count]
+
+
+def cores() -> int:
+    """Returns how many cores this process shares work among."""
+    if hasattr(os, "sched_getaffinity"):
+        available = len(os.sched_getaffinity(0))
+    else:
+        available = os.cpu_count() or 1
+    return min([available, *_LIMIT])
+
+
+def share(work: Callable[[_Item], _Result], items: Sequence[_Item], *, level: str) -> list[_Result]:
+    """Does independent work in threads, one for each core.
+
+    Args:
+        work: holds Python's lock for a small part of its time only.
+        items: one call of `work` for each.
+        level: work that waits for other shared work names another level than that does.
+
+    Returns:
+        The results in the order of the items. The first exception is raised again.
+    """
+    threads = min(cores(), len(items))
+    if threads <= 1:
+        return [work(item) for item in items]
+    return list(_pool(level, threads).map(work, items))
+
+
+@functools.cache
+def _pool(level: str, threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix=f"cfx-{level}")
+
+
+# A forked process has none of its parent's threads, and would wait for them forever.
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 @contextmanager

@@ -22,7 +22,7 @@ from cfx.calibration.losses import PooledLosses, SegmentLosses
 from cfx.models.base import DrivingModel
 from cfx.objectives.rmse import SpeedRmse
 from cfx.optimizers.random import RandomSearch, sobol
-from cfx.simulation.kernel import run
+from cfx.simulation import threads
 from cfx.simulation.rollout import MemoryStepper
 
 numba_loops = pytest.importorskip("tests.benchmarks.numba_loops", reason="numba is not installed")
@@ -94,7 +94,7 @@ def by_hand(losses: SegmentLosses, name: str) -> Callable[[], Tensor]:
 @pytest.mark.parametrize("name", ["krauss", "idm", "w99"])
 @pytest.mark.parametrize("kind", list(WORK))
 def test_calibration(benchmark: Any, name: str, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run, "_available", lambda: 1)
+    monkeypatch.setattr(threads, "cores", lambda: 1)
     model = model_of(name)
     own = segments(model, *WORK[kind])
     losses: SegmentLosses | PooledLosses = own

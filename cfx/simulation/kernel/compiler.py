@@ -15,6 +15,7 @@ import platform
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 from cfx.files import atomic_write
@@ -64,6 +65,26 @@ def build(source: str) -> ctypes.CDLL | None:
     except (OSError, subprocess.SubprocessError) as error:
         log.info("The C++ compiler made no kernel (%s); PyTorch simulates instead", error)
         return None
+
+
+def remembered(key: str | None, make: Callable[[], str]) -> str:
+    """Returns the text that `make` gives, kept for later processes under a key; None: not kept.
+
+    Recording a step takes seconds, most of them in importing PyTorch's tracer.
+    """
+    if key is None:
+        return make()
+    path = cache_folder() / f"{key}.cpp"
+    try:
+        if path.is_file():
+            return path.read_text(encoding="utf-8")
+        text = make()
+        with atomic_write(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    except OSError as error:
+        log.info("The cache of kernels cannot be used (%s)", error)
+        return make()
+    return text
 
 
 def _compile(compiler: str, source: str, path: Path) -> None:

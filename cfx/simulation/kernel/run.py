@@ -7,18 +7,20 @@ from __future__ import annotations
 
 import ctypes
 import logging
-import os
-from collections.abc import Hashable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+import threading
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from cfx.models.base import DrivingModel
+from cfx.simulation import pages
 from cfx.simulation.kernel import compiler
 from cfx.simulation.kernel.graph import Unsupported, record
+from cfx.simulation.kernel.keys import ComponentKey, KernelKey
 from cfx.simulation.kernel.source import BLOCK, SIGNALS, write
+from cfx.simulation.threads import share
 from cfx.simulation.trajectory import Segments, Terms
 
 log = logging.getLogger(__name__)
@@ -33,7 +35,8 @@ class _View(ctypes.Structure):
     _fields_ = (("data", ctypes.c_void_p), ("problem", ctypes.c_long), ("other", ctypes.c_long))
 
 
-_KERNELS: dict[Hashable, _Kernel | None] = {}
+_KERNELS: dict[KernelKey, _Kernel | None] = {}
+_MAKING = threading.Lock()
 
 
 class _Kernel(NamedTuple):
@@ -48,10 +51,11 @@ def accumulate(
     p: Mapping[str, Tensor],
     terms: Terms,
     *,
-    key: Hashable,
-    cores: int | None = None,
+    key: ComponentKey | str,
 ) -> tuple[Tensor, ...] | None:
     """Simulates segments in closed loop and sums up the terms of their frames that count.
+
+    The work is shared among threads; the result does not depend on their number.
 
     Args:
         model: the driving model.
@@ -59,8 +63,7 @@ def accumulate(
         segments: P segments, on the CPU.
         p: one tensor per parameter, `()`, or broadcasting to `(P, q)`.
         terms: what a frame adds to each sum.
-        key: names model, settings and terms; equal keys share a kernel.
-        cores: threads at most; None: one for each core. The result does not depend on it.
+        key: what the terms depend on; equal keys share a kernel.
 
     Returns:
         Each sum, `(P, q)`; None where no kernel can be made of this model.
@@ -68,59 +71,78 @@ def accumulate(
     kernel = _kernel(model, dt, p, terms, key)
     if kernel is None:
         return None
+    pages.keep()
     shape = torch.broadcast_shapes(  # type: ignore[no-untyped-call]  # torch leaves it untyped
         (len(segments.speed), 1), *[value.shape for value in p.values()]
     )
     sums = segments.speed.new_empty((kernel.terms, *shape))
-    _run(kernel, segments, list(p.values()), sums, cores or _available())
+    _run(kernel, segments, list(p.values()), sums)
     return tuple(sums)
 
 
 def exists(
-    model: DrivingModel, dt: float, p: Mapping[str, Tensor], terms: Terms, *, key: Hashable
+    model: DrivingModel,
+    dt: float,
+    p: Mapping[str, Tensor],
+    terms: Terms,
+    *,
+    key: ComponentKey | str,
 ) -> bool:
     """Says whether `accumulate` has a kernel for these arguments; makes it at the first call."""
     return _kernel(model, dt, p, terms, key) is not None
 
 
+def model_key(model: DrivingModel) -> ComponentKey:
+    """Returns what a model's equations depend on; its parameters are inputs of them."""
+    return ComponentKey(type(model), model.settings.model_dump_json(exclude={"parameters"}))
+
+
 def _kernel(
-    model: DrivingModel, dt: float, p: Mapping[str, Tensor], terms: Terms, key: Hashable
-) -> _Kernel | None:
-    """Returns the kernel for a model and an objective, made at the first call."""
-    names, varied = tuple(p), tuple(value.dim() > 0 for value in p.values())
-    dtype = next(iter(p.values())).dtype
-    full_key = (key, dt, names, varied, dtype)
-    if full_key not in _KERNELS:
-        _KERNELS[full_key] = _made(model, dt, names, varied, terms, dtype)
-    return _KERNELS[full_key]
-
-
-def _made(
     model: DrivingModel,
     dt: float,
-    names: Sequence[str],
-    varied: Sequence[bool],
+    p: Mapping[str, Tensor],
     terms: Terms,
-    dtype: torch.dtype,
+    key: ComponentKey | str,
 ) -> _Kernel | None:
+    """Returns the kernel for a model and an objective, made at the first call."""
+    parameters = tuple((name, value.dim() > 0) for name, value in p.items())
+    whole_key = KernelKey(
+        model=model_key(model),
+        temperature=float(model.temperature),
+        terms=key,
+        dt=dt,
+        parameters=parameters,
+        dtype=next(iter(p.values())).dtype,
+    )
+    with _MAKING:
+        if whole_key not in _KERNELS:
+            _KERNELS[whole_key] = _made(model, terms, whole_key)
+        return _KERNELS[whole_key]
+
+
+def _made(model: DrivingModel, terms: Terms, key: KernelKey) -> _Kernel | None:
     if compiler.find_compiler() is None:
         return None
-    try:
-        program = record(model, names, dt, terms, dtype)
-    except Unsupported as reason:
-        log.info(
-            "%s has no compiled kernel (%s); PyTorch simulates it", type(model).__name__, reason
-        )
-        return None
-    library = compiler.build(write(program, varied, dtype))
+    source = compiler.remembered(key.lasting(), lambda: _source(model, terms, key))
+    library = compiler.build(source) if source else None
     if library is None:
         return None
-    return _Kernel(library.accumulate, len(program.terms))
+    return _Kernel(library.accumulate, int(library.terms()))
 
 
-def _run(
-    kernel: _Kernel, segments: Segments, parameters: Sequence[Tensor], sums: Tensor, cores: int
-) -> None:
+def _source(model: DrivingModel, terms: Terms, key: KernelKey) -> str:
+    """Returns the C++ source of a kernel; nothing where there can be none."""
+    names = tuple(name for name, _ in key.parameters)
+    try:
+        program = record(model, names, key.dt, terms, key.dtype)
+    except Unsupported as reason:
+        name = type(model).__name__
+        log.info("%s has no compiled kernel (%s); PyTorch simulates it", name, reason)
+        return ""
+    return write(program, [varied for _, varied in key.parameters], key.dtype)
+
+
+def _run(kernel: _Kernel, segments: Segments, parameters: Sequence[Tensor], sums: Tensor) -> None:
     _, problems, candidates = sums.shape
     ends = _ends(segments.counted)
     signals = []
@@ -145,15 +167,8 @@ def _run(
             ctypes.c_long(min(first + _UNITS_AT_ONCE, units)),
         )
 
-    firsts = range(0, units, _UNITS_AT_ONCE)
-    if cores == 1 or len(firsts) == 1:
-        for first in firsts:
-            take(first)
-        return
-    # A call of the kernel holds no lock of Python's; threads that have nothing to do sleep.
-    with ThreadPoolExecutor(min(cores, len(firsts))) as pool:
-        for _ in pool.map(take, firsts):
-            pass
+    # A call of the kernel holds no lock of Python's.
+    share(take, range(0, units, _UNITS_AT_ONCE), level="kernel")
 
 
 def _ends(counted: Tensor) -> Tensor:
@@ -174,10 +189,3 @@ def _parameter(value: Tensor, problems: int, candidates: int) -> _View:
         return _View(value.data_ptr(), 0, 0)
     whole = value.expand(problems, candidates)
     return _View(whole.data_ptr(), whole.stride(0), whole.stride(1))
-
-
-def _available() -> int:
-    """Returns how many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

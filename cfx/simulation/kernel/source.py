@@ -92,6 +92,7 @@ def write(program: StepProgram, varied: Sequence[bool], dtype: torch.dtype) -> s
         target = f"sums[({k} * problems + i) * candidates + begin + j]"
         lines.append(f"    for (long j = 0; j < width; ++j) {target} = S{k}[j];")
     lines += ["  }", "}"]
+    lines.append(f'extern "C" long terms() {{ return {len(program.terms)}; }}')
     return "\n".join(lines) + "\n"
 
 
