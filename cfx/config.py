@@ -87,6 +87,9 @@ class JobConfig(Settings):
     seed: int = Field(0, ge=0, lt=2**32, description="seed of everything random")
     device: str = Field("auto", description="auto, cpu, cuda or cuda:N")
     dtype: Literal["float32", "float64"] = Field("float64", description="precision of simulations")
+    cores: int | None = Field(
+        None, ge=1, description="cores that calibration shares its work among; null: all"
+    )
     threads: int | None = Field(1, ge=1, description="torch's threads; null: torch's own choice")
     split: float = Field(
         0.8, gt=0, lt=1, description="share of each pair that is calibrated and learned on"

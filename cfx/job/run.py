@@ -33,6 +33,7 @@ from cfx.learners.curves import best_losses
 from cfx.pairs import PairBatch, PairSet
 from cfx.progress import Task
 from cfx.protocols.base import Protocol, ProtocolContext, ProtocolResult
+from cfx.simulation.threads import limit_cores
 from cfx.style.entropy import measure_style, select_cluster
 from cfx.style.result import StyleResult
 
@@ -60,6 +61,7 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
 
     console = console or Console()
     device = choose_device(config.device)
+    limit_cores(config.cores)
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     protocol = make_protocol(config)

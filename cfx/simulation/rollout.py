@@ -11,6 +11,7 @@ candidates)` without a copy.
 
 from __future__ import annotations
 
+import copy
 import importlib.util
 import itertools
 import math
@@ -63,27 +64,18 @@ class MemoryStepper(Stepper):
 
     differentiable: ClassVar[bool] = True
 
-    def __init__(
-        self, model: DrivingModel, dt: float, *, compile: Compile = "auto", together: int = 0
-    ) -> None:
-        """Makes a stepper.
-
-        Args:
-            model: the driving model.
-            dt: time step, s.
-            compile: compile the model's step: `auto`: where it pays.
-            together: vehicle steps of calls that belong together.
-        """
+    def __init__(self, model: DrivingModel, dt: float, *, compile: Compile = "auto") -> None:
         super().__init__(model, dt)
         self._mode: Compile = compile
-        self._together = together
+        self._together = 0  # vehicle steps of calls that belong together
 
     def identity(self) -> str:
         return folder_hash(__file__) + folder_hash(kernel.__file__)
 
     def for_work(self, steps: int) -> MemoryStepper:
-        together = max(steps, self._together)
-        return MemoryStepper(self.model, self.dt, compile=self._mode, together=together)
+        stepper = copy.copy(self)
+        stepper._together = max(steps, self._together)  # noqa: SLF001 - a copy of itself
+        return stepper
 
     def advance(
         self, follower: Follower, leader: Leader, p: Mapping[str, Tensor]

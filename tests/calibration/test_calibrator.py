@@ -26,6 +26,7 @@ from cfx.optimizers.botorch import BotorchOptimizer
 from cfx.optimizers.random import RandomSearch
 from cfx.pairs import PairBatch, PairSet
 from cfx.progress import Task
+from cfx.simulation import threads
 from cfx.simulation.rollout import MemoryStepper
 from tests.drives import straight_pairs, wavy_pairs
 
@@ -265,3 +266,15 @@ def test_ties_have_the_objectives_tolerance_unless_a_setting_says_another() -> N
     tool = calibrator(RandomSearch(samples=8), objective=TheilU())
     assert tool.tie_tolerance(WindowSettings()) == TheilU.tie_tolerance
     assert tool.tie_tolerance(WindowSettings(tie_tolerance=0.0)) == 0.0
+
+
+@pytest.mark.parametrize("samples", [2048, 1 << 18], ids=["kernel", "a chunk for each driver"])
+def test_the_number_of_cores_changes_no_bit(samples: int, request: pytest.FixtureRequest) -> None:
+    request.addfinalizer(lambda: threads.limit_cores(None))
+    pairs = wavy_pairs(Krauss(), TRUE, frames=60)
+    batch = PairBatch.of(pairs)
+    tool = calibrator(RandomSearch(samples=samples))
+    threads.limit_cores(1)
+    alone = tool.fixed(pairs, batch, batch.lengths - 1)
+    threads.limit_cores(None)
+    assert torch.equal(tool.fixed(pairs, batch, batch.lengths - 1), alone)

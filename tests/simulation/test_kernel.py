@@ -12,11 +12,14 @@ from torch import Tensor
 from cfx import registry
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.krauss import Krauss
+from cfx.models.w99 import W99
 from cfx.objectives.base import FrameValues, Objective
+from cfx.objectives.rmse import SpeedRmse
 from cfx.simulation import threads
 from cfx.simulation.base import Stepper
 from cfx.simulation.kernel import compiler
 from cfx.simulation.kernel.graph import literal
+from cfx.simulation.kernel.keys import ComponentKey, KernelKey
 from cfx.simulation.kernel.run import accumulate
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.trajectory import Segments, Start
@@ -292,3 +295,53 @@ def test_numbers_are_written_exactly(value: float) -> None:
         assert text == "real(INFINITY)"
     else:
         assert float.fromhex(text.removeprefix("real(").removesuffix(")")) == value
+
+
+def test_a_recorded_step_is_remembered_under_the_code_that_it_came_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CFX_KERNEL_CACHE", str(tmp_path / "kernels"))
+    compiler.cache_folder.cache_clear()
+    calls = []
+
+    def make() -> str:
+        calls.append(None)
+        return "source"
+
+    assert [compiler.remembered("key", make) for _ in range(2)] == ["source", "source"]
+    assert len(calls) == 1
+    assert [compiler.remembered(None, make) for _ in range(2)] == ["source", "source"]
+    assert len(calls) == 3
+    compiler.cache_folder.cache_clear()
+
+
+def key_of(model: type, settings: str = "{}", temperature: float = 0.0) -> KernelKey:
+    return KernelKey(
+        model=ComponentKey(model, settings),
+        temperature=temperature,
+        terms=ComponentKey(SpeedRmse, "{}"),
+        dt=DT,
+        parameters=(("t_r", True),),
+        dtype=torch.float64,
+    )
+
+
+def test_what_a_kernel_depends_on_is_in_its_key() -> None:
+    keys = {
+        key_of(Krauss).lasting(),
+        key_of(W99).lasting(),
+        key_of(Krauss, '{"variant": "sumo"}').lasting(),
+        key_of(Krauss, temperature=0.5).lasting(),
+        key_of(Branches).lasting(),
+    }
+    assert None not in keys
+    assert len(keys) == 5
+    assert key_of(Krauss).lasting() == key_of(Krauss).lasting()
+
+
+def test_a_class_made_in_a_function_is_known_to_its_process_alone() -> None:
+    class Here(Krauss):
+        pass
+
+    assert key_of(Here).lasting() is None
+    assert key_of(Krauss)._replace(terms="a name").lasting() is None
