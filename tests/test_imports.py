@@ -160,3 +160,28 @@ def test_the_public_names_are_there_and_an_unknown_one_is_not() -> None:
         _ = cfx.nonsense
     assert cfx.get("model", "krauss").__name__ == "Krauss"
     assert cfx.__version__[0].isdigit()
+
+
+def test_a_wrong_path_is_answered_before_anything_heavy_is_imported(tmp_path: Path) -> None:
+    script = f"""
+        import sys
+        from cfx.errors import DataError
+        from cfx.config import JobConfig
+        from cfx.job.run import run_job
+        from pathlib import Path
+
+        nodes = dict.fromkeys(("model", "policy", "optimizer", "learner", "protocol"), {{}})
+        data = {{"name": "tidy", "path": "nowhere.parquet"}}
+        try:
+            run_job(JobConfig(data=data, **nodes), Path({str(tmp_path)!r}))
+        except DataError as error:
+            assert "no such file" in str(error), error
+        else:
+            raise AssertionError("there is no such file")
+        heavy = {{"torch", "lightning", "mlflow", "scipy", "matplotlib"}} & set(sys.modules)
+        assert not heavy, heavy
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
