@@ -174,7 +174,7 @@ def _with_slope(search: _Search, around: Tensor, losses: Tensor) -> _Search:
 
 
 def _learned(search: _Search, slope: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns the inverse after the BFGS update, where the last step teaches something."""
+    """Returns the inverse after the BFGS update, where the last step says something."""
     s, y = search.moved[..., None], (slope - search.slope)[..., None]
     curvature = (s * y).sum((-2, -1))
     usable = curvature > 1e-12
