@@ -6,6 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 QUICK = (
+    "model=krauss",
+    "learner=imitation",
+    "protocol=within_driver",
+    "data=synthetic",
     "data.pairs=2",
     "data.frames=150",
     "optimizer=random",

@@ -133,8 +133,8 @@ def test_ctrl_c_and_sigterm_have_their_exit_codes(run: Run, seed: int, code: int
             "'policy.hiden_size'. Did you mean 'policy.hidden_size'? Known keys of policy: ",
         ),
         (
-            ["modl.parameters.t_r.low=3"],
-            "'modl.parameters.t_r.low'. Did you mean 'model.parameters.t_r.low'?",
+            ["modl.parameters.v0.low=3"],
+            "'modl.parameters.v0.low'. Did you mean 'model.parameters.v0.low'?",
         ),
         (["modle=w99", "policy=nope"], "policy=nope: there is no policy 'nope'."),
         (["seed=-1"], "seed=-1: should be greater than or equal to 0."),
@@ -292,7 +292,7 @@ def test_help_lists_the_groups_and_names_only_keys_that_exist(run: Run, capsys) 
     assert listed["policy"] >= {"default", "fixed", "gru", "lstm"}
     for override in (
         "style.cluster=aggressive",
-        "model.parameters.t_r.high=12",
+        "model.parameters.T.high=12",
         "seed=1",
         "device=cuda",
         "split=0.7",

@@ -241,7 +241,7 @@ def test_a_broken_plugin_harms_no_composition_that_does_not_choose_it(install) -
         "cfx.policies": {"ghost": "not_there_at_all:Ghost"},
     }
     install("bad-models", points, files)
-    assert values_of()["model"]["name"] == "krauss"
+    assert values_of()["model"]["name"] == "idm"
     assert values_of("model=other")["model"] == {"name": "krauss"}
     with pytest.raises(PluginError, match=r"bad-models 1\.0 cannot be imported: SystemExit: 5"):
         values_of("model=bad")

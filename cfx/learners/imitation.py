@@ -10,6 +10,7 @@ token, c features of conditioning, n tuned parameters.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -31,6 +32,8 @@ from cfx.learners.batched import BatchedModule, Grid, fit
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import measured_history, tokens
 from cfx.progress import Task
+
+log = logging.getLogger(__name__)
 
 
 class ImitationSettings(Settings):
@@ -115,6 +118,10 @@ class ImitationLearner(Learner):
         if not any(parameter.requires_grad for parameter in network.parameters()):
             curves = pd.DataFrame(columns=CURVE_COLUMNS)
             return TrainingResult(network.eval(), dataset.scaler, curves, base, head.name)
+        log.info(
+            "learner=imitation, the paper's method, reproduces labels; trained through simulation"
+            " (learner=rollout) policies follow real drivers more closely"
+        )
         task = Task(f"Training ({len(names)} networks, at most {s.epochs} epochs)", s.epochs)
         module = ImitationModule(network, dataset, head, s, names, on_epoch=task.advance)
         fit(

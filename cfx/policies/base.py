@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from cfx.component import Component, Settings
 from cfx.policies.driver_features import check_driver_features, named_driver_features
-from cfx.policies.features import Summary, check_inputs, named_inputs
+from cfx.policies.features import SITUATION, Summary, check_inputs, named_inputs
 
 
 class PolicyNetwork(nn.Module, ABC):
@@ -48,10 +48,10 @@ class PolicySettings(Settings):
     """Settings of policies that read states."""
 
     inputs: Annotated[tuple[str, ...], BeforeValidator(named_inputs)] = Field(
-        ("leader_speed", "follower_speed"),
-        description="signals that the policy sees; also: gap, relative_speed, time_headway,"
-        " leader_acceleration, follower_acceleration, inverse_time_to_collision; or situation: what"
-        " works best with learner=rollout",
+        SITUATION,
+        description="signals that the policy sees, of leader_speed, follower_speed, gap,"
+        " relative_speed, time_headway, leader_acceleration, follower_acceleration and"
+        " inverse_time_to_collision; the paper's are [leader_speed, follower_speed]",
     )
     summary: Summary = Field(
         "frames",

@@ -101,16 +101,17 @@ INPUTS: dict[str, Callable[[History], Tensor]] = {
 }
 """Signals that a policy may see, each `(*batch, length)`."""
 
-INPUT_SETS: dict[str, tuple[str, ...]] = {
-    "situation": (
-        "leader_speed",
-        "relative_speed",
-        "gap",
-        "time_headway",
-        "follower_acceleration",
-        "leader_acceleration",
-    ),
-}
+SITUATION = (
+    "leader_speed",
+    "relative_speed",
+    "gap",
+    "time_headway",
+    "follower_acceleration",
+    "leader_acceleration",
+)
+"""The inputs with which closed-loop training works best."""
+
+INPUT_SETS: dict[str, tuple[str, ...]] = {"situation": SITUATION}
 """Inputs that go by one name: `policy.inputs=situation`."""
 
 

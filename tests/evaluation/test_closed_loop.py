@@ -27,6 +27,8 @@ from cfx.simulation.trajectory import Start
 from cfx.style.result import StyleResult
 from tests.drives import wavy_pairs
 
+SPEEDS = ("leader_speed", "follower_speed")
+
 
 def constant(model: DrivingModel, parameters: Tensor) -> Agent:
     unit = model.space.to_unit(parameters)
@@ -162,7 +164,7 @@ def test_a_pair_drives_the_same_whatever_drives_beside_it() -> None:
     model = Krauss()
     true = torch.tensor([[1.5, 0.1], [3.0, 0.5], [2.0, 0.0]], dtype=torch.float64)
     batch = PairBatch.of(wavy_pairs(model, true))
-    policy = adaptive(model, GruPolicy(start="middle"), 3, 10)
+    policy = adaptive(model, GruPolicy(start="middle", inputs=SPEEDS), 3, 10)
     together = simulate_closed_loop(
         MemoryStepper(model, 0.1), policy, batch, torch.tensor([150, 200, 100]), torch.arange(3)
     )
@@ -178,7 +180,7 @@ def test_several_drivers_share_one_network() -> None:
     batch = PairBatch.of(
         wavy_pairs(model, torch.tensor([[1.5, 0.1], [3.0, 0.5]], dtype=torch.float64))
     )
-    shared = adaptive(model, GruPolicy(start="middle"), 1, 10)
+    shared = adaptive(model, GruPolicy(start="middle", inputs=SPEEDS), 1, 10)
     both = simulate_closed_loop(
         MemoryStepper(model, 0.1), shared, batch, torch.tensor([150, 150]), torch.tensor([0, 0])
     )

@@ -150,7 +150,7 @@ def plugins_idm() -> Twin | None:
     """The plugin's `idm`: no brake cap (lifted in SUMO here), and other gaps below 0.1 m."""
     if importlib.util.find_spec("cfx_idm") is None:
         return None
-    from cfx_idm.idm import IDM
+    from cfx.models.idm import IDM
 
     names = {
         "v0": "maxSpeed",

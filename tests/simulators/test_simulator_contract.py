@@ -24,6 +24,10 @@ from cfx.simulators.sumo.simulator import SumoSimulator
 from cfx.testing import SimulatorContract
 
 QUICK = [
+    "model=krauss",
+    "learner=imitation",
+    "protocol=within_driver",
+    "data=synthetic",
     "data.pairs=2",
     "data.frames=150",
     "optimizer=random",

@@ -22,6 +22,9 @@ needs_sumo = pytest.mark.skipif(
 )
 
 QUICK = [
+    "model=krauss",
+    "learner=imitation",
+    "protocol=within_driver",
     "data=synthetic_short",
     "data.max_pairs=3",
     "optimizer=random",

@@ -94,7 +94,10 @@ def test_cfx_recovers_known_drivers_with_it(
     result = cfx.run(
         [
             "optimizer=cma",
+            "model=krauss",
             "policy=fixed",
+            "protocol=within_driver",
+            "data=synthetic",
             *options,
             "tracking.enabled=false",
             "figures.enabled=false",

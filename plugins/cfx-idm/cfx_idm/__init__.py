@@ -1,1 +1,1 @@
-"""The Intelligent Driver Model (`idm`) and its improved acceleration function (`iidm`), for cfx."""
+"""The improved acceleration function of the Intelligent Driver Model (`iidm`), for cfx."""

@@ -7,15 +7,26 @@ section 11.3.7.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import cast
 
 import torch
 from torch import Tensor
 
-from cfx import DrivingModel, Follower, Leader, bumper_gap
-from cfx_idm.idm import CLOSEST, IDM_PARAMETERS, desired_gap
+from cfx import DrivingModel, Follower, Leader, bumper_gap, get
+
+IDM = cast(type[DrivingModel], get("model", "idm"))
+
+CLOSEST = 0.1
+"""Smallest gap, m: a smaller one counts as this, because the desired gap is divided by it."""
 
 _NEARLY_ZERO = 1e-6
 """m/s2: least free acceleration in the exponent that it divides."""
+
+
+def desired_gap(v: Tensor, v_l: Tensor, p: Mapping[str, Tensor]) -> Tensor:
+    """Returns s*, m: `s0 + max(0, v T + v (v - v_l) / (2 sqrt(a b)))`, of speeds in m/s."""
+    dynamic = v * p["T"] + v * (v - v_l) / (2.0 * torch.sqrt(p["a"] * p["b"]))
+    return p["s0"] + dynamic.clamp(min=0.0)
 
 
 class IIDM(DrivingModel):
@@ -45,7 +56,7 @@ class IIDM(DrivingModel):
 
     reference = "Treiber and Kesting (2013), Traffic Flow Dynamics, section 11.3.7"
     collision_free = True
-    parameters = IDM_PARAMETERS
+    parameters = IDM.parameters
 
     def next_speed(
         self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float

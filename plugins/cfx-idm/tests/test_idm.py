@@ -19,11 +19,11 @@ from torch import Tensor
 import cfx
 from cfx import Follower, Leader, Start, simulate
 from cfx.testing.models import Equilibrium, ModelContract
-from cfx_idm.idm import IDM
 from cfx_idm.iidm import IIDM
 
 from .rollouts import order
 
+IDM: Any = cfx.get("model", "idm")
 PAPER = {"v0": 120 / 3.6, "T": 1.6, "s0": 2.0, "a": 0.73, "b": 1.67, "delta": 4.0}
 
 
@@ -255,6 +255,8 @@ def test_a_job_runs_with_the_preset_for_city_traffic(tmp_path, monkeypatch) -> N
     monkeypatch.chdir(tmp_path)
     overrides = [
         "model=idm_city",
+        "protocol=within_driver",
+        "data=synthetic",
         "data.pairs=2",
         "data.frames=200",
         "optimizer=random",

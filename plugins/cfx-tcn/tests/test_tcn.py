@@ -118,6 +118,7 @@ def test_a_job_trains_it_and_what_is_saved_drives_the_same(
     monkeypatch.chdir(tmp_path)
     quick = [
         "debug=quick",
+        "policy.inputs=[leader_speed,follower_speed]",
         "data.frames=300",
         "learner.epochs=15",
         "tracking.enabled=false",

@@ -12,7 +12,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from cfx import DrivingModel, Follower, Leader, Parameter, ParameterSpace, bumper_gap
+from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
+from cfx.parameters import Parameter, ParameterSpace
 
 _PAPER = (
     "default: Treiber et al. (2000), table I;"
