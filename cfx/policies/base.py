@@ -51,7 +51,7 @@ class PolicySettings(Settings):
         SITUATION,
         description="signals that the policy sees, of leader_speed, follower_speed, gap,"
         " relative_speed, time_headway, leader_acceleration, follower_acceleration and"
-        " inverse_time_to_collision; the paper's are [leader_speed, follower_speed]",
+        " inverse_time_to_collision; or speeds, the paper's two, or situation, the default",
     )
     summary: Summary = Field(
         "frames",

@@ -111,7 +111,10 @@ SITUATION = (
 )
 """The inputs with which closed-loop training works best."""
 
-INPUT_SETS: dict[str, tuple[str, ...]] = {"situation": SITUATION}
+SPEEDS = ("leader_speed", "follower_speed")
+"""The paper's inputs."""
+
+INPUT_SETS: dict[str, tuple[str, ...]] = {"situation": SITUATION, "speeds": SPEEDS}
 """Inputs that go by one name: `policy.inputs=situation`."""
 
 
