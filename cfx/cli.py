@@ -173,8 +173,8 @@ def _drive(arguments: Sequence[str]) -> int:
     parser.add_argument(
         "--speed-mode",
         type=int,
-        default=0,
-        help="SUMO's bit set; 0 (default): exact; 31: SUMO's own checks bound each speed",
+        default=31,
+        help="SUMO's bit set; 31 (default): SUMO's own checks bound each speed; 0: none, exact",
     )
     given = list(arguments)
     cut = len(given)

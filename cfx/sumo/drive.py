@@ -34,6 +34,7 @@ class Tally:
         metres: the distance that all covered together.
         lane_changes: on the same edge.
         hard_brakings: times that a vehicle began to brake harder than its vType's `decel`.
+        hardest_braking: the largest deceleration of any, m/s2.
         collisions, teleports: vehicles that SUMO reported; a vehicle may do so more than once.
     """
 
@@ -43,6 +44,7 @@ class Tally:
     metres: float = 0.0
     lane_changes: int = 0
     hard_brakings: int = 0
+    hardest_braking: float = 0.0
     collisions: int = 0
     teleports: int = 0
 
@@ -83,7 +85,7 @@ def run_scenario(
     seed: int | None = None,
     output: Path | None = None,
     look_ahead: float = 200.0,
-    speed_mode: int = 0,
+    speed_mode: int = 31,
     options: Sequence[str] = (),
 ) -> ScenarioRun:
     """Runs a scenario in libsumo until it is over.
@@ -98,7 +100,8 @@ def run_scenario(
         end: s of simulated time.
         seed: SUMO's; None for the scenario's.
         output: a CSV file with a row for each driven vehicle and step.
-        look_ahead, speed_mode: as in `Driver`.
+        look_ahead: as in `Driver`.
+        speed_mode: as in `Driver`; 31 lets SUMO's own checks bound each speed.
         options: more of SUMO's own options.
 
     Raises:
@@ -247,7 +250,9 @@ class _Run:
         if before[0] == lane[0] and before[1] != lane[1]:
             tally.lane_changes += 1
         self._lanes[name] = lane
-        if vehicle.getAcceleration(name) >= -self._decel[kind] - 1e-6:
+        acceleration = vehicle.getAcceleration(name)
+        tally.hardest_braking = max(tally.hardest_braking, -acceleration)
+        if acceleration >= -self._decel[kind] - 1e-6:
             self._braking.discard(name)
         elif name not in self._braking:
             self._braking.add(name)
@@ -352,6 +357,7 @@ def report(run: ScenarioRun) -> None:
         "mean speed [m/s]",
         "lane changes",
         "hard brakings",
+        "hardest [m/s2]",
         "collisions",
         "teleports",
     )
@@ -366,6 +372,7 @@ def report(run: ScenarioRun) -> None:
             f"{tally.metres / (tally.steps * run.dt):.2f}",
             str(tally.lane_changes),
             str(tally.hard_brakings),
+            f"{tally.hardest_braking:.1f}",
             str(tally.collisions),
             str(tally.teleports),
         )

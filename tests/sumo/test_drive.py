@@ -249,6 +249,7 @@ def test_the_table_says_it_all(capsys: pytest.CaptureFixture[str]) -> None:
         metres=240.0,
         lane_changes=3,
         hard_brakings=2,
+        hardest_braking=6.25,
         collisions=1,
         teleports=4,
     )
@@ -261,6 +262,7 @@ def test_the_table_says_it_all(capsys: pytest.CaptureFixture[str]) -> None:
         "12.00",
         "3",
         "2",
+        "6.2",
         "1",
         "4",
     ]
