@@ -148,7 +148,7 @@ def _shade_outside(axes: Axes, bounds: tuple[float, float], low: float, high: fl
 
 
 def _two_line_title(axes: Axes, strong: str, fine: str) -> None:
-    axes.set_title(fine, fontsize=8.5, color=INK)  # several methods' errors beside each other
+    axes.set_title(fine, fontsize=7.6, color=INK)  # several methods' errors beside each other
     if strong:
         axes.annotate(
             strong,
