@@ -13,7 +13,7 @@ from typing import Any, Literal
 from pydantic import Field, field_validator
 
 from cfx import registry, renamed
-from cfx.calibration.settings import WindowSettings
+from cfx.calibration.settings import CalibrationSettings, WindowSettings
 from cfx.component import Settings, validate
 from cfx.errors import ConfigError
 from cfx.style.settings import StyleSettings
@@ -95,6 +95,9 @@ class JobConfig(Settings):
         0.8, gt=0, lt=1, description="share of each pair that is calibrated and learned on"
     )
     windows: WindowSettings = Field(WindowSettings(), description="how trajectories are cut")
+    calibration: CalibrationSettings = Field(
+        CalibrationSettings(), description="how constant parameters are calibrated"
+    )
     style: StyleSettings = Field(StyleSettings(), description="driving style")
     cache: CacheSettings = Field(CacheSettings(), description="cache of calibrations")
     tracking: TrackingSettings = Field(TrackingSettings(), description="MLflow")

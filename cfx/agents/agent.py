@@ -24,9 +24,15 @@ from cfx import renamed
 from cfx.agents.context import UNSEEN, ContextRule, DriverContext
 from cfx.agents.core import AgentCore
 from cfx.agents.heads.base import ParameterHead
-from cfx.agents.heads.offset import shrunk
+from cfx.agents.heads.offset import blended, shrunk
 from cfx.agents.placement import ALL, driver_places
 from cfx.agents.scaler import Scaler
+from cfx.agents.valid_range import (
+    SIGNALS,
+    ValidRange,
+    situation_of,
+    weight_of_answer,
+)
 from cfx.calibration.windows import WindowSettings
 from cfx.errors import DataError
 from cfx.pairs import PairBatch, PairSet
@@ -48,6 +54,9 @@ class AgentState(NamedTuple):
         state: of the networks, `(N, B, s)`.
         base: `(D, n)` in unit space; None where the head needs none.
         conditioning: what networks read of each driver in every window, `(D, c)`.
+        score: how far outside what was learned each was in the last window, `(D,)`; up to 1 is
+            inside. 0 where nothing is known of that.
+        beyond: which signals alone were unusual, too low and then too high, bool `(D, 2 f)`.
     """
 
     network: Tensor
@@ -55,6 +64,8 @@ class AgentState(NamedTuple):
     state: Tensor
     base: Tensor | None
     conditioning: Tensor
+    score: Tensor
+    beyond: Tensor
 
 
 @dataclass(frozen=True)
@@ -74,6 +85,9 @@ class Agent:
             `(N, n)`, SI units; None if there are none.
         learned_from: the pairs that were learned from or calibrated on: `Pair.content` and the
             driver's name.
+        valid_range: the situations that each network learned from; None if they are not known.
+            Outside, answers fade towards the base, or towards the pooled parameters where the head
+            has no base.
     """
 
     core: AgentCore
@@ -86,6 +100,7 @@ class Agent:
     context_rule: ContextRule = field(default_factory=ContextRule)
     population: Tensor | None = None
     learned_from: Mapping[str, str] = field(default_factory=dict)
+    valid_range: ValidRange | None = None
 
     @property
     def policy(self) -> Policy:
@@ -154,7 +169,12 @@ class Agent:
         known = base if base is not None else self.scaler.mean.new_zeros((len(network), 0)).double()
         features = self._known_features(network, context)
         state = self.network.initial_state(len(self.names), int(place.max()) + 1)
-        return AgentState(network, place, state, base, self.core.condition(known, features))
+        conditioning = self.core.condition(known, features)
+        score = torch.zeros(len(network), dtype=torch.float64, device=network.device)
+        beyond = torch.zeros(
+            (len(network), 2 * len(SIGNALS)), dtype=torch.bool, device=network.device
+        )
+        return AgentState(network, place, state, base, conditioning, score, beyond)
 
     def observe(self, history: History, state: AgentState, present: Tensor) -> AgentState:
         """Lets networks see one window of D drivers without acting.
@@ -174,6 +194,8 @@ class Agent:
     def act(self, history: History, state: AgentState) -> tuple[Tensor, AgentState]:
         """Chooses the parameters of the next window.
 
+        Outside the situations that were learned from, the answer fades towards the base.
+
         Args:
             history: the last `windows.length` frames of D drivers, `(D, L)` each, SI units.
             state: where they stand.
@@ -184,7 +206,8 @@ class Agent:
         dtype = history.follower_speed.dtype
         answers, after = self.core.answer(self._features(history, state), state.state)
         answer = answers[state.network, state.place].to(dtype)
-        unit = self.head.unit_parameters(answer.double(), state.base).to(dtype)
+        state = self._judged(history, state)
+        unit = self._faded(answer.double(), state).to(dtype)
         return self.space.from_unit(unit), state._replace(state=after)
 
     def burn_in(
@@ -290,6 +313,7 @@ class Agent:
             names=(ALL,),
             base=None if self.base is None else self.base[row],
             population=None if self.population is None else self.population[row],
+            valid_range=None if self.valid_range is None else self.valid_range.only(number),
         )
 
     def to(self, device: torch.device) -> Agent:
@@ -299,7 +323,35 @@ class Agent:
             core=self.core.to(device),
             base=None if self.base is None else self.base.to(device),
             population=None if self.population is None else self.population.to(device),
+            valid_range=None if self.valid_range is None else self.valid_range.to(device),
         )
+
+    def _judged(self, history: History, state: AgentState) -> AgentState:
+        """Notes how far outside what was learned the drivers are."""
+        if self.valid_range is None:
+            return state
+        situation = situation_of(history)
+        return state._replace(
+            score=self.valid_range.score(situation, state.network),
+            beyond=self.valid_range.beyond(situation, state.network),
+        )
+
+    def _faded(self, answer: Tensor, state: AgentState) -> Tensor:
+        """Returns the parameters `(D, n)`, in unit space, of answers as far as they are used."""
+        unit = self.head.unit_parameters(answer, state.base)
+        weight = weight_of_answer(state.score)[:, None]
+        fallback = self._fallback(state)
+        if fallback is None or not bool((weight < 1.0).any()):
+            return unit
+        return torch.where(weight < 1.0, blended(fallback, unit, weight), unit)
+
+    def _fallback(self, state: AgentState) -> Tensor | None:
+        """Returns what is driven with far outside, `(D, n)` in unit space; None if nothing is."""
+        if state.base is not None:
+            return state.base
+        if self.population is None:
+            return None
+        return self.space.to_unit(self.population[state.network].double())
 
     def _unit_base(self, network: Tensor, context: DriverContext) -> Tensor | None:
         """Returns the drivers' base in unit space, `(D, n)`, in double precision."""

@@ -1,8 +1,8 @@
 """Saved policies: an agent in a folder.
 
-`policy.json` holds everything that is text or a number, `policy.pt` the tensors (a state dict that
-is read with `weights_only=True`, so no code runs). Format 2 names the head; format 1 did not, and
-what it saved loads too.
+`policy.json` holds everything that is text or a number, `policy.safetensors` the tensors: neither
+can hold code. Formats 1 and 2 kept the tensors in `policy.pt`, a state dict that is read with
+`weights_only=True`; format 1 did not name the head. What they saved loads too.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import safetensors.torch
 import torch
+from safetensors import SafetensorError
 from torch import Tensor
 
 from cfx import registry, renamed
@@ -22,26 +24,39 @@ from cfx.agents.core import AgentCore, features_read, network_with_weights
 from cfx.agents.heads import HEADS, head_name
 from cfx.agents.heads.base import ParameterHead
 from cfx.agents.scaler import Scaler
+from cfx.agents.valid_range import ValidRange
 from cfx.calibration.windows import WindowSettings
 from cfx.errors import DataError
 from cfx.files import atomic_write
 from cfx.models.base import DrivingModel
 from cfx.policies.base import Policy
 
-_FORMAT = 2
-_READABLE = (1, 2)
+_FORMAT = 3
+_READABLE = (1, 2, 3)
+
+_DESCRIPTION = "policy.json"
+_TENSORS = "policy.safetensors"
+_TENSORS_BEFORE = "policy.pt"
+"""Where formats 1 and 2 kept the tensors."""
+
+_LARGEST_MB = 256
+"""A policy's files are larger only if they are something else."""
+
+_RANGE = "valid_range."
+"""What names of tensors of the valid range begin with."""
 
 
 def save(agent: Agent, folder: Path) -> None:
-    """Writes `policy.pt` and `policy.json`; each appears whole.
+    """Writes `policy.safetensors` and `policy.json`; each appears whole.
 
     Raises:
         OSError: a file cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    with atomic_write(folder / "policy.pt") as temporary:
-        torch.save(_tensors(agent), temporary)
-    with atomic_write(folder / "policy.json") as temporary:
+    tensors = {name: value.contiguous() for name, value in _tensors(agent).items()}
+    with atomic_write(folder / _TENSORS) as temporary:
+        temporary.write_bytes(safetensors.torch.save(tensors))
+    with atomic_write(folder / _DESCRIPTION) as temporary:
         text = json.dumps(_description(agent), indent=2)
         temporary.write_text(text + "\n", encoding="utf-8")
 
@@ -92,6 +107,7 @@ def load(folder: Path | str) -> Agent:
         ),
         population=weights.get("population"),
         learned_from=description.get("learned_from", {}),
+        valid_range=_valid_range(weights),
     )
 
 
@@ -105,7 +121,20 @@ def _tensors(agent: Agent) -> dict[str, Tensor]:
         tensors["base"] = agent.base.cpu()
     if agent.population is not None:
         tensors["population"] = agent.population.cpu()
+    if agent.valid_range is not None:
+        for name, value in agent.valid_range.state_dict().items():
+            tensors[f"{_RANGE}{name}"] = value.cpu()
     return tensors
+
+
+def _valid_range(weights: Mapping[str, Tensor]) -> ValidRange | None:
+    found = {}
+    for name, value in weights.items():
+        if name.startswith(_RANGE):
+            found[name.removeprefix(_RANGE)] = value
+    if not found:
+        return None
+    return ValidRange(**found)
 
 
 def _description(agent: Agent) -> dict[str, Any]:
@@ -129,9 +158,12 @@ def _description(agent: Agent) -> dict[str, Any]:
 
 def _read(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     try:
-        description = json.loads((folder / "policy.json").read_text(encoding="utf-8"))
-        weights = torch.load(folder / "policy.pt", weights_only=True, map_location="cpu")
-    except (OSError, ValueError, RuntimeError) as error:
+        text = _bounded(folder / _DESCRIPTION).read_text(encoding="utf-8")
+        description = json.loads(text)
+        if not isinstance(description, dict):
+            raise ValueError(f"{_DESCRIPTION} is no JSON object")
+        weights = _read_tensors(folder)
+    except (OSError, ValueError, RuntimeError, SafetensorError) as error:
         raise DataError(
             f"{folder} holds no policy that can be read ({error}); give a job's folder"
         ) from error
@@ -141,6 +173,22 @@ def _read(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
             f" reads formats {_READABLE[0]} to {_READABLE[-1]}"
         )
     return description, weights
+
+
+def _read_tensors(folder: Path) -> dict[str, Tensor]:
+    if (folder / _TENSORS).is_file():
+        return safetensors.torch.load(_bounded(folder / _TENSORS).read_bytes())
+    before = _bounded(folder / _TENSORS_BEFORE)
+    weights: dict[str, Tensor] = torch.load(before, weights_only=True, map_location="cpu")
+    return weights
+
+
+def _bounded(path: Path) -> Path:
+    """Returns the path of a file that is not too large to be a policy's."""
+    size = path.stat().st_size
+    if size > _LARGEST_MB * 2**20:
+        raise ValueError(f"{path.name} has {size / 2**20:.0f} MB, at most {_LARGEST_MB} are read")
+    return path
 
 
 def _head(

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from cfx.calibration.cache import Arrays, Cache
 from cfx.calibration.losses import PooledLosses, SegmentLosses
+from cfx.calibration.prior import LossesWithPrior
 from cfx.calibration.windows import Windows, WindowSettings
 from cfx.component import content_key, folder_hash
 from cfx.objectives.base import Objective
@@ -109,6 +110,8 @@ class Calibrator:
         memory: bound for one chunk, bytes.
         progress: makes a progress display, given a description and a total.
         reported: objectives by name whose losses `losses` reports beside the minimised one.
+        prior: weight of the prior on driver-specific and pooled parameters
+            (`cfx.calibration.prior`); 0: none. Labels have none: ties go to the driver's own set.
     """
 
     def __init__(
@@ -122,6 +125,7 @@ class Calibrator:
         progress: Callable[[str, int], Task],
         objective: Objective | None = None,
         reported: Mapping[str, Objective] | None = None,
+        prior: float = 0.0,
     ) -> None:
         self.simulator = simulator
         self.optimizer = optimizer
@@ -133,6 +137,7 @@ class Calibrator:
         self.memory = memory
         self.progress = progress
         self.reported = reported or {}
+        self.prior = prior
 
     @property
     def space(self) -> ParameterSpace:
@@ -161,12 +166,12 @@ class Calibrator:
         last = last.to(device)
         keys = []
         for pair, end in zip(pairs, last.tolist(), strict=True):
-            keys.append(self._key("fixed", pair.fingerprint, frames=end))
+            keys.append(self._key("fixed", pair.fingerprint, frames=end, **self._prior_key))
 
         def solve(chosen: Tensor, report: Progress) -> list[Arrays]:
             chosen = chosen.to(device)
             losses = self._segments(batch, chosen, last[chosen])
-            return _rows(self._minimize(losses, self._defaults(len(chosen), device), report))
+            return _rows(self._minimize_with_prior(losses, report))
 
         results = self._cached("Driver-specific parameters", keys, [1] * len(pairs), solve)
         return _stacked(results, device)
@@ -189,14 +194,15 @@ class Calibrator:
         members, last = members.cpu(), last.to(device)
         keys = []
         for row in members:
-            keys.append(self._key("population", "", pairs=_group_key(pairs, last, row)))
+            group = _group_key(pairs, last, row)
+            keys.append(self._key("population", "", pairs=group, **self._prior_key))
 
         def solve(chosen: Tensor, report: Progress) -> list[Arrays]:
             groups = members[chosen.cpu()].to(device)
             used = groups.any(0).nonzero()[:, 0]
             segments = self._segments(batch, used, last[used])
             losses = PooledLosses(segments, groups[:, used], self.memory)
-            return _rows(self._minimize(losses, self._defaults(len(chosen), device), report))
+            return _rows(self._minimize_with_prior(losses, report))
 
         results = self._cached("Pooled parameters", keys, [1] * len(members), solve)
         return _stacked(results, device)
@@ -285,9 +291,29 @@ class Calibrator:
         guess = self.space.to_unit(self.space.defaults(device=device))
         return guess[None, None, :].expand(problems, 1, -1)
 
+    @property
+    def _prior_key(self) -> dict[str, float]:
+        if self.prior == 0:
+            return {}
+        return {"prior": self.prior}
+
+    def _minimize_with_prior(
+        self, losses: SegmentLosses | PooledLosses, report: Progress
+    ) -> Arrays:
+        """Minimises from the model's defaults on; the loss returned is without the prior."""
+        device = losses.device
+        guesses = self._defaults(losses.problems, device)
+        if self.prior == 0:
+            return self._minimize(losses, guesses, report)
+        default = self.space.to_unit(self.space.defaults(device=device))
+        found = self._minimize(LossesWithPrior.of(losses, default, self.prior), guesses, report)
+        best = torch.as_tensor(found["parameters"], device=device)
+        unit = self.space.to_unit(best)[:, None]
+        return {**found, "loss": losses(unit)[:, 0].cpu().numpy()}
+
     def _minimize(
         self,
-        losses: SegmentLosses | PooledLosses,
+        losses: SegmentLosses | PooledLosses | LossesWithPrior,
         guesses: Tensor,
         report: Progress,
         tolerance: float = 0.0,

@@ -97,6 +97,11 @@ class SegmentLosses:
         return len(self.leader_length)
 
     @property
+    def device(self) -> torch.device:
+        """Where the tensors lie."""
+        return self.leader_length.device
+
+    @property
     def steps(self) -> int:
         """K."""
         return len(self.measured_speed)
@@ -259,6 +264,11 @@ class PooledLosses:
     def problems(self) -> int:
         """K."""
         return len(self.members)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the tensors lie."""
+        return self.segments.device
 
     @property
     def bytes_per_candidate(self) -> int:

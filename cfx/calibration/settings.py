@@ -5,9 +5,21 @@ Imports no torch, so that a wrong configuration is answered at once.
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field, model_validator
 
 from cfx.component import Settings
+
+
+class CalibrationSettings(Settings):
+    """How driver-specific and pooled parameters are calibrated."""
+
+    prior: Literal["weak", "none"] = Field(
+        "weak",
+        description="weak: parameters that a recording does not determine stay near the model's"
+        " default; none: as in the paper",
+    )
 
 
 class WindowSettings(Settings):

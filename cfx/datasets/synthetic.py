@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, field_validator
 from scipy.signal import lfilter
 
 from cfx.component import Settings
@@ -38,7 +38,7 @@ HOLD_S = 0.5
 """Seconds for which a driver's parameters stay the same: the paper's window."""
 
 _WARM_UP_S = 60.0  # drivers settle behind their leaders before the recording begins
-_CRUISE_MPS = (9.0, 16.0)  # congested motorway
+_FASTEST_MPS = 60.0  # at which leaders may cruise
 _CRAWL_MPS = (1.5, 5.0)  # slow phase of a wave; above 0, where Krauss's gap would vanish
 _GO_S, _SLOW_S = 25.0, 10.0  # mean lengths of the two phases
 _SPEED_SD_MPS, _SPEED_SCALE_S = 0.8, 6.0  # the leader's own variation of speed
@@ -62,6 +62,10 @@ class SyntheticSettings(DatasetSettings):
     model: Literal["krauss", "w99"] = Field(
         "krauss", description="the driving model that the drivers truly follow"
     )
+    cruise_mps: tuple[float, float] = Field(
+        (9.0, 16.0),
+        description="m/s: between which speeds leaders cruise; the default is a congested motorway",
+    )
     variation: float = Field(
         0.4, ge=0, le=1, description="how much true parameters drift in time; 0: constant"
     )
@@ -74,6 +78,15 @@ class SyntheticSettings(DatasetSettings):
     noise_speed_mps: float = Field(
         0.0, ge=0, description="standard deviation of measured speeds, m/s"
     )
+
+    @field_validator("cruise_mps")
+    @classmethod
+    def _in_order(cls, cruise: tuple[float, float]) -> tuple[float, float]:
+        if not 0 < cruise[0] <= cruise[1] <= _FASTEST_MPS:
+            raise ValueError(
+                f"give a lower and a higher speed above 0 and up to {_FASTEST_MPS:g} m/s"
+            )
+        return cruise
 
 
 class SyntheticDataset(Dataset):
@@ -143,7 +156,7 @@ def _simulate(s: SyntheticSettings, platoons: int, rng: np.random.Generator) -> 
     unit = _true_parameters(model.space, (platoons, s.platoon_size), windows, hold * s.dt, s, rng)
     parameters = model.space.from_unit(torch.from_numpy(unit))
     length = torch.from_numpy(rng.uniform(*_LENGTH_M, (platoons, s.platoon_size + 1)))
-    speed = torch.from_numpy(leader_speed(platoons, frames, s.dt, rng))
+    speed = torch.from_numpy(leader_speed(platoons, frames, s.dt, rng, s.cruise_mps))
     moved = (speed[:, 1:] * s.dt).cumsum(1)
     positions = [torch.cat([torch.zeros(platoons, 1, dtype=speed.dtype), moved], 1)]
     speeds = [speed]
@@ -266,12 +279,18 @@ def smooth_noise(
     return scaled
 
 
-def leader_speed(platoons: int, frames: int, dt: float, rng: np.random.Generator) -> Floats:
+def leader_speed(
+    platoons: int,
+    frames: int,
+    dt: float,
+    rng: np.random.Generator,
+    cruise_mps: tuple[float, float] = (9.0, 16.0),
+) -> Floats:
     """Returns the speed of stop-and-go leaders, `(platoons, frames)`, m/s.
 
     It is never negative, and its acceleration and jerk are bounded.
     """
-    wanted = _wanted_speed(platoons, frames, dt, rng)
+    wanted = _wanted_speed(platoons, frames, dt, rng, cruise_mps)
     speed = np.empty_like(wanted)
     v, a = wanted[:, 0].copy(), np.zeros(platoons)
     for k in range(frames):
@@ -282,9 +301,15 @@ def leader_speed(platoons: int, frames: int, dt: float, rng: np.random.Generator
     return speed
 
 
-def _wanted_speed(platoons: int, frames: int, dt: float, rng: np.random.Generator) -> Floats:
+def _wanted_speed(
+    platoons: int,
+    frames: int,
+    dt: float,
+    rng: np.random.Generator,
+    cruise_mps: tuple[float, float],
+) -> Floats:
     """Returns the speed that the leaders want, `(platoons, frames)`, m/s."""
-    cruise = rng.uniform(*_CRUISE_MPS, (platoons, 1))
+    cruise = rng.uniform(*cruise_mps, (platoons, 1))
     variation = _SPEED_SD_MPS * smooth_noise((platoons,), frames, dt / _SPEED_SCALE_S, rng)
     # Three times as many waves as fit on average.
     waves = int(np.ceil(3.0 * frames * dt / (_GO_S + _SLOW_S))) + 10

@@ -17,6 +17,7 @@ from torch import Tensor
 from cfx.agents.agent import Agent, AgentState
 from cfx.agents.context import DriverContext
 from cfx.models.base import Leader
+from cfx.models.limits import at_limits
 from cfx.pairs import PairBatch
 from cfx.policies.features import History
 from cfx.simulation.base import Stepper
@@ -32,12 +33,22 @@ class ClosedLoop(NamedTuple):
         parameters: `(P, K + 1, n)`, what held on the way to each frame (at frame 0: what holds
             next).
         counted: `(P, K + 1)` bool, frames within the recording; frame 0 does not count.
+        at_limits: `(P, K + 1)` bool, frames at a limit of acceleration (`model.limits`).
+        outside: `(P, K + 1)` bool, frames of windows that began outside what the agent learned
+            from (`cfx.agents.valid_range`).
+        beyond: `(2 f,)` float64, at how many frames that count each signal alone was too low, then
+            too high.
+
+    The last three are None where nobody looked.
     """
 
     speed: Tensor
     gap: Tensor
     parameters: Tensor
     counted: Tensor
+    at_limits: Tensor | None = None
+    outside: Tensor | None = None
+    beyond: Tensor | None = None
 
 
 @torch.no_grad()
@@ -69,17 +80,26 @@ def simulate_closed_loop(
     position, speed, acceleration = track.now()
     follower = simulator.begin(Start(position, speed, acceleration))
     parameters = track.speed.new_empty((len(batch), track.steps + 1, len(agent.space)))
+    outside = torch.zeros(parameters.shape[:2], dtype=torch.bool, device=parameters.device)
+    beyond = torch.zeros(state.beyond.shape[1], dtype=torch.float64, device=parameters.device)
+    _, _, counted = track.result()
     for begin in range(0, track.steps, agent.windows.stride):
         end = min(begin + agent.windows.stride, track.steps)
         chosen, state = agent.act(track.history(begin), state)
         p = agent.space.unpack(chosen)
         follower, positions, speeds = simulator.advance(follower, track.leader(begin, end), p)
         track.write(begin, end, positions.T, speeds.T, simulator.dt)
-        parameters[:, begin + 1 : end + 1] = chosen[:, None]
+        simulated = slice(begin + 1, end + 1)
+        parameters[:, simulated] = chosen[:, None]
+        is_outside = state.score > 1.0
+        outside[:, simulated] = is_outside[:, None]
+        frames = counted[:, simulated].sum(1) * is_outside
+        beyond += (state.beyond * frames[:, None]).sum(0)
         if begin == 0:
             parameters[:, 0] = chosen
     speed, gap, counted = track.result()
-    return ClosedLoop(speed, gap, parameters, counted)
+    at_limit = at_limits(simulator.model.limits, speed, simulator.dt)
+    return ClosedLoop(speed, gap, parameters, counted, at_limit, outside, beyond)
 
 
 def _burnt_in(

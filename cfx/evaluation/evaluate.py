@@ -128,6 +128,8 @@ def trajectories_of(
         speed=of_any.measured_speed,
         gap=of_any.measured_gap,
         parameters=torch.full_like(of_any.parameters, torch.nan),
+        at_limits=None,
+        outside=None,
     )
     return found
 
@@ -146,6 +148,8 @@ def _trajectories(
         counted=loop.counted,
         dt=batch.dt,
         space=space,
+        at_limits=loop.at_limits,
+        outside=loop.outside,
     )
 
 

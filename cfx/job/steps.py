@@ -14,6 +14,7 @@ from cfx import registry, renamed
 from cfx.agents import checkpoint
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
+from cfx.calibration.prior import prior_weight
 from cfx.calibration.settings import WindowSettings
 from cfx.config import JobConfig
 from cfx.errors import PluginError
@@ -147,6 +148,7 @@ def _context(
         progress=Task,
         objective=parts.objective,
         reported=reported_objectives(config, parts.objective),
+        prior=prior_weight(config.calibration.prior),
     )
     return ProtocolContext(
         pairs=pairs,

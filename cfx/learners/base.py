@@ -14,6 +14,7 @@ import pandas as pd
 from torch import Tensor
 
 from cfx.agents.scaler import Scaler
+from cfx.agents.valid_range import ValidRange
 from cfx.calibration.calibrator import Labels
 from cfx.calibration.windows import Split, WindowSettings
 from cfx.component import Component
@@ -81,6 +82,8 @@ class TrainingResult:
             units; None where the head needs none.
         head: what makes parameters of answers (`cfx.agents.heads.HEADS`); None: `offset` where
             there is a base, otherwise `direct`.
+        valid_range: the situations that each network learned from; None: those of its training
+            parts (`cfx.learners.situations`).
     """
 
     network: PolicyNetwork
@@ -88,6 +91,7 @@ class TrainingResult:
     curves: pd.DataFrame
     base: Tensor | None = None
     head: str | None = None
+    valid_range: ValidRange | None = None
 
 
 class Learner(Component):

@@ -29,6 +29,7 @@ from cfx.component import Settings
 from cfx.errors import DataError
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.learners.batched import BatchedModule, Grid, fit
+from cfx.learners.situations import learned_range
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import measured_history, tokens
 from cfx.progress import Task
@@ -117,7 +118,9 @@ class ImitationLearner(Learner):
             base = space.from_unit(fixed.to(training_data.fixed.dtype))
         if not any(parameter.requires_grad for parameter in network.parameters()):
             curves = pd.DataFrame(columns=CURVE_COLUMNS)
-            return TrainingResult(network.eval(), dataset.scaler, curves, base, head.name)
+            found = learned_range(training_data)
+            scaler = dataset.scaler
+            return TrainingResult(network.eval(), scaler, curves, base, head.name, found)
         log.info(
             "learner=imitation, the paper's method, reproduces labels; trained through simulation"
             " (learner=rollout) policies follow real drivers more closely"
@@ -133,7 +136,8 @@ class ImitationLearner(Learner):
             task=task,
         )
         scaler = dataset.scaler.to(device)
-        return TrainingResult(module.network, scaler, module.curves(), base, head.name)
+        found = learned_range(training_data)
+        return TrainingResult(module.network, scaler, module.curves(), base, head.name, found)
 
 
 class _Rows(NamedTuple):

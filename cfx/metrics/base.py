@@ -59,6 +59,9 @@ class Trajectories:
         counted: `(P, K + 1)` bool, which frames count; frame 0 never does.
         dt: time step, s.
         space: the tuned parameters, in the bounds within which they were chosen.
+        at_limits: `(P, K + 1)` bool, frames at a limit of acceleration; None: unknown.
+        outside: `(P, K + 1)` bool, frames outside what a policy has learned from; None: unknown,
+            or no policy drove.
     """
 
     speed: Tensor
@@ -70,6 +73,8 @@ class Trajectories:
     counted: Tensor
     dt: float
     space: ParameterSpace
+    at_limits: Tensor | None = None
+    outside: Tensor | None = None
 
     def counting(self, counted: Tensor) -> Trajectories:
         """Returns the same trajectories with other frames that count, `(P, K + 1)` bool."""

@@ -62,6 +62,36 @@ class HardBrakingShare(Metric):
         return frames.to(trajectories.speed.dtype) / counted[:, 1:].sum(1)
 
 
+class AtLimits(Metric):
+    """Share of the frames at a limit of acceleration (`model.limits`): there the guard steps in."""
+
+    unit = ""
+    direction = "lower"
+    heading = "at limits"
+    meaning = "share of the frames at a limit of acceleration, where the guard steps in"
+    scopes = ("test", "full_trajectory")
+    headline = False
+    order = 25
+
+    def compute(self, trajectories: Trajectories) -> Tensor:
+        return _share(trajectories.at_limits, trajectories)
+
+
+class OutsideRange(Metric):
+    """Share of the frames outside what the policy has learned from (`cfx.agents.valid_range`)."""
+
+    unit = ""
+    direction = "lower"
+    heading = "outside range"
+    meaning = "share of the frames outside what the policy has learned from"
+    scopes = ("test", "full_trajectory")
+    headline = False
+    order = 26
+
+    def compute(self, trajectories: Trajectories) -> Tensor:
+        return _share(trajectories.outside, trajectories)
+
+
 class MinTtc(Metric):
     """Minimum time to collision: the least s / (v - v_leader) over the frames with v > v_leader.
 
@@ -88,6 +118,14 @@ class MinTtc(Metric):
         time = torch.where(met, 0.0, gap / torch.where(closing > 0, closing, 1.0))
         least = torch.where(defined, time, torch.inf).amin(1)
         return torch.where(defined.any(1), least, torch.nan)
+
+
+def _share(marked: Tensor | None, trajectories: Trajectories) -> Tensor:
+    """Returns the share of the frames that count which are marked; NaN where nobody looked."""
+    counted = trajectories.counted
+    if marked is None:
+        return trajectories.speed.new_full((len(trajectories),), torch.nan)
+    return (marked & counted).sum(1).to(trajectories.speed.dtype) / counted.sum(1)
 
 
 def hard_braking_frames(speed: Tensor, counted: Tensor, dt: float) -> Tensor:

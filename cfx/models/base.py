@@ -21,6 +21,7 @@ from torch import Tensor
 
 from cfx.component import Component, Settings
 from cfx.models.earlier import EarlierNames
+from cfx.models.limits import LimitSettings
 from cfx.models.regimes import Temperature
 from cfx.parameters import ParameterOverride, ParameterSpace
 
@@ -69,6 +70,11 @@ class ModelSettings(Settings):
         description="what a policy of offsets (learner=rollout) may move, where that is not what"
         " calibration may: {NAME: [low, high]}, farther; {NAME: null}, not at all",
     )
+    limits: LimitSettings | None = Field(
+        LimitSettings(),
+        description="what the vehicle can do, whatever the model wants (m/s2); null: no limits, as"
+        " in the paper",
+    )
 
 
 class DrivingModel(EarlierNames, Component):
@@ -116,6 +122,16 @@ class DrivingModel(EarlierNames, Component):
         self.space = self.parameters.override(self.settings.parameters)
         self._adaptation_bounds = self.settings.adaptation_bounds or {}
         self.space.for_adaptation(self._adaptation_bounds)  # says now what is wrong with them
+
+    @property
+    def limits(self) -> LimitSettings | None:
+        """What the vehicle can do, whatever the model wants; the step keeps to it."""
+        return self.settings.limits
+
+    @property
+    def brakes_within_bounds(self) -> bool:
+        """Whether nothing makes the vehicle brake harder than a vehicle can."""
+        return self.limits is not None
 
     @property
     def adaptation_space(self) -> ParameterSpace:

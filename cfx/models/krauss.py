@@ -98,6 +98,10 @@ class Krauss(DrivingModel):
         ),
     )
 
+    @property
+    def brakes_within_bounds(self) -> bool:
+        return self.limits is not None or self.settings.variant == "sumo"
+
     def next_speed(
         self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
     ) -> Tensor:

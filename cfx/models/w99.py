@@ -158,6 +158,10 @@ class W99(DrivingModel):
         Parameter("v_max", "m/s", 5.0, 70.0, 55.0, "maximum speed", _SUMO, tuned=False),
     )
 
+    @property
+    def brakes_within_bounds(self) -> bool:
+        return True
+
     def next_speed(
         self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
     ) -> Tensor:

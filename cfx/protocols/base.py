@@ -174,6 +174,7 @@ class ProtocolContext:
             names=names,
             base=training_result.base,
             learned_from=learned_from,
+            valid_range=training_result.valid_range,
         )
 
     def _head(self, policy: Policy, training_result: TrainingResult) -> ParameterHead:

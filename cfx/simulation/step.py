@@ -2,10 +2,11 @@
 
 Forward Euler with the new speed, as the paper prints it and SUMO does it by default:
 
-    v' = model(...)        x' = x + v' dt        a' = (v' - v) / dt
+    v' = guard(model(...))        x' = x + v' dt        a' = (v' - v) / dt
 
-The model sees the leader at t. The rollout, training through the simulation and live drivers in
-SUMO all take this step.
+The guard keeps the vehicle to what it can do (`cfx.models.limits`), so that no change of parameters
+makes the speed jump. The model sees the leader at t. The rollout, training through the simulation
+and live drivers in SUMO all take this step.
 
 Shapes: `*batch` are any leading dimensions; m is the width of the model's memory.
 """
@@ -17,6 +18,7 @@ from collections.abc import Mapping
 from torch import Tensor
 
 from cfx.models.base import DrivingModel, Follower, Leader
+from cfx.models.limits import limited_speed
 
 
 def advance_vehicle(
@@ -34,7 +36,8 @@ def advance_vehicle(
     Returns:
         State at t + dt, in the dtype of the follower.
     """
-    speed = model.next_speed(follower, leader, p, dt)
+    wanted = model.next_speed(follower, leader, p, dt)
+    speed = limited_speed(model.limits, follower.speed, follower.acceleration, wanted, dt)
     memory = model.next_memory(follower, leader, p, dt, speed)
     position = follower.position + speed * dt
     acceleration = (speed - follower.speed) / dt

@@ -101,6 +101,21 @@ def shrunk(space: ParameterSpace, parameters: Tensor, shrinkage: float) -> Tenso
     return space.from_unit(torch.sigmoid(torch.lerp(own, target, shrinkage)))
 
 
+def blended(base: Tensor, unit: Tensor, weight: Tensor) -> Tensor:
+    """Returns parameters between two sets, mixed in the squashed space.
+
+    Args:
+        base: `(*batch, n)` in unit space; exactly this where the weight is 0.
+        unit: `(*batch, n)` in unit space.
+        weight: of the second, 0 to 1, broadcasting to `(*batch, n)`.
+
+    Returns:
+        `(*batch, n)` in unit space.
+    """
+    mixed = torch.sigmoid(torch.lerp(coordinates(base), coordinates(unit), weight))
+    return torch.where(weight > 0, mixed, base)
+
+
 def moved(base: Tensor, answer: Tensor, adaptable: Tensor | None = None) -> Tensor:
     """Returns the base moved by an answer; exactly the base where the answer is 1/2.
 

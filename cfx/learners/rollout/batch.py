@@ -20,6 +20,9 @@ class RolloutBatch(NamedTuple):
         weight: `(N, D)`; 0 leaves a trajectory out.
         scale: factor on all distances, speeds and accelerations, `(N, D)`; None: 1. It makes a
             recording of another driver on another road.
+        shift: m/s added to the speeds of both vehicles, `(N, D)`; None: nothing. It makes a
+            recording of a faster road.
+        wider: m by which the gap is wider for that, `(N, D)`; given where `shift` is.
     """
 
     place: Tensor
@@ -28,6 +31,8 @@ class RolloutBatch(NamedTuple):
     last: Tensor
     weight: Tensor
     scale: Tensor | None = None
+    shift: Tensor | None = None
+    wider: Tensor | None = None
 
     @property
     def row(self) -> Tensor:
@@ -43,14 +48,19 @@ class RolloutBatch(NamedTuple):
         most = int(has_weight.sum(1).max())
         order = has_weight.long().argsort(dim=1, descending=True, stable=True)
         kept = order[:, :most].sort(1).values
-        scale = self.scale
-        if scale is not None:
-            scale = scale.gather(1, kept)
+
+        def chosen(values: Tensor | None) -> Tensor | None:
+            if values is None:
+                return None
+            return values.gather(1, kept)
+
         return RolloutBatch(
             place=self.place.gather(1, kept),
             start=self.start.gather(1, kept),
             cold_start=self.cold_start.gather(1, kept),
             last=self.last.gather(1, kept),
             weight=self.weight.gather(1, kept),
-            scale=scale,
+            scale=chosen(self.scale),
+            shift=chosen(self.shift),
+            wider=chosen(self.wider),
         )

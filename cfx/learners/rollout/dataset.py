@@ -27,6 +27,13 @@ _FEW_DRIVERS = 5
 """A network with fewer drivers keeps the end of each trajectory for validation, not drivers."""
 
 
+_MOVING_MPS = 3.0
+_STANDSTILL_M = 2.0
+_TIME_GAPS_S = (0.8, 2.5)
+"""Above which speed a driver moves, which gap remains at standstill, and which time gaps are usual
+on motorways."""
+
+
 class Conditioning(NamedTuple):
     """What is known of the drivers of N by D trajectories.
 
@@ -57,6 +64,7 @@ class RolloutDataset:
         tokens: measured, `(P, W, f)`.
         driver_features: from each driver's whole training part, `(P, k)`; NaN where too little was
             measured.
+        time_gap: each driver's usual one, `(P,)`, s.
         scaler: normalises tokens and conditioning, f + c features; alike for all members of an
             ensemble.
         ensemble_size: networks of an ensemble, which stand behind one another.
@@ -72,6 +80,7 @@ class RolloutDataset:
     pooled: Tensor
     tokens: Tensor
     driver_features: Tensor
+    time_gap: Tensor
     scaler: Scaler
     ensemble_size: int = 1
 
@@ -130,6 +139,7 @@ class RolloutDataset:
             pooled=pooled.repeat_interleave(ensemble_size, 0),
             tokens=seen,
             driver_features=driver_features,
+            time_gap=usual_time_gap(batch, training_data.split.frame.to(device)),
             scaler=Scaler(
                 scaler.mean.repeat_interleave(ensemble_size, 0),
                 scaler.scale.repeat_interleave(ensemble_size, 0),
@@ -194,6 +204,20 @@ class RolloutDataset:
             known = torch.where(cold_start | measured.isnan(), usual, measured)
             features = torch.cat([features, known], -1)
         return Conditioning(pair, base, features)
+
+
+def usual_time_gap(batch: PairBatch, last: Tensor) -> Tensor:
+    """Returns each driver's median time gap while they move, `(P,)`, s.
+
+    Args:
+        batch: P pairs.
+        last: `(P,)`, the last frame that may be used.
+    """
+    frames = torch.arange(batch.mask.shape[1], device=last.device)
+    moves = (frames <= last[:, None]) & (batch.follower_speed > _MOVING_MPS)
+    time_gap = (batch.gap - _STANDSTILL_M) / batch.follower_speed.clamp(min=_MOVING_MPS)
+    median = torch.where(moves, time_gap, torch.nan).nanmedian(1).values
+    return median.nan_to_num(_TIME_GAPS_S[0]).clamp(*_TIME_GAPS_S)
 
 
 class _Validation(NamedTuple):

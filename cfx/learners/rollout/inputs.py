@@ -98,6 +98,14 @@ class RolloutInputs:
             zero = torch.zeros_like(scale)
             rear = torch.stack([leader_length[..., None], zero, zero])[:, None]
             leader = (leader - rear) * scale + rear
+        if batch.shift is not None and batch.wider is not None:
+            shift, wider = batch.shift[..., None], batch.wider[..., None]
+            zero = torch.zeros_like(shift)
+            before = (past - now) * step.dt
+            follower = follower + torch.stack(_moved(shift, before, zero))
+            after = (around - now) * step.dt
+            leader = leader + torch.stack(_moved(shift, after, wider))
+            speed, gap = speed + shift, gap + wider
         counted = (simulated <= batch.last[..., None]).to(follower.dtype)
         memory = step.model.initial_memory(follower[1, ..., -1])
         return cls(leader, leader_length, follower, memory, Measured(speed, gap, counted))
@@ -129,6 +137,12 @@ class RolloutInputs:
         """Returns the leader around a window."""
         position, speed, acceleration = self.leader[:, window].unbind(0)
         return LeaderWindow(position, speed, acceleration)
+
+
+def _moved(shift: Tensor, time: Tensor, ahead: Tensor) -> list[Tensor]:
+    """Returns what a faster road adds to position, speed and acceleration at times, s."""
+    position = shift * time + ahead
+    return [position, shift.expand_as(position), torch.zeros_like(position)]
 
 
 def _at(signal: Tensor, pair: Tensor, frames: Tensor) -> Tensor:

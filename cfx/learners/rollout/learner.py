@@ -25,12 +25,14 @@ from cfx.agents.scaler import Scaler
 from cfx.component import Settings
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.learners.batched import fit
+from cfx.learners.rollout.augmentation import Augmentation
 from cfx.learners.rollout.base_errors import BaseErrors
 from cfx.learners.rollout.checkpoint import checkpoint_path
 from cfx.learners.rollout.dataset import RolloutDataset
 from cfx.learners.rollout.distillation import Expert
 from cfx.learners.rollout.module import RolloutModule, StepNumbers
 from cfx.learners.rollout.settings import RolloutSettings
+from cfx.learners.situations import learned_range
 from cfx.models.base import DrivingModel
 from cfx.models.direct import Direct
 from cfx.policies.base import Policy, PolicyNetwork
@@ -93,7 +95,7 @@ class RolloutLearner(Learner):
         network = _untrained(policy, dataset, simulator.model, generator)
         if not any(parameter.requires_grad for parameter in network.parameters()):
             curves = pd.DataFrame(columns=CURVE_COLUMNS)
-            return _training_result(network.eval(), dataset, training_data, curves)
+            return self._result(network.eval(), dataset, training_data, curves)
         errors = BaseErrors.of(training_data, dataset, s.horizon)
         checkpoint = self.checkpoint(policy, training_data)
         expert_checkpoint = None
@@ -108,7 +110,23 @@ class RolloutLearner(Learner):
         for file in (checkpoint, expert_checkpoint):
             if file is not None:
                 file.unlink(missing_ok=True)
-        return _training_result(module.network, dataset, training_data, module.curves())
+        return self._result(module.network, dataset, training_data, module.curves())
+
+    def _result(
+        self,
+        network: PolicyNetwork,
+        dataset: RolloutDataset,
+        training_data: TrainingData,
+        curves: pd.DataFrame,
+    ) -> TrainingResult:
+        """Returns the networks with the situations that they have learned from."""
+        found = _training_result(network, dataset, training_data, curves)
+        has_cold_starts = training_data.base is not None and self.settings.cold_start_fraction > 0
+        augment = None
+        if has_cold_starts:
+            generator = torch.Generator().manual_seed(training_data.seed)
+            augment = Augmentation(self.settings, dataset.time_gap, generator)
+        return replace(found, valid_range=learned_range(training_data, augment))
 
     def checkpoint(self, policy: Policy, training_data: TrainingData) -> Path | None:
         """Returns the file from which this very training goes on, or None without a workspace."""

@@ -16,6 +16,10 @@ _VALIDATION_STARTS = (0.2, 0.4, 0.6, 0.8)
 """Shares of a validation trajectory at which the policy takes over."""
 
 
+SHIFTED = 0.3
+"""Share of the cold starts that are made faster."""
+
+
 class TrajectorySampler:
     """Chooses trajectories.
 
@@ -74,9 +78,23 @@ class TrajectorySampler:
         if self.cold_start_fraction > 0 and s.scaling > 0:
             factor = torch.exp(s.scaling * torch.randn(shape, generator=generator)).to(device)
             scale = torch.where(cold_start, factor, 1.0)
+        shift, wider = self._shift(place, cold_start, generator)
         weight = dataset.trains.gather(1, place).float()
         start = (share * latest).long()
-        return RolloutBatch(place, start, cold_start, until, weight, scale).without_unweighted()
+        batch = RolloutBatch(place, start, cold_start, until, weight, scale, shift, wider)
+        return batch.without_unweighted()
+
+    def _shift(
+        self, place: Tensor, cold_start: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor | None, Tensor | None]:
+        """Returns the speed (m/s) and the gap (m) added to trajectories, `(N, D)` each."""
+        s, device = self.settings, place.device
+        if self.cold_start_fraction == 0 or s.speed_shift == 0:
+            return None, None
+        lots = torch.rand((2, *place.shape), generator=generator).to(device)
+        shift = torch.where(cold_start & (lots[0] < SHIFTED), s.speed_shift * lots[1], 0.0)
+        time_gap = self.dataset.time_gap[self.dataset.pair.gather(1, place)]
+        return shift, shift * time_gap
 
     def validation_with_history(self) -> RolloutBatch:
         """Returns validation trajectories over the horizon, with observed history."""

@@ -92,6 +92,14 @@ class ColdStartSettings(Settings):
         description="augmentation: standard deviation of the logarithm of a factor on distances,"
         " speeds and accelerations of a cold start",
     )
+    speed_shift: float = Field(
+        20.0,
+        ge=0,
+        le=40,
+        description="augmentation: m/s, at most added to the speeds of both vehicles in a part of"
+        " the cold starts, which makes motorways of congestion: accelerations stay, and the gap"
+        " grows by the driver's own time gap; 0: none",
+    )
 
 
 class LossSettings(Settings):

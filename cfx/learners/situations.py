@@ -1,0 +1,57 @@
+"""The situations that networks learn from, for the valid range of an agent.
+
+Shapes: P pairs, N networks, S situations, f signals of a situation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from cfx.agents.valid_range import ValidRange, stacked
+from cfx.learners.base import TrainingData
+from cfx.policies.features import History, measured_history
+
+Augment = Callable[[History, Tensor], History]
+"""Takes the situations of pairs `(P,)`, `(P, W)` each, and returns others of the same shape."""
+
+
+def learned_range(training_data: TrainingData, augment: Augment | None = None) -> ValidRange:
+    """Measures the situations at the windows of each network's training parts.
+
+    Args:
+        training_data: what the networks learn from.
+        augment: what training made of situations besides; None: nothing.
+    """
+    batch = training_data.batch
+    device = batch.lengths.device
+    last = training_data.split.frame.to(device)
+    windows = torch.arange(0, int(last.max()) + 1, training_data.windows.stride, device=device)
+    pairs = torch.arange(len(batch), device=device)
+    history = measured_history(batch, pairs[:, None], windows, 1)
+    recorded = History(*(signal[..., 0] for signal in history))
+    counted = windows <= last[:, None]
+    versions = [_situations(recorded)]
+    if augment is not None:
+        versions.append(_situations(augment(recorded, pairs)))
+    found = []
+    for number in range(len(training_data.names)):
+        own = training_data.network.to(device) == number
+        of_network = []
+        for situations in versions:
+            of_network.append(situations[own][counted[own]])
+        found.append(torch.cat(of_network))
+    return ValidRange.of(found)
+
+
+def _situations(history: History) -> Tensor:
+    """Returns situations `(P, W, f)` of signals `(P, W)` each."""
+    return stacked(
+        history.follower_speed,
+        history.follower_acceleration,
+        history.leader_acceleration,
+        history.leader_speed,
+        history.gap,
+    )
