@@ -3,6 +3,7 @@
 #   make run [ARGS="model=w99 policy=lstm"]   set up .venv, then run one job
 #   make test                                 set up .venv, then ruff, mypy and the fast tests: what CI runs
 #   make test-slow | make bench               the tests that take minutes | the benchmarks
+#   make policies                             train the ready-made policies anew from ../shared/data (an hour)
 #   make conf                                 write conf/<group>/<name>.yaml anew from the built-in classes
 #   make lock                                 write constraints.txt anew from what resolves today
 #   make clean                                remove .venv and every cache; outputs/ stays
@@ -19,7 +20,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 TORCH = $(shell sed -n 's/^torch==//p' constraints.txt)
 
-.PHONY: run test test-slow bench conf lock clean
+.PHONY: run test test-slow bench policies conf lock clean
 
 run: $(VENV)/.ready
 	$(BIN)/python -m cfx $(ARGS)
@@ -35,6 +36,11 @@ test-slow: $(VENV)/.ready-test
 
 bench: $(VENV)/.ready-test
 	$(BIN)/python -m pytest tests/benchmarks -m "" --override-ini addopts="--import-mode=importlib" --benchmark-only
+
+DATA ?= ../shared/data/i80_reconstructed_pairs.parquet
+
+policies: $(VENV)/.ready-test
+	$(BIN)/python -m cfx policies make --data $(DATA)
 
 conf: $(VENV)/.ready
 	$(BIN)/python -m cfx.nodes

@@ -48,6 +48,12 @@ def _plugins(arguments: Sequence[str]) -> int:
     return plugins(arguments)
 
 
+def _policies(arguments: Sequence[str]) -> int:
+    from cfx.publish.command import main as policies
+
+    return policies(arguments)
+
+
 def _data(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser("cfx data", description="Looks at recordings.")
     actions = parser.add_subparsers(dest="action", required=True)
@@ -215,6 +221,7 @@ def _export(arguments: Sequence[str]) -> int:
 
 COMMANDS = {
     "plugins": _plugins,
+    "policies": _policies,
     "data": _data,
     "report": _report,
     "ui": _ui,

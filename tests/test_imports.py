@@ -17,7 +17,7 @@ PACKAGE = Path(cfx.__file__).parent
 FLOORS = (
     ("errors", "renamed"),
     ("component",),
-    ("parameters", "pairs", "progress", "console", "files"),
+    ("parameters", "pairs", "progress", "console", "files", "ready"),
     ("registry",),
     ("models",),
     ("simulation", "metrics"),
@@ -30,7 +30,17 @@ FLOORS = (
     ("protocols",),
     ("tracking", "plots"),
     ("config", "nodes", "ui", "testing", "report"),
-    ("job", "hydra_source", "user_errors", "sweep", "application", "plugins", "cli", "sumo"),
+    (
+        "job",
+        "hydra_source",
+        "user_errors",
+        "sweep",
+        "application",
+        "plugins",
+        "cli",
+        "sumo",
+        "publish",
+    ),
 )
 """From the ground up; a room may use rooms on its own floor and below."""
 

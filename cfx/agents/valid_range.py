@@ -135,6 +135,25 @@ def weight_of_answer(score: Tensor) -> Tensor:
     return ((FADED - score) / (FADED - 1.0)).clamp(0.0, 1.0)
 
 
+def share_in_words(valid_range: ValidRange, outside: int, steps: int, beyond: Tensor) -> str:
+    """Returns how many steps were outside and why, in words; "" if none was.
+
+    Args:
+        valid_range: of one network or more; the first is quoted.
+        outside: steps outside.
+        steps: all steps.
+        beyond: as `in_words` takes it.
+    """
+    if outside == 0:
+        return ""
+    share = 100 * outside / steps
+    number = f"{share:.0f}" if share >= 1 else f"{share:.1g}"
+    reason = in_words(valid_range, beyond)
+    if reason:
+        reason = f" ({reason})"
+    return f"{number} % of steps outside what the policy has learned{reason}"
+
+
 def in_words(valid_range: ValidRange, beyond: Tensor) -> str:
     """Returns what was unusual most often: "speed above 18 m/s"; "" if no signal alone was.
 

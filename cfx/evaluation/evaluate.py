@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cfx import registry
+from cfx.agents.agent import Agent
 from cfx.evaluation.closed_loop import ClosedLoop
+from cfx.evaluation.outside import outside_in_words
 from cfx.evaluation.result import METHODS, Array, Evaluation, Improvement, PairTrajectory, Platoon
 from cfx.evaluation.statistics import improvement_statistics
 from cfx.evaluation.tables import long_table, values_of
@@ -45,6 +47,7 @@ def evaluate(
     platoon: Platoon | None = None,
     history: pd.DataFrame | None = None,
     metrics: MetricSet | None = None,
+    agent: Agent | None = None,
 ) -> Evaluation:
     """Measures closed loops against the recording.
 
@@ -63,6 +66,7 @@ def evaluate(
             into; None if there are none.
         platoon, history: further results, handed on; see `Evaluation`.
         metrics: what is measured; None: cfx's own metrics.
+        agent: what drove as `policy`; None: nothing is said of where it is valid.
     """
     loops = {method: loops[method] for method in METHODS if method in loops}
     policy_space = space
@@ -94,7 +98,24 @@ def evaluate(
         platoon=platoon,
         history=history,
         left_out=left_out,
+        outside=_outside(agent, loops, full_trajectory or {}),
     )
+
+
+def _outside(
+    agent: Agent | None, test: Mapping[str, ClosedLoop], full: Mapping[str, ClosedLoop]
+) -> dict[str, str]:
+    """Returns `Evaluation.outside`."""
+    found: dict[str, str] = {}
+    if agent is None:
+        return found
+    for scope, loops in (("test", test), ("full_trajectory", full)):
+        words = ""
+        if "policy" in loops:
+            words = outside_in_words(agent, loops["policy"])
+        if words:
+            found[scope] = words
+    return found
 
 
 def closed_loop_errors(batch: PairBatch, first: Tensor, loop: ClosedLoop) -> tuple[Array, Array]:

@@ -190,6 +190,8 @@ class Evaluation:
         steady_improvements: as `improvements`, after the transient; empty if no test part is
             longer.
         left_out: plugins' metrics that are broken.
+        outside: how much of the test part, and of full trajectories, the policy drove outside what
+            it has learned from, in words by scope; empty if it did not.
     """
 
     about: pd.DataFrame
@@ -205,6 +207,7 @@ class Evaluation:
     history: pd.DataFrame | None = None
     steady_improvements: Mapping[str, Improvement] = field(default_factory=dict)
     left_out: tuple[LeftOut, ...] = ()
+    outside: Mapping[str, str] = field(default_factory=dict)
 
     @cached_property
     def table(self) -> pd.DataFrame:

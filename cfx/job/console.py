@@ -50,6 +50,9 @@ def report(
         )
         console.print(text, soft_wrap=True)
     _print_safety(evaluation, result.metrics, console)
+    for scope, words in evaluation.outside.items():
+        text = f"Policy, {_SCOPES[scope]}: {words}; there it fades towards its base parameters."
+        console.print(text, soft_wrap=True, highlight=False)
     for one in evaluation.left_out:
         text = f"Not measured: {one.name} of the distribution {one.distribution} ({one.reason})."
         console.print(text, soft_wrap=True, highlight=False)

@@ -257,6 +257,7 @@ def write_provenance(
         "objective": dict(objective),
         "transient_s": TRANSIENT_S,
         "metrics": [metric.to_json() for metric in evaluation.measured],
+        "outside": dict(evaluation.outside),
         "metrics_left_out": [asdict(one) for one in evaluation.left_out],
         "cfx": version(),
     }

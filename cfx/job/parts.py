@@ -19,6 +19,7 @@ from cfx.objectives.base import Objective
 from cfx.optimizers.base import Optimizer
 from cfx.policies.base import Policy
 from cfx.protocols.base import Protocol
+from cfx.ready import is_ready_made
 from cfx.simulators.base import Simulator
 from cfx.tracking.store import folder_of, is_run_id
 
@@ -101,7 +102,7 @@ def make_protocol(config: JobConfig) -> Protocol:
         protocol = cast(type[Protocol], registry.get("protocol", name))
         for setting in protocol.jobs:
             given = str(node.get(setting))
-            if is_run_id(given):
+            if is_run_id(given) or is_ready_made(given):
                 node[setting] = folder_of(given, config.tracking.uri)
     return cast(Protocol, registry.create("protocol", node))
 

@@ -14,6 +14,7 @@ from cfx.agents import checkpoint
 from cfx.agents.agent import Agent
 from cfx.errors import DataError
 from cfx.evaluation.result import Evaluation
+from cfx.ready import is_ready_made
 from cfx.style.result import StyleResult
 from cfx.tracking.store import folder_of
 
@@ -47,16 +48,18 @@ def load(folder_or_run: str | Path) -> JobResult:
     """Reads a finished job back.
 
     Args:
-        folder_or_run: a job's output folder, or the id of its MLflow run.
+        folder_or_run: a job's output folder, the id of its MLflow run, or a ready-made policy
+            (`cfx://NAME`), whose table of pairs is empty.
 
     Raises:
-        DataError: there is no finished job.
+        DataError: there is no finished job, or no such policy.
     """
     folder = folder_of(folder_or_run)
     try:
         defined = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-        pairs = pd.read_csv(folder / "pairs.csv", dtype={"leader_id": str, "follower_id": str})
-        pairs = renamed.results(pairs)
+        pairs = pd.DataFrame()  # no recording, and nothing of one, comes with a ready-made policy
+        if not is_ready_made(folder_or_run):
+            pairs = _pairs(folder)
     except (OSError, ValueError, KeyError) as error:
         raise DataError(
             f"{folder} holds no finished job ({error}); give the output folder that a job printed"
@@ -70,3 +73,8 @@ def load(folder_or_run: str | Path) -> JobResult:
     figures = tuple(sorted((folder / "figures").glob("*.png")))
     policy = checkpoint.load(folder / "policy")
     return JobResult(renamed.metrics(values), pairs, policy, figures, folder)
+
+
+def _pairs(folder: Path) -> pd.DataFrame:
+    table = pd.read_csv(folder / "pairs.csv", dtype={"leader_id": str, "follower_id": str})
+    return renamed.results(table)

@@ -79,6 +79,7 @@ class HeldOut:
             fold=fold,
             full_trajectory=self._full_trajectory(methods),
             metrics=context.metrics,
+            agent=self.policy,
             platoon=self._platoons(methods),
             history=history,
         )

@@ -82,6 +82,7 @@ class WithinDriver(Protocol):
             seed=context.seed,
             platoon=self._platoons(context, policy, fixed),
             metrics=context.metrics,
+            agent=policy,
         )
         return ProtocolResult(
             evaluation,

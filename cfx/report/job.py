@@ -167,6 +167,11 @@ class Job:
         """Length of the transient at the beginning of the test part, s."""
         return float(self.data.get("transient_s", TRANSIENT_S))
 
+    @property
+    def outside(self) -> dict[str, str]:
+        """How much the policy drove outside what it has learned from, in words by scope."""
+        return dict(self.data.get("outside") or {})
+
     def scope_label(self, scope: str) -> str:
         """Returns how a part of the trajectories is named."""
         return scope_label(scope, self.transient_s)

@@ -15,6 +15,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
@@ -32,6 +33,7 @@ from cfx.agents.scaler import Scaler
 from cfx.calibration.settings import WindowSettings
 from cfx.errors import DataError, ParameterError, SumoError
 from cfx.models.base import DrivingModel, Follower, Leader
+from cfx.models.limits import at_limits
 from cfx.policies.base import ConstantNetwork
 from cfx.policies.features import History
 from cfx.policies.fixed import FixedPolicy
@@ -40,6 +42,65 @@ from cfx.simulation.threads import one_thread
 from cfx.sumo.surroundings import Connection, Seen, look
 from cfx.sumo.vehicles import VehicleTable
 from cfx.tracking.store import folder_of
+
+_BOUNDS_BRAKING = 4
+"""Bit of SUMO's speed mode with which a vehicle brakes no harder than its `decel`."""
+
+_MARGIN = 1.5
+"""How much harder than needed a vehicle may brake: it cannot know what its leader does next."""
+
+_NEAR_M = 0.5
+"""Room to brake in counts as this at least, m."""
+
+
+@dataclass
+class DriveCounts:
+    """What a driver did over all steps of all its vehicles.
+
+    Attributes:
+        steps: vehicle steps that the model drove.
+        outside: those of them that began outside what the policy has learned from.
+        limited: those at a limit of acceleration.
+        beyond: in how many each signal alone was too low, then too high; None before the first.
+    """
+
+    steps: int = 0
+    outside: int = 0
+    limited: int = 0
+    beyond: Tensor | None = None
+
+    def add(self, score: Tensor, beyond: Tensor) -> None:
+        """Counts one step of D vehicles: scores `(D,)`, unusual signals `(D, 2 f)`."""
+        is_outside = score > 1.0
+        self.steps += len(score)
+        self.outside += int(is_outside.sum())
+        found = beyond[is_outside].sum(0)
+        self.beyond = found if self.beyond is None else self.beyond + found
+
+
+def needed_deceleration(seen: Seen) -> Tensor:
+    """Returns how hard vehicles must brake at least so that they do not hit their leaders.
+
+    The leader goes on as it is, or brakes on to a standstill: the harder of both counts. Within a
+    gap s, with the speeds v and v_l and the leader's deceleration b_l,
+
+        b = (v - v_l)^2 / (2 s)  if v > v_l        b = v^2 / (2 (s + v_l^2 / (2 b_l)))
+
+    Returns:
+        `(D,)`, m/s2, not negative.
+    """
+    room = seen.gap.clamp(min=_NEAR_M)
+    closing = (seen.speed - seen.leader_speed).clamp(min=0.0)
+    steady = closing.square() / (2.0 * room)
+    braking = (-seen.leader_acceleration).clamp(min=0.0)
+    path = seen.leader_speed.square() / (2.0 * braking.clamp(min=1e-3))
+    stopping = torch.where(braking > 0, seen.speed.square() / (2.0 * (room + path)), 0.0)
+    return torch.maximum(steady, stopping)
+
+
+def _is_limited(model: DrivingModel, before: Tensor, after: Tensor, dt: float) -> Tensor:
+    """Says which vehicles are at a limit of acceleration, bool `(D,)`, of speeds in m/s."""
+    return at_limits(model.limits, torch.stack([before, after], -1), dt)[:, 1]
 
 
 class Driver:
@@ -64,6 +125,10 @@ class Driver:
     default `speed_mode` 0 nothing else of SUMO's changes the speed, so junctions, red lights and
     stops are not obeyed behind a leader: exact, and meant for motorways. `speed_mode=31` lets
     SUMO's checks bound the speed, its own safe gap among them. Lane changes are SUMO's.
+
+    The model's limits of acceleration hold always (`model.limits`). Where SUMO bounds braking too
+    (bit 4 of the speed mode), a vehicle brakes comfortably at most, unless the situation needs
+    more: see `needed_deceleration`. SUMO's `decel` of the vehicle is raised to that meanwhile.
 
     A driver holds the state of one simulation; make another for another simulation.
     """
@@ -90,8 +155,8 @@ class Driver:
             source: where the policy comes from, for messages.
 
         Raises:
-            DataError: the policy has no such network, or its driving model has equations in SUMO
-                only.
+            DataError: the policy has no such network; or its driving model has equations in SUMO
+                only, or may brake harder than a vehicle can.
         """
         self.policy = policy
         self.look_ahead = look_ahead
@@ -104,6 +169,12 @@ class Driver:
                 " alone drives: they cannot be changed on the way; a live driver needs a model that"
                 " cfx has, such as krauss or w99"
             )
+        if not self.model.brakes_within_bounds:
+            raise DataError(
+                f"{source}: its driving model has neither limits nor a brake cap, so it may brake"
+                " harder than a vehicle can; train it with model.limits as they are by default"
+                " (or model.variant=sumo) to drive live"
+            )
         self._network = None
         if network is not None:
             self._network = self._number(network)
@@ -111,6 +182,9 @@ class Driver:
         self._bases: dict[str, list[float]] = {}
         self._driver_features: dict[str, list[float]] = {}
         self._speed_modes: dict[str, int] = {}
+        self._decels: dict[str, float] = {}
+        self._raised: set[str] = set()
+        self.counts = DriveCounts()
         self._slots: dict[str, int] = {}
         self._free: list[int] = []
         self._store = VehicleTable.empty(policy, self.model, 0)
@@ -318,6 +392,7 @@ class Driver:
         self._choose(slots[store.steps[slots] % self.policy.windows.stride == 0])
         store.steps[slots] += 1
         if drive:
+            self.counts.add(store.score[slots], store.beyond[slots])
             speeds = self._speeds(connection, following, slots, seen).tolist()
             for name, speed in zip(following, speeds, strict=True):
                 connection.vehicle.setSpeed(name, speed)
@@ -335,6 +410,8 @@ class Driver:
     def forget(self, vehicle: str) -> None:
         """Drops all that is known of a vehicle; SUMO keeps the last speed that it was given."""
         self._speed_modes.pop(vehicle, None)
+        self._decels.pop(vehicle, None)
+        self._raised.discard(vehicle)
         slot = self._slots.pop(vehicle, None)
         if slot is not None:
             self._free.append(slot)
@@ -344,6 +421,7 @@ class Driver:
         if vehicle in self._speed_modes:
             connection.vehicle.setSpeed(vehicle, -1)
             connection.vehicle.setSpeedMode(vehicle, self._speed_modes[vehicle])
+            self._set_decel(connection, vehicle, 0.0)
         self.forget(vehicle)
 
     def _number(self, network: str) -> int:
@@ -477,6 +555,7 @@ class Driver:
         history = History(*store.history[slots].unbind(1))
         chosen, after = self.policy.act(history, begun._replace(state=state))
         store.parameters[slots] = chosen
+        store.score[slots], store.beyond[slots] = after.score, after.beyond
         store.state[slots] = after.state[after.network, after.place]
 
     def _speeds(
@@ -496,12 +575,37 @@ class Driver:
         p = self.policy.space.unpack(store.parameters[slots])
         after = advance_vehicle(self.model, follower, leader, p, dt)
         store.memory[slots] = after.memory
+        speed = after.speed
+        limits = self.model.limits
+        if limits is not None and self.speed_mode & _BOUNDS_BRAKING:
+            needed = _MARGIN * needed_deceleration(seen)
+            hardest = needed.clamp(limits.comfortable_deceleration, limits.emergency_deceleration)
+            speed = torch.maximum(speed, (seen.speed - hardest * dt).clamp(min=0.0))
+            is_needed = hardest > limits.comfortable_deceleration
+            bounds = torch.where(is_needed, hardest, 0.0).tolist()
+            for name, bound in zip(names, bounds, strict=True):
+                self._set_decel(connection, name, bound)
+        self.counts.limited += int(_is_limited(self.model, seen.speed, speed, dt).sum())
         limit = seen.allowed.clone()
         # For a limit no vehicle brakes harder than its `decel`.
         for index in (seen.speed > seen.allowed).nonzero().flatten().tolist():
             slowest = seen.speed[index] - connection.vehicle.getDecel(names[index]) * dt
             limit[index] = max(limit[index], slowest)
-        return torch.minimum(after.speed, limit)
+        return torch.minimum(speed, limit)
+
+    def _set_decel(self, connection: Connection, name: str, bound: float) -> None:
+        """Lets SUMO brake a vehicle by `bound`, m/s2, where that is more than its own `decel`."""
+        if bound == 0.0 and name not in self._raised:
+            return
+        if name not in self._decels:
+            self._decels[name] = connection.vehicle.getDecel(name)
+        own = self._decels[name]
+        if bound > own:
+            connection.vehicle.setDecel(name, bound)
+            self._raised.add(name)
+        elif name in self._raised:
+            connection.vehicle.setDecel(name, own)
+            self._raised.discard(name)
 
 
 def _load_policy(run: str | Path) -> Agent:

@@ -31,6 +31,8 @@ class VehicleTable:
         steps: `(C,)` int64, since the vehicle's first window.
         time: `(C,)` s, of the last frame; NaN before the first.
         driven: `(C,)` bool; the others are watched.
+        score: `(C,)`, how far outside what was learned each was when its window began.
+        beyond: `(C, 2 f)` bool, which signals alone were unusual then.
     """
 
     history: Tensor
@@ -43,11 +45,14 @@ class VehicleTable:
     steps: Tensor
     time: Tensor
     driven: Tensor
+    score: Tensor
+    beyond: Tensor
 
     @classmethod
     def empty(cls, agent: Agent, model: DrivingModel, count: int) -> VehicleTable:
         """Returns rows for `count` vehicles."""
-        state = agent.begin(torch.zeros(1, dtype=torch.int64)).state
+        begun = agent.begin(torch.zeros(1, dtype=torch.int64))
+        state = begun.state
         length, parameters = agent.windows.length, len(agent.space)
         features = len(agent.core.driver_features)
         return cls(
@@ -61,6 +66,8 @@ class VehicleTable:
             steps=torch.zeros(count, dtype=torch.int64),
             time=_unknown(count),
             driven=torch.zeros(count, dtype=torch.bool),
+            score=torch.zeros(count, dtype=torch.float64),
+            beyond=torch.zeros((count, begun.beyond.shape[-1]), dtype=torch.bool),
         )
 
     def with_rows(self, more: VehicleTable) -> VehicleTable:

@@ -18,6 +18,8 @@ _COLUMNS = (
     ("Hard braking", "hard_braking", ".0f"),
     ("Jerk (m/s³)", "jerk", ".2f"),
     ("At bounds", "at_bounds", ".1%"),
+    ("At limits", "at_limits", ".1%"),
+    ("Outside", "outside_range", ".1%"),
     ("last / leader", "platoon/head_to_tail", ".2f"),
     ("last / first", "platoon/amplification", ".2f"),
     ("Stable", "platoon/string_stable", ".0%"),
@@ -30,7 +32,9 @@ _COLUMNS = (
 _METHODS = (
     "Slowing down of the last follower divided by that of the leader, and by that of the first"
     " follower; shares of the networks whose platoons are string stable, and had settled before the"
-    f" leader braked. Hard braking counts frames below {MINUS}8 m/s²."
+    f" leader braked. Hard braking counts frames below {MINUS}8 m/s². At limits:"
+    " share of frames at a limit of acceleration, where the guard steps in. Outside: share of"
+    " frames outside what the policy has learned from."
 )
 _PLATOONS = (
     "All followers use the same method, each behind the vehicle ahead; the leader brakes from 15 to"
@@ -50,6 +54,9 @@ def blocks(runs: Runs) -> list[Block]:
     if sheet.rows:
         table = Table(sheet, compact=True)
         found = [Fold("Every method of every job", (Text(_METHODS), table))]
+    for job in runs.jobs:
+        for scope, words in job.outside.items():
+            found.append(Text(f"{job.name}, {job.scope_label(scope)}: {words}."))
     with_platoon = [job for job in runs.jobs if job.platoon is not None]
     if with_platoon:
         found += [Heading("Ten followers in a row"), Text(_PLATOONS)]

@@ -1,0 +1,19 @@
+"""What is said of a policy that drove outside what it has learned from."""
+
+from __future__ import annotations
+
+from cfx.agents.agent import Agent
+from cfx.agents.valid_range import share_in_words
+from cfx.evaluation.closed_loop import ClosedLoop
+
+
+def outside_in_words(agent: Agent, loop: ClosedLoop) -> str:
+    """Returns "37 % of steps outside what the policy has learned (speed above 18 m/s)".
+
+    It is "" where no step was, or where nobody knows.
+    """
+    if agent.valid_range is None or loop.outside is None or loop.beyond is None:
+        return ""
+    steps = int(loop.counted.sum())
+    outside = int((loop.outside & loop.counted).sum())
+    return share_in_words(agent.valid_range, outside, steps, loop.beyond)

@@ -1,0 +1,1 @@
+"""Makes ready-made policies of finished jobs, and shows them: `cfx policies`."""
