@@ -152,14 +152,22 @@ def _drive(arguments: Sequence[str]) -> int:
         epilog="What follows -- goes to SUMO as it is:"
         " cfx drive city.sumocfg --drivers calm=RUN -- --step-length 0.1",
     )
-    parser.add_argument("scenario", help="SUMO's configuration, .sumocfg")
+    parser.add_argument(
+        "scenario",
+        nargs="?",
+        default="ring",
+        help="SUMO's configuration (.sumocfg), or a scenario that comes with cfx: ring (default),"
+        " motorway, stress",
+    )
     parser.add_argument(
         "--drivers",
         nargs="+",
-        required=True,
+        default=["car=cfx://i80-idm"],
         metavar="TYPE=RUN",
-        help="a vType, and who drives it: a job",
+        help="a vType, and who drives it: a job, a ready-made policy (cfx policies lists them), or"
+        " RUN#NETWORK for one of its networks; default: car=cfx://i80-idm",
     )
+    parser.add_argument("--gui", action="store_true", help="show SUMO's window")
     parser.add_argument(
         "--end", type=float, metavar="SECONDS", help="of simulated time; default: the scenario's"
     )

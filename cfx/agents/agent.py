@@ -85,6 +85,8 @@ class Agent:
             `(N, n)`, SI units; None if there are none.
         learned_from: the pairs that were learned from or calibrated on: `Pair.content` and the
             driver's name.
+        recorded: quantiles (5, 50, 95 %) of speed (m/s), acceleration (m/s2) and time gap (s) of
+            the drivers learned from; empty if they are not known.
         valid_range: the situations that each network learned from; None if they are not known.
             Outside, answers fade towards the base, or towards the pooled parameters where the head
             has no base.
@@ -101,6 +103,7 @@ class Agent:
     population: Tensor | None = None
     learned_from: Mapping[str, str] = field(default_factory=dict)
     valid_range: ValidRange | None = None
+    recorded: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     @property
     def policy(self) -> Policy:

@@ -108,6 +108,7 @@ def load(folder: Path | str) -> Agent:
         population=weights.get("population"),
         learned_from=description.get("learned_from", {}),
         valid_range=_valid_range(weights),
+        recorded=_recorded(description),
     )
 
 
@@ -125,6 +126,13 @@ def _tensors(agent: Agent) -> dict[str, Tensor]:
         for name, value in agent.valid_range.state_dict().items():
             tensors[f"{_RANGE}{name}"] = value.cpu()
     return tensors
+
+
+def _recorded(description: Mapping[str, Any]) -> dict[str, tuple[float, ...]]:
+    found = {}
+    for name, values in description.get("recorded", {}).items():
+        found[name] = tuple(values)
+    return found
 
 
 def _valid_range(weights: Mapping[str, Tensor]) -> ValidRange | None:
@@ -153,6 +161,7 @@ def _description(agent: Agent) -> dict[str, Any]:
         "own": rule.driver_specific,
         "history": rule.history_s,
         "learned_from": dict(agent.learned_from),
+        "recorded": {name: list(values) for name, values in agent.recorded.items()},
     }
 
 

@@ -20,6 +20,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from cfx.pairs import PairBatch
 from cfx.policies.features import History
 
 FADED = 2.5
@@ -43,6 +44,12 @@ _INSIDE = 0.995
 
 _EXTREMES = (0.001, 0.999)
 """Quantiles between which a single signal counts as usual, for naming what is unusual."""
+
+_RECORDED = (0.05, 0.5, 0.95)
+"""Quantiles of recordings that are kept, to be set beside live traffic."""
+
+_WALKING_MPS = 1.5
+"""Speed below which a time gap means nothing."""
 
 _LEAST_VARIANCE = 1e-6
 """Added to variances, so that a signal that never changes does no harm."""
@@ -133,6 +140,24 @@ def stacked(
 def weight_of_answer(score: Tensor) -> Tensor:
     """Returns how much of an agent's answer is used at these scores, 1 to 0, `(*batch,)`."""
     return ((FADED - score) / (FADED - 1.0)).clamp(0.0, 1.0)
+
+
+def recorded_quantiles(batch: PairBatch) -> dict[str, tuple[float, ...]]:
+    """Returns quantiles of what recorded drivers do: see `Agent.recorded`."""
+    speed = batch.follower_speed[batch.mask]
+    moves = speed > _WALKING_MPS
+    signals = {
+        "speed": speed,
+        "acceleration": batch.follower_acceleration[batch.mask],
+        "time_gap": batch.gap[batch.mask][moves] / speed[moves],
+    }
+    found = {}
+    for name, values in signals.items():
+        quantiles: tuple[float, ...] = ()
+        if len(values):
+            quantiles = tuple(float(_quantile(values, share)) for share in _RECORDED)
+        found[name] = quantiles
+    return found
 
 
 def share_in_words(valid_range: ValidRange, outside: int, steps: int, beyond: Tensor) -> str:

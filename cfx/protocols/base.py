@@ -19,6 +19,7 @@ from cfx.agents.core import AgentCore
 from cfx.agents.heads import HEADS, head_name
 from cfx.agents.heads.base import ParameterHead
 from cfx.agents.scaler import Scaler
+from cfx.agents.valid_range import recorded_quantiles
 from cfx.calibration.calibrator import Calibrator, Labels
 from cfx.calibration.windows import Windows, WindowSettings
 from cfx.component import Component
@@ -175,6 +176,7 @@ class ProtocolContext:
             base=training_result.base,
             learned_from=learned_from,
             valid_range=training_result.valid_range,
+            recorded=recorded_quantiles(self.batch),
         )
 
     def _head(self, policy: Policy, training_result: TrainingResult) -> ParameterHead:

@@ -27,19 +27,31 @@ def drive_scenario(options: argparse.Namespace, sumos: Sequence[str]) -> None:
     sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]
     from cfx.console import console_logging
     from cfx.sumo.drive import parse_drivers, report, run_scenario
+    from cfx.sumo.scenarios import SCENARIOS
 
     output = None
     if options.output:
         output = Path(options.output).expanduser()
     with console_logging():
+        runs = parse_drivers(options.drivers)
+        if options.scenario == "stress":
+            from cfx.sumo.stress import report_stress, run_stress
+
+            result = run_stress(runs, seed=options.seed or 0, speed_mode=options.speed_mode)
+            report_stress(result, output)
+            return
+        scenario = options.scenario
+        if scenario not in SCENARIOS:
+            scenario = Path(scenario).expanduser()
         run = run_scenario(
-            Path(options.scenario).expanduser(),
-            parse_drivers(options.drivers),
+            scenario,
+            runs,
             end=options.end,
             seed=options.seed,
             output=output,
             look_ahead=options.look_ahead,
             speed_mode=options.speed_mode,
+            gui=options.gui,
             options=sumos,
         )
         report(run)

@@ -9,18 +9,33 @@ from __future__ import annotations
 import csv
 import math
 import os
+import shutil
+import tempfile
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
+
+import numpy as np
 
 from cfx.errors import ConfigError, DataError, OutputError, SumoError, nearest
 from cfx.files import atomic_write
 from cfx.progress import Task
 from cfx.simulators.sumo.installed import require_sumo
 from cfx.sumo.fleet import Fleet
+from cfx.sumo.histogram import Histogram
+from cfx.sumo.scenarios import SCENARIOS
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+Actor = Callable[[Any], None]
+"""Acts on a simulation before each of its steps."""
+
+_QUANTILES = (0.05, 0.5, 0.95)
+"""Quantiles by which live traffic is compared with the recording."""
 
 
 @dataclass
@@ -35,6 +50,10 @@ class Tally:
         lane_changes: on the same edge.
         hard_brakings: times that a vehicle began to brake harder than its vType's `decel`.
         hardest_braking: the largest deceleration of any, m/s2.
+        braking: decelerations of all steps, m/s2; 0 where a vehicle did not brake.
+        speeds: of all steps, m/s.
+        accelerations: of all steps, m/s2.
+        time_gaps: of the steps that the model drove faster than walking, s.
         collisions, teleports: vehicles that SUMO reported; a vehicle may do so more than once.
     """
 
@@ -45,6 +64,10 @@ class Tally:
     lane_changes: int = 0
     hard_brakings: int = 0
     hardest_braking: float = 0.0
+    braking: Histogram = field(default_factory=lambda: Histogram(0.0, 20.0, 0.02))
+    speeds: Histogram = field(default_factory=lambda: Histogram(0.0, 70.0, 0.1))
+    accelerations: Histogram = field(default_factory=lambda: Histogram(-15.0, 8.0, 0.02))
+    time_gaps: Histogram = field(default_factory=lambda: Histogram(0.0, 30.0, 0.05))
     collisions: int = 0
     teleports: int = 0
 
@@ -60,6 +83,12 @@ class ScenarioRun:
         seconds: how long it took.
         others: most vehicles of other types at one time.
         most: most vehicles of the driven types at one time.
+        limited: for each vType, the share of the steps that the model drove at a limit of
+            acceleration.
+        outside: for each vType, how much was driven outside what its policy has learned, in words;
+            "" where nothing was.
+        recorded: for each vType, quantiles of the recording that its policy learned from, by
+            signal (`Agent.recorded`).
     """
 
     tallies: Mapping[str, Tally]
@@ -68,6 +97,9 @@ class ScenarioRun:
     seconds: float
     others: int
     most: int
+    limited: Mapping[str, float] = field(default_factory=dict)
+    outside: Mapping[str, str] = field(default_factory=dict)
+    recorded: Mapping[str, Mapping[str, Sequence[float]]] = field(default_factory=dict)
 
     @property
     def real_time(self) -> float:
@@ -78,7 +110,7 @@ class ScenarioRun:
 
 
 def run_scenario(
-    scenario: Path,
+    scenario: Path | str,
     runs: Mapping[str, str | Path],
     *,
     end: float | None = None,
@@ -86,22 +118,26 @@ def run_scenario(
     output: Path | None = None,
     look_ahead: float = 200.0,
     speed_mode: int = 31,
+    gui: bool = False,
     options: Sequence[str] = (),
 ) -> ScenarioRun:
-    """Runs a scenario in libsumo until it is over.
+    """Runs a scenario in libsumo, or in SUMO's window, until it is over.
 
     It is over when no vehicle is on the road or still to come, at the end that the scenario gives,
     or at `end`. A vehicle that arrives, teleports, collides or changes lanes ends nothing: it is
     counted, and goes on with what SUMO makes of it (one that teleported begins anew).
 
     Args:
-        scenario: SUMO's configuration (`.sumocfg`).
-        runs: vType -> a job's output folder, or the id of its MLflow run.
+        scenario: SUMO's configuration (`.sumocfg`), or the name of a scenario that comes with cfx
+            (`cfx.sumo.scenarios`).
+        runs: vType -> a job's output folder, the id of its MLflow run, or a ready-made policy
+            (`cfx://NAME`).
         end: s of simulated time.
         seed: SUMO's; None for the scenario's.
         output: a CSV file with a row for each driven vehicle and step.
         look_ahead: as in `Driver`.
         speed_mode: as in `Driver`; 31 lets SUMO's own checks bound each speed.
+        gui: show SUMO's window, at most ten steps in a second.
         options: more of SUMO's own options.
 
     Raises:
@@ -111,37 +147,116 @@ def run_scenario(
         OutputError: the output cannot be written.
     """
     require_sumo()
-    if not scenario.is_file():
+    with ExitStack() as stack:
+        path, actor = _prepared(scenario, stack)
+        fleet = Fleet.load(runs, look_ahead=look_ahead, speed_mode=speed_mode)
+        connection = stack.enter_context(started(path, _command(path, seed, gui, options), gui))
+        rows = _Rows.opened(stack, output, fleet) if output is not None else None
+        try:
+            return _Run(connection, fleet, path, rows, actor, _name(scenario)).go(end)
+        except OSError as error:
+            raise OutputError(
+                f"{output} cannot be written ({error.strerror or error}); name another --output"
+            ) from error
+
+
+def _name(scenario: Path | str) -> str:
+    """Returns how messages call a scenario."""
+    return Path(scenario).name
+
+
+def _prepared(scenario: Path | str, stack: ExitStack) -> tuple[Path, Actor | None]:
+    """Returns SUMO's configuration, and what acts on the simulation besides the drivers."""
+    shipped = SCENARIOS.get(str(scenario))
+    path = Path(scenario)
+    if shipped is not None and not path.exists():
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cfx-")))
+        actor = None
+        if shipped.make_actor is not None:
+            actor = shipped.make_actor()
+        return shipped.write(folder), actor
+    if not path.is_file():
         raise DataError(
-            f"{scenario} is not there; name SUMO's configuration of the scenario (.sumocfg)"
+            f"{path} is not there; name SUMO's configuration of the scenario (.sumocfg), or a"
+            f" scenario that comes with cfx: {', '.join((*SCENARIOS, 'stress'))}"
         )
-    fleet = Fleet.load(runs, look_ahead=look_ahead, speed_mode=speed_mode)
+    return path, None
+
+
+@contextmanager
+def started(scenario: Path, command: Sequence[str], gui: bool) -> Iterator[Any]:
+    """Starts SUMO for a block; gives its connection.
+
+    Args:
+        scenario: for messages.
+        command: SUMO's command line.
+        gui: whether it is that of SUMO's window.
+
+    Raises:
+        SumoError: SUMO refuses the scenario, or stops in the block.
+    """
+    sumo = _traci() if gui else _libsumo()
+    try:
+        sumo.start(list(command))
+    except Exception as error:
+        if not _is_sumos(error):
+            raise
+        raise SumoError(f"SUMO refuses {scenario}: {_reason(error)}") from error
+    try:
+        yield sumo
+    except Exception as error:
+        if not _is_sumos(error):
+            raise
+        raise SumoError(f"SUMO stopped {scenario}: {_reason(error)}") from error
+    finally:
+        _close(sumo)
+
+
+def _libsumo() -> Any:
     # No word about pyarrow, which is not loaded here.
     os.environ.setdefault("LIBSUMO_AS_TRACI", "quiet")
     import libsumo
 
-    command = _command(scenario, seed, options)
-    try:
-        libsumo.start(command)
-    except libsumo.TraCIException as error:
-        raise SumoError(f"SUMO refuses {scenario}: {_reason(error)}") from error
-    try:
-        with ExitStack() as stack:
-            rows = _Rows.opened(stack, output, fleet) if output is not None else None
-            return _Run(libsumo, fleet, scenario, rows).go(end)
-    except libsumo.TraCIException as error:
-        raise SumoError(f"SUMO stopped {scenario}: {_reason(error)}") from error
-    except OSError as error:
-        raise OutputError(
-            f"{output} cannot be written ({error.strerror or error}); name another --output"
-        ) from error
-    finally:
-        libsumo.close()
+    return libsumo
 
 
-def _command(scenario: Path, seed: int | None, options: Sequence[str]) -> list[str]:
+def _traci() -> Any:
+    import traci  # type: ignore[import-untyped]  # SUMO brings no types
+
+    return traci
+
+
+def _close(sumo: Any) -> None:
+    try:
+        sumo.close()
+    except Exception as error:  # SUMO has gone already; why was said
+        if not _is_sumos(error):
+            raise
+
+
+def _is_sumos(error: Exception) -> bool:
+    """Says whether an error is SUMO's word; libsumo's and traci's are classes of the same names."""
+    return type(error).__name__ in {"TraCIException", "FatalTraCIError"}
+
+
+def _gui_program() -> str:
+    try:
+        import sumo  # of the wheel eclipse-sumo, which the extra leaves out for its size
+
+        program = shutil.which("sumo-gui", path=str(Path(sumo.__file__).parent / "bin"))
+    except ImportError:
+        program = shutil.which("sumo-gui")
+    if program is None:
+        raise SumoError("--gui needs SUMO's window, sumo-gui: pip install eclipse-sumo")
+    return program
+
+
+def _command(scenario: Path, seed: int | None, gui: bool, options: Sequence[str]) -> list[str]:
     """Returns SUMO's command line; the user's own options come last and win."""
     command = ["sumo", "-c", str(scenario)]
+    if gui:
+        command[0] = _gui_program()
+        command += ["--start", "--quit-on-end", "--delay", "100"]
     for name in ("--no-step-log", "--duration-log.disable", "--no-warnings"):
         if name not in options:
             command += [name, "true"]
@@ -153,7 +268,7 @@ def _command(scenario: Path, seed: int | None, options: Sequence[str]) -> list[s
 def _reason(error: Exception) -> str:
     """Returns SUMO's words on one line; some of them it prints on stderr alone."""
     said = " ".join(str(error).split()).rstrip(".")
-    if said in {"", "Process Error"}:
+    if said in {"", "Process Error", "Connection closed by SUMO"}:
         return "its own message stands above"
     return said
 
@@ -161,8 +276,18 @@ def _reason(error: Exception) -> str:
 class _Run:
     """One run of a scenario."""
 
-    def __init__(self, sumo: Any, fleet: Fleet, scenario: Path, rows: _Rows | None) -> None:
+    def __init__(
+        self,
+        sumo: Any,
+        fleet: Fleet,
+        scenario: Path,
+        rows: _Rows | None,
+        actor: Actor | None = None,
+        name: str = "",
+    ) -> None:
         self._sumo = sumo
+        self._actor = actor
+        self._name = name or scenario.name
         self._fleet = fleet
         self._scenario = scenario
         self._rows = rows
@@ -199,8 +324,10 @@ class _Run:
         if last < math.inf:
             total = max(0, round((last - simulation.getTime()) / dt))
         began = time.perf_counter()
-        with Task(f"Driving {self._scenario.name}", total) as task:
+        with Task(f"Driving {self._name}", total) as task:
             while simulation.getMinExpectedNumber() > 0 and simulation.getTime() < last - 1e-9:
+                if self._actor is not None:
+                    self._actor(self._sumo)
                 self._sumo.simulationStep()
                 self._fleet.step(self._sumo)
                 self._after_step(dt)
@@ -212,7 +339,22 @@ class _Run:
                     f"no vehicle of vType '{name}' was ever on the road in {self._scenario}"
                     f" ({self._steps * dt:g} s); give it a flow, or a later --end"
                 )
-        return ScenarioRun(self._tallies, self._steps, dt, seconds, self._others, self._most)
+        limited, outside, recorded = {}, {}, {}
+        for name, driver in self._fleet.drivers.items():
+            limited[name] = driver.counts.limited / max(1, driver.counts.steps)
+            outside[name] = driver.outside_in_words()
+            recorded[name] = driver.policy.recorded
+        return ScenarioRun(
+            self._tallies,
+            self._steps,
+            dt,
+            seconds,
+            self._others,
+            self._most,
+            limited,
+            outside,
+            recorded,
+        )
 
     def _last(self, end: float | None) -> float:
         """Returns the simulated time at which the run ends at the latest, s."""
@@ -231,6 +373,7 @@ class _Run:
         self._type_of |= vehicles
         for name, kind in vehicles.items():
             self._count(name, kind, dt)
+        self._count_motions()
         self._count_events()
         if self._rows is not None:
             self._rows.write(self._sumo, self._fleet)
@@ -257,6 +400,24 @@ class _Run:
         elif name not in self._braking:
             self._braking.add(name)
             tally.hard_brakings += 1
+
+    def _count_motions(self) -> None:
+        """Notes speeds, accelerations and time gaps of all vehicles of the fleet."""
+        vehicle = self._sumo.vehicle
+        motions: dict[str, list[tuple[float, float]]] = {name: [] for name in self._tallies}
+        for name, kind in self._fleet.vehicles.items():
+            motions[kind].append((vehicle.getSpeed(name), vehicle.getAcceleration(name)))
+        for kind, pairs in motions.items():
+            if not pairs:
+                continue
+            values = np.array(pairs)
+            tally = self._tallies[kind]
+            tally.speeds.add(values[:, 0])
+            tally.accelerations.add(values[:, 1])
+            tally.braking.add((-values[:, 1]).clip(min=0.0))
+        for kind, driver in self._fleet.drivers.items():
+            names = [name for name, its in self._fleet.vehicles.items() if its == kind]
+            self._tallies[kind].time_gaps.add(driver.time_gaps(names).numpy())
 
     def _count_events(self) -> None:
         """Notes which vehicles SUMO reports as collided or teleported."""
@@ -347,23 +508,31 @@ def parse_drivers(given: Sequence[str]) -> dict[str, str]:
 
 
 def report(run: ScenarioRun) -> None:
-    """Prints what happened: one table, and one line about speed."""
-    from cfx.console import blank_table, put
+    """Prints what happened: tables, and one line about speed."""
+    from cfx.console import put
 
-    columns = (
+    put(_what_happened(run))
+    put(_braking(run))
+    put(_beside_the_recording(run))
+    for name, words in run.outside.items():
+        if words:
+            print(f"{name}: {words}; there it fades towards its base parameters")
+    print(
+        f"{run.steps} steps of {run.dt:g} s in {run.seconds:.1f} s, {run.real_time:.1f} times real"
+        f" time; at most {run.most} of these vehicles at once, {run.others} others"
+    )
+
+
+def _what_happened(run: ScenarioRun) -> Table:
+    table = _table(
         "vType",
         "vehicles",
         "model drove",
         "mean speed [m/s]",
         "lane changes",
-        "hard brakings",
-        "hardest [m/s2]",
         "collisions",
         "teleports",
     )
-    table = blank_table(*columns)
-    for column in table.columns[1:]:
-        column.justify = "right"
     for name, tally in run.tallies.items():
         table.add_row(
             name,
@@ -371,13 +540,57 @@ def report(run: ScenarioRun) -> None:
             f"{tally.driven / tally.steps:.0%}",
             f"{tally.metres / (tally.steps * run.dt):.2f}",
             str(tally.lane_changes),
-            str(tally.hard_brakings),
-            f"{tally.hardest_braking:.1f}",
             str(tally.collisions),
             str(tally.teleports),
         )
-    put(table)
-    print(
-        f"{run.steps} steps of {run.dt:g} s in {run.seconds:.1f} s, {run.real_time:.1f} times real"
-        f" time; at most {run.most} of these vehicles at once, {run.others} others"
+    return table
+
+
+def _braking(run: ScenarioRun) -> Table:
+    """Returns how hard vehicles braked, m/s2."""
+    table = _table(
+        "braking [m/s2]",
+        "95 % of steps below",
+        "99.9 % below",
+        "hardest",
+        "times above decel",
+        "steps at limits",
     )
+    for name, tally in run.tallies.items():
+        table.add_row(
+            name,
+            f"{tally.braking.quantile(0.95):.2f}",
+            f"{tally.braking.quantile(0.999):.2f}",
+            f"{tally.hardest_braking:.2f}",
+            str(tally.hard_brakings),
+            f"{run.limited.get(name, 0.0):.1%}",
+        )
+    return table
+
+
+def _beside_the_recording(run: ScenarioRun) -> Table:
+    """Returns quantiles of the live vehicles beside those of what their policy learned from."""
+    table = _table("5 %, median, 95 %", "speed [m/s]", "acceleration [m/s2]", "time gap [s]")
+    for name, tally in run.tallies.items():
+        live = []
+        for histogram in (tally.speeds, tally.accelerations, tally.time_gaps):
+            live.append(_listed([histogram.quantile(share) for share in _QUANTILES]))
+        table.add_row(name, *live)
+        recorded = run.recorded.get(name) or {}
+        if recorded:
+            signals = ("speed", "acceleration", "time_gap")
+            table.add_row("its recording", *(_listed(recorded[signal]) for signal in signals))
+    return table
+
+
+def _table(*columns: str) -> Table:
+    from cfx.console import blank_table
+
+    table = blank_table(*columns)
+    for column in table.columns[1:]:
+        column.justify = "right"
+    return table
+
+
+def _listed(values: Sequence[float]) -> str:
+    return ", ".join(f"{value:.2f}" for value in values)

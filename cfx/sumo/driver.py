@@ -30,6 +30,7 @@ from cfx.agents.core import AgentCore
 from cfx.agents.heads.direct import DirectHead
 from cfx.agents.placement import ALL
 from cfx.agents.scaler import Scaler
+from cfx.agents.valid_range import share_in_words
 from cfx.calibration.settings import WindowSettings
 from cfx.errors import DataError, ParameterError, SumoError
 from cfx.models.base import DrivingModel, Follower, Leader
@@ -48,6 +49,9 @@ _BOUNDS_BRAKING = 4
 
 _MARGIN = 1.5
 """How much harder than needed a vehicle may brake: it cannot know what its leader does next."""
+
+_WALKING_MPS = 1.5
+"""Speed below which a time gap means nothing."""
 
 _NEAR_M = 0.5
 """Room to brake in counts as this at least, m."""
@@ -350,6 +354,21 @@ class Driver:
         """Says whether the model drives a vehicle now; a watched vehicle is not driven."""
         return vehicle in self._speed_modes
 
+    def outside_in_words(self) -> str:
+        """Returns how much was driven outside what the policy has learned, in words; or ""."""
+        valid_range, counts = self.policy.valid_range, self.counts
+        if valid_range is None or counts.beyond is None:
+            return ""
+        return share_in_words(valid_range, counts.outside, counts.steps, counts.beyond)
+
+    def time_gaps(self, vehicles: Iterable[str]) -> Tensor:
+        """Returns the time gaps of those that the model drives faster than walking, `(d,)`, s."""
+        slots = [self._slots[name] for name in vehicles if self.drives(name)]
+        history = self._store.history[slots, :, -1]
+        gap = history[:, History._fields.index("gap")]
+        speed = history[:, History._fields.index("follower_speed")]
+        return (gap / speed)[speed > _WALKING_MPS]
+
     def parameters(self, vehicle: str) -> dict[str, float]:
         """Returns the parameters of a vehicle now, SI units; empty if it has no leader."""
         slot = self._slots.get(vehicle)
@@ -434,7 +453,8 @@ class Driver:
             raise DataError(
                 f"{self.source} has {len(names)} networks, each for one driver ({names[0]}, ...),"
                 " and none for unseen drivers; train with protocol.networks=all or"
-                " protocol=across_drivers, or name one of them: Driver.load(..., network=...)"
+                " protocol=across_drivers, or name one of them: Driver.load(..., network=...), or"
+                f" --drivers TYPE={self.source}#{names[0]}"
             )
         listed = ", ".join(names[:5])
         if len(names) > 5:

@@ -52,12 +52,14 @@ class Fleet:
     ) -> Fleet:
         """Reads the policy of a run for each vType; types with the same run share a driver.
 
-        The other arguments are those of `Driver.load`.
+        A run may be followed by `#` and the name of one of its networks, which drives then. The
+        other arguments are those of `Driver.load`.
         """
         loaded = {}
         for run in dict.fromkeys(runs.values()):
+            folder, chosen = _network_of(run, network)
             loaded[run] = Driver.load(
-                run, network=network, look_ahead=look_ahead, speed_mode=speed_mode
+                folder, network=chosen, look_ahead=look_ahead, speed_mode=speed_mode
             )
         return cls({name: loaded[run] for name, run in runs.items()})
 
@@ -92,3 +94,12 @@ class Fleet:
     def driver(self, vehicle: str) -> Driver:
         """Returns the driver of a vehicle of the fleet."""
         return self.drivers[self._type_of[vehicle]]
+
+
+def _network_of(run: str | Path, network: str) -> tuple[str | Path, str]:
+    """Splits `RUN#NETWORK`; a folder of such a name is taken as it is."""
+    text = str(run)
+    if "#" not in text or Path(text).exists():
+        return run, network
+    folder, _, chosen = text.rpartition("#")
+    return folder, chosen
