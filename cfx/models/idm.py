@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
+from cfx.models.vtype import VType
 from cfx.parameters import Parameter, ParameterSpace
 
 _PAPER = (
@@ -66,13 +67,29 @@ class IDM(DrivingModel):
 
     Differences from SUMO: with v0 = maxSpeed, T = tau, s0 = minGap, a = accel, b = decel it is
     SUMO's IDM wherever SUMO takes one sub-step, that is for steps up to 0.37 s unless its
-    `stepping` is changed. SUMO also brakes no harder than emergencyDecel (9 m/s2 by default; here
-    braking has no bound), rounds speeds below 1e-5 m/s to 0, and the road's limit lowers v0.
+    `stepping` is changed. Its limits are emergencyDecel and accel there, and `model.limits` here.
+    SUMO also rounds speeds below 1e-5 m/s to 0, and the road's limit lowers v0.
     """
 
     reference = "Treiber, Hennecke and Helbing (2000), Phys. Rev. E 62(2)"
     collision_free = True
     parameters = IDM_PARAMETERS
+
+    def sumo_vtype(self, p: Mapping[str, Tensor]) -> VType:
+        names = {
+            "v0": "maxSpeed",
+            "T": "tau",
+            "s0": "minGap",
+            "a": "accel",
+            "b": "decel",
+            "delta": "delta",
+        }
+        attributes: dict[str, Tensor | str] = {}
+        for ours, theirs in names.items():
+            attributes[theirs] = p[ours]
+        if self.limits is not None:
+            attributes["emergencyDecel"] = repr(self.limits.emergency_deceleration)
+        return VType("IDM", attributes)
 
     def next_speed(
         self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float

@@ -283,11 +283,11 @@ class _Run:
         scenario: Path,
         rows: _Rows | None,
         actor: Actor | None = None,
-        name: str = "",
+        title: str = "",
     ) -> None:
         self._sumo = sumo
         self._actor = actor
-        self._name = name or scenario.name
+        self._name = title or scenario.name
         self._fleet = fleet
         self._scenario = scenario
         self._rows = rows

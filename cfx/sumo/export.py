@@ -22,6 +22,9 @@ from cfx.tracking.store import folder_of
 
 NAME = "drivers.add.xml"
 
+ALL_DRIVERS = "drivers"
+"""The vTypeDistribution of all drivers."""
+
 _WITHOUT_LAG = {"variant": "sumo", "leader_deceleration": None}
 """Settings with which krauss is SUMO's KraussOrig1, once its t_i is 0."""
 
@@ -29,7 +32,9 @@ _WITHOUT_LAG = {"variant": "sumo", "leader_deceleration": None}
 def export(run: str | Path, output: str | Path | None = None) -> list[str]:
     """Writes a vTypeDistribution for each cluster, with a vType for each pair's parameters.
 
-    The parameters are those of the method `fixed`: calibrated to the driver, constant.
+    The parameters are those of the method `fixed`: calibrated to the driver, constant. The
+    distribution `drivers` holds them all. Each vType is one driver's whole set, so that a vehicle
+    drawn from it has parameters that belong together, as correlated as they are among drivers.
 
     Args:
         run: a job's output folder, or the id of its MLflow run.
@@ -61,10 +66,10 @@ def export(run: str | Path, output: str | Path | None = None) -> list[str]:
         counts.append(f"{name} {count}")
     return [
         f"vTypes of SUMO's {kind.car_follow_model}, in one vTypeDistribution for each cluster:"
-        f" {', '.join(counts)}",
+        f" {', '.join(counts)}; all together in '{ALL_DRIVERS}'",
         *[f"Note: {note}" for note in notes],
         f"Use it: sumo --additional-files {path.absolute()}; then in a flow or vehicle:"
-        f" type={first}",
+        f' type="{ALL_DRIVERS}", or type={first}',
     ]
 
 
@@ -94,7 +99,7 @@ def vtypes(node: Mapping[str, Any], table: pd.DataFrame) -> tuple[VType, list[st
     if not isinstance(model, InSumo):
         raise ConfigError(
             f"SUMO has no car-following model that drives as model={node['name']}; export jobs with"
-            " model=krauss, w99, krauss_sumo, idm_sumo or sumo_vtype"
+            " model=idm, krauss, w99, krauss_sumo, idm_sumo or sumo_vtype"
         )
     return model.sumo_vtype(p), notes
 
@@ -158,12 +163,15 @@ def _xml(table: pd.DataFrame, kind: VType, notes: list[str]) -> str:
     for note in notes:
         lines.append(f"     {note}.")
     lines += ["-->", "<additional>"]
+    names = []
     for cluster, rows in table.groupby("cluster", sort=False):
         lines.append(f"    <vTypeDistribution id={quoteattr(str(cluster))}>")
         for place, row in enumerate(rows.index):
             attributes = {name: values[row] for name, values in columns.items()}
-            lines += _vtype(f"{cluster}_{place}", kind, attributes, rows["pair_id"][row])
+            names.append(f"{cluster}_{place}")
+            lines += _vtype(names[-1], kind, attributes, rows["pair_id"][row])
         lines.append("    </vTypeDistribution>")
+    lines.append(f'    <vTypeDistribution id="{ALL_DRIVERS}" vTypes={quoteattr(" ".join(names))}/>')
     return "\n".join([*lines, "</additional>", ""])
 
 
