@@ -18,6 +18,7 @@ from cfx.agents.core import AgentCore
 from cfx.agents.heads.direct import DirectHead
 from cfx.agents.heads.offset import shrunk
 from cfx.agents.scaler import Scaler
+from cfx.agents.valid_range import ValidRange
 from cfx.errors import DataError, ParameterError, SumoError
 from cfx.evaluation.closed_loop import simulate_closed_loop
 from cfx.evaluation.evaluate import evaluate
@@ -33,9 +34,10 @@ from cfx.style.result import StyleResult
 from cfx.style.settings import StyleSettings
 from cfx.sumo.demo import simulate_in_sumo
 from cfx.sumo.demo_request import PolicyKnowledge
-from cfx.sumo.driver import Driver
+from cfx.sumo.driver import Driver, needed_deceleration
 from cfx.sumo.fleet import Fleet
 from cfx.sumo.motorway import read_motorway
+from cfx.sumo.surroundings import Seen
 from tests.drives import wavy_pairs
 from tests.sumo.policies import adaptive
 
@@ -53,6 +55,7 @@ class Car:
     kind: str = "calm"
     told: list[float] = field(default_factory=list)
     mode: int = 31
+    decel: float = 4.5
 
 
 class TraCIException(Exception):  # noqa: N818 - SUMO's name
@@ -89,7 +92,10 @@ class Road:
         return 2.5
 
     def getDecel(self, name: str) -> float:  # noqa: N802
-        return 4.5
+        return self.cars[name].decel
+
+    def setDecel(self, name: str, decel: float) -> None:  # noqa: N802
+        self.cars[name].decel = decel
 
     def setSpeed(self, name: str, speed: float) -> None:  # noqa: N802
         self.cars[name].told.append(speed)
@@ -358,9 +364,104 @@ def test_what_cannot_be_driven_is_one_sentence(tmp_path: Path) -> None:
         DataError, match=r"with the parameters t_r, other, but model=krauss here has t_r, t_i"
     ):
         Driver.load(tmp_path, network="p1")
-    (tmp_path / "policy" / "policy.pt").unlink()
+    (tmp_path / "policy" / "policy.safetensors").unlink()
     with pytest.raises(DataError, match="holds no policy"):
         Driver.load(tmp_path, network="p1")
+
+
+def seen(**values: float) -> Seen:
+    """Returns one vehicle at 20 m/s, 30 m behind a leader as fast as itself, or as said."""
+    usual = {
+        "speed": 20.0,
+        "acceleration": 0.0,
+        "gap": 30.0,
+        "leader_speed": 20.0,
+        "leader_acceleration": 0.0,
+        "leader_length": 5.0,
+        "allowed": 60.0,
+    }
+    columns = {}
+    for name, value in (usual | values).items():
+        columns[name] = torch.tensor([value], dtype=torch.float64)
+    return Seen(**columns)
+
+
+def test_the_needed_deceleration_just_avoids_the_leader() -> None:
+    assert float(needed_deceleration(seen())) == 0.0
+    # A leader 6 m/s slower: the gap is used up as the speeds meet.
+    slower = seen(leader_speed=14.0)
+    assert float(needed_deceleration(slower)) == pytest.approx(36.0 / 60.0)
+    # A leader who brakes at 9 m/s2 to a standstill 22.2 m farther on.
+    braking = seen(leader_acceleration=-9.0)
+    needed = float(needed_deceleration(braking))
+    assert 400.0 / (2.0 * needed) == pytest.approx(30.0 + 400.0 / 18.0)
+    assert float(needed_deceleration(seen(gap=-1.0, speed=10.0, leader_speed=0.0))) == 100.0
+
+
+def test_a_live_vehicle_brakes_comfortably_unless_it_must_brake_harder() -> None:
+    """The policy's Krauss wants to stop at once in a gap that is gone."""
+    node = {"name": "krauss"}
+    for gap, leader_speed, hardest in ((8.0, 10.0, 4.5), (8.0, 2.0, 6.0), (3.0, 0.0, 9.0)):
+        road = Road(lead=Car(speed=leader_speed), v=Car(speed=10.0, gap=gap, leader="lead"))
+        driver = Driver(adaptive(node), speed_mode=31)
+        driver.step(road, "v")
+        told = road.cars["v"].told[-1]
+        assert told == pytest.approx(10.0 - 0.1 * hardest)
+        assert road.cars["v"].decel == pytest.approx(max(4.5, hardest))
+    road.cars["v"].gap, road.cars["v"].speed = 80.0, 0.0
+    road.advance()
+    driver.step(road, "v")
+    assert road.cars["v"].decel == 4.5, "SUMO's own bound is restored"
+    exact = Driver(adaptive(node), speed_mode=0)
+    road = Road(lead=Car(speed=10.0), v=Car(speed=10.0, gap=1.0, leader="lead"))
+    exact.step(road, "v")
+    assert road.cars["v"].told[-1] == pytest.approx(10.0 - 0.1 * 9.0), "the guard holds always"
+
+
+def test_a_vehicle_that_leaves_its_driver_has_its_own_bound_again() -> None:
+    road = Road(lead=Car(speed=0.0), v=Car(speed=10.0, gap=3.0, leader="lead"))
+    driver = Driver(adaptive({"name": "krauss"}), speed_mode=31)
+    driver.step(road, "v")
+    assert road.cars["v"].decel > 4.5
+    driver.release(road, "v")
+    assert road.cars["v"].decel == 4.5
+    assert road.cars["v"].mode == 31
+
+
+def test_a_model_without_limits_does_not_go_live() -> None:
+    unbounded = adaptive({"name": "krauss", "limits": None})
+    with pytest.raises(DataError, match="neither limits nor a brake cap"):
+        Driver(unbounded)
+    Driver(adaptive({"name": "krauss", "limits": None, "variant": "sumo"}))
+
+
+def test_steps_outside_the_valid_range_and_at_limits_are_counted() -> None:
+    rows = torch.randn((500, 5), generator=torch.Generator().manual_seed(0)).double()
+    narrow = ValidRange.of([rows * 0.5 + torch.tensor([5.0, 0.0, 0.0, 0.0, 2.5])])
+    driver = Driver(replace(adaptive({"name": "krauss"}), valid_range=narrow))
+    road = platoon(4)
+    for _ in range(3):
+        driver.step(road, ["v0", "v1", "v2", "v3"])
+        road.advance()
+    assert driver.counts.steps == 12
+    assert driver.counts.outside > 0
+    assert "% of steps outside what the policy has learned (" in driver.outside_in_words()
+    assert driver.counts.limited > 0
+    assert len(driver.time_gaps(["v0", "v1"])) == 2
+    assert Driver(adaptive({"name": "krauss"})).outside_in_words() == ""
+
+
+def test_a_network_may_be_named_behind_the_run(tmp_path: Path) -> None:
+    checkpoint.save(adaptive({"name": "krauss"}, ("p1", "p2")), tmp_path / "policy")
+    fleet = Fleet.load({"calm": f"{tmp_path}#p2"})
+    road = platoon(1)
+    fleet.step(road)
+    one = Driver.load(tmp_path, network="p2")
+    other = platoon(1)
+    one.step(other, "v0")
+    assert road.cars["v0"].told == other.cars["v0"].told
+    with pytest.raises(DataError, match=r"--drivers TYPE=.*#p1"):
+        Fleet.load({"calm": tmp_path})
 
 
 def test_a_fleet_drives_each_type_by_its_own_and_finds_who_comes(

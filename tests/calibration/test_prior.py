@@ -1,0 +1,73 @@
+"""The prior: it holds what a recording does not determine, and hardly moves what it does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from cfx.calibration.cache import Cache
+from cfx.calibration.calibrator import Calibrator
+from cfx.calibration.losses import SegmentLosses
+from cfx.calibration.prior import LossesWithPrior, prior_weight
+from cfx.models.idm import IDM
+from cfx.objectives.rmse import SpeedRmse
+from cfx.optimizers.gradient import GradientSearch
+from cfx.pairs import PairBatch
+from cfx.progress import Task
+from cfx.simulation.rollout import MemoryStepper
+from tests.drives import wavy_pairs
+
+MODEL = IDM()
+TRUE = torch.tensor([[30.0, 1.2, 1.5, 1.1, 1.6], [36.0, 1.8, 2.5, 0.9, 1.9]], dtype=torch.float64)
+PAIRS = wavy_pairs(MODEL, TRUE, frames=300)
+BATCH = PairBatch.of(PAIRS)
+
+
+def found(prior: float, folder: Path | None = None) -> torch.Tensor:
+    calibrator = Calibrator(
+        MemoryStepper(MODEL, 0.1),
+        GradientSearch(samples=2048),
+        seed=0,
+        cache=Cache(folder),
+        memory=1 << 28,
+        progress=Task,
+        prior=prior,
+    )
+    return calibrator.fixed(PAIRS, BATCH, BATCH.lengths - 1)
+
+
+def losses() -> SegmentLosses:
+    pair = torch.arange(2)
+    return SegmentLosses.of_segments(
+        MemoryStepper(MODEL, 0.1), SpeedRmse(), BATCH, pair, pair * 0, BATCH.lengths - 1
+    )
+
+
+def test_the_default_costs_nothing_and_distance_costs_more() -> None:
+    default = MODEL.space.to_unit(MODEL.space.defaults())
+    with_prior = LossesWithPrior.of(losses(), default, 0.01)
+    near = default[None, None].expand(2, 1, -1)
+    far = torch.full_like(near, 0.9)
+    plain = losses()
+    torch.testing.assert_close(with_prior(near), plain(near))
+    assert bool((with_prior(far) > plain(far)).all())
+    both = torch.cat([near, far], 1)
+    torch.testing.assert_close(with_prior.select(1, 2)(both[1:]), with_prior(both)[1:])
+
+
+def test_what_is_determined_is_found_and_what_is_not_stays() -> None:
+    """These drivers never go faster than 20 m/s, so their data say little of v0."""
+    values = found(prior_weight("weak"))
+    time_gap = values[:, 1]
+    assert bool(((time_gap - TRUE[:, 1]).abs() < 0.15).all())
+    default = MODEL.space["v0"].default
+    assert bool(((values[:, 0] - default).abs() < 8.0).all())
+
+
+def test_without_prior_and_with_it_are_different_entries(tmp_path: Path) -> None:
+    plain = found(0.0, tmp_path)
+    held = found(0.01, tmp_path)
+    assert not torch.equal(plain, held)
+    assert torch.equal(found(0.0, tmp_path), plain)
+    assert torch.equal(found(0.01, tmp_path), held)

@@ -1,0 +1,105 @@
+"""Cold starts on faster roads: accelerations stay human, and the gap is one of the driver's own."""
+
+from __future__ import annotations
+
+import torch
+
+from cfx.learners.rollout.augmentation import Augmentation
+from cfx.learners.rollout.batch import RolloutBatch
+from cfx.learners.rollout.dataset import usual_time_gap
+from cfx.learners.rollout.inputs import RolloutInputs
+from cfx.learners.rollout.settings import RolloutSettings
+from cfx.policies.features import History
+from tests.learners.made import TRUE, gru, module_of, training_data
+
+DATA = training_data(base=TRUE.repeat(2, 1))
+MODULE = module_of(DATA, cold_start_fraction=1.0, speed_shift=20.0)
+
+
+def inputs(batch: RolloutBatch) -> RolloutInputs:
+    dataset = MODULE.dataset
+    pair = dataset.pair.gather(1, batch.place)
+    return RolloutInputs.of(dataset.batch, pair, batch, MODULE.exact_step, 3)
+
+
+def batch(shift: float, wider: float) -> RolloutBatch:
+    place = torch.arange(3).expand(2, 3)
+    like = torch.ones(2, 3)
+    return RolloutBatch(
+        place=place,
+        start=torch.full_like(place, 8),
+        cold_start=torch.ones_like(place, dtype=torch.bool),
+        last=torch.full_like(place, 200),
+        weight=like,
+        shift=shift * like,
+        wider=wider * like,
+    )
+
+
+def test_a_faster_road_moves_both_vehicles_alike() -> None:
+    slow, fast = inputs(batch(0.0, 0.0)), inputs(batch(15.0, 22.5))
+    torch.testing.assert_close(fast.follower[2], slow.follower[2])
+    torch.testing.assert_close(fast.leader[2], slow.leader[2])
+    torch.testing.assert_close(fast.leader[1], slow.leader[1] + 15.0)
+    torch.testing.assert_close(fast.measured.speed, slow.measured.speed + 15.0)
+    torch.testing.assert_close(fast.measured.gap, slow.measured.gap + 22.5)
+    # Positions go with the speeds, from the moment at which the policy takes over.
+    step = fast.leader[0, 1:, ..., 0] - fast.leader[0, :-1, ..., 0]
+    before = slow.leader[0, 1:, ..., 0] - slow.leader[0, :-1, ..., 0]
+    stride = MODULE.exact_step.stride * MODULE.exact_step.dt
+    torch.testing.assert_close(step, before + 15.0 * stride, rtol=1e-4, atol=1e-4)
+    gap = fast.leader[0, 0][..., MODULE.exact_step.length - 1]
+    slow_gap = slow.leader[0, 0][..., MODULE.exact_step.length - 1]
+    torch.testing.assert_close(gap, slow_gap + 22.5, rtol=1e-4, atol=1e-4)
+
+
+def test_some_cold_starts_are_faster_and_their_gap_fits() -> None:
+    drawn = MODULE.sampler.training(0)
+    assert drawn.shift is not None
+    assert drawn.wider is not None
+    faster = drawn.shift > 0
+    share = []
+    for step in range(30):
+        shift = MODULE.sampler.training(step).shift
+        assert shift is not None
+        share.append(float((shift > 0).float().mean()))
+    assert 0.15 < sum(share) / len(share) < 0.45
+    pair = MODULE.dataset.pair.gather(1, drawn.place)
+    time_gap = MODULE.dataset.time_gap[pair]
+    torch.testing.assert_close(drawn.wider[faster], (drawn.shift * time_gap)[faster])
+    none = module_of(DATA, cold_start_fraction=1.0, speed_shift=0.0).sampler.training(0)
+    assert none.shift is None
+
+
+def test_time_gaps_are_those_of_people() -> None:
+    found = usual_time_gap(DATA.batch, DATA.split.frame)
+    assert bool(((found >= 0.8) & (found <= 2.5)).all())
+
+
+def test_situations_are_augmented_as_trajectories_are() -> None:
+    settings = RolloutSettings(scaling=0.0, speed_shift=20.0)
+    time_gap = torch.tensor([1.0, 2.0], dtype=torch.float64)
+    values = torch.full((2, 500), 5.0, dtype=torch.float64)
+    history = History(values, values * 0.1, values, values * 0.1, values * 2)
+    augment = Augmentation(settings, time_gap, torch.Generator().manual_seed(0))
+    after = augment(history, torch.arange(2))
+    shift = after.follower_speed - 5.0
+    torch.testing.assert_close(after.leader_speed - 5.0, shift)
+    torch.testing.assert_close(after.gap - 10.0, shift * time_gap[:, None])
+    torch.testing.assert_close(after.follower_acceleration, history.follower_acceleration)
+    assert 0.2 < float((shift > 0).double().mean()) < 0.4
+    assert float(shift.max()) <= 20.0
+
+
+def test_what_was_learned_on_faster_roads_is_inside_the_valid_range() -> None:
+    from cfx.learners.rollout import RolloutLearner
+    from tests.learners.made import QUICK
+
+    ranges = {}
+    for shift in (0.0, 20.0):
+        quick = {**QUICK, "epochs": 1, "steps": 1}
+        learner = RolloutLearner(speed_shift=shift, cold_start_fraction=1.0, **quick)
+        found = learner.fit(gru(), DATA).valid_range
+        assert found is not None
+        ranges[shift] = found
+    assert float(ranges[20.0].high[0, 0]) > float(ranges[0.0].high[0, 0]) + 10.0

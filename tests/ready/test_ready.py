@@ -1,0 +1,119 @@
+"""Ready-made policies: complete, safe to read, and usable wherever a job is named."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+import cfx
+from cfx import cli, ready
+from cfx.agents import checkpoint
+from cfx.errors import DataError
+from cfx.job.parts import make_protocol
+from cfx.policies.features import History
+from cfx.publish.recipes import RECIPES
+
+NAMES = ready.names()
+
+
+def test_there_is_one_for_each_recipe() -> None:
+    assert set(NAMES) == set(RECIPES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_is_small_and_holds_no_code_and_no_recording(name: str) -> None:
+    folder = ready.folder_of_ready_made(f"cfx://{name}")
+    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert files == {
+        "card.json",
+        "CARD.md",
+        "metrics.json",
+        "policy/policy.json",
+        "policy/policy.safetensors",
+    }
+    assert sum((folder / file).stat().st_size for file in files) < 600_000
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_drives_an_unseen_driver(name: str) -> None:
+    agent = cfx.load(f"cfx://{name}").policy
+    assert agent.names == ("all",) or len(agent.names) == 1
+    assert agent.valid_range is not None
+    assert agent.recorded
+    frames = torch.full((1, agent.windows.length), 10.0, dtype=torch.float64)
+    history = History(frames, frames * 0, frames, frames * 0, frames * 2)
+    chosen, state = agent.act(history, agent.begin(torch.zeros(1, dtype=torch.int64)))
+    low, high = agent.space.bounds()
+    assert bool(((chosen >= low - 1e-9) & (chosen <= high + 1e-9)).all())
+    assert float(state.score[0]) < 1.0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_card_says_what_a_user_must_know(name: str) -> None:
+    card = ready.card_of(name)
+    assert card["errors_on_unseen_drivers"]["rmse_speed"] < 0.61
+    assert card["errors_on_unseen_drivers"]["improvement_over_pooled"] > 0
+    assert card["safety"]["collisions"] == 0
+    assert card["safety"]["jerk"] < 1.5
+    kinds = {event["kind"]: event for event in card["stress"]["events"]}
+    assert kinds["cut-ins"]["number"] >= 1000
+    for event in kinds.values():
+        assert event["collisions"] == 0
+        assert event["hardest_braking"] <= 9.0 + 1e-6
+        assert event["hardest_acceleration"] <= 2.6 + 1e-6
+    text = (ready.FOLDER / name / "CARD.md").read_text(encoding="utf-8")
+    assert card["command"] in text
+    assert "Valid range" in text
+
+
+def test_an_unknown_one_is_one_sentence() -> None:
+    with pytest.raises(DataError, match=r"there is no ready-made policy 'i80-idn'\. Did you mean"):
+        cfx.load("cfx://i80-idn")
+
+
+def test_the_command_lists_and_shows_them(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["policies"]) == 0
+    listed = capsys.readouterr().out
+    for name in NAMES:
+        assert f"cfx://{name}" in listed
+    assert cli.main(["policies", "show", NAMES[0]]) == 0
+    assert capsys.readouterr().out.startswith(f"# {NAMES[0]}")
+    assert cli.main(["policies", "show", "nobody"]) == 2
+
+
+def test_transfer_takes_one_by_its_name() -> None:
+    from cfx.config import JobConfig
+
+    node = {"name": "transfer", "run": f"cfx://{NAMES[0]}"}
+    config = JobConfig.of(
+        {
+            "data": {"name": "synthetic"},
+            "model": {"name": "idm"},
+            "policy": {"name": "gru"},
+            "optimizer": {"name": "random"},
+            "learner": {"name": "rollout"},
+            "protocol": node,
+        }
+    )
+    determined = make_protocol(config).determines()
+    assert determined["model"]["name"] == ready.card_of(NAMES[0])["model"]
+
+
+def test_a_policy_that_is_too_large_or_no_object_is_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    agent = checkpoint.load(ready.FOLDER / NAMES[0] / "policy")
+    checkpoint.save(agent, tmp_path)
+    monkeypatch.setattr(checkpoint, "_LARGEST_MB", 0.2)
+    with pytest.raises(DataError, match=r"policy\.safetensors has 0 MB, at most 0\.2"):
+        checkpoint.load(tmp_path)
+    monkeypatch.undo()
+    (tmp_path / "policy.json").write_text(json.dumps([1, 2]))
+    with pytest.raises(DataError, match="is no JSON object"):
+        checkpoint.load(tmp_path)
+    (tmp_path / "policy.safetensors").write_bytes(b"\xff" * 100)
+    with pytest.raises(DataError, match="holds no policy that can be read"):
+        checkpoint.load(tmp_path)
