@@ -148,7 +148,7 @@ def run_scenario(
     """
     require_sumo()
     with ExitStack() as stack:
-        path, actor = _prepared(scenario, stack)
+        path, actor = _prepared(scenario, end, stack)
         fleet = Fleet.load(runs, look_ahead=look_ahead, speed_mode=speed_mode)
         connection = stack.enter_context(started(path, _command(path, seed, gui, options), gui))
         rows = _Rows.opened(stack, output, fleet) if output is not None else None
@@ -165,7 +165,9 @@ def _name(scenario: Path | str) -> str:
     return Path(scenario).name
 
 
-def _prepared(scenario: Path | str, stack: ExitStack) -> tuple[Path, Actor | None]:
+def _prepared(
+    scenario: Path | str, end: float | None, stack: ExitStack
+) -> tuple[Path, Actor | None]:
     """Returns SUMO's configuration, and what acts on the simulation besides the drivers."""
     shipped = SCENARIOS.get(str(scenario))
     path = Path(scenario)
@@ -174,7 +176,7 @@ def _prepared(scenario: Path | str, stack: ExitStack) -> tuple[Path, Actor | Non
         actor = None
         if shipped.make_actor is not None:
             actor = shipped.make_actor()
-        return shipped.write(folder), actor
+        return shipped.write(folder, end), actor
     if not path.is_file():
         raise DataError(
             f"{path} is not there; name SUMO's configuration of the scenario (.sumocfg), or a"

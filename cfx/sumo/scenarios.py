@@ -54,15 +54,23 @@ class Scenario(NamedTuple):
     end: float
     make_actor: Callable[[], Callable[[Any], None]] | None = None
 
-    def write(self, folder: Path) -> Path:
-        """Writes the scenario's files into a folder; returns SUMO's configuration."""
+    def write(self, folder: Path, end: float | None = None) -> Path:
+        """Writes the scenario's files into a folder; returns SUMO's configuration.
+
+        Args:
+            folder: that is there.
+            end: s; None: the scenario's own.
+        """
+        last = self.end
+        if end is not None:
+            last = end
         routes = folder / "scenario.rou.xml"
         routes.write_text(self.routes, encoding="utf-8")
         configuration = folder / "scenario.sumocfg"
         configuration.write_text(
             f'<configuration><input><net-file value="{self.network}"/>'
             f'<route-files value="{routes}"/></input>'
-            f'<time><end value="{self.end:g}"/><step-length value="{STEP_S:g}"/></time>'
+            f'<time><end value="{last:g}"/><step-length value="{STEP_S:g}"/></time>'
             '<processing><collision.action value="warn"/>'
             '<collision.mingap-factor value="0"/><time-to-teleport value="-1"/>'
             "</processing></configuration>",
