@@ -201,6 +201,14 @@ def test_a_node_reads_back_as_the_defaults_of_its_class() -> None:
     assert max(len(line) for line in text.splitlines()) <= 130
 
 
+LIMITS = {
+    "acceleration": 2.6,
+    "comfortable_deceleration": 4.5,
+    "emergency_deceleration": 9.0,
+    "response_time": None,
+}
+
+
 def test_a_third_partys_model_is_an_option_and_its_node_is_written_from_its_class(install) -> None:
     install("mine-models", {"cfx.models": {"mine": "mine_models:Mine"}}, {"mine_models.py": PLUGIN})
     node = values_of("model=mine", "model.parameters.tau.high=9", "model.mood=wild")["model"]
@@ -208,6 +216,7 @@ def test_a_third_partys_model_is_an_option_and_its_node_is_written_from_its_clas
     assert node == {
         "name": "mine",
         "adaptation_bounds": None,
+        "limits": LIMITS,
         "mood": "wild",
         "parameters": {"tau": tau},
     }
@@ -226,6 +235,7 @@ def test_a_plugins_own_yaml_wins_and_may_extend_the_generated_node(install) -> N
     assert far == {
         "name": "mine",
         "adaptation_bounds": None,
+        "limits": LIMITS,
         "mood": "wild",
         "parameters": {"tau": {"low": 0.7, "high": 8.0, "default": 1.0, "tuned": True}},
     }

@@ -72,7 +72,7 @@ def test_the_folder_holds_what_the_contract_says(finished: cfx.JobResult) -> Non
         "config.yaml",
         "metrics.json",
         "pairs.csv",
-        "policy/policy.pt",
+        "policy/policy.safetensors",
         "policy/policy.json",
         "cfx.log",
     } <= names

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import safetensors.torch
 import torch
 
 from cfx.agents import checkpoint
@@ -63,6 +64,9 @@ def test_format_1_which_names_no_head_is_read(tmp_path: Path, offsets: bool) -> 
     for name in ("head", "shrinkage", "own", "history", "learned_from"):
         del description[name]
     (tmp_path / "policy.json").write_text(json.dumps(description))
+    tensors = safetensors.torch.load_file(tmp_path / "policy.safetensors")
+    torch.save(tensors, tmp_path / "policy.pt")
+    (tmp_path / "policy.safetensors").unlink()
     loaded = checkpoint.load(tmp_path)
     assert torch.equal(chosen(loaded), chosen(agent))
     assert loaded.head.name == agent.head.name
@@ -80,7 +84,7 @@ def test_policies_that_mlflow_logged_before_find_what_they_import(tmp_path: Path
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("format", 3, "has format 3; this version of cfx reads formats 1 to 2"),
+        ("format", 4, "has format 4; this version of cfx reads formats 1 to 3"),
         ("head", "residual", "this version of cfx has no head 'residual'; it has direct, offset"),
         ("head", "offset", "the weights read 25 features, the policy's settings give 27"),
     ],

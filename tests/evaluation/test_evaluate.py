@@ -130,7 +130,9 @@ def test_what_comes_after_the_start_is_measured_on_its_own() -> None:
     assert metrics["steady/rmse_speed/policy"] == pytest.approx(0.2)
     assert metrics["steady/rmse_improvement/fixed/mean"] == pytest.approx(0.6)
     assert found.steady_improvements["fixed"].undefined == 1
-    alone = {method: ClosedLoop(*(values[1:] for values in one)) for method, one in loops.items()}
+    alone = {
+        method: ClosedLoop(*(values[1:] for values in one[:4])) for method, one in loops.items()
+    }
     short = evaluate(
         pairs.select([False, True], "long"),
         batch[1:],

@@ -171,16 +171,16 @@ def plugins_idm() -> Twin | None:
     def same(follower: Follower, leader: Leader, p: Mapping[str, Tensor]) -> Tensor:
         return bumper_gap(follower, leader) >= 0.1
 
-    return Twin("idm (cfx-idm) / IDM", IDM(), anywhere(IDM()), same=same, vtype=vtype)
+    return Twin("idm (cfx-idm) / IDM", IDM(limits=None), anywhere(IDM()), same=same, vtype=vtype)
 
 
 PLUGINS_IDM = plugins_idm()
-KRAUSS = Krauss(variant="sumo", parameters={"t_i": {"default": 0.0, "tuned": False}})
+KRAUSS = Krauss(limits=None, variant="sumo", parameters={"t_i": {"default": 0.0, "tuned": False}})
 TWINS = [
     Twin("krauss, t_i = 0 / KraussOrig1", KRAUSS, krauss_parameters, same=krauss_radicand),
-    Twin("krauss_sumo / Krauss", KraussSumo(), sumos_krauss),
-    Twin("idm_sumo / IDM", IdmSumo(), anywhere(IdmSumo())),
-    Twin("w99 / W99", W99(), anywhere(W99(), b=4.5, b_max=9.0, v_max=55.0), draws=True),
+    Twin("krauss_sumo / Krauss", KraussSumo(limits=None), sumos_krauss),
+    Twin("idm_sumo / IDM", IdmSumo(limits=None), anywhere(IdmSumo())),
+    Twin("w99 / W99", W99(limits=None), anywhere(W99(), b=4.5, b_max=9.0, v_max=55.0), draws=True),
     *([PLUGINS_IDM] if PLUGINS_IDM is not None else []),
 ]  # fmt: skip
 every_twin = pytest.mark.parametrize("twin", TWINS, ids=[twin.name for twin in TWINS])

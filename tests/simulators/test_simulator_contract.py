@@ -38,7 +38,7 @@ QUICK = [
     "cache.enabled=false",
 ]
 
-DOUBLING = """
+HALVING = """
     from cfx import Simulator
     from cfx.simulation.rollout import MemoryStepper
 
@@ -46,14 +46,14 @@ DOUBLING = """
         differentiable = True
 
         def stepper(self, model, dt):
-            return Doubling(model, dt)
+            return Halving(model, dt)
 
-    class Doubling(MemoryStepper):
+    class Halving(MemoryStepper):
         def advance(self, follower, leader, p):
-            return super().advance(follower, leader, {**p, "a": 2 * p["a"]})
+            return super().advance(follower, leader, {**p, "a": 0.5 * p["a"]})
 
         def identity(self):
-            return "doubling"
+            return "halving"
 """
 
 
@@ -96,7 +96,7 @@ def test_a_model_without_equations_is_refused_by_what_uses_equations() -> None:
 
 
 def test_a_third_partys_simulator_takes_the_steps_of_a_job(install: Any, tmp_path: Path) -> None:
-    install("mine-sims", {"cfx.simulators": {"mine": "mine_sims:Mine"}}, {"mine_sims.py": DOUBLING})
+    install("mine-sims", {"cfx.simulators": {"mine": "mine_sims:Mine"}}, {"mine_sims.py": HALVING})
     own = run_job(JobConfig.of(values_of(*QUICK)), tmp_path / "memory")
     theirs = run_job(JobConfig.of(values_of(*QUICK, "simulator=mine")), tmp_path / "mine")
     assert own.metrics["rmse_speed/fixed"] != theirs.metrics["rmse_speed/fixed"]

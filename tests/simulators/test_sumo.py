@@ -26,7 +26,7 @@ pytestmark = pytest.mark.skipif(
 )
 
 STEPS, PAIRS, DT = 60, 9, 0.1
-KRAUSS = Krauss(variant="sumo", parameters={"t_i": {"default": 0.0, "tuned": False}})
+KRAUSS = Krauss(limits=None, variant="sumo", parameters={"t_i": {"default": 0.0, "tuned": False}})
 TAU = {"low": 0.5, "high": 3.0, "default": 1.0}
 EIDM = SumoVType(parameters={"tau": TAU})
 
@@ -81,7 +81,9 @@ def eidm() -> Iterator[object]:
 
 
 @pytest.mark.parametrize(
-    "model", [KRAUSS, KraussSumo(), IdmSumo(), W99()], ids=lambda model: type(model).__name__
+    "model",
+    [KRAUSS, KraussSumo(limits=None), IdmSumo(limits=None), W99(limits=None)],
+    ids=lambda model: type(model).__name__,
 )
 def test_drives_in_sumo_are_drives_in_memory(model: DrivingModel, case: Case) -> None:
     memory, p = MemoryStepper(model, DT), case.parameters(model)
@@ -94,7 +96,9 @@ def test_drives_in_sumo_are_drives_in_memory(model: DrivingModel, case: Case) ->
             torch.testing.assert_close(theirs, ours, rtol=0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("model", [KraussSumo(), IdmSumo()], ids=lambda model: type(model).__name__)
+@pytest.mark.parametrize(
+    "model", [KraussSumo(limits=None), IdmSumo(limits=None)], ids=lambda model: type(model).__name__
+)
 @pytest.mark.parametrize("dt", [0.2, 0.5, 1.0])
 def test_longer_time_steps_are_sumos_too(model: DrivingModel, dt: float, case: Case) -> None:
     from cfx.simulators.sumo.stepper import SumoStepper

@@ -93,7 +93,7 @@ def test_the_command_drives_a_scenario_and_says_what_happened(scenario: Path) ->
     assert done.returncode == 0, done.stderr
     table = {
         line.split()[0]: line.split()
-        for line in done.stdout.splitlines()
+        for line in reversed(done.stdout.splitlines())
         if line.strip().startswith(("calm", "hasty"))
     }
     assert int(table["calm"][1]) > 15
@@ -253,18 +253,32 @@ def test_the_table_says_it_all(capsys: pytest.CaptureFixture[str]) -> None:
         collisions=1,
         teleports=4,
     )
-    report(ScenarioRun({"calm": tally}, steps=100, dt=0.1, seconds=2.0, others=5, most=2))
+    tally.braking.add([0.0] * 189 + [0.49] * 10 + [4.99])
+    tally.speeds.add([10.05] * 20 + [12.05] * 160 + [14.05] * 20)
+    recorded = dict.fromkeys(("speed", "acceleration", "time_gap"), (1.0, 2.0, 3.0))
+    run = ScenarioRun(
+        {"calm": tally},
+        steps=100,
+        dt=0.1,
+        seconds=2.0,
+        others=5,
+        most=2,
+        limited={"calm": 0.25},
+        outside={"calm": "3 % of steps outside what the policy has learned (speed above 18 m/s)"},
+        recorded={"calm": recorded},
+    )
+    report(run)
     out = capsys.readouterr().out
-    assert next(line for line in out.splitlines() if "calm" in line).split() == [
-        "calm",
-        "2",
-        "75%",
-        "12.00",
-        "3",
-        "2",
-        "6.2",
-        "1",
-        "4",
+    rows = [line.split() for line in out.splitlines() if "calm" in line]
+    assert rows[0] == ["calm", "2", "75%", "12.00", "3", "1", "4"]
+    assert rows[1] == ["calm", "0.49", "4.99", "6.25", "2", "25.0%"]
+    assert rows[2] == ["calm", "10.05,", "12.05,", "14.05", *["nan,", "nan,", "nan"] * 2]
+    assert rows[3][0] == "calm:"
+    assert "calm: 3 % of steps outside what the policy has learned (speed above 18 m/s)" in out
+    assert next(line.split() for line in out.splitlines() if "its recording" in line)[2:5] == [
+        "1.00,",
+        "2.00,",
+        "3.00",
     ]
     assert (
         "100 steps of 0.1 s in 2.0 s, 5.0 times real time; at most 2 of these vehicles at once, 5"

@@ -407,7 +407,7 @@ def test_a_logged_policy_loads_again_and_predicts_the_same(
             os.environ.pop("MLFLOW_TRACKING_URI", None)  # MLflow sets it too
         pd.testing.assert_frame_equal(loaded.predict(saved_policy.frame), expected)
     files = {path.name for path in (tmp_path / "store").rglob("*") if path.is_file()}
-    assert {"served_policy.py", "policy.pt", "policy.json", "requirements.txt"} <= files
+    assert {"served_policy.py", "policy.safetensors", "policy.json", "requirements.txt"} <= files
     assert not any(name.endswith(".pkl") for name in files)
     (requirements,) = (tmp_path / "store").rglob("requirements.txt")
     assert f"cfx-driving=={provenance.version()}" in requirements.read_text().split()

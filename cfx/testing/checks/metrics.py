@@ -47,6 +47,8 @@ def trajectories() -> Trajectories:
         counted=counted,
         dt=DT,
         space=space,
+        at_limits=torch.arange(FRAMES) % (3 + torch.arange(PAIRS)[:, None]) == 0,
+        outside=torch.arange(FRAMES) % (4 + torch.arange(PAIRS)[:, None]) == 1,
     )
 
 
@@ -78,6 +80,8 @@ def frames_that_do_not_count_do_not_matter(metric: Metric) -> None:
             measured_gap=given.measured_gap.masked_fill(outside, value),
             leader_speed=given.leader_speed.masked_fill(outside, value),
             parameters=given.parameters.masked_fill(outside[..., None], value),
+            at_limits=_flipped(given.at_limits, outside),
+            outside=_flipped(given.outside, outside),
         )
         _same(
             metric.compute(other),
@@ -148,6 +152,11 @@ def inputs_stay_as_they_are(metric: Metric) -> None:
             assert torch.equal(value, getattr(expected, one.name)), (
                 f"`compute` changed `{one.name}`, which every other metric reads too"
             )
+
+
+def _flipped(marked: Tensor | None, where: Tensor) -> Tensor:
+    assert marked is not None
+    return marked ^ where
 
 
 def _of_pairs(given: Trajectories, index: Tensor) -> Trajectories:

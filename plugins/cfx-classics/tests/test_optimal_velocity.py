@@ -138,7 +138,7 @@ def test_swings_grow_exactly_where_the_linear_theory_says(model: DrivingModel) -
     )
 
 
-@pytest.mark.parametrize("model", [OVM(), FVDM()], ids=["ovm", "fvdm"])
+@pytest.mark.parametrize("model", [OVM(limits=None), FVDM(limits=None)], ids=["ovm", "fvdm"])
 def test_steps_converge_to_the_differential_equation_with_order_one(model: DrivingModel) -> None:
     p, mean, swing, pace, end, gap, speed = (
         {**DEFAULTS[type(model)]},
