@@ -132,7 +132,7 @@ _MOTORWAY_ROUTES = f"""<routes>
 <route id="through" edges="1001 1002 1003"/>
 <route id="ramp" edges="1004 1002 1003"/>
 <flow id="car" type="car" route="through" begin="0" end="100000" vehsPerHour="5400"
-  departLane="best" departSpeed="20" departPos="last"/>
+  departLane="free" departSpeed="avg"/>
 <flow id="joining" type="car" route="ramp" begin="0" end="100000" vehsPerHour="400"
   departSpeed="12"/>
 <flow id="wave" type="wave" route="through" begin="5" end="100000" vehsPerHour="360"

@@ -360,7 +360,7 @@ _TOWN = (
     (
         "a lane drop",
         '<route id="r" edges="wide narrow"/><flow id="car" type="car" route="r" begin="0" end="500"'
-        ' vehsPerHour="1700" departLane="random" departSpeed="desired" departPos="base"/>',
+        ' vehsPerHour="2600" departLane="random" departSpeed="desired" departPos="base"/>',
         600.0,
     ),
     (
