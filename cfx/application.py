@@ -31,7 +31,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from cfx import hydra_source, nodes, registry, renamed
-from cfx.errors import CfxError, ConfigError
+from cfx.errors import CfxError, ConfigError, printable, without_passwords
+from cfx.plugin_errors import blame
 from cfx.sweep import (
     STATUS,
     JobStatus,
@@ -167,6 +168,7 @@ class Terminated(BaseException):
 def start(arguments: Sequence[str], *, target: str = JOB) -> int:
     """Runs the Hydra application and returns its exit code; prints each message once."""
     arguments = todays(arguments)
+    _refuse_passwords(arguments)
     job = JobFunction(target, uuid.uuid4().hex, wants_traceback(arguments))
     SweepFolder.take()
     code = _run_hydra(job, arguments)
@@ -177,6 +179,20 @@ def start(arguments: Sequence[str], *, target: str = JOB) -> int:
         print(job.status.detail or job.status.message, file=sys.stderr)
         return job.status.code
     return code
+
+
+def _refuse_passwords(arguments: Sequence[str]) -> None:
+    """Refuses a password in `tracking.uri`, before Hydra writes it into the job's folder.
+
+    Raises:
+        ConfigError: there is one.
+    """
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        if key.lstrip("+") == "tracking.uri" and without_passwords(value) != value:
+            from cfx.config import SAYS_TOO_MUCH
+
+            raise ConfigError(f"tracking.uri={without_passwords(value)} {SAYS_TOO_MUCH}")
 
 
 def _run_hydra(job: JobFunction, arguments: Sequence[str]) -> int:
@@ -264,7 +280,20 @@ def _call(target: str, values: Any, folder: Path) -> Any:
 
     job_config = JobConfig.of(values)
     module, _, function = target.partition(":")
-    return getattr(import_module(module), function)(job_config, folder)
+    run_it = getattr(import_module(module), function)
+    try:
+        return run_it(job_config, folder)
+    except CfxError:
+        raise
+    except (Exception, SystemExit) as error:  # a plugin may raise anything
+        if _signal_behind(error) is not None:
+            raise
+        blamed = blame(error)
+        if blamed is None:
+            raise
+        detail = "".join(traceback.format_exception(error)).rstrip()
+        log.error("%s\n%s", blamed, detail, extra={"file_only": True})
+        raise blamed from error
 
 
 def _is_done(earlier: JobStatus | None, status: JobStatus) -> TypeGuard[JobStatus]:
@@ -322,7 +351,7 @@ def _report(error: BaseException | None, overrides: Sequence[str], show_tracebac
         traceback.print_exception(error)
     if not mistake:
         return 1
-    print(explain(error, overrides), file=sys.stderr)
+    print(printable(without_passwords(explain(error, overrides))), file=sys.stderr)
     return 2
 
 

@@ -15,7 +15,7 @@ from pydantic import Field, field_validator
 from cfx import registry, renamed
 from cfx.calibration.settings import CalibrationSettings, WindowSettings
 from cfx.component import Settings, validate
-from cfx.errors import ConfigError
+from cfx.errors import ConfigError, without_passwords
 from cfx.style.settings import StyleSettings
 
 Node = dict[str, Any]
@@ -30,6 +30,13 @@ class CacheSettings(Settings):
     folder: Path = Field(Path("outputs/cache"), description="where it lies")
 
 
+SAYS_TOO_MUCH = (
+    "holds a password, and a job's configuration is written to files and to MLflow; put the URI"
+    " into the environment variable MLFLOW_TRACKING_URI instead"
+)
+"""What is said of a tracking URI that holds one."""
+
+
 class TrackingSettings(Settings):
     """What MLflow keeps."""
 
@@ -38,6 +45,14 @@ class TrackingSettings(Settings):
         None, description="tracking store; null: MLFLOW_TRACKING_URI, or SQLite beside the outputs"
     )
     experiment: str = Field("cfx", min_length=1, description="MLflow's experiment")
+
+    @field_validator("uri")
+    @classmethod
+    def _no_password(cls, uri: str | None) -> str | None:
+        if uri is not None and without_passwords(uri) != uri:
+            raise ValueError(SAYS_TOO_MUCH)
+        return uri
+
     sweep: str | None = Field(
         None, description="name that the jobs of a multirun share: they get a common parent run"
     )

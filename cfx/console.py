@@ -7,6 +7,8 @@ import logging
 import sys
 from typing import TYPE_CHECKING
 
+from cfx.errors import printable, without_passwords
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -50,6 +52,7 @@ def console_logging() -> Iterator[None]:
 
 
 def _say(message: str, level: int) -> None:
+    message = printable(without_passwords(message))
     stream = sys.stdout
     if level >= logging.WARNING:
         stream = sys.stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
 
 
@@ -13,6 +14,29 @@ class CfxError(Exception):
     """
 
     exit_code = 2
+
+    def __str__(self) -> str:
+        """Returns the text without passwords, and without what a terminal would obey."""
+        return printable(without_passwords(super().__str__()))
+
+
+def printable(text: str) -> str:
+    r"""Returns a text in which control characters other than new lines are written as `\x1b`.
+
+    Names in recordings may hold sequences that change a terminal's title or clear it.
+    """
+    found = []
+    for character in text:
+        if character.isprintable() or character in "\n\t":
+            found.append(character)
+        else:
+            found.append(character.encode("unicode_escape").decode())
+    return "".join(found)
+
+
+def without_passwords(text: str) -> str:
+    """Returns a text in which the passwords of URIs are written as `***`."""
+    return re.sub(r"(://[^/\s:@]*):[^/\s@]+@", r"\1:***@", text)
 
 
 class ConfigError(CfxError):

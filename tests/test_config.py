@@ -257,3 +257,53 @@ def test_a_broken_plugin_harms_no_composition_that_does_not_choose_it(install) -
         values_of("model=bad")
     with pytest.raises(PluginError, match="not_there_at_all"):
         values_of("policy=ghost")
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("seed=true", "seed=True: give a number, not true or false"),
+        ("optimizer.samples=false", "optimizer.samples=False: give a number"),
+        ("learner.learning_rate=true", "learner.learning_rate=True: give a number"),
+        ("cores=true", "cores=True: give a number"),
+    ],
+)
+def test_truth_is_no_number(override: str, message: str) -> None:
+
+    def made() -> None:
+        config = JobConfig.of(values_of(override))
+        registry.create("optimizer", config.optimizer)
+        registry.create("learner", config.learner)
+
+    with pytest.raises(ConfigError, match=message):
+        made()
+
+
+def test_a_password_in_the_tracking_uri_is_refused_before_anything_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from cfx import cli
+
+    folder = tmp_path / "job"
+    uri = "tracking.uri=postgresql://me:secret@host/db"
+    assert cli.main([uri, f"hydra.run.dir={folder}"]) == 2
+    err = capsys.readouterr().err
+    assert "MLFLOW_TRACKING_URI" in err
+    assert "secret" not in err
+    assert not folder.exists()
+    with pytest.raises(ConfigError, match="holds a password"):
+        JobConfig.of(values_of(uri))
+
+
+def test_more_threads_than_cores_are_not_used(caplog: pytest.LogCaptureFixture) -> None:
+    import torch
+
+    from cfx.simulation.threads import cores, set_threads
+
+    before = torch.get_num_threads()
+    try:
+        set_threads(100_000)
+        assert torch.get_num_threads() == cores()
+        assert f"there are {cores()} cores here" in caplog.text
+    finally:
+        torch.set_num_threads(before)

@@ -40,6 +40,7 @@ FLOORS = (
         "cli",
         "sumo",
         "publish",
+        "plugin_errors",
     ),
 )
 """From the ground up; a room may use rooms on its own floor and below."""

@@ -1,8 +1,10 @@
 """A cache of calibration results, by content.
 
 An entry's name is the SHA-256 of everything that the result depends on. A hit is therefore always
-right, and nothing ever needs to be invalidated. Entries are NumPy archives that are read without
-pickle. Each appears whole or not at all; a damaged one is computed again.
+right, and nothing ever needs to be invalidated. An entry is a line with a mark and the checksum of
+what follows, a NumPy archive that is read without pickle. It appears whole or not at all. One that
+is damaged, or that something else wrote, is computed again: nothing of it is looked at before its
+checksum is right.
 
 Processes that need the same entries share the work. Each claims what it is about to compute by a
 file lock, and comes back later to what another process has claimed. The operating system frees a
@@ -12,6 +14,7 @@ claim when its process ends, however it ends.
 from __future__ import annotations
 
 import hashlib
+import io
 import logging
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,6 +37,12 @@ Arrays = dict[str, NDArray[Any]]
 _SHARES = 32
 """Parts in which processes claim the entries of one calibration."""
 
+_MARK = b"cfx calibration 1 "
+"""What an entry begins with; the number counts layouts."""
+
+_LARGEST = 1 << 30
+"""Bytes: no calibration of one pair or group is larger."""
+
 _POLL_S = 0.2
 """Seconds between two looks at a claim of another process."""
 
@@ -50,8 +59,8 @@ class Cache:
         if path is None or not path.is_file():
             return None
         try:
-            # NumPy does not close a file that it has opened itself when the archive is damaged.
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            content = _content(path)
+            with np.load(io.BytesIO(content), allow_pickle=False) as archive:
                 return {name: archive[name] for name in archive.files}
         except (OSError, ValueError, zipfile.BadZipFile, EOFError):
             log.warning("The cached calibration %s is damaged; it is computed again.", path)
@@ -69,8 +78,11 @@ class Cache:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with atomic_write(path) as temporary:
+                archive = io.BytesIO()
                 # NumPy's stubs take every name for `allow_pickle`.
-                np.savez(temporary, **arrays)  # type: ignore[arg-type]
+                np.savez(archive, **arrays)  # type: ignore[arg-type]
+                content = archive.getvalue()
+                temporary.write_bytes(_head(content) + content)
         except OSError as error:
             raise self._unwritable(error) from error
 
@@ -151,4 +163,26 @@ class Cache:
     def _path(self, key: str) -> Path | None:
         if self.folder is None:
             return None
-        return self.folder / key[:2] / f"{key}.npz"
+        return self.folder / key[:2] / f"{key}.entry"
+
+
+def _head(content: bytes) -> bytes:
+    """Returns the line before an archive."""
+    return _MARK + hashlib.sha256(content).hexdigest().encode() + b"\n"
+
+
+def _content(path: Path) -> bytes:
+    """Returns the archive of an entry whose checksum is right.
+
+    Raises:
+        ValueError: it is not.
+        OSError: the file cannot be read.
+    """
+    if path.stat().st_size > _LARGEST:
+        raise ValueError("larger than any entry")
+    whole = path.read_bytes()
+    length = len(_head(b""))
+    content = whole[length:]
+    if whole[:length] != _head(content):
+        raise ValueError("the checksum is wrong")
+    return content

@@ -52,7 +52,8 @@ class DatasetSettings(Settings):
     )
     time_step: float | None = Field(
         None,
-        gt=0,
+        ge=0.001,
+        le=10.0,
         description="s: bring all pairs to this step, in which windows and policies count too;"
         " null: as recorded",
     )
@@ -158,6 +159,11 @@ class Dataset(Component):
             pairs = _select_ids(pairs, self.settings.pair_ids)
         if self.settings.time_step is not None:
             pairs = resampled(pairs, self.settings.time_step)
+            if not len(pairs):
+                raise DataError(
+                    f"data.time_step={self.settings.time_step:g}: no pair in {pairs.source} lasts"
+                    " two such steps; give a shorter one"
+                )
         selected = _select_first(_select_long(pairs, self.settings.min_frames), self.settings)
         return scaled(selected, self.settings.scale)
 

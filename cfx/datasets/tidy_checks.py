@@ -195,7 +195,7 @@ def _check_pairs(table: TidyTable, order: Ints, starts: Ints) -> None:
             )
     if LANE in table.numbers:
         lane = table.numbers[LANE]
-        is_broken = ~np.isnan(lane) & (lane != np.floor(lane))
+        is_broken = ~np.isnan(lane) & ~(np.isfinite(lane) & (lane == np.floor(lane)))
         _reject(table, LANE, is_broken, "is no lane number")
 
 

@@ -199,7 +199,7 @@ def _read_parquet(path: Path) -> TidyTable:
 
 def _from_arrow(source: str, columns: Any, ignored: Sequence[str]) -> TidyTable:
     numbers, labels, _ = _roles(source, columns.schema.names)
-    texts = {name: as_labels(_text(columns.column(name))) for name in labels}
+    texts = {name: _names(source, name, columns.column(name)) for name in labels}
     values = {name: _floats(source, name, columns.column(name)) for name in numbers}
     others = [name for name in ignored if name != _PANDAS_INDEX]
     return TidyTable(source, texts, values, 1, others)
@@ -210,6 +210,42 @@ def _first_line(error: Exception) -> str:
     if not lines:
         return type(error).__name__
     return lines[0]
+
+
+def _names(source: str, name: str, column: Any) -> Labels:
+    """Returns a column of names.
+
+    Raises:
+        DataError: it holds something else, or bytes that are no UTF-8.
+    """
+    if pa.types.is_nested(column.type):
+        raise DataError(
+            f"{source}, column {name}: holds {column.type}, not names; write a text or a number in"
+            " each row"
+        )
+    try:
+        column.validate(full=True)
+    except pa.ArrowException:
+        raise DataError(
+            f"{source}{_first_broken(column)}, column {name}: is no text in UTF-8; write the file"
+            " again in UTF-8"
+        ) from None
+    return as_labels(_text(column))
+
+
+def _first_broken(column: Any) -> str:
+    """Returns ", row N" for the first cell that is no UTF-8; "" where the rows cannot be told."""
+    row = 1
+    for chunk in column.chunks:
+        if not (pa.types.is_string(chunk.type) or pa.types.is_large_string(chunk.type)):
+            return ""
+        for cell in chunk.cast(pa.large_binary(), safe=False):
+            try:
+                (cell.as_py() or b"").decode()
+            except UnicodeDecodeError:
+                return f", row {row}"
+            row += 1
+    return ""
 
 
 def _text(column: Any) -> Any:

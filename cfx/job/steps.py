@@ -34,7 +34,7 @@ from cfx.learners.curves import best_losses
 from cfx.pairs import PairBatch, PairSet
 from cfx.progress import Task
 from cfx.protocols.base import Protocol, ProtocolContext, ProtocolResult
-from cfx.simulation.threads import limit_cores
+from cfx.simulation.threads import limit_cores, set_threads
 from cfx.style.entropy import measure_style, select_cluster
 from cfx.style.result import StyleResult
 
@@ -68,7 +68,7 @@ def take_steps(
     device = choose_device(config.device)
     limit_cores(config.cores)
     if config.threads is not None:
-        torch.set_num_threads(config.threads)
+        set_threads(config.threads)
     protocol = make_protocol(config)
     config = complete(config, protocol)
     parts = Parts.of(config, protocol)

@@ -7,6 +7,7 @@ else wants the core.
 from __future__ import annotations
 
 import functools
+import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,6 +15,8 @@ from contextlib import contextmanager
 from typing import TypeVar
 
 import torch
+
+log = logging.getLogger(__name__)
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -32,6 +35,20 @@ def cores() -> int:
     else:
         available = os.cpu_count() or 1
     return min([available, *_LIMIT])
+
+
+def set_threads(count: int) -> None:
+    """Sets how many threads PyTorch uses: no more than this process has cores, with a warning."""
+    available = cores()
+    if count > available:
+        log.warning(
+            "threads=%d: there are %d cores here, and more threads than cores only wait for one"
+            " another; %d are used",
+            count,
+            available,
+            available,
+        )
+    torch.set_num_threads(min(count, available))
 
 
 def share(work: Callable[[_Item], _Result], items: Sequence[_Item], *, level: str) -> list[_Result]:

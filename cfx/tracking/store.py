@@ -203,6 +203,15 @@ def quiet() -> Iterator[None]:
                 os.environ[_BAR] = bar
 
 
+_DRIVERS = {
+    "psycopg": "psycopg[binary]",
+    "psycopg2": "psycopg2-binary",
+    "MySQLdb": "mysqlclient",
+    "pymysql": "PyMySQL",
+}
+"""Packages of database drivers, by the module that is imported."""
+
+
 @contextmanager
 def translate_errors(doing: str) -> Iterator[None]:
     """Runs MLflow quietly; what goes wrong becomes one sentence that says what it was doing.
@@ -216,6 +225,12 @@ def translate_errors(doing: str) -> Iterator[None]:
 
         try:
             yield
+        except ImportError as error:
+            package = _DRIVERS.get(str(error.name), str(error.name))
+            raise TrackingError(
+                f"MLflow could not {doing}: the database's driver is not installed; pip install"
+                f" {package}"
+            ) from error
         except (MlflowException, SQLAlchemyError, sqlite3.Error, OSError) as error:
             reason = _first_line(error)
             if "database is locked" in str(error):

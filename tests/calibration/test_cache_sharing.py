@@ -105,7 +105,7 @@ def test_two_processes_share_one_calibration_and_solve_each_problem_once(tmp_pat
     assert set(counts) == {worker.pid for worker in workers}  # neither only waited
     assert outputs[0][0] == outputs[1][0]
     assert len(json.loads(outputs[0][0])) == PAIRS
-    assert len(list((tmp_path / "cache").rglob("*.npz"))) == PAIRS
+    assert len(list((tmp_path / "cache").rglob("*.entry"))) == PAIRS
 
 
 def test_a_process_that_is_killed_with_its_claims_blocks_nobody(tmp_path: Path) -> None:

@@ -198,15 +198,21 @@ def test_an_interrupted_calibration_goes_on_where_it_stopped(
 def test_a_damaged_entry_is_computed_again(tmp_path: Path) -> None:
     pairs = wavy_pairs(Krauss(), TRUE)
     everything(calibrator(Counting(), tmp_path), pairs)
-    entries = sorted(tmp_path.rglob("*.npz"))
+    entries = sorted(tmp_path.rglob("*.entry"))
     assert len(entries) == 6
     entries[0].write_bytes(entries[0].read_bytes()[:50])
     entries[1].write_bytes(b"")
     np.savez(entries[2], parameters=np.array([object()], dtype=object), allow_pickle=True)
+    # Whole archives of something else: one without the mark, one whose content was changed.
+    with entries[3].open("wb") as file:
+        np.savez(file, parameters=np.full((9, 9), np.nan))
+    flipped = bytearray(entries[4].read_bytes())
+    flipped[-200] ^= 1
+    entries[4].write_bytes(bytes(flipped))
     again = Counting()
     everything(calibrator(again, tmp_path), pairs)
     assert again.solved > 0
-    assert sorted(tmp_path.rglob("*.npz")) == entries  # no partial file is left beside them
+    assert sorted(tmp_path.rglob("*.entry")) == entries  # no partial file is left beside them
 
 
 def test_a_cache_that_cannot_be_written_is_said(tmp_path: Path) -> None:

@@ -45,7 +45,7 @@ def test_the_table_is_the_same_with_sumo_in_the_loop(tmp_path: Path) -> None:
     memory = job(tmp_path / "memory", "model=krauss_sumo")
     sumo = job(tmp_path / "sumo", "model=krauss_sumo", "simulator=sumo", "simulator.followers=8")
     pd.testing.assert_frame_equal(sumo.pairs, memory.pairs, rtol=0, atol=1e-9)
-    assert len(list((tmp_path / "cache").rglob("*.npz"))) == 2 * 3, (
+    assert len(list((tmp_path / "cache").rglob("*.entry"))) == 2 * 3, (
         "each simulator has its own results in the cache"
     )
 
