@@ -169,6 +169,7 @@ def start(arguments: Sequence[str], *, target: str = JOB) -> int:
     """Runs the Hydra application and returns its exit code; prints each message once."""
     arguments = todays(arguments)
     _refuse_passwords(arguments)
+    _refuse_interpolated_folder()
     job = JobFunction(target, uuid.uuid4().hex, wants_traceback(arguments))
     SweepFolder.take()
     code = _run_hydra(job, arguments)
@@ -193,6 +194,20 @@ def _refuse_passwords(arguments: Sequence[str]) -> None:
             from cfx.config import SAYS_TOO_MUCH
 
             raise ConfigError(f"tracking.uri={without_passwords(value)} {SAYS_TOO_MUCH}")
+
+
+def _refuse_interpolated_folder() -> None:
+    """Refuses a working directory whose name Hydra would take for an interpolation.
+
+    Raises:
+        ConfigError: it is such a one.
+    """
+    folder = str(Path.cwd())
+    if "${" in folder:
+        raise ConfigError(
+            f"the working directory {folder} holds '${{', which Hydra replaces in paths; start from"
+            " another folder"
+        )
 
 
 def _run_hydra(job: JobFunction, arguments: Sequence[str]) -> int:

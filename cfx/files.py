@@ -51,6 +51,28 @@ def atomic_write(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
+def remove_leftovers(folder: Path) -> None:
+    """Removes temporary files of `atomic_write` whose processes have ended, here and below.
+
+    Raises:
+        OSError: one cannot be removed.
+    """
+    for path in sorted(folder.rglob(".*.*")):
+        number = path.name[1:].partition(".")[0]
+        if path.is_file() and number.isdecimal() and not _runs(int(number)):
+            path.unlink(missing_ok=True)
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
+
+
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
     """Writes a JSON file, whole.
 

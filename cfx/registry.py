@@ -357,6 +357,14 @@ def origin(component: Component | type[Component]) -> str:
     return f"{cls.kind} {cls.__name__}"
 
 
+def is_own(component: Component) -> bool:
+    """Says whether a component is one of cfx's own."""
+    for found, loaded in _loaded.items():
+        if loaded is type(component):
+            return found.distribution == OWN
+    return False
+
+
 def name_of(component: Component) -> str:
     """Returns the name under which configs choose a component; its class's if it is none's."""
     for found, loaded in _loaded.items():

@@ -22,6 +22,8 @@ def is_user_error(error: BaseException) -> bool:
         error, CfxError | HydraException | OmegaConfBaseException | yaml.YAMLError | OSError
     ):
         return True
+    if isinstance(error, ValueError) and isinstance(error.__cause__, OSError):
+        return str(error).startswith("Unable to configure handler")  # the log cannot be opened
     # Hydra raises plain errors for contradictory flags and for options of the wrong type.
     if not isinstance(error, ValueError | AssertionError | RuntimeError | ImportError):
         return False

@@ -17,7 +17,7 @@ from cfx.config import JobConfig
 from cfx.datasets.tidy import write_tidy
 from cfx.errors import OutputError
 from cfx.evaluation.result import Evaluation
-from cfx.files import atomic_write
+from cfx.files import atomic_write, remove_leftovers
 from cfx.metrics.base import TRANSIENT_S
 from cfx.pairs import PairSet
 from cfx.protocols.base import ProtocolResult
@@ -35,6 +35,10 @@ TRACKED = (
     "curves.parquet",
 )
 """Files of a job's folder that MLflow keeps too, besides its figures and its policy."""
+
+
+METRICS = "metrics.json"
+"""The file that is written last: a folder that has it is complete."""
 
 
 class Output:
@@ -61,7 +65,35 @@ class Output:
                 f"cannot make the output folder {folder}: {error.strerror};"
                 " set hydra.run.dir to a place that can be written"
             ) from error
-        return cls(folder)
+        output = cls(folder)
+        output.run(lambda: remove_leftovers(folder))
+        return output
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the folder holds the results of an earlier job."""
+        return (self.folder / METRICS).is_file()
+
+    def begin(self, config: JobConfig) -> None:
+        """Writes the configuration of the job that begins.
+
+        Where the folder holds an earlier job's results, these stay as they are until the new ones
+        are there (`replace`), so that the folder never mixes two jobs.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        if not self.is_complete:
+            write_config(self, config)
+
+    def replace(self, config: JobConfig) -> None:
+        """Takes away the mark of complete results, and writes the configuration of new ones.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        self.run(lambda: (self.folder / METRICS).unlink(missing_ok=True))
+        write_config(self, config)
 
     def file(self, name: str, write: Callable[[Path], object]) -> None:
         """Writes one file, whole.

@@ -73,7 +73,7 @@ def take_steps(
     config = complete(config, protocol)
     parts = Parts.of(config, protocol)
     output = Output.make(folder)
-    files.write_config(output, config)
+    output.begin(config)
     with Tracker.open(config, folder) as tracker:
         if config.data != data:  # the protocol has determined other data
             loaded = load_pairs(parts.dataset)
@@ -196,6 +196,7 @@ def _keep(
     of_training |= protocol_result.calibration
     metrics = renamed.Metrics(evaluation.metrics() | of_training)
 
+    output.replace(config)
     policy_folder = output.folder / "policy"
     further = files.write_tables(output, pairs, style, protocol_result)
     output.run(lambda: checkpoint.save(protocol_result.policy, policy_folder))

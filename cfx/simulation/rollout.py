@@ -49,6 +49,9 @@ pays: about a second of eager work. The rule looks at these alone, so that the s
 same bits whatever came before it.
 """
 
+_BOUND = 1e-6
+"""Share of a range by which rounding may put a value beyond its bound."""
+
 _WORTH_A_KERNEL = 1_000_000
 """Vehicle steps in one call, or in calls that belong together, from which a kernel pays."""
 
@@ -254,6 +257,7 @@ def simulate(
     *,
     window: int | None = None,
     compile: Compile = "auto",
+    outside: Literal["refuse", "allow"] = "refuse",
 ) -> Trajectory:
     """Simulates followers behind recorded leaders, as calibration, learning and evaluation do.
 
@@ -268,6 +272,8 @@ def simulate(
         dt: time step, s.
         window: steps for which one set of parameters holds.
         compile: `auto` compiles where that pays.
+        outside: parameters outside the model's bounds, in which its equations are tested, are
+            refused unless this is `allow`.
 
     The leading dimensions of `parameters`, `leader` and `start` broadcast: a leader `(pairs, 1,
     time)` drives ahead of candidates `(pairs, candidates, n)`.
@@ -276,9 +282,11 @@ def simulate(
         Frames 0 to time - 1, `(*batch, time)`.
 
     Raises:
-        ParameterError: the number of parameters or a name does not fit the model, or `window` does
-            not fit their shape. Values outside the bounds are simulated as they are.
+        ParameterError: the number of parameters or a name does not fit the model, `window` does not
+            fit their shape, or a value is outside its bounds.
     """
+    if outside == "refuse":
+        _check_bounds(model, parameters)
     windows = _windows(model, parameters, start.speed, leader.position.shape[-1] - 1, window)
     batch = _batch(leader, start, windows)
     stepper = MemoryStepper(model, dt, compile=compile)
@@ -300,6 +308,35 @@ def simulate(
     position = torch.cat(positions).movedim(0, -1)
     gap = leader.position - leader.length[..., None] - position
     return Trajectory(position, torch.cat(speeds).movedim(0, -1), gap, gap < 0)
+
+
+def _check_bounds(
+    model: DrivingModel, parameters: Tensor | Mapping[str, Tensor | float] | None
+) -> None:
+    """Raises ParameterError for a value outside the bounds, those of adaptation where wider."""
+    if parameters is None:
+        return
+    given: Mapping[str, Tensor | float]
+    if isinstance(parameters, Tensor):
+        if parameters.shape[-1] != len(model.space):
+            return  # what is wrong with the shape is said where it is read
+        given = model.space.unpack(parameters)
+        given = {name: given[name] for name in model.space.names}
+    else:
+        given = parameters
+    for name, value in given.items():
+        bounds = (model.space[name], model.adaptation_space[name])
+        low = min(one.low for one in bounds)
+        high = max(one.high for one in bounds)
+        values = torch.as_tensor(value)
+        room = _BOUND * (high - low)
+        wrong = (values < low - room) | (values > high + room)
+        if bool(wrong.any()):
+            found = float(values[wrong].flatten()[0])
+            raise ParameterError(
+                f"{name}={found:g} is outside its bounds, {low:g} to {high:g}"
+                f" {bounds[0].unit}; give a value within, or outside='allow'"
+            )
 
 
 def _batch(
