@@ -69,3 +69,36 @@ def test_errors_of_cfx_itself_are_nobody_elses() -> None:
     with pytest.raises(AttributeError) as caught:
         ParameterSpace(()).from_unit(None)  # type: ignore[arg-type]
     assert blame(caught.value) is None
+
+
+MIXED = """
+import torch
+from cfx import Optimizer
+
+class Mixed(Optimizer):
+    def evaluations(self):
+        return 8
+
+    def bytes_per_problem(self, n):
+        return 1000
+
+    def solve(self, objective, guesses, *, seed):
+        generator = torch.Generator().manual_seed(seed)
+        shape = (len(guesses), 8 - guesses.shape[1], guesses.shape[2])
+        more = torch.rand(shape, generator=generator, dtype=torch.float64)
+        tried = torch.cat([guesses, more], 1)
+        return tried.flip(1), objective(tried)
+"""
+
+
+def test_an_optimizer_that_mixes_up_candidates_and_losses_is_refused(
+    install: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = {"mixed_optimizers.py": MIXED}
+    install("mixed-optimizers", {"cfx.optimizers": {"mixed": "mixed_optimizers:Mixed"}}, files)
+    overrides = [one for one in QUICK if not one.startswith("optimizer")]
+    code = cli.main([*overrides, "optimizer=mixed", f"hydra.run.dir={tmp_path / 'job'}"])
+    err = capsys.readouterr().err
+    assert code == 2
+    assert "mixed-optimizers" in err
+    assert "candidates with losses that are not theirs" in err

@@ -370,3 +370,25 @@ def test_cuda_agrees_with_the_cpu(model: DrivingModel) -> None:
     )
     assert cuda.speed.device.type == "cuda"
     torch.testing.assert_close(cuda.speed.cpu(), cpu.speed, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("parameters", [{"cc4": 0.5}, {"b_max": 25.0}])
+def test_parameters_outside_their_bounds_are_refused_unless_asked_for(
+    parameters: dict[str, float],
+) -> None:
+    """There W99 departs from SUMO: its signs mean something else."""
+    position = torch.linspace(30.0, 60.0, 31, dtype=torch.float64)
+    speed = torch.full_like(position, 10.0)
+    leader = Leader(position, speed, speed * 0, torch.tensor(4.5))
+    start = Start(*(torch.tensor(value, dtype=torch.float64) for value in (0.0, 10.0, 0.0)))
+    with pytest.raises(ParameterError, match="is outside its bounds"):
+        simulate(W99(), parameters, leader, start, 0.1)
+    allowed = simulate(W99(), parameters, leader, start, 0.1, outside="allow")
+    assert bool(allowed.speed.isfinite().all())
+    values = W99().space.defaults(dtype=torch.float64)
+    values[4] = 0.5
+    with pytest.raises(ParameterError, match=r"cc4=0\.5 is outside its bounds, -2 to -0\.01 m/s"):
+        simulate(W99(), values, leader, start, 0.1)
+    bounds = W99().space.bounds(dtype=torch.float64)
+    for edge in bounds:
+        simulate(W99(), edge, leader, start, 0.1)
