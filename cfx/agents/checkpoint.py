@@ -14,6 +14,7 @@ from typing import Any
 
 import safetensors.torch
 import torch
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 from safetensors import SafetensorError
 from torch import Tensor
 
@@ -24,9 +25,9 @@ from cfx.agents.core import AgentCore, features_read, network_with_weights
 from cfx.agents.heads import HEADS, head_name
 from cfx.agents.heads.base import ParameterHead
 from cfx.agents.scaler import Scaler
-from cfx.agents.valid_range import ValidRange
+from cfx.agents.valid_range import SIGNALS, ValidRange
 from cfx.calibration.windows import WindowSettings
-from cfx.errors import DataError
+from cfx.errors import ConfigError, DataError, ParameterError
 from cfx.files import atomic_write
 from cfx.models.base import DrivingModel
 from cfx.policies.base import Policy
@@ -69,46 +70,109 @@ def load(folder: Path | str) -> Agent:
         PluginError: the model or the policy is not installed.
     """
     folder = Path(folder)
-    description, weights = _read(folder)
-    policy_node = renamed.node("policy", description["policy"])
-    model_node = renamed.node("model", description["model"])
-    policy = registry.create("policy", policy_node)
-    model = registry.create("model", model_node)
+    written, weights = _read(folder)
+    description = _validated(folder, written)
+    policy_node = renamed.node("policy", description.policy)
+    model_node = renamed.node("model", description.model)
+    try:
+        policy = registry.create("policy", policy_node)
+        model = registry.create("model", model_node)
+    except (ConfigError, ParameterError) as error:
+        raise DataError(f"{folder}/{_DESCRIPTION}: {error}") from None
     assert isinstance(policy, Policy)
     assert isinstance(model, DrivingModel)
-    windows = WindowSettings(**description["windows"])
-    base = weights.get("base")
-    head = _head(folder, description, model, has_base=base is not None)
-    scaler = Scaler(weights["scaler.mean"], weights["scaler.scale"])
-    expected = features_read(policy, head, windows.length)
-    found = scaler.mean.shape[1]
-    if found != expected:
+    head = _head(folder, description, model, has_base="base" in weights)
+    try:
+        return _agent(description, weights, policy, model_node, policy_node, head)
+    except (ValueError, KeyError, TypeError, IndexError, AttributeError, RuntimeError) as error:
+        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        raise DataError(f"{folder}: the weights do not fit the description ({reason})") from error
+
+
+class _Description(BaseModel):
+    """What `policy.json` must hold; formats 1 and 2 lack some of it."""
+
+    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
+
+    policy: dict[str, Any]
+    model: dict[str, Any]
+    windows: WindowSettings
+    dt: float = Field(gt=0, le=100)
+    names: tuple[str, ...] = Field(min_length=1)
+    head: str | None = None
+    ensemble_size: int = Field(
+        1, ge=1, le=64, validation_alias=AliasChoices("ensemble_size", "members")
+    )
+    own: bool = True
+    shrinkage: float = Field(0.0, ge=0, le=1)
+    history: float | None = Field(None, ge=0)
+    learned_from: dict[str, str] = {}
+    recorded: dict[str, tuple[float, ...]] = {}
+
+
+def _validated(folder: Path, written: Mapping[str, Any]) -> _Description:
+    try:
+        return _Description.model_validate(written)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
         raise DataError(
-            f"{folder}: the weights read {found} features, the policy's settings give {expected}"
+            f"{folder}/{_DESCRIPTION}: {key}: {first['msg']}; give a folder that a job has written"
+        ) from None
+
+
+def _agent(
+    description: _Description,
+    weights: Mapping[str, Tensor],
+    policy: Policy,
+    model_node: Mapping[str, Any],
+    policy_node: Mapping[str, Any],
+    head: ParameterHead,
+) -> Agent:
+    """Puts an agent together.
+
+    Raises:
+        ValueError, KeyError, RuntimeError and others: the weights do not fit.
+    """
+    scaler = Scaler(weights["scaler.mean"], weights["scaler.scale"])
+    expected = features_read(policy, head, description.windows.length)
+    networks, found = scaler.mean.shape
+    if found != expected:
+        raise ValueError(
+            f"the weights read {found} features, the policy's settings give {expected}"
         )
+    if networks != len(description.names) or scaler.scale.shape != scaler.mean.shape:
+        raise ValueError(f"there are weights of {networks} networks")
+    for name in ("base", "population"):
+        if name in weights and weights[name].shape != (networks, len(head.space)):
+            raise ValueError(f"'{name}' has the shape {tuple(weights[name].shape)}")
+    for name, value in weights.items():
+        if not bool(value.isfinite().all()):
+            raise ValueError(f"'{name}' holds a number that is not finite")
     trained = {}
     for name, value in weights.items():
         if name.startswith("network."):
             trained[name.removeprefix("network.")] = value
-    size = _ensemble_size(description)
-    network = network_with_weights(policy, trained, size, scaler, len(head.space))
+    network = network_with_weights(
+        policy, trained, description.ensemble_size, scaler, len(head.space)
+    )
     return Agent(
         core=AgentCore(policy, network, scaler, head),
         model_node=model_node,
         policy_node=policy_node,
-        windows=windows,
-        dt=description["dt"],
-        names=tuple(description["names"]),
-        base=base,
+        windows=description.windows,
+        dt=description.dt,
+        names=description.names,
+        base=weights.get("base"),
         context_rule=ContextRule(
-            driver_specific=description.get("own", True),
-            shrinkage=description.get("shrinkage", 0.0),
-            history_s=description.get("history"),
+            driver_specific=description.own,
+            shrinkage=description.shrinkage,
+            history_s=description.history,
         ),
         population=weights.get("population"),
-        learned_from=description.get("learned_from", {}),
+        learned_from=description.learned_from,
         valid_range=_valid_range(weights),
-        recorded=_recorded(description),
+        recorded=description.recorded,
     )
 
 
@@ -128,13 +192,6 @@ def _tensors(agent: Agent) -> dict[str, Tensor]:
     return tensors
 
 
-def _recorded(description: Mapping[str, Any]) -> dict[str, tuple[float, ...]]:
-    found = {}
-    for name, values in description.get("recorded", {}).items():
-        found[name] = tuple(values)
-    return found
-
-
 def _valid_range(weights: Mapping[str, Tensor]) -> ValidRange | None:
     found = {}
     for name, value in weights.items():
@@ -142,7 +199,18 @@ def _valid_range(weights: Mapping[str, Tensor]) -> ValidRange | None:
             found[name.removeprefix(_RANGE)] = value
     if not found:
         return None
-    return ValidRange(**found)
+    valid_range = ValidRange(**found)
+    networks, signals = len(weights["scaler.mean"]), len(SIGNALS)
+    expected = [
+        (networks, signals),
+        (networks, signals, signals),
+        (networks,),
+        (networks, signals),
+        (networks, signals),
+    ]
+    if [tuple(value.shape) for value in valid_range.state_dict().values()] != expected:
+        raise ValueError("the valid range has another shape")
+    return valid_range
 
 
 def _description(agent: Agent) -> dict[str, Any]:
@@ -201,17 +269,12 @@ def _bounded(path: Path) -> Path:
 
 
 def _head(
-    folder: Path, description: Mapping[str, Any], model: DrivingModel, *, has_base: bool
+    folder: Path, description: _Description, model: DrivingModel, *, has_base: bool
 ) -> ParameterHead:
-    name = description.get("head", head_name(has_base=has_base))
+    name = description.head or head_name(has_base=has_base)
     if name not in HEADS:
         raise DataError(
             f"{folder}/policy.json: this version of cfx has no head '{name}'; it has"
             f" {', '.join(HEADS)}"
         )
     return HEADS[name].for_model(model)
-
-
-def _ensemble_size(description: Mapping[str, Any]) -> int:
-    """Returns how many networks answer together; format 1 once called them members."""
-    return int(description.get("ensemble_size", description.get("members", 1)))

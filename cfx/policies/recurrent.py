@@ -23,8 +23,8 @@ _EDGE = 0.02
 class RecurrentSettings(PolicySettings):
     """Settings of the recurrent policies."""
 
-    hidden_size: int = Field(32, ge=1, description="units of each recurrent layer")
-    layers: int = Field(1, ge=1, description="recurrent layers")
+    hidden_size: int = Field(32, ge=1, le=4096, description="units of each recurrent layer")
+    layers: int = Field(1, ge=1, le=16, description="recurrent layers")
     dropout: float = Field(
         0.0, ge=0, lt=1, description="dropout before the output layer while training"
     )

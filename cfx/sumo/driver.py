@@ -639,7 +639,8 @@ def _load_policy(run: str | Path) -> Agent:
     if not (folder / "policy.json").is_file():
         folder /= "policy"
     policy = checkpoint.load(folder)
-    trained = json.loads((folder / "policy.json").read_text(encoding="utf-8"))["parameters"]
+    written = json.loads((folder / "policy.json").read_text(encoding="utf-8"))
+    trained = written.get("parameters", [])
     if tuple(trained) != policy.space.names:
         raise DataError(
             f"the policy of {run} was trained for a model with the parameters {', '.join(trained)},"

@@ -20,6 +20,7 @@ class EnsembleSettings(Settings):
     ensemble_size: int = Field(
         4,
         ge=1,
+        le=64,
         description="networks of an ensemble, which answer together; each keeps other drivers for"
         " validation",
     )
