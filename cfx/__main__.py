@@ -1,7 +1,5 @@
 """`python -m cfx`: the same program as the command `cfx`."""
 
-import sys
+from cfx.cli import program
 
-from cfx.cli import main
-
-sys.exit(main())
+program()

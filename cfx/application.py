@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import signal
 import sys
 import time
 import traceback
@@ -21,7 +20,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any, TypeGuard, cast
 
 import hydra
@@ -31,8 +29,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from cfx import hydra_source, nodes, registry, renamed
-from cfx.errors import CfxError, ConfigError, printable, without_passwords
+from cfx.errors import CfxError, ConfigError, Terminated, printable, without_passwords
 from cfx.plugin_errors import blame
+from cfx.signals import terminable
 from cfx.sweep import (
     STATUS,
     JobStatus,
@@ -159,10 +158,6 @@ class JobFunction:
         if isinstance(error, SystemExit):
             message = f"the job called sys.exit({error.code!r})"
         return replace(blank, code=1, message=message, detail=detail)
-
-
-class Terminated(BaseException):
-    """SIGTERM arrived."""
 
 
 def start(arguments: Sequence[str], *, target: str = JOB) -> int:
@@ -404,7 +399,7 @@ def _process_state(arguments: Sequence[str]) -> Iterator[None]:
     sys.argv = ["cfx", *arguments]
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
-        with _sigterm():
+        with terminable():
             yield
     finally:
         sys.argv = argv
@@ -420,24 +415,6 @@ def _process_state(arguments: Sequence[str]) -> Iterator[None]:
             if handler not in root.handlers:
                 root.addHandler(handler)
         root.setLevel(level)
-
-
-@contextlib.contextmanager
-def _sigterm() -> Iterator[None]:
-    """Turns SIGTERM into `Terminated`."""
-
-    def terminate(_number: int, _frame: FrameType | None) -> None:
-        raise Terminated
-
-    try:
-        before = signal.signal(signal.SIGTERM, terminate)
-    except ValueError:  # not in the main thread, where signals do not arrive either
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 @contextlib.contextmanager

@@ -11,8 +11,10 @@ import io
 import os
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
-from cfx.errors import CfxError
+from cfx.errors import CfxError, Terminated
+from cfx.signals import ignore_signals, terminable
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -29,19 +31,36 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments:
         command = COMMANDS.get(arguments[0])
     try:
-        if command is None:
-            from cfx.application import start
+        with terminable():
+            if command is None:
+                from cfx.application import start
 
-            return start(arguments)
-        return command(arguments[1:])
+                return start(arguments)
+            return command(arguments[1:])
     except CfxError as error:
         print(error, file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
         return 130
+    except Terminated:
+        return 143
     except BrokenPipeError:  # `cfx plugins | head`: the reader has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+
+
+def program() -> NoReturn:
+    """Runs the program and ends the process; a signal that comes too late changes nothing.
+
+    Raises:
+        SystemExit: always, with the exit code.
+    """
+    try:
+        code = main()
+    except KeyboardInterrupt:
+        code = 130
+    ignore_signals()
+    sys.exit(code)
 
 
 def _print_anything() -> None:

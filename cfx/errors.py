@@ -39,6 +39,10 @@ def without_passwords(text: str) -> str:
     return re.sub(r"(://[^/\s:@]*):[^/\s@]+@", r"\1:***@", text)
 
 
+class Terminated(BaseException):
+    """SIGTERM arrived."""
+
+
 class ConfigError(CfxError):
     """A value or a key of the configuration is wrong."""
 

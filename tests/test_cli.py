@@ -7,6 +7,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -497,3 +498,30 @@ def test_ui_on_a_foreign_file_says_so(tmp_path: Path, capsys) -> None:
 def test_ui_on_a_server_says_where_it_is(capsys) -> None:
     assert cli.main(["ui", "--uri", "http://127.0.0.1:5999"]) == 0
     assert "http://127.0.0.1:5999" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
+@pytest.mark.parametrize("delay", [0.12, 0.25])
+def test_a_signal_that_comes_early_has_its_exit_code(
+    name: str, code: int, delay: float, tmp_path: Path
+) -> None:
+    """Before the application is there; a machine that is slower is hit even earlier."""
+    ready = tmp_path / "ready"
+    script = (
+        "import pathlib, sys; from cfx.cli import program;"
+        f" pathlib.Path({str(ready)!r}).touch();"
+        " sys.argv = ['cfx', 'debug=quick', 'hydra.run.dir=' + sys.argv[1]]; program()"
+    )
+    started = subprocess.Popen(
+        [sys.executable, "-c", script, str(tmp_path / "job")],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    while not ready.exists():
+        time.sleep(0.005)
+    time.sleep(delay)
+    started.send_signal(getattr(signal, name))
+    _, err = started.communicate(timeout=60)
+    assert started.returncode == code
+    assert b"Traceback" not in err

@@ -26,6 +26,8 @@ DOCUMENTS = [
     "CONTRIBUTING.md",
     "docs/results.md",
     "docs/tried.md",
+    "docs/policies.md",
+    "docs/security.md",
     "docs/decisions/README.md",
 ]
 

@@ -17,7 +17,7 @@ PACKAGE = Path(cfx.__file__).parent
 FLOORS = (
     ("errors", "renamed"),
     ("component",),
-    ("parameters", "pairs", "progress", "console", "files", "ready"),
+    ("parameters", "pairs", "progress", "console", "files", "ready", "signals"),
     ("registry",),
     ("models",),
     ("simulation", "metrics"),
