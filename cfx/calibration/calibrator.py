@@ -16,18 +16,23 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from cfx import registry
 from cfx.calibration.cache import Arrays, Cache
 from cfx.calibration.losses import PooledLosses, SegmentLosses
 from cfx.calibration.prior import LossesWithPrior
 from cfx.calibration.windows import Windows, WindowSettings
 from cfx.component import content_key, folder_hash
+from cfx.errors import PluginError
 from cfx.objectives.base import Objective
 from cfx.objectives.rmse import SpeedRmse
-from cfx.optimizers.base import Optimizer, Progress
+from cfx.optimizers.base import Optimizer, Progress, Solution
 from cfx.pairs import Pair, PairBatch, PairSet
 from cfx.parameters import ParameterSpace
 from cfx.progress import Task
 from cfx.simulation.base import Stepper
+
+_SAME_RELATIVE, _SAME_ABSOLUTE = 1e-5, 1e-8
+"""How far a loss that is computed again may differ: candidates in another batch round otherwise."""
 
 _GROUP = 1024
 """Problems solved together: enough to fill the batch, few enough that an interruption loses
@@ -327,12 +332,35 @@ class Calibrator:
             progress=report,
             tolerance=tolerance,
         )
+        self._check_losses(losses, solution)
         return {
             "parameters": self.space.from_unit(solution.best).cpu().numpy(),
             "loss": solution.loss.cpu().numpy(),
             "sensitivity": solution.sensitivity.cpu().numpy(),
             "diverged": solution.diverged.cpu().numpy(),
         }
+
+    def _check_losses(
+        self, losses: SegmentLosses | PooledLosses | LossesWithPrior, solution: Solution
+    ) -> None:
+        """Computes the losses of what a third party's optimizer returns once more.
+
+        Raises:
+            PluginError: it has mixed up its candidates.
+        """
+        if registry.is_own(self.optimizer):
+            return
+        again, found = losses(solution.best[:, None])[:, 0], solution.loss
+        both = again.isfinite() & found.isfinite()
+        same = torch.isclose(again, found, rtol=_SAME_RELATIVE, atol=_SAME_ABSOLUTE)
+        wrong = both & ~same
+        if bool(wrong.any()):
+            at = int(wrong.nonzero()[0])
+            raise PluginError(
+                f"{registry.origin(self.optimizer)}: solve returned candidates with losses that are"
+                f" not theirs: {float(found[at]):.6g} where the candidate has"
+                f" {float(again[at]):.6g} ({int(wrong.sum())} of {len(found)} problems)"
+            )
 
     def _cached(
         self,

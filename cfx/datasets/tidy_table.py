@@ -234,7 +234,7 @@ def _names(source: str, name: str, column: Any) -> Labels:
 
 
 def _first_broken(column: Any) -> str:
-    """Returns ", row N" for the first cell that is no UTF-8; "" where the rows cannot be told."""
+    """Returns ", row N" for the first cell that is no UTF-8; "" where no row is known."""
     row = 1
     for chunk in column.chunks:
         if not (pa.types.is_string(chunk.type) or pa.types.is_large_string(chunk.type)):

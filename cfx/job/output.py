@@ -87,7 +87,7 @@ class Output:
             write_config(self, config)
 
     def replace(self, config: JobConfig) -> None:
-        """Takes away the mark of complete results, and writes the configuration of new ones.
+        """Removes what marks results as complete, and writes the configuration of new ones.
 
         Raises:
             OutputError: the file cannot be written.

@@ -1,4 +1,4 @@
-"""Nothing that a stranger sends ends in a traceback: a sentence, or a result.
+"""Nothing that anybody sends ends in a traceback: a sentence, or a result.
 
 `make fuzz` tries more (`CFX_FUZZ_EXAMPLES`, 5,000 for each statement); the suite takes a few of each.
 """

@@ -246,7 +246,8 @@ def ours(
         column(d.acceleration for d in cases),
     )
     with torch.no_grad():
-        return simulate(model, parameters(cases), leader, start, DT), leader
+        values = parameters(cases)
+        return simulate(model, values, leader, start, DT, outside="allow"), leader
 
 
 def parameters(cases: list[Drive]) -> dict[str, Tensor]:
@@ -485,7 +486,7 @@ def test_w74_takes_the_steps_of_sumos_wiedemann_where_both_follow_or_approach() 
         cases.append(Drive(np.array([v_l, v_l]), 0.0, 5.0, gap, v, 0.5, p))
     twin = Twin(
         "w74 / Wiedemann, two cases",
-        W74(),
+        W74(limits=None),
         lambda *_: [],
         same=wiedemanns_case,
         vtype=sumos_wiedemann,

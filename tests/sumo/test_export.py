@@ -59,12 +59,13 @@ def types(path: Path) -> dict[str, dict[str, dict[str, str]]]:
 def test_each_cluster_is_a_distribution_of_its_drivers_own_fixed_parameters(tmp_path: Path) -> None:
     folder = job(tmp_path / "w99", {"name": "w99"})
     lines = export(folder)
-    assert lines[0].endswith("conservative 1, normal 2, aggressive 1")
+    assert lines[0].endswith("conservative 1, normal 2, aggressive 1; all together in 'drivers'")
     found = types(folder / "drivers.add.xml")
     assert {cluster: len(kinds) for cluster, kinds in found.items()} == {
         "conservative": 1,
         "normal": 2,
         "aggressive": 1,
+        "drivers": 0,
     }
     table = (
         pd.read_csv(folder / "pairs.csv")
@@ -108,7 +109,7 @@ def test_krauss_loses_its_brake_build_up_time_and_says_so(tmp_path: Path) -> Non
 def test_sumo_loads_it_as_it_is_and_one_vehicle_of_each_type_drives(tmp_path: Path) -> None:
     pytest.importorskip("traci", reason="needs the extra sumo")
     nodes: list[dict[str, Any]] = [
-        {"name": name} for name in ("krauss", "w99", "krauss_sumo", "idm_sumo")
+        {"name": name} for name in ("krauss", "w99", "krauss_sumo", "idm_sumo", "idm")
     ]
     for number, node in enumerate(nodes):
         folder = job(tmp_path / str(number), node)
@@ -119,6 +120,7 @@ def test_sumo_loads_it_as_it_is_and_one_vehicle_of_each_type_drives(tmp_path: Pa
             for i, kind in enumerate(every)
         ]
         vehicles.append('<vehicle id="any" type="normal" route="m" depart="9"/>')
+        vehicles.append('<vehicle id="anybody" type="drivers" route="m" depart="12"/>')
         (folder / "demand.rou.xml").write_text(
             f'<routes><route id="m" edges="1001"/>{"".join(vehicles)}</routes>'
         )
@@ -127,7 +129,7 @@ import json, os, sys
 os.environ["LIBSUMO_AS_TRACI"] = "quiet"
 import libsumo as sumo
 answers = []
-for k in range(4):
+for k in range(5):
     files = ["-n", sys.argv[1], "-a", f"{k}/drivers.add.xml", "-r", f"{k}/demand.rou.xml"]
     sumo.start(["sumo", *files, "--no-step-log", "--step-length", "0.1"])
     seen = {}
@@ -195,5 +197,5 @@ def test_the_command_says_how_to_use_it(tmp_path: Path, capsys: pytest.CaptureFi
     )
     assert (
         f"sumo --additional-files {tmp_path / 'x.add.xml'}; then in a flow or vehicle:"
-        ' type="conservative"' in capsys.readouterr().out
+        ' type="drivers", or type="conservative"' in capsys.readouterr().out
     )
