@@ -137,7 +137,7 @@ def run_scenario(
         output: a CSV file with a row for each driven vehicle and step.
         look_ahead: as in `Driver`.
         speed_mode: as in `Driver`; 31 lets SUMO's own checks bound each speed.
-        gui: show SUMO's window, at most ten steps in a second.
+        gui: show SUMO's window, slowly enough to watch.
         options: more of SUMO's own options.
 
     Raises:
