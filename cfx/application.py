@@ -30,6 +30,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from cfx import hydra_source, nodes, registry, renamed
 from cfx.errors import CfxError, ConfigError, Terminated, printable, without_passwords
+from cfx.memory import is_out_of_memory
 from cfx.plugin_errors import blame
 from cfx.signals import terminable
 from cfx.sweep import (
@@ -298,7 +299,12 @@ def _call(target: str, values: Any, folder: Path) -> Any:
     except (Exception, SystemExit) as error:  # a plugin may raise anything
         if _signal_behind(error) is not None:
             raise
-        blamed = blame(error)
+        blamed: CfxError | None = blame(error)
+        if blamed is None and is_out_of_memory(error):
+            blamed = CfxError(
+                f"memory ran out ({registry.in_words(error)}); take fewer pairs (data.max_pairs),"
+                " smaller networks or a smaller simulator.memory_mb"
+            )
         if blamed is None:
             raise
         detail = "".join(traceback.format_exception(error)).rstrip()

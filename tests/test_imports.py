@@ -17,7 +17,7 @@ PACKAGE = Path(cfx.__file__).parent
 FLOORS = (
     ("errors", "renamed"),
     ("component",),
-    ("parameters", "pairs", "progress", "console", "files", "ready", "signals"),
+    ("parameters", "pairs", "progress", "console", "files", "ready", "signals", "memory"),
     ("registry",),
     ("models",),
     ("simulation", "metrics"),

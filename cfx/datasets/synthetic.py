@@ -24,6 +24,7 @@ from scipy.signal import lfilter
 from cfx.component import Settings
 from cfx.datasets.base import Dataset, DatasetSettings
 from cfx.errors import DataError
+from cfx.memory import require_memory
 from cfx.pairs import Dropped, Pair, PairSet
 
 if TYPE_CHECKING:
@@ -46,6 +47,7 @@ _ACCELERATION_MPS2, _BRAKING_MPS2, _JERK_MPS3 = 1.8, 2.5, 1.5
 _RESPONSE_PER_S = 0.5
 _DRIFT_SCALE_S = 8.0  # over which a driver's parameters change
 _LENGTH_M = (4.2, 5.2)
+_BYTES = 200.0  # of a pair and frame: signals, and the true parameters over time
 
 
 class SyntheticSettings(DatasetSettings):
@@ -108,6 +110,8 @@ class SyntheticDataset(Dataset):
 
     def read(self) -> PairSet:
         s = self.settings
+        frames = s.frames + round(_WARM_UP_S / s.dt)
+        require_memory(_BYTES * s.pairs * frames, f"data.pairs={s.pairs} of {s.frames} frames")
         rng = np.random.default_rng(s.seed)
         platoons = math.ceil(s.pairs / s.platoon_size)
         traffic = _simulate(s, platoons, rng)

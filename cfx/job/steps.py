@@ -31,6 +31,7 @@ from cfx.job.parts import (
 from cfx.job.results import JobResult
 from cfx.job.run import load_pairs
 from cfx.learners.curves import best_losses
+from cfx.memory import require_memory
 from cfx.pairs import PairBatch, PairSet
 from cfx.progress import Task
 from cfx.protocols.base import Protocol, ProtocolContext, ProtocolResult
@@ -132,6 +133,8 @@ def _context(
     config: JobConfig, parts: Parts, pairs: PairSet, style: StyleResult, device: torch.device
 ) -> ProtocolContext:
     """Returns what the protocol works with."""
+    bound = parts.simulator.settings.memory_mb * 2**20
+    require_memory(bound, f"simulator.memory_mb={parts.simulator.settings.memory_mb}")
     batch = PairBatch.of(pairs, dtype=getattr(torch, config.dtype), device=device)
     stepper = parts.simulator.stepper(parts.model, batch.dt)
     cache_folder = None
@@ -144,7 +147,7 @@ def _context(
         parts.optimizer,
         seed=config.seed,
         cache=Cache(cache_folder),
-        memory=parts.simulator.settings.memory_mb * 2**20,
+        memory=bound,
         progress=Task,
         objective=parts.objective,
         reported=reported_objectives(config, parts.objective),

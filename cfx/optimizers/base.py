@@ -18,6 +18,7 @@ from torch import Tensor
 from cfx import registry
 from cfx.component import Component
 from cfx.errors import PluginError
+from cfx.memory import require_memory
 from cfx.simulation.threads import cores, share
 
 Progress = Callable[[int], None]
@@ -180,6 +181,9 @@ class Optimizer(Component):
         problems, _, n = guesses.shape
         returned = 8 * self.evaluations() * (2 * n + 4)
         each = self.bytes_per_problem(n) + returned + objective_bytes * self.evaluations_at_once()
+        require_memory(
+            each, f"an optimizer with {self.evaluations():,} evaluations of each problem"
+        )
         chunks_at_once = cores() if self.in_threads else 1
         chunk = max(1, min(problems, memory // (each * chunks_at_once)))
         if guesses.device.type == "cpu":

@@ -14,7 +14,11 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
+from cfx.memory import require_memory
 from cfx.policies.base import PolicyNetwork, PolicySettings
+
+_BYTES = 16.0
+"""Of a weight in training: itself, its gradient and what Adam remembers of it."""
 
 _EDGE = 0.02
 """How close to a bound an untrained network may start, in unit space."""
@@ -79,6 +83,8 @@ class RecurrentNetwork(PolicyNetwork):
         super().__init__()
         networks, parameters = fixed.shape
         self.hidden = settings.hidden_size
+        count = self.gates * self.hidden * (features + self.hidden) * settings.layers * networks
+        require_memory(_BYTES * count, f"policy.hidden_size={self.hidden}")
         widths = [features, *[settings.hidden_size] * (settings.layers - 1)]
         self.layers = nn.ModuleList(
             RecurrentLayer(networks, width, self.hidden, self.gates, generator) for width in widths

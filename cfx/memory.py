@@ -1,0 +1,41 @@
+"""What fits into this machine's memory, asked before anything is allocated."""
+
+from __future__ import annotations
+
+import psutil  # type: ignore[import-untyped]  # it ships no types
+
+from cfx.errors import ConfigError
+
+_UNITS = ("bytes", "kB", "MB", "GB", "TB", "PB", "EB")
+
+
+def require_memory(needed: float, what: str) -> None:
+    """Checks that this machine has as much memory.
+
+    Args:
+        needed: an estimate, bytes.
+        what: the setting that asks for it, as a user writes it.
+
+    Raises:
+        ConfigError: it has less, whatever else runs.
+    """
+    available = float(psutil.virtual_memory().total)
+    if needed > available:
+        raise ConfigError(
+            f"{what} needs about {in_units(needed)} of memory, and this machine has"
+            f" {in_units(available)}; lower it"
+        )
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Says whether an error is that memory ran out; PyTorch says so in words."""
+    return isinstance(error, MemoryError) or "allocate memory" in str(error)
+
+
+def in_units(size: float) -> str:
+    """Returns a number of bytes for people: 3.1 TB."""
+    place = 0
+    while size >= 1000 and place < len(_UNITS) - 1:
+        size /= 1000
+        place += 1
+    return f"{size:.3g} {_UNITS[place]}"
