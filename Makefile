@@ -3,7 +3,7 @@
 #   make run [ARGS="model=w99 policy=lstm"]   set up .venv, then run one job
 #   make test                                 set up .venv, then ruff, mypy and the fast tests: what CI runs
 #   make test-slow | make bench               the tests that take minutes | the benchmarks
-#   make fuzz [EXAMPLES=5000]                 bad configurations, recordings, policies and caches, many of each
+#   make fuzz [EXAMPLES=5000]                 bad configurations, recordings, policies and caches; each file of a job fails once
 #   make policies                             train the ready-made policies anew from ../shared/data (an hour)
 #   make conf                                 write conf/<group>/<name>.yaml anew from the built-in classes
 #   make lock                                 write constraints.txt anew from what resolves today
@@ -36,7 +36,7 @@ test-slow: $(VENV)/.ready-test
 	$(BIN)/python -m pytest -m slow
 
 fuzz: $(VENV)/.ready-test
-	CFX_FUZZ_EXAMPLES=$(or $(EXAMPLES),5000) $(BIN)/python -m pytest tests/fuzz --timeout 0 -n auto
+	CFX_FUZZ_EXAMPLES=$(or $(EXAMPLES),5000) CFX_FAULTS_STRIDE=1 $(BIN)/python -m pytest tests/fuzz --timeout 0 -n auto
 
 bench: $(VENV)/.ready-test
 	$(BIN)/python -m pytest tests/benchmarks -m "" --override-ini addopts="--import-mode=importlib" --benchmark-only
