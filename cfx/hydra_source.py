@@ -13,11 +13,13 @@ node stays available as `_NAME` in a defaults list:
 from __future__ import annotations
 
 import importlib.util
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
+import hydra
 from hydra import compose, initialize_config_dir
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.hydra_config import HydraConfig
@@ -28,6 +30,11 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 
 from cfx import nodes, registry, renamed
+
+log = logging.getLogger(__name__)
+
+_MADE_BY_HYDRA = {"hydra/config.yaml", "hydra/launcher/basic.yaml", "hydra/sweeper/basic.yaml"}
+"""Options that Hydra has in code; a file of the same name on the search path replaces them."""
 
 
 class ComponentSource(ConfigSource):
@@ -89,8 +96,29 @@ class ComponentSearchPath(SearchPathPlugin):
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         for package, folder in plugin_conf_dirs().items():
+            replaced = _replaced_of_hydra(folder)
+            if replaced:
+                log.warning(
+                    "The plugin %s brings %s, which would replace Hydra's own; its folder %s is"
+                    " left out: repair that package, or uninstall it",
+                    package,
+                    ", ".join(replaced),
+                    folder,
+                )
+                continue
             search_path.append(package, f"file://{folder}")
         search_path.append("cfx", "cfx://")
+
+
+def _replaced_of_hydra(folder: Path) -> list[str]:
+    """Returns the files in a plugin's `conf/` that Hydra has under the same name."""
+    own = Path(hydra.__file__).parent / "conf"
+    found = []
+    for path in sorted(folder.rglob("*.yaml")):
+        name = path.relative_to(folder)
+        if (own / name).is_file() or name.as_posix() in _MADE_BY_HYDRA:
+            found.append(name.as_posix())
+    return found
 
 
 def plugin_conf_dirs() -> dict[str, Path]:

@@ -53,6 +53,7 @@ def smoke_check_model(model: DrivingModel) -> None:
     for dtype in (torch.float64, torch.float32):
         follower, leader = _states(model, dtype)
         p = _Noted(_values(model.parameters, dtype))
+        before = _copies(follower, leader, dict(p))
         speed = model.next_speed(follower, leader, p, DT)
         _require_tensor(speed, "next_speed", (STATES,), dtype, "(*batch,)")
         wrong = ~(speed.isfinite() & (speed >= 0))
@@ -68,7 +69,24 @@ def smoke_check_model(model: DrivingModel) -> None:
         )
         if not bool(memory.isfinite().all()):
             raise PluginError("next_memory gives a number that is not finite in an ordinary state")
+        _require_unchanged(before, _copies(follower, leader, dict(p)))
         _require_all_read(model, p)
+
+
+def _copies(follower: Follower, leader: Leader, p: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Returns copies of all that a step is given, by name."""
+    given = {f"follower.{name}": value for name, value in follower._asdict().items()}
+    given |= {f"leader.{name}": value for name, value in leader._asdict().items()}
+    given |= {f"p['{name}']": value for name, value in p.items()}
+    return {name: value.clone() for name, value in given.items()}
+
+
+def _require_unchanged(before: dict[str, Tensor], after: dict[str, Tensor]) -> None:
+    for name, value in before.items():
+        if not torch.equal(value, after[name]):
+            raise PluginError(
+                f"a step changes {name} in place; compute new tensors, for others read these"
+            )
 
 
 def _states(model: DrivingModel, dtype: torch.dtype) -> tuple[Follower, Leader]:

@@ -102,3 +102,75 @@ def test_an_optimizer_that_mixes_up_candidates_and_losses_is_refused(
     assert code == 2
     assert "mixed-optimizers" in err
     assert "candidates with losses that are not theirs" in err
+
+
+def test_a_model_that_changes_its_inputs_is_refused(
+    install: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = MODEL.replace("        STEPS.append(1)\n", "        leader.speed.mul_(0.9)\n")
+    text = text.replace("        if len(STEPS) > 300:\n            {failure}\n", "")
+    install("late-models", {"cfx.models": {"late": "late_models:Late"}}, {"late_models.py": text})
+    overrides = [one for one in QUICK if not one.startswith("model=")]
+    assert cli.main([*overrides, "model=late", f"hydra.run.dir={tmp_path / 'job'}"]) == 2
+    err = capsys.readouterr().err
+    assert "late-models" in err
+    assert "a step changes leader.speed in place" in err
+
+
+POLICY = """
+import torch
+from cfx import Policy, PolicyNetwork, PolicySettings
+
+class Nan(Policy):
+    schema = PolicySettings
+    trainable = False
+
+    def build(self, features, default, fixed, generator):
+        return Network(fixed)
+
+class Network(PolicyNetwork):
+    def __init__(self, fixed):
+        super().__init__()
+        self.register_buffer("fixed", fixed)
+        self.calls = 0
+
+    def initial_state(self, networks, drivers):
+        return self.fixed.new_zeros((networks, drivers, 0))
+
+    def forward(self, tokens, state):
+        self.calls += 1
+        shape = (*tokens.shape[:3], self.fixed.shape[1])
+        answer = self.fixed[:, None, None].expand(shape)
+        if self.calls > 6:
+            answer = answer * float("nan")
+        return answer, state
+"""
+
+
+def test_a_policy_that_answers_no_number_is_refused(
+    install: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = {"nan_policies.py": POLICY}
+    install("nan-policies", {"cfx.policies": {"void": "nan_policies:Nan"}}, files)
+    overrides = [one for one in QUICK if not one.startswith("policy=")]
+    assert cli.main([*overrides, "policy=void", f"hydra.run.dir={tmp_path / 'job'}"]) == 2
+    err = capsys.readouterr().err
+    assert "nan-policies" in err
+    assert "answer numbers that are not finite" in err
+
+
+def test_a_plugins_files_never_replace_hydras_own(
+    install: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    from cfx.hydra_source import composed
+
+    files = {
+        "shadow_models/__init__.py": MODEL.replace("{failure}", "pass"),
+        "shadow_models/conf/hydra/launcher/basic.yaml": "_target_: nowhere.Launcher\n",
+        "shadow_models/conf/model/shadow_far.yaml": "defaults: [_shadow]\n",
+    }
+    install("shadow-models", {"cfx.models": {"shadow": "shadow_models:Late"}}, files)
+    config = composed([])
+    assert config.hydra.launcher._target_.startswith("hydra.")
+    assert "shadow_models brings hydra/launcher/basic.yaml" in caplog.text
+    assert composed(["model=shadow"]).model.name == "shadow"

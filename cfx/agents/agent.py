@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from cfx import renamed
+from cfx import registry, renamed
 from cfx.agents.context import UNSEEN, ContextRule, DriverContext
 from cfx.agents.core import AgentCore
 from cfx.agents.heads.base import ParameterHead
@@ -34,7 +34,7 @@ from cfx.agents.valid_range import (
     weight_of_answer,
 )
 from cfx.calibration.windows import WindowSettings
-from cfx.errors import DataError
+from cfx.errors import DataError, PluginError
 from cfx.pairs import PairBatch, PairSet
 from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy, PolicyNetwork
@@ -209,6 +209,11 @@ class Agent:
         dtype = history.follower_speed.dtype
         answers, after = self.core.answer(self._features(history, state), state.state)
         answer = answers[state.network, state.place].to(dtype)
+        if not bool(answer.isfinite().all()):
+            raise PluginError(
+                f"{registry.origin(self.policy)}: its networks answer numbers that are not finite;"
+                " train with a smaller learner.learning_rate, or repair that policy"
+            )
         state = self._judged(history, state)
         unit = self._faded(answer.double(), state).to(dtype)
         return self.space.from_unit(unit), state._replace(state=after)

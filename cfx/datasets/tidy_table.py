@@ -190,7 +190,7 @@ def _read_parquet(path: Path) -> TidyTable:
         file = pq.ParquetFile(path)
         numbers, labels, ignored = _roles(str(path), file.schema_arrow.names)
         columns = file.read(columns=[*numbers, *labels])
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise DataError(
             f"{path}: the parquet file is cut off or damaged ({_first_line(error)}); write it again"
         ) from None

@@ -237,6 +237,12 @@ def _check_training_result(
         tokens = mean.new_zeros((networks, 1, 1, mean.shape[1]))
         state = training_result.network.initial_state(networks, 1)
         answer, _ = training_result.network(tokens, state)
+        finite = answer.isfinite().all() and mean.isfinite().all()
+        if answer.shape == expected and answer.dtype == mean.dtype and not bool(finite):
+            raise PluginError(
+                f"{who}: its networks answer numbers that are not finite; train with a smaller"
+                " learner.learning_rate, or repair it"
+            )
         if answer.shape == expected and answer.dtype == mean.dtype:
             return
         got = (
