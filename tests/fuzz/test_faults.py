@@ -51,9 +51,10 @@ class Faults:
     def __init__(self, at: int | None = None, kind: str = "", moment: str = "") -> None:
         self.at, self.kind, self.moment = at, kind, moment
         self.count = 0
+        self.hit = ""
 
-    def strike(self, moment: str) -> None:
-        if self.count != self.at or moment != self.moment:
+    def strike(self, number: int, moment: str) -> None:
+        if number != self.at or moment != self.moment:
             return
         if self.kind == "killed":
             raise Terminated
@@ -63,11 +64,14 @@ class Faults:
     @contextlib.contextmanager
     def atomic_write(self, path: Path) -> Iterator[Path]:
         self.count += 1
-        self.strike("before")
+        number = self.count  # another file may be written within this one
+        if number == self.at:
+            self.hit = path.name
+        self.strike(number, "before")
         with WHOLE(path) as temporary:
             yield temporary
-            self.strike("unnamed")
-        self.strike("named")
+            self.strike(number, "unnamed")
+        self.strike(number, "named")
 
 
 def job(folder: Path, faults: Faults, monkeypatch: pytest.MonkeyPatch) -> int:
@@ -100,9 +104,10 @@ def test_each_file_fails_once(
         kind, moment = KINDS[rest // len(MOMENTS)], MOMENTS[rest % len(MOMENTS)]
         folder = tmp_path / str(number)
         capsys.readouterr()
-        code = job(folder, Faults(at + 1, kind, moment), monkeypatch)
+        faults = Faults(at + 1, kind, moment)
+        code = job(folder, faults, monkeypatch)
         said = capsys.readouterr().err
-        where = f"file {at + 1} of {counted.count}, {kind}, {moment}: {code} {said}"
+        where = f"{faults.hit} ({at + 1} of {counted.count}), {kind}, {moment}: {code} {said}"
         assert code == (143 if kind == "killed" else 2), where
         assert "Traceback" not in said, where
         assert len(said.strip().splitlines()) <= 3, where
