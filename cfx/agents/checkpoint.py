@@ -143,6 +143,8 @@ def _agent(
         )
     if networks != len(description.names) or scaler.scale.shape != scaler.mean.shape:
         raise ValueError(f"there are weights of {networks} networks")
+    if head.needs_base and "base" not in weights:
+        raise ValueError(f"the head '{head.name}' needs 'base'")
     for name in ("base", "population"):
         if name in weights and weights[name].shape != (networks, len(head.space)):
             raise ValueError(f"'{name}' has the shape {tuple(weights[name].shape)}")
