@@ -52,8 +52,9 @@ def smoke_check_model(model: DrivingModel) -> None:
         return
     for dtype in (torch.float64, torch.float32):
         follower, leader = _states(model, dtype)
-        p = _Noted(_values(model.parameters, dtype))
-        before = _copies(follower, leader, dict(p))
+        values = _values(model.parameters, dtype)
+        p = _Noted(values)
+        before = _copies(follower, leader, values)
         speed = model.next_speed(follower, leader, p, DT)
         _require_tensor(speed, "next_speed", (STATES,), dtype, "(*batch,)")
         wrong = ~(speed.isfinite() & (speed >= 0))
@@ -69,7 +70,7 @@ def smoke_check_model(model: DrivingModel) -> None:
         )
         if not bool(memory.isfinite().all()):
             raise PluginError("next_memory gives a number that is not finite in an ordinary state")
-        _require_unchanged(before, _copies(follower, leader, dict(p)))
+        _require_unchanged(before, _copies(follower, leader, values))
         _require_all_read(model, p)
 
 

@@ -102,6 +102,12 @@ def _labels(split: Split, truth: Tensor) -> Labels:
     )
 
 
+_ANSWERS = (
+    "a trained policy answers in unit space, finite and within [0, 1]: nothing outside the model's"
+    " bounds ever drives"
+)
+
+
 def delivers_networks_that_are_ready_to_drive(learner: Learner) -> None:
     for together in (False, True):
         data = training_data(needs_labels=learner.needs_labels, together=together)
@@ -120,6 +126,7 @@ def delivers_networks_that_are_ready_to_drive(learner: Learner) -> None:
                 " `network` and `names` of the training data say how many there are and what each"
                 " learns from"
             )
+            assert bool(value.isfinite().all()), f"{name} is not finite: {_ANSWERS}"
         head = _head(result, data)
         assert (result.base is not None) == head.needs_base, (
             "`base` and `head` of the result disagree: the offset head comes with the base of"
@@ -135,10 +142,7 @@ def delivers_networks_that_are_ready_to_drive(learner: Learner) -> None:
             " driver's parameters random"
         )
         answers = _answers(result, data)
-        assert bool(((answers >= 0) & (answers <= 1)).all()), (
-            "a trained policy answers in unit space, finite and within [0, 1]: nothing outside the"
-            " model's bounds ever drives"
-        )
+        assert bool(((answers >= 0) & (answers <= 1)).all()), _ANSWERS
 
 
 def learns_something(learner: Learner) -> None:
