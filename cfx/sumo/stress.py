@@ -33,22 +33,11 @@ _ROAD_M, _APART_M, _LANE_MPS = 6000.0, 12.0, 40.0
 _BEGIN_M = 1500.0  # where cars stand at first, with room behind and ahead
 _SETTLE_S, _LASTS_S = 8.0, 30.0  # before an event, and after it
 
+_HARDEST = 9.0
+"""m/s2: how leaders brake."""
+
 _BEARABLE = 6.0
 """m/s2: what a cut-in needs at least if the driver reacts within a step; 9 can be braked."""
-
-
-class Vehicle(NamedTuple):
-    """A vehicle that no policy drives: where it begins, and its speeds.
-
-    Attributes:
-        lane: 0 is the driven car's.
-        ahead: gap to the car at first, m; the cutter's counts from the moment of its cut-in.
-        speed: m/s.
-    """
-
-    lane: int
-    ahead: float
-    speed: float
 
 
 class Event(NamedTuple):
@@ -56,15 +45,20 @@ class Event(NamedTuple):
 
     Attributes:
         speed: the car's at first.
-        leader: whom it follows at first; None: nobody.
-        cutter: who cuts in; None: nobody.
-        braking: deceleration to a standstill of the leader; 0: it goes on.
+        ahead: gap to its leader at first, m.
+        leader_speed: the leader's, until the event.
+        slower: by which share of the car's speed the vehicle is slower that cuts in; None: nobody
+            cuts in.
+        margin: what its gap has beyond what braking at `_BEARABLE` needs, m.
+        headway: at which the leader begins to brake, s; None: it goes on.
     """
 
     speed: float
-    leader: Vehicle | None = None
-    cutter: Vehicle | None = None
-    braking: float = 0.0
+    ahead: float
+    leader_speed: float
+    slower: float | None = None
+    margin: float = 0.0
+    headway: float | None = None
 
 
 @dataclass
@@ -73,7 +67,9 @@ class EventResult:
 
     Attributes:
         kind: of the events.
-        number: of events.
+        number: of events that took place: the vehicle that cut in or braked was the next ahead.
+        headway: smallest, median and largest time headway as the events began, s; None where an
+            event has no such moment.
         collisions: driven vehicles that hit something.
         hardest_braking: of any driven vehicle, m/s2.
         hardest_acceleration: of any driven vehicle, m/s2.
@@ -83,6 +79,7 @@ class EventResult:
 
     kind: str
     number: int
+    headway: tuple[float, float, float] | None = None
     collisions: int = 0
     hardest_braking: float = 0.0
     hardest_acceleration: float = 0.0
@@ -144,6 +141,7 @@ def report_stress(result: StressResult, output: Path | None = None) -> None:
     table = blank_table(
         "event",
         "number",
+        "headway at first [s]",
         "collisions",
         "hardest braking [m/s2]",
         "above 4.5 m/s2",
@@ -156,6 +154,7 @@ def report_stress(result: StressResult, output: Path | None = None) -> None:
         table.add_row(
             one.kind,
             str(one.number),
+            _range(one.headway),
             str(one.collisions),
             f"{one.hardest_braking:.2f}",
             str(one.braked_hard),
@@ -167,6 +166,12 @@ def report_stress(result: StressResult, output: Path | None = None) -> None:
         write_json(output, result.to_json())
 
 
+def _range(headway: tuple[float, float, float] | None) -> str:
+    if headway is None:
+        return ""
+    return f"{headway[0]:.2f} to {headway[2]:.2f}"
+
+
 def _fleet(runs: Mapping[str, str | Path], speed_mode: int) -> Fleet:
     return Fleet.load(runs, speed_mode=speed_mode)
 
@@ -174,23 +179,18 @@ def _fleet(runs: Mapping[str, str | Path], speed_mode: int) -> Fleet:
 def _cut_in(rng: np.random.Generator) -> Event:
     """Returns a cut-in that braking at `_BEARABLE` survives."""
     speed = float(rng.uniform(5.0, 33.0))
-    slower = float(rng.uniform(0.0, 0.3) * speed)
-    needed = 1.0 + slower * STEP_S + slower**2 / (2.0 * _BEARABLE)
-    gap = needed + float(rng.uniform(0.0, 12.0))
-    leader = Vehicle(0, 4.0 + 1.5 * speed, speed)
-    return Event(speed, leader, Vehicle(1, gap, speed - slower))
+    slower, margin = float(rng.uniform(0.0, 0.3)), float(rng.uniform(0.0, 12.0))
+    return Event(speed, 4.0 + 1.5 * speed, speed, slower=slower, margin=margin)
 
 
 def _braking_leader(rng: np.random.Generator) -> Event:
     speed = float(rng.uniform(5.0, 33.0))
-    headway = float(rng.uniform(1.0, 2.5))
-    return Event(speed, Vehicle(0, 2.0 + headway * speed, speed), braking=9.0)
+    return Event(speed, 4.0 + 1.5 * speed, speed, headway=float(rng.uniform(1.0, 2.5)))
 
 
 def _standing_vehicle(rng: np.random.Generator) -> Event:
     speed = float(rng.uniform(5.0, 33.0))
-    ahead = 150.0 + _SETTLE_S * speed
-    return Event(speed, Vehicle(0, ahead, 0.0))
+    return Event(speed, 150.0 + _SETTLE_S * speed, 0.0)
 
 
 def _run_events(kind: str, events: list[Event], fleet: Fleet) -> EventResult:
@@ -204,7 +204,10 @@ def _run_events(kind: str, events: list[Event], fleet: Fleet) -> EventResult:
         if step == 0:
             _take_hold(sumo, events)
         if step == events_at:
-            _happen(sumo, events)
+            headways = _happen(sumo, events)
+            if headways is not None:
+                result.number = len(headways)
+                result.headway = _spread(headways)
 
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cfx-")))
@@ -214,29 +217,71 @@ def _run_events(kind: str, events: list[Event], fleet: Fleet) -> EventResult:
     return result
 
 
+def _spread(values: list[float]) -> tuple[float, float, float] | None:
+    if not values:
+        return None
+    return (float(np.min(values)), float(np.median(values)), float(np.max(values)))
+
+
 def _take_hold(sumo: Any, events: list[Event]) -> None:
     """Lets the vehicles that no policy drives keep their speeds and lanes."""
     vehicle = sumo.vehicle
     for name in vehicle.getIDList():
         vehicle.setLaneChangeMode(name, 0)
-        if name.startswith(_KIND):
-            continue
         kind, _, number = name.partition(".")
-        other = getattr(events[int(number)], kind)
-        vehicle.setSpeedMode(name, 0)
-        vehicle.setSpeed(name, other.speed)
+        if kind != _KIND:
+            vehicle.setSpeedMode(name, 0)
+            vehicle.setSpeed(name, events[int(number)].leader_speed)
 
 
-def _happen(sumo: Any, events: list[Event]) -> None:
-    """Lets cutters cut in and leaders brake."""
+def _happen(sumo: Any, events: list[Event]) -> list[float] | None:
+    """Lets vehicles cut in and leaders brake.
+
+    A policy has driven for `_SETTLE_S` by now, at a gap and a speed that are its own. So what
+    happens is laid out from where the car is at this moment.
+
+    Returns:
+        Time headway, s, of each event in which the vehicle that acts is the next ahead of the car;
+        None where nobody acts.
+    """
     vehicle = sumo.vehicle
+    acting: dict[int, str] = {}
     for number, event in enumerate(events):
-        if event.cutter is not None:
-            position = vehicle.getLanePosition(f"{_KIND}.{number}") + event.cutter.ahead + _LENGTH_M
-            vehicle.moveTo(f"cutter.{number}", f"road{number}_0", position)
-        if event.braking > 0 and event.leader is not None:
-            lasts = event.leader.speed / event.braking
-            vehicle.slowDown(f"leader.{number}", 0.0, lasts)
+        car, leader, cutter = f"{_KIND}.{number}", f"leader.{number}", f"cutter.{number}"
+        position, speed = vehicle.getLanePosition(car), vehicle.getSpeed(car)
+        if event.slower is not None:
+            cutter_speed = min((1.0 - event.slower) * speed, event.leader_speed)
+            closing = speed - cutter_speed
+            gap = 1.0 + closing * STEP_S + closing**2 / (2.0 * _BEARABLE) + event.margin
+            front = position + gap + _LENGTH_M
+            # The leader goes on ahead of whoever cuts in, and never slower.
+            room = front + _LENGTH_M + 2.0 + event.leader_speed
+            if vehicle.getLanePosition(leader) < room:
+                vehicle.moveTo(leader, f"road{number}_0", room)
+            vehicle.moveTo(cutter, f"road{number}_0", front)
+            vehicle.setPreviousSpeed(cutter, cutter_speed)
+            vehicle.setSpeed(cutter, cutter_speed)
+            acting[number] = cutter
+        elif event.headway is not None:
+            # The leader takes the car's speed: then braking as hard as it does is enough.
+            front = position + 2.0 + event.headway * speed + _LENGTH_M
+            vehicle.moveTo(leader, f"road{number}_0", front)
+            vehicle.setPreviousSpeed(leader, speed)
+            vehicle.slowDown(leader, 0.0, speed / _HARDEST)
+            acting[number] = leader
+    return _headways(vehicle, acting) if acting else None
+
+
+def _headways(vehicle: Any, acting: Mapping[int, str]) -> list[float]:
+    """Returns headways of the cars whose next vehicle ahead is the one that acts."""
+    headways = []
+    for number, name in acting.items():
+        car = f"{_KIND}.{number}"
+        ahead = vehicle.getLeader(car, 200.0)
+        if ahead and ahead[0] == name:
+            gap = ahead[1] + vehicle.getMinGap(car)
+            headways.append(gap / max(vehicle.getSpeed(car), STEP_S))
+    return headways
 
 
 def _drive(
@@ -338,20 +383,19 @@ def _placed(events: list[Event]) -> str:
     ]
     for number, event in enumerate(events):
         lines.append(f'<route id="route{number}" edges="road{number}"/>')
-        lines.append(_vehicle(_KIND, _KIND, number, Vehicle(0, 0.0, event.speed), _BEGIN_M))
-        if event.leader is not None:
-            at = _BEGIN_M + event.leader.ahead + _LENGTH_M
-            lines.append(_vehicle("leader", "other", number, event.leader, at))
-        if event.cutter is not None:
-            lines.append(_vehicle("cutter", "other", number, event.cutter, _BEGIN_M))
+        lines.append(_vehicle(_KIND, _KIND, number, 0, event.speed, _BEGIN_M))
+        at = _BEGIN_M + event.ahead + _LENGTH_M
+        lines.append(_vehicle("leader", "other", number, 0, event.leader_speed, at))
+        if event.slower is not None:
+            lines.append(_vehicle("cutter", "other", number, 1, event.leader_speed, _BEGIN_M))
     lines.append("</routes>")
     return "\n".join(lines)
 
 
-def _vehicle(role: str, kind: str, number: int, vehicle: Vehicle, at: float) -> str:
+def _vehicle(role: str, kind: str, number: int, lane: int, speed: float, at: float) -> str:
     return (
         f'<vehicle id="{role}.{number}" type="{kind}" route="route{number}" depart="0"'
-        f' departLane="{vehicle.lane}" departPos="{at!r}" departSpeed="{vehicle.speed!r}"'
+        f' departLane="{lane}" departPos="{at!r}" departSpeed="{speed!r}"'
         ' insertionChecks="none"/>'
     )
 

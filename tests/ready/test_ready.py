@@ -60,6 +60,7 @@ def test_each_card_says_what_a_user_must_know(name: str) -> None:
     assert card["safety"]["jerk"] < 1.5
     kinds = {event["kind"]: event for event in card["stress"]["events"]}
     assert kinds["cut-ins"]["number"] >= 1000
+    assert kinds["cut-ins"]["headway"][0] < 0.1
     for event in kinds.values():
         assert event["collisions"] == 0
         assert event["hardest_braking"] <= 9.0 + 1e-6

@@ -69,7 +69,12 @@ print(json.dumps(result.to_json()))
         "a lane drop",
         "a red light",
     ]
+    # Each vehicle that cuts in or brakes is the next ahead of the car, at a gap that was asked for.
     assert events[0]["number"] == 60
+    assert events[1]["number"] == 12
+    assert 0 < events[0]["headway"][0] < 0.5
+    assert 1.0 < events[1]["headway"][0] < events[1]["headway"][2] < 3.0
+    assert events[2]["headway"] is None
     assert events[3]["number"] > 100
     for event in events:
         assert event["collisions"] == 0
