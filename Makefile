@@ -4,6 +4,7 @@
 #   make test                                 set up .venv, then ruff, mypy and the fast tests: what CI runs
 #   make test-slow | make bench               the tests that take minutes | the benchmarks
 #   make fuzz [EXAMPLES=5000]                 bad configurations, recordings, policies and caches; each file of a job fails once
+#   make kills [KILLS=100]                    kill a sweep at random moments, with each launcher
 #   make policies                             train the ready-made policies anew from ../shared/data (an hour)
 #   make conf                                 write conf/<group>/<name>.yaml anew from the built-in classes
 #   make lock                                 write constraints.txt anew from what resolves today
@@ -21,7 +22,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 TORCH = $(shell sed -n 's/^torch==//p' constraints.txt)
 
-.PHONY: run test test-slow fuzz bench policies conf lock clean
+.PHONY: run test test-slow fuzz kills bench policies conf lock clean
 
 run: $(VENV)/.ready
 	$(BIN)/python -m cfx $(ARGS)
@@ -37,6 +38,9 @@ test-slow: $(VENV)/.ready-test
 
 fuzz: $(VENV)/.ready-test
 	CFX_FUZZ_EXAMPLES=$(or $(EXAMPLES),5000) CFX_FAULTS_STRIDE=1 $(BIN)/python -m pytest tests/fuzz --timeout 0 -n auto
+
+kills: $(VENV)/.ready-test
+	CFX_KILLS=$(or $(KILLS),100) $(BIN)/python -m pytest -m slow tests/fuzz/test_kills.py -s
 
 bench: $(VENV)/.ready-test
 	$(BIN)/python -m pytest tests/benchmarks -m "" --override-ini addopts="--import-mode=importlib" --benchmark-only

@@ -19,12 +19,17 @@ def require_memory(needed: float, what: str) -> None:
     Raises:
         ConfigError: it has less, whatever else runs.
     """
-    available = float(psutil.virtual_memory().total)
+    available = total_memory()
     if needed > available:
         raise ConfigError(
             f"{what} needs about {in_units(needed)} of memory, and this machine has"
             f" {in_units(available)}; lower it"
         )
+
+
+def total_memory() -> float:
+    """Returns this machine's memory, bytes."""
+    return float(psutil.virtual_memory().total)
 
 
 def is_out_of_memory(error: BaseException) -> bool:

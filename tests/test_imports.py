@@ -17,7 +17,17 @@ PACKAGE = Path(cfx.__file__).parent
 FLOORS = (
     ("errors", "renamed"),
     ("component",),
-    ("parameters", "pairs", "progress", "console", "files", "ready", "signals", "memory"),
+    (
+        "parameters",
+        "pairs",
+        "progress",
+        "console",
+        "files",
+        "ready",
+        "signals",
+        "memory",
+        "job_folder",
+    ),
     ("registry",),
     ("models",),
     ("simulation", "metrics"),

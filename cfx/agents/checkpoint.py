@@ -29,6 +29,7 @@ from cfx.agents.valid_range import SIGNALS, ValidRange
 from cfx.calibration.windows import WindowSettings
 from cfx.errors import ConfigError, DataError, ParameterError
 from cfx.files import atomic_write
+from cfx.job_folder import examine, parse_json
 from cfx.models.base import DrivingModel
 from cfx.policies.base import Policy
 
@@ -39,9 +40,6 @@ _DESCRIPTION = "policy.json"
 _TENSORS = "policy.safetensors"
 _TENSORS_BEFORE = "policy.pt"
 """Where formats 1 and 2 kept the tensors."""
-
-_LARGEST_MB = 256
-"""A policy's files are larger only if they are something else."""
 
 _RANGE = "valid_range."
 """What names of tensors of the valid range begin with."""
@@ -70,6 +68,7 @@ def load(folder: Path | str) -> Agent:
         PluginError: the model or the policy is not installed.
     """
     folder = Path(folder)
+    examine(folder)
     written, weights = _read(folder)
     description = _validated(folder, written)
     policy_node = renamed.node("policy", description.policy)
@@ -99,6 +98,7 @@ class _Description(BaseModel):
     windows: WindowSettings
     dt: float = Field(gt=0, le=100)
     names: tuple[str, ...] = Field(min_length=1)
+    parameters: tuple[str, ...] = ()
     head: str | None = None
     ensemble_size: int = Field(
         1, ge=1, le=64, validation_alias=AliasChoices("ensemble_size", "members")
@@ -237,8 +237,8 @@ def _description(agent: Agent) -> dict[str, Any]:
 
 def _read(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     try:
-        text = _bounded(folder / _DESCRIPTION).read_text(encoding="utf-8")
-        description = json.loads(text)
+        text = (folder / _DESCRIPTION).read_text(encoding="utf-8")
+        description = parse_json(text)
         if not isinstance(description, dict):
             raise ValueError(f"{_DESCRIPTION} is no JSON object")
         weights = _read_tensors(folder)
@@ -256,18 +256,10 @@ def _read(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
 
 def _read_tensors(folder: Path) -> dict[str, Tensor]:
     if (folder / _TENSORS).is_file():
-        return safetensors.torch.load(_bounded(folder / _TENSORS).read_bytes())
-    before = _bounded(folder / _TENSORS_BEFORE)
+        return safetensors.torch.load((folder / _TENSORS).read_bytes())
+    before = folder / _TENSORS_BEFORE
     weights: dict[str, Tensor] = torch.load(before, weights_only=True, map_location="cpu")
     return weights
-
-
-def _bounded(path: Path) -> Path:
-    """Returns the path of a file that is not too large to be a policy's."""
-    size = path.stat().st_size
-    if size > _LARGEST_MB * 2**20:
-        raise ValueError(f"{path.name} has {size / 2**20:.0f} MB, at most {_LARGEST_MB} are read")
-    return path
 
 
 def _head(

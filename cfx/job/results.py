@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,7 +12,9 @@ from cfx.agents import checkpoint
 from cfx.agents.agent import Agent
 from cfx.errors import DataError
 from cfx.evaluation.result import Evaluation
+from cfx.job_folder import examine
 from cfx.ready import is_ready_made
+from cfx.report.files import read_metrics
 from cfx.style.result import StyleResult
 from cfx.tracking.store import folder_of
 
@@ -55,8 +55,10 @@ def load(folder_or_run: str | Path) -> JobResult:
         DataError: there is no finished job, or no such policy.
     """
     folder = folder_of(folder_or_run)
+    examine(folder)
     try:
-        defined = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        if not (folder / "metrics.json").is_file():
+            raise FileNotFoundError("it has no metrics.json")
         pairs = pd.DataFrame()  # no recording, and nothing of one, comes with a ready-made policy
         if not is_ready_made(folder_or_run):
             pairs = _pairs(folder)
@@ -64,15 +66,10 @@ def load(folder_or_run: str | Path) -> JobResult:
         raise DataError(
             f"{folder} holds no finished job ({error}); give the output folder that a job printed"
         ) from error
-    values: dict[str, float] = {}
-    for name, value in defined.items():
-        if value is None:
-            values[name] = math.nan
-        else:
-            values[name] = float(value)
+    metrics = read_metrics(folder / "metrics.json")
     figures = tuple(sorted((folder / "figures").glob("*.png")))
     policy = checkpoint.load(folder / "policy")
-    return JobResult(renamed.metrics(values), pairs, policy, figures, folder)
+    return JobResult(metrics, pairs, policy, figures, folder)
 
 
 def _pairs(folder: Path) -> pd.DataFrame:

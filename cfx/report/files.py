@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -10,13 +9,18 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import pandas as pd
-import yaml
+import pyarrow.parquet as pq
 
 from cfx import renamed
 from cfx.errors import DataError
+from cfx.job_folder import parse_json, parse_yaml
+from cfx.memory import in_units, total_memory
 from cfx.style.result import CLUSTERS
 
 T = TypeVar("T")
+
+_CELL_BYTES = 8
+"""At the least."""
 
 TEXT_COLUMNS = frozenset(
     {
@@ -104,6 +108,7 @@ def read_table(path: Path, columns: Iterable[str]) -> pd.DataFrame:
 def _load(path: Path) -> pd.DataFrame:
     # pyarrow's and pandas' errors are ValueErrors or OSErrors.
     try:
+        _check_memory(path)
         if path.suffix == ".parquet":
             return pd.read_parquet(path)
         # An id such as "NA" is an id, and "007" is no number.
@@ -115,23 +120,36 @@ def _load(path: Path) -> pd.DataFrame:
         raise _unreadable(path, error) from error
 
 
+def _check_memory(path: Path) -> None:
+    """Checks that a table fits the memory: a short file may mean a long table."""
+    needed = float(path.stat().st_size)
+    if path.suffix == ".parquet":
+        found = pq.read_metadata(path)
+        needed = float(found.num_rows) * found.num_columns * _CELL_BYTES
+    if needed > total_memory():
+        raise DataError(
+            f"{path} holds a table of {in_units(needed)}, more than this machine's memory; no job"
+            " writes so much"
+        )
+
+
 def read_json(path: Path) -> dict[str, Any]:
     """Reads a mapping.
 
     Raises:
         DataError: the file cannot be read, or holds something else.
     """
-    return _mapping(path, json.loads)
+    return _mapping(path, parse_json)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
     """Reads a mapping; errors as of `read_json`."""
-    return _mapping(path, yaml.safe_load)
+    return _mapping(path, parse_yaml)
 
 
 def read_yaml_list(path: Path) -> list[Any]:
     """Reads a list; what is none is an empty one. Errors as of `read_json`."""
-    content = _parsed(path, yaml.safe_load)
+    content = _parsed(path, parse_yaml)
     return list(content) if isinstance(content, list) else []
 
 
@@ -145,7 +163,7 @@ def _mapping(path: Path, parse: Callable[[str], Any]) -> dict[str, Any]:
 def _parsed(path: Path, parse: Callable[[str], Any]) -> Any:
     try:
         return parse(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, yaml.YAMLError) as error:
+    except (OSError, ValueError) as error:
         raise _unreadable(path, error) from error
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import pandas as pd
 
 from cfx import renamed
+from cfx.job_folder import examine
 from cfx.report.files import (
     optional,
     public,
@@ -71,6 +72,7 @@ def read_job(folder: Path, origin: Origin) -> Job:
     Raises:
         DataError: a file cannot be read, or is not what a job writes.
     """
+    examine(folder)
     config = read_yaml(folder / "config.yaml")
     data = optional(folder / "data.json", read_json) or {}
     tables = {name: _table(folder, name) for name in _COLUMNS if name != "pairs.csv"}

@@ -12,7 +12,6 @@ Shapes: D vehicles, n tuned parameters, L frames of a token.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -33,6 +32,7 @@ from cfx.agents.scaler import Scaler
 from cfx.agents.valid_range import share_in_words
 from cfx.calibration.settings import WindowSettings
 from cfx.errors import DataError, ParameterError, SumoError
+from cfx.job_folder import parse_json
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.limits import at_limits
 from cfx.policies.base import ConstantNetwork
@@ -639,7 +639,7 @@ def _load_policy(run: str | Path) -> Agent:
     if not (folder / "policy.json").is_file():
         folder /= "policy"
     policy = checkpoint.load(folder)
-    written = json.loads((folder / "policy.json").read_text(encoding="utf-8"))
+    written = parse_json((folder / "policy.json").read_text(encoding="utf-8"))
     trained = written.get("parameters", [])
     if tuple(trained) != policy.space.names:
         raise DataError(

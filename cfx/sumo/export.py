@@ -10,12 +10,12 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import pandas as pd
 import torch
-import yaml
 from torch import Tensor
 
 from cfx import registry
 from cfx.errors import ConfigError, DataError, OutputError
 from cfx.files import atomic_write
+from cfx.job_folder import examine, parse_yaml
 from cfx.models.base import DrivingModel
 from cfx.models.vtype import InSumo, VType
 from cfx.tracking.store import folder_of
@@ -133,14 +133,17 @@ def _folder(run: str | Path) -> tuple[Path, Path]:
 
 def _read(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
     """Reads the model's node, and the rows of `fixed`, calmest cluster first."""
+    examine(folder)
     try:
-        node = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))["model"]
+        node = parse_yaml((folder / "config.yaml").read_text(encoding="utf-8"))["model"]
+        if not isinstance(node, dict):
+            raise ValueError("config.yaml: model is no mapping")
         table = pd.read_csv(folder / "pairs.csv", dtype={"pair_id": str})
         fixed = table[table["method"] == "fixed"]
         values = fixed.filter(like="parameter_").to_numpy(dtype=float)
         fixed = fixed[np.isfinite(values).all(axis=1)]
         fixed = fixed.sort_values("style_score", kind="stable").reset_index(drop=True)
-    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(
             f"{folder} holds no finished job ({error}); give the output folder that a job printed"
         ) from error

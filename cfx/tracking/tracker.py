@@ -354,6 +354,8 @@ class MlflowTracker(Tracker):
         with translate_errors("close the run"):
             if reason:
                 self.store.client.log_batch(self.run_id, tags=_tags({"cfx.failure": reason}))
+            if status == "FINISHED" and self._sweep is not None:
+                _remove_repeated(self.store, self.run_id)
             self.store.client.set_terminated(self.run_id, status)
             if self._parent_id is not None and self._sweep is not None:
                 with self.store.locked():
@@ -451,6 +453,24 @@ def _replace_earlier(store: Store, run_id: str, tags: Mapping[str, str]) -> None
             store.client.set_tag(run.info.run_id, "cfx.replaced_by", run_id)
             for tag in ("cfx.sweep", "mlflow.parentRunId"):
                 store.client.delete_tag(run.info.run_id, tag)
+
+
+def _remove_repeated(store: Store, run_id: str) -> None:
+    """Moves runs to MLflow's trash that a run replaces as it ends, and that say just the same.
+
+    There is one if a job was killed after its run was closed, and before its folder said so.
+    """
+    own = store.client.get_run(run_id)
+    same = f"tags.`cfx.replaced_by` = '{run_id}' and attributes.status = 'FINISHED'"
+    for run in store.client.search_runs([store.experiment_id], same):
+        if run.data.tags.get("cfx.job") != own.data.tags.get("cfx.job"):
+            continue
+        if _written(run.data.metrics) == _written(own.data.metrics):
+            store.client.delete_run(run.info.run_id)
+
+
+def _written(metrics: Mapping[str, float]) -> dict[str, str]:
+    return {name: repr(value) for name, value in metrics.items()}
 
 
 def _is_running(run: Any) -> bool:

@@ -241,6 +241,23 @@ def test_a_job_that_starts_again_goes_on_in_its_run(uri: str, client: Any, tmp_p
     assert len({first.run_id, third.run_id, fourth.run_id}) == 3
 
 
+@pytest.mark.parametrize("loss", [0.5, 0.25])
+def test_a_job_of_a_sweep_that_is_done_twice_is_there_once(
+    loss: float, uri: str, client: Any, tmp_path: Path
+) -> None:
+    """A job may be killed after its run was closed, and before its folder says so."""
+    same = {"tags": {"cfx.folder": str(tmp_path)}, "sweep": "s"}
+    with begin(uri, **same) as first:
+        first.log_metrics({"loss": 0.5, "undefined": float("nan")})
+    with begin(uri, **same) as second:
+        second.log_metrics({"loss": loss, "undefined": float("nan")})
+    assert second.run_id != first.run_id
+    kept = client.get_run(first.run_id)
+    assert kept.data.tags["cfx.replaced_by"] == second.run_id
+    # Other numbers are kept beside the new ones.
+    assert (kept.info.lifecycle_stage == "deleted") == (loss == 0.5)
+
+
 def test_a_run_whose_process_is_gone_is_closed(uri: str, client: Any) -> None:
     with begin(uri, sweep="s") as gone, begin(uri, parameters={"seed": "1"}) as alive:
         dead = subprocess.run(
