@@ -508,7 +508,9 @@ def test_a_signal_that_comes_early_has_its_exit_code(
     """Before the application is there; a machine that is slower is hit even earlier."""
     ready = tmp_path / "ready"
     script = (
-        "import pathlib, sys; from cfx.cli import program;"
+        "import pathlib, signal, sys; from cfx.cli import program;"
+        # Who starts the tests in the background makes their processes deaf to Ctrl-C.
+        " signal.signal(signal.SIGINT, signal.default_int_handler);"
         f" pathlib.Path({str(ready)!r}).touch();"
         " sys.argv = ['cfx', 'debug=quick', 'hydra.run.dir=' + sys.argv[1]]; program()"
     )

@@ -88,6 +88,8 @@ def _cell(metric: MetricInfo, value: float | None) -> str:
     """Returns a number as the table shows it: sums of whole numbers without decimals."""
     if value is None:
         return ""
+    if not math.isfinite(value):
+        return "not defined"
     if metric.summary == "sum" and value == round(value):
         return f"{value:.0f}"
     return f"{value:.3f}"
@@ -109,6 +111,14 @@ def _print_improvements(evaluation: Evaluation, console: Console) -> None:
 
 
 def _print_improvement(i: Improvement, baseline: str, console: Console) -> None:
+    if i.pairs == 0:
+        console.print(
+            f"Improvement of policy over {baseline}, RMSE of speed: not defined for any of"
+            f" {i.undefined} pairs: a simulation diverged, or {baseline} has no error at all.",
+            soft_wrap=True,
+            highlight=False,
+        )
+        return
     interval = "no interval: it needs two drivers"
     if math.isfinite(i.ci95_low):
         interval = f"95 % interval {i.ci95_low:+.1%} to {i.ci95_high:+.1%}"
@@ -123,7 +133,9 @@ def _print_improvement(i: Improvement, baseline: str, console: Console) -> None:
     if i.undefined:
         console.print(
             f"{i.undefined} pairs have no improvement: a simulation diverged,"
-            f" or {baseline} has no error at all."
+            f" or {baseline} has no error at all.",
+            soft_wrap=True,
+            highlight=False,
         )
 
 

@@ -422,7 +422,9 @@ def _begin(store: Store, name: str, parameters: Mapping[str, str], tags: Mapping
         if "cfx.failure" in run.data.tags:
             client.delete_tag(run.info.run_id, "cfx.failure")
     else:
-        run, known = client.create_run(store.experiment_id, run_name=name), {}
+        # With its tags from the start: whoever finds it after a kill knows whose it was.
+        whose = {tag.key: tag.value for tag in _tags(tags)}
+        run, known = client.create_run(store.experiment_id, run_name=name, tags=whose), {}
     run_id = str(run.info.run_id)
     try:
         missing = [Param(key, value) for key, value in parameters.items() if key not in known]

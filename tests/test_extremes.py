@@ -1,0 +1,107 @@
+"""Recordings at the edges of what there is: no number that is none reaches a table without a word.
+
+`test_job.py` has the ordinary ones.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cfx import cli
+from cfx.datasets.tidy import write_tidy
+from cfx.pairs import Pair, PairSet
+
+DT = 0.1
+LENGTH = 5.0
+JOB = (
+    "data=tidy",
+    "data.min_frames=20",
+    "protocol=within_driver",
+    "policy=gru",
+    "policy.hidden_size=4",
+    "learner=imitation",
+    "learner.epochs=1",
+    "optimizer=random",
+    "optimizer.samples=64",
+    "cache.enabled=false",
+    "tracking.enabled=false",
+    "figures.enabled=false",
+)
+
+
+def follower(name: str, frames: int, speed: Callable[[np.ndarray], np.ndarray], gap: float) -> Pair:
+    """Returns somebody who does what their leader did a second ago, from a gap, m."""
+    leader_speed = speed(np.arange(frames) * DT) + np.zeros(frames)
+    own = np.concatenate([np.full(10, leader_speed[0]), leader_speed[:-10]])
+    leader, position = way(leader_speed), way(own) - gap - LENGTH
+    acceleration = [np.gradient(one, DT) for one in (leader_speed, own)]
+    first = (leader, leader_speed, acceleration[0])
+    return Pair(name, "r", "1", name, 0, DT, LENGTH, *first, position, own, acceleration[1])
+
+
+def way(speed: np.ndarray) -> np.ndarray:
+    steps = (speed[1:] + speed[:-1]) / 2 * DT
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+RECORDINGS = {
+    "standstill throughout": [follower(f"p{i}", 300, lambda t: 0 * t, 3.0 + i) for i in range(3)],
+    "60 m/s": [
+        follower(f"p{i}", 300, lambda t, i=i: 60 + 4 * np.sin(t / (3 + i)), 60.0) for i in range(3)
+    ],
+    "gaps of 1 cm": [follower(f"p{i}", 300, lambda t: 1 + 0 * t, 0.01) for i in range(3)],
+    "an hour": [follower("p", 36_000, lambda t: 15 + 6 * np.sin(t / 7), 30.0)],
+    "one window": [
+        follower(f"p{i}", 27, lambda t, i=i: 10 + 2 * np.sin(t / (3 + i)), 20.0) for i in range(2)
+    ],
+    "two drivers": [
+        follower(f"p{i}", 300, lambda t, i=i: 10 + 4 * np.sin(t / (3 + i)), 20.0) for i in range(2)
+    ],
+}
+
+
+@pytest.mark.parametrize("model", ["krauss", "w99", "idm"])
+@pytest.mark.parametrize("recording", RECORDINGS)
+def test_the_edges_of_what_is_recorded(
+    recording: str, model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "pairs.parquet"
+    write_tidy(PairSet(tuple(RECORDINGS[recording]), "test"), path)
+    folder = tmp_path / "job"
+    job = [*JOB, f"model={model}", f"data.path={path}", f"hydra.run.dir={folder}"]
+    if recording == "an hour":
+        job.append("windows.stride=200")  # labels of 36,000 windows take a while
+    code = cli.main(job)
+    out, err = capsys.readouterr()
+    assert code == 0, err
+    assert "nan" not in out
+    metrics = json.loads((folder / "metrics.json").read_text())
+    for method in ("default", "fixed", "policy"):
+        for name in ("rmse_speed", "rmse_gap", "collisions", "jerk"):
+            assert np.isfinite(metrics[f"{name}/{method}"]), name
+    # What has no value is null, and only where a value makes no sense.
+    undefined = {name.split("/")[0] for name, value in metrics.items() if value is None}
+    assert undefined <= {"nrmse_speed", "theil_u", "min_ttc", "rmse_improvement", "steady"}
+    if metrics["rmse_improvement/mean"] is None:
+        assert "not defined for any of 3 pairs" in out
+
+
+def test_the_precision_is_no_part_of_the_result(tmp_path: Path) -> None:
+    """In float32 the same job ends within a thousandth of what it ends with in float64."""
+    path = tmp_path / "pairs.parquet"
+    write_tidy(PairSet(tuple(RECORDINGS["two drivers"]), "test"), path)
+    found = {}
+    for dtype in ("float32", "float64"):
+        folder = tmp_path / dtype
+        job = [*JOB, f"data.path={path}", f"dtype={dtype}"]
+        assert cli.main([*job, f"hydra.run.dir={folder}"]) == 0
+        found[dtype] = json.loads((folder / "metrics.json").read_text())
+    for method in ("default", "fixed"):
+        for name in ("rmse_speed", "rmse_gap"):
+            single, double = (found[one][f"{name}/{method}"] for one in found)
+            assert single == pytest.approx(double, rel=1e-3)
