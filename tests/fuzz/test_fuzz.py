@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -28,6 +29,7 @@ from cfx.datasets.ngsim import NgsimDataset
 from cfx.datasets.tidy import TidyDataset, write_tidy
 from cfx.errors import CfxError
 from cfx.hydra_source import composed, plain
+from cfx.tracking.tracker import MlflowTracker
 from cfx.user_errors import explain, is_user_error
 from tests.drives import straight_pairs
 from tests.sumo.policies import adaptive
@@ -206,6 +208,38 @@ def test_any_saved_policy(data: st.DataObject, tmp_path: Path) -> None:
     try:
         agent = checkpoint.load(tmp_path)
         agent.begin(torch.zeros(1, dtype=torch.int64))
+    except CfxError as error:
+        said(error)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An MLflow store with a run of a sweep."""
+    file = tmp_path_factory.mktemp("store") / "mlflow.db"
+    tags = {"cfx.folder": str(file.parent)}
+    names = {"run_name": "one", "parameters": {"seed": "0"}, "tags": tags, "sweep": "s"}
+    with MlflowTracker.run(f"sqlite:///{file}", **names) as run:
+        run.log_metrics({"loss": 0.5})
+    return file
+
+
+@settings(fuzz, max_examples=max(10, EXAMPLES // 20))
+@given(data=st.data())
+def test_any_mlflow_store(data: st.DataObject, store: Path, tmp_path: Path) -> None:
+    file = tmp_path / "mlflow.db"
+    file.unlink(missing_ok=True)
+    content = bytearray(store.read_bytes())
+    if data.draw(st.booleans()):
+        # SQLite keeps what a table is in the first pages, and much of the others is empty.
+        page = 4096 * data.draw(st.integers(0, len(content) // 4096 - 1))
+        content[page : page + 4096] = damaged(bytes(content[page : page + 4096]), data)
+    else:
+        content = bytearray(damaged(bytes(content), data))
+    file.write_bytes(bytes(content))
+    try:
+        names = {"run_name": "two", "parameters": {"seed": "1"}, "sweep": "s"}
+        with MlflowTracker.run(f"sqlite:///{file}", **names) as run:
+            run.log_metrics({"loss": 0.5})
     except CfxError as error:
         said(error)
 
