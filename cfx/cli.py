@@ -165,10 +165,20 @@ def _report(arguments: Sequence[str]) -> int:
         help="default: report.html in the folder; for several, or a run: here",
     )
     parser.add_argument("--title", help="of the page")
+    parser.add_argument(
+        "--tables", choices=["latex", "csv"], help="write the table of a paper instead of the page"
+    )
+    parser.add_argument(
+        "--group-by",
+        metavar="SETTING",
+        help="with --tables: jobs that differ in this setting alone, for instance seed, share a row"
+        " with mean and standard deviation",
+    )
     options = parser.parse_args(list(arguments))
     from cfx.report.command import report
 
-    for line in report(options.runs, options.output, options.title):
+    chosen = {"tables": options.tables, "group_by": options.group_by}
+    for line in report(options.runs, options.output, options.title, **chosen):
         print(line)
     return 0
 

@@ -5,31 +5,53 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from cfx.errors import ConfigError
 from cfx.plots.words import plural
 from cfx.report.page import write_report
+from cfx.report.paper import FORMS, write_table
 from cfx.report.runs import read_runs
 
 NAME = "report.html"
 
 
-def report(runs: Sequence[str], output: str | None = None, title: str | None = None) -> list[str]:
+def report(
+    runs: Sequence[str],
+    output: str | None = None,
+    title: str | None = None,
+    *,
+    tables: str | None = None,
+    group_by: str | None = None,
+) -> list[str]:
     """Writes the report about some jobs; returns what to tell the user.
 
     Args:
         runs: as `read_runs` takes them.
-        output: the file; None for `report.html` in the only folder that was given, else in the
-            current one.
+        output: the file; None for `report.html` (`.tex`, `.csv`) in the only folder that was given,
+            else in the current one.
         title: of the page; None for one that names the driving models.
+        tables: `latex` or `csv` for the table of a paper instead of the page.
+        group_by: as `write_table` takes it.
 
     Raises:
+        ConfigError: `group_by` goes with `tables` alone, or is no setting of these jobs.
         DataError, TrackingError: the jobs cannot be read.
         OutputError: the page cannot be written.
     """
+    if group_by is not None and tables is None:
+        raise ConfigError(f"--group-by {group_by} goes with --tables latex or --tables csv")
     found = read_runs(runs)
     folder = Path(runs[0]).expanduser()
     home = folder if len(runs) == 1 and folder.is_dir() else Path()
-    path = write_report(found, Path(output).expanduser() if output else home / NAME, title)
+    kind = "Report"
+    if tables is None:
+        path = write_report(found, Path(output).expanduser() if output else home / NAME, title)
+    else:
+        kind, name = "Table", Path(NAME).with_suffix(FORMS[tables])
+        file = Path(output).expanduser() if output else home / name
+        path = write_table(found, file, tables, group_by)
     left_out = ""
-    if found.unfinished:
+    if found.unfinished and tables is None:
         left_out = f"; {len(found.unfinished)} unfinished ones are named in it"
-    return [f"Report of {plural(len(found.jobs), 'job')}{left_out}: {path.absolute()}"]
+    elif found.unfinished:
+        left_out = f"; {len(found.unfinished)} unfinished ones are not in it"
+    return [f"{kind} of {plural(len(found.jobs), 'job')}{left_out}: {path.absolute()}"]

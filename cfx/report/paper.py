@@ -1,0 +1,235 @@
+"""The table of a report for a paper, as LaTeX or CSV: a row for each job, or for jobs alike."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from cfx.errors import ConfigError, OutputError
+from cfx.files import atomic_write
+from cfx.plots.words import short_label
+from cfx.report.job import Job, Runs
+from cfx.report.names import SEPARATOR, differences
+from cfx.tracking.provenance import flatten
+
+FORMS = {"latex": ".tex", "csv": ".csv"}
+"""What a table can be written as, and how its file ends."""
+
+_ABSOLUTE = re.compile(r"(?<![\w.~-])/(?:[^/\s'\",\]]+/)+")
+"""The folders of an absolute path, which nobody else has."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """Jobs that a row sums up: one, or several that differ in one setting.
+
+    Attributes:
+        name: what tells the row from the others.
+        jobs: at least one.
+    """
+
+    name: str
+    jobs: tuple[Job, ...]
+
+    def values(self, name: str, method: str) -> np.ndarray:
+        """Returns a metric of a method in each job, `(jobs,)`."""
+        return np.array([job.metric(name, method) for job in self.jobs])
+
+    def improvements(self, statistic: str, baseline: str) -> np.ndarray:
+        """Returns a statistic of the policy's improvement in each job, `(jobs,)`, a fraction."""
+        return np.array([job.improvement(statistic, baseline) for job in self.jobs])
+
+
+def write_table(runs: Runs, output: Path, form: str, group_by: str | None = None) -> Path:
+    """Writes the table; returns its path.
+
+    Args:
+        runs: at least one finished job.
+        output: the file; what was there is replaced once the new one is complete.
+        form: `latex` or `csv`.
+        group_by: a setting such as `seed`: jobs that differ in nothing else share a row, with mean
+            and standard deviation. None: a row for each job, with its interval over drivers.
+
+    Raises:
+        ConfigError: no job has such a setting.
+        OutputError: the file cannot be written.
+    """
+    rows = rows_of(runs.jobs, group_by)
+    text = latex(rows) if form == "latex" else frame(rows).to_csv(index=False)
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(output) as partial:
+            partial.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(
+            f"{output}: the table cannot be written ({error.strerror or error});"
+            " name another --output"
+        ) from error
+    return output
+
+
+def rows_of(jobs: Sequence[Job], group_by: str | None = None) -> tuple[Row, ...]:
+    """Returns the rows of a table, in the order of the jobs.
+
+    Raises:
+        ConfigError: no job has the setting `group_by`.
+    """
+    ignored = () if group_by is None else (group_by,)
+    if group_by is not None and not any(group_by in flatten(dict(job.config)) for job in jobs):
+        raise ConfigError(
+            f"--group-by {group_by}: no job has this setting; name one as config.yaml does, for"
+            " instance seed or data.max_pairs"
+        )
+    names = _short(differences(jobs, ignored))
+    found: dict[str, list[Job]] = {}
+    for number, (name, job) in enumerate(zip(names, jobs, strict=True)):
+        key = name if group_by is not None or names.count(name) == 1 else f"{name} ({number + 1})"
+        found.setdefault(key, []).append(job)
+    return tuple(Row(name, tuple(alike)) for name, alike in found.items())
+
+
+def _short(parts: Sequence[Sequence[str]]) -> list[str]:
+    """Returns names of as few parts as tell apart what all parts tell apart."""
+    kinds = len({tuple(one) for one in parts})
+    for length in range(1, max(map(len, parts)) + 1):
+        names = [SEPARATOR.join(one[:length]) for one in parts]
+        if len(set(names)) == kinds:
+            return names
+    return [SEPARATOR.join(one) for one in parts]
+
+
+def frame(rows: Sequence[Row]) -> pd.DataFrame:
+    """Returns a table of numbers in SI units, improvements as fractions.
+
+    Columns: `row`, `jobs`, `pairs`, `drivers`; `rmse_speed_mps/METHOD`, `rmse_gap_m/METHOD`,
+    `collisions/METHOD` and `improvement/BASELINE`, each a mean over the row's jobs, with its
+    standard deviation (`.../sd`) where there are several; `improvement/BASELINE/ci95_low` and
+    `ci95_high`, over drivers, where there is one; `version` and `command`.
+    """
+    table = []
+    for row in rows:
+        values: dict[str, object] = {"row": row.name, "jobs": len(row.jobs), **_amounts(row)}
+        for method in _methods(rows):
+            for metric, unit in (("rmse_speed", "_mps"), ("rmse_gap", "_m"), ("collisions", "")):
+                values |= _spread(f"{metric}{unit}/{method}", row.values(metric, method))
+        for baseline in _baselines(rows):
+            name = f"improvement/{baseline}"
+            values |= _spread(name, row.improvements("mean", baseline))
+            if len(row.jobs) == 1:
+                for end in ("ci95_low", "ci95_high"):
+                    values[f"{name}/{end}"] = row.improvements(end, baseline)[0]
+        values["version"] = ", ".join(sorted({job.version for job in row.jobs if job.version}))
+        values["command"] = "; ".join(_command(job) for job in row.jobs)
+        table.append(values)
+    return pd.DataFrame(table)
+
+
+def latex(rows: Sequence[Row]) -> str:
+    r"""Returns a `table` with rules of `booktabs`, and how it came about in comments."""
+    cells = []
+    several = max(len(row.jobs) for row in rows) > 1
+    for row in rows:
+        line = {"": row.name}
+        if several:
+            line["jobs"] = str(len(row.jobs))
+        line["drivers"] = str(_amounts(row)["drivers"])
+        for method in _methods(rows):
+            line[short_label(method)] = _text(row.values("rmse_speed", method))
+        line["gap of the policy [m]"] = _text(row.values("rmse_gap", "policy"), 2)
+        for baseline in _baselines(rows):
+            line[f"over {short_label(baseline)}"] = _improvement(row, baseline)
+        cells.append(line)
+    table = pd.DataFrame(cells).fillna("--")
+    styled = table.style.hide(axis="index").format(escape="latex")
+    styled = styled.format_index(escape="latex", axis=1)
+    spread = "mean and standard deviation over the jobs of a row"
+    if not several:
+        spread = "improvements with their 95 \\% bootstrap interval over drivers"
+    body: str = styled.to_latex(
+        hrules=True,
+        column_format="l" + "r" * (table.shape[1] - 1),
+        position_float="centering",
+        caption=f"RMSE of speed [m/s] by method, in closed loop on the test part of each"
+        f" trajectory; improvement of the policy; {spread}.",
+        label="tab:cfx",
+    )
+    comments = ["% Needs \\usepackage{booktabs}."]
+    for row in rows:
+        for job in row.jobs:
+            said = f"cfx {job.version}: {_command(job)}".replace("\n", " ")
+            comments.append(f"% {row.name}: {said}")
+    return "\n".join([*comments, body])
+
+
+def _amounts(row: Row) -> dict[str, int]:
+    pairs: set[str] = set()
+    drivers: set[str] = set()
+    for job in row.jobs:
+        pairs |= set(job.pairs["pair_id"].astype(str))
+        drivers |= set(job.pairs["driver"].astype(str))
+    return {"pairs": len(pairs), "drivers": len(drivers)}
+
+
+def _methods(rows: Sequence[Row]) -> list[str]:
+    found: dict[str, None] = {}
+    for row in rows:
+        for job in row.jobs:
+            found |= dict.fromkeys(job.meaningful_methods)
+    found.pop("policy", None)
+    return [*found, "policy"]
+
+
+def _baselines(rows: Sequence[Row]) -> list[str]:
+    found: dict[str, None] = {}
+    for row in rows:
+        for job in row.jobs:
+            for baseline in job.baselines():
+                if baseline in {"fixed", "population"}:
+                    found[baseline] = None
+    return list(found)
+
+
+def _spread(name: str, values: np.ndarray) -> dict[str, float]:
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return {name: math.nan}
+    found = {name: float(known.mean())}
+    if len(values) > 1:
+        found[f"{name}/sd"] = float(known.std(ddof=1)) if len(known) > 1 else math.nan
+    return found
+
+
+def _text(values: np.ndarray, digits: int = 3) -> str:
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return "--"
+    if len(known) == 1:
+        return f"{known[0]:.{digits}f}"
+    return f"{known.mean():.{digits}f} ± {known.std(ddof=1):.{digits}f}"
+
+
+def _improvement(row: Row, baseline: str) -> str:
+    values = row.improvements("mean", baseline)
+    known = 100 * values[np.isfinite(values)]
+    if not len(known):
+        return "--"
+    if len(known) > 1:
+        return f"{known.mean():+.1f} ± {known.std(ddof=1):.1f} %"
+    low, high = (100 * row.improvements(end, baseline)[0] for end in ("ci95_low", "ci95_high"))
+    if not math.isfinite(low):
+        return f"{known[0]:+.1f} %"
+    return f"{known[0]:+.1f} % ({low:+.1f} to {high:+.1f})"
+
+
+def _command(job: Job) -> str:
+    """Returns what was typed, without the folders of absolute paths."""
+    if job.overrides is None:
+        return "not known"
+    typed = " ".join(("python -m cfx", *job.overrides))
+    return _ABSOLUTE.sub("", typed)

@@ -1,0 +1,105 @@
+"""The table of a report for a paper."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from cfx.cli import main
+from cfx.report.runs import read_runs
+from tests.report.folders import ACROSS, write_job
+
+SEEDS = (0, 1, 2)
+
+
+@pytest.fixture
+def sweep(tmp_path: Path) -> Path:
+    """Two models, each with three seeds."""
+    for model in ("krauss", "w99"):
+        for seed in SEEDS:
+            folder = tmp_path / "sweep" / f"{model}-{seed}"
+            write_job(folder, model=model, methods=ACROSS, seed=seed, settings={"seed": seed})
+            hydra = folder / ".hydra"
+            hydra.mkdir(exist_ok=True)
+            typed = [f"model={model}", f"seed={seed}", "data.path=/home/ann/secret/pairs.parquet"]
+            (hydra / "overrides.yaml").write_text(yaml.safe_dump(typed))
+    return tmp_path / "sweep"
+
+
+def written(sweep: Path, *arguments: str) -> str:
+    output = sweep.parent / "table"
+    assert main(["report", str(sweep), "--output", str(output), *arguments]) == 0
+    return output.read_text(encoding="utf-8")
+
+
+def test_a_row_of_seeds_has_their_mean_and_spread(sweep: Path) -> None:
+    table = pd.read_csv(io.StringIO(written(sweep, "--tables", "csv", "--group-by", "seed")))
+    assert list(table["row"]) == ["krauss", "w99"]
+    assert list(table["jobs"]) == [3, 3]
+    for model, row in table.set_index("row").iterrows():
+        values, gains = [], []
+        for seed in SEEDS:
+            metrics = json.loads((sweep / f"{model}-{seed}" / "metrics.json").read_text())
+            values.append(metrics["rmse_speed/policy"])
+            gains.append(metrics["rmse_improvement/mean"])
+        assert row["rmse_speed_mps/policy"] == pytest.approx(np.mean(values))
+        assert row["rmse_speed_mps/policy/sd"] == pytest.approx(np.std(values, ddof=1))
+        assert row["improvement/fixed"] == pytest.approx(np.mean(gains))
+
+
+def test_each_job_has_a_row_with_its_interval(sweep: Path) -> None:
+    table = pd.read_csv(io.StringIO(written(sweep, "--tables", "csv")))
+    assert len(table) == 6
+    assert "krauss · seed 1" in set(table["row"])
+    low, high = table["improvement/fixed/ci95_low"], table["improvement/fixed/ci95_high"]
+    assert bool(((low <= table["improvement/fixed"]) & (table["improvement/fixed"] <= high)).all())
+
+
+def test_the_order_of_rows_is_that_of_the_jobs(sweep: Path) -> None:
+    names = [job.name for job in read_runs([str(sweep)]).jobs]
+    table = pd.read_csv(io.StringIO(written(sweep, "--tables", "csv")))
+    assert list(table["row"]) == names
+
+
+def test_latex_has_a_row_each_and_says_how_it_came_about(sweep: Path) -> None:
+    text = written(sweep, "--tables", "latex", "--group-by", "seed")
+    body = text[text.index("\\midrule") : text.index("\\bottomrule")].strip().splitlines()[1:]
+    assert len(body) == 2
+    assert body[0].startswith("krauss & 3 & ")
+    assert body[0].count("±") >= 5
+    columns = text[text.index("\\toprule") :].splitlines()[1].count("&")
+    assert all(line.count("&") == columns for line in body)
+    comments = [line for line in text.splitlines() if line.startswith("%")]
+    assert any("python -m cfx model=w99 seed=2 data.path=pairs.parquet" in one for one in comments)
+    assert "/home/ann" not in text
+
+
+def test_names_are_text_and_no_commands_of_latex(tmp_path: Path) -> None:
+    for number in range(2):
+        settings = {"style": {"cluster": f"a_b%{number}\\input{{x}}"}}
+        write_job(tmp_path / "sweep" / str(number), settings=settings)
+    text = written(tmp_path / "sweep", "--tables", "latex")
+    rows = [line for line in text.splitlines() if "&" in line and not line.startswith("%")]
+    assert any("a\\_b\\%0\\textbackslash" in line for line in rows)
+    assert not any("\\input" in line for line in rows)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--group-by", "seed"], "--group-by seed goes with --tables latex or --tables csv"),
+        (["--tables", "csv", "--group-by", "sed"], "--group-by sed: no job has this setting"),
+    ],
+)
+def test_what_cannot_be_grouped_is_one_sentence(
+    arguments: list[str], said: str, sweep: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["report", str(sweep), *arguments]) == 2
+    assert said in capsys.readouterr().err
+    assert not list(sweep.glob("report.*"))
