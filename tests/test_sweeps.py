@@ -18,6 +18,7 @@ import pytest
 from filelock import FileLock
 
 from cfx import application, sweep
+from cfx.sweep import SweepFolder
 from cfx.tracking import provenance
 
 JOB = """
@@ -295,6 +296,24 @@ def test_a_job_that_a_process_of_a_killed_sweep_still_runs_is_waited_for(tmp_pat
         order.append("mine")
     thread.join()
     assert order == ["other", "mine"]
+
+
+def test_a_sweep_keeps_no_configuration_of_its_jobs(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of two hundred jobs they would take a hundred megabytes."""
+    at_end, kept = SweepFolder.on_job_end, []
+
+    def noted(self: SweepFolder, config: Any, job_return: Any, **options: Any) -> None:
+        assert job_return.cfg is not None
+        at_end(self, config, job_return, **options)
+        kept.append(job_return)
+
+    monkeypatch.setattr(SweepFolder, "on_job_end", noted)
+    assert run("-m", "seed=1,2,3") == 0
+    assert [one.hydra_cfg for one in kept] == [None, None, None]
+    assert [one.cfg for one in kept] == [None, None, None]
+    assert all(isinstance(one.return_value, float) for one in kept)
 
 
 def test_the_summary_compares_jobs_by_what_differs(run: Run, capsys) -> None:

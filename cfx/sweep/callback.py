@@ -8,7 +8,10 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.utils import JobReturn
 from hydra.experimental.callback import Callback
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from cfx import renamed
@@ -34,6 +37,15 @@ class SweepFolder(Callback):
             SweepFolder._current.lead(config)
         except Exception as error:
             raise Refused from error
+
+    def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
+        """Lets go of a job's configurations, which Hydra would keep until the sweep ends.
+
+        They take half a megabyte for each job; what a sweeper asks for is the returned value.
+        """
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            job_return.cfg = None
+            job_return.hydra_cfg = None
 
     @classmethod
     def take(cls) -> Sweep | None:
