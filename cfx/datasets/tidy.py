@@ -147,13 +147,19 @@ def _labels_at(table: TidyTable, row: int) -> dict[str, str]:
     return found
 
 
+_CAMERAS = tuple(Fraction(1001, 1000 * rate) for rate in (24, 30, 48, 60, 120))
+"""Time steps of television's frame rates, s: 30 frames per second are 29.97."""
+
+
 def _simplest(step: float) -> float:
     """Returns the time step that a mean of rounded times stands for.
 
-    It is 0.1 for 0.09999999998, and 1/30 for 0.0333333.
+    It is 0.1 for 0.09999999998, 1/30 for 0.0333333, and 1001/30000 for a camera's 29.97 frames per
+    second.
     """
-    for largest in (100, 10_000):
-        simple = Fraction(step).limit_denominator(largest)
+    candidates = [Fraction(step).limit_denominator(100), *_CAMERAS]
+    candidates.append(Fraction(step).limit_denominator(10_000))
+    for simple in candidates:
         if simple > 0 and abs(float(simple) - step) < 1e-6 * step:
             return float(simple)
     return step

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from cfx.datasets.synthetic import SyntheticDataset
@@ -143,6 +143,9 @@ def test_writing_and_reading_real_pairs_changes_nothing(
 @settings(
     max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
+@example(
+    seed=0, dt=1001 / 30000, first_frame=0, lane=None, name="t.parquet", ids="0"
+)  # 29.97 frames per second
 @given(
     seed=st.integers(0, 10_000),
     dt=st.sampled_from([0.1, 0.04, 1 / 30, 0.2, 1001 / 30000, 0.123]),
