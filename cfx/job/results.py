@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from cfx.style.result import StyleResult
 from cfx.tracking.store import folder_of
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class JobResult:
     """What a job leaves behind; `cfx.load` reads it back from the job's folder.
 
@@ -42,6 +43,21 @@ class JobResult:
     run_id: str = ""
     evaluation: Evaluation | None = field(default=None, repr=False)
     style: StyleResult | None = field(default=None, repr=False)
+
+    def __repr__(self) -> str:
+        """Returns two lines for people: what it is and how well it drives, and where it lies."""
+        pairs = self.pairs["pair_id"].nunique() if "pair_id" in self.pairs else 0
+        said = [f"model={self.policy.model_node['name']}"]
+        said.append(f"policy={self.policy.policy_node['name']}")
+        if pairs:
+            said.append(f"{pairs} pairs")
+        rmse = self.metrics.get("rmse_speed/policy", math.nan)
+        if math.isfinite(rmse):
+            said.append(f"RMSE of speed {rmse:.3f} m/s")
+        mean = self.metrics.get("rmse_improvement/mean", math.nan)
+        if math.isfinite(mean):
+            said.append(f"{mean:+.1%} over driver-specific parameters")
+        return f"JobResult({', '.join(said)},\n  folder={str(self.folder)!r})"
 
 
 def load(folder_or_run: str | Path) -> JobResult:

@@ -70,6 +70,13 @@ def test_each_card_says_what_a_user_must_know(name: str) -> None:
     assert "Valid range" in text
 
 
+def test_what_was_loaded_is_shown_in_two_lines() -> None:
+    lines = repr(cfx.load("cfx://i80-idm")).splitlines()
+    assert len(lines) == 2
+    assert lines[0].startswith("JobResult(model=idm, policy=gru, RMSE of speed 0.57")
+    assert lines[1].strip().startswith("folder=")
+
+
 def test_an_unknown_one_is_one_sentence() -> None:
     with pytest.raises(DataError, match=r"there is no ready-made policy 'i80-idn'\. Did you mean"):
         cfx.load("cfx://i80-idn")
