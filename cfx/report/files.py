@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import pandas as pd
+import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cfx import renamed
@@ -97,7 +98,7 @@ def read_table(path: Path, columns: Iterable[str]) -> pd.DataFrame:
         elif column not in _NAMES:
             try:
                 table[column] = table[column].astype(float)
-            except (TypeError, ValueError) as error:
+            except (TypeError, ValueError, ArithmeticError) as error:
                 raise DataError(
                     f"{path} is damaged: column '{column}' holds something else than numbers"
                     f" ({error})"
@@ -106,7 +107,7 @@ def read_table(path: Path, columns: Iterable[str]) -> pd.DataFrame:
 
 
 def _load(path: Path) -> pd.DataFrame:
-    # pyarrow's and pandas' errors are ValueErrors or OSErrors.
+    # Most of pyarrow's and pandas' errors are ValueErrors or OSErrors.
     try:
         _check_memory(path)
         if path.suffix == ".parquet":
@@ -116,7 +117,7 @@ def _load(path: Path) -> pd.DataFrame:
         empty = {str(column): ["", "nan"] for column in header if column not in _NAMES}
         types: Any = dict.fromkeys(TEXT_COLUMNS, str)
         return pd.read_csv(path, dtype=types, keep_default_na=False, na_values=empty)
-    except (OSError, ValueError, ArithmeticError) as error:
+    except (OSError, ValueError, ArithmeticError, pa.ArrowException) as error:
         raise _unreadable(path, error) from error
 
 

@@ -39,14 +39,14 @@ SCRIPT = "</script><script>alert('ran')</script>"
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("stranger") / "job"
+    folder = tmp_path_factory.mktemp("foreign") / "job"
     assert cli.main([*JOB, f"hydra.run.dir={folder}"]) == 0
     return folder
 
 
 @pytest.fixture
 def folder(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A stranger's folder, beside what is not theirs."""
+    """Somebody else's folder, beside what is not theirs."""
     monkeypatch.chdir(tmp_path)
     copy = tmp_path / "job"
     shutil.copytree(finished, copy)
