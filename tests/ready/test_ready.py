@@ -115,7 +115,7 @@ def test_a_policy_that_is_too_large_or_no_object_is_not_read(
 ) -> None:
     agent = checkpoint.load(ready.FOLDER / NAMES[0] / "policy")
     checkpoint.save(agent, tmp_path)
-    monkeypatch.setattr(job_folder, "_LARGEST_MB", 0.2)
+    monkeypatch.setattr("cfx.job_folder._LARGEST_MB", 0.2)
     with pytest.raises(DataError, match=r"policy\.safetensors has 0 MB, at most 0\.2"):
         checkpoint.load(tmp_path)
     monkeypatch.undo()
