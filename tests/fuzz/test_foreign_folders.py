@@ -13,7 +13,7 @@ from typing import Any
 import pandas as pd
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import cfx
@@ -26,7 +26,7 @@ from cfx.report.runs import read_runs
 from cfx.sumo.driver import Driver
 from cfx.sumo.export import export
 from tests.broken_plugins import QUICK
-from tests.fuzz.test_fuzz import JUNK, damaged, fuzz, leaves, put, said
+from tests.fuzz.test_fuzz import EXAMPLES, JUNK, damaged, fuzz, leaves, put, said
 
 JOB = [one for one in QUICK if not one.startswith(("policy", "protocol", "learner", "data.pairs"))]
 JOB += ["policy=gru", "learner=imitation", "learner.epochs=1", "policy.hidden_size=4"]
@@ -112,7 +112,7 @@ def test_an_honest_folder_is_read_in_every_way(folder: Path) -> None:
     nothing_happened(folder)
 
 
-@fuzz
+@settings(fuzz, max_examples=max(8, EXAMPLES // 5))
 @given(data=st.data())
 def test_any_file_of_a_folder(data: st.DataObject, finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "job"
