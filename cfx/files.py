@@ -12,6 +12,8 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator
 from pydantic_core import PydanticCustomError
 
+from cfx.errors import OutputError
+
 
 def absolute(value: Any) -> Path:
     """Returns an absolute path; `~` is the user's home.
@@ -49,6 +51,29 @@ def atomic_write(path: Path) -> Iterator[Path]:
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def write_output(path: Path, text: str, what: str) -> None:
+    """Writes a text where the user's `--output` names it, whole; makes its folders.
+
+    Args:
+        path: the file; what was there is replaced once the new text is complete.
+        text: of the file.
+        what: it is, for the error: "the report".
+
+    Raises:
+        OutputError: the place cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_dir():
+            raise IsADirectoryError(None, "it is a folder", str(path))
+        with atomic_write(path) as partial:
+            partial.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(
+            f"{path}: {what} cannot be written ({error.strerror or error}); name another --output"
+        ) from error
 
 
 def remove_leftovers(folder: Path) -> None:

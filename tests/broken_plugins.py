@@ -37,7 +37,7 @@ class Bad(DrivingModel):
         return {}
 """
 
-_POLICY = """
+POLICY = """
 import torch
 from cfx import Policy, PolicyNetwork
 
@@ -242,32 +242,32 @@ BROKEN = (
     Broken(
         "policy_nan",
         "policies",
-        _POLICY.format("answer * float('nan')"),
+        POLICY.format("answer * float('nan')"),
         r"forward answers NaN or a number outside \[0, 1\]",
     ),
     Broken(
         "policy_out",
         "policies",
-        _POLICY.format("answer + 1.0"),
+        POLICY.format("answer + 1.0"),
         r"forward answers NaN or a number outside \[0, 1\]",
     ),
     Broken(
         "policy_more",
         "policies",
-        _POLICY.format("torch.cat([answer, answer[..., :1]], -1)"),
+        POLICY.format("torch.cat([answer, answer[..., :1]], -1)"),
         r"forward gives the shape \(3, 2, 4, 6\); it must give"
         r" \(networks, drivers, windows, parameters\), here \(3, 2, 4, 5\)",
     ),
     Broken(
         "policy_float",
         "policies",
-        _POLICY.format("answer.float()"),
+        POLICY.format("answer.float()"),
         r"forward gives torch\.float32 for torch\.float64",
     ),
     Broken(
         "policy_none",
         "policies",
-        _POLICY.replace("return Network(fixed)", "return None"),
+        POLICY.replace("return Network(fixed)", "return None"),
         "build returns a NoneType",
     ),
     Broken(

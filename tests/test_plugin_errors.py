@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +11,9 @@ import pytest
 
 from cfx import cli
 from cfx.plugin_errors import blame
-from tests.broken_plugins import QUICK
+from tests.broken_plugins import POLICY, QUICK
+
+Job = Callable[[str, str, str], tuple[int, str]]
 
 MODEL = """
 import torch
@@ -32,6 +36,27 @@ class Late(DrivingModel):
 """
 
 
+@pytest.fixture
+def job(install: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Job:
+    """Runs a quick job with one component of a third party, a distribution of one module.
+
+    The job gets `GROUP=NAME`, the distribution's name and the module's text; its class is the last
+    part of the text that is a component. It gives the exit code and what stood on stderr.
+    """
+
+    def run(override: str, distribution: str, text: str) -> tuple[int, str]:
+        group, _, name = override.partition("=")
+        module = distribution.replace("-", "_")
+        kind = {"policy": "policies"}.get(group, f"{group}s")
+        target = re.findall(r"^class (\w+)\((?:DrivingModel|Policy|Optimizer)\)", text, re.M)[-1]
+        install(distribution, {f"cfx.{kind}": {name: f"{module}:{target}"}}, {f"{module}.py": text})
+        overrides = [one for one in QUICK if not one.startswith((f"{group}=", f"{group}."))]
+        code = cli.main([*overrides, override, f"hydra.run.dir={tmp_path / 'job'}"])
+        return code, capsys.readouterr().err
+
+    return run
+
+
 @pytest.mark.parametrize(
     ("failure", "said"),
     [
@@ -42,17 +67,9 @@ class Late(DrivingModel):
     ],
 )
 def test_a_model_that_fails_late_is_named_with_its_line(
-    failure: str,
-    said: str,
-    install: Any,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    failure: str, said: str, job: Job, tmp_path: Path
 ) -> None:
-    text = MODEL.replace("{failure}", failure)
-    install("late-models", {"cfx.models": {"late": "late_models:Late"}}, {"late_models.py": text})
-    overrides = [one for one in QUICK if not one.startswith("model=")]
-    code = cli.main([*overrides, "model=late", f"hydra.run.dir={tmp_path / 'job'}"])
-    err = capsys.readouterr().err
+    code, err = job("model=late", "late-models", MODEL.replace("{failure}", failure))
     assert code == 2
     assert "late-models" in err
     assert "failed in late_models.py, line 1" in err
@@ -91,70 +108,34 @@ class Mixed(Optimizer):
 """
 
 
-def test_an_optimizer_that_mixes_up_candidates_and_losses_is_refused(
-    install: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    files = {"mixed_optimizers.py": MIXED}
-    install("mixed-optimizers", {"cfx.optimizers": {"mixed": "mixed_optimizers:Mixed"}}, files)
-    overrides = [one for one in QUICK if not one.startswith("optimizer")]
-    code = cli.main([*overrides, "optimizer=mixed", f"hydra.run.dir={tmp_path / 'job'}"])
-    err = capsys.readouterr().err
+def test_an_optimizer_that_mixes_up_candidates_and_losses_is_refused(job: Job) -> None:
+    code, err = job("optimizer=mixed", "mixed-optimizers", MIXED)
     assert code == 2
     assert "mixed-optimizers" in err
     assert "candidates with losses that are not theirs" in err
 
 
-def test_a_model_that_changes_its_inputs_is_refused(
-    install: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_model_that_changes_its_inputs_is_refused(job: Job) -> None:
     text = MODEL.replace("        STEPS.append(1)\n", "        leader.speed.mul_(0.9)\n")
     text = text.replace("        if len(STEPS) > 300:\n            {failure}\n", "")
-    install("late-models", {"cfx.models": {"late": "late_models:Late"}}, {"late_models.py": text})
-    overrides = [one for one in QUICK if not one.startswith("model=")]
-    assert cli.main([*overrides, "model=late", f"hydra.run.dir={tmp_path / 'job'}"]) == 2
-    err = capsys.readouterr().err
+    code, err = job("model=late", "late-models", text)
+    assert code == 2
     assert "late-models" in err
     assert "a step changes leader.speed in place" in err
 
 
-POLICY = """
-import torch
-from cfx import Policy, PolicyNetwork, PolicySettings
+LATE_NAN = """
+CALLS = []
 
-class Nan(Policy):
-    schema = PolicySettings
-    trainable = False
-
-    def build(self, features, default, fixed, generator):
-        return Network(fixed)
-
-class Network(PolicyNetwork):
-    def __init__(self, fixed):
-        super().__init__()
-        self.register_buffer("fixed", fixed)
-        self.calls = 0
-
-    def initial_state(self, networks, drivers):
-        return self.fixed.new_zeros((networks, drivers, 0))
-
-    def forward(self, tokens, state):
-        self.calls += 1
-        shape = (*tokens.shape[:3], self.fixed.shape[1])
-        answer = self.fixed[:, None, None].expand(shape)
-        if self.calls > 6:
-            answer = answer * float("nan")
-        return answer, state
+def late(answer):
+    CALLS.append(1)
+    return answer * float("nan") if len(CALLS) > 6 else answer
 """
 
 
-def test_a_policy_that_answers_no_number_is_refused(
-    install: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    files = {"nan_policies.py": POLICY}
-    install("nan-policies", {"cfx.policies": {"void": "nan_policies:Nan"}}, files)
-    overrides = [one for one in QUICK if not one.startswith("policy=")]
-    assert cli.main([*overrides, "policy=void", f"hydra.run.dir={tmp_path / 'job'}"]) == 2
-    err = capsys.readouterr().err
+def test_a_policy_that_answers_no_number_is_refused(job: Job) -> None:
+    code, err = job("policy=void", "nan-policies", POLICY.format("late(answer)") + LATE_NAN)
+    assert code == 2
     assert "nan-policies" in err
     assert "answer numbers that are not finite" in err
 

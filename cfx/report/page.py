@@ -7,8 +7,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from cfx.errors import OutputError
-from cfx.files import atomic_write
+from cfx.files import write_output
 from cfx.plots.look import CLUSTER_COLOURS, COLOURS
 from cfx.plots.plotly.figure import Plot
 from cfx.plots.plotly.html import embedded_json, inline_scripts, security_policy
@@ -32,18 +31,7 @@ def write_report(runs: Runs, output: Path, title: str | None = None) -> Path:
     Raises:
         OutputError: the page cannot be written.
     """
-    page = render(runs, title)
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        if output.is_dir():
-            raise IsADirectoryError(None, "it is a folder", str(output))
-        with atomic_write(output) as partial:
-            partial.write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise OutputError(
-            f"{output}: the report cannot be written ({error.strerror or error});"
-            " name another --output"
-        ) from error
+    write_output(output, render(runs, title), "the report")
     return output
 
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from cfx.errors import ConfigError, OutputError
-from cfx.files import atomic_write
+from cfx.errors import ConfigError
+from cfx.files import write_output
 from cfx.plots.words import short_label
-from cfx.report.job import Job, Runs
+from cfx.report.job import Job, Runs, any_baselines
 from cfx.report.names import SEPARATOR, differences
 from cfx.tracking.provenance import flatten
 
@@ -62,15 +62,7 @@ def write_table(runs: Runs, output: Path, form: str, group_by: str | None = None
     """
     rows = rows_of(runs.jobs, group_by)
     text = latex(rows) if form == "latex" else frame(rows).to_csv(index=False)
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_write(output) as partial:
-            partial.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise OutputError(
-            f"{output}: the table cannot be written ({error.strerror or error});"
-            " name another --output"
-        ) from error
+    write_output(output, text, "the table")
     return output
 
 
@@ -186,13 +178,8 @@ def _methods(rows: Sequence[Row]) -> list[str]:
 
 
 def _baselines(rows: Sequence[Row]) -> list[str]:
-    found: dict[str, None] = {}
-    for row in rows:
-        for job in row.jobs:
-            for baseline in job.baselines():
-                if baseline in {"fixed", "population"}:
-                    found[baseline] = None
-    return list(found)
+    found = any_baselines(job for row in rows for job in row.jobs)
+    return [baseline for baseline in found if baseline in {"fixed", "population"}]
 
 
 def _spread(name: str, values: np.ndarray) -> dict[str, float]:

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from cfx import registry
-from cfx.errors import ConfigError, DataError, OutputError
-from cfx.files import atomic_write
+from cfx.errors import ConfigError, DataError
+from cfx.files import write_output
 from cfx.job_folder import examine, parse_yaml
 from cfx.models.base import DrivingModel
 from cfx.models.vtype import InSumo, VType
@@ -52,14 +52,7 @@ def export(run: str | Path, output: str | Path | None = None) -> list[str]:
     node, table = _read(folder)
     kind, notes = vtypes(node, table)
     path = Path(output).expanduser() if output else home / NAME
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_write(path) as partial:
-            partial.write_text(_xml(table, kind, notes), encoding="utf-8")
-    except OSError as error:
-        raise OutputError(
-            f"{path} cannot be written ({error.strerror or error}); name another --output"
-        ) from error
+    write_output(path, _xml(table, kind, notes), "the list of vTypes")
     first = quoteattr(str(table["cluster"].iloc[0]))
     counts = []
     for name, count in table.groupby("cluster", sort=False).size().items():
