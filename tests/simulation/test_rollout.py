@@ -319,6 +319,8 @@ def test_compiled_equals_eager_and_shapes_do_not_recompile(monkeypatch: pytest.M
     monkeypatch.setattr(rollout, "tile_size", lambda like: 64)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        # PyTorch's advice to take a newer Python than 3.13.0.
+        warnings.filterwarnings("ignore", "Guards may run slower", RuntimeWarning)
         # The shapes of a job: windows of many candidates, one candidate for each window, last
         # chunks, whole drives.
         for batch, frames in (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import warnings
 from collections.abc import Callable, Mapping
 
 import torch
@@ -326,7 +327,9 @@ def can_be_compiled_as_one_graph(model: DrivingModel) -> None:
     whole = torch.compile(  # type: ignore[call-overload]  # torch's overloads leave isolate_recompiles out
         step, fullgraph=True, backend="aot_eager", isolate_recompiles=True
     )
-    with torch.no_grad():
+    with torch.no_grad(), warnings.catch_warnings():
+        # PyTorch's advice to take a newer Python than 3.13.0; it says nothing about the model.
+        warnings.filterwarnings("ignore", "Guards may run slower", RuntimeWarning)
         try:
             compiled = whole(follower, leader, p)
         except Exception as error:  # the compiler's errors have no common base
