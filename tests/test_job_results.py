@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from cfx.evaluation.result import Evaluation
+from cfx.evaluation.result import Evaluation, Improvement
 from cfx.job.console import report
 from cfx.job.output import Output, write_further_tables
 from cfx.job.results import JobResult
@@ -23,14 +23,14 @@ class Untracked:
         return ()
 
 
-def said(evaluation: Evaluation, *, has_constant_baseline: bool = True) -> str:
+def said(evaluation: Evaluation, *, has_constant_baseline: bool = True, width: int = 200) -> str:
     """Returns what a job prints."""
     out = io.StringIO()
     result = JobResult(evaluation.metrics(), evaluation.table, cast(Any, None), (), Path("folder"))
     report(
         result,
         evaluation,
-        Console(file=out, width=200),
+        Console(file=out, width=width),
         cast(Any, Untracked()),
         has_constant_baseline=has_constant_baseline,
     )
@@ -62,10 +62,59 @@ def test_hard_braking_and_parameters_at_bounds_are_told() -> None:
 
 def test_a_model_that_follows_nobody_is_not_compared_with_its_fixed_parameters() -> None:
     evaluation = make_results(pairs=4, frames=20).evaluation
-    assert "Improvement of policy over fixed" in said(evaluation)
+    assert "Improvement of the policy over other methods" in said(evaluation)
     text = said(evaluation, has_constant_baseline=False)
     assert "Improvement" not in text
     assert "compare the policy's RMSE with other jobs'" in text
+
+
+def improvement(**changes: Any) -> Improvement:
+    known = Improvement(0.325, 0.363, 0.421, 0.211, 0.433, 0.85, 3.8e-6, 40, 0, 40)
+    return dataclasses.replace(known, **changes)
+
+
+def compared(**improvements: Improvement) -> str:
+    """Returns what is said of improvements over baselines."""
+    evaluation = make_results(pairs=4, frames=20).evaluation
+    return said(dataclasses.replace(evaluation, improvements=improvements))
+
+
+def row(text: str, over: str) -> list[str]:
+    """Returns the cells of the row of a baseline in the table of improvements."""
+    table = text.partition("Improvement of the policy")[2]
+    line = next(line for line in table.splitlines() if line.startswith(f"│ {over} "))
+    return [cell.strip() for cell in line.strip("│").split("│")]
+
+
+def test_improvements_are_a_table_in_percent_that_fits_80_columns() -> None:
+    gains = {"fixed": improvement(), "population": improvement(mean=-0.05, win_rate=0.25)}
+    evaluation = make_results(pairs=4, frames=20).evaluation
+    evaluation = dataclasses.replace(
+        evaluation,
+        improvements=gains,
+        steady_improvements={"fixed": improvement()},
+        full_trajectory_improvements={"population": improvement()},
+    )
+    text = said(evaluation, width=80)
+    cells = ["+32.5", "+21.1 to +43.3", "+42.1", "34 of 40", "3.8e-06"]
+    assert row(text, "fixed") == ["fixed", *cells]
+    assert row(text, "fixed, after 5 s") == ["fixed, after 5 s", *cells]
+    assert row(text, "population, full") == ["population, full", *cells]
+    assert row(text, "population")[1:] == ["-5.0", cells[1], cells[2], "10 of 40", cells[4]]
+    assert "say little about other drivers" not in text
+
+
+def test_few_drivers_and_undefined_improvements_are_said() -> None:
+    nan = float("nan")
+    text = compared(
+        fixed=improvement(pairs=1, drivers=1, ci95_low=nan, ci95_high=nan, p_value=nan),
+        population=improvement(pairs=0, drivers=0, undefined=4),
+    )
+    assert row(text, "fixed")[2:] == ["one driver", "+42.1", "1 of 1", ""]
+    assert row(text, "population")[1] == "not defined"
+    assert "Over population: 4 of 4 pairs have no improvement" in text
+    assert "1 driver: with fewer than 20" in text
+    assert "nan" not in text
 
 
 @pytest.mark.parametrize("present", [True, False])

@@ -1,4 +1,4 @@
-"""What a job prints when it is done: a table of the methods, then a few sentences."""
+"""What a job prints when it is done: tables of methods and improvements, then some sentences."""
 
 from __future__ import annotations
 
@@ -12,13 +12,16 @@ from rich.table import Table
 
 from cfx.evaluation.result import Evaluation, Improvement
 from cfx.job.results import JobResult
-from cfx.metrics.base import MetricInfo, key_of
+from cfx.metrics.base import TRANSIENT_S, MetricInfo, key_of
 
 if TYPE_CHECKING:
     from cfx.tracking.tracker import Tracker
 
 _SCOPES = {"test": "test part", "full_trajectory": "full trajectories"}
 """The scopes that have a table of their own, in words."""
+
+_FEW_DRIVERS = 20
+"""With fewer, a bootstrap interval over drivers is too narrow."""
 
 
 def report(
@@ -96,47 +99,75 @@ def _cell(metric: MetricInfo, value: float | None) -> str:
 
 
 def _print_improvements(evaluation: Evaluation, console: Console) -> None:
-    """Prints a sentence for each comparison of the policy with a baseline."""
-    test, full = evaluation.improvements, evaluation.full_trajectory_improvements
-    sentences = [
-        (test, "fixed", "fixed"),
-        (evaluation.steady_improvements, "fixed", "fixed after the transient"),
-        (test, "shrunk", "shrunk (the driver's own, shrunk towards the default)"),
-        (test, "population", "population"),
-        (full, "population", "population on full trajectories"),
-    ]
-    for improvements, baseline, words in sentences:
-        if baseline in improvements:
-            _print_improvement(improvements[baseline], words, console)
-
-
-def _print_improvement(i: Improvement, baseline: str, console: Console) -> None:
-    if i.pairs == 0:
-        console.print(
-            f"Improvement of policy over {baseline}, RMSE of speed: not defined for any of"
-            f" {i.undefined} pairs: a simulation diverged, or {baseline} has no error at all.",
-            soft_wrap=True,
-            highlight=False,
-        )
+    """Prints a table of the comparisons of the policy with baselines, and what limits it."""
+    compared = _comparisons(evaluation)
+    if not compared:
         return
-    interval = "no interval: it needs two drivers"
-    if math.isfinite(i.ci95_low):
-        interval = f"95 % interval {i.ci95_low:+.1%} to {i.ci95_high:+.1%}"
-    pairs = "1 pair" if i.pairs == 1 else f"{i.pairs} pairs"
-    console.print(
-        f"Improvement of policy over {baseline}, RMSE of speed: mean {i.mean:+.1%} ({interval}),"
-        f" trimmed mean {i.trimmed_mean:+.1%}, median {i.median:+.1%};"
-        f" better for {i.win_rate:.0%} of {pairs}; Wilcoxon p = {i.p_value:.2g}",
-        soft_wrap=True,
-        highlight=False,
-    )
-    if i.undefined:
+    console.print(improvements_table(compared))
+    for over, one in compared.items():
+        if one.undefined:
+            console.print(
+                f"Over {over}: {one.undefined} of {one.pairs + one.undefined} pairs have no"
+                f" improvement: a simulation diverged, or {over.partition(',')[0]} has no error at"
+                " all.",
+                soft_wrap=True,
+                highlight=False,
+            )
+    drivers = max(one.drivers for one in compared.values())
+    if 0 < drivers < _FEW_DRIVERS:
+        plural = "" if drivers == 1 else "s"
         console.print(
-            f"{i.undefined} pairs have no improvement: a simulation diverged,"
-            f" or {baseline} has no error at all.",
+            f"{drivers} driver{plural}: with fewer than {_FEW_DRIVERS}, means and intervals say"
+            " little about other drivers.",
             soft_wrap=True,
             highlight=False,
         )
+
+
+def _comparisons(evaluation: Evaluation) -> dict[str, Improvement]:
+    """Returns what the table compares, by what it says in its first column."""
+    test, full = evaluation.improvements, evaluation.full_trajectory_improvements
+    steady = f"fixed, after {TRANSIENT_S:g} s"
+    candidates = [
+        (test, "fixed", "fixed"),
+        (evaluation.steady_improvements, "fixed", steady),
+        (test, "shrunk", "shrunk"),
+        (test, "population", "population"),
+        (full, "population", "population, full"),
+    ]
+    found = {}
+    for improvements, baseline, words in candidates:
+        if baseline in improvements:
+            found[words] = improvements[baseline]
+    return found
+
+
+def improvements_table(compared: Mapping[str, Improvement]) -> Table:
+    """Returns a row per baseline: mean, interval, median, and for how many pairs it is better.
+
+    It fits 80 columns. The other statistics are in `metrics.json` and in the report.
+    """
+    title = "Improvement of the policy over other methods, RMSE of speed, %"
+    table = Table(title=title, title_justify="left")
+    table.add_column("over")
+    for column in ("mean", "95 % interval", "median", "better for", "p"):
+        table.add_column(column, justify="right")
+    for over, one in compared.items():
+        if one.pairs == 0:
+            table.add_row(over, "not defined")
+            continue
+        interval = "one driver"
+        if math.isfinite(one.ci95_low):
+            interval = f"{100 * one.ci95_low:+.1f} to {100 * one.ci95_high:+.1f}"
+        table.add_row(
+            over,
+            f"{100 * one.mean:+.1f}",
+            interval,
+            f"{100 * one.median:+.1f}",
+            f"{one.win_rate * one.pairs:.0f} of {one.pairs}",
+            f"{one.p_value:.2g}" if math.isfinite(one.p_value) else "",
+        )
+    return table
 
 
 def _print_safety(evaluation: Evaluation, metrics: Mapping[str, float], console: Console) -> None:
