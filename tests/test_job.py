@@ -81,6 +81,7 @@ def test_the_folder_holds_what_the_contract_says(finished: cfx.JobResult) -> Non
         "drives.png",
         "chosen_parameters.png",
         "improvement_per_driver.png",
+        "calibration.png",
         "learning_curve.png",
     }
     assert not [name for name in names if Path(name).name.startswith(".")]

@@ -23,7 +23,13 @@ class Untracked:
         return ()
 
 
-def said(evaluation: Evaluation, *, has_constant_baseline: bool = True, width: int = 200) -> str:
+def said(
+    evaluation: Evaluation,
+    *,
+    has_constant_baseline: bool = True,
+    adapts: bool = True,
+    width: int = 200,
+) -> str:
     """Returns what a job prints."""
     out = io.StringIO()
     result = JobResult(evaluation.metrics(), evaluation.table, cast(Any, None), (), Path("folder"))
@@ -33,6 +39,7 @@ def said(evaluation: Evaluation, *, has_constant_baseline: bool = True, width: i
         Console(file=out, width=width),
         cast(Any, Untracked()),
         has_constant_baseline=has_constant_baseline,
+        adapts=adapts,
     )
     return out.getvalue()
 
@@ -66,6 +73,12 @@ def test_a_model_that_follows_nobody_is_not_compared_with_its_fixed_parameters()
     text = said(evaluation, has_constant_baseline=False)
     assert "Improvement" not in text
     assert "compare the policy's RMSE with other jobs'" in text
+
+
+def test_constant_parameters_are_a_calibration_and_not_compared_with_themselves() -> None:
+    text = said(make_results(pairs=4, frames=20).evaluation, adapts=False)
+    assert "this is a calibration, without adaptation" in text
+    assert "Improvement" not in text
 
 
 def improvement(**changes: Any) -> Improvement:

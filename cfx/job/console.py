@@ -31,6 +31,7 @@ def report(
     tracker: Tracker,
     *,
     has_constant_baseline: bool = True,
+    adapts: bool = True,
 ) -> None:
     """Prints the table, where the results are and how to open them.
 
@@ -40,11 +41,17 @@ def report(
         console: where it is printed.
         tracker: says how to open the job's run.
         has_constant_baseline: as `DrivingModel.has_constant_baseline`.
+        adapts: as `Policy.adapts`.
     """
     console.print(methods_table(evaluation, result.metrics))
     if evaluation.full_trajectory_improvements:
         console.print(methods_table(evaluation, result.metrics, "full_trajectory"))
-    if has_constant_baseline:
+    if not adapts:
+        text = (
+            "The policy keeps its parameters constant: this is a calibration, without adaptation."
+        )
+        console.print(text, soft_wrap=True)
+    elif has_constant_baseline:
         _print_improvements(evaluation, console)
     else:
         text = (

@@ -200,9 +200,21 @@ def write_further_tables(output: Output, evaluation: Evaluation) -> list[Path]:
 
 
 def write_figures(
-    output: Output, config: JobConfig, style: StyleResult, protocol_result: ProtocolResult
+    output: Output,
+    config: JobConfig,
+    style: StyleResult,
+    protocol_result: ProtocolResult,
+    *,
+    adapts: bool,
 ) -> list[Path]:
     """Writes the figures, if the configuration wants any; returns their paths.
+
+    Args:
+        output: the job's folder.
+        config: of the job.
+        style: of its drivers.
+        protocol_result: what is drawn.
+        adapts: as `Policy.adapts`.
 
     Raises:
         OutputError: a file cannot be written.
@@ -216,7 +228,11 @@ def write_figures(
         def write_all() -> None:
             paths.extend(
                 write.write_figures(
-                    folder, protocol_result.evaluation, style, protocol_result.curves
+                    folder,
+                    protocol_result.evaluation,
+                    style,
+                    protocol_result.curves,
+                    adapts=adapts,
                 )
             )
 
@@ -260,6 +276,7 @@ def write_provenance(
     protocol_result: ProtocolResult,
     *,
     has_constant_baseline: bool,
+    adapts: bool,
     objective: Mapping[str, str],
 ) -> None:
     """Writes `data.json`: where the data came from, and what a report must know of the model.
@@ -286,6 +303,7 @@ def write_provenance(
         "dropped": dropped,
         "parameters": parameters,
         "has_constant_baseline": has_constant_baseline,
+        "adapts": adapts,
         "objective": dict(objective),
         "transient_s": TRANSIENT_S,
         "metrics": [metric.to_json() for metric in evaluation.measured],

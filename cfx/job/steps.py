@@ -100,6 +100,7 @@ def take_steps(
         console,
         tracker,
         has_constant_baseline=parts.model.has_constant_baseline,
+        adapts=parts.policy.adapts,
     )
     return result
 
@@ -203,13 +204,16 @@ def _keep(
     policy_folder = output.folder / "policy"
     further = files.write_tables(output, pairs, style, protocol_result)
     output.run(lambda: checkpoint.save(protocol_result.policy, policy_folder))
-    figures = files.write_figures(output, config, style, protocol_result)
+    figures = files.write_figures(
+        output, config, style, protocol_result, adapts=parts.policy.adapts
+    )
     demo = files.write_demo(output, config, pairs, protocol_result)
     files.write_provenance(
         output,
         pairs,
         protocol_result,
         has_constant_baseline=parts.model.has_constant_baseline,
+        adapts=parts.policy.adapts,
         objective={"name": config.objective["name"], "unit": parts.objective.unit},
     )
     # Before MLflow, so that no failure there loses it.

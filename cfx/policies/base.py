@@ -74,12 +74,15 @@ class Policy(Component):
 
     Attributes:
         trainable: whether a learner must train what `build` returns.
+        adapts: whether the parameters may change while a vehicle drives. Jobs whose policy does not
+            adapt are calibrations: nothing is compared with itself.
     """
 
     kind = "policy"
     schema: ClassVar[type[Settings]] = PolicySettings
     settings: Settings
     trainable: ClassVar[bool] = True
+    adapts: ClassVar[bool] = True
 
     def __init__(self, settings: Settings | None = None, **options: object) -> None:
         super().__init__(settings, **options)

@@ -16,6 +16,7 @@ class FixedPolicy(Policy):
 
     schema: ClassVar[type[Settings]] = Settings
     trainable = False
+    adapts = False
 
     def build(
         self, features: int, default: Tensor, fixed: Tensor, generator: torch.Generator

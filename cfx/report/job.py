@@ -102,6 +102,14 @@ class Job:
         return self.methods if self.has_constant_baseline else ("policy",)
 
     @property
+    def adapts(self) -> bool:
+        """Whether its policy may change the parameters; if not, the job is a calibration."""
+        known = self.data.get("adapts")
+        if isinstance(known, bool):
+            return known
+        return self.component("policy") not in {"fixed", "default"}
+
+    @property
     def has_constant_baseline(self) -> bool:
         """Whether the model follows its leader with constant parameters: those are baselines."""
         return renamed.data(self.data).get("has_constant_baseline") is not False
@@ -142,12 +150,12 @@ class Job:
     def baselines(self, scope: str = TEST) -> tuple[str, ...]:
         """Returns what the policy was compared with, driver-specific calibration first.
 
-        It is empty if `has_constant_baseline` is false.
+        It is empty if `has_constant_baseline` or `adapts` is false.
 
         Args:
             scope: the part of the trajectories.
         """
-        if not self.has_constant_baseline:
+        if not (self.has_constant_baseline and self.adapts):
             return ()
         found: list[str] = []
         for method in ("fixed", *self.methods):
@@ -283,6 +291,16 @@ class Origin:
 
 def with_baseline(jobs: Iterable[Job]) -> list[Job]:
     """Returns the jobs whose policy is compared with constant parameters."""
+    return [job for job in with_constant_baseline(jobs) if job.adapts]
+
+
+def calibrations(jobs: Iterable[Job]) -> list[Job]:
+    """Returns the jobs whose parameters are constant; nothing in them adapts."""
+    return [job for job in with_constant_baseline(jobs) if not job.adapts]
+
+
+def with_constant_baseline(jobs: Iterable[Job]) -> list[Job]:
+    """Returns the jobs whose model follows its leader with constant parameters."""
     return [job for job in jobs if job.has_constant_baseline]
 
 

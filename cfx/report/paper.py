@@ -42,8 +42,15 @@ class Row:
         return np.array([job.metric(name, method) for job in self.jobs])
 
     def improvements(self, statistic: str, baseline: str) -> np.ndarray:
-        """Returns a statistic of the policy's improvement in each job, `(jobs,)`, a fraction."""
-        return np.array([job.improvement(statistic, baseline) for job in self.jobs])
+        """Returns a statistic of the policy's improvement in each job, `(jobs,)`, a fraction.
+
+        NaN for jobs that do not compare their policy with the baseline.
+        """
+        values = np.full(len(self.jobs), math.nan)
+        for place, job in enumerate(self.jobs):
+            if baseline in job.baselines():
+                values[place] = job.improvement(statistic, baseline)
+        return values
 
 
 def write_table(runs: Runs, output: Path, form: str, group_by: str | None = None) -> Path:

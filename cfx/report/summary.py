@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cfx.plots.words import explained, percent, plural
-from cfx.report.job import Job, with_baseline, without_baseline
+from cfx.plots.words import explained, percent, plural, short_label
+from cfx.report.job import Job, calibrations, with_baseline, without_baseline
 
 _MOST = 3
 """Up to so many jobs have a sentence each."""
@@ -22,6 +22,13 @@ def summary(jobs: Sequence[Job]) -> list[str]:
     )
     compared = with_baseline(jobs)
     references = [_reference(job) for job in without_baseline(jobs)]
+    constant = calibrations(jobs)
+    if not compared and not references:
+        first = f"{_amount(jobs)}: how close does the driving model come with constant parameters?"
+    if len(constant) <= _MOST:
+        references += [_calibration(job) for job in constant]
+    else:
+        references.append(f"{len(constant)} jobs are calibrations, without adaptation.")
     if len(compared) <= _MOST:
         return [first, *map(_verdict, compared), *references]
     best = max(compared, key=_mean_for_ranking)
@@ -56,6 +63,19 @@ def _reference(job: Job) -> str:
     return (
         f"{job.name}: the policy sets the acceleration itself. RMSE of speed {speed:.3f} m/s, of"
         f" gap {gap:.2f} m: an upper reference for the models that follow."
+    )
+
+
+def _calibration(job: Job) -> str:
+    """Says how close constant parameters come."""
+    errors = []
+    for method in job.methods:
+        error = job.metric("rmse_speed", method)
+        if method != "policy" and np.isfinite(error):
+            errors.append(f"{short_label(method)} {error:.3f}")
+    return (
+        f"{job.name}: a calibration; its parameters stay constant. RMSE of speed (m/s):"
+        f" {', '.join(errors)}."
     )
 
 

@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cfx.evaluation.result import Evaluation
+from cfx.plots.choice.calibration import correlations, parameter_spreads
 from cfx.plots.choice.errors import error_panels
 from cfx.plots.choice.history import amounts_of, history_curves
 from cfx.plots.choice.improvements import improvement_bars
@@ -23,6 +24,7 @@ from cfx.plots.choice.style import style_histogram
 from cfx.plots.choice.trajectories import PairPanels, pair_panels, parameter_axes
 from cfx.plots.look import colour_of
 from cfx.plots.matplotlib import figures
+from cfx.plots.matplotlib.calibration import draw_calibration
 from cfx.plots.matplotlib.errors import draw_errors
 from cfx.plots.matplotlib.history import draw_history
 from cfx.plots.matplotlib.improvements import draw_improvements
@@ -30,6 +32,7 @@ from cfx.plots.matplotlib.learning import draw_learning
 from cfx.plots.matplotlib.platoon import draw_platoons
 from cfx.plots.matplotlib.style import draw_style
 from cfx.plots.matplotlib.trajectories import draw_pairs, draw_parameters
+from cfx.plots.plotly.calibration import calibration_plot
 from cfx.plots.plotly.errors import errors_plot
 from cfx.plots.plotly.history import history_plot
 from cfx.plots.plotly.improvements import improvements_view
@@ -260,3 +263,30 @@ def test_the_report_of_a_job_shows_the_pairs_of_its_figures(tmp_path: Path) -> N
     titles = "\n".join(text.get_text() for axes in figure.axes for text in axes.texts)
     for one in ranked:
         assert f"{one.rank} pair, {one.pair_id}" in titles
+
+
+def test_calibrated_parameters_have_the_same_places_and_correlations() -> None:
+    evaluation = make_results(
+        pairs=9, frames=20, methods=("default", "population", "fixed")
+    ).evaluation
+    axes = parameter_axes(evaluation.names, evaluation.units, evaluation.bounds)
+    spreads = parameter_spreads(evaluation.table, axes)
+    assert len(spreads) == len(axes)
+    table = correlations(evaluation.table, axes)
+    figure = draw_calibration(spreads, table)
+    views = calibration_plot(spreads, table).views
+    drawn, image = figure.axes[:2]
+    for name in ("fixed", "population", "default"):
+        places = []
+        for line in drawn.lines:
+            if line.get_color() == colour_of(name):
+                places.append(np.asarray(line.get_xdata(), dtype=float))
+        (trace,) = [
+            one
+            for one in views["values between the bounds"]["data"]
+            if one["marker"]["color"] == colour_of(name)
+        ]
+        np.testing.assert_allclose(np.concatenate(places), numbers(trace["x"]))
+    heat = views["rank correlation"]["data"][0]
+    values = np.asarray(image.images[0].get_array())
+    np.testing.assert_allclose(values, numbers(heat["z"]).reshape(values.shape))

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cfx.plots.choice.calibration import correlations, parameter_spreads, spread_offsets
 from cfx.plots.choice.common import natural_order
 from cfx.plots.choice.improvements import WORST_WITHOUT_CUT, improvement_axis, improvement_bars
 from cfx.plots.choice.jobs import error_dots
 from cfx.plots.choice.pairs import evenly_spread, rank_pairs
 from cfx.plots.choice.style import style_histogram
+from cfx.plots.choice.trajectories import ParameterAxis
 from cfx.plots.words import common_prefix, scope_label, short
 
 GAIN = st.floats(-50, 1) | st.sampled_from([np.nan, -np.inf])
@@ -81,3 +84,48 @@ def test_names() -> None:
     assert sorted(["a/11", "a/9"], key=natural_order) == ["a/9", "a/11"]
     assert scope_label("steady", 4.0) == "test part after the first 4 s"
     assert short("abcdefghij", 7) == "abc…hij"
+
+
+def calibrated(values: list[float]) -> pd.DataFrame:
+    """A table of pairs: driver-specific values of `tau`, `a` with the opposite order, defaults."""
+    rows = []
+    for value in values:
+        rows.append({"method": "fixed", "parameter_tau": value, "parameter_a": -(value**3)})
+        rows.append({"method": "default", "parameter_tau": 1.0, "parameter_a": 0.0})
+        rows.append({"method": "population", "parameter_tau": 1.5, "parameter_a": 0.0})
+    return pd.DataFrame(rows)
+
+
+AXES = (ParameterAxis("tau", "s", 0.0, 4.0), ParameterAxis("a", "m/s2", -64.0, 0.0))
+
+
+@given(st.lists(st.floats(0.0, 4.0), min_size=1, max_size=40))
+def test_calibrated_values_lie_between_their_bounds_and_are_counted_there(
+    values: list[float],
+) -> None:
+    tau, a = parameter_spreads(calibrated(values), AXES)
+    places = tau.places(tau.values)
+    np.testing.assert_allclose(places * 4.0, values)
+    assert tau.at_low == np.mean([value < 0.04 for value in values])
+    assert 0 <= tau.at_high <= 1 - tau.at_low
+    assert (tau.default, list(tau.pooled), a.axis.unit) == (1.0, [1.5], "m/s2")
+
+
+def test_parameters_without_bounds_or_values_are_left_out() -> None:
+    unbounded = (ParameterAxis("tau", "s"), ParameterAxis("b", "s", 0.0, 1.0), AXES[1])
+    assert [one.axis.name for one in parameter_spreads(calibrated([1.0]), unbounded)] == ["a"]
+    nothing = calibrated([float("nan")])
+    assert parameter_spreads(nothing, AXES) == ()
+
+
+def test_correlations_are_of_ranks() -> None:
+    table = correlations(calibrated([1.0, 2.0, 4.0, 3.0]), AXES)
+    np.testing.assert_allclose(table.to_numpy(), [[1.0, -1.0], [-1.0, 1.0]])
+
+
+@given(st.integers(0, 400))
+def test_dots_spread_over_their_line(count: int) -> None:
+    offsets = spread_offsets(count)
+    assert offsets.shape == (count,)
+    assert (np.abs(offsets) <= 1).all()
+    assert len(np.unique(offsets)) == count

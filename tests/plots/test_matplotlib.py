@@ -50,13 +50,13 @@ def with_improvement(results: MadeUp, gains: dict[int, float]) -> Evaluation:
 @pytest.mark.parametrize(
     ("options", "files"),
     [
-        ({}, 7),
-        ({"space": TEN}, 7),
-        ({"pairs": 1, "epochs": 1}, 7),
-        ({"pairs": 94, "frames": 40, "space": TEN}, 7),
-        ({"pairs": 2, "frames": 1}, 7),
-        ({"pairs": 3, "networks": 0}, 6),
-        ({"pairs": 3, "methods": ("default", "population", "fixed", "policy")}, 7),
+        ({}, 8),
+        ({"space": TEN}, 8),
+        ({"pairs": 1, "epochs": 1}, 8),
+        ({"pairs": 94, "frames": 40, "space": TEN}, 8),
+        ({"pairs": 2, "frames": 1}, 8),
+        ({"pairs": 3, "networks": 0}, 7),
+        ({"pairs": 3, "methods": ("default", "population", "fixed", "policy")}, 8),
     ],
     ids=[
         "krauss",
@@ -198,7 +198,7 @@ def test_names_are_text_and_never_formulas(tmp_path: Path) -> None:
         values=results.evaluation.values.assign(pair_id=name),
         trajectories=(dataclasses.replace(results.evaluation.trajectories[0], pair_id=name),),
     )
-    assert len(write_figures(tmp_path, evaluation, results.style, results.curves)) == 7
+    assert len(write_figures(tmp_path, evaluation, results.style, results.curves)) == 8
 
 
 def test_cuts_and_cluster_sizes_stand_in_the_style_figure() -> None:
@@ -318,4 +318,12 @@ def test_platoon_and_history_are_written_where_a_protocol_delivered_them(tmp_pat
     )
     names = {path.name for path in write_figures(tmp_path, further, results.style, results.curves)}
     assert {"platoon.png", "history.png"} <= names
-    assert len(names) == 9
+    assert len(names) == 10
+
+
+def test_a_policy_that_does_not_adapt_has_no_figure_of_improvements(tmp_path: Path) -> None:
+    made = make_results(pairs=3, frames=20)
+    drawn = write_figures(tmp_path, made.evaluation, made.style, made.curves, adapts=False)
+    names = {path.name for path in drawn}
+    assert "improvement_per_driver.png" not in names
+    assert "calibration.png" in names

@@ -10,12 +10,14 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 
 from cfx.report.page import render
 from cfx.report.runs import read_runs
 from cfx.report.sections import paper
+from cfx.report.sections.calibration import sheet, spreads_of
 from cfx.report.sections.clusters import cluster_series
 from cfx.report.sections.comparison import absolute
 from cfx.report.sections.drivers import per_driver
@@ -35,6 +37,7 @@ SECTIONS = (
     "metrics",
     "drivers",
     "clusters",
+    "calibration",
     "style",
     "trajectories",
     "errors",
@@ -369,6 +372,41 @@ def test_the_summary_answers_by_the_interval(tmp_path: Path) -> None:
         assert said.startswith(
             f"krauss: {answer}. Improvement of the RMSE of speed: +12.3 % on average"
         )
+
+
+def test_a_calibration_is_none_of_the_policies_that_adapt(tmp_path: Path) -> None:
+    for name, policy in (("still", "fixed"), ("moves", "gru")):
+        write_job(tmp_path / name, settings={"policy": {"name": policy}})
+    runs = read_runs([str(tmp_path)])
+    said = summary(runs.jobs)
+    assert any("a calibration; its parameters stay constant" in line for line in said)
+    assert sum("Improvement of the RMSE of speed" in line for line in said) == 1
+    views = overview(runs.jobs).views["against driver-specific calibration"]
+    assert len(views["data"][0]["text"]) == 1
+    alone = [job for job in runs.jobs if not job.adapts]
+    assert "with constant parameters?" in summary(alone)[0]
+    page = page_of(tmp_path / "still")
+    assert "Improvement of every pair" not in page.words
+    assert "over driver-specific calibration" not in page.words.split("Trajectories")[-1]
+
+
+def test_calibrated_parameters_have_their_bounds_and_shares(tmp_path: Path) -> None:
+    write_job(tmp_path / "job", methods=ACROSS)
+    table = pd.read_csv(tmp_path / "job" / "pairs.csv")
+    axes = json.loads((tmp_path / "job" / "data.json").read_text())["parameters"]
+    first = axes[0]
+    fixed = table["method"] == "fixed"
+    values = np.linspace(first["low"], first["high"], fixed.sum())
+    table.loc[fixed, f"parameter_{first['name']}"] = values
+    table.to_csv(tmp_path / "job" / "pairs.csv", index=False)
+    (job,) = read_runs([str(tmp_path / "job")]).jobs
+    spreads = spreads_of(job)
+    assert [spread.axis.name for spread in spreads] == [one["name"] for one in axes]
+    assert spreads[0].at_low == spreads[0].at_high == pytest.approx(1 / fixed.sum())
+    row = sheet(spreads).rows[0]
+    assert float(row[5].sort) == pytest.approx(np.median(values))
+    page = page_of(tmp_path / "job")
+    assert page.words.count("Calibrated parameters") >= 1
 
 
 def test_the_papers_figures_stand_beside_those_of_its_experiments(

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from cfx.errors import ConfigError, nearest
 from cfx.evaluation.result import Evaluation, PairTrajectory, Platoon
 from cfx.metrics.base import TRANSIENT_S
+from cfx.plots.choice.calibration import correlations, parameter_spreads
 from cfx.plots.choice.errors import error_panels
 from cfx.plots.choice.history import amounts_of, history_curves
 from cfx.plots.choice.improvements import improvement_bars
@@ -26,6 +27,7 @@ from cfx.plots.choice.trajectories import (
     pair_panels,
     parameter_axes,
 )
+from cfx.plots.matplotlib.calibration import draw_calibration
 from cfx.plots.matplotlib.errors import draw_errors
 from cfx.plots.matplotlib.history import draw_history
 from cfx.plots.matplotlib.improvements import draw_improvements
@@ -111,6 +113,20 @@ def errors(evaluation: Evaluation) -> Figure:
     """RMSE of speed and of gap over all pairs at each moment since the test part began."""
     methods = [method for method in evaluation.methods if method not in HIDDEN]
     return draw_errors(error_panels(evaluation.trajectories, methods, TRANSIENT_S), methods)
+
+
+def calibration(evaluation: Evaluation) -> Figure:
+    """The calibrated parameters of all drivers between their bounds, and their correlations.
+
+    Raises:
+        ConfigError: no calibrated parameter of a driver is known.
+    """
+    axes = parameter_axes(evaluation.names, evaluation.units, evaluation.bounds)
+    spreads = parameter_spreads(evaluation.table, axes)
+    if not spreads:
+        raise ConfigError("the evaluation holds no driver-specific parameters")
+    table = correlations(evaluation.table, [spread.axis for spread in spreads])
+    return draw_calibration(spreads, table)
 
 
 def style(result: StyleResult) -> Figure:

@@ -19,7 +19,12 @@ from cfx.style.result import StyleResult
 
 
 def write_figures(
-    folder: Path, evaluation: Evaluation, style: StyleResult, curves: pd.DataFrame
+    folder: Path,
+    evaluation: Evaluation,
+    style: StyleResult,
+    curves: pd.DataFrame,
+    *,
+    adapts: bool = True,
 ) -> list[Path]:
     """Draws and writes all figures of a job as PNG; returns their paths.
 
@@ -30,18 +35,23 @@ def write_figures(
         style: of its drivers.
         curves: columns `network`, `epoch`, `train_loss`, `validation_loss`; if it is empty there is
             no `learning_curve.png`.
+        adapts: as `Policy.adapts`; if it does not, there is no `improvement_per_driver.png`.
 
     Raises:
         OutputError: a file cannot be written.
     """
-    draw: dict[str, Callable[[], Figure]] = {
-        "improvement_per_driver": partial(figures.improvements, evaluation),
+    draw: dict[str, Callable[[], Figure]] = {}
+    if adapts:
+        draw["improvement_per_driver"] = partial(figures.improvements, evaluation)
+    draw |= {
         "drives": partial(figures.pairs, evaluation),
         "speeds": partial(figures.speeds, evaluation),
         "error_over_time": partial(figures.errors, evaluation),
         "chosen_parameters": partial(figures.parameters, evaluation),
         "style_distribution": partial(figures.style, style),
     }
+    if "fixed" in evaluation.methods and evaluation.names:
+        draw["calibration"] = partial(figures.calibration, evaluation)
     if len(curves):
         draw["learning_curve"] = partial(figures.learning, curves)
     if evaluation.platoon is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from cfx.report.blocks import Section
 from cfx.report.sections import (
+    calibration,
     clusters,
     comparison,
     configurations,
@@ -30,6 +31,7 @@ SECTIONS: tuple[Section, ...] = (
     paper.SECTION,
     drivers.SECTION,
     clusters.SECTION,
+    calibration.SECTION,
     style.SECTION,
     trajectories.SECTION,
     errors.SECTION,

@@ -25,6 +25,8 @@ _INTRODUCTION = (
     "The pair that improves most over driver-specific calibration, the one in the middle and the"
     " one that improves least, on the test part. A click on the legend hides a method in all"
     " panels; drag to zoom, double-click to come back. Thin lines mark the bounds of a parameter."
+    " Of a calibration without adaptation: the pairs with the least, the median and the largest"
+    " RMSE of speed."
 )
 
 
@@ -47,7 +49,9 @@ def chosen_pairs(job: Job) -> tuple[RankedPair, ...]:
     """Returns the best, the median and the worst pair; fewer if there are fewer."""
     present = [trajectory.pair_id for trajectory in job.pair_trajectories]
     table = job.by_pair[job.by_pair["pair_id"].isin(present)]
-    gains = table["improvement/fixed"].to_numpy(dtype=float)
+    gains = table["improvement/fixed" if job.adapts else "rmse_speed/policy"].to_numpy(dtype=float)
+    if not job.adapts:
+        gains = -gains
     return rank_pairs(table["pair_id"].astype(str).tolist(), gains)
 
 
@@ -61,7 +65,7 @@ def pair_of(job: Job, pair_id: str) -> Plot:
 
 def _title(job: Job, pair: RankedPair) -> str:
     title = pair.title[:1].upper() + pair.title[1:]
-    if job.has_constant_baseline and math.isfinite(pair.improvement):
+    if job.adapts and job.has_constant_baseline and math.isfinite(pair.improvement):
         improvement = percent_or_undefined(pair.improvement, 1)
         title += f": {improvement} over {short_label('fixed')} calibration"
     return title
