@@ -11,7 +11,7 @@ from cfx.files import write_output
 from cfx.plots.look import CLUSTER_COLOURS, COLOURS
 from cfx.plots.plotly.figure import Plot
 from cfx.plots.plotly.html import embedded_json, inline_scripts, security_policy
-from cfx.report.job import Runs
+from cfx.report.job import Runs, calibrations
 from cfx.report.sections import SECTIONS
 from cfx.report.summary import summary
 from cfx.style.result import CLUSTERS
@@ -59,9 +59,12 @@ def _content(runs: Runs, title: str | None) -> dict[str, Any]:
         blocks = section.blocks(runs)
         if blocks:
             sections.append((section, blocks))
+    subject = "Parameters that adapt"
+    if len(calibrations(runs.jobs)) == len(runs.jobs):
+        subject = "Calibration"
     models = " and ".join(dict.fromkeys(job.component("model") for job in runs.jobs))
     return {
-        "title": title or f"Parameters that adapt: {models}",
+        "title": title or f"{subject}: {models}",
         "written": f"{datetime.now():%d %B %Y}".lstrip("0"),
         # Nothing of a job's data is in them.
         "scripts": [Markup(script) for script in scripts],  # noqa: S704

@@ -185,7 +185,10 @@ def _methods(rows: Sequence[Row]) -> list[str]:
 
 
 def _baselines(rows: Sequence[Row]) -> list[str]:
-    found = any_baselines(job for row in rows for job in row.jobs)
+    jobs: list[Job] = []
+    for row in rows:
+        jobs += row.jobs
+    found = any_baselines(jobs)
     return [baseline for baseline in found if baseline in {"fixed", "population"}]
 
 

@@ -95,7 +95,10 @@ def _dots(
 def _correlations(table: pd.DataFrame) -> dict[str, Any]:
     names = safe_all(table.columns)
     values = table.to_numpy(dtype=float)
-    texts = [["" if not np.isfinite(v) else f"{v:.2f}" for v in row] for row in values]
+    texts = np.full(values.shape, "", dtype=object)
+    for place, value in np.ndenumerate(values):
+        if np.isfinite(value):
+            texts[place] = f"{value:.2f}"
     data = [
         {
             "type": "heatmap",
@@ -106,7 +109,7 @@ def _correlations(table: pd.DataFrame) -> dict[str, Any]:
             "zmax": 1,
             "colorscale": "RdBu",
             "reversescale": True,
-            "text": texts,
+            "text": texts.tolist(),
             "texttemplate": "%{text}",
             "hovertemplate": "%{y}, %{x}: %{z:.2f}<extra></extra>",
         }

@@ -19,21 +19,29 @@ from cfx.report.blocks import (
     job_fold,
     missing_file,
 )
-from cfx.report.job import Job, Runs
+from cfx.report.job import Job, Runs, calibrations
 
-_INTRODUCTION = (
+_ADAPTING = (
     "The pair that improves most over driver-specific calibration, the one in the middle and the"
-    " one that improves least, on the test part. A click on the legend hides a method in all"
+    " one that improves least, on the test part."
+)
+_CONSTANT = "Of a calibration: the pairs with the least, the median and the largest RMSE of speed."
+_CONTROLS = (
+    "A click on the legend hides a method in all"
     " panels; drag to zoom, double-click to come back. Thin lines mark the bounds of a parameter."
-    " Of a calibration without adaptation: the pairs with the least, the median and the largest"
-    " RMSE of speed."
 )
 
 
 def blocks(runs: Runs) -> list[Block]:
     """Returns the chosen pairs of each job."""
-    found: list[Block] = [Text(_INTRODUCTION)]
     jobs = [job for job in runs.jobs if job.trajectories is not None]
+    constant = calibrations(jobs)
+    chosen = [_CONTROLS]
+    if constant:
+        chosen.insert(0, _CONSTANT)
+    if len(constant) < len(jobs):
+        chosen.insert(0, _ADAPTING)
+    found: list[Block] = [Text(" ".join(chosen))]
     for k, job in enumerate(jobs):
         groups = []
         for pair in chosen_pairs(job):
