@@ -24,6 +24,7 @@ from torch import Tensor
 from cfx.agents.placement import driver_places
 from cfx.files import atomic_write
 from cfx.learners.base import CURVE_COLUMNS
+from cfx.learners.curves import networks_without_loss
 from cfx.policies.base import PolicyNetwork
 from cfx.progress import Task
 from cfx.simulation.threads import one_thread
@@ -245,6 +246,18 @@ def fit(
             _run(trainer, module, data, checkpoint)
     module.restore_best()
     module.network.to(device).eval()
+    _warn_of_nothing_learned(module.curves())
+
+
+def _warn_of_nothing_learned(curves: pd.DataFrame) -> None:
+    lost = networks_without_loss(curves)
+    if lost:
+        log.warning(
+            "%d of %d networks have learned nothing: their training loss is not a number in any"
+            " epoch (curves.parquet); their parameters are those that training began with",
+            len(lost),
+            curves["network"].nunique(),
+        )
 
 
 class EveryEpoch(ModelCheckpoint):

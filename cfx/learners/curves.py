@@ -35,3 +35,10 @@ def best_losses(curves: pd.DataFrame) -> dict[str, float]:
     if lowest.empty:
         return {}
     return {"validation_loss/best": float(lowest.mean())}
+
+
+def networks_without_loss(curves: pd.DataFrame) -> list[str]:
+    """Returns the networks whose training loss is finite in no epoch: they have learned nothing."""
+    losses = curves["train_loss"].astype(float).replace([np.inf, -np.inf], np.nan)
+    measured = losses.groupby(curves["network"]).count()
+    return [str(name) for name in measured.index[measured == 0]]

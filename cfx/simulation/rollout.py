@@ -16,7 +16,6 @@ import importlib.util
 import itertools
 import math
 import shutil
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar, Literal
 
@@ -27,6 +26,7 @@ from cfx.component import folder_hash
 from cfx.errors import ParameterError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.simulation.base import Stepper
+from cfx.simulation.compiling import torch_compiled
 from cfx.simulation.kernel import run as kernel
 from cfx.simulation.kernel.keys import ComponentKey
 from cfx.simulation.step import advance_vehicle
@@ -219,11 +219,7 @@ def _compiled_stepper(model: DrivingModel, dt: float, steps: int) -> _Step:
         # Each model and block has a cache of its own: torch counts recompilations per function, and
         # gives up after eight.
         take = _stepper(model, dt)
-        with warnings.catch_warnings():
-            # torch's own, about itself, as it imports its compiler
-            warnings.simplefilter("ignore", DeprecationWarning)
-            # torch's overloads leave isolate_recompiles out.
-            _COMPILED[key] = torch.compile(take, dynamic=True, isolate_recompiles=True)  # type: ignore[call-overload]
+        _COMPILED[key] = torch_compiled(take, dynamic=True, isolate_recompiles=True)
     return _COMPILED[key]
 
 

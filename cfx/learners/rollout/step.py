@@ -10,9 +10,6 @@ a token, n tuned parameters, c features of conditioning, s width of the policy's
 
 from __future__ import annotations
 
-import importlib
-import warnings
-
 import torch
 from torch import Tensor
 
@@ -21,6 +18,7 @@ from cfx.calibration.windows import WindowSettings
 from cfx.learners.rollout.state import LeaderWindow, LoopState
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.policies.features import History
+from cfx.simulation.compiling import torch_compiled
 from cfx.simulation.step import advance_vehicle
 
 
@@ -48,13 +46,9 @@ class WindowStep:
 
     def compile(self) -> None:
         """Lets `torch.compile` make one function of `observe` and one of `drive_window`."""
-        with warnings.catch_warnings():
-            # torch warns of itself as it imports its compiler.
-            warnings.simplefilter("ignore", DeprecationWarning)
-            importlib.import_module("torch._inductor.compile_fx")
         # The compiled functions take the methods' places.
-        self.observe = torch.compile(self.observe, dynamic=False)  # type: ignore[method-assign]
-        self.drive_window = torch.compile(self.drive_window, dynamic=False)  # type: ignore[method-assign]
+        self.observe = torch_compiled(self.observe, dynamic=False)  # type: ignore[method-assign]
+        self.drive_window = torch_compiled(self.drive_window, dynamic=False)  # type: ignore[method-assign]
 
     def observe(
         self, token: Tensor, conditioning: Tensor, state: Tensor, present: Tensor

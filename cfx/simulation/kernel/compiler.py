@@ -107,12 +107,12 @@ def _key(source: str, compiler: str) -> str:
     """Returns what the library depends on, as a hash: source, compiler and processor."""
     real = Path(compiler).resolve()
     version = f"{real}:{real.stat().st_mtime_ns}"
-    parts = (source, " ".join((*FLAGS, *_VECTOR_MATH)), version, platform.machine(), _processor())
+    parts = (source, " ".join((*FLAGS, *_VECTOR_MATH)), version, platform.machine(), processor())
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
 @functools.cache
-def _processor() -> str:
+def processor() -> str:
     """Returns the processor's instruction sets, for which `-march=native` compiles."""
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
