@@ -6,6 +6,7 @@
 #   make fuzz [EXAMPLES=5000]                 bad configurations, recordings, policies and caches; each file of a job fails once
 #   make kills [KILLS=100]                    kill a sweep at random moments, with each launcher
 #   make policies                             train the ready-made policies anew from ../shared/data (an hour)
+#   make docs                                 build the site from docs/ and the docstrings into site/; warnings are errors
 #   make conf                                 write conf/<group>/<name>.yaml anew from the built-in classes
 #   make lock                                 write constraints.txt anew from what resolves today
 #   make clean                                remove .venv and every cache; outputs/ stays
@@ -22,7 +23,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 TORCH = $(shell sed -n 's/^torch==//p' constraints.txt)
 
-.PHONY: run test test-slow fuzz kills bench policies conf lock clean
+.PHONY: run test test-slow fuzz kills bench policies docs conf lock clean
 
 run: $(VENV)/.ready
 	$(BIN)/python -m cfx $(ARGS)
@@ -50,6 +51,11 @@ DATA ?= ../shared/data/i80_reconstructed_pairs.parquet
 policies: $(VENV)/.ready-test
 	$(BIN)/python -m cfx policies make --data $(DATA)
 
+# Zensical's --strict stops on links without a target; docstrings that do not fit their signatures are only printed, so they are looked for.
+docs: $(VENV)/.ready-docs
+	$(BIN)/zensical build --clean --strict >site.log 2>&1 || { cat site.log; exit 1; }
+	@cat site.log; ! grep -qE "^(griffe|mkdocstrings):" site.log && rm site.log
+
 conf: $(VENV)/.ready
 	$(BIN)/python -m cfx.nodes
 
@@ -63,6 +69,10 @@ $(VENV)/.ready-test: pyproject.toml constraints.txt $(wildcard plugins/*/pyproje
 	$(PIP) install --quiet --constraint constraints.txt --editable '.[test]'
 	$(PIP) install --quiet --no-deps $(addprefix --editable ,$(wildcard plugins/*/))
 	touch $(VENV)/.ready $@
+
+$(VENV)/.ready-docs: pyproject.toml constraints.txt $(VENV)/.ready
+	$(PIP) install --quiet --constraint constraints.txt --editable '.[docs]'
+	touch $@
 
 $(VENV)/.torch: constraints.txt | $(BIN)/python
 ifneq ($(TORCH_INDEX),)
@@ -86,12 +96,12 @@ lock:
 	rm -rf .venv-lock
 	$(PYTHON) -m venv .venv-lock
 	$(MAKE) VENV=.venv-lock .venv-lock/.torch
-	.venv-lock/bin/python -m pip install --quiet --upgrade --editable '.[test]'
+	.venv-lock/bin/python -m pip install --quiet --upgrade --editable '.[test,docs]'
 	{ echo "# Versions that were tested together; make lock writes this file. pip install --constraint constraints.txt ..."; \
 	  .venv-lock/bin/python -m pip freeze --exclude-editable | sed 's/+cpu$$//'; } > constraints.new
 	mv constraints.new constraints.txt
 	rm -rf .venv-lock
 
 clean:
-	rm -rf $(VENV) .venv-lock .mypy_cache .ruff_cache .pytest_cache .hypothesis .benchmarks dist
+	rm -rf $(VENV) .venv-lock .mypy_cache .ruff_cache .pytest_cache .hypothesis .benchmarks dist site site.log
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

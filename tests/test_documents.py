@@ -8,28 +8,26 @@ import shlex
 import subprocess
 import sysconfig
 import venv
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
 import torch
+import yaml
 
 import cfx
 from cfx import registry, renamed
+from cfx.cli import COMMANDS
 from cfx.hydra_source import composed
 from cfx.models.base import DrivingModel
 from tests.conftest import ROOT
 from tests.drives import straight_pairs
 from tests.test_imports import FLOORS
 
-DOCUMENTS = [
-    "README.md",
-    "CONTRIBUTING.md",
-    "docs/results.md",
-    "docs/tried.md",
-    "docs/policies.md",
-    "docs/security.md",
-    "docs/decisions/README.md",
-]
+PAGES = sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").rglob("*.md"))
+DOCUMENTS = ["README.md", "CONTRIBUTING.md", *PAGES]
+GUIDES = {"docs/plugins.md", "docs/how-to/own-model.md"}
+"""Their commands need packages that they write before."""
 
 
 def blocks(name: str, language: str) -> list[str]:
@@ -43,30 +41,70 @@ def blocks(name: str, language: str) -> list[str]:
     ]
 
 
+def printed(language: str) -> Iterator[str]:
+    """Yields the lines of all blocks of a language, comments cut off."""
+    for name in DOCUMENTS:
+        if name in GUIDES:
+            continue
+        for block in blocks(name, language):
+            for line in block.splitlines():
+                yield line.partition("  # ")[0].rstrip()
+
+
 def commands() -> list[str]:
-    lines = [
-        line
-        for name in ("README.md", "docs/results.md")
-        for block in blocks(name, "")
-        for line in block.splitlines()
-    ]
-    return [line for line in lines if line.startswith("python -m cfx ")]
+    """Returns the jobs that documents print, each once; sub-commands are not among them."""
+    found = []
+    for line in (*printed(""), *printed("sh")):
+        words = line.split()
+        if line.startswith("python -m cfx ") and words[3] not in (*COMMANDS, "--help"):
+            found.append(line)
+    return sorted(set(found))
 
 
 def summarised() -> list[str]:
-    """Returns what follows `python -m cfx` in the README's table of results."""
-    section = (
-        (ROOT / "README.md")
-        .read_text(encoding="utf-8")
-        .partition("## Does it help?\n")[2]
-        .partition("\n## ")[0]
-    )
+    """Returns what follows `python -m cfx` in the table that sums up the results."""
+    text = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
+    section = text.partition("## In short\n")[2].partition("\n## ")[0]
     return re.findall(r"^\| [^|]* \| `([^`]+)` \|", section, flags=re.MULTILINE)
 
 
+def nav_of(entries: Iterable[object]) -> Iterator[str]:
+    """Yields the pages that a list of mkdocs.yml's navigation names."""
+    for entry in entries:
+        page = entry
+        if isinstance(entry, dict):
+            (page,) = entry.values()
+        if isinstance(page, list):
+            yield from nav_of(page)
+        else:
+            yield str(page)
+
+
 def test_there_are_commands_to_check() -> None:
-    assert len(commands()) >= 10
+    assert len(commands()) >= 40
     assert len(summarised()) == 6
+
+
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 900
+
+
+def test_the_site_names_pages_that_exist() -> None:
+    nav = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))["nav"]
+    pages = list(nav_of(nav))
+    assert len(set(pages)) == len(pages) > 30
+    assert not [page for page in pages if not (ROOT / "docs" / page).is_file()]
+
+
+def test_the_list_of_how_tos_is_the_one_of_the_site() -> None:
+    folder = ROOT / "docs" / "how-to"
+    index = (folder / "index.md").read_text(encoding="utf-8")
+    for path in sorted(folder.glob("*.md")):
+        if path.name == "index.md":
+            continue
+        title = path.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
+        assert title.endswith("?")
+        assert f"[{title}]({path.name})" in index
 
 
 def anchors(text: str) -> set[str]:
@@ -109,7 +147,12 @@ def test_every_decision_is_in_the_index_and_has_its_three_parts() -> None:
     "command", [*commands(), *(f"python -m cfx {words}" for words in summarised())]
 )
 def test_the_documents_commands_compose(command: str) -> None:
-    overrides = [word.split(",")[0] for word in shlex.split(command)[3:] if word != "-m"]
+    overrides = []
+    for word in shlex.split(command)[3:]:
+        if re.match(r"[\w./]+=[^\[{]*,", word):  # a sweep: its first value
+            overrides.append(word.partition(",")[0])
+        elif word != "-m":
+            overrides.append(word)
     assert composed(overrides)
 
 
@@ -127,9 +170,9 @@ def test_the_readmes_python_runs(
     assert "pair_id" in capsys.readouterr().out
 
 
-def test_the_model_in_contributing_can_be_simulated() -> None:
+def test_the_model_in_the_guide_can_be_simulated() -> None:
     (block,) = [
-        one for one in blocks("CONTRIBUTING.md", "python") if "class Pipes(DrivingModel)" in one
+        one for one in blocks("docs/plugins.md", "python") if "class Pipes(DrivingModel)" in one
     ]
     names: dict[str, object] = {"__name__": "example"}
     exec(block, names)  # noqa: S102 - it is our own document
@@ -153,7 +196,7 @@ def test_the_model_in_contributing_can_be_simulated() -> None:
 def test_the_table_of_kinds_names_what_is_there() -> None:
     import cfx.testing
 
-    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (\w+) \| `cfx\.(\w+)` \| .* \| `(\w+)` \|$", text, flags=re.MULTILINE)
     assert {kind for kind, _, _ in rows} == set(registry.KINDS)
     for kind, base, suite in rows:
@@ -199,7 +242,7 @@ def test_the_changelog_names_everything_that_was_renamed_or_removed() -> None:
 
 def guide() -> list[tuple[str, str]]:
     """Returns the shell and Python blocks of the guide, in order."""
-    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
     section = text.partition("## Writing a plugin\n")[2].partition("\n## ")[0]
     return re.findall(r"^```(sh|python)\n(.*?)^```$", section, flags=re.DOTALL | re.MULTILINE)
 

@@ -163,7 +163,8 @@ class DrivingModel(EarlierNames, Component):
         """Returns the follower's speed one time step later.
 
         Args:
-            follower, leader: states at time t.
+            follower: its state at time t.
+            leader: its state at time t.
             p: one tensor per parameter, by name, each broadcasting to `(*batch,)`.
             dt: time step, s.
 
