@@ -62,6 +62,7 @@ def simulate_closed_loop(
     *,
     base: Tensor | None = None,
     history: float | None = None,
+    steps: int | None = None,
 ) -> ClosedLoop:
     """Simulates the test part of P pairs with an agent in the loop.
 
@@ -74,9 +75,10 @@ def simulate_closed_loop(
         base: `(P, n)` in SI units, the drivers' base parameters; None: the agent's own base.
         history: seconds of measured history before `first` that the agent observes, and in which
             driver features are measured; None: all there is.
+        steps: K, how many steps are simulated at most; None: to the end of the longest pair.
     """
     state = _burnt_in(agent, batch, first, network, base, history, simulator.dt)
-    track = _Track(batch, first, agent.windows.length)
+    track = _Track(batch, first, agent.windows.length, steps)
     position, speed, acceleration = track.now()
     follower = simulator.begin(Start(position, speed, acceleration))
     parameters = track.speed.new_empty((len(batch), track.steps + 1, len(agent.space)))
@@ -128,8 +130,12 @@ class _Track:
         speed: of the followers, `(P, T)`; NaN where nothing was simulated yet.
     """
 
-    def __init__(self, batch: PairBatch, first: Tensor, length: int) -> None:
+    def __init__(
+        self, batch: PairBatch, first: Tensor, length: int, steps: int | None = None
+    ) -> None:
         self.steps = int((batch.lengths - 1 - first).max())
+        if steps is not None:
+            self.steps = min(self.steps, steps)
         self._length = length
         self._now = length - 1
         self._lengths = batch.lengths

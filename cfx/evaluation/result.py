@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from cfx.evaluation.forecasts import Forecasts
 from cfx.evaluation.tables import summaries, wide_table
 from cfx.metrics.base import MetricInfo
 from cfx.metrics.installed import LeftOut
@@ -166,6 +167,7 @@ class Evaluation:
         `platoon/MEASURE/METHOD`: see `Platoon`.
         `history/BASE/AMOUNT/rmse_improvement`: see `history`; AMOUNT is `80pct` for "80 %" and
             `10s` for "10 s".
+        `forecast/...`: see `Forecasts`.
 
     Attributes:
         about: a row per pair and method: pair_id, recording, leader_id, follower_id, driver,
@@ -192,6 +194,7 @@ class Evaluation:
         left_out: plugins' metrics that are broken.
         outside: how much of the test part, and of full trajectories, the policy drove outside what
             it has learned from, in words by scope; empty if it did not.
+        forecasts: from many moments of each trajectory; None if there were none.
     """
 
     about: pd.DataFrame
@@ -208,11 +211,19 @@ class Evaluation:
     steady_improvements: Mapping[str, Improvement] = field(default_factory=dict)
     left_out: tuple[LeftOut, ...] = ()
     outside: Mapping[str, str] = field(default_factory=dict)
+    forecasts: Forecasts | None = None
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """A row per pair and method, as in `pairs.csv`; see `wide_table`."""
-        return wide_table(self.about, self.values, self.measured)
+        """A row per pair and method, as in `pairs.csv`; see `wide_table`.
+
+        With forecasts there are also the columns `forecast_METRIC`.
+        """
+        table = wide_table(self.about, self.values, self.measured)
+        if self.forecasts is None:
+            return table
+        columns = self.forecasts.columns(pd.MultiIndex.from_frame(table[["pair_id", "method"]]))
+        return pd.concat([table, pd.DataFrame(columns, index=table.index)], axis=1)
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -245,6 +256,8 @@ class Evaluation:
             for (base, amount), gains in self.history.groupby(["base", "amount"])["improvement"]:
                 name = str(amount).replace(" ", "").replace("%", "pct")
                 values[f"history/{base}/{name}/rmse_improvement"] = float(gains.mean())
+        if self.forecasts is not None:
+            values |= self.forecasts.metrics()
         return values
 
     def trajectories_table(self) -> pd.DataFrame:

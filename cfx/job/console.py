@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from cfx.evaluation.forecasts import Forecasts
 from cfx.evaluation.result import Evaluation, Improvement
 from cfx.job.results import JobResult
 from cfx.metrics.base import TRANSIENT_S, MetricInfo, key_of
@@ -59,6 +60,8 @@ def report(
             " with other jobs'."
         )
         console.print(text, soft_wrap=True)
+    if evaluation.forecasts is not None:
+        console.print(forecasts_table(evaluation.forecasts))
     _print_safety(evaluation, result.metrics, console)
     for scope, words in evaluation.outside.items():
         text = f"Policy, {_SCOPES[scope]}: {words}; there it fades towards its base parameters."
@@ -90,6 +93,30 @@ def methods_table(
         cells = []
         for metric, value in zip(shown, values, strict=True):
             cells.append(_cell(metric, value))
+        table.add_row(method, *cells)
+    return table
+
+
+def forecasts_table(forecasts: Forecasts) -> Table:
+    """Returns the RMSE of speed of each method at each horizon: mean over drivers.
+
+    Errors of position and intervals are in `metrics.json` and in the report.
+    """
+    leader = "given"
+    if forecasts.leader != "given":
+        leader = f"predicted at {forecasts.leader.replace('_', ' ')}"
+    drivers = int(forecasts.summary["drivers"].max())
+    title = f"Forecasts of {drivers} drivers, leader {leader}: RMSE of speed (m/s) after"
+    table = Table(title=title, title_justify="left")
+    table.add_column("method")
+    for horizon in forecasts.horizons:
+        table.add_column(f"{horizon:g} s", justify="right")
+    by_method = forecasts.summary.set_index(["method", "horizon_s"])["rmse_speed"]
+    for method in forecasts.methods:
+        cells = []
+        for horizon in forecasts.horizons:
+            value = by_method.get((method, horizon))
+            cells.append("" if value is None else f"{value:.3f}")
         table.add_row(method, *cells)
     return table
 

@@ -187,7 +187,14 @@ def write_further_tables(output: Output, evaluation: Evaluation) -> list[Path]:
     platoon = None
     if evaluation.platoon is not None:
         platoon = evaluation.platoon.table
-    tables = {"platoon.parquet": platoon, "history.parquet": evaluation.history}
+    forecasts = None
+    if evaluation.forecasts is not None:
+        forecasts = evaluation.forecasts.table
+    tables = {
+        "platoon.parquet": platoon,
+        "history.parquet": evaluation.history,
+        "forecasts.parquet": forecasts,
+    }
     paths = []
     for name, table in tables.items():
         path = output.folder / name

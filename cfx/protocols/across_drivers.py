@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
+import pandas as pd
 from pydantic import Field
 from torch import Tensor
 
@@ -88,6 +90,24 @@ class _Calibrated:
     labels: Labels | None
 
 
+@dataclass(frozen=True)
+class Trained:
+    """What calibration and training over the folds delivered; Q test pairs.
+
+    Attributes:
+        test: the test pairs and all methods.
+        fold: in which fold each test pair is tested, `(Q,)`.
+        curves, labels, notes, calibration: as in `ProtocolResult`.
+    """
+
+    test: HeldOut
+    fold: Tensor
+    curves: pd.DataFrame
+    labels: Labels | None
+    notes: Mapping[str, Any]
+    calibration: Mapping[str, float]
+
+
 class AcrossDrivers(Protocol):
     """The paper's experiment on clusters: a policy is trained on some drivers and tested on others.
 
@@ -116,6 +136,20 @@ class AcrossDrivers(Protocol):
     settings: AcrossDriversSettings
 
     def run(self, context: ProtocolContext) -> ProtocolResult:
+        trained = self.trained(context)
+        test = trained.test
+        evaluation = test.evaluation(self.settings.histories, fold=trained.fold)
+        return ProtocolResult(
+            evaluation,
+            test.policy,
+            trained.curves,
+            trained.labels,
+            trained.notes,
+            calibration=trained.calibration,
+        )
+
+    def trained(self, context: ProtocolContext) -> Trained:
+        """Calibrates and trains, and returns what is to be tested."""
         pairs = context.pairs
         fold = self.folds(pairs, seed=context.seed)
         notes = describe_folds(pairs, fold, apart=self.settings.together == "recording")
@@ -124,19 +158,16 @@ class AcrossDrivers(Protocol):
         full = Split.none(pairs, context.windows)
         found = self._calibrated(context, split, full, members)
         policy, training_result = self._learn(context, full, members, found)
-        test = self._held_out(context, fold, split, found, policy)
-        tested = fold >= 0
-        evaluation = test.evaluation(self.settings.histories, fold=fold[tested])
         calibration = context.calibration_metrics("fixed", split.frame, found.fixed)
         calibration |= context.calibration_metrics(
             "population", full.frame, found.population, members
         )
-        return ProtocolResult(
-            evaluation,
-            policy,
-            training_result.curves,
-            found.labels,
-            notes,
+        return Trained(
+            test=self._held_out(context, fold, split, found, policy),
+            fold=fold[fold >= 0],
+            curves=training_result.curves,
+            labels=found.labels,
+            notes=notes,
             calibration=calibration,
         )
 

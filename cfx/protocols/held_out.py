@@ -52,6 +52,11 @@ class HeldOut:
     population: Tensor | None
     policy: Agent
 
+    @property
+    def drivers(self) -> list[str]:
+        """The driver of each pair, Q of them."""
+        return [pair.driver for pair in self.pairs]
+
     def evaluation(
         self, histories: Sequence[float] = (), *, fold: Tensor | None = None
     ) -> Evaluation:
@@ -62,7 +67,7 @@ class HeldOut:
             fold: in which fold each pair is tested, `(Q,)`; None: there are none.
         """
         context = self.context
-        methods = self._methods_without_history()
+        methods = self.methods_without_history()
         loops = self._test_part(methods)
         history = None
         if self.policy.base is not None and histories:
@@ -84,8 +89,8 @@ class HeldOut:
             history=history,
         )
 
-    def _methods_without_history(self) -> dict[str, Agent]:
-        """Returns the methods that need nothing of a test driver beforehand."""
+    def methods_without_history(self) -> dict[str, Agent]:
+        """Returns the agents that need nothing of a test driver beforehand, by method."""
         context, networks = self.context, len(self.policy.names)
         default = context.space.defaults(dtype=self.fixed.dtype, device=self.fixed.device)
         methods = {

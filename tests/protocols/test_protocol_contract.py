@@ -6,12 +6,14 @@ import pytest
 
 from cfx.protocols.across_drivers import AcrossDrivers
 from cfx.protocols.base import Protocol
+from cfx.protocols.forecast import Forecast
 from cfx.protocols.within_driver import WithinDriver
 from cfx.testing import ProtocolContract
 
 # Kept for all tests, which then share a run.
 WITHIN = {networks: WithinDriver(networks=networks) for networks in ("pair", "all")}
 ACROSS = AcrossDrivers(folds=3)
+FORECAST = Forecast(folds=3, horizons=(0.5, 1.0), histories=())
 
 
 class TestWithinDriver(ProtocolContract):
@@ -24,3 +26,9 @@ class TestAcrossDrivers(ProtocolContract):
     @pytest.fixture
     def protocol(self) -> Protocol:
         return ACROSS
+
+
+class TestForecast(ProtocolContract):
+    @pytest.fixture
+    def protocol(self) -> Protocol:
+        return FORECAST

@@ -1,0 +1,236 @@
+"""Forecasts: followers simulated from many moments of their trajectories, all in one batch.
+
+An *origin* is a moment of a measured trajectory. Everything measured up to it may be read; of what
+comes after it the follower is never read, and the leader only where their future is given. From
+each origin the follower is simulated for some seconds. `simulate_from_origins` does this for any
+agent.
+
+Shapes: P pairs, Q origins, K simulated steps, T frames, n tuned parameters. SI units.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from cfx.agents.agent import Agent
+from cfx.evaluation.closed_loop import simulate_closed_loop
+from cfx.pairs import SIGNALS, PairBatch
+from cfx.simulation.base import Stepper
+
+LeaderFuture = Literal["given", "constant_speed", "constant_acceleration"]
+"""What is known of the leader after an origin.
+
+`given`: what they did; the errors are the follower's alone. `constant_speed`,
+`constant_acceleration`: what can be known at the origin, if the leader drives on as they do there.
+"""
+
+_CHUNK_BYTES = 1 << 28
+"""What one chunk of origins takes at most, for signals and for the state of networks."""
+
+_COPIES = 4
+"""How many tensors of the networks' state are alive at once, and of the signals besides."""
+
+
+@dataclass(frozen=True)
+class Origins:
+    """Q moments of P pairs, pair after pair.
+
+    Attributes:
+        pair: `(Q,)` int64, index of the pair.
+        frame: `(Q,)` int64, the last measured frame that may be read.
+    """
+
+    pair: Tensor
+    frame: Tensor
+
+    @classmethod
+    def every(cls, stride: int, first: Tensor, last: Tensor) -> Origins:
+        """Returns an origin every `stride` frames of each pair.
+
+        Args:
+            stride: in frames.
+            first: `(P,)`, the first origin of each pair.
+            last: `(P,)`, the latest frame that an origin may be at; a pair that has none gets none.
+        """
+        counts = ((last - first).div(stride, rounding_mode="floor") + 1).clamp(min=0)
+        pair = torch.repeat_interleave(torch.arange(len(first), device=first.device), counts)
+        before = torch.cumsum(counts, 0) - counts
+        number = torch.arange(len(pair), device=first.device) - before[pair]
+        return cls(pair, first[pair] + number * stride)
+
+    def __len__(self) -> int:
+        """Q."""
+        return len(self.pair)
+
+    def __getitem__(self, index: slice) -> Origins:
+        """Selects origins."""
+        return Origins(self.pair[index], self.frame[index])
+
+
+class Paths(NamedTuple):
+    """Q paths from their origins on, frame 0 being the origin.
+
+    Attributes:
+        speed: `(Q, K + 1)`, m/s.
+        travelled: `(Q, K + 1)`, m since the origin.
+    """
+
+    speed: Tensor
+    travelled: Tensor
+
+
+def measured_paths(batch: PairBatch, origins: Origins, steps: int) -> tuple[Paths, Tensor]:
+    """Returns what followers did after origins.
+
+    Args:
+        batch: P pairs.
+        origins: Q of them.
+        steps: K.
+
+    Returns:
+        The paths, and which of their frames were recorded, bool `(Q, K + 1)`.
+    """
+    frames = origins.frame[:, None] + torch.arange(steps + 1, device=origins.frame.device)
+    recorded = frames < batch.lengths[origins.pair][:, None]
+    index = frames.clamp(max=batch.mask.shape[1] - 1)
+    rows = origins.pair[:, None]
+    position = batch.follower_position[rows, index]
+    return Paths(batch.follower_speed[rows, index], position - position[:, :1]), recorded
+
+
+def kinematic_paths(batch: PairBatch, origins: Origins, steps: int, *, accelerates: bool) -> Paths:
+    """Returns followers that go on as they do at the origin: at constant speed or acceleration.
+
+    Nobody drives backwards: who brakes, stops.
+
+    Args:
+        batch: P pairs.
+        origins: Q of them.
+        steps: K.
+        accelerates: the acceleration is constant, not the speed.
+    """
+    speed = batch.follower_speed[origins.pair, origins.frame]
+    acceleration = torch.zeros_like(speed)
+    if accelerates:
+        acceleration = batch.follower_acceleration[origins.pair, origins.frame]
+    return _extrapolated(speed, acceleration, steps, batch.dt)
+
+
+def _extrapolated(speed: Tensor, acceleration: Tensor, steps: int, dt: float) -> Paths:
+    """Returns paths at constant acceleration, `(Q, K + 1)`, in the steps of the simulation."""
+    time = dt * torch.arange(steps + 1, dtype=speed.dtype, device=speed.device)
+    speeds = (speed[:, None] + acceleration[:, None] * time).clamp(min=0.0)
+    moved = speeds * dt
+    moved[:, 0] = 0.0
+    return Paths(speeds, moved.cumsum(1))
+
+
+def simulate_from_origins(
+    simulator: Stepper,
+    agent: Agent,
+    batch: PairBatch,
+    origins: Origins,
+    steps: int,
+    network: Tensor,
+    *,
+    base: Tensor | None = None,
+    history: float | None = None,
+    leader: LeaderFuture = "given",
+) -> Paths:
+    """Simulates followers from origins on, with an agent in the loop.
+
+    Up to an origin the agent observes what was measured (burn-in, driver features). From there on
+    it sees the simulated follower only. All origins are one batch, in chunks that fit the memory.
+
+    Args:
+        simulator: the model and its time step.
+        agent: chooses the parameters of each window; of any kind.
+        batch: P pairs, complete.
+        origins: Q of them.
+        steps: K, at least 1.
+        network: `(P,)`, which of the agent's networks drives each pair.
+        base: `(P, n)` in SI units, the drivers' base parameters; None: the agent's own base.
+        history: s of measured history before an origin that the agent observes; None: all there is.
+        leader: what is known of the leader after the origin.
+    """
+    speeds, travelled = [], []
+    for chunk in _chunks(agent, batch, origins):
+        part = _with_future(batch[chunk.pair], chunk.frame, steps, leader)
+        own_base = None
+        if base is not None:
+            own_base = base[chunk.pair]
+        loop = simulate_closed_loop(
+            simulator,
+            agent,
+            part,
+            chunk.frame,
+            network[chunk.pair],
+            base=own_base,
+            history=history,
+            steps=steps,
+        )
+        index = chunk.frame[:, None] + torch.arange(steps + 1, device=chunk.frame.device)
+        index = index.clamp(max=part.mask.shape[1] - 1)
+        position = part.leader_position.gather(1, index) - loop.gap
+        speeds.append(loop.speed)
+        travelled.append(position - position[:, :1])
+    return Paths(torch.cat(speeds), torch.cat(travelled))
+
+
+def _chunks(agent: Agent, batch: PairBatch, origins: Origins) -> Iterator[Origins]:
+    """Cuts origins into parts whose signals and states fit the memory."""
+    frames = batch.mask.shape[1]
+    per_origin = _COPIES * (len(SIGNALS) + 2) * frames
+    states = agent.network.initial_state(len(agent.names), 1)
+    per_origin += _COPIES * math.prod(states.shape[2:])
+    size = max(1, _CHUNK_BYTES // (8 * per_origin))
+    for first in range(0, len(origins), size):
+        yield origins[first : first + size]
+
+
+def _with_future(batch: PairBatch, origin: Tensor, steps: int, leader: LeaderFuture) -> PairBatch:
+    """Returns pairs that last to the end of their forecasts, with what is known of their leaders.
+
+    Frames after a recording's end hold something, and are in no error (`measured_paths`).
+
+    Args:
+        batch: Q pairs, one for each origin.
+        origin: `(Q,)`, frames.
+        steps: K.
+        leader: what is known of the leader after the origin.
+    """
+    frames = torch.arange(batch.mask.shape[1], device=origin.device)
+    after = frames - origin[:, None]
+    lasting = replace(batch, lengths=origin + steps + 1, mask=after <= steps)
+    if leader == "given":
+        return lasting
+    rows = torch.arange(len(origin), device=origin.device)
+    speed = batch.leader_speed[rows, origin]
+    acceleration = torch.zeros_like(speed)
+    if leader == "constant_acceleration":
+        acceleration = batch.leader_acceleration[rows, origin]
+    ahead = _extrapolated(speed, acceleration, steps, batch.dt)
+    step = after.clamp(min=0, max=steps)
+    position = batch.leader_position[rows, origin][:, None] + ahead.travelled.gather(1, step)
+    speeds = ahead.speed.gather(1, step)
+    known = after <= 0
+    return replace(
+        lasting,
+        leader_position=torch.where(known, batch.leader_position, position),
+        leader_speed=torch.where(known, batch.leader_speed, speeds),
+        leader_acceleration=torch.where(
+            known, batch.leader_acceleration, _while_moving(speeds, acceleration)
+        ),
+    )
+
+
+def _while_moving(speed: Tensor, acceleration: Tensor) -> Tensor:
+    """Returns accelerations `(Q, T)`: constant `(Q,)` while moving, and 0 once standing."""
+    standing = (speed <= 0.0) & (acceleration < 0.0)[:, None]
+    return torch.where(standing, 0.0, acceleration[:, None])

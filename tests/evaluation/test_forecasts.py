@@ -1,0 +1,207 @@
+"""Forecasts: where origins lie, what may be read at them, and how errors become numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from torch import Tensor
+
+from cfx.agents.agent import Agent
+from cfx.evaluation import forecast_paths
+from cfx.evaluation.closed_loop import simulate_closed_loop
+from cfx.evaluation.forecast_paths import (
+    LeaderFuture,
+    Origins,
+    kinematic_paths,
+    measured_paths,
+    simulate_from_origins,
+)
+from cfx.evaluation.forecasts import Forecasts, errors_by, forecast_errors
+from cfx.models.krauss import Krauss
+from cfx.pairs import PairBatch
+from cfx.policies.gru import GruPolicy
+from cfx.simulation.rollout import MemoryStepper
+from tests.drives import straight_pairs, wavy_pairs
+from tests.evaluation.test_closed_loop import adaptive, constant
+
+MODEL = Krauss()
+STEPS = 30
+
+
+@pytest.fixture(scope="module")
+def batch() -> PairBatch:
+    true = MODEL.space.defaults() + torch.tensor([[0.0, 0.0], [0.8, 0.2], [1.5, 0.1]]).double()
+    return PairBatch.of(wavy_pairs(MODEL, true))
+
+
+def policy(networks: int = 3) -> Agent:
+    """Answers something else in each window."""
+    return adaptive(MODEL, GruPolicy(hidden_size=6, inputs="speeds"), networks, 2 * 5)
+
+
+def test_origins_lie_between_the_first_and_the_last() -> None:
+    origins = Origins.every(5, torch.tensor([10, 7, 90]), torch.tensor([21, 7, 80]))
+    assert origins.pair.tolist() == [0, 0, 0, 1]
+    assert origins.frame.tolist() == [10, 15, 20, 7]
+
+
+def test_a_driver_with_the_true_parameters_is_forecast_exactly(batch: PairBatch) -> None:
+    true = MODEL.space.defaults() + torch.tensor([[0.0, 0.0], [0.8, 0.2], [1.5, 0.1]]).double()
+    origins = Origins.every(20, torch.tensor([40, 50, 60]), torch.tensor([269, 269, 269]))
+    paths = simulate_from_origins(
+        MemoryStepper(MODEL, 0.1), constant(MODEL, true), batch, origins, STEPS, torch.arange(3)
+    )
+    measured, recorded = measured_paths(batch, origins, STEPS)
+    assert bool(recorded.all())
+    torch.testing.assert_close(paths.speed, measured.speed)
+    torch.testing.assert_close(paths.travelled, measured.travelled, atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("chunk_bytes", [1, 1 << 28])
+def test_each_origin_is_a_closed_loop_of_its_own(
+    batch: PairBatch, chunk_bytes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A batch of origins, in chunks of any size, is what each origin alone gives."""
+    monkeypatch.setattr(forecast_paths, "_CHUNK_BYTES", chunk_bytes)
+    agent, stepper = policy(), MemoryStepper(MODEL, 0.1)
+    origins = Origins(torch.tensor([0, 2, 2]), torch.tensor([33, 100, 250]))
+    network = torch.tensor([2, 0, 1])
+    paths = simulate_from_origins(stepper, agent, batch, origins, STEPS, network)
+    for k, (pair, frame) in enumerate(
+        zip(origins.pair.tolist(), origins.frame.tolist(), strict=True)
+    ):
+        alone = simulate_closed_loop(
+            stepper,
+            agent,
+            batch[pair : pair + 1],
+            torch.tensor([frame]),
+            network[pair : pair + 1],
+            steps=STEPS,
+        )
+        torch.testing.assert_close(paths.speed[k], alone.speed[0])
+
+
+@pytest.mark.parametrize("leader", ["given", "constant_speed", "constant_acceleration"])
+def test_nothing_is_read_that_is_not_known_at_the_origin(
+    batch: PairBatch, leader: LeaderFuture
+) -> None:
+    """What the follower does afterwards changes no forecast, nor the leader if predicted."""
+    origins = Origins(torch.tensor([0, 1, 2]), torch.tensor([100, 120, 140]))
+    after = torch.arange(batch.mask.shape[1]) > origins.frame[:, None]
+    names = ["follower_position", "follower_speed", "follower_acceleration"]
+    if leader != "given":
+        names += ["leader_position", "leader_speed", "leader_acceleration"]
+    changed = {}
+    for name in names:
+        signal = getattr(batch, name)
+        changed[name] = torch.where(after, 0.3 * signal - 7.0, signal)
+    found = []
+    for one in (batch, replace(batch, **changed)):
+        for agent in (policy(), constant(MODEL, MODEL.space.defaults().expand(3, -1))):
+            found.append(
+                simulate_from_origins(
+                    MemoryStepper(MODEL, 0.1),
+                    agent,
+                    one,
+                    origins,
+                    STEPS,
+                    torch.arange(3),
+                    leader=leader,
+                )
+            )
+    assert torch.equal(found[0].speed, found[2].speed)
+    assert torch.equal(found[1].travelled, found[3].travelled)
+
+
+def test_a_leader_at_constant_speed_is_predicted_exactly_at_constant_speed() -> None:
+    batch = PairBatch.of(straight_pairs([200, 150]))
+    origins = Origins(torch.tensor([0, 1]), torch.tensor([60, 70]))
+    agent = constant(MODEL, MODEL.space.defaults().expand(2, -1))
+    found: list[Tensor] = []
+    for leader in ("given", "constant_speed", "constant_acceleration"):
+        paths = simulate_from_origins(
+            MemoryStepper(MODEL, 0.1),
+            agent,
+            batch,
+            origins,
+            STEPS,
+            torch.arange(2),
+            leader=leader,  # type: ignore[arg-type]  # one of its three
+        )
+        found.append(paths.travelled)
+    torch.testing.assert_close(found[0], found[1])
+    torch.testing.assert_close(found[0], found[2])
+
+
+def test_kinematic_forecasts_are_the_closed_forms(batch: PairBatch) -> None:
+    origins = Origins(torch.tensor([0, 1, 2]), torch.tensor([100, 120, 140]))
+    speed = batch.follower_speed[origins.pair, origins.frame]
+    acceleration = batch.follower_acceleration[origins.pair, origins.frame]
+    steady = kinematic_paths(batch, origins, STEPS, accelerates=False)
+    torch.testing.assert_close(steady.travelled[:, -1], 3.0 * speed)
+    paths = kinematic_paths(batch, origins, STEPS, accelerates=True)
+    expected = (speed + 3.0 * acceleration).clamp(min=0.0)
+    torch.testing.assert_close(paths.speed[:, -1], expected)
+    moves = (expected > 0) & (speed > 0)
+    # Steps with the new speed: half a step more than the integral.
+    way = 3.0 * speed + 0.5 * acceleration * 3.0 * (3.0 + 0.1)
+    torch.testing.assert_close(paths.travelled[moves, -1], way[moves])
+
+
+def test_who_brakes_stops_and_does_not_drive_back() -> None:
+    batch = PairBatch.of(straight_pairs([100], speed=2.0))
+    braking = torch.full_like(batch.follower_acceleration, -1.0)
+    origins = Origins(torch.tensor([0]), torch.tensor([50]))
+    paths = kinematic_paths(
+        replace(batch, follower_acceleration=braking), origins, 60, accelerates=True
+    )
+    assert float(paths.speed[0, -1]) == 0.0
+    assert float(paths.travelled[0, -1]) == pytest.approx(
+        0.1 * sum(2 - 0.1 * k for k in range(21)) - 0.2
+    )
+
+
+def test_errors_are_means_over_drivers_of_the_rmse_over_their_origins() -> None:
+    """A driver with many origins counts as much as one with few."""
+    pairs = straight_pairs([400, 100])
+    batch = PairBatch.of(pairs)
+    origins = Origins.every(10, torch.tensor([50, 50]), batch.lengths - 11)
+    measured, recorded = measured_paths(batch, origins, 10)
+    off = torch.where(origins.pair == 0, 1.0, 3.0).double()[:, None]
+    ramp = torch.linspace(0.0, 1.0, 11).double()
+    path = measured._replace(
+        speed=measured.speed + off * ramp, travelled=measured.travelled - 2.0 * off * ramp
+    )
+    table = forecast_errors(pairs, origins, {"policy": path}, measured, recorded, (0.5, 1.0), 0.1)
+    forecasts = Forecasts(table, (0.5, 1.0), "given", seed=0)
+    metrics = forecasts.metrics()
+    assert metrics["forecast/rmse_speed_1s/policy"] == pytest.approx(2.0)
+    assert metrics["forecast/rmse_speed_0.5s/policy"] == pytest.approx(1.0)
+    assert metrics["forecast/fde_1s/policy"] == pytest.approx(4.0)
+    assert metrics["forecast/ade_1s/policy"] == pytest.approx(4.0 * np.mean(ramp[1:].numpy()))
+    low = metrics["forecast/rmse_speed_1s/policy/ci95_low"]
+    assert (low, metrics["forecast/rmse_speed_1s/policy/ci95_high"]) == pytest.approx((1.0, 3.0))
+    row = forecasts.summary.iloc[-1]
+    assert (row["drivers"], row["origins"]) == (2, 34 + 4)
+    values = forecasts.values()
+    own = values[(values["metric"] == "rmse_position_1s") & (values["pair_id"] == "p1")]
+    assert own["value"].tolist() == pytest.approx([6.0])
+    assert set(values["scope"]) == {"forecast"}
+
+
+def test_a_horizon_counts_origins_whose_recording_lasts_that_long() -> None:
+    pairs = straight_pairs([81])
+    batch = PairBatch.of(pairs)
+    origins = Origins.every(10, torch.tensor([50]), torch.tensor([70]))
+    measured, recorded = measured_paths(batch, origins, 20)
+    table = forecast_errors(
+        pairs, origins, {"policy": measured}, measured, recorded, (1.0, 2.0), 0.1
+    )
+    counts = errors_by(table, ["horizon_s"]).set_index("horizon_s")["origins"]
+    assert counts.to_dict() == {1.0: 3, 2.0: 2}
+    assert not table.isna().to_numpy().any()
+    assert pd.api.types.is_float_dtype(table["history_s"])
