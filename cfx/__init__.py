@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from cfx.component import Settings as Settings
     from cfx.datasets.base import Dataset as Dataset
     from cfx.datasets.base import DatasetSettings as DatasetSettings
+    from cfx.engine.base import Engine as Engine
     from cfx.job import JobResult as JobResult
     from cfx.job import load as load
     from cfx.learners.base import Learner as Learner
@@ -76,6 +77,7 @@ _HOMES = {
     "Simulator": "cfx.simulators.base",
     "SimulatorSettings": "cfx.simulators.base",
     "Stepper": "cfx.simulation.base",
+    "Engine": "cfx.engine.base",
     "Optimizer": "cfx.optimizers.base",
     "CandidateLosses": "cfx.optimizers.base",
     "Objective": "cfx.objectives.base",

@@ -96,6 +96,7 @@ class JobConfig(Settings):
     learner: Node = Field(description="the learner's node")
     protocol: Node = Field(description="the protocol's node")
     simulator: Node = Field({"name": "memory"}, description="the simulator's node")
+    engine: Node = Field({"name": "local"}, description="the engine's node")
     metrics: Literal["all"] | tuple[str, ...] = Field(
         "all", description="what is measured: all that are installed, or some by name"
     )

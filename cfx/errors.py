@@ -67,6 +67,10 @@ class OutputError(CfxError):
     """A result cannot be written."""
 
 
+class EngineError(CfxError):
+    """The workers of an engine cannot be reached, or were lost for good."""
+
+
 class SumoError(CfxError):
     """SUMO is missing, or does not do what is asked of it."""
 

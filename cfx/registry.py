@@ -104,6 +104,7 @@ KINDS: dict[str, Kind] = {
             "cfx.objectives.base:Objective",
             "cfx.smoke_checks:smoke_check_objective",
         ),
+        Kind("engine", "engine", "cfx.engines", "cfx.engine.base:Engine"),
         Kind("learner", "learner", "cfx.learners", "cfx.learners.base:Learner"),
         Kind("protocol", "protocol", "cfx.protocols", "cfx.protocols.base:Protocol"),
         Kind(

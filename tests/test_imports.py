@@ -31,7 +31,7 @@ FLOORS = (
     ("registry",),
     ("models",),
     ("simulation", "metrics"),
-    ("simulators",),
+    ("simulators", "engine"),
     ("datasets", "style", "optimizers", "objectives", "calibration"),
     ("policies",),
     ("agents",),

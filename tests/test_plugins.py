@@ -122,7 +122,17 @@ def test_all_broken_plugins_at_once_harm_nobody_else(
 
 @pytest.mark.parametrize(
     "kind",
-    ["model", "simulator", "policy", "optimizer", "objective", "dataset", "learner", "protocol"],
+    [
+        "model",
+        "simulator",
+        "policy",
+        "optimizer",
+        "objective",
+        "dataset",
+        "engine",
+        "learner",
+        "protocol",
+    ],
 )
 def test_check_finds_every_broken_plugin_and_says_one_sentence_each(
     install: Installer, twins: None, kind: str, capsys: pytest.CaptureFixture[str]
@@ -364,6 +374,7 @@ GENERATED = [
     pytest.param("optimizer", marks=pytest.mark.slow),
     pytest.param("objective", marks=pytest.mark.slow),
     pytest.param("policy", marks=pytest.mark.slow),
+    pytest.param("engine", marks=pytest.mark.slow),
     pytest.param("learner", marks=pytest.mark.slow),
     pytest.param("protocol", marks=pytest.mark.slow),
 ]

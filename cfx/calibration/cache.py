@@ -107,7 +107,7 @@ class Cache:
         return parts
 
     @contextmanager
-    def claim(self, sizes: Mapping[str, int], enough: int) -> Iterator[list[str]]:
+    def claim(self, sizes: Mapping[str, int], enough: float) -> Iterator[list[str]]:
         """Claims shares while the block lasts.
 
         Nothing is claimed while this waits, so there is no deadlock.
@@ -164,6 +164,28 @@ class Cache:
         if self.folder is None:
             return None
         return self.folder / key[:2] / f"{key}.entry"
+
+
+def first_fit(sizes: Mapping[str, int], enough: int) -> list[list[str]]:
+    """Puts shares together as claims would that find all of them free, one claim after the other.
+
+    Args:
+        sizes: problems in each share.
+        enough: problems in each claim at most, but for one share that alone has more.
+    """
+    left = dict(sizes)
+    bundles: list[list[str]] = []
+    while left:
+        bundle: list[str] = []
+        problems = 0
+        for name, size in left.items():
+            if not bundle or problems + size <= enough:
+                bundle.append(name)
+                problems += size
+        for name in bundle:
+            del left[name]
+        bundles.append(bundle)
+    return bundles
 
 
 def _head(content: bytes) -> bytes:

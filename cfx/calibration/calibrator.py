@@ -7,8 +7,11 @@ where it stopped.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,23 +19,28 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from cfx import registry
-from cfx.calibration.cache import Arrays, Cache
-from cfx.calibration.losses import PooledLosses, SegmentLosses
-from cfx.calibration.prior import LossesWithPrior
+from cfx.calibration.cache import Arrays, Cache, first_fit
+from cfx.calibration.losses import SegmentLosses
+from cfx.calibration.shards import (
+    CalibrationShard,
+    DriverShard,
+    PooledShard,
+    Solver,
+    WindowShard,
+    cut,
+    solve_shard,
+)
 from cfx.calibration.windows import Windows, WindowSettings
-from cfx.component import content_key, folder_hash
-from cfx.errors import PluginError
+from cfx.component import content_key
+from cfx.engine.base import Engine
+from cfx.engine.local import LocalEngine
 from cfx.objectives.base import Objective
 from cfx.objectives.rmse import SpeedRmse
-from cfx.optimizers.base import Optimizer, Progress, Solution
+from cfx.optimizers.base import Optimizer
 from cfx.pairs import Pair, PairBatch, PairSet
 from cfx.parameters import ParameterSpace
 from cfx.progress import Task
 from cfx.simulation.base import Stepper
-
-_SAME_RELATIVE, _SAME_ABSOLUTE = 1e-5, 1e-8
-"""How far a loss that is computed again may differ: candidates in another batch round otherwise."""
 
 _GROUP = 1024
 """Problems solved together: enough to fill the batch, few enough that an interruption loses
@@ -117,6 +125,7 @@ class Calibrator:
         reported: objectives by name whose losses `losses` reports beside the minimised one.
         prior: weight of the prior on driver-specific and pooled parameters
             (`cfx.calibration.prior`); 0: none. Labels have none: ties go to the driver's own set.
+        engine: solves the problems, shard by shard; this machine's cores unless given.
     """
 
     def __init__(
@@ -131,6 +140,7 @@ class Calibrator:
         objective: Objective | None = None,
         reported: Mapping[str, Objective] | None = None,
         prior: float = 0.0,
+        engine: Engine | None = None,
     ) -> None:
         self.simulator = simulator
         self.optimizer = optimizer
@@ -143,6 +153,9 @@ class Calibrator:
         self.progress = progress
         self.reported = reported or {}
         self.prior = prior
+        self.engine: Engine = LocalEngine()
+        if engine is not None:
+            self.engine = engine
 
     @property
     def space(self) -> ParameterSpace:
@@ -173,12 +186,11 @@ class Calibrator:
         for pair, end in zip(pairs, last.tolist(), strict=True):
             keys.append(self._key("fixed", pair.fingerprint, frames=end, **self._prior_key))
 
-        def solve(chosen: Tensor, report: Progress) -> list[Arrays]:
+        def shard(chosen: Tensor) -> DriverShard:
             chosen = chosen.to(device)
-            losses = self._segments(batch, chosen, last[chosen])
-            return _rows(self._minimize_with_prior(losses, report))
+            return DriverShard(self.solver, self._code, cut(batch, chosen), last[chosen])
 
-        results = self._cached("Driver-specific parameters", keys, [1] * len(pairs), solve)
+        results = self._cached("Driver-specific parameters", keys, [1] * len(pairs), shard)
         return _stacked(results, device)
 
     def population(self, pairs: PairSet, batch: PairBatch, last: Tensor, members: Tensor) -> Tensor:
@@ -202,14 +214,13 @@ class Calibrator:
             group = _group_key(pairs, last, row)
             keys.append(self._key("population", "", pairs=group, **self._prior_key))
 
-        def solve(chosen: Tensor, report: Progress) -> list[Arrays]:
-            groups = members[chosen.cpu()].to(device)
+        def shard(chosen: Tensor) -> PooledShard:
+            groups = members[chosen].to(device)
             used = groups.any(0).nonzero()[:, 0]
-            segments = self._segments(batch, used, last[used])
-            losses = PooledLosses(segments, groups[:, used], self.memory)
-            return _rows(self._minimize_with_prior(losses, report))
+            trajectories = cut(batch, used)
+            return PooledShard(self.solver, self._code, trajectories, last[used], groups[:, used])
 
-        results = self._cached("Pooled parameters", keys, [1] * len(members), solve)
+        results = self._cached("Pooled parameters", keys, [1] * len(members), shard)
         return _stacked(results, device)
 
     def labels(self, pairs: PairSet, batch: PairBatch, windows: Windows, fixed: Tensor) -> Labels:
@@ -233,18 +244,22 @@ class Calibrator:
         defaults = self.space.defaults(device=device).expand_as(fixed)
         guesses = self.space.to_unit(torch.stack([fixed, defaults], dim=1))
 
-        def solve(chosen: Tensor, report: Progress) -> list[Arrays]:
-            own = torch.isin(windows.pair, chosen)
-            pair, first = windows.pair[own].to(device), windows.first[own].to(device)
-            steps = torch.full_like(first, windows.settings.length)
-            losses = SegmentLosses.of_segments(
-                self.simulator, self.objective, batch, pair, first, steps
+        def shard(chosen: Tensor) -> WindowShard:
+            own, _ = windows.select(chosen)
+            chosen = chosen.to(device)
+            return WindowShard(
+                self.solver,
+                self._code,
+                cut(batch, chosen),
+                pair=own.pair.to(device),
+                first=own.first.to(device),
+                length=windows.settings.length,
+                guesses=guesses[chosen],
+                tolerance=tolerance,
             )
-            found = self._minimize(losses, guesses[pair], report, tolerance)
-            return _by_pair(found, windows.pair[own], chosen)
 
         title = "Per-window calibrated parameters (labels)"
-        results = self._cached(title, keys, counts, solve, **description)
+        results = self._cached(title, keys, counts, shard, **description)
         joined = {}
         for name in results[0]:
             parts = np.concatenate([entry[name] for entry in results])
@@ -291,83 +306,18 @@ class Calibrator:
         first = torch.zeros_like(pair)
         return SegmentLosses.of_segments(self.simulator, self.objective, batch, pair, first, last)
 
-    def _defaults(self, problems: int, device: torch.device) -> Tensor:
-        """Returns the model's defaults as the first guess of each problem, `(problems, 1, n)`."""
-        guess = self.space.to_unit(self.space.defaults(device=device))
-        return guess[None, None, :].expand(problems, 1, -1)
-
     @property
     def _prior_key(self) -> dict[str, float]:
         if self.prior == 0:
             return {}
         return {"prior": self.prior}
 
-    def _minimize_with_prior(
-        self, losses: SegmentLosses | PooledLosses, report: Progress
-    ) -> Arrays:
-        """Minimises from the model's defaults on; the loss returned is without the prior."""
-        device = losses.device
-        guesses = self._defaults(losses.problems, device)
-        if self.prior == 0:
-            return self._minimize(losses, guesses, report)
-        default = self.space.to_unit(self.space.defaults(device=device))
-        found = self._minimize(LossesWithPrior.of(losses, default, self.prior), guesses, report)
-        best = torch.as_tensor(found["parameters"], device=device)
-        unit = self.space.to_unit(best)[:, None]
-        return {**found, "loss": losses(unit)[:, 0].cpu().numpy()}
-
-    def _minimize(
-        self,
-        losses: SegmentLosses | PooledLosses | LossesWithPrior,
-        guesses: Tensor,
-        report: Progress,
-        tolerance: float = 0.0,
-    ) -> Arrays:
-        solution = self.optimizer.minimize(
-            losses.for_work(self.optimizer.evaluations()),
-            guesses,
-            seed=self.seed,
-            objective_bytes=losses.bytes_per_candidate,
-            memory=self.memory,
-            progress=report,
-            tolerance=tolerance,
-        )
-        self._check_losses(losses, solution)
-        return {
-            "parameters": self.space.from_unit(solution.best).cpu().numpy(),
-            "loss": solution.loss.cpu().numpy(),
-            "sensitivity": solution.sensitivity.cpu().numpy(),
-            "diverged": solution.diverged.cpu().numpy(),
-        }
-
-    def _check_losses(
-        self, losses: SegmentLosses | PooledLosses | LossesWithPrior, solution: Solution
-    ) -> None:
-        """Computes the losses of what a third party's optimizer returns once more.
-
-        Raises:
-            PluginError: it has mixed up its candidates.
-        """
-        if registry.is_own(self.optimizer):
-            return
-        again, found = losses(solution.best[:, None])[:, 0], solution.loss
-        both = again.isfinite() & found.isfinite()
-        same = torch.isclose(again, found, rtol=_SAME_RELATIVE, atol=_SAME_ABSOLUTE)
-        wrong = both & ~same
-        if bool(wrong.any()):
-            at = int(wrong.nonzero()[0])
-            raise PluginError(
-                f"{registry.origin(self.optimizer)}: solve returned candidates with losses that are"
-                f" not theirs: {float(found[at]):.6g} where the candidate has"
-                f" {float(again[at]):.6g} ({int(wrong.sum())} of {len(found)} problems)"
-            )
-
     def _cached(
         self,
         what: str,
         keys: list[str],
         problems: list[int],
-        solve: Callable[[Tensor, Progress], list[Arrays]],
+        shard: Callable[[Tensor], CalibrationShard],
         **scope: Any,
     ) -> list[Arrays]:
         """Returns one entry per key; solves what neither the cache nor another process provides.
@@ -376,46 +326,56 @@ class Calibrator:
             what: what is calibrated, for the progress display.
             keys: of the entries.
             problems: how many each entry stands for.
-            solve: takes the numbers of entries and returns these entries.
+            shard: takes the numbers of entries and returns what solves these entries.
             scope: settings that all keys share, besides those of the calibrator.
         """
-        work = _Work(self.cache, keys, problems, self.optimizer.evaluations(), solve)
+        work = _Work(self.cache, keys, problems, self.optimizer.evaluations())
         wanted = work.shares(self._key(what, "", **scope))
         optimizer = type(self.optimizer).__name__
         objective = type(self.objective).__name__
         if self.objective.unit:
             objective = f"{objective} in {self.objective.unit}"
         title = f"{what} ({optimizer}, {objective}, {work.missing_problems} problems)"
+        enough: float = _GROUP
+        if self.engine.distributes:
+            enough = math.inf
         with self.progress(title, work.missing_problems * work.evaluations) as task:
             while wanted:
-                sizes = {}
-                for name, indices in wanted.items():
-                    sizes[name] = work.size(indices)
-                with self.cache.claim(sizes, _GROUP) as claimed:
-                    mine = []
-                    for name in claimed:
-                        mine += wanted.pop(name)
-                    work.do(sorted(mine), task)
+                with self.cache.claim(work.sizes(wanted), enough) as claimed:
+                    mine = {name: wanted.pop(name) for name in claimed}
+                    self._solve(work.groups(mine, task), shard, work, task)
         return work.results()
 
-    def _key(self, what: str, pair: str, **details: Any) -> str:
-        model = self.simulator.model
-        parameters = [(p.name, p.low, p.high, p.default, p.tuned) for p in self.space]
-        return content_key(
-            {
-                "what": what,
-                "pair": pair,
-                "dt": self.simulator.dt,
-                "simulation": self.simulator.identity(),
-                "calibration": folder_hash(__file__),
-                "model": model.identity(),
-                "parameters": parameters,
-                "optimizer": self.optimizer.identity(),
-                "objective": self.objective.identity(),
-                "seed": self.seed,
-                **details,
-            }
+    def _solve(
+        self,
+        groups: list[list[int]],
+        shard: Callable[[Tensor], CalibrationShard],
+        work: _Work,
+        task: Task,
+    ) -> None:
+        """Has the engine solve groups of entries; each result is kept as soon as it is there."""
+        shards = (shard(torch.tensor(group)) for group in groups)
+        with closing(self.engine.map(solve_shard, shards, task.advance)) as results:
+            for number, entries in results:
+                work.keep(groups[number], entries)
+
+    @cached_property
+    def solver(self) -> Solver:
+        """What all problems have in common."""
+        return Solver(
+            self.simulator, self.optimizer, self.objective, self.seed, self.memory, self.prior
         )
+
+    @cached_property
+    def _scope(self) -> dict[str, Any]:
+        return self.solver.scope
+
+    @cached_property
+    def _code(self) -> str:
+        return content_key(self._scope)
+
+    def _key(self, what: str, pair: str, **details: Any) -> str:
+        return content_key({"what": what, "pair": pair, **self._scope, **details})
 
 
 class _Work:
@@ -427,20 +387,14 @@ class _Work:
     """
 
     def __init__(
-        self,
-        cache: Cache,
-        keys: list[str],
-        problems: list[int],
-        evaluations: int,
-        solve: Callable[[Tensor, Progress], list[Arrays]],
+        self, cache: Cache, keys: list[str], problems: list[int], evaluations: int
     ) -> None:
         self._cache = cache
         self._keys = keys
         self._problems = problems
-        self._solve = solve
         self._entries = [cache.get(key) for key in keys]
         self.evaluations = evaluations
-        self.missing_problems = self.size(self._missing(range(len(keys))))
+        self.missing_problems = self._size(self._missing(range(len(keys))))
 
     def shares(self, scope: str) -> dict[str, list[int]]:
         """Returns the missing entries by the share of the cache in which they are claimed."""
@@ -451,28 +405,47 @@ class _Work:
             shares[name] = [missing[position] for position in positions]
         return shares
 
-    def size(self, indices: Sequence[int]) -> int:
-        """Returns how many problems some entries stand for."""
-        total = 0
-        for index in indices:
-            total += self._problems[index]
-        return total
+    def sizes(self, shares: Mapping[str, list[int]]) -> dict[str, int]:
+        """Returns how many problems the entries of each share stand for."""
+        sizes = {}
+        for name, indices in shares.items():
+            sizes[name] = self._size(indices)
+        return sizes
 
-    def do(self, indices: list[int], task: Task) -> None:
-        """Provides claimed entries: another process may have solved some before the claim."""
-        for index in indices:
-            self._entries[index] = self._cache.get(self._keys[index])
-        left = self._missing(indices)
-        task.advance(self.evaluations * (self.size(indices) - self.size(left)))
-        for group in _groups(left, self._problems):
-            solved = self._solve(torch.tensor(group), task.advance)
-            for index, entry in zip(group, solved, strict=True):
-                self._cache.put(self._keys[index], entry)
-                self._entries[index] = entry
+    def groups(self, shares: dict[str, list[int]], task: Task) -> list[list[int]]:
+        """Returns what is left of claimed shares: entries that are solved together.
+
+        Another process may have solved some before the claim. Shares are put together as an engine
+        claims them that solves one group after the other, so that every engine has the same groups.
+        """
+        groups: list[list[int]] = []
+        for names in first_fit(self.sizes(shares), _GROUP):
+            indices: list[int] = []
+            for name in names:
+                indices += shares[name]
+            indices.sort()
+            for index in indices:
+                self._entries[index] = self._cache.get(self._keys[index])
+            left = self._missing(indices)
+            task.advance(self.evaluations * (self._size(indices) - self._size(left)))
+            groups.extend(_groups(left, self._problems))
+        return groups
+
+    def keep(self, group: list[int], entries: list[Arrays]) -> None:
+        """Keeps what was solved."""
+        for index, entry in zip(group, entries, strict=True):
+            self._cache.put(self._keys[index], entry)
+            self._entries[index] = entry
 
     def results(self) -> list[Arrays]:
         """Returns all entries."""
         return [entry for entry in self._entries if entry is not None]
+
+    def _size(self, indices: Sequence[int]) -> int:
+        total = 0
+        for index in indices:
+            total += self._problems[index]
+        return total
 
     def _missing(self, indices: Sequence[int]) -> list[int]:
         return [index for index in indices if self._entries[index] is None]
@@ -498,29 +471,6 @@ def _group_key(pairs: Sequence[Pair] | PairSet, last: Tensor, members: Tensor) -
     for index in members.nonzero()[:, 0].tolist():
         found.append((pairs[index].fingerprint, int(last[index])))
     return sorted(found)
-
-
-def _rows(found: Arrays) -> list[Arrays]:
-    """Returns an entry for each problem."""
-    entries = []
-    for number in range(len(found["loss"])):
-        entries.append({name: values[number] for name, values in found.items()})
-    return entries
-
-
-def _by_pair(found: Arrays, pair: Tensor, chosen: Tensor) -> list[Arrays]:
-    """Returns an entry for each chosen pair, with all its windows.
-
-    Args:
-        found: a row per window.
-        pair: `(W,)`, the pair of each window.
-        chosen: the pairs.
-    """
-    entries = []
-    for number in chosen.tolist():
-        own = (pair == number).numpy()
-        entries.append({name: values[own] for name, values in found.items()})
-    return entries
 
 
 def _stacked(entries: list[Arrays], device: torch.device) -> Tensor:

@@ -11,6 +11,7 @@ import torch
 from cfx import registry
 from cfx.config import JobConfig
 from cfx.datasets.base import Dataset
+from cfx.engine.base import Engine
 from cfx.errors import ConfigError
 from cfx.learners.base import Learner
 from cfx.metrics.installed import MetricSet
@@ -42,6 +43,7 @@ class Parts:
     learner: Learner
     protocol: Protocol
     metrics: MetricSet
+    engine: Engine
 
     @classmethod
     def of(cls, config: JobConfig, protocol: Protocol) -> Parts:
@@ -70,6 +72,7 @@ class Parts:
             learner=learner,
             protocol=protocol,
             metrics=MetricSet.of(config.metrics),
+            engine=cast(Engine, registry.create("engine", config.engine)),
         )
 
 

@@ -91,7 +91,7 @@ def take_steps(
             }
         )
         context = _context(config, parts, pairs, style, device)
-        with closing(context.simulator):
+        with closing(context.simulator), closing(parts.engine):
             protocol_result = _run_protocol(parts.protocol, context)
         result = _keep(config, parts, output, pairs, style, protocol_result, tracker)
     report(
@@ -153,6 +153,7 @@ def _context(
         objective=parts.objective,
         reported=reported_objectives(config, parts.objective),
         prior=prior_weight(config.calibration.prior),
+        engine=parts.engine,
     )
     return ProtocolContext(
         pairs=pairs,

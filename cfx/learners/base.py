@@ -18,6 +18,8 @@ from cfx.agents.valid_range import ValidRange
 from cfx.calibration.calibrator import Labels
 from cfx.calibration.windows import Split, WindowSettings
 from cfx.component import Component
+from cfx.engine.base import Engine
+from cfx.engine.local import LocalEngine
 from cfx.errors import ConfigError
 from cfx.models.base import DrivingModel
 from cfx.objectives.base import Objective
@@ -53,6 +55,7 @@ class TrainingData:
             kept.
         objective: what training that simulates in closed loop minimises; calibration has minimised
             it too.
+        engine: where independent networks may train.
     """
 
     simulator: Stepper
@@ -68,6 +71,7 @@ class TrainingData:
     drivers: tuple[str, ...] | None = None
     workspace: Path | None = None
     objective: Objective = field(default_factory=SpeedRmse)
+    engine: Engine = field(default_factory=LocalEngine)
 
 
 @dataclass(frozen=True)

@@ -295,4 +295,5 @@ def _training_data(
         base=base,
         drivers=tuple(context.pairs[number].driver for number in index.tolist()),
         workspace=context.workspace,
+        engine=context.engine,
     )

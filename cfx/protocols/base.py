@@ -23,6 +23,7 @@ from cfx.agents.valid_range import recorded_quantiles
 from cfx.calibration.calibrator import Calibrator, Labels
 from cfx.calibration.windows import Windows, WindowSettings
 from cfx.component import Component
+from cfx.engine.base import Engine
 from cfx.errors import PluginError
 from cfx.evaluation.result import Evaluation
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingResult
@@ -80,6 +81,11 @@ class ProtocolContext:
     def objective(self) -> Objective:
         """What calibration minimises and closed-loop training back-propagates."""
         return self.calibrator.objective
+
+    @property
+    def engine(self) -> Engine:
+        """Where calibration, training and evaluation run."""
+        return self.calibrator.engine
 
     def labels(self, counts: Tensor, fixed: Tensor) -> Labels | None:
         """Calibrates parameters per window (labels), if the learner needs any.

@@ -65,6 +65,7 @@ class WithinDriver(Protocol):
                 base=fixed if self.settings.networks == "all" else None,
                 drivers=tuple(pair.driver for pair in pairs),
                 workspace=context.workspace,
+                engine=context.engine,
             )
             training_result = context.learner.fit(context.policy, training_data)
         else:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from cfx.testing.contract import NotApplicable as NotApplicable
     from cfx.testing.contract import violations as violations
     from cfx.testing.datasets import DatasetContract as DatasetContract
+    from cfx.testing.engines import EngineContract as EngineContract
     from cfx.testing.learners import LearnerContract as LearnerContract
     from cfx.testing.metrics import MetricContract as MetricContract
     from cfx.testing.models import ModelContract as ModelContract
@@ -40,6 +41,7 @@ _HOMES = {
     "ObjectiveContract": "cfx.testing.objectives",
     "OptimizerContract": "cfx.testing.optimizers",
     "PolicyContract": "cfx.testing.policies",
+    "EngineContract": "cfx.testing.engines",
     "LearnerContract": "cfx.testing.learners",
     "ProtocolContract": "cfx.testing.protocols",
     "MetricContract": "cfx.testing.metrics",
@@ -57,6 +59,7 @@ _CHECKS = {
     "optimizer": "cfx.testing.checks.optimizers",
     "objective": "cfx.testing.checks.objectives",
     "policy": "cfx.testing.checks.policies",
+    "engine": "cfx.testing.checks.engines",
     "learner": "cfx.testing.checks.learners",
     "protocol": "cfx.testing.checks.protocols",
     "metric": "cfx.testing.checks.metrics",

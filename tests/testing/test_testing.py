@@ -17,6 +17,7 @@ from cfx.testing.suite import hold
 SUITES = {
     "dataset": cfx.testing.DatasetContract,
     "model": cfx.testing.ModelContract,
+    "engine": cfx.testing.EngineContract,
     "simulator": cfx.testing.SimulatorContract,
     "objective": cfx.testing.ObjectiveContract,
     "optimizer": cfx.testing.OptimizerContract,

@@ -1,0 +1,270 @@
+"""What a calibration hands to an engine: problems with the trajectories that they need.
+
+A shard holds whatever its solution depends on, and nothing else. It is solved in the same way in
+this process, in another one and on another machine.
+
+Shapes: P pairs of a shard, T frames of the longest, W windows, K groups, n tuned parameters.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from cfx import registry
+from cfx.calibration.cache import Arrays
+from cfx.calibration.losses import PooledLosses, SegmentLosses
+from cfx.calibration.prior import LossesWithPrior
+from cfx.component import content_key, folder_hash
+from cfx.engine.base import Report
+from cfx.errors import EngineError, PluginError
+from cfx.objectives.base import Objective
+from cfx.optimizers.base import Optimizer, Solution
+from cfx.pairs import PairBatch
+from cfx.parameters import ParameterSpace
+from cfx.simulation.base import Stepper
+
+_SAME_RELATIVE, _SAME_ABSOLUTE = 1e-5, 1e-8
+"""How far a loss that is computed again may differ: candidates in another batch round otherwise."""
+
+
+@dataclass(frozen=True)
+class Solver:
+    """What all problems of a calibration have in common.
+
+    Attributes:
+        simulator: the model and its time step.
+        optimizer: solves the problems.
+        objective: what is minimised.
+        seed: the same seed gives the same parameters.
+        memory: bound for one chunk, bytes.
+        prior: weight of the prior (`cfx.calibration.prior`); 0: none.
+    """
+
+    simulator: Stepper
+    optimizer: Optimizer
+    objective: Objective
+    seed: int
+    memory: int
+    prior: float = 0.0
+
+    @property
+    def space(self) -> ParameterSpace:
+        """The model's parameter space."""
+        return self.simulator.model.space
+
+    @property
+    def scope(self) -> dict[str, Any]:
+        """What every result depends on besides its trajectories; keys of the cache hold it."""
+        model = self.simulator.model
+        parameters = [(p.name, p.low, p.high, p.default, p.tuned) for p in self.space]
+        return {
+            "dt": self.simulator.dt,
+            "simulation": self.simulator.identity(),
+            "calibration": folder_hash(__file__),
+            "model": model.identity(),
+            "parameters": parameters,
+            "optimizer": self.optimizer.identity(),
+            "objective": self.objective.identity(),
+            "seed": self.seed,
+        }
+
+    def minimize_from_defaults(
+        self, losses: SegmentLosses | PooledLosses, report: Report
+    ) -> Arrays:
+        """Minimises from the model's defaults on, with the prior.
+
+        The loss that is returned is without it.
+        """
+        device = losses.device
+        default = self.space.to_unit(self.space.defaults(device=device))
+        guesses = default[None, None, :].expand(losses.problems, 1, -1)
+        if self.prior == 0:
+            return self.minimize(losses, guesses, report)
+        found = self.minimize(LossesWithPrior.of(losses, default, self.prior), guesses, report)
+        best = torch.as_tensor(found["parameters"], device=device)
+        unit = self.space.to_unit(best)[:, None]
+        return {**found, "loss": losses(unit)[:, 0].cpu().numpy()}
+
+    def minimize(
+        self,
+        losses: SegmentLosses | PooledLosses | LossesWithPrior,
+        guesses: Tensor,
+        report: Report,
+        tolerance: float = 0.0,
+    ) -> Arrays:
+        """Returns a row per problem.
+
+        Args:
+            losses: of the problems.
+            guesses: first guesses `(problems, g, n)` in unit space.
+            report: called with how many evaluations are done.
+            tolerance: losses this close are equal.
+
+        Raises:
+            PluginError: the optimizer breaks its contract.
+        """
+        solution = self.optimizer.minimize(
+            losses.for_work(self.optimizer.evaluations()),
+            guesses,
+            seed=self.seed,
+            objective_bytes=losses.bytes_per_candidate,
+            memory=self.memory,
+            progress=report,
+            tolerance=tolerance,
+        )
+        self._check_losses(losses, solution)
+        return {
+            "parameters": self.space.from_unit(solution.best).cpu().numpy(),
+            "loss": solution.loss.cpu().numpy(),
+            "sensitivity": solution.sensitivity.cpu().numpy(),
+            "diverged": solution.diverged.cpu().numpy(),
+        }
+
+    def _check_losses(
+        self, losses: SegmentLosses | PooledLosses | LossesWithPrior, solution: Solution
+    ) -> None:
+        """Computes the losses of what a third party's optimizer returns once more.
+
+        Raises:
+            PluginError: it has mixed up its candidates.
+        """
+        if registry.is_own(self.optimizer):
+            return
+        again, found = losses(solution.best[:, None])[:, 0], solution.loss
+        both = again.isfinite() & found.isfinite()
+        same = torch.isclose(again, found, rtol=_SAME_RELATIVE, atol=_SAME_ABSOLUTE)
+        wrong = both & ~same
+        if bool(wrong.any()):
+            at = int(wrong.nonzero()[0])
+            raise PluginError(
+                f"{registry.origin(self.optimizer)}: solve returned candidates with losses that are"
+                f" not theirs: {float(found[at]):.6g} where the candidate has"
+                f" {float(again[at]):.6g} ({int(wrong.sum())} of {len(found)} problems)"
+            )
+
+
+@dataclass(frozen=True)
+class CalibrationShard:
+    """Base of the shards of a calibration.
+
+    Attributes:
+        solver: what all problems have in common.
+        code: hash of `solver.scope` where the shard was cut.
+        batch: the trajectories, `(P, T)`.
+    """
+
+    solver: Solver
+    code: str
+    batch: PairBatch
+
+    def segments(self, pair: Tensor, first: Tensor, steps: Tensor) -> SegmentLosses:
+        """Returns the losses of segments `(S,)` of pairs, from a first frame on."""
+        return SegmentLosses.of_segments(
+            self.solver.simulator, self.solver.objective, self.batch, pair, first, steps
+        )
+
+    def whole(self, last: Tensor) -> SegmentLosses:
+        """Returns the losses of each pair from frame 0 to a last one, `(P,)`."""
+        pair = torch.arange(len(self.batch), device=last.device)
+        return self.segments(pair, torch.zeros_like(last), last)
+
+    def solve(self, report: Report) -> list[Arrays]:
+        """Returns an entry of the cache for each of what was asked for."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class DriverShard(CalibrationShard):
+    """Constant parameters of each pair.
+
+    Attributes:
+        last: `(P,)`, the last frame that may be used of each.
+    """
+
+    last: Tensor
+
+    def solve(self, report: Report) -> list[Arrays]:
+        return _rows(self.solver.minimize_from_defaults(self.whole(self.last), report))
+
+
+@dataclass(frozen=True)
+class PooledShard(CalibrationShard):
+    """Constant parameters of groups of pairs.
+
+    Attributes:
+        last: `(P,)`, the last frame that may be used of each.
+        members: `(K, P)` bool, the pairs of each group.
+    """
+
+    last: Tensor
+    members: Tensor
+
+    def solve(self, report: Report) -> list[Arrays]:
+        losses = PooledLosses(self.whole(self.last), self.members, self.solver.memory)
+        return _rows(self.solver.minimize_from_defaults(losses, report))
+
+
+@dataclass(frozen=True)
+class WindowShard(CalibrationShard):
+    """Parameters of each window.
+
+    Attributes:
+        pair, first: `(W,)`, the pair of each window and the frame that it starts from.
+        length: steps of a window.
+        guesses: `(P, g, n)` in unit space, first guesses in each window of a pair.
+        tolerance: losses this close are equal, in the objective's unit.
+    """
+
+    pair: Tensor
+    first: Tensor
+    length: int
+    guesses: Tensor
+    tolerance: float
+
+    def solve(self, report: Report) -> list[Arrays]:
+        steps = torch.full_like(self.first, self.length)
+        losses = self.segments(self.pair, self.first, steps)
+        found = self.solver.minimize(losses, self.guesses[self.pair], report, self.tolerance)
+        entries = []
+        for number in range(len(self.batch)):
+            own = (self.pair == number).cpu().numpy()
+            entries.append({name: values[own] for name, values in found.items()})
+        return entries
+
+
+def solve_shard(shard: CalibrationShard, report: Report) -> list[Arrays]:
+    """Solves a shard, wherever it is.
+
+    Raises:
+        EngineError: here is other code than where the shard was cut.
+    """
+    if content_key(shard.solver.scope) != shard.code:
+        raise EngineError(
+            "a worker has other code than this job (another version of cfx or of a plugin); install"
+            " the same on all workers, and start them again"
+        )
+    return shard.solve(report)
+
+
+def cut(batch: PairBatch, pairs: Tensor) -> PairBatch:
+    """Returns some pairs of a batch, `(P,)`, without the frames that none of them has."""
+    chosen = batch[pairs]
+    frames = int(chosen.lengths.max())
+    signals: dict[str, Any] = {}
+    for field in fields(chosen):
+        value = getattr(chosen, field.name)
+        if isinstance(value, Tensor) and value.dim() == 2:
+            signals[field.name] = value[:, :frames]
+    return replace(chosen, **signals)
+
+
+def _rows(found: Arrays) -> list[Arrays]:
+    """Returns an entry for each problem."""
+    entries = []
+    for number in range(len(found["loss"])):
+        entries.append({name: values[number] for name, values in found.items()})
+    return entries

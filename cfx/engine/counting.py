@@ -1,0 +1,27 @@
+"""Work in another process, which counts its progress there and hands it over with the result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Generic
+
+from cfx.engine.base import ResultT, ShardT, Work
+
+
+@dataclass(frozen=True)
+class Counted(Generic[ResultT]):
+    """A result, and the units of work that it took."""
+
+    result: ResultT
+    units: int
+
+
+def counted(work: Work[ShardT, ResultT], shard: ShardT) -> Counted[ResultT]:
+    """Does the work of one shard."""
+    units = 0
+
+    def report(more: int) -> None:
+        nonlocal units
+        units += more
+
+    return Counted(work(shard, report), units)

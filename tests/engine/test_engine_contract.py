@@ -1,0 +1,33 @@
+"""cfx's own engines keep the contract; a job chooses one by name."""
+
+from __future__ import annotations
+
+import pytest
+
+import cfx
+from cfx import registry
+from cfx.engine.base import Engine
+from cfx.engine.local import LocalEngine
+from cfx.simulation import threads
+from cfx.testing import EngineContract
+
+
+class TestLocalOnOneCore(EngineContract):
+    @pytest.fixture
+    def engine(self, monkeypatch: pytest.MonkeyPatch) -> Engine:
+        monkeypatch.setattr(threads, "_LIMIT", [1])
+        return LocalEngine()
+
+
+@pytest.mark.slow
+class TestLocal(EngineContract):
+    """In processes of its own, each of which imports PyTorch."""
+
+    @pytest.fixture
+    def engine(self) -> Engine:
+        return LocalEngine()
+
+
+def test_it_is_chosen_by_name() -> None:
+    assert cfx.get("engine", "local") is LocalEngine
+    assert isinstance(registry.create("engine", {"name": "local"}), LocalEngine)
