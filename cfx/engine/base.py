@@ -58,7 +58,8 @@ class Engine(Component):
                 outside. Where workers are other processes, it, the shards and the results are
                 pickled.
             shards: made one after the other, not long before they are worked on.
-            report: called with how many units are done; they add up, also where a shard is done again.
+            report: called with how many units are done; they add up, also where a shard is done
+                again.
             shares_cores: `work` uses all of a machine's cores by itself. Work that uses one core
                 says False, and an engine may then run several on one machine.
 
