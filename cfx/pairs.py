@@ -45,6 +45,9 @@ class Pair:
         dt: time step, s.
         leader_length: m.
         lane: lane number, None where the source has none.
+        driver_type: what drives the follower, as the source labels it: "human", "acc", "automated",
+            "truck", a vType; "" where it has no labels.
+        leader_driver_type: what drives the leader.
         truth: true parameters over time, name -> `(T,)`, known only for synthetic pairs.
         truth_model: name of the model these parameters belong to.
     """
@@ -65,6 +68,8 @@ class Pair:
     lane: int | None = None
     truth: Mapping[str, Array] = field(default_factory=dict)
     truth_model: str = ""
+    driver_type: str = ""
+    leader_driver_type: str = ""
 
     def __post_init__(self) -> None:
         shapes = {name: getattr(self, name).shape for name in SIGNALS}
@@ -107,7 +112,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Dropped:
-    """A count of what a dataset left out, and why.
+    """A count of what a dataset left out or cut, and why.
 
     Attributes:
         unit: what was counted: rows, pairs or vehicles.
@@ -120,11 +125,16 @@ class Dropped:
 
 @dataclass(frozen=True)
 class PairSet(Sequence[Pair]):
-    """Pairs in a fixed order, where they came from, and a count of everything that was left out."""
+    """Pairs in a fixed order, where they came from, and a count of everything that was left out.
+
+    Attributes:
+        ends: why the pairs that were cut out of tracks end, counted over all that were found.
+    """
 
     pairs: tuple[Pair, ...]
     source: str
     dropped: tuple[Dropped, ...] = ()
+    ends: tuple[Dropped, ...] = ()
 
     def __post_init__(self) -> None:
         seen: set[str] = set()

@@ -6,7 +6,7 @@ from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import BeforeValidator, Field
@@ -14,7 +14,9 @@ from pydantic_core import PydanticCustomError
 
 from cfx import registry
 from cfx.component import Component, Settings
+from cfx.datasets.files import FileStart
 from cfx.datasets.resample import resampled
+from cfx.datasets.tracks import summed
 from cfx.errors import DataError, PluginError, nearest
 from cfx.files import absolute
 from cfx.pairs import SIGNALS, Dropped, Pair, PairSet
@@ -61,6 +63,14 @@ class DatasetSettings(Settings):
     lanes: list[int] | None = Field(None, description="keep pairs in these lanes alone; null: all")
     pair_ids: list[str] | None = Field(
         None, description="keep these pairs alone, by their ids; null: all"
+    )
+    driver_type: str | None = Field(
+        None,
+        description="keep followers of this type alone, as the recording labels them: human, acc,"
+        " automated, truck, a vType; null: all",
+    )
+    leader_driver_type: str | None = Field(
+        None, description="keep pairs behind leaders of this type alone; null: all"
     )
     max_pairs: int | None = Field(None, ge=1, description="keep the first so many pairs; null: all")
     scale: float = Field(
@@ -116,17 +126,56 @@ def _matching(path: Path) -> list[Path]:
     return sorted(found)
 
 
+class Contents(NamedTuple):
+    """A file's pairs, and what the pairs do not show, for `data describe`.
+
+    Attributes:
+        rows: of the file.
+        vehicles: how many there are, over all recordings.
+        problem: a sentence on what a user should know before they use it; "" if there is none.
+    """
+
+    pairs: PairSet
+    rows: int
+    vehicles: int
+    problem: str = ""
+
+
 class Dataset(Component):
     """Base of every dataset.
 
     Life cycle: constructed once per job; `load` is called once, calls `read`, and selects.
 
-    A subclass implements `read`. Its settings extend `DatasetSettings`.
+    A subclass implements `read`. Its settings extend `DatasetSettings`. One that reads files tells
+    `data describe` about its layout by `layout` and `recognises`.
+
+    Attributes:
+        layout: what the layout is called, units included; "" for a dataset that reads no files.
     """
 
     kind = "dataset"
+    layout: ClassVar[str] = ""
     schema: ClassVar[type[Settings]] = DatasetSettings
     settings: DatasetSettings
+
+    @classmethod
+    def recognises(cls, start: FileStart) -> bool:  # noqa: ARG003 - what overrides look at
+        """Says whether a file is in this dataset's layout, from its beginning alone."""
+        return False
+
+    def contents(self) -> Contents:
+        """Returns everything in the file, before any selection.
+
+        Raises:
+            DataError: as `read`.
+        """
+        pairs = self.read()
+        rows = sum(len(pair) for pair in pairs)
+        vehicles = set()
+        for pair in pairs:
+            vehicles.add((pair.recording, pair.leader_id))
+            vehicles.add((pair.recording, pair.follower_id))
+        return Contents(pairs, rows, len(vehicles))
 
     @abstractmethod
     def read(self) -> PairSet:
@@ -139,12 +188,12 @@ class Dataset(Component):
     def load(self) -> PairSet:
         """Returns the pairs that the settings select.
 
-        They are selected by recording, lane, id and length; of those the first `max_pairs` are
-        kept. Lengths count in steps of `time_step`.
+        They are selected by recording, lane, id, what drives them, and length; of those the first
+        `max_pairs` are kept. Lengths count in steps of `time_step`.
 
         Raises:
-            DataError: as `read`; or the recording or a pair id is unknown, the source has no lanes,
-                or too few pairs remain.
+            DataError: as `read`; or the recording, a pair id or a type of driver is unknown, the
+                source has no lanes, or too few pairs remain.
             PluginError: `read` gives anything but pairs of finite numbers.
         """
         pairs = self.read()
@@ -157,6 +206,8 @@ class Dataset(Component):
             pairs = _select_lanes(pairs, self.settings.lanes)
         if self.settings.pair_ids is not None:
             pairs = _select_ids(pairs, self.settings.pair_ids)
+        for name in ("driver_type", "leader_driver_type"):
+            pairs = _select_type(pairs, name, getattr(self.settings, name))
         if self.settings.time_step is not None:
             pairs = resampled(pairs, self.settings.time_step)
             if not len(pairs):
@@ -213,17 +264,14 @@ def joined(parts: Sequence[PairSet]) -> PairSet:
         return parts[0]
     _require_different(parts)
     pairs: list[Pair] = []
-    counts: dict[tuple[str, str], int] = {}
+    dropped: list[Dropped] = []
+    ends: list[Dropped] = []
     for part in parts:
         pairs += part
-        for drop in part.dropped:
-            key = (drop.reason, drop.unit)
-            counts[key] = counts.get(key, 0) + drop.count
-    dropped = []
-    for (reason, unit), count in counts.items():
-        dropped.append(Dropped(reason, count, unit))
+        dropped += part.dropped
+        ends += part.ends
     sources = listed([part.source for part in parts], 3)
-    return PairSet(tuple(pairs), f"{len(parts)} files ({sources})", tuple(dropped))
+    return PairSet(tuple(pairs), f"{len(parts)} files ({sources})", summed(dropped), summed(ends))
 
 
 def _require_different(parts: Sequence[PairSet]) -> None:
@@ -305,6 +353,25 @@ def _select_ids(pairs: PairSet, wanted: Sequence[str]) -> PairSet:
             f"data.pair_ids={list(wanted)}: {pairs.source}: {what} Known: {listed(known)}."
         )
     return pairs.select([name in wanted for name in known], "other pairs than data.pair_ids")
+
+
+def _select_type(pairs: PairSet, name: str, wanted: str | None) -> PairSet:
+    """Keeps the pairs whose follower or leader is of a type; all where None is wanted."""
+    if wanted is None:
+        return pairs
+    types = [getattr(pair, name) for pair in pairs]
+    known = sorted(set(types) - {""})
+    if not known:
+        raise DataError(
+            f"data.{name}={wanted}: {pairs.source} does not say what drives its vehicles; leave"
+            f" data.{name} out"
+        )
+    if wanted not in known:
+        raise DataError(
+            f"data.{name}={wanted}: {pairs.source} has no such type.{nearest(wanted, known)}"
+            f" Known: {listed(known)}."
+        )
+    return pairs.select([one == wanted for one in types], f"another {name} than '{wanted}'")
 
 
 def _select_long(pairs: PairSet, min_frames: int) -> PairSet:

@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import io
+import logging
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console, RenderableType
 from rich.table import Table
 
-from cfx.datasets.base import listed
-from cfx.datasets.files import PARQUET, Floats, magic, sniff
-from cfx.datasets.ngsim_file import read_ngsim
-from cfx.datasets.tidy import read_tidy
-from cfx.datasets.tidy_table import LABELS, NUMBERS
-from cfx.pairs import Pair, PairSet
+from cfx import registry
+from cfx.datasets.base import Contents, Dataset, listed
+from cfx.datasets.files import Floats, beginning
+from cfx.errors import DataError, PluginError
+from cfx.pairs import Dropped, Pair, PairSet
+from cfx.registry import Entry
 from cfx.style.entropy import STANDING_MPS
+
+log = logging.getLogger(__name__)
 
 Marks = NDArray[np.bool_]
 
@@ -36,38 +40,34 @@ _QUANTILES = {
 }
 """Quantiles in the table of motion, and their headings."""
 
-_LAYOUTS = {"tidy": "tidy pairs (SI units)", "ngsim": "NGSIM (feet)"}
+_TYPES = {"driver_type": "followers", "leader_driver_type": "leaders"}
+"""Labels of a pair, and the questions that they answer."""
 
 _WIDTH = 110
-
-
-class _Contents(NamedTuple):
-    """A file's pairs, and what the pairs do not show."""
-
-    layout: str
-    pairs: PairSet
-    rows: int
-    vehicles: int
-    problem: str = ""
 
 
 def describe(path: Path) -> str:
     """Says what a recording holds.
 
     These are its rows, recordings and pairs, their motion, what was left out and why, and what
-    looks wrong. The layout, tidy or NGSIM, is found from the file itself.
+    looks wrong. The layout is found from the file itself: each dataset says whether it is its own,
+    those of plugins too.
 
     Raises:
         DataError: the file cannot be used; the message says why.
     """
     path = path.expanduser()
-    contents = _read(path)
-    pieces: list[RenderableType] = [str(path), "", _overview(contents)]
+    name = _dataset_of(path)
+    cls = cast(type[Dataset], registry.get("dataset", name))
+    contents = cls(path=path).contents()
+    pieces: list[RenderableType] = [str(path), "", _overview(cls.layout, contents)]
     if len(contents.pairs):
         pieces += ["", _motion(contents.pairs)]
     pieces += ["", *_left_out(contents.pairs)]
+    if contents.pairs.ends:
+        pieces += ["", "Why pairs end:", *_counts(contents.pairs.ends)]
     pieces += ["", *_problems(contents)]
-    pieces += ["", f"Use it: data={contents.layout} data.path={path}"]
+    pieces += ["", f"Use it: data={name} data.path={path}"]
     text = io.StringIO()
     console = Console(file=text, width=_WIDTH, highlight=False, markup=False, emoji=False)
     for piece in pieces:
@@ -75,32 +75,49 @@ def describe(path: Path) -> str:
     return "\n".join(line.rstrip() for line in text.getvalue().splitlines())
 
 
-def _read(path: Path) -> _Contents:
-    """Reads a file in either layout."""
-    if magic(path) == PARQUET or _looks_tidy(sniff(path).header):
-        pairs = read_tidy(path)
-        vehicles = set()
-        for pair in pairs:
-            vehicles.add((pair.recording, pair.leader_id))
-            vehicles.add((pair.recording, pair.follower_id))
-        return _Contents("tidy", pairs, _frames(pairs), len(vehicles))
-    rows = read_ngsim(path)
-    return _Contents(
-        "ngsim", rows.pairs(), rows.rows_read, rows.vehicles, rows.boundary_artefacts()
-    )
+def _dataset_of(path: Path) -> str:
+    """Returns the name of the dataset that reads a file; cfx's own are asked before plugins'.
+
+    Raises:
+        DataError: it has columns that none of them knows.
+    """
+    start = beginning(path)
+    layouts = []
+    found = sorted(registry.entries("dataset"), key=lambda one: one.distribution != registry.OWN)
+    for one in found:
+        cls = _usable(one)
+        if cls is None:
+            continue
+        if cls.recognises(start):
+            return one.name
+        if cls.layout:
+            layouts.append(f"{cls.layout} (data={one.name})")
+    has_names = any(character.isalpha() for character in "".join(start.columns))
+    if start.path.is_dir() or has_names:
+        columns = listed(start.columns, 20) or "none: it is a folder"
+        raise DataError(
+            f"{path}: no dataset knows this layout. Columns found: {columns}. Known layouts:"
+            f" {'; '.join(layouts)}. Write its pairs in the tidy layout, or see docs/readers.md"
+        )
+    return "ngsim"  # whose reader says what is wrong with a file without column names
 
 
-def _looks_tidy(header: Sequence[str] | None) -> bool:
-    if header is None:
-        return False
-    return len(set(header) & {*LABELS, *NUMBERS}) >= 3
+def _usable(found: Entry) -> type[Dataset] | None:
+    """Returns a dataset's class; None, and a warning, for a plugin that is broken."""
+    if registry.rivals(found):
+        return None
+    try:
+        return cast(type[Dataset], registry.get("dataset", found.name))
+    except PluginError as error:
+        log.warning("%s", error)
+        return None
 
 
 def _frames(pairs: PairSet) -> int:
     return sum(len(pair) for pair in pairs)
 
 
-def _overview(contents: _Contents) -> Table:
+def _overview(layout: str, contents: Contents) -> Table:
     """Returns what a file holds, a row per question."""
     pairs = contents.pairs
     recordings: dict[str, int] = {}
@@ -113,7 +130,7 @@ def _overview(contents: _Contents) -> Table:
     truth = {pair.truth_model for pair in pairs if pair.truth}
 
     table = Table.grid(padding=(0, 3))
-    table.add_row("layout", _LAYOUTS[contents.layout])
+    table.add_row("layout", layout)
     table.add_row("rows", f"{contents.rows:,}")
     table.add_row("vehicles", f"{contents.vehicles:,}")
     if counted:
@@ -126,6 +143,10 @@ def _overview(contents: _Contents) -> Table:
     for frames in _THRESHOLDS:
         count = sum(len(pair) >= frames for pair in pairs)
         table.add_row(f"  of at least {frames} frames", f"{count:,}")
+    for name, title in _TYPES.items():
+        types = Counter(getattr(pair, name) or "not known" for pair in pairs)
+        if set(types) - {"not known"}:
+            table.add_row(title, listed([f"{one} ({count} pairs)" for one, count in types.items()]))
     if truth:
         table.add_row("true parameters", f"known, of {listed(sorted(truth))}")
     return table
@@ -169,13 +190,14 @@ def _joined(pairs: PairSet, name: str) -> Floats:
 def _left_out(pairs: PairSet) -> list[str]:
     if not pairs.dropped:
         return ["Left out: nothing"]
-    lines = ["Left out:"]
-    for drop in pairs.dropped:
-        lines.append(f"  {drop.count:,} {drop.unit}: {drop.reason}")
-    return lines
+    return ["Left out:", *_counts(pairs.dropped)]
 
 
-def _problems(contents: _Contents) -> list[str]:
+def _counts(counts: Sequence[Dropped]) -> list[str]:
+    return [f"  {one.count:,} {one.unit}: {one.reason}" for one in counts]
+
+
+def _problems(contents: Contents) -> list[str]:
     """Returns what a recording may hold but rarely should."""
     found = list(_suspicions(contents.pairs))
     if contents.problem:
@@ -198,6 +220,12 @@ def _suspicions(pairs: PairSet) -> Iterator[str]:
     length = float(np.median([pair.leader_length for pair in pairs]))
     if length > 11:
         yield f"leaders are typically {length:.1f} m long: feet, or lorries only?"
+    without = sum(pair.leader_length == 0 for pair in pairs)
+    if without:
+        yield (
+            f"{without} pairs have leaders of length 0: their gaps are bumper to bumper if"
+            " leader positions are those of rear bumpers, and too long by a vehicle if not"
+        )
     for what, wrong in _CHECKS.items():
         yield from _counted(pairs, what, wrong)
 

@@ -50,6 +50,52 @@ class Labels(NamedTuple):
     names: list[str]
 
 
+class FileStart(NamedTuple):
+    """The beginning of a file or folder, from which its layout is known.
+
+    Attributes:
+        magic: the first bytes; b"" for a folder.
+        lines: the first lines of a text, unpacked; () for anything else.
+    """
+
+    path: Path
+    magic: bytes
+    lines: tuple[str, ...]
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The cells of the first line, where commas separate them."""
+        if not self.lines:
+            return ()
+        return tuple(cell.strip().strip('"') for cell in self.lines[0].split(","))
+
+    def has_columns(self, *names: str) -> bool:
+        """Says whether the first line has all these cells."""
+        return set(names) <= set(self.columns)
+
+
+def beginning(path: Path) -> FileStart:
+    """Returns the beginning of a file or folder.
+
+    Raises:
+        DataError: there is none, it cannot be read, or it is empty.
+    """
+    if path.is_dir():
+        return FileStart(path, b"", ())
+    start = magic(path)
+    if start.startswith(_ZIP):
+        return FileStart(path, start, ())
+    with open_text(path) as file:
+        head = _guarded(path, lambda: file.read(_HEAD))
+    try:
+        text = head.decode("utf-8-sig", errors="strict" if len(head) < _HEAD else "ignore")
+    except UnicodeDecodeError:
+        text = ""
+    if "\0" in text:
+        text = ""
+    return FileStart(path, start, tuple(text.splitlines()[:20]))
+
+
 @dataclass(frozen=True)
 class TextTable:
     """A delimited text file whose first line has been looked at.
@@ -58,18 +104,20 @@ class TextTable:
         delimiter: "," or " ", the latter for any run of white space.
         header: the column names as written; None if the first line holds data.
         width: number of columns.
+        above: lines above the header that are no part of the table.
     """
 
     path: Path
     delimiter: str
     header: tuple[str, ...] | None
     width: int
+    above: int = 0
 
     def row(self, index: int | np.integer[Any]) -> int:
         """Returns the row number that an editor shows for the data row `index` (from 0)."""
         if self.header is None:
             return int(index) + 1
-        return int(index) + 2
+        return int(index) + 2 + self.above
 
 
 def magic(path: Path) -> bytes:
@@ -282,7 +330,7 @@ def _batches(
         use_threads=False,
         block_size=_BLOCK,
         column_names=[f"c{at}" for at in range(table.width)],
-        skip_rows=int(table.header is not None),
+        skip_rows=table.above + int(table.header is not None),
     )
     parse_options = pa.csv.ParseOptions(invalid_row_handler=note)
     convert_options = pa.csv.ConvertOptions(column_types=types, include_columns=list(types))

@@ -8,6 +8,7 @@ the public domain.
 from __future__ import annotations
 
 import logging
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,7 +18,8 @@ from typing import ClassVar
 from pydantic import Field
 
 from cfx.component import Settings
-from cfx.datasets.base import Dataset, FileDatasetSettings, joined
+from cfx.datasets.base import Contents, Dataset, FileDatasetSettings, joined
+from cfx.datasets.files import FileStart
 from cfx.datasets.ngsim_file import read_ngsim, stem
 from cfx.datasets.ngsim_rows import Rows
 from cfx.errors import DataError
@@ -79,11 +81,33 @@ class NgsimDataset(Dataset):
     behind its follower".
     """
 
+    layout = "NGSIM (feet)"
     schema: ClassVar[type[Settings]] = NgsimSettings
     settings: NgsimSettings
 
+    @classmethod
+    def recognises(cls, start: FileStart) -> bool:
+        plain = {re.sub(r"[^a-z]", "", name.lower()) for name in start.columns}
+        return len(plain & {"vehicleid", "frameid", "localy", "vvel"}) >= 2
+
     def read(self) -> PairSet:
-        files = [read_ngsim(path, self.settings.location) for path in self.settings.files()]
+        return self._pairs(self._rows())
+
+    def contents(self) -> Contents:
+        files = self._rows()
+        problems = [rows.boundary_artefacts() for rows in files]
+        return Contents(
+            self._pairs(files),
+            sum(rows.rows_read for rows in files),
+            sum(rows.vehicles for rows in files),
+            "; ".join(problem for problem in problems if problem),
+        )
+
+    def _rows(self) -> list[Rows]:
+        """Returns the rows of each file."""
+        return [read_ngsim(path, self.settings.location) for path in self.settings.files()]
+
+    def _pairs(self, files: Sequence[Rows]) -> PairSet:
         parts = []
         for rows in _with_different_names(files):
             if self.settings.trim:

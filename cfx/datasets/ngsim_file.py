@@ -22,7 +22,8 @@ from cfx.datasets.files import (
     read_columns,
     sniff,
 )
-from cfx.datasets.ngsim_rows import DT, FOOT, Rows, changes
+from cfx.datasets.ngsim_rows import DT, FOOT, Rows
+from cfx.datasets.tracks import changes
 from cfx.errors import DataError, nearest
 from cfx.pairs import Dropped
 
@@ -156,6 +157,7 @@ def _rows(
     vehicle = columns["Vehicle_ID"].astype(np.int64)
     return Rows(
         source=source,
+        dt=DT,
         recordings=names,
         recording=recording,
         vehicle=vehicle,

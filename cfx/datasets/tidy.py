@@ -11,8 +11,13 @@ One row per pair and frame, SI units, a constant time step within a pair, no gap
 | `leader_speed_mps`, `follower_speed_mps` | m/s | |
 | `leader_acceleration_mps2`, `follower_acceleration_mps2` | m/s2 | |
 | `leader_length_m` | m | net gap = leader position - leader length - follower position |
+| `gap_m` | m | optional, the net gap: lengths, positions and accelerations may then be left out |
+| `driver_type`, `leader_driver_type` | | optional labels such as human or acc, one for each pair |
 | `lane` | | optional, one value for each pair |
 | `true_model`, `true_NAME` | | optional: a synthetic driver's model and its parameters over time |
+
+A length of 0 says that the leader's position is that of its rear bumper. See
+`cfx.datasets.tidy_gaps` for what follows from a column of gaps.
 """
 
 from __future__ import annotations
@@ -30,11 +35,14 @@ import pyarrow.parquet as pq
 
 from cfx.component import Settings
 from cfx.datasets.base import Dataset, FileDatasetSettings, joined, listed
-from cfx.datasets.files import Floats, Ints
-from cfx.datasets.tidy_checks import check, time_steps
+from cfx.datasets.files import PARQUET, FileStart, Floats, Ints
+from cfx.datasets.tidy_checks import check
+from cfx.datasets.tidy_gaps import time_steps
 from cfx.datasets.tidy_table import (
+    DRIVER_TYPES,
     LABELS,
     LANE,
+    NUMBERS,
     SIGNAL_COLUMNS,
     TRUE,
     TRUE_MODEL,
@@ -57,8 +65,13 @@ class TidyDataset(Dataset):
     that names row and column.
     """
 
+    layout = "tidy pairs (SI units)"
     schema: ClassVar[type[Settings]] = FileDatasetSettings
     settings: FileDatasetSettings
+
+    @classmethod
+    def recognises(cls, start: FileStart) -> bool:
+        return start.magic == PARQUET or len(set(start.columns) & {*LABELS, *NUMBERS}) >= 3
 
     def read(self) -> PairSet:
         return joined([read_tidy(path) for path in self.settings.files()])
@@ -88,7 +101,7 @@ def pairs_from_frame(frame: pd.DataFrame, source: str = "table") -> PairSet:
 def _pairs(table: TidyTable) -> PairSet:
     if not len(table):
         raise DataError(f"{table.source}: has the right columns but no rows")
-    order, starts = check(table)
+    table, order, starts = check(table)
     dropped: tuple[Dropped, ...] = ()
     if table.ignored:
         reason = f"not part of the layout: {listed(table.ignored)}"
@@ -131,6 +144,8 @@ def _build(table: TidyTable, order: Ints, starts: Ints) -> list[Pair]:
             lane=lane,
             truth=truth,
             truth_model=label.get(TRUE_MODEL, ""),
+            driver_type=label.get("driver_type", ""),
+            leader_driver_type=label.get("leader_driver_type", ""),
         )
         pairs.append(pair)
     return pairs
@@ -228,11 +243,14 @@ def _as_table(pairs: PairSet) -> Any:
     columns["leader_length_m"] = per_pair([pair.leader_length for pair in pairs], pa.float64())
     if any(pair.lane is not None for pair in pairs):
         columns[LANE] = per_pair([pair.lane for pair in pairs], pa.int64())
-    if any(pair.truth_model for pair in pairs):
-        columns[TRUE_MODEL] = per_pair([pair.truth_model for pair in pairs], pa.string())
+    for name in (TRUE_MODEL, *DRIVER_TYPES):
+        attribute = name.replace(TRUE_MODEL, "truth_model")
+        values = [getattr(pair, attribute) for pair in pairs]
+        if any(values):
+            columns[name] = per_pair(values, pa.string())
     for name in _truth_names(pairs):
-        values = [pair.truth.get(name, np.full(len(pair), np.nan)) for pair in pairs]
-        columns[TRUE + name] = _over_time(values)
+        truths = [pair.truth.get(name, np.full(len(pair), np.nan)) for pair in pairs]
+        columns[TRUE + name] = _over_time(truths)
     return pa.table(columns)
 
 

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cfx.datasets.files import Floats, Ints, bad_cells
-from cfx.datasets.tidy_table import LABELS, LANE, NUMBERS, TidyTable
+from cfx.datasets.files import Ints, bad_cells
+from cfx.datasets.tidy_gaps import time_steps, with_positions
+from cfx.datasets.tidy_table import GAP, LABELS, LANE, LENGTH, NUMBERS, TidyTable
 from cfx.errors import DataError
 
 Marks = NDArray[np.bool_]
@@ -29,12 +30,12 @@ _TOO_LITTLE_M = 10.0
 """Distance below which positions and speeds cannot be compared."""
 
 
-def check(table: TidyTable) -> tuple[Ints, Ints]:
+def check(table: TidyTable) -> tuple[TidyTable, Ints, Ints]:
     """Checks everything that the layout asks for.
 
     Returns:
-        The order `(N,)` that sorts the rows by pair (as they first appear) and frame, and where in
-        it each pair begins.
+        The table, completed where it has gaps in place of other columns; the order `(N,)` that
+        sorts the rows by pair (as they first appear) and frame; and where in it each pair begins.
 
     Raises:
         DataError: names file, row and column.
@@ -42,21 +43,11 @@ def check(table: TidyTable) -> tuple[Ints, Ints]:
     _check_cells(table)
     order, starts = _check_frames(table)
     _check_pairs(table, order, starts)
+    if GAP in table.numbers:
+        table = with_positions(table, order, starts)
     _check_motion(table, order, starts)
     _check_gap(table)
-    return order, starts
-
-
-def time_steps(time: Floats, starts: Ints) -> Floats:
-    """Returns the mean time step of each pair, s.
-
-    Args:
-        time: of the rows in order, s.
-        starts: where each pair begins.
-    """
-    ends = np.append(starts[1:], len(time)) - 1
-    mean: Floats = (time[ends] - time[starts]) / (ends - starts)
-    return mean
+    return table, order, starts
 
 
 def _check_cells(table: TidyTable) -> None:
@@ -69,7 +60,9 @@ def _check_cells(table: TidyTable) -> None:
                 " give a name"
             )
     numbers = table.numbers
-    for name in NUMBERS:
+    for name in (*NUMBERS, GAP):
+        if name not in numbers:
+            continue
         bad = bad_cells(numbers[name])
         if bad is not None:
             index, count, what = bad
@@ -82,8 +75,9 @@ def _check_cells(table: TidyTable) -> None:
     for name in ("leader_speed_mps", "follower_speed_mps"):
         why = "is negative; speeds count along the lane and must be 0 or more"
         _reject(table, name, numbers[name] < 0, why)
-    is_short = numbers["leader_length_m"] <= 0
-    _reject(table, "leader_length_m", is_short, "is no vehicle length; give metres")
+    if LENGTH in numbers:
+        why = "is no vehicle length; give metres, or 0 where positions are of rear bumpers"
+        _reject(table, LENGTH, numbers[LENGTH] < 0, why)
 
 
 def _reject(table: TidyTable, name: str, wrong: Marks, why: str) -> None:
@@ -171,7 +165,7 @@ def _check_pairs(table: TidyTable, order: Ints, starts: Ints) -> None:
     for name, labels in table.labels.items():
         if name != "pair_id":
             described[name] = labels.codes
-    for name in ("leader_length_m", LANE):
+    for name in (LENGTH, LANE):
         if name in table.numbers:
             described[name] = table.numbers[name]
     for name, values in described.items():

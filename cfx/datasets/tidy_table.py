@@ -39,9 +39,15 @@ SIGNAL_COLUMNS = {
 }
 """A pair's signals, and the columns that they are written in."""
 
-NUMBERS = ("frame", "time_s", *SIGNAL_COLUMNS.values(), "leader_length_m")
-"""Columns of numbers that every file has."""
+LENGTH = "leader_length_m"
+NUMBERS = ("frame", "time_s", *SIGNAL_COLUMNS.values(), LENGTH)
+"""Columns of numbers that every file has, unless it has a column of gaps."""
 
+GAP = "gap_m"
+WITH_GAP = ("frame", "time_s", "leader_speed_mps", "follower_speed_mps")
+"""Columns of numbers that a file with gaps has at least; the others follow from them."""
+
+DRIVER_TYPES = ("driver_type", "leader_driver_type")
 LANE = "lane"
 TRUE = "true_"
 """What the columns of true parameters begin with."""
@@ -140,15 +146,16 @@ def _roles(source: str, names: Sequence[str]) -> tuple[dict[str, int], dict[str,
         raise DataError(
             f"{source}: column {min(twice)} stands in the file more than once; remove one of them"
         )
-    missing = [name for name in (*LABELS, *NUMBERS) if name not in at]
+    needed = WITH_GAP if GAP in at else NUMBERS
+    missing = [name for name in (*LABELS, *needed) if name not in at]
     if missing:
         raise DataError(_missing(source, missing, names))
     numbers: dict[str, int] = {}
     labels: dict[str, int] = {}
-    for name in (*NUMBERS, LANE):
+    for name in (*NUMBERS, GAP, LANE):
         if name in at:
             numbers[name] = at[name]
-    for name in (*LABELS, TRUE_MODEL):
+    for name in (*LABELS, TRUE_MODEL, *DRIVER_TYPES):
         if name in at:
             labels[name] = at[name]
     ignored = []

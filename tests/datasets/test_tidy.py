@@ -256,7 +256,7 @@ SPEEDS = ("leader_speed_mps", "follower_speed_mps")
         (put("time_s", 0.83), ["time step", "0.13 s here and 0.1 s on average"]),
         (put("time_s", 0.5), ["row 5", "time does not advance"]),
         (put("follower_speed_mps", -0.5), ["row 5", "follower_speed_mps", "-0.5 is negative"]),
-        (put("leader_length_m", 0.0), ["row 5", "leader_length_m", "no vehicle length"]),
+        (put("leader_length_m", -1.0), ["row 5", "leader_length_m", "no vehicle length"]),
         (
             put("leader_length_m", 4.6),
             ["row 5", "leader_length_m", "differs from the pair's first row"],
@@ -369,3 +369,90 @@ def test_bom_blank_lines_and_windows_line_ends_do_no_harm(
         b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode() + b"\r\n\r\n"
     )
     same(read_tidy(tmp_path / "w.csv"), read(good, tmp_path))
+
+
+# --- gaps in place of positions, and who drives ---------------------------------------------------
+
+LENGTHS_AND_POSITIONS = ["leader_length_m", "leader_position_m", "follower_position_m"]
+ACCELERATIONS = ["leader_acceleration_mps2", "follower_acceleration_mps2"]
+
+
+def with_gap(frame: pd.DataFrame) -> pd.DataFrame:
+    gap = frame["leader_position_m"] - frame["leader_length_m"] - frame["follower_position_m"]
+    return frame.assign(gap_m=gap)
+
+
+@pytest.mark.parametrize(
+    "absent",
+    [
+        [],
+        ["leader_length_m"],
+        ["leader_position_m"],
+        ["follower_position_m"],
+        ["leader_length_m", "leader_position_m"],
+        LENGTHS_AND_POSITIONS,
+        [*LENGTHS_AND_POSITIONS, *ACCELERATIONS],
+    ],
+)
+def test_a_column_of_gaps_replaces_what_follows_from_it(
+    good: pd.DataFrame, tmp_path: Path, absent: list[str]
+) -> None:
+    whole = read(good, tmp_path)
+    pairs = read(with_gap(good).drop(columns=absent), tmp_path, "gaps.csv")
+    for pair, original in zip(pairs, whole, strict=True):
+        np.testing.assert_allclose(pair.gap, original.gap, atol=1e-9)
+        for who in ("leader", "follower"):
+            moved = np.diff(getattr(pair, f"{who}_position"))
+            np.testing.assert_allclose(
+                moved, np.diff(getattr(original, f"{who}_position")), atol=1e-9
+            )
+            np.testing.assert_array_equal(
+                getattr(pair, f"{who}_speed"), getattr(original, f"{who}_speed")
+            )
+        known = "leader_length_m" not in absent or "leader_position_m" not in absent
+        assert pair.leader_length == pytest.approx(4.5 if known else 0.0)
+    if "leader_acceleration_mps2" in absent:
+        expected = np.gradient(whole[0].follower_speed, whole[0].dt)
+        np.testing.assert_allclose(pairs[0].follower_acceleration, expected)
+
+
+def test_a_length_of_0_says_that_positions_are_rear_bumpers(
+    good: pd.DataFrame, tmp_path: Path
+) -> None:
+    rear = good["leader_position_m"] - 4.5
+    pairs = read(good.assign(leader_position_m=rear, leader_length_m=0), tmp_path)
+    np.testing.assert_allclose(pairs[0].gap, read(good, tmp_path, "front.csv")[0].gap)
+
+
+def test_a_gap_that_contradicts_the_positions_is_refused(
+    good: pd.DataFrame, tmp_path: Path
+) -> None:
+    wrong = with_gap(good)
+    wrong.loc[3, "gap_m"] = 2.0
+    with pytest.raises(DataError, match=r"row 5, column gap_m .* is 2.00 m, but the positions and"):
+        read(wrong, tmp_path)
+
+
+def test_without_a_gap_a_length_is_still_needed(good: pd.DataFrame, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="column leader_length_m is missing"):
+        read(good.drop(columns=["leader_length_m"]), tmp_path)
+
+
+def test_who_drives_is_kept_and_selected(good: pd.DataFrame, tmp_path: Path) -> None:
+    labelled = good.assign(driver_type=np.where(good["pair_id"] == "p", "human", "acc"))
+    path = tmp_path / "t.csv"
+    labelled.to_csv(path, index=False)
+    assert [pair.driver_type for pair in read_tidy(path)] == ["human", "acc"]
+    pairs = TidyDataset(path=path, min_frames=2, driver_type="acc").load()
+    assert [pair.pair_id for pair in pairs] == ["q"]
+    assert pairs.dropped[-1].count == 1
+    write_tidy(read_tidy(path), tmp_path / "again.parquet")
+    same(read_tidy(path), read_tidy(tmp_path / "again.parquet"))
+    with pytest.raises(DataError, match="does not say what drives"):
+        TidyDataset(path=path, min_frames=2, leader_driver_type="acc").load()
+
+
+def test_a_driver_that_changes_within_a_pair_is_refused(good: pd.DataFrame, tmp_path: Path) -> None:
+    labels = np.where(good["frame"] > 10, "human", "acc")
+    with pytest.raises(DataError, match=r"column driver_type .* differs from the pair's first row"):
+        read(good.assign(driver_type=labels), tmp_path)

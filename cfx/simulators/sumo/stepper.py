@@ -28,6 +28,9 @@ _REPLAYED = {"sigma": "0", "maxSpeed": "130"}
 _STILL = {"speedFactor": "1", "sigma": "0"}
 """Attributes of a follower, unless its model gives them; SUMO's defaults make both random."""
 
+_SHORTEST_M = 0.1
+"""Length of a vehicle in SUMO whose own is not known."""
+
 _Values = dict[str, Tensor | str]
 
 
@@ -201,14 +204,16 @@ class _Scene:
     def of(cls, follower: Follower, leader: Leader, kind: VType) -> _Scene:
         batch = follower.speed.shape
         states = (follower.position, follower.speed, follower.acceleration)
+        # A length of 0 says that a position is a rear bumper's; SUMO's vehicles have a length.
+        length = leader.length.clamp(min=_SHORTEST_M)
         return cls(
-            leader_position=_frames(leader.position, batch),
+            leader_position=_frames(leader.position + (length - leader.length), batch),
             leader_speed=_frames(leader.speed, batch),
             leader_acceleration=_frames(leader.acceleration, batch),
             entry=torch.zeros(batch.numel(), dtype=torch.int64),
             start=torch.stack([_flat(state, batch) for state in states]),
             attributes=_flat_values(kind.attributes, batch),
-            leader_attributes=_flat_values({"length": leader.length, **kind.leader}, batch),
+            leader_attributes=_flat_values({"length": length, **kind.leader}, batch),
         )
 
     def then(self, following: _Scene) -> _Scene:

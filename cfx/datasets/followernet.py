@@ -1,0 +1,211 @@
+"""FollowNet's event arrays: spacing, speed, relative speed and leader's speed over time.
+
+X. Chen, M. Zhu, K. Chen et al. (2023), FollowNet: A comprehensive benchmark for car-following
+behavior modeling, Scientific Data 10, 828; events of HighD, NGSIM, SPMD, Waymo and Lyft.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from cfx.component import Settings
+from cfx.datasets.base import Contents, Dataset, FileDatasetSettings, joined
+from cfx.datasets.files import FileStart, Floats, magic
+from cfx.datasets.ngsim_file import stem
+from cfx.datasets.series import Series, pairs_of
+from cfx.errors import DataError
+from cfx.pairs import PairSet
+
+_NPY, _ZIP, _MATLAB, _HDF = b"\x93NUM", b"PK\x03\x04", b"MATL", b"\x89HDF"
+
+_SPACING, _SPEED, _RELATIVE, _LEADER_SPEED = range(4)
+"""Rows of an event."""
+
+_UNPICKLE = (
+    "its arrays are Python objects, which NumPy can only unpickle, and unpickling a file runs the"
+    " code that is in it. If you trust it, convert it yourself: docs/readers.md has the five lines"
+)
+
+
+class FollowernetSettings(FileDatasetSettings):
+    """What the arrays do not say of themselves."""
+
+    min_frames: int = Field(
+        150, ge=2, description="shortest event that is kept, frames; 375 are 15 s of HighD's"
+    )
+    recorded_step: float = Field(
+        0.1,
+        gt=0,
+        le=2.0,
+        description="s between two samples: 0.04 for HighD, 0.1 for the others; the file does not"
+        " say it, but speeds and spacings show where it is wrong",
+    )
+    vehicle_length: float = Field(
+        0.0,
+        ge=0,
+        description="m: taken off every spacing; 0 where it is bumper to bumper. In NGSIM's and"
+        " Waymo's events it holds a vehicle's length (some 4.5 and 4.9 m)",
+    )
+
+
+class FollowernetDataset(Dataset):
+    """Events from arrays `(events, 4, samples)` in an `.npy`, `.npz` or `.mat` file.
+
+    The rows of an event are spacing, m; the follower's speed; the relative speed; the leader's
+    speed, m/s. Events of different lengths are padded by NaN, or are arrays `(4, samples)` of their
+    own in an `.npz` file, or in a cell array of a `.mat` file (version 7 or older).
+
+    **Nothing is unpickled.** FollowNet's NGSIM, Waymo, Lyft and SPMD files are `.npy` files of
+    Python objects. They are refused, since unpickling runs code; docs/readers.md shows how to
+    convert a file that you trust.
+
+    **Positions.** The leader's is the distance that its speed gives, the follower's is that less
+    the gap; accelerations are central differences of speeds (`cfx.datasets.series`).
+
+    **Drivers.** The events carry no ids. Each counts as a driver of its own, so drivers cannot be
+    kept apart: in an evaluation on unseen drivers the same driver may be learned from and tested.
+    """
+
+    layout = "FollowNet events (SI units)"
+    schema: ClassVar[type[Settings]] = FollowernetSettings
+    settings: FollowernetSettings
+
+    @classmethod
+    def recognises(cls, start: FileStart) -> bool:
+        return start.magic in {_NPY, _ZIP, _MATLAB}
+
+    def read(self) -> PairSet:
+        return self.contents().pairs
+
+    def contents(self) -> Contents:
+        parts = []
+        rows = 0
+        for path in self.settings.files():
+            series = []
+            for number, event in enumerate(_events(path), start=1):
+                rows += event.shape[1]
+                series.append(self._series(path, number, event))
+            if not series:
+                raise DataError(f"{path}: holds no events")
+            self._check_step(path, series)
+            parts.append(pairs_of(series, str(path)))
+        pairs = joined(parts)
+        problem = "events carry no drivers' ids: one driver may be learned from and tested"
+        return Contents(pairs, rows, 2 * len(pairs), problem)
+
+    def _series(self, path: Path, number: int, event: Floats) -> Series:
+        recording = stem(path)
+        speeds = event[_LEADER_SPEED] - event[_SPEED]
+        if bool((np.abs(np.abs(speeds) - np.abs(event[_RELATIVE])) > 0.05).any()):
+            raise DataError(
+                f"{path}, event {number}: row 3 is not the difference of rows 4 and 2 (the leader's"
+                " speed less the follower's); the rows of an event are spacing, speed, relative"
+                " speed, leader's speed"
+            )
+        return Series(
+            name=f"{recording}-{number}",
+            recording=recording,
+            leader_id=f"leader-{number}",
+            follower_id=str(number),
+            dt=self.settings.recorded_step,
+            frame=np.arange(event.shape[1]),
+            signals={"leader_speed": event[_LEADER_SPEED], "follower_speed": event[_SPEED]},
+            gap=event[_SPACING] - self.settings.vehicle_length,
+        )
+
+    def _check_step(self, path: Path, series: list[Series]) -> None:
+        """Raises DataError if spacings change faster or slower than the relative speeds say."""
+        moved = expected = 0.0
+        for one in series:
+            relative = one.signals["leader_speed"] - one.signals["follower_speed"]
+            middle = (relative[1:] + relative[:-1]) / 2
+            assert one.gap is not None  # _series gives one
+            change = np.diff(one.gap)
+            both = np.isfinite(change) & np.isfinite(middle)
+            moved += float((change[both] * middle[both]).sum())
+            expected += float((middle[both] ** 2).sum())
+        if not expected:
+            return
+        step = moved / expected
+        given = self.settings.recorded_step
+        if not 0.75 < step / given < 1.33:
+            raise DataError(
+                f"{path}: spacings change as if samples were {step:.3g} s apart, not {given:g} s;"
+                f" set data.recorded_step={step:.2g}, if the speeds are in m/s and the spacings in"
+                " m"
+            )
+
+
+def _events(path: Path) -> Iterator[Floats]:
+    """Yields the events of a file, `(4, T)` each, without the NaN that pads them."""
+    for name, array in _arrays(path):
+        values = _numbers(path, name, array)
+        if values.ndim == 2:
+            values = values[None]
+        if values.ndim != 3 or values.shape[1] != 4:
+            raise DataError(
+                f"{path}, array '{name}': has the shape {array.shape}; events are arrays"
+                " (events, 4, samples), or (4, samples)"
+            )
+        for event in values:
+            known = np.flatnonzero(np.isfinite(event).any(axis=0))
+            if len(known):
+                yield event[:, : known[-1] + 1]
+
+
+def _arrays(path: Path) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Yields the arrays of a file by their names; runs no code that may be in it."""
+    start = magic(path)
+    try:
+        if start == _NPY:
+            yield path.name, np.load(path, allow_pickle=False)
+        elif start == _ZIP:
+            with np.load(path, allow_pickle=False) as arrays:
+                for name in arrays.files:
+                    yield name, arrays[name]
+        elif start == _MATLAB:
+            yield from _matlab(path)
+        elif start == _HDF:
+            raise DataError(
+                f"{path}: is a MATLAB file of version 7.3; save it with -v7, or as .npz"
+            )
+        else:
+            raise DataError(f"{path}: is none of .npy, .npz and .mat")
+    except ValueError as error:
+        if "allow_pickle" in str(error):
+            raise DataError(f"{path}: {_UNPICKLE}") from None
+        raise DataError(f"{path}: is cut off or damaged ({error}); download it again") from None
+    except (OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
+        raise DataError(f"{path}: is cut off or damaged ({error}); download it again") from None
+
+
+def _matlab(path: Path) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Yields the arrays of a MATLAB file; cells one by one."""
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        found = loadmat(path)
+    except (MatReadError, NotImplementedError, TypeError) as error:
+        raise DataError(f"{path}: cannot be read as a MATLAB file ({error})") from None
+    for name, array in found.items():
+        if name.startswith("__"):
+            continue
+        if array.dtype == object:
+            for number, cell in enumerate(array.ravel(), start=1):
+                yield f"{name}{{{number}}}", np.asarray(cell)
+        else:
+            yield name, array
+
+
+def _numbers(path: Path, name: str, array: NDArray[Any]) -> Floats:
+    if array.dtype.kind not in "fiu":
+        raise DataError(f"{path}, array '{name}': holds {array.dtype}, not numbers")
+    return array.astype(np.float64)

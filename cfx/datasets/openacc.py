@@ -1,0 +1,236 @@
+"""OpenACC: platoons of cars with adaptive cruise control, and of human drivers, at 10 Hz.
+
+M. Makridis, K. Mattas, A. Anesiadou and B. Ciuffo (2021), OpenACC. An open database of
+car-following experiments to study the properties of commercial ACC systems, Transportation Research
+Part C 125, 103047. European Commission, Joint Research Centre; CC BY 4.0.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import ClassVar, NamedTuple, TypeVar
+
+import numpy as np
+
+from cfx.component import Settings
+from cfx.datasets.base import Contents, Dataset, FileDatasetSettings, joined, listed
+from cfx.datasets.files import FileStart, Floats, Ints, Labels, TextTable, beginning, read_columns
+from cfx.datasets.ngsim_file import stem
+from cfx.datasets.series import Series, frames_at, pairs_of
+from cfx.errors import DataError
+from cfx.pairs import PairSet
+
+_Column = TypeVar("_Column", Floats, Labels)
+
+DT = 0.1
+"""Seconds between two rows of every campaign."""
+
+_LINES = 5
+"""Lines of metadata above the table."""
+
+_KEYS = ("Date", "Vehicle_order", "Number_of_vehicles", "ACC", "Distance_setting")
+
+_HUMAN, _ACC = "human", "acc"
+
+_TYPE_OF_FLAG = {"0": _HUMAN, "1": _ACC}
+"""What `ACC` above the table says of all followers; 2 is mixed, empty is not known."""
+
+
+class OpenaccDataset(Dataset):
+    """Pairs from OpenACC's CSV files: five lines about the experiment, then a table.
+
+    Each vehicle k of a platoon has its columns `Speedk`, `Ek`, ...; `IVSk` is the bumper-to-bumper
+    distance between vehicle k and the one behind it, k + 1. Columns are found by their names, as
+    campaigns have different ones in different orders. A pair needs `Speedk`, `Speed(k+1)` and
+    `IVSk`.
+
+    **Positions.** Cars are located by satellite on roads that bend, so positions are made of what
+    was measured along the road: the leader's is the distance that its speed gives, the follower's
+    is that less the gap (`cfx.datasets.series`). Lengths are not recorded, and are 0: positions of
+    leaders are those of rear bumpers. Accelerations are central differences of the speeds, which
+    most campaigns left unfiltered.
+
+    **Labels.** `driver_type` is human or acc, from the follower's `Driver` column, or, where a file
+    has none, from its line `ACC` (0 or 1). A pair is cut where the driver hands over.
+    `leader_driver_type` is the leader's, where it is the same in the whole file, else "".
+
+    **Cuts.** Rows with empty cells, negative speeds, gaps of 0 or less, and missing times (tunnels,
+    toll stations) end a pair and are counted.
+
+    **Drivers.** A recording is one file. The same car drives in many files: an evaluation on unseen
+    drivers is one on unseen cars only if all files of a car are in one fold.
+    """
+
+    layout = "OpenACC (SI units)"
+    schema: ClassVar[type[Settings]] = FileDatasetSettings
+    settings: FileDatasetSettings
+
+    @classmethod
+    def recognises(cls, start: FileStart) -> bool:
+        if len(start.lines) <= _LINES:
+            return False
+        names = {line.split(",")[0].strip() for line in start.lines[:_LINES]}
+        return len(names & set(_KEYS)) >= 3
+
+    def read(self) -> PairSet:
+        return self.contents().pairs
+
+    def contents(self) -> Contents:
+        files = [_read(path) for path in self.settings.files()]
+        vehicles = sum(len(file.speeds) for file in files)
+        rows = sum(len(file.frame) for file in files)
+        return Contents(joined([_pairs(file) for file in files]), rows, vehicles)
+
+
+class _File(NamedTuple):
+    """One experiment.
+
+    Attributes:
+        about: what stands above the table, by its name in small letters.
+        frame: of each row `(N,)`.
+        speeds: by the vehicle's place in the platoon.
+        gaps: to the vehicle behind, by the place of the one ahead.
+        drivers: labels, by place, where there are any.
+    """
+
+    path: Path
+    about: Mapping[str, Sequence[str]]
+    frame: Ints
+    speeds: Mapping[int, Floats]
+    gaps: Mapping[int, Floats]
+    drivers: Mapping[int, Labels]
+
+
+def _read(path: Path) -> _File:
+    start = beginning(path)
+    if not OpenaccDataset.recognises(start):
+        raise DataError(
+            f"{path}: is no OpenACC file: five lines must stand above its table: {listed(_KEYS)}"
+        )
+    about = {}
+    for line in start.lines[:_LINES]:
+        key, *values = [cell.strip() for cell in line.split(",")]
+        about[key.lower()] = [value for value in values if value]
+    header = tuple(cell.strip() for cell in start.lines[_LINES].split(","))
+    table = TextTable(path, ",", header, len(header), above=_LINES)
+    numbers, labels = read_columns(
+        table, {"Time": _time(table), **_places(header, "Speed", "IVS")}, _places(header, "Driver")
+    )
+    time = numbers.pop("Time")
+    _check_time(table, time)
+    return _File(
+        path,
+        about,
+        frames_at(time, DT),
+        _by_place(numbers, "Speed"),
+        _by_place(numbers, "IVS"),
+        _by_place(labels, "Driver"),
+    )
+
+
+def _time(table: TextTable) -> int:
+    header = table.header or ()
+    if "Time" not in header:
+        raise DataError(
+            f"{table.path}, row {_LINES + 1}: column Time is missing. Columns found:"
+            f" {listed(header, 20)}"
+        )
+    return header.index("Time")
+
+
+def _places(header: Sequence[str], *kinds: str) -> dict[str, int]:
+    """Returns where the columns of these kinds are, such as Speed1, Speed2."""
+    found = {}
+    for at, name in enumerate(header):
+        match = re.fullmatch(r"([A-Za-z]+)(\d+)", name)
+        if match and match[1] in kinds:
+            found[name] = at
+    return found
+
+
+def _by_place(columns: Mapping[str, _Column], kind: str) -> dict[int, _Column]:
+    found = {}
+    for name, values in columns.items():
+        if name.startswith(kind):
+            found[int(name.removeprefix(kind))] = values
+    return found
+
+
+def _check_time(table: TextTable, time: Floats) -> None:
+    """Raises DataError unless times advance, on a grid of 0.1 s."""
+    if not len(time):
+        raise DataError(f"{table.path}: has a header but no rows")
+    empty = np.flatnonzero(~np.isfinite(time))
+    if len(empty):
+        raise DataError(f"{table.path}, row {table.row(empty[0])}, column Time: the cell is empty")
+    back = np.flatnonzero(np.diff(time) <= 0)
+    if len(back):
+        raise DataError(
+            f"{table.path}, row {table.row(back[0] + 1)}, column Time: does not advance from the"
+            " row before"
+        )
+    at = (time - time[0]) / DT
+    off = np.flatnonzero(np.abs(at - np.rint(at)) > 0.25)
+    if len(off):
+        raise DataError(
+            f"{table.path}, row {table.row(off[0])}, column Time: {time[off[0]]:g} s is between two"
+            f" frames of {DT:g} s; OpenACC's rows are {DT:g} s apart"
+        )
+
+
+def _pairs(file: _File) -> PairSet:
+    series = []
+    for ahead in sorted(file.gaps):
+        behind = ahead + 1
+        if ahead in file.speeds and behind in file.speeds:
+            series.append(_series(file, ahead, behind))
+    if not series:
+        raise DataError(
+            f"{file.path}: no two vehicles have Speed and IVS columns; columns IVS found for"
+            f" vehicles {listed(sorted(file.gaps)) or 'none'}, Speed for"
+            f" {listed(sorted(file.speeds)) or 'none'}"
+        )
+    return pairs_of(series, str(file.path))
+
+
+def _series(file: _File, ahead: int, behind: int) -> Series:
+    leader, follower = _name(file, ahead), _name(file, behind)
+    codes, types = _driver(file, behind)
+    _, leader_types = _driver(file, ahead)
+    known = [one for one in leader_types if one]
+    return Series(
+        name=f"{stem(file.path)}-{follower}-{leader}",
+        recording=stem(file.path),
+        leader_id=leader,
+        follower_id=follower,
+        dt=DT,
+        frame=file.frame,
+        signals={"leader_speed": file.speeds[ahead], "follower_speed": file.speeds[behind]},
+        gap=file.gaps[ahead],
+        labels={"driver_type": codes},
+        driver_types=types,
+        leader_driver_type=known[0] if len(known) == 1 else "",
+    )
+
+
+def _name(file: _File, place: int) -> str:
+    """Returns a vehicle's name: its place in the platoon, and what the file calls it."""
+    order = file.about.get("vehicle_order", [])
+    if place <= len(order):
+        return f"{place}-{order[place - 1]}"
+    return str(place)
+
+
+def _driver(file: _File, place: int) -> tuple[Ints, list[str]]:
+    """Returns who drives at each row `(N,)`, an index into the types, and the types."""
+    labels = file.drivers.get(place)
+    if labels is not None and labels.names:
+        types = [name.lower() for name in labels.names]
+        return np.where(labels.codes < 0, len(types), labels.codes), [*types, ""]
+    flag = "".join(file.about.get("acc", [])[:1])
+    kind = ""
+    if place > min(file.speeds):
+        kind = _TYPE_OF_FLAG.get(flag, "")
+    return np.zeros(len(file.frame), dtype=np.int64), [kind]

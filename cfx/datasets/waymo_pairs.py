@@ -1,0 +1,192 @@
+"""Car-following pairs of the Waymo Open Dataset, as its extractors published them.
+
+X. Hu, Z. Zheng, D. Chen, X. Zhang and J. Sun (2022), Processing, assessing, and enhancing the Waymo
+autonomous vehicle open dataset for driving behavior research, Transportation Research Part C 134,
+103490; Mendeley Data, 10.17632/wfn2c3437n.2, CC BY 4.0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from cfx.component import Settings
+from cfx.datasets.base import Contents, Dataset, FileDatasetSettings, joined, listed
+from cfx.datasets.files import FileStart, Floats, Ints, TextTable, bad_cells, read_columns, sniff
+from cfx.datasets.ngsim_file import stem
+from cfx.datasets.series import Series, frames_at, pairs_of
+from cfx.datasets.tracks import changes
+from cfx.errors import DataError
+from cfx.pairs import PairSet
+
+DT = 0.1
+"""Seconds between two rows of a vehicle."""
+
+AUTOMATED = 0
+"""Number of Waymo's own vehicle in every segment."""
+
+_KEYS = ("segment_id", "local_veh_id", "follower_id", "leader_id")
+_TIME, _LENGTH = "local_time", "length"
+_MOTION = {
+    "position": ("filter_pos", "processed_position"),
+    "speed": ("filter_speed", "processed_speed"),
+    "acceleration": ("filter_accer", "processed_accer"),
+}
+"""Columns of motion: as the second and third version call them, and as the first."""
+
+
+class WaymoPairsSettings(FileDatasetSettings):
+    """How to read the Waymo pairs."""
+
+    min_frames: int = Field(
+        150, ge=2, description="shortest pair that is kept, frames; segments last 20 s"
+    )
+
+
+class WaymoPairsDataset(Dataset):
+    """Pairs of one CSV file, `all_seg_paired_cf_trj_final_with_large_vehicle.csv` for instance.
+
+    A pair is a `segment_id` with a `follower_id` and a `leader_id`. The file holds the rows of both
+    vehicles, and `local_veh_id` says whose a row is. Positions are those of the middle of a
+    vehicle's box along the path, so that the front bumper is half a `length` farther. Only times at
+    which both vehicles have a row count.
+
+    **Labels.** Vehicle 0 is Waymo's: its type is automated, all others are human.
+
+    **Drivers.** `local_veh_id` counts anew in each segment, so a recording is a segment. Waymo's
+    vehicle is vehicle 0 of every segment.
+    """
+
+    layout = "Waymo car-following pairs (Hu et al. 2022)"
+    schema: ClassVar[type[Settings]] = WaymoPairsSettings
+    settings: WaymoPairsSettings
+
+    @classmethod
+    def recognises(cls, start: FileStart) -> bool:
+        return start.has_columns("segment_id", "local_veh_id", "follower_id", "leader_id")
+
+    def read(self) -> PairSet:
+        return self.contents().pairs
+
+    def contents(self) -> Contents:
+        files = [_read(path) for path in self.settings.files()]
+        vehicles = 0
+        for file in files:
+            whole = np.stack([file.numbers["segment_id"], file.numbers["local_veh_id"]])
+            vehicles += len(np.unique(whole, axis=1).T)
+        rows = sum(len(file.numbers[_TIME]) for file in files)
+        return Contents(joined([_pairs(file) for file in files]), rows, vehicles)
+
+
+class _File(NamedTuple):
+    table: TextTable
+    numbers: dict[str, Floats]
+
+
+def _read(path: Path) -> _File:
+    table = sniff(path)
+    header = table.header or ()
+    wanted = {}
+    for name in (*_KEYS, _TIME, _LENGTH):
+        wanted[name] = _position(table, header, (name,))
+    for name, spellings in _MOTION.items():
+        wanted[name] = _position(table, header, spellings)
+    numbers, _ = read_columns(table, wanted, {})
+    for name in (*_KEYS, _TIME, _LENGTH):
+        bad = bad_cells(numbers[name])
+        if bad is not None:
+            index, count, what = bad
+            raise DataError(
+                f"{path}, row {table.row(index)}, column {name}: the cell is {what}"
+                f" ({count} such cells); correct it or remove the row"
+            )
+    if not len(numbers[_TIME]):
+        raise DataError(f"{path}: has a header but no rows")
+    short = np.flatnonzero(numbers[_LENGTH] <= 0)
+    if len(short):
+        raise DataError(
+            f"{path}, row {table.row(short[0])}, column {_LENGTH}:"
+            f" {numbers[_LENGTH][short[0]]:g} is no vehicle length"
+        )
+    return _File(table, numbers)
+
+
+def _position(table: TextTable, header: Sequence[str], spellings: Sequence[str]) -> int:
+    for name in spellings:
+        if name in header:
+            return header.index(name)
+    raise DataError(
+        f"{table.path}: column {' or '.join(spellings)} is missing. Columns found:"
+        f" {listed(header, 30)}"
+    )
+
+
+def _pairs(file: _File) -> PairSet:
+    """Returns the pairs of a file, in the order of segment, follower and leader."""
+    numbers = file.numbers
+    keys = [numbers[name] for name in ("leader_id", "follower_id", "segment_id")]
+    order = np.lexsort((numbers[_TIME], *keys))
+    starts = np.flatnonzero(changes(*[key[order] for key in keys]))
+    series = []
+    for rows in np.split(order, starts[1:]):
+        one = _series(file, {name: values[rows] for name, values in numbers.items()})
+        if one is not None:
+            series.append(one)
+    return pairs_of(series, str(file.table.path))
+
+
+def _series(file: _File, rows: Mapping[str, Floats]) -> Series | None:
+    """Returns one pair's series; None where its vehicles have no time in common."""
+    segment = f"{stem(file.table.path)}-{rows['segment_id'][0]:g}"
+    follower, leader = int(rows["follower_id"][0]), int(rows["leader_id"][0])
+    of_follower = np.flatnonzero(rows["local_veh_id"] == follower)
+    of_leader = np.flatnonzero(rows["local_veh_id"] == leader)
+    if not len(of_follower) or not len(of_leader):
+        return None
+    frame = frames_at(rows[_TIME], DT)
+    _require_once(file, segment, frame, of_follower)
+    _require_once(file, segment, frame, of_leader)
+    both, in_follower, in_leader = np.intersect1d(
+        frame[of_follower], frame[of_leader], assume_unique=True, return_indices=True
+    )
+    if not len(both):
+        return None
+    behind, ahead = of_follower[in_follower], of_leader[in_leader]
+    signals = {}
+    length = {}
+    for who, at in (("follower", behind), ("leader", ahead)):
+        length[who] = float(np.median(rows[_LENGTH][at]))
+        signals[f"{who}_position"] = rows["position"][at] + length[who] / 2
+        signals[f"{who}_speed"] = rows["speed"][at]
+        signals[f"{who}_acceleration"] = rows["acceleration"][at]
+    return Series(
+        name=f"{segment}-{follower}-{leader}",
+        recording=segment,
+        leader_id=str(leader),
+        follower_id=str(follower),
+        dt=DT,
+        frame=both,
+        signals=signals,
+        leader_length=length["leader"],
+        driver_types=(_type(follower),),
+        leader_driver_type=_type(leader),
+    )
+
+
+def _require_once(file: _File, segment: str, frame: Ints, rows: Ints) -> None:
+    """Raises DataError where a vehicle has two rows at one time."""
+    if len(np.unique(frame[rows])) < len(rows):
+        raise DataError(
+            f"{file.table.path}: a vehicle of {segment} has two rows of one pair at the same"
+            f" {_TIME}; keep one of them"
+        )
+
+
+def _type(vehicle: int) -> str:
+    if vehicle == AUTOMATED:
+        return "automated"
+    return "human"

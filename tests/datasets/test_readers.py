@@ -1,0 +1,290 @@
+"""OpenACC, FollowNet, Waymo and Lyft pairs: files made in their layouts give the pairs back."""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.io import savemat
+
+from cfx.datasets.base import Dataset
+from cfx.datasets.describe import describe
+from cfx.datasets.followernet import FollowernetDataset
+from cfx.datasets.lyft_pairs import LyftPairsDataset
+from cfx.datasets.openacc import OpenaccDataset
+from cfx.datasets.waymo_pairs import WaymoPairsDataset
+from cfx.errors import DataError
+from cfx.pairs import PairSet
+from cfx.testing.datasets import DatasetContract
+from tests.datasets.layouts import events_of, made_pairs, write_lyft, write_openacc, write_waymo
+
+
+def npy(folder: Path, pairs: PairSet) -> Path:
+    path = folder / "HighD_train_data.npy"
+    np.save(path, events_of(pairs))
+    return path
+
+
+def openacc(folder: Path, pairs: PairSet) -> Path:
+    return write_openacc(folder / "ASta_040719_platoon3.csv", pairs)
+
+
+def waymo(folder: Path, pairs: PairSet) -> Path:
+    return write_waymo(folder / "all_seg_paired_cf_trj_final.csv", pairs)
+
+
+def lyft(folder: Path, pairs: PairSet) -> Path:
+    return write_lyft(folder / "trainHH.zarr", pairs)
+
+
+READERS: dict[str, tuple[type[Dataset], Callable[[Path, PairSet], Path]]] = {
+    "openacc": (OpenaccDataset, openacc),
+    "followernet": (FollowernetDataset, npy),
+    "waymo_pairs": (WaymoPairsDataset, waymo),
+    "lyft_pairs": (LyftPairsDataset, lyft),
+}
+
+
+@pytest.mark.parametrize("name", READERS)
+class TestReaders(DatasetContract):
+    @pytest.fixture
+    def dataset(self, name: str, tmp_path: Path) -> Dataset:
+        cls, write = READERS[name]
+        return cls(path=write(tmp_path, made_pairs()), min_frames=100)
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_gives_gaps_and_speeds_back(name: str, tmp_path: Path) -> None:
+    cls, write = READERS[name]
+    made = made_pairs()
+    pairs = cls(path=write(tmp_path, made), min_frames=2).load()
+    assert len(pairs) == len(made)
+    for pair, original in zip(pairs, made, strict=True):
+        np.testing.assert_allclose(pair.gap, original.gap, atol=1e-6)
+        np.testing.assert_allclose(pair.follower_speed, original.follower_speed, atol=1e-9)
+        assert pair.dt == 0.1
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_is_recognised(name: str, tmp_path: Path) -> None:
+    text = describe(READERS[name][1](tmp_path, made_pairs()))
+    assert f"data={name}" in text
+    assert "3 of 3 drivers" in text
+
+
+# --- OpenACC --------------------------------------------------------------------------------------
+
+
+def test_a_platoon_is_cut_where_the_driver_hands_over(tmp_path: Path) -> None:
+    made = made_pairs(pairs=1, frames=100)
+    drivers = {2: ["Human"] * 40 + ["ACC"] * 60}
+    path = write_openacc(tmp_path / "a.csv", made, drivers=drivers)
+    pairs = OpenaccDataset(path=path, min_frames=2).load()
+    assert [(pair.driver_type, len(pair)) for pair in pairs] == [("human", 40), ("acc", 60)]
+    assert {one.reason: one.count for one in pairs.ends} == {
+        "the driver type changes": 1,
+        "the source's pair ends": 1,
+    }
+    (only,) = OpenaccDataset(path=path, min_frames=2, driver_type="acc").load()
+    assert only.pair_id == "a-2-XC40-1-Golf-run2"
+
+
+@pytest.mark.parametrize(("acc", "kind"), [("0", "human"), ("1", "acc"), ("2", ""), ("", "")])
+def test_the_line_above_the_table_says_who_drives_where_no_column_does(
+    tmp_path: Path, acc: str, kind: str
+) -> None:
+    path = write_openacc(tmp_path / "a.csv", made_pairs(pairs=2), acc=acc)
+    pairs = OpenaccDataset(path=path, min_frames=2).load()
+    assert [pair.driver_type for pair in pairs] == [kind, kind]
+    assert pairs[0].leader_driver_type == "", "nobody says how the first car is driven"
+
+
+def test_empty_cells_and_missing_times_cut_a_pair_and_are_counted(tmp_path: Path) -> None:
+    path = write_openacc(tmp_path / "a.csv", made_pairs(pairs=1, frames=100))
+    lines = path.read_text().splitlines()
+    time, speed, east, follower, _ = lines[36].split(",")  # the 31st row of the table
+    lines[36] = ",".join([time, speed, east, follower, ""])
+    del lines[66:76]
+    path.write_text("\n".join(lines))
+    pairs = OpenaccDataset(path=path, min_frames=2).load()
+    assert [(pair.first_frame, len(pair)) for pair in pairs] == [(0, 30), (31, 29), (70, 30)]
+    assert {one.reason: one.count for one in pairs.dropped} == {"a value is missing": 1}
+    assert {one.reason for one in pairs.ends} == {
+        "a value is missing",
+        "frames are missing",
+        "the source's pair ends",
+    }
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda text: text.replace("Time,", "Clock,"), "row 6: column Time is missing"),
+        (lambda text: text.replace("IVS1", "Gap1"), "no two vehicles have Speed and IVS"),
+        (lambda text: text.replace("36000.5", "36000.1"), "row 12, column Time: does not advance"),
+        (lambda text: text.replace("36000.5", "36000.45"), "is between two frames of 0.1 s"),
+        (lambda text: "\n".join(text.splitlines()[5:]), "five lines must stand above its table"),
+    ],
+)
+def test_openacc_says_what_is_wrong(
+    tmp_path: Path, change: Callable[[str], str], says: str
+) -> None:
+    path = write_openacc(tmp_path / "a.csv", made_pairs(pairs=1))
+    path.write_text(change(path.read_text()))
+    with pytest.raises(DataError, match=says):
+        OpenaccDataset(path=path).read()
+
+
+# --- FollowNet ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["npz", "padded", "mat", "cells", "one"])
+def test_events_come_in_any_kind_of_array(tmp_path: Path, kind: str) -> None:
+    made = made_pairs()
+    whole = events_of(made)
+    path = tmp_path / "events.mat"
+    if kind == "npz":
+        path = tmp_path / "events.npz"
+        np.savez(path, **{f"e{number}": event for number, event in enumerate(whole)})
+    elif kind == "padded":
+        path = tmp_path / "events.npy"
+        np.save(path, np.concatenate([whole, np.full((3, 4, 5), np.nan)], axis=2))
+    elif kind == "mat":
+        savemat(path, {"events": whole})
+    elif kind == "cells":
+        cells = np.empty(3, dtype=object)
+        for number, event in enumerate(whole):
+            cells[number] = event
+        savemat(path, {"events": cells})
+    else:
+        path = tmp_path / "events.npy"
+        np.save(path, whole[0])
+    pairs = FollowernetDataset(path=path, min_frames=2).load()
+    assert [len(pair) for pair in pairs] == [150] * (1 if kind == "one" else 3)
+    np.testing.assert_allclose(pairs[0].gap, made[0].gap, atol=1e-9)
+
+
+class Bomb:
+    """Writes a file when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (Path.touch, (self.path,))
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.npz", "a.pkl"])
+def test_nothing_is_unpickled(tmp_path: Path, name: str) -> None:
+    mark = tmp_path / "ran"
+    path = tmp_path / name
+    objects = np.array([Bomb(mark), None], dtype=object)
+    if name == "a.npy":
+        np.save(path, objects, allow_pickle=True)
+    elif name == "a.npz":
+        np.savez(path, a=objects)
+    else:
+        path.write_bytes(pickle.dumps(Bomb(mark)))
+    with pytest.raises(DataError, match=r"unpickling a file runs the code|is none of \.npy"):
+        FollowernetDataset(path=path).read()
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize(
+    ("events", "says"),
+    [
+        (np.zeros((2, 3, 50)), r"has the shape \(2, 3, 50\)"),
+        (np.zeros((2, 4, 50)) + np.array([[9], [1], [5], [3]]), "row 3 is not the difference"),
+        (np.full((2, 4, 50), np.nan), "holds no events"),
+        (np.array(["a", "b"]), "not numbers"),
+    ],
+)
+def test_events_say_what_is_wrong(tmp_path: Path, events: np.ndarray, says: str) -> None:
+    path = tmp_path / "a.npy"
+    np.save(path, events)
+    with pytest.raises(DataError, match=says):
+        FollowernetDataset(path=path).read()
+
+
+def test_a_wrong_step_is_seen_in_the_spacings(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"set data\.recorded_step=0\.1"):
+        FollowernetDataset(path=npy(tmp_path, made_pairs()), recorded_step=0.04).read()
+
+
+def test_a_spacing_that_holds_a_vehicle_is_corrected(tmp_path: Path) -> None:
+    made = made_pairs()
+    path = npy(tmp_path, made)
+    pairs = FollowernetDataset(path=path, min_frames=2, vehicle_length=1.0).load()
+    np.testing.assert_allclose(pairs[0].gap, made[0].gap - 1.0, atol=1e-9)
+
+
+def test_a_damaged_array_says_so(tmp_path: Path) -> None:
+    buffer = io.BytesIO()
+    np.save(buffer, events_of(made_pairs()))
+    path = tmp_path / "a.npy"
+    path.write_bytes(buffer.getvalue()[:500])
+    with pytest.raises(DataError, match="is cut off or damaged"):
+        FollowernetDataset(path=path).read()
+
+
+# --- Waymo and Lyft -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("first_version", [True, False])
+def test_waymo_knows_who_is_automated(tmp_path: Path, first_version: bool) -> None:
+    path = write_waymo(tmp_path / "w.csv", made_pairs(pairs=2), first_version=first_version)
+    pairs = WaymoPairsDataset(path=path).load()
+    assert [(pair.driver_type, pair.leader_driver_type) for pair in pairs] == [
+        ("automated", "human"),
+        ("human", "automated"),
+    ]
+
+
+def test_waymo_uses_the_times_at_which_both_have_rows(tmp_path: Path) -> None:
+    path = write_waymo(tmp_path / "w.csv", made_pairs(pairs=1))
+    table = pd.read_csv(path)
+    of_leader = table["local_veh_id"] == 7
+    late = of_leader & (table["local_time"] < 1.95)
+    table[~late].sample(frac=1.0, random_state=1).to_csv(path, index=False)
+    (pair,) = WaymoPairsDataset(path=path, min_frames=2).load()
+    assert len(pair) == 130
+    np.testing.assert_allclose(pair.gap, made_pairs(pairs=1)[0].gap[20:], atol=1e-6)
+
+
+def test_waymo_names_what_is_missing(tmp_path: Path) -> None:
+    path = write_waymo(tmp_path / "w.csv", made_pairs(pairs=1))
+    path.write_text(path.read_text().replace("filter_pos", "where"))
+    with pytest.raises(DataError, match="column filter_pos or processed_position is missing"):
+        WaymoPairsDataset(path=path).read()
+
+
+def test_lyft_takes_its_own_length_where_a_store_has_none(tmp_path: Path) -> None:
+    made = made_pairs()
+    path = write_lyft(tmp_path / "trainHA.zarr", made, with_size=False)
+    pairs = LyftPairsDataset(path=path).load()
+    np.testing.assert_allclose(pairs[0].gap, made[0].gap, atol=1e-9)
+    assert pairs[0].leader_length == 4.85
+    assert (pairs[0].driver_type, pairs[0].leader_driver_type) == ("human", "automated")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"dtype": "|O", "filters": [{"id": "pickle"}]},
+        {"filters": [{"id": "pickle"}]},
+        {"compressor": {"id": "pickle"}},
+    ],
+)
+def test_lyft_refuses_stores_that_could_run_code(tmp_path: Path, change: dict[str, Any]) -> None:
+    path = write_lyft(tmp_path / "trainHH.zarr", made_pairs(pairs=1))
+    about = path / "lead_centroid" / ".zarray"
+    about.write_text(json.dumps(json.loads(about.read_text()) | change))
+    with pytest.raises(DataError, match="could run code"):
+        LyftPairsDataset(path=path).read()
