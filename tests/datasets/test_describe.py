@@ -12,6 +12,7 @@ from cfx.datasets.describe import describe
 from cfx.datasets.synthetic import SyntheticDataset
 from cfx.datasets.tidy import write_tidy
 from cfx.errors import DataError
+from tests.conftest import Installer
 
 
 def test_describes_real_tidy_pairs(shared_data: Path) -> None:
@@ -68,3 +69,44 @@ def test_needs_no_torch() -> None:
         " sys.exit('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+MINE = """
+import numpy as np
+from cfx import Dataset, Pair, PairSet
+from cfx.datasets.base import FileDatasetSettings
+
+
+class Mine(Dataset):
+    layout = "my recorder (m)"
+    schema = FileDatasetSettings
+
+    @classmethod
+    def recognises(cls, start):
+        return start.has_columns("my_time", "my_gap")
+
+    def read(self):
+        speed = np.full(50, 10.0)
+        there = np.cumsum(speed) * 0.1
+        signals = [there + 20, speed, 0 * speed, there, speed, 0 * speed]
+        return PairSet((Pair("p", "r", "1", "2", 0, 0.1, 4.0, *signals),), "mine")
+"""
+
+
+def test_a_plugin_tells_about_its_layout(tmp_path: Path, install: Installer) -> None:
+    install("cfx-mine", {"cfx.datasets": {"mine": "cfx_mine:Mine"}}, {"cfx_mine.py": MINE})
+    path = tmp_path / "m.csv"
+    path.write_text("my_time,my_gap\n0,1\n")
+    text = describe(path)
+    assert "my recorder (m)" in text
+    assert f"Use it: data=mine data.path={path}" in text
+
+
+def test_a_broken_plugin_is_warned_of_and_stops_nothing(
+    tmp_path: Path, install: Installer, caplog: pytest.LogCaptureFixture
+) -> None:
+    install("cfx-bad", {"cfx.datasets": {"bad": "cfx_bad:Bad"}}, {"cfx_bad.py": "1 / 0"})
+    (tmp_path / "m.csv").write_text("my_time,my_gap\n0,1\n")
+    with pytest.raises(DataError, match="no dataset knows this layout"):
+        describe(tmp_path / "m.csv")
+    assert "cfx-bad" in caplog.text
