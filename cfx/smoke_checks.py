@@ -15,9 +15,11 @@ from typing import Any, NoReturn
 import torch
 from torch import Tensor
 
+from cfx.calibration.settings import WindowSettings
 from cfx.errors import CfxError, PluginError
 from cfx.metrics.base import Metric, Trajectories
 from cfx.models.base import DrivingModel, Follower, Leader
+from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
 from cfx.objectives.base import FrameValues, Objective
 from cfx.optimizers.base import Optimizer
@@ -35,6 +37,8 @@ DT = 0.1
 """Time step, s."""
 
 NETWORKS, DRIVERS, WINDOWS, PARAMETERS, LENGTH = 3, 2, 4, 5, 5
+"""As many parameters as IDM has, for which a policy is built."""
+
 PAIRS, FRAMES = 4, 60
 
 
@@ -200,6 +204,8 @@ def smoke_check_policy(policy: Policy) -> None:
     # that constants stay what they are.
     dtype = torch.float32 if policy.trainable else torch.float64
     draw = torch.Generator().manual_seed(0)
+    windows = WindowSettings(length=LENGTH, stride=LENGTH)
+    policy = policy.for_model(IDM(), DT, windows)
     features = token_width(policy.inputs, policy.summary, LENGTH)
     fixed = torch.rand((NETWORKS, PARAMETERS), generator=draw, dtype=dtype)
     with torch.random.fork_rng(devices=[]):

@@ -80,6 +80,7 @@ def load(folder: Path | str) -> Agent:
         raise DataError(f"{folder}/{_DESCRIPTION}: {error}") from None
     assert isinstance(policy, Policy)
     assert isinstance(model, DrivingModel)
+    policy = policy.for_model(model, description.dt, description.windows)
     head = _head(folder, description, model, has_base="base" in weights)
     try:
         return _agent(description, weights, policy, model_node, policy_node, head)

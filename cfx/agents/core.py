@@ -110,7 +110,7 @@ class AgentCore:
         Returns:
             The networks' state afterwards.
         """
-        _, after = self.answer(features, state)
+        after = self.network.observe(self.scaler(features[:, :, None]), state)
         return torch.where(present[..., None], after, state)
 
     def act(

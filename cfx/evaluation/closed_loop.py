@@ -63,6 +63,7 @@ def simulate_closed_loop(
     base: Tensor | None = None,
     history: float | None = None,
     steps: int | None = None,
+    state: AgentState | None = None,
 ) -> ClosedLoop:
     """Simulates the test part of P pairs with an agent in the loop.
 
@@ -76,8 +77,10 @@ def simulate_closed_loop(
         history: seconds of measured history before `first` that the agent observes, and in which
             driver features are measured; None: all there is.
         steps: K, how many steps are simulated at most; None: to the end of the longest pair.
+        state: of the agent after what it has observed up to `first`; None: it observes that here.
     """
-    state = _burnt_in(agent, batch, first, network, base, history, simulator.dt)
+    if state is None:
+        state = _burnt_in(agent, batch, first, network, base, history, simulator.dt)
     track = _Track(batch, first, agent.windows.length, steps)
     position, speed, acceleration = track.now()
     follower = simulator.begin(Start(position, speed, acceleration))

@@ -18,9 +18,11 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from cfx.agents.agent import Agent
+from cfx.agents.agent import Agent, AgentState
+from cfx.agents.context import DriverContext
 from cfx.evaluation.closed_loop import simulate_closed_loop
 from cfx.pairs import SIGNALS, PairBatch
+from cfx.policies.features import measured_history
 from cfx.simulation.base import Stepper
 
 LeaderFuture = Literal["given", "constant_speed", "constant_acceleration"]
@@ -161,6 +163,9 @@ def simulate_from_origins(
     """
     speeds, travelled = [], []
     for chunk in _chunks(agent, batch, origins):
+        state = None
+        if history is None and not agent.core.driver_features:
+            state = _observed(agent, batch, chunk, network, base)
         part = _with_future(batch[chunk.pair], chunk.frame, steps, leader)
         own_base = None
         if base is not None:
@@ -174,6 +179,7 @@ def simulate_from_origins(
             base=own_base,
             history=history,
             steps=steps,
+            state=state,
         )
         index = chunk.frame[:, None] + torch.arange(steps + 1, device=chunk.frame.device)
         index = index.clamp(max=part.mask.shape[1] - 1)
@@ -181,6 +187,45 @@ def simulate_from_origins(
         speeds.append(loop.speed)
         travelled.append(position - position[:, :1])
     return Paths(torch.cat(speeds), torch.cat(travelled))
+
+
+@torch.no_grad()
+def _observed(
+    agent: Agent, batch: PairBatch, origins: Origins, network: Tensor, base: Tensor | None
+) -> AgentState:
+    """Returns the agent's state at origins, each pair being observed once.
+
+    What was observed up to an origin is the beginning of what is observed up to the next one. Not
+    so where driver features condition the networks: each origin has its own.
+
+    Args:
+        agent: observes.
+        batch: P pairs.
+        origins: Q of them.
+        network, base: as for `simulate_from_origins`.
+    """
+    pairs, row = torch.unique(origins.pair, return_inverse=True)
+    at_origins = _begun(agent, network, base, origins.pair)
+    state = _begun(agent, network, base, pairs)
+    stride = agent.windows.stride
+    last = torch.zeros_like(pairs).scatter_reduce(0, row, origins.frame, "amax")
+    windows = origins.frame.add(stride - 1).div(stride, rounding_mode="floor")
+    for window in range(int(windows.max()) + 1):
+        due = (windows == window).nonzero()[:, 0]
+        places = (at_origins.network[due], at_origins.place[due])
+        at_origins.state[places] = state.state[state.network[row[due]], state.place[row[due]]]
+        frame = torch.full_like(last, window * stride)
+        history = measured_history(batch, pairs, frame, agent.windows.length)
+        state = agent.observe(history, state, frame < last)
+    return at_origins
+
+
+def _begun(agent: Agent, network: Tensor, base: Tensor | None, pairs: Tensor) -> AgentState:
+    """Returns the state of drivers of some pairs before their first window."""
+    own = None
+    if base is not None:
+        own = base[pairs]
+    return agent.begin(network[pairs], DriverContext(own))
 
 
 def _chunks(agent: Agent, batch: PairBatch, origins: Origins) -> Iterator[Origins]:

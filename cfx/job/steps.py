@@ -163,7 +163,7 @@ def _context(
         model_node=config.model,
         policy_node=config.policy,
         calibrator=calibrator,
-        policy=parts.policy,
+        policy=parts.policy.for_model(parts.model, batch.dt, config.windows),
         learner=parts.learner,
         windows=config.windows,
         split=config.split,

@@ -8,7 +8,7 @@ with a network each cost about as much as one.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar, Self
 
 import torch
 from pydantic import BeforeValidator, Field
@@ -17,6 +17,10 @@ from torch import Tensor, nn
 from cfx.component import Component, Settings
 from cfx.policies.driver_features import check_driver_features, named_driver_features
 from cfx.policies.features import SITUATION, Summary, check_inputs, named_inputs
+
+if TYPE_CHECKING:
+    from cfx.calibration.settings import WindowSettings
+    from cfx.models.base import DrivingModel
 
 
 class PolicyNetwork(nn.Module, ABC):
@@ -30,9 +34,21 @@ class PolicyNetwork(nn.Module, ABC):
     def initial_state(self, networks: int, drivers: int) -> Tensor:
         """Returns the state `(N, B, s)` before the first window; s may be 0."""
 
+    def observe(self, tokens: Tensor, state: Tensor) -> Tensor:
+        """Reads windows of measured driving, in which somebody else drives.
+
+        Args:
+            tokens: `(N, B, W, f)`, normalised.
+            state: `(N, B, s)`.
+
+        Returns:
+            The state after the last window.
+        """
+        return self(tokens, state)[1]  # type: ignore[no-any-return]  # torch's modules are untyped
+
     @abstractmethod
     def forward(self, tokens: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Reads windows in order.
+        """Reads windows in order, and chooses the parameters of each.
 
         Args:
             tokens: `(N, B, W, f)`, normalised.
@@ -68,9 +84,9 @@ class PolicySettings(Settings):
 class Policy(Component):
     """Base of every policy.
 
-    Life cycle: a protocol calls `build` once for N networks; if `trainable`, a learner then trains
-    them; afterwards they choose parameters in closed loop, one window at a time. A subclass
-    implements `build`.
+    Life cycle: a job calls `for_model` once it knows the model and the time step. A protocol calls
+    `build` once for N networks; if `trainable`, a learner then trains them; afterwards they choose
+    parameters in closed loop, one window at a time. A subclass implements `build`.
 
     Attributes:
         trainable: whether a learner must train what `build` returns.
@@ -110,6 +126,19 @@ class Policy(Component):
         if isinstance(self.settings, PolicySettings):
             return self.settings.summary
         return "last"
+
+    def for_model(self, model: DrivingModel, dt: float, windows: WindowSettings) -> Self:
+        """Returns this policy for a driving model; most do not depend on it.
+
+        Args:
+            model: whose parameters are chosen.
+            dt: time step, s.
+            windows: how often parameters change, and how many frames a token holds.
+
+        Raises:
+            ConfigError: it cannot choose for this model, or in such windows.
+        """
+        return self
 
     @abstractmethod
     def build(

@@ -5,11 +5,17 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from cfx.calibration.settings import WindowSettings
+from cfx.models.idm import IDM
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import token_width
 from cfx.testing.contract import contract_of
 
-NETWORKS, DRIVERS, WINDOWS, PARAMETERS, LENGTH = 3, 2, 7, 4, 5
+NETWORKS, DRIVERS, WINDOWS, PARAMETERS, LENGTH = 3, 2, 7, 5, 5
+"""As many parameters as IDM has, for which a policy is built."""
+
+DT = 0.1
+"""Time step, s."""
 
 
 def _features(policy: Policy) -> int:
@@ -141,6 +147,7 @@ def a_trainable_policy_has_gradients(policy: Policy) -> None:
 
 
 def _build(policy: Policy, features: int, *, seed: int) -> PolicyNetwork:
+    policy = policy.for_model(IDM(), DT, WindowSettings(length=LENGTH, stride=LENGTH))
     generator = torch.Generator().manual_seed(seed)
     fixed = torch.rand((NETWORKS, PARAMETERS), generator=torch.Generator().manual_seed(0))
     return policy.build(features, torch.full((PARAMETERS,), 0.5), fixed, generator)
