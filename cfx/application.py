@@ -209,13 +209,8 @@ def _refuse_interpolated_folder() -> None:
 def _run_hydra(job: JobFunction, arguments: Sequence[str]) -> int:
     """Lets Hydra compose and call `job`; every way in which that ends becomes an exit code."""
     overrides = [one for one in arguments if not one.startswith("-")]
-    application = hydra.main(
-        config_path=str(nodes.conf_dir()), config_name="config", version_base="1.3"
-    )
     try:
-        with _process_state(arguments):
-            hydra_source.register()
-            application(job)()
+        _call_hydra(job, arguments)
     except SystemExit as error:
         # Hydra exits with 0 after --help and the like, with 1 or argparse's 2 after a message about
         # a wrong flag.
@@ -232,6 +227,31 @@ def _run_hydra(job: JobFunction, arguments: Sequence[str]) -> int:
             return _interrupted(signalled)
         return _report(error, overrides, job.show_traceback)
     return 0
+
+
+def _call_hydra(job: JobFunction, arguments: Sequence[str]) -> None:
+    """Lets Hydra compose and call `job`, once more where a file asks for a multirun."""
+    application = hydra.main(
+        config_path=str(nodes.conf_dir()), config_name="config", **hydra_source.main_keywords()
+    )
+    try:
+        with _process_state(arguments):
+            hydra_source.register()
+            application(job)()
+    except Exception as error:
+        if not _asks_for_a_multirun(error) or "--multirun" in arguments:
+            raise
+    else:
+        return
+    _call_hydra(job, [*arguments, "--multirun"])
+
+
+def _asks_for_a_multirun(error: Exception) -> bool:
+    """Says whether a file such as an experiment's asks for a multirun.
+
+    Hydra 1.3 finds out by itself; 1.4 wants to know from the command line.
+    """
+    return "hydra.mode changed during config composition" in str(error)
 
 
 def run(overrides: Sequence[str] = (), *, target: str = JOB) -> JobResult:

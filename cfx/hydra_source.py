@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import hydra
+import hydra.utils
 from hydra import compose, initialize_config_dir
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.hydra_config import HydraConfig
@@ -35,6 +36,12 @@ log = logging.getLogger(__name__)
 
 _MADE_BY_HYDRA = {"hydra/config.yaml", "hydra/launcher/basic.yaml", "hydra/sweeper/basic.yaml"}
 """Options that Hydra has in code; a file of the same name on the search path replaces them."""
+
+
+_MAKES = ("cfx.*", "hydra.*", "hydra_plugins.*", "logging.*", "optuna.*", "nevergrad.*")
+"""What a configuration may make under Hydra 1.4: callbacks, launchers, sweepers and log handlers.
+
+Components are none of Hydra's objects: the registry makes them."""
 
 
 class ComponentSource(ConfigSource):
@@ -164,10 +171,29 @@ def composed(overrides: Sequence[str]) -> DictConfig:
         HydraException: an override fits nothing.
         PluginError: a chosen component cannot be loaded.
     """
-    with initialize_config_dir(
-        config_dir=str(nodes.conf_dir()), job_name="cfx", version_base="1.3"
-    ):
+    with initialize_config_dir(config_dir=str(nodes.conf_dir()), job_name="cfx", **version_base()):
         return compose("config", overrides=list(overrides), return_hydra_config=True)
+
+
+def version_base() -> dict[str, str]:
+    """Returns the keyword by which Hydra 1.3 is asked for its own defaults; 1.4 wants none."""
+    if _has_whitelist():
+        return {}
+    return {"version_base": "1.3"}
+
+
+def main_keywords() -> dict[str, Any]:
+    """Returns the keywords of `hydra.main` besides the configuration.
+
+    Hydra 1.4 asks which objects a configuration may make.
+    """
+    if _has_whitelist():
+        return {"execution_whitelist": list(_MAKES)}
+    return dict(version_base())
+
+
+def _has_whitelist() -> bool:
+    return hasattr(hydra.utils, "execution_whitelist")
 
 
 @contextmanager

@@ -186,9 +186,11 @@ class Calibrator:
         for pair, end in zip(pairs, last.tolist(), strict=True):
             keys.append(self._key("fixed", pair.fingerprint, frames=end, **self._prior_key))
 
+        compiled = self._has_kernel(batch)
+
         def shard(chosen: Tensor) -> DriverShard:
             chosen = chosen.to(device)
-            return DriverShard(self.solver, self._code, cut(batch, chosen), last[chosen])
+            return DriverShard(self.solver, self._code, compiled, cut(batch, chosen), last[chosen])
 
         results = self._cached("Driver-specific parameters", keys, [1] * len(pairs), shard)
         return _stacked(results, device)
@@ -214,11 +216,15 @@ class Calibrator:
             group = _group_key(pairs, last, row)
             keys.append(self._key("population", "", pairs=group, **self._prior_key))
 
+        compiled = self._has_kernel(batch)
+
         def shard(chosen: Tensor) -> PooledShard:
             groups = members[chosen].to(device)
             used = groups.any(0).nonzero()[:, 0]
             trajectories = cut(batch, used)
-            return PooledShard(self.solver, self._code, trajectories, last[used], groups[:, used])
+            return PooledShard(
+                self.solver, self._code, compiled, trajectories, last[used], groups[:, used]
+            )
 
         results = self._cached("Pooled parameters", keys, [1] * len(members), shard)
         return _stacked(results, device)
@@ -244,12 +250,15 @@ class Calibrator:
         defaults = self.space.defaults(device=device).expand_as(fixed)
         guesses = self.space.to_unit(torch.stack([fixed, defaults], dim=1))
 
+        compiled = self._has_kernel(batch)
+
         def shard(chosen: Tensor) -> WindowShard:
             own, _ = windows.select(chosen)
             chosen = chosen.to(device)
             return WindowShard(
                 self.solver,
                 self._code,
+                compiled,
                 cut(batch, chosen),
                 pair=own.pair.to(device),
                 first=own.first.to(device),
@@ -305,6 +314,13 @@ class Calibrator:
         """Returns the losses of pairs `(S,)` from their frame 0 to a last one `(S,)`."""
         first = torch.zeros_like(pair)
         return SegmentLosses.of_segments(self.simulator, self.objective, batch, pair, first, last)
+
+    def _has_kernel(self, batch: PairBatch) -> bool:
+        """Says whether losses come from a compiled kernel here; asked where others solve them."""
+        if not self.engine.distributes:
+            return False
+        pair = torch.zeros(1, dtype=torch.int64, device=batch.lengths.device)
+        return self._segments(batch, pair, pair + 1).accumulates
 
     @property
     def _prior_key(self) -> dict[str, float]:

@@ -115,7 +115,7 @@ class SegmentLosses:
         is another value with another term.
         """
         parameters = len(self.simulator.model.space.names)
-        if self._accumulates:
+        if self.accumulates:
             values = 3 * parameters + 8
         elif "gap" in self.objective.signals:
             values = 6 * self.steps + 32
@@ -124,7 +124,8 @@ class SegmentLosses:
         return values * self.measured_speed.element_size()
 
     @property
-    def _accumulates(self) -> bool:
+    def accumulates(self) -> bool:
+        """Whether losses come from a compiled kernel, given enough work, without trajectories."""
         space = self.simulator.model.space
         p = self._parameters(space.to_unit(space.defaults()).to(self.counted.device)[None, None])
         return self.simulator.accumulates(p, self._terms, self._terms_key)

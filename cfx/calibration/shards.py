@@ -19,7 +19,7 @@ from cfx.calibration.cache import Arrays
 from cfx.calibration.losses import PooledLosses, SegmentLosses
 from cfx.calibration.prior import LossesWithPrior
 from cfx.component import content_key, folder_hash
-from cfx.engine.base import Report
+from cfx.engine.base import Report, Unfit
 from cfx.errors import EngineError, PluginError
 from cfx.objectives.base import Objective
 from cfx.optimizers.base import Optimizer, Solution
@@ -154,11 +154,13 @@ class CalibrationShard:
     Attributes:
         solver: what all problems have in common.
         code: hash of `solver.scope` where the shard was cut.
+        compiled: losses came from a compiled kernel there: its last bits are its own.
         batch: the trajectories, `(P, T)`.
     """
 
     solver: Solver
     code: str
+    compiled: bool
     batch: PairBatch
 
     def segments(self, pair: Tensor, first: Tensor, steps: Tensor) -> SegmentLosses:
@@ -171,6 +173,12 @@ class CalibrationShard:
         """Returns the losses of each pair from frame 0 to a last one, `(P,)`."""
         pair = torch.arange(len(self.batch), device=last.device)
         return self.segments(pair, torch.zeros_like(last), last)
+
+    @property
+    def has_kernel(self) -> bool:
+        """Whether losses come from a compiled kernel here."""
+        pair = torch.zeros(1, dtype=torch.int64, device=self.batch.lengths.device)
+        return self.segments(pair, pair, pair + 1).accumulates
 
     def solve(self, report: Report) -> list[Arrays]:
         """Returns an entry of the cache for each of what was asked for."""
@@ -241,11 +249,17 @@ def solve_shard(shard: CalibrationShard, report: Report) -> list[Arrays]:
 
     Raises:
         EngineError: here is other code than where the shard was cut.
+        Unfit: no kernel can be compiled here, as there: the compiler is missing, or the disk full.
     """
     if content_key(shard.solver.scope) != shard.code:
         raise EngineError(
             "a worker has other code than this job (another version of cfx or of a plugin); install"
             " the same on all workers, and start them again"
+        )
+    if shard.compiled and not shard.has_kernel:
+        raise Unfit(
+            "no kernel can be compiled there (no C++ compiler, or no place on the disk), so that"
+            " results would differ in their last bits"
         )
     return shard.solve(report)
 

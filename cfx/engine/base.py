@@ -23,6 +23,10 @@ Work = Callable[[ShardT, Report], ResultT]
 """What is done with each shard: a function of a module, which a worker can import by its name."""
 
 
+class Unfit(Exception):  # noqa: N818 - the shard is well, its worker is not
+    """A worker cannot do a shard as the job would do it here; another one perhaps can."""
+
+
 class Engine(Component):
     """Base of every engine.
 
@@ -54,9 +58,9 @@ class Engine(Component):
 
         Args:
             work: called once for each shard, with the shard and with what it reports progress to.
-                It may be called again for a shard whose worker was lost, so it changes nothing
-                outside. Where workers are other processes, it, the shards and the results are
-                pickled.
+                It may be called again for a shard whose worker was lost, or raised `Unfit`, an
+                `OSError` or a `MemoryError`, so it changes nothing outside. Where workers are other
+                processes, it, the shards and the results are pickled.
             shards: made one after the other, not long before they are worked on.
             report: called with how many units are done; they add up, also where a shard is done
                 again.

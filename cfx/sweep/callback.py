@@ -8,14 +8,16 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
+import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import JobReturn
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf
 
 from cfx import renamed
-from cfx.sweep.running import Sweep
+from cfx.errors import ConfigError
+from cfx.sweep.running import Sweep, writable
 
 
 class Refused(BaseException):
@@ -68,6 +70,12 @@ def _rename_parameters(config: DictConfig) -> None:
     for argument in renamed.overrides(arguments):
         key, _, value = argument.partition("=")
         today[key] = value
-    if today != before:
-        with open_dict(config.hydra):
-            config.hydra.sweeper.params = today
+    if today == before:
+        return
+    if not hydra.__version__.startswith("1.3"):
+        raise ConfigError(
+            f"hydra.sweeper.params: write {', '.join(today)} instead of {', '.join(before)} in the"
+            " file that asks for this sweep: this version of Hydra takes today's names alone"
+        )
+    with writable(config):
+        config.hydra.sweeper.params = today

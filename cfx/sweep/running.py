@@ -7,14 +7,14 @@ import copy
 import logging
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self, cast
 
 from filelock import FileLock
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from cfx.console import put
@@ -96,7 +96,7 @@ class Sweep:
             if not override.startswith("hydra.sweep.dir="):
                 overrides.append(override)
         overrides.append(f"hydra.sweep.dir='{escaped}'")
-        with open_dict(config.hydra):
+        with writable(config):
             config.hydra.sweep.dir = path
             config.hydra.overrides.hydra = overrides
 
@@ -192,6 +192,13 @@ class Sweep:
         except TrackingError as error:
             log.warning("%s", error)
             return ()
+
+
+@contextlib.contextmanager
+def writable(config: DictConfig) -> Iterator[None]:
+    """Lets the block change Hydra's node, which Hydra 1.4 has made read-only by then."""
+    with read_write(config.hydra), open_dict(config.hydra):
+        yield
 
 
 def _continuing(folder: Path, record: Record, earlier: Record) -> str:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import pytest
 
 import cfx
 from cfx import registry
 from cfx.engine.base import Engine
+from cfx.engine.dask.engine import DaskEngine
 from cfx.engine.local import LocalEngine
 from cfx.simulation import threads
 from cfx.testing import EngineContract
+from tests.engine.clusters import running_cluster
 
 
 class TestLocalOnOneCore(EngineContract):
@@ -31,3 +35,16 @@ class TestLocal(EngineContract):
 def test_it_is_chosen_by_name() -> None:
     assert cfx.get("engine", "local") is LocalEngine
     assert isinstance(registry.create("engine", {"name": "local"}), LocalEngine)
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[str]:
+    """One cluster for all statements: starting it takes seconds."""
+    with running_cluster(workers=1) as address:
+        yield address
+
+
+class TestDask(EngineContract):
+    @pytest.fixture
+    def engine(self, cluster: str) -> Engine:
+        return DaskEngine(address=cluster)

@@ -1,0 +1,1 @@
+"""The engine `dask`: shards run on a Dask cluster. Dask is imported when it is used."""

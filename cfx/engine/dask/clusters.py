@@ -1,0 +1,139 @@
+"""Clusters of a job's own: processes on this machine, jobs in a queue, pods."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import logging
+from typing import Any, NamedTuple
+
+from cfx.engine.dask.settings import DaskSettings
+from cfx.errors import EngineError
+from cfx.simulation.threads import cores
+
+_WORKERS_ELSEWHERE = 4
+
+
+class _Package(NamedTuple):
+    """Where a cluster's class comes from."""
+
+    module: str
+    name: str
+    extra: str
+
+
+_PACKAGES = {
+    "slurm": _Package("dask_jobqueue", "SLURMCluster", "dask"),
+    "pbs": _Package("dask_jobqueue", "PBSCluster", "dask"),
+    "lsf": _Package("dask_jobqueue", "LSFCluster", "dask"),
+    "kubernetes": _Package("dask_kubernetes.operator", "KubeCluster", "kubernetes"),
+}
+
+
+def require_installed(settings: DaskSettings) -> None:
+    """Checks that what the settings need is installed. Imports none of it.
+
+    Raises:
+        EngineError: it is not; says what to type.
+    """
+    _require("distributed", "engine=dask", "dask")
+    if settings.cluster in _PACKAGES:
+        package = _PACKAGES[settings.cluster]
+        module = package.module.partition(".")[0]
+        _require(module, f"engine.cluster={settings.cluster}", package.extra)
+
+
+def _require(module: str, what: str, extra: str) -> None:
+    if importlib.util.find_spec(module) is None:
+        raise EngineError(f'{what} needs the package {module}: pip install "cfx-driving[{extra}]"')
+
+
+def workers_of(settings: DaskSettings) -> int:
+    """Returns how many workers a cluster of the job's own has."""
+    if settings.workers is not None:
+        return settings.workers
+    if settings.cluster in _PACKAGES:
+        return _WORKERS_ELSEWHERE
+    return cores()
+
+
+def start(settings: DaskSettings) -> Any:
+    """Starts a cluster of the job's own; its workers come later.
+
+    Raises:
+        EngineError: it cannot be started.
+    """
+    make = _local
+    if settings.is_queue:
+        make = _in_queue
+    elif settings.cluster == "kubernetes":
+        make = _pods
+    try:
+        return make(settings)
+    except Exception as error:  # these packages raise whatever their programs end in
+        first = next(iter(str(error).splitlines()), "")
+        raise EngineError(
+            f"engine.cluster={settings.cluster or 'local'} cannot be started"
+            f" ({type(error).__name__}: {first}); engine.options={settings.options} goes to it as"
+            " it is"
+        ) from error
+
+
+def _local(settings: DaskSettings) -> Any:
+    from distributed import LocalCluster
+
+    arguments = {
+        "n_workers": workers_of(settings),
+        "threads_per_worker": 1,
+        "memory_limit": settings.memory,
+        "host": "127.0.0.1",
+        "dashboard_address": None,
+        "silence_logs": logging.CRITICAL,
+        "security": _security(settings),
+    }
+    return LocalCluster(**{**arguments, **settings.options})
+
+
+def _in_queue(settings: DaskSettings) -> Any:
+    from dask.utils import format_bytes, parse_bytes
+
+    package = _PACKAGES[str(settings.cluster)]
+    together = settings.workers_per_job
+    arguments = {
+        "cores": together,
+        "processes": together,
+        "memory": format_bytes(together * parse_bytes(settings.memory)),
+        "scheduler_options": {"dashboard": False},
+        "silence_logs": logging.CRITICAL,
+        "security": _security(settings),
+    }
+    cluster = _class(package)(**{**arguments, **settings.options})
+    # Unlike `scale`, this replaces jobs that the queue has ended.
+    wanted = workers_of(settings)
+    cluster.adapt(minimum=wanted, maximum=wanted)
+    return cluster
+
+
+def _pods(settings: DaskSettings) -> Any:
+    package = _PACKAGES["kubernetes"]
+    limits = {"cpu": "1", "memory": settings.memory}
+    arguments = {
+        "name": "cfx",
+        "n_workers": workers_of(settings),
+        "resources": {"limits": limits, "requests": limits},
+        "quiet": True,
+    }
+    return _class(package)(**{**arguments, **settings.options})
+
+
+def _class(package: _Package) -> Any:
+    return getattr(importlib.import_module(package.module), package.name)
+
+
+def _security(settings: DaskSettings) -> Any:
+    """Returns credentials that this cluster alone knows."""
+    from distributed.security import Security
+
+    if settings.tls:
+        return Security.temporary()
+    return None

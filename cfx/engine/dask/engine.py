@@ -1,0 +1,52 @@
+"""The engine `dask`: a Dask cluster that runs already, or one that the job starts for itself.
+
+Dask development team (2016), *Dask: Library for dynamic task scheduling*, https://dask.org
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterable
+from contextlib import closing
+from typing import Any, ClassVar
+
+from cfx.component import Settings
+from cfx.engine.base import Engine, Report, ResultT, ShardT, Work
+from cfx.engine.dask.clusters import require_installed
+from cfx.engine.dask.connection import Connection
+from cfx.engine.dask.run import Run
+from cfx.engine.dask.settings import DaskSettings
+
+
+class DaskEngine(Engine):
+    """Runs shards as Dask futures, one on each core of the cluster.
+
+    A worker that dies is replaced and its shard done again, as is one whose scheduler was started
+    again. Whatever is finished lies in the cache, so that a job that had to stop goes on from it.
+
+    Raises:
+        EngineError: Dask is not installed.
+    """
+
+    schema: ClassVar[type[Settings]] = DaskSettings
+    settings: DaskSettings
+    distributes = True
+
+    def __init__(self, settings: Settings | None = None, **options: Any) -> None:
+        super().__init__(settings, **options)
+        require_installed(self.settings)
+        self._connection = Connection(self.settings)
+
+    def map(
+        self,
+        work: Work[ShardT, ResultT],
+        shards: Iterable[ShardT],
+        report: Report,
+        *,
+        shares_cores: bool = True,
+    ) -> Generator[tuple[int, ResultT], None, None]:
+        run = Run(self._connection, self.settings, work, report)
+        with closing(run.results(shards)) as results:
+            yield from results
+
+    def close(self) -> None:
+        self._connection.close()

@@ -1,0 +1,87 @@
+"""Schedulers and workers as processes of their own, on this machine, which tests stop and kill."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def free_port() -> int:
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        return int(server.getsockname()[1])
+
+
+class Cluster:
+    """A scheduler, and workers with a nanny that starts a killed one again."""
+
+    def __init__(self) -> None:
+        self.port = free_port()
+        self.address = f"tcp://127.0.0.1:{self.port}"
+        self.scheduler = self.start_scheduler()
+        self.workers: list[subprocess.Popen[bytes]] = []
+
+    def start_scheduler(self) -> subprocess.Popen[bytes]:
+        where = ["--host", "127.0.0.1", "--port", str(self.port), "--no-dashboard"]
+        return _start("distributed.cli.dask_scheduler", *where)
+
+    def start_worker(self, *options: str, **environment: str) -> subprocess.Popen[bytes]:
+        where = [self.address, "--host", "127.0.0.1", "--nthreads", "1", "--no-dashboard"]
+        worker = _start("distributed.cli.dask_worker", *where, *options, **environment)
+        self.workers.append(worker)
+        return worker
+
+    def children(self, worker: subprocess.Popen[bytes]) -> list[int]:
+        """Returns the processes that a nanny has started."""
+        listed = Path(f"/proc/{worker.pid}/task/{worker.pid}/children").read_text()
+        return [int(number) for number in listed.split()]
+
+    def stop(self) -> None:
+        for process in [*self.workers, self.scheduler]:
+            _end(process)
+
+
+def _start(module: str, *arguments: str, **environment: str) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [sys.executable, "-m", module, *arguments],
+        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", **environment},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,  # so that its children can be ended with it
+    )
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGCONT)
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait(30)
+
+
+@contextmanager
+def running_cluster(workers: int, *options: str) -> Iterator[str]:
+    """Yields the address of a cluster that is stopped after the block."""
+    cluster = Cluster()
+    try:
+        for _ in range(workers):
+            cluster.start_worker(*options)
+        yield cluster.address
+    finally:
+        cluster.stop()
+
+
+def until(what: object, seconds: float = 60.0) -> None:
+    """Waits until a function returns something true."""
+    end = time.monotonic() + seconds
+    while not what():  # type: ignore[operator]
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.05)
