@@ -29,7 +29,7 @@ from cfx.simulation.rollout import MemoryStepper
 from tests.drives import wavy_pairs
 from tests.engine.clusters import Cluster, until
 
-SAMPLES = 65536
+SAMPLES = 24576
 PAIRS, WINDOWS = 60, 120
 """8 groups of windows, each of some seconds on one core."""
 
