@@ -40,6 +40,7 @@ from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.driver_features import measure
 from cfx.policies.features import History, measured_history
+from cfx.simulation.base import Stepper
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -130,15 +131,39 @@ class Agent:
         """The parameters that the agent chooses, with their bounds."""
         return self.core.head.space
 
+    @property
+    def model_space(self) -> ParameterSpace:
+        """Those of them that the driving model has."""
+        return self.core.head.model_space
+
     def __getattr__(self, name: str) -> Any:
         new = renamed.attribute(type(self), name)
         if new is None:
             raise AttributeError(f"an agent has no attribute '{name}'")
         return getattr(self, new)
 
+    def stepper(self, simulator: Stepper) -> Stepper:
+        """Returns what takes the steps of the model that this agent drives.
+
+        Args:
+            simulator: takes those of the job's driving model.
+
+        Raises:
+            ConfigError: the head needs a model around it, which this simulator does not have.
+        """
+        model = self.head.driven_model(simulator.model)
+        if model is simulator.model:
+            return simulator
+        return simulator.for_model(model)
+
     def base_of(self, parameters: Tensor) -> Tensor:
-        """Returns the base of drivers with these calibrated parameters; both `(D, n)`, SI units."""
-        return shrunk(self.space, parameters, self.context_rule.shrinkage)
+        """Returns the base of drivers with these calibrated parameters, `(D, n)`, SI units.
+
+        Args:
+            parameters: of the driving model, `(D, m)`, SI units.
+        """
+        complete = self.head.completed(parameters)
+        return shrunk(self.space, complete, self.context_rule.shrinkage)
 
     def driver_features_of(
         self, batch: PairBatch, until: Tensor, since: Tensor | None = None
@@ -370,7 +395,7 @@ class Agent:
             if self.base is None:
                 raise ValueError(f"the {self.head.name} head needs a base, and this agent has none")
             base = self.base[network]
-        return self.space.to_unit(base.double())
+        return self.space.to_unit(self.head.completed(base.double()))
 
     def _known_features(self, network: Tensor, context: DriverContext) -> Tensor | None:
         """Returns driver features `(D, k)`, the training drivers' mean where they are unknown."""

@@ -146,8 +146,9 @@ def _agent(
         raise ValueError(f"there are weights of {networks} networks")
     if head.needs_base and "base" not in weights:
         raise ValueError(f"the head '{head.name}' needs 'base'")
-    for name in ("base", "population"):
-        if name in weights and weights[name].shape != (networks, len(head.space)):
+    widths = {"base": len(head.space), "population": len(head.model_space)}
+    for name, width in widths.items():
+        if name in weights and weights[name].shape != (networks, width):
             raise ValueError(f"'{name}' has the shape {tuple(weights[name].shape)}")
     for name, value in weights.items():
         if not bool(value.isfinite().all()):

@@ -15,7 +15,8 @@ class DriverContext(NamedTuple):
     """What is known of D drivers; an empty context is that of unseen drivers.
 
     Attributes:
-        base: parameters that answers refer to, `(D, n)`, SI units; None: the agent's own base.
+        base: parameters that answers refer to, `(D, n)`, or those of the driving model alone, `(D,
+            m)`, SI units; None: the agent's own base.
         driver_features: `(D, k)`, NaN where unknown; None: unknown for all. The mean over the
             training drivers stands for what is unknown.
     """

@@ -30,8 +30,8 @@ class ClosedLoop(NamedTuple):
 
     Attributes:
         speed, gap: `(P, K + 1)`.
-        parameters: `(P, K + 1, n)`, what held on the way to each frame (at frame 0: what holds
-            next).
+        parameters: of the driving model, `(P, K + 1, n)`, what held on the way to each frame (at
+            frame 0: what holds next).
         counted: `(P, K + 1)` bool, frames within the recording; frame 0 does not count.
         at_limits: `(P, K + 1)` bool, frames at a limit of acceleration (`model.limits`).
         outside: `(P, K + 1)` bool, frames of windows that began outside what the agent learned
@@ -79,12 +79,14 @@ def simulate_closed_loop(
         steps: K, how many steps are simulated at most; None: to the end of the longest pair.
         state: of the agent after what it has observed up to `first`; None: it observes that here.
     """
+    simulator = agent.stepper(simulator)
     if state is None:
         state = _burnt_in(agent, batch, first, network, base, history, simulator.dt)
     track = _Track(batch, first, agent.windows.length, steps)
     position, speed, acceleration = track.now()
     follower = simulator.begin(Start(position, speed, acceleration))
-    parameters = track.speed.new_empty((len(batch), track.steps + 1, len(agent.space)))
+    width = len(agent.model_space)
+    parameters = track.speed.new_empty((len(batch), track.steps + 1, width))
     outside = torch.zeros(parameters.shape[:2], dtype=torch.bool, device=parameters.device)
     beyond = torch.zeros(state.beyond.shape[1], dtype=torch.float64, device=parameters.device)
     _, _, counted = track.result()
@@ -95,13 +97,13 @@ def simulate_closed_loop(
         follower, positions, speeds = simulator.advance(follower, track.leader(begin, end), p)
         track.write(begin, end, positions.T, speeds.T, simulator.dt)
         simulated = slice(begin + 1, end + 1)
-        parameters[:, simulated] = chosen[:, None]
+        parameters[:, simulated] = chosen[:, None, :width]
         is_outside = state.score > 1.0
         outside[:, simulated] = is_outside[:, None]
         frames = counted[:, simulated].sum(1) * is_outside
         beyond += (state.beyond * frames[:, None]).sum(0)
         if begin == 0:
-            parameters[:, 0] = chosen
+            parameters[:, 0] = chosen[:, :width]
     speed, gap, counted = track.result()
     at_limit = at_limits(simulator.model.limits, speed, simulator.dt)
     return ClosedLoop(speed, gap, parameters, counted, at_limit, outside, beyond)

@@ -169,7 +169,9 @@ def measure_platoons(
     methods = [method for method in METHODS if method in agents]
     driving = [agents[method][0] for method in methods]
     dt = driving[0].dt
-    simulated = simulate_platoons(model, driving, manoeuvre or Manoeuvre())
+    simulated = []
+    for together in _grouped(model, driving):
+        simulated += simulate_platoons(model, together, manoeuvre or Manoeuvre())
     tables = []
     measures = []
     for method, (speed, gap) in zip(methods, simulated, strict=True):
@@ -177,6 +179,17 @@ def measure_platoons(
         tables.append(_table(method, names, speed, gap, dt))
         measures.append(_measures(method, names, speed, gap, dt))
     return Platoon(pd.concat(tables, ignore_index=True), pd.concat(measures, ignore_index=True))
+
+
+def _grouped(model: DrivingModel, agents: Sequence[Agent]) -> list[list[Agent]]:
+    """Returns the agents in order, those behind one another together that drive the same model."""
+    groups: list[list[Agent]] = []
+    for agent in agents:
+        is_alone = agent.head.driven_model(model) is not model
+        if is_alone or not groups or groups[-1][-1].head.driven_model(model) is not model:
+            groups.append([])
+        groups[-1].append(agent)
+    return groups
 
 
 @torch.no_grad()
@@ -188,7 +201,8 @@ def simulate_platoons(
 
     Args:
         model: the driving model.
-        agents: what chooses the parameters; their windows and time steps are the same.
+        agents: what chooses the parameters; their windows and time steps are the same, and so is
+            the model that each drives (`Agent.stepper`).
         manoeuvre: what the leader does.
 
     Returns:
@@ -203,14 +217,14 @@ def simulate_platoons(
     for agent in agents:
         network = torch.arange(len(agent.names), device=device).repeat(VEHICLES)
         states.append(agent.begin(network))
-    simulator = MemoryStepper(model, dt, compile="never")
+    simulator = agents[0].stepper(MemoryStepper(model, dt, compile="never"))
     follower = simulator.begin(road.start())
     parameters: dict[str, Tensor] = {}
     for frame in range(road.speed.shape[-1] - 1):
         if frame % windows.stride == 0:
             seen = [road.history(frame, windows.length, part) for part in parts]
             chosen, states = _choose(agents, seen, states)
-            parameters = model.space.unpack(chosen)
+            parameters = simulator.model.space.unpack(chosen)
         follower, _, _ = simulator.advance(follower, road.leader(frame), parameters)
         road.write(frame + 1, follower)
     return [(road.speed[:, part], road.gap[:, part]) for part in parts]

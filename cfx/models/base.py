@@ -123,6 +123,10 @@ class DrivingModel(EarlierNames, Component):
         self._adaptation_bounds = self.settings.adaptation_bounds or {}
         self.space.for_adaptation(self._adaptation_bounds)  # says now what is wrong with them
 
+    def equations_key(self) -> str:
+        """Returns what the equations depend on besides the class; parameters are inputs of them."""
+        return self.settings.model_dump_json(exclude={"parameters"})
+
     @property
     def limits(self) -> LimitSettings | None:
         """What the vehicle can do, whatever the model wants; the step keeps to it."""

@@ -89,6 +89,28 @@ def _inverse_time_to_collision(history: History) -> Tensor:
     return approach / history.gap.clamp(min=_STANDING)
 
 
+_FRAME_S = 0.1
+"""Time between frames for which jerk is in m/s3; a network's scaler takes out what differs."""
+
+
+def _follower_jerk(history: History) -> Tensor:
+    """Differences of the acceleration between frames, in m/s3 at 0.1 s; the first stands twice."""
+    return _differences(history.follower_acceleration) / _FRAME_S
+
+
+def _leader_jerk(history: History) -> Tensor:
+    """As the follower's."""
+    return _differences(history.leader_acceleration) / _FRAME_S
+
+
+def _differences(signal: Tensor) -> Tensor:
+    """Returns differences between frames `(*batch, length)`; 0 where there is one frame only."""
+    if signal.shape[-1] == 1:
+        return torch.zeros_like(signal)
+    difference = signal.diff(dim=-1)
+    return torch.cat([difference[..., :1], difference], -1)
+
+
 INPUTS: dict[str, Callable[[History], Tensor]] = {
     "leader_speed": _leader_speed,
     "leader_acceleration": _leader_acceleration,
@@ -98,6 +120,8 @@ INPUTS: dict[str, Callable[[History], Tensor]] = {
     "relative_speed": _relative_speed,
     "time_headway": _time_headway,
     "inverse_time_to_collision": _inverse_time_to_collision,
+    "follower_jerk": _follower_jerk,
+    "leader_jerk": _leader_jerk,
 }
 """Signals that a policy may see, each `(*batch, length)`."""
 
@@ -111,10 +135,17 @@ SITUATION = (
 )
 """The inputs with which closed-loop training works best."""
 
+MOTION = (*SITUATION, "follower_jerk", "leader_jerk")
+"""The situation and the jerks: for policies that start from the driver's acceleration."""
+
 SPEEDS = ("leader_speed", "follower_speed")
 """The paper's inputs."""
 
-INPUT_SETS: dict[str, tuple[str, ...]] = {"situation": SITUATION, "speeds": SPEEDS}
+INPUT_SETS: dict[str, tuple[str, ...]] = {
+    "situation": SITUATION,
+    "motion": MOTION,
+    "speeds": SPEEDS,
+}
 """Inputs that go by one name: `policy.inputs=situation`."""
 
 

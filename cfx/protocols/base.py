@@ -163,13 +163,10 @@ class ProtocolContext:
         Raises:
             PluginError: the learner or the policy did not deliver such networks.
         """
-        _check_training_result(
-            registry.origin(self.learner if policy.trainable else policy),
-            training_result,
-            len(names),
-            len(self.space),
-        )
+        who = registry.origin(self.learner if policy.trainable else policy)
+        _check_training_result(who, training_result)
         head = self._head(policy, training_result)
+        _check_networks(who, training_result, len(names), len(head.space))
         # Constant parameters are calibrated on these pairs, too.
         learned_from = {pair.content: pair.driver for pair in self.pairs}
         return Agent(
@@ -227,16 +224,19 @@ class ProtocolResult:
     calibration: Mapping[str, float] = field(default_factory=dict)
 
 
-@torch.no_grad()
-def _check_training_result(
-    who: str, training_result: object, networks: int, parameters: int
-) -> None:
-    """Asks the networks about one window, so that a wrong shape or dtype ends in a sentence."""
+def _check_training_result(who: str, training_result: object) -> None:
     if not isinstance(training_result, TrainingResult):
         raise PluginError(
             f"{who}: fit must return a cfx.TrainingResult, but returned a"
             f" {type(training_result).__name__}"
         )
+
+
+@torch.no_grad()
+def _check_networks(
+    who: str, training_result: TrainingResult, networks: int, parameters: int
+) -> None:
+    """Asks the networks about one window, so that a wrong shape or dtype ends in a sentence."""
     mean = training_result.scaler.mean
     expected = (networks, 1, 1, parameters)
     if mean.shape[0] == networks:

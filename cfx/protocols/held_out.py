@@ -79,7 +79,7 @@ class HeldOut:
             loops,
             context.space,
             context.style,
-            adaptation_space=self.policy.space,
+            adaptation_space=self.policy.model_space,
             seed=context.seed,
             fold=fold,
             full_trajectory=self._full_trajectory(methods),

@@ -79,7 +79,7 @@ class WithinDriver(Protocol):
             _test_part(context, policy, network, first, fixed),
             context.space,
             context.style,
-            adaptation_space=policy.space,
+            adaptation_space=policy.model_space,
             seed=context.seed,
             platoon=self._platoons(context, policy, fixed),
             metrics=context.metrics,

@@ -8,6 +8,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
+from cfx.errors import ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.simulation.kernel.keys import ComponentKey
 from cfx.simulation.trajectory import Segments, Start, Terms
@@ -94,6 +95,17 @@ class Stepper(ABC):
             steps: of all vehicles, however many calls of `advance` they are cut into.
         """
         return self
+
+    def for_model(self, model: DrivingModel) -> Stepper:
+        """Returns what takes the steps of a model that has this stepper's model inside.
+
+        Raises:
+            ConfigError: it can take those of its own model only.
+        """
+        raise ConfigError(
+            f"{type(self).__name__} takes the steps of its own model only, so a policy with a"
+            " residual acceleration cannot drive it; set simulator=memory"
+        )
 
     def close(self) -> None:  # noqa: B027 - most hold nothing
         """Lets go of what takes the steps, such as processes; `advance` may start it again."""

@@ -98,6 +98,11 @@ class MemoryStepper(Stepper):
                 return eager(follower, leader, dict(p))
             return self._in_tiles(follower, leader, p, size, compiled=compiled)
 
+    def for_model(self, model: DrivingModel) -> MemoryStepper:
+        stepper = copy.copy(self)
+        stepper.model = model
+        return stepper
+
     def _in_tiles(
         self,
         follower: Follower,

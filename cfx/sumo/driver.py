@@ -179,6 +179,7 @@ class Driver:
                 " harder than a vehicle can; train it with model.limits as they are by default"
                 " (or model.variant=sumo) to drive live"
             )
+        self._driven = policy.head.driven_model(self.model)
         self._network = None
         if network is not None:
             self._network = self._number(network)
@@ -191,7 +192,7 @@ class Driver:
         self.counts = DriveCounts()
         self._slots: dict[str, int] = {}
         self._free: list[int] = []
-        self._store = VehicleTable.empty(policy, self.model, 0)
+        self._store = VehicleTable.empty(policy, self._driven, 0)
         self._swept = math.nan
 
     @classmethod
@@ -322,7 +323,7 @@ class Driver:
             self._driver_features[vehicle] = self._ordered_features(driver_features)
 
     def _shrunk_base(self, base: Mapping[str, float]) -> list[float]:
-        names = self.policy.space.names
+        names = self.policy.model_space.names
         if set(base) != set(names):
             raise ParameterError(
                 f"base: give a value for each of {', '.join(names)}, and nothing else"
@@ -499,7 +500,7 @@ class Driver:
         if name not in self._slots:
             if not self._free:
                 taken = len(self._slots)
-                more = VehicleTable.empty(self.policy, self.model, max(16, taken))
+                more = VehicleTable.empty(self.policy, self._driven, max(16, taken))
                 self._store = self._store.with_rows(more)
                 self._free = list(range(taken, len(self._store.time)))
             self._slots[name] = slot = self._free.pop()
@@ -560,7 +561,7 @@ class Driver:
             name, slot = names[index], int(slots[index])
             store.driven[slot] = True
             store.steps[slot] = 0
-            store.memory[slot] = self.model.initial_memory(store.history[slot, speed, -1])
+            store.memory[slot] = self._driven.initial_memory(store.history[slot, speed, -1])
             self._speed_modes.setdefault(name, connection.vehicle.getSpeedMode(name))
             connection.vehicle.setSpeedMode(name, self.speed_mode)
 
@@ -593,7 +594,7 @@ class Driver:
             seen.leader_length,
         )
         p = self.policy.space.unpack(store.parameters[slots])
-        after = advance_vehicle(self.model, follower, leader, p, dt)
+        after = advance_vehicle(self._driven, follower, leader, p, dt)
         store.memory[slots] = after.memory
         speed = after.speed
         limits = self.model.limits

@@ -156,7 +156,7 @@ def _scene(
         for kind in FOLLOWERS:
             roads.append(Road(number, kind, pair, arrays))
         frames = len(arrays[f"{number}/leader"][0])
-        chosen[number] = np.full((frames, len(policy.policy.space)), np.nan)
+        chosen[number] = np.full((frames, len(policy.policy.model_space)), np.nan)
         policy.assign(
             f"{number}/policy",
             pair["network"],
@@ -214,7 +214,8 @@ def _frame(
     for road in roads:
         if road.kind == "policy" and frame >= road.pair["first"]:
             parameters = drivers["policy"].parameters(road.follower.name)
-            chosen[road.number][frame] = list(parameters.values()) or np.nan
+            of_model = list(parameters.values())[: chosen[road.number].shape[1]]
+            chosen[road.number][frame] = of_model or np.nan
         if frame + 1 < road.frames:
             road.aim(sumo, frame + 1)
         else:

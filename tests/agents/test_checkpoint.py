@@ -36,10 +36,11 @@ def chosen(agent: Agent) -> torch.Tensor:
     return agent.act(now, state)[0]
 
 
-@pytest.mark.parametrize("offsets", [False, True])
-def test_a_loaded_agent_chooses_what_the_saved_one_chose(tmp_path: Path, offsets: bool) -> None:
+@pytest.mark.parametrize("head", ["direct", "offset", "residual"])
+def test_a_loaded_agent_chooses_what_the_saved_one_chose(tmp_path: Path, head: str) -> None:
+    made = adaptive(NODE, ("p1", "all"), offsets=head == "offset", residual=head == "residual")
     agent = replace(
-        adaptive(NODE, ("p1", "all"), offsets=offsets),
+        made,
         context_rule=ContextRule(driver_specific=False, shrinkage=0.3, history_s=20.0),
         learned_from={"abc": "a/1"},
     )
@@ -50,7 +51,7 @@ def test_a_loaded_agent_chooses_what_the_saved_one_chose(tmp_path: Path, offsets
     assert loaded.learned_from == agent.learned_from
     assert loaded.names == agent.names
     description = json.loads((tmp_path / "policy.json").read_text())
-    assert description["head"] == ("offset" if offsets else "direct")
+    assert description["head"] == head
 
 
 @pytest.mark.parametrize("offsets", [False, True])
@@ -85,7 +86,7 @@ def test_policies_that_mlflow_logged_before_find_what_they_import(tmp_path: Path
     ("key", "value", "message"),
     [
         ("format", 4, "has format 4; this version of cfx reads formats 1 to 3"),
-        ("head", "residual", "this version of cfx has no head 'residual'; it has direct, offset"),
+        ("head", "mixture", "this version of cfx has no head 'mixture'; it has direct, offset"),
         ("head", "offset", "the weights read 25 features, the policy's settings give 27"),
     ],
 )

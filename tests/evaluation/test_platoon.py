@@ -27,6 +27,7 @@ from cfx.parameters import Parameter, ParameterSpace
 from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
 from tests.evaluation.test_closed_loop import adaptive, constant
+from tests.sumo.policies import adaptive as live
 
 
 class Linear(DrivingModel):
@@ -147,6 +148,21 @@ def test_platoons_of_several_methods_do_not_touch_each_other() -> None:
     for (speed, _), policy in zip(together, (one, other), strict=True):
         ((alone, _),) = simulate_platoons(model, [policy], short)
         assert torch.equal(speed, alone)
+
+
+def test_an_agent_with_a_residual_drives_its_own_model_beside_others() -> None:
+    """Its vehicles start at the common speed without acceleration, whatever the model wants."""
+    residual = live({"name": "krauss"}, residual=True)
+    model, short = Krauss(), Manoeuvre(settle=5, after=5, hold=2)
+    other = constant(model, model.space.defaults()[None])
+    agents = {"default": (other, ("any",)), "policy": (residual, ("all",))}
+    found = measure_platoons(model, agents, short)
+    assert found is not None
+    ((speed, _),) = simulate_platoons(model, [residual], short)
+    table = found.table[found.table["method"] == "policy"]
+    assert table["speed"].to_numpy() == pytest.approx(speed.flatten().numpy(), abs=1e-5)
+    assert speed[1:, 0, 1].tolist() == pytest.approx([15.0] * VEHICLES, abs=1e-9)
+    assert float((speed[1:, 0, 5] - 15.0).abs().max()) > 1e-3
 
 
 def test_what_a_vehicle_overshoots_on_the_way_back_is_no_slowing() -> None:

@@ -105,17 +105,23 @@ def error(found: ClosedLoop, data: TrainingData, first: int = 0) -> float:
     return float((found.speed - measured)[found.counted].square().mean().sqrt())
 
 
-def untrained(data: TrainingData, policy: Policy) -> TrainingResult:
+def untrained(data: TrainingData, policy: Policy, **options: Any) -> TrainingResult:
     """Returns what one gradient step without a rate leaves."""
     still = {"epochs": 1, "steps": 1, "learning_rate": 1e-12, "weight_decay": 0.0}
-    return RolloutLearner(**(QUICK | still)).fit(policy, data)
+    return RolloutLearner(**(QUICK | still | options)).fit(policy, data)
 
 
 def placed(
-    data: TrainingData, policy: Policy, share: float = 0.25, seed: int = 0
+    data: TrainingData,
+    policy: Policy,
+    share: float = 0.25,
+    seed: int = 0,
+    head: str = "offset",
 ) -> RolloutDataset:
     """Returns the training data placed on networks."""
-    return RolloutDataset.of(data, policy, share, torch.Generator().manual_seed(seed))
+    generator = torch.Generator().manual_seed(seed)
+    made = HEADS[head].for_model(data.simulator.model)
+    return RolloutDataset.of(data, policy, share, generator, head=made)
 
 
 def module_of(data: TrainingData, **options: Any) -> RolloutModule:

@@ -10,8 +10,10 @@ import torch
 from cfx import registry
 from cfx.agents.agent import Agent
 from cfx.agents.core import AgentCore
+from cfx.agents.heads.base import ParameterHead
 from cfx.agents.heads.direct import DirectHead
 from cfx.agents.heads.offset import OffsetHead
+from cfx.agents.heads.residual import ResidualHead
 from cfx.agents.scaler import Scaler
 from cfx.calibration.windows import WindowSettings
 from cfx.models.base import DrivingModel
@@ -27,18 +29,25 @@ def adaptive(
     dt: float = 0.1,
     length: int = 5,
     offsets: bool = False,
+    residual: bool = False,
     driver_features: tuple[str, ...] = (),
 ) -> Agent:
     """Returns a GRU for each name; what it chooses depends on all it sees.
 
-    With `offsets` it answers offsets, from the middle between the bounds for who brings no base.
+    With `offsets` it answers offsets, from the middle between the bounds for who brings no base;
+    with `residual` also how the residual acceleration decays.
     """
     model = registry.create("model", dict(node))
     assert isinstance(model, DrivingModel)
     policy = GruPolicy(inputs=INPUTS, driver_features=driver_features, start="middle")
     networks = len(names)
-    features = length * len(INPUTS) + (len(model.space) if offsets else 0) + len(driver_features)
-    unit = model.space.to_unit(model.space.defaults())
+    head: ParameterHead = DirectHead(model.space)
+    if residual:
+        head = ResidualHead.for_model(model)
+    elif offsets:
+        head = OffsetHead(model.space)
+    features = length * len(INPUTS) + head.width + len(driver_features)
+    unit = head.space.to_unit(head.space.defaults())
     network = (
         policy.build(features, unit, unit.expand(networks, -1), torch.Generator().manual_seed(3))
         .double()
@@ -51,7 +60,9 @@ def adaptive(
         torch.full((networks, features), 6.0).double(),
         torch.full((networks, features), 4.0).double(),
     )
-    head = OffsetHead(model.space) if offsets else DirectHead(model.space)
+    base = None
+    if head.needs_base:
+        base = head.space.from_unit(torch.full((networks, len(head.space)), 0.5).double())
     return Agent(
         core=AgentCore(policy, network, scaler, head),
         model_node=dict(node),
@@ -64,7 +75,5 @@ def adaptive(
         windows=WindowSettings(length=length, stride=5),
         dt=dt,
         names=names,
-        base=model.space.from_unit(torch.full((networks, len(model.space)), 0.5).double())
-        if offsets
-        else None,
+        base=base,
     )

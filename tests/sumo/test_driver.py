@@ -515,12 +515,13 @@ def test_the_package_gives_the_driver_and_imports_no_sumo() -> None:
 
 
 def _baseline(policy: Agent, component: Any, pairs: int) -> Agent:
-    unit = policy.space.to_unit(policy.space.defaults()).expand(pairs, -1)
+    space = policy.model_space
+    unit = space.to_unit(space.defaults()).expand(pairs, -1)
     blank = torch.zeros((pairs, 1)).double()
     names = tuple(str(i) for i in range(pairs))
     return Agent(
         core=AgentCore(
-            component, ConstantNetwork(unit), Scaler(blank, blank + 1), DirectHead(policy.space)
+            component, ConstantNetwork(unit), Scaler(blank, blank + 1), DirectHead(space)
         ),
         model_node=policy.model_node,
         policy_node={"name": "default"},
@@ -535,14 +536,16 @@ def style_of(pairs: Sequence[Any]) -> StyleResult:
 
 
 @pytest.mark.parametrize(
-    ("node", "length", "frames", "history", "driver_features"),
+    ("node", "length", "frames", "history", "driver_features", "residual"),
     [
-        ({"name": "krauss"}, 5, 250, 5.3, ()),
-        ({"name": "krauss"}, 5, 250, 17.3, ("acceleration", "time_gap")),
-        ({"name": "w99"}, 8, 1000, None, ("time_headway",)),
+        ({"name": "krauss"}, 5, 250, 5.3, (), False),
+        ({"name": "w99"}, 5, 250, 5.3, (), True),
+        ({"name": "krauss"}, 5, 250, 17.3, ("acceleration", "time_gap"), False),
+        ({"name": "w99"}, 8, 1000, None, ("time_headway",), False),
     ],
     ids=[
         "offsets from own parameters, after 5 s",
+        "with a residual acceleration, after 5 s",
         "with driver features, after 17 s",
         "parameters and driver features, after all there is",
     ],
@@ -553,6 +556,7 @@ def test_in_sumo_a_policy_drives_as_in_memory(
     frames: int,
     history: float | None,
     driver_features: tuple[str, ...],
+    residual: bool,
     tmp_path: Path,
 ) -> None:
     """Behind replayed leaders in libsumo, across edges and junctions, to 1e-9."""
@@ -568,6 +572,7 @@ def test_in_sumo_a_policy_drives_as_in_memory(
         tuple(pair.pair_id for pair in pairs),
         length=length,
         offsets=history is not None,
+        residual=residual,
         driver_features=driver_features,
     )
     checkpoint.save(policy, tmp_path / "policy")

@@ -8,8 +8,13 @@ from __future__ import annotations
 from cfx.agents.heads.base import ParameterHead
 from cfx.agents.heads.direct import DirectHead
 from cfx.agents.heads.offset import OffsetHead
+from cfx.agents.heads.residual import ResidualHead
 
-HEADS: dict[str, type[ParameterHead]] = {head.name: head for head in (DirectHead, OffsetHead)}
+HEADS: dict[str, type[ParameterHead]] = {
+    DirectHead.name: DirectHead,
+    OffsetHead.name: OffsetHead,
+    ResidualHead.name: ResidualHead,
+}
 """Heads by the names that saved policies give."""
 
 

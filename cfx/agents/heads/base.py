@@ -42,6 +42,26 @@ class ParameterHead(ABC):
         """Returns the same head for tensors of a device."""
         return type(self)(self.space, device)
 
+    def driven_model(self, model: DrivingModel) -> DrivingModel:
+        """Returns the model whose steps these parameters drive: the job's, or one around it."""
+        return model
+
+    @property
+    def model_space(self) -> ParameterSpace:
+        """The driving model's parameters, which stand first in `space`."""
+        return self.space
+
+    def completed(self, parameters: Tensor) -> Tensor:
+        """Returns the driving model's parameters with defaults for all else that the head answers.
+
+        Args:
+            parameters: of the driving model, or already complete; `(*batch, m)`, SI units.
+
+        Returns:
+            `(*batch, n)`, SI units.
+        """
+        return parameters
+
     @property
     def width(self) -> int:
         """The number of features by which networks learn of the base, c."""

@@ -174,8 +174,12 @@ class _ConstantParameters:
         return torch.stack([objective, self.gap_rmse(values, counted)], -1)
 
     def _by_name(self, unit: Tensor) -> dict[str, Tensor]:
-        """Returns parameters by name, those that differ between rows as `(R, 1)`."""
+        """Returns the model's parameters by name, those that differ between rows as `(R, 1)`.
+
+        What heads answer beyond them stands behind them, and is left out.
+        """
         space = self.simulator.model.adaptation_space
+        unit = unit[..., : len(space)]
         named = {}
         for name, value in space.unpack(space.from_unit(unit)).items():
             named[name] = value[:, None] if value.dim() else value

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cfx.agents.heads.offset import coordinates
+from cfx.agents.heads.base import ParameterHead
+from cfx.agents.heads.offset import OffsetHead, coordinates
 from cfx.agents.scaler import Scaler
 from cfx.learners.base import TrainingData
 from cfx.learners.batched import Grid
@@ -92,6 +93,7 @@ class RolloutDataset:
         share: float,
         generator: torch.Generator,
         ensemble_size: int = 1,
+        head: ParameterHead | None = None,
     ) -> RolloutDataset:
         """Places training data.
 
@@ -102,24 +104,27 @@ class RolloutDataset:
                 drivers are few).
             generator: chooses these drivers, for each member of an ensemble anew.
             ensemble_size: networks of an ensemble.
+            head: says which parameters bases have; None: those of the driving model.
         """
+        if head is None:
+            head = OffsetHead.for_model(training_data.simulator.model)
         batch = _single_precision(training_data.batch)
         device = batch.lengths.device
-        space = training_data.simulator.model.adaptation_space
+        space, fixed = head.space, head.completed(training_data.fixed)
         grid = Grid(training_data.network.to(device), len(training_data.names))
         pairs = torch.arange(len(batch), device=device)
         pair = grid.scatter(pairs).repeat_interleave(ensemble_size, 0)
         present = grid.scatter(torch.ones_like(pairs)).bool().repeat_interleave(ensemble_size, 0)
-        pooled = grid.mean(space.to_unit(training_data.fixed)).float()
+        pooled = grid.mean(space.to_unit(fixed)).float()
         last = training_data.split.frame.to(device)[pair]
         validation = _validation_drivers(training_data, pair.cpu(), present.cpu(), share, generator)
         kept, few = validation.kept.to(device), validation.few.to(device)[:, None]
         trains = present & (few | ~kept)
         until = torch.where(few, (last * (1.0 - share)).long(), last)
         if training_data.base is None:
-            base = space.to_unit(training_data.fixed).float()
+            base = space.to_unit(fixed).float()
         else:
-            base = space.to_unit(training_data.base).float()
+            base = space.to_unit(head.completed(training_data.base)).float()
         seen = _measured_tokens(training_data, policy, batch)
         driver_features = _driver_features(training_data, policy, batch)
         # Whatever a member of the ensemble trains on counts, so that all members share one scaler.

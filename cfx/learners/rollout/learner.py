@@ -20,6 +20,8 @@ from typing import Any, ClassVar
 import pandas as pd
 import torch
 
+from cfx.agents.heads import HEADS
+from cfx.agents.heads.base import ParameterHead
 from cfx.agents.heads.offset import OffsetHead
 from cfx.agents.scaler import Scaler
 from cfx.component import Settings
@@ -33,7 +35,6 @@ from cfx.learners.rollout.distillation import Expert
 from cfx.learners.rollout.module import RolloutModule, StepNumbers
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.learners.situations import learned_range
-from cfx.models.base import DrivingModel
 from cfx.models.direct import Direct
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.ensemble import Ensemble
@@ -47,11 +48,14 @@ class RolloutLearner(Learner):
     """Back-propagates the job's objective through closed-loop simulation into the policy.
 
     Networks answer offsets (`cfx.agents.heads.offset`): untrained, each driver is driven by their
-    base parameters, so training starts from a fixed model. Before a trajectory the policy observes
-    the driver's measured history; cold starts, as of unseen drivers, have none. The drivers of all
-    networks (at most `drivers` of each) are simulated at once, from random measured states. The
-    switches of models with regimes are smoothed meanwhile; validation is exact. Networks can first
-    imitate experts that set the acceleration (`distillation_epochs`).
+    base parameters, so training starts from a fixed model. With `head=residual` they also choose
+    how the acceleration that the model misses at first decays (`cfx.agents.heads.residual`).
+
+    Before a trajectory the policy observes the driver's measured history; cold starts, as of unseen
+    drivers, have none. The drivers of all networks (at most `drivers` of each) are simulated at
+    once, from random measured states. The switches of models with regimes are smoothed meanwhile;
+    validation is exact. Networks can first imitate experts that set the acceleration
+    (`distillation_epochs`).
 
     A trajectory's loss is the objective plus `gap_weight` times the gap's RMSE, each divided by
     what the base parameters have there, plus `jerk_weight` times the RMS jerk.
@@ -91,8 +95,11 @@ class RolloutLearner(Learner):
                 "The policy does not see the gap; policy.inputs=situation gives smaller errors"
             )
         generator = torch.Generator().manual_seed(training_data.seed)
-        dataset = RolloutDataset.of(training_data, policy, s.validation, generator, s.ensemble_size)
-        network = _untrained(policy, dataset, simulator.model, generator)
+        head = HEADS[s.head].for_model(simulator.model)
+        dataset = RolloutDataset.of(
+            training_data, policy, s.validation, generator, s.ensemble_size, head
+        )
+        network = _untrained(policy, dataset, head, generator)
         if not any(parameter.requires_grad for parameter in network.parameters()):
             curves = pd.DataFrame(columns=CURVE_COLUMNS)
             return self._result(network.eval(), dataset, training_data, curves)
@@ -120,7 +127,8 @@ class RolloutLearner(Learner):
         curves: pd.DataFrame,
     ) -> TrainingResult:
         """Returns the networks with the situations that they have learned from."""
-        found = _training_result(network, dataset, training_data, curves)
+        head = HEADS[self.settings.head].for_model(training_data.simulator.model)
+        found = _training_result(network, dataset, training_data, curves, head)
         has_cold_starts = training_data.base is not None and self.settings.cold_start_fraction > 0
         augment = None
         if has_cold_starts:
@@ -182,8 +190,13 @@ class RolloutLearner(Learner):
         )
         expert_dataset = dataset.for_base(space.to_unit(default).float())
         generator = torch.Generator().manual_seed(training_data.seed)
-        network = _untrained(policy, expert_dataset, simulator.model, generator)
-        changes = {"distillation_epochs": 0, "epochs": s.epochs - s.distillation_epochs}
+        head = OffsetHead.for_model(simulator.model)
+        network = _untrained(policy, expert_dataset, head, generator)
+        changes = {
+            "head": head.name,
+            "distillation_epochs": 0,
+            "epochs": s.epochs - s.distillation_epochs,
+        }
         learner = RolloutLearner(s.model_copy(update=changes))
         module = learner._trained(
             "Training experts", network, policy, expert_data, expert_dataset, errors, checkpoint
@@ -193,11 +206,10 @@ class RolloutLearner(Learner):
 
 
 def _untrained(
-    policy: Policy, dataset: RolloutDataset, model: DrivingModel, generator: torch.Generator
+    policy: Policy, dataset: RolloutDataset, head: ParameterHead, generator: torch.Generator
 ) -> PolicyNetwork:
     """Returns networks that answer no offset, on the device of the dataset."""
     device = dataset.pair.device
-    head = OffsetHead.for_model(model)
     default = head.space.to_unit(head.space.defaults()).float()
     start = head.untrained_answer(default.expand(len(dataset.pair), -1))
     features = dataset.scaler.mean.shape[-1]
@@ -209,9 +221,10 @@ def _training_result(
     dataset: RolloutDataset,
     training_data: TrainingData,
     curves: pd.DataFrame,
+    head: ParameterHead,
 ) -> TrainingResult:
     """Returns the networks; those of an ensemble as one."""
-    space, ensemble_size = training_data.simulator.model.adaptation_space, dataset.ensemble_size
+    ensemble_size = dataset.ensemble_size
     first = slice(None, None, ensemble_size)
     if ensemble_size > 1:
         network = Ensemble(network, ensemble_size).eval()
@@ -219,6 +232,6 @@ def _training_result(
         network=network,
         scaler=Scaler(dataset.scaler.mean[first].clone(), dataset.scaler.scale[first].clone()),
         curves=curves,
-        base=space.from_unit(dataset.pooled[first].to(training_data.fixed.dtype)),
-        head=OffsetHead.name,
+        base=head.space.from_unit(dataset.pooled[first].to(training_data.fixed.dtype)),
+        head=head.name,
     )

@@ -31,12 +31,14 @@ class Segment(NamedTuple):
         measured: at the same frames.
         expert_speed: the speeds at which experts would have driven each window, m/s; None without
             experts.
+        first: how many frames were simulated before.
     """
 
     speed: Tensor
     gap: Tensor
     measured: Measured
     expert_speed: Tensor | None
+    first: int = 0
 
 
 def burn_in(
@@ -123,5 +125,6 @@ def simulate(
         if wanted:
             expert_speed = torch.cat(wanted, -1)
         measured = inputs.measured_at(frames)
-        yield Segment(torch.cat(speeds, -1), torch.cat(gaps, -1), measured, expert_speed)
+        speed, gap = torch.cat(speeds, -1), torch.cat(gaps, -1)
+        yield Segment(speed, gap, measured, expert_speed, frames.start)
         now = path.after_segment(now)

@@ -5,6 +5,9 @@ Shapes: N networks, D trajectories of each, K simulated frames.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
+import torch
 from torch import Tensor
 
 from cfx.learners.rollout.base_errors import Divisors
@@ -17,6 +20,46 @@ _EPSILON = 1e-4
 """(m/s)2, m2: keeps the slope of a root finite where a trajectory has no error."""
 
 
+_LEAST_ERROR = 0.1
+"""Share of the mean error that an error counts as at least, in weights of frames: in the first
+frames after the start nothing can be wrong."""
+
+
+class FrameWeights(NamedTuple):
+    """How much each frame after the start counts, `(K,)` each, 1 in the mean error.
+
+    Frames after the last count as the last.
+
+    Attributes:
+        speed: weight of what the objective adds up.
+        gap: weight of squared errors of the gap.
+    """
+
+    speed: Tensor
+    gap: Tensor
+
+    @classmethod
+    def relative_to(cls, speed_error: Tensor, gap_error: Tensor) -> FrameWeights:
+        """Returns weights that let each frame count alike relative to these errors.
+
+        Args:
+            speed_error: mean square at each frame, `(K,)`, (m/s)2.
+            gap_error: the same, m2.
+        """
+        return cls(_relative(speed_error), _relative(gap_error))
+
+    def at(self, first: int, count: int) -> FrameWeights:
+        """Returns the weights of `count` frames from frame `first` on."""
+        index = torch.arange(first, first + count, device=self.speed.device)
+        index = index.clamp(max=len(self.speed) - 1)
+        return FrameWeights(self.speed[index], self.gap[index])
+
+
+def _relative(error: Tensor) -> Tensor:
+    mean = error.mean()
+    return mean / error.clamp(min=_LEAST_ERROR**2 * mean)
+
+
 class TrajectoryLoss:
     """The loss of each trajectory, without unit except for the jerk's term.
 
@@ -24,9 +67,13 @@ class TrajectoryLoss:
         objective: of the job.
         settings: weights of the other terms.
         dt: time step, s.
+
+    Attributes:
+        frame_weights: how much each frame counts; None: all count alike.
     """
 
     def __init__(self, objective: Objective, settings: LossSettings, dt: float) -> None:
+        self.frame_weights: FrameWeights | None = None
         self.objective = objective
         self.settings = settings
         self.dt = dt
@@ -41,14 +88,17 @@ class TrajectoryLoss:
         """
         counted = segment.measured.counted
         values = self._values(segment, segment.measured.speed)
-        objective = self.objective(values, counted, dim=-1, epsilon=_EPSILON)
-        gap = self.gap_rmse(values, counted, dim=-1, epsilon=_EPSILON)
+        weights = None
+        if self.frame_weights is not None:
+            weights = self.frame_weights.at(segment.first, counted.shape[-1])
+        objective = _loss(self.objective, values, counted, weights and weights.speed)
+        gap = _loss(self.gap_rmse, values, counted, weights and weights.gap)
         loss = objective / divisors.objective + self.settings.gap_weight * (gap / divisors.gap)
         loss = loss + self.settings.jerk_weight * _rms_jerk(segment.speed, counted, self.dt)
         if segment.expert_speed is None:
             return loss
         values = self._values(segment, segment.expert_speed)
-        difference = self.speed_rmse(values, counted, dim=-1, epsilon=_EPSILON)
+        difference = _loss(self.speed_rmse, values, counted, weights and weights.speed)
         return loss.detach() + (difference - difference.detach())
 
     def _values(self, segment: Segment, speed: Tensor) -> FrameValues:
@@ -60,6 +110,16 @@ class TrajectoryLoss:
             measured_gap=segment.measured.gap,
             dt=self.dt,
         )
+
+
+def _loss(
+    objective: Objective, values: FrameValues, counted: Tensor, weight: Tensor | None
+) -> Tensor:
+    """Returns an objective of trajectories, `(N, D)`, whose frames have a weight `(K,)`."""
+    if weight is None:
+        return objective(values, counted, dim=-1, epsilon=_EPSILON)
+    sums = objective.sums(values, counted * weight, dim=-1)
+    return objective.finish(sums, counted.sum(-1).clamp(min=1), _EPSILON)
 
 
 def _rms_jerk(speeds: Tensor, counted: Tensor, dt: float) -> Tensor:

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from cfx.agents.core import AgentCore
-from cfx.agents.heads.offset import OffsetHead
+from cfx.agents.heads import HEADS
 from cfx.learners.base import TrainingData
 from cfx.learners.batched import BatchedModule
 from cfx.learners.rollout.base_errors import BaseErrors, Divisors
@@ -25,7 +25,7 @@ from cfx.learners.rollout.dataset import RolloutDataset
 from cfx.learners.rollout.distillation import Expert
 from cfx.learners.rollout.gradients import GradientPath, NoGradients, ThroughMemory, ThroughTime
 from cfx.learners.rollout.loop import simulate
-from cfx.learners.rollout.loss import TrajectoryLoss
+from cfx.learners.rollout.loss import FrameWeights, TrajectoryLoss
 from cfx.learners.rollout.sampling import TrajectorySampler
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.learners.rollout.step import WindowStep
@@ -96,7 +96,8 @@ class RolloutModule(BatchedModule):
         device = dataset.base.device
         model, dt = training_data.simulator.model, training_data.simulator.dt
         windows = training_data.windows
-        head = OffsetHead.for_model(model, device)
+        head = HEADS[settings.head].for_model(model, device)
+        model = head.driven_model(model)
         core = AgentCore(policy, network, dataset.scaler, head)
         self.temperature = torch.tensor(settings.temperature, device=device)
         self.exact_step = WindowStep(core, model, windows, dt)
@@ -116,6 +117,8 @@ class RolloutModule(BatchedModule):
             has_cold_starts=training_data.base is not None,
             seed=training_data.seed,
         )
+        if settings.time_weighting == "relative":
+            self.loss.frame_weights = self._frame_weights()
         clip = settings.gradient_clip_state / self.sampler.trajectories
         bounds = (settings.gradient_decay, clip, settings.tbptt_windows)
         self.through_time = ThroughTime(*bounds)
@@ -190,6 +193,19 @@ class RolloutModule(BatchedModule):
         )
         for segment in segments:
             yield self.loss(segment, divisors)
+
+    @torch.no_grad()
+    def _frame_weights(self) -> FrameWeights:
+        """Returns weights relative to the errors of the untrained networks."""
+        batch = self.sampler.training(0)
+        windows = self.settings.horizon
+        segments = simulate(self.exact_step, self.dataset, batch, windows, NoGradients())
+        segment = next(segments)
+        weight = segment.measured.counted * batch.weight[..., None]
+        count = weight.sum((0, 1)).clamp(min=1.0)
+        speed = (segment.speed - segment.measured.speed).square() * weight
+        gap = (segment.gap - segment.measured.gap).square() * weight
+        return FrameWeights.relative_to(speed.sum((0, 1)) / count, gap.sum((0, 1)) / count)
 
     @property
     def burn_in_windows(self) -> int | None:

@@ -6,12 +6,23 @@ set of parameters holds (`windows.stride`).
 
 from __future__ import annotations
 
-from typing import Self
+from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
 from cfx.component import Settings
 from cfx.simulation.rollout import Compile
+
+
+class HeadSettings(Settings):
+    """What networks answer."""
+
+    head: Literal["offset", "residual"] = Field(
+        "offset",
+        description="offset: offsets from each driver's base parameters; residual: also how the"
+        " acceleration that the model misses at the start decays, so that the policy starts with"
+        " exactly the acceleration that the driver has",
+    )
 
 
 class EnsembleSettings(Settings):
@@ -109,6 +120,12 @@ class LossSettings(Settings):
     gap_weight: float = Field(
         0.1, ge=0, description="weight of the gap's RMSE beside the job's objective"
     )
+    time_weighting: Literal["even", "relative"] = Field(
+        "even",
+        description="how times after a trajectory's start count: even: errors alike; relative:"
+        " errors relative to what an untrained policy has at that time, so that the first second"
+        " counts too",
+    )
     jerk_weight: float = Field(
         0.0,
         ge=0,
@@ -182,6 +199,7 @@ class RolloutSettings(
     SamplingSettings,
     OptimisationSettings,
     EnsembleSettings,
+    HeadSettings,
 ):
     """Settings of `rollout`."""
 

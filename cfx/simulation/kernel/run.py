@@ -94,7 +94,7 @@ def exists(
 
 def model_key(model: DrivingModel) -> ComponentKey:
     """Returns what a model's equations depend on; its parameters are inputs of them."""
-    return ComponentKey(type(model), model.settings.model_dump_json(exclude={"parameters"}))
+    return ComponentKey(type(model), model.equations_key())
 
 
 def _kernel(

@@ -63,6 +63,24 @@ def test_it_learns_to_drive_like_the_drivers() -> None:
     assert curves.validation_loss.min() < 0.8 * curves.validation_loss.iloc[0]
 
 
+def test_a_residual_policy_starts_where_the_driver_is_and_drives_better() -> None:
+    """It has exactly the driver's acceleration at first, trained or not."""
+    policy, data = gru(), training_data()
+    options = QUICK | {"cold_start_fraction": 0.0, "head": "residual"}
+    errors = []
+    for result in (
+        untrained(data, policy, head="residual"),
+        RolloutLearner(**options).fit(policy, data),
+    ):
+        found = loop(result, data, policy, first=100)
+        first = (found.speed[:, 1] - found.speed[:, 0]) / 0.1
+        measured = data.batch.follower_acceleration[:, 100]
+        torch.testing.assert_close(first, measured, rtol=0, atol=1e-5)
+        assert found.parameters.shape[-1] == len(data.simulator.model.space)
+        errors.append(error(found, data, first=100))
+    assert errors[1] < 0.6 * errors[0]
+
+
 @pytest.mark.parametrize(
     "objective", [GapRmse(), Mixed(), TheilU(), SpeedHuber()], ids=lambda o: type(o).__name__
 )
@@ -194,6 +212,7 @@ def test_an_ensemble_learns_and_drives_as_one() -> None:
         {"cold_start_fraction": 1.0},
         {"temperature": 0.0},
         {"distillation_epochs": 1},
+        {"head": "residual", "time_weighting": "relative", "distillation_epochs": 1},
     ],
     ids=lambda options: next(iter(options)),
 )

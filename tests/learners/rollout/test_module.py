@@ -24,23 +24,25 @@ from tests.learners.made import (
     module_of,
     placed,
     training_data,
+    untrained,
 )
 
 
 @pytest.mark.parametrize(
     "driver_features", [(), ("time_headway", "acceleration")], ids=["", "driver_features"]
 )
+@pytest.mark.parametrize("head", ["offset", "residual"])
 @pytest.mark.parametrize("model", [Krauss(), W99()], ids=["krauss", "w99"])
 def test_training_simulates_what_evaluation_simulates(
-    model: Any, driver_features: tuple[str, ...]
+    model: Any, head: str, driver_features: tuple[str, ...]
 ) -> None:
     """Training's closed loop and evaluation's give the same speeds and gaps after a burn-in."""
     policy = gru(driver_features=driver_features)
     data = training_data(model=model, networks=1)
-    options = QUICK | {"epochs": 1, "learning_rate": 0.05}
+    options = QUICK | {"epochs": 1, "learning_rate": 0.05, "head": head}
     result = RolloutLearner(**options).fit(policy, data)
-    settings = RolloutSettings(**QUICK)
-    dataset = placed(data, policy, settings.validation)
+    settings = RolloutSettings(**(QUICK | {"head": head}))
+    dataset = placed(data, policy, settings.validation, head=head)
     dataset.scaler = result.scaler
     module = RolloutModule(result.network, dataset, policy, data, settings)
     if driver_features:  # training measures full trajectories, evaluation what was before
@@ -82,6 +84,32 @@ def test_a_bounded_burn_in_forgets_what_was_before() -> None:
             torch.testing.assert_close(short[0, number], state[0, number])
     assert not bool(short[0, 5].any())
     assert not torch.allclose(short[0, 4], full[0, 4], atol=1e-6)
+
+
+def test_weights_let_each_time_after_the_start_count_alike() -> None:
+    """Relative to the untrained errors every frame has the same weighted error."""
+    policy, data = gru(), training_data(networks=1)
+    options = QUICK | {"head": "residual", "time_weighting": "relative"}
+    settings = RolloutSettings(**options)
+    dataset = placed(data, policy, settings.validation, head="residual")
+    result = untrained(data, policy, head="residual")
+    module = RolloutModule(result.network, dataset, policy, data, settings)
+    weights = module.loss.frame_weights
+    assert weights is not None
+    batch = module.sampler.training(0)
+    with torch.no_grad():
+        segment = next(simulate(module.exact_step, dataset, batch, 12, NoGradients()))
+    counted = segment.measured.counted * batch.weight[..., None]
+    square = (segment.speed - segment.measured.speed).square() * counted
+    error = square.sum((0, 1)) / counted.sum((0, 1))
+    weighted = error * weights.speed
+    assert float(error[1] / error.mean()) < 0.05, "the residual makes the start nearly exact"
+    late = error > 0.01 * error.mean()
+    expected = error.mean().expand(int(late.sum()))
+    torch.testing.assert_close(weighted[late], expected, rtol=1e-4, atol=0)
+    assert float(weighted.max()) < 1.001 * float(error.mean())
+    beyond = weights.at(55, 20)
+    assert torch.equal(beyond.speed[5:], weights.speed[-1].expand(15))
 
 
 def exact_losses(module: RolloutModule, batch: RolloutBatch, windows: int, full: bool) -> Any:

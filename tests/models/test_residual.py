@@ -1,0 +1,151 @@
+"""The residual acceleration beside a driving model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import pytest
+import torch
+from torch import Tensor
+
+from cfx.errors import ConfigError
+from cfx.models.base import DrivingModel, Follower, Leader
+from cfx.models.idm import IDM
+from cfx.models.krauss import Krauss
+from cfx.models.residual import WithResidual
+from cfx.models.sumo_vtype import SumoVType
+from cfx.models.w99 import W99
+from cfx.parameters import Parameter, ParameterSpace
+from cfx.simulation.kernel.run import model_key
+from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.trajectory import Start
+from cfx.testing.checks import models
+
+DT = 0.1
+
+
+class Steady(DrivingModel):
+    """Wants one acceleration whatever happens, so that all else is the residual's."""
+
+    parameters = ParameterSpace.of(Parameter("a", "m/s2", -2.0, 2.0, 0.0, "acceleration"))
+
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
+        return (follower.speed + p["a"] * dt).clamp(min=0.0)
+
+
+def far_leader(steps: int, *batch: int) -> Leader:
+    position = (1000.0 + 1.5 * torch.arange(steps).double())[:, None].expand(steps, *batch)
+    speed = torch.full((steps, *batch), 15.0).double()
+    return Leader(position, speed, torch.zeros_like(speed), torch.tensor(5.0).double())
+
+
+def speeds(model: DrivingModel, start: Start, leader: Leader, *parameters: float) -> Tensor:
+    """Returns the speeds of one follower at all steps, `(T,)`."""
+    wrapped = WithResidual(model)
+    p = wrapped.space.unpack(torch.tensor([parameters]).double())
+    simulator = MemoryStepper(wrapped, DT)
+    return simulator.advance(simulator.begin(start), leader, p)[2][:, 0]
+
+
+def start(speed: float, acceleration: float) -> Start:
+    values = (0.0, speed, acceleration)
+    return Start(*(torch.tensor([value], dtype=torch.float64) for value in values))
+
+
+CHECKS = (
+    models.every_parameter_says_what_it_is,
+    models.keeps_shape_dtype_and_device,
+    models.is_pure,
+    models.a_batch_equals_the_loop_over_it,
+    models.speeds_are_finite_and_not_negative_at_every_extreme,
+    models.a_bad_neighbour_does_no_harm,
+    models.no_rollout_leaves_what_is_finite,
+)
+"""What of the contract of models can hold: a first step asks nobody for the leader."""
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=[check.__name__ for check in CHECKS])
+def test_the_contract_of_models_holds(check: Callable[[DrivingModel], None]) -> None:
+    check(WithResidual(Krauss()))
+
+
+def test_it_starts_with_the_measured_acceleration_and_decays_exponentially() -> None:
+    """Against the closed form, for many values at once: the speed is a sum of exponentials."""
+    draw = torch.rand((4, 200), generator=torch.Generator().manual_seed(0)).double()
+    alone, measured, target = 4.0 * draw[0] - 2.0, 4.0 * draw[1] - 2.0, 2.0 * draw[2] - 1.0
+    tau = 0.3 + 10.0 * draw[3]
+    model = WithResidual(Steady(limits=None))
+    begin = Start(torch.zeros_like(alone), torch.full_like(alone, 50.0), measured)
+    p = {"a": alone, "residual_time": tau, "residual_target": target}
+    simulator = MemoryStepper(model, DT)
+    _, _, speed = simulator.advance(simulator.begin(begin), far_leader(60, 1), p)
+    kept, steps = torch.exp(-DT / tau), torch.arange(1, 61)[:, None]
+    decaying = (measured - alone - target) * (1.0 - kept**steps) / (1.0 - kept)
+    expected = 50.0 + DT * ((alone + target) * steps + decaying)
+    torch.testing.assert_close(speed, expected, rtol=0, atol=1e-9)
+    torch.testing.assert_close((speed[0] - 50.0) / DT, measured, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("model", [Krauss(), IDM(), W99()], ids=["krauss", "idm", "w99"])
+def test_the_first_step_is_the_drivers_and_the_rest_becomes_the_models(
+    model: DrivingModel,
+) -> None:
+    """With a short time constant it is soon where the model alone is."""
+    leader = far_leader(600, 1)
+    leader = leader._replace(position=leader.position - 970.0)
+    first = start(14.0, -0.4)
+    parameters = model.space.defaults().tolist()
+    with_residual = speeds(model, first, leader, *parameters, 0.2, 0.0)
+    assert (float(with_residual[0]) - 14.0) / DT == pytest.approx(-0.4, abs=1e-9)
+    if not isinstance(model, W99):  # who never stops oscillating
+        simulator, p = MemoryStepper(model, DT), model.space.unpack(model.space.defaults())
+        alone = simulator.advance(simulator.begin(first), leader, p)[2][:, 0]
+        assert float(with_residual[-1]) == pytest.approx(float(alone[-1]), abs=0.02)
+
+
+def test_no_residual_keeps_a_vehicle_from_braking_for_its_leader() -> None:
+    """The leader stands; the residual alone would let the follower run into it."""
+    steps = 200
+    still = torch.zeros((steps, 1)).double()
+    leader = Leader(still + 65.0, still, still, torch.tensor(5.0).double())
+    model = IDM()
+    parameters = (*model.space.defaults().tolist(), 20.0, 3.0)
+    wrapped = WithResidual(model)
+    p = wrapped.space.unpack(torch.tensor([parameters]).double())
+    simulator = MemoryStepper(wrapped, DT)
+    _, position, speed = simulator.advance(simulator.begin(start(12.0, 1.5)), leader, p)
+    assert float((speed[:1] - 12.0) / DT) == pytest.approx(1.5, abs=1e-6), "not needed yet"
+    assert float(position.max()) < 60.0
+    assert float(speed[100:].max()) < 1.0
+
+
+def test_each_vehicle_has_its_own_residual_and_candidates_broadcast() -> None:
+    model = WithResidual(IDM())
+    leader = far_leader(30, 1)
+    many = torch.tensor([-1.0, 0.0, 0.7]).double()
+    together = simulate_starts(model, many, leader)
+    for number, acceleration in enumerate(many.tolist()):
+        alone = simulate_starts(model, torch.tensor([acceleration]).double(), leader)
+        torch.testing.assert_close(together[:, number], alone[:, 0], rtol=0, atol=1e-12)
+
+
+def simulate_starts(model: WithResidual, acceleration: Tensor, leader: Leader) -> Tensor:
+    begin = Start(torch.zeros_like(acceleration), 10.0 + 0 * acceleration, acceleration)
+    simulator = MemoryStepper(model, DT)
+    p = model.space.unpack(model.space.defaults())
+    return simulator.advance(simulator.begin(begin), leader, p)[2]
+
+
+def test_compiled_code_is_that_of_the_inner_model() -> None:
+    """Two inner models with equal settings are told apart."""
+    assert Krauss().settings.model_dump_json() != ""
+    keys = {model_key(WithResidual(model)) for model in (Steady(), IDM(), Krauss())}
+    assert len(keys) == 3
+    assert model_key(WithResidual(IDM())) == model_key(WithResidual(IDM()))
+
+
+def test_a_model_without_equations_is_refused() -> None:
+    with pytest.raises(ConfigError, match="has equations in sumo only"):
+        WithResidual(SumoVType(parameters={"tau": {"low": 0.5, "high": 3.0, "default": 1.0}}))
