@@ -38,7 +38,7 @@ class RecalibrateSettings(Settings):
         10.0, gt=0, description="s of the latest measured history that is calibrated on"
     )
     prior: float = Field(
-        0.03,
+        1.0,
         ge=0,
         description="weight of the pooled parameters: what a parameter that is one unit of the"
         " squashed space away from them costs, as a share of their loss over the number of"
