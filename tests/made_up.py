@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from cfx.evaluation.forecasts import FORECAST_COLUMNS, FORECAST_METHODS, Forecasts
 from cfx.evaluation.result import Evaluation, Improvement, PairTrajectory, Platoon
 from cfx.evaluation.tables import VALUE_COLUMNS
 from cfx.metrics.base import MetricInfo
@@ -178,6 +179,20 @@ def make_history(
         for k, one in enumerate(trajectories)
     ]
     return pd.DataFrame(rows)
+
+
+def make_forecasts(drivers: int = 6, methods: tuple[str, ...] = FORECAST_METHODS) -> Forecasts:
+    """Errors that grow with the horizon and shrink with the history, another size per method."""
+    rows = []
+    for k, method in enumerate(methods):
+        for driver in range(drivers):
+            for history in np.arange(10.0, 40.0, 2.0):
+                for horizon in (0.5, 2.0, 10.0):
+                    error = (k + 1) * horizon * (1 + 5 / history) * (-1) ** driver / 10
+                    row = (f"p{driver}", f"d{driver}", method, history, horizon)
+                    rows.append((*row, error, 2 * error, abs(error)))
+    table = pd.DataFrame(rows, columns=list(FORECAST_COLUMNS))
+    return Forecasts(table, (0.5, 2.0, 10.0), "given", seed=0)
 
 
 GAINS = {

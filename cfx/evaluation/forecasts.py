@@ -44,6 +44,9 @@ ERRORS = {
 
 _QUADRATIC = {"rmse_speed": "speed_error", "rmse_position": "position_error"}
 
+_SPANS = 6
+"""Most spans of history that errors are told apart by."""
+
 FORECAST_COLUMNS = (
     "pair_id",
     "driver",
@@ -94,6 +97,11 @@ class Forecasts:
     def summary(self) -> pd.DataFrame:
         """A row per method and horizon; see `summarize_forecasts`."""
         return summarize_forecasts(self.table, self.seed)
+
+    @property
+    def varies_history(self) -> bool:
+        """Whether origins have so different histories that errors can be told apart by them."""
+        return len(set(errors_by_history(self.table)["span_s"])) > 1
 
     def values(self) -> pd.DataFrame:
         """Returns rows of the long table: pair_id, driver, method, scope, metric, value."""
@@ -240,6 +248,35 @@ def summarize_forecasts(table: pd.DataFrame, seed: int, by: str = "horizon_s") -
         row |= {"drivers": len(found), "origins": int(found["origins"].sum())}
         rows.append(row)
     return pd.DataFrame(rows)
+
+
+def errors_by_history(table: pd.DataFrame) -> pd.DataFrame:
+    """Returns errors by how much of a driver had been measured up to the origin.
+
+    Histories are cut into spans of whole seconds, six of them up to the longest history that half
+    of the drivers have. A span counts if half of the drivers have origins in it, so that none is of
+    few drivers only.
+
+    Args:
+        table: of single forecasts.
+
+    Returns:
+        A row per method, horizon and span: method, horizon_s, span_s (its middle), a column for
+        each error (mean over drivers), drivers.
+    """
+    history = table["history_s"]
+    first = float(history.min())
+    last = float(table.groupby("driver")["history_s"].max().median())
+    width = max(1.0, float(np.ceil((last - first) / _SPANS)))
+    middle = first + width * (np.floor((history - first) / width) + 0.5)
+    groups = ["method", "horizon_s", "span_s", "driver"]
+    of_driver = errors_by(table.assign(span_s=middle), groups)
+    grouped = of_driver.groupby(groups[:-1], sort=False, observed=True)
+    found = grouped[list(ERRORS)].mean()
+    found["drivers"] = grouped.size()
+    found = found.reset_index().sort_values("span_s", kind="stable")
+    enough = found["drivers"] >= 0.5 * table["driver"].nunique()
+    return found[enough].reset_index(drop=True)
 
 
 def _array(values: Tensor) -> np.ndarray:

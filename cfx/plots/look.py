@@ -15,6 +15,10 @@ COLOURS = {
     "fixed": "#0072b2",
     "shrunk": "#7a5c3e",
     "policy": "#d55e00",
+    "constant_speed": "#bdbdbd",
+    "constant_acceleration": "#666666",
+    "population_residual": "#dba6d0",
+    "fixed_residual": "#7fb8dc",
 }
 OTHER_COLOUR = "#777777"
 """A method of a protocol that cfx does not know."""

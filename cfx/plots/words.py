@@ -16,6 +16,10 @@ LABELS = {
     "fixed": "driver-specific calibration",
     "shrunk": "driver-specific, shrunk",
     "policy": "policy",
+    "constant_speed": "constant speed",
+    "constant_acceleration": "constant acceleration",
+    "population_residual": "pooled, with residual",
+    "fixed_residual": "driver-specific, with residual",
 }
 """Methods and recorded vehicles as legends name them."""
 
@@ -23,6 +27,10 @@ SHORT = {
     "population": "pooled",
     "fixed": "driver-specific",
     "shrunk": "shrunk",
+    "constant_speed": "constant speed",
+    "constant_acceleration": "constant acceleration",
+    "population_residual": "pooled + residual",
+    "fixed_residual": "driver-specific + residual",
 }
 """Methods as tables name them, where the key of the metrics says too little."""
 
@@ -36,6 +44,12 @@ EXPLAINED = {
     "shrunk": "driver-specific calibration shrunk towards the default, which is where the policy"
     " starts from",
     "policy": "parameters that the policy chooses anew in each window",
+    "constant_speed": "the driver goes on at the speed that they have",
+    "constant_acceleration": "the driver goes on at the acceleration that they have",
+    "population_residual": "pooled calibration, and what it misses of the acceleration at the"
+    " origin, which decays in two seconds",
+    "fixed_residual": "driver-specific calibration, and what it misses of the acceleration at the"
+    " origin, which decays in two seconds",
 }
 """Methods in words that end a sentence."""
 

@@ -39,6 +39,7 @@ class Job:
         history: as `Evaluation.history`; None if that was not tried.
         values: every metric of every pair, method and part of the trajectories (columns pair_id,
             driver, method, scope, metric, value); None if the job left none.
+        forecasts: as `Forecasts.table`; None if there were none.
         overrides: what was typed; None if that is not known.
         experiment: the preset that was chosen, "" for none; None if that is not known.
         started: when it began; None if that is not known.
@@ -59,6 +60,7 @@ class Job:
     platoon: pd.DataFrame | None = None
     history: pd.DataFrame | None = None
     values: pd.DataFrame | None = None
+    forecasts: pd.DataFrame | None = None
     overrides: tuple[str, ...] | None = None
     experiment: str | None = None
     started: datetime | None = None

@@ -14,6 +14,7 @@ from typing import Any
 import pandas as pd
 
 from cfx import renamed
+from cfx.evaluation.forecasts import FORECAST_COLUMNS
 from cfx.job_folder import examine
 from cfx.report.files import (
     optional,
@@ -55,6 +56,7 @@ _COLUMNS = {
         "improvement",
     ),
     "pair_metrics.parquet": ("pair_id", "method", "scope", "metric", "value"),
+    "forecasts.parquet": FORECAST_COLUMNS,
 }
 """Columns that the files of a job have at the least."""
 
@@ -90,6 +92,7 @@ def read_job(folder: Path, origin: Origin) -> Job:
         platoon=tables["platoon.parquet"],
         history=tables["history.parquet"],
         values=tables["pair_metrics.parquet"],
+        forecasts=tables["forecasts.parquet"],
         overrides=_overrides(hydra),
         experiment=_experiment(config, hydra),
         started=started,

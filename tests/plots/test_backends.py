@@ -12,9 +12,11 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from cfx.evaluation.forecasts import errors_by_history
 from cfx.evaluation.result import Evaluation
 from cfx.plots.choice.calibration import correlations, parameter_spreads
 from cfx.plots.choice.errors import error_panels
+from cfx.plots.choice.forecasts import history_panels, horizon_panels
 from cfx.plots.choice.history import amounts_of, history_curves
 from cfx.plots.choice.improvements import improvement_bars
 from cfx.plots.choice.learning import learning_curves
@@ -26,6 +28,7 @@ from cfx.plots.look import colour_of
 from cfx.plots.matplotlib import figures
 from cfx.plots.matplotlib.calibration import draw_calibration
 from cfx.plots.matplotlib.errors import draw_errors
+from cfx.plots.matplotlib.forecasts import draw_forecasts
 from cfx.plots.matplotlib.history import draw_history
 from cfx.plots.matplotlib.improvements import draw_improvements
 from cfx.plots.matplotlib.learning import draw_learning
@@ -34,6 +37,7 @@ from cfx.plots.matplotlib.style import draw_style
 from cfx.plots.matplotlib.trajectories import draw_pairs, draw_parameters
 from cfx.plots.plotly.calibration import calibration_plot
 from cfx.plots.plotly.errors import errors_plot
+from cfx.plots.plotly.forecasts import forecasts_plot
 from cfx.plots.plotly.history import history_plot
 from cfx.plots.plotly.improvements import improvements_view
 from cfx.plots.plotly.learning import learning_plot
@@ -42,7 +46,7 @@ from cfx.plots.plotly.style import style_plot
 from cfx.plots.plotly.trajectories import pair_plot
 from cfx.report.runs import read_runs
 from cfx.report.sections.trajectories import chosen_pairs
-from tests.made_up import GAINS, make_history, make_platoon, make_results
+from tests.made_up import GAINS, make_forecasts, make_history, make_platoon, make_results
 from tests.report.folders import write_job
 
 Trace = dict[str, Any]
@@ -218,6 +222,36 @@ def test_history_has_the_same_means_and_intervals() -> None:
         np.testing.assert_allclose(segments[:, 0, 1], low)
         assert container.get_label() == trace["name"]
     assert list(view["layout"]["xaxis"]["categoryarray"]) == amounts
+
+
+def test_forecasts_have_the_same_lines() -> None:
+    forecasts = make_forecasts()
+    panels = horizon_panels(forecasts.summary, forecasts.methods)
+    panels += history_panels(errors_by_history(forecasts.table), forecasts.methods)
+    assert len(panels) == 5
+    figure = draw_forecasts(panels, forecasts.methods, "any")
+    view = view_of(forecasts_plot(panels, "any"))
+    for k, panel in enumerate(panels):
+        lines = drawn_lines(figure.axes[k])
+        traces = on_axes(view, str(k + 1) if k else "")
+        assert len(panel.lines) == len(lines) == len(traces) == len(forecasts.methods)
+        for line, trace in zip(panel.lines, traces, strict=True):
+            drawn = lines[colour_of(line.method)]
+            np.testing.assert_allclose(drawn.get_ydata(), line.values)
+            np.testing.assert_allclose(numbers(trace["y"]), line.values, rtol=1e-6)
+            np.testing.assert_allclose(numbers(trace["x"]), drawn.get_xdata())
+        is_logarithmic = figure.axes[k].get_yscale() == "log"
+        assert is_logarithmic == panel.logarithmic
+        assert (view["layout"][f"yaxis{k + 1 if k else ''}"].get("type") == "log") == is_logarithmic
+
+
+def test_longer_histories_stand_to_the_right() -> None:
+    forecasts = make_forecasts()
+    (short, *_, long) = history_panels(errors_by_history(forecasts.table), ["policy"])
+    assert long.title.startswith("RMSE of speed after 10 s")
+    (line,) = short.lines
+    assert bool((np.diff(line.time) > 0).all())
+    assert bool((np.diff(line.values) < 0).all())
 
 
 def test_style_has_the_same_bars_and_cuts() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,10 +13,12 @@ from cfx.report.job import Job
 from cfx.report.page import render
 from cfx.report.runs import read_runs
 from cfx.report.sections.comparison import absolute, closeness, safety
+from cfx.report.sections.forecasts import errors
 from cfx.report.sections.safety import safety_of_methods
 from cfx.report.summary import summary
 from cfx.report.tables import Sheet
 from tests.browser import Browser
+from tests.made_up import make_forecasts
 from tests.report.folders import ACROSS, write_job
 from tests.report.test_page import page_of
 
@@ -174,6 +177,25 @@ def test_history_has_a_plot_and_a_table(sweep: Path) -> None:
         if "" in content["views"]
     ]
     assert amounts.count(["0 s", "10 s", "80 %"]) == 3
+
+
+def test_forecasts_have_plots_and_tables(tmp_path: Path) -> None:
+    metrics = write_job(tmp_path / "job", pairs=4)
+    forecasts = make_forecasts(drivers=4)
+    forecasts.table.to_parquet(tmp_path / "job" / "forecasts.parquet", index=False)
+    found = {**metrics, **forecasts.metrics()}
+    (tmp_path / "job" / "metrics.json").write_text(json.dumps(found))
+    page = page_of(tmp_path)
+    assert "forecasts" in page.having("id")
+    speed, position = (table for table in page.tables if table[0][0] == "Method")
+    assert len(speed) == len(position) == 1 + len(forecasts.methods)
+    (job,) = read_runs([str(tmp_path)]).jobs
+    sheet = errors(job, forecasts.table, "rmse_speed", "m/s")
+    row = [cell.text for cell in sheet.rows[0]]
+    assert row[0] == "constant speed"
+    key = "forecast/rmse_speed_2s/constant_speed"
+    low, high = found[f"{key}/ci95_low"], found[f"{key}/ci95_high"]
+    assert row[2] == f"{found[key]:.3f} ({low:.3f} to {high:.3f})"
 
 
 def test_the_comparison_fits_a_laptop_and_sorts(

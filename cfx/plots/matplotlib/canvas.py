@@ -29,10 +29,17 @@ DASHES: dict[str, Dash] = {
     "population": (0, (6.0, 1.5, 1.2, 1.5)),
     "fixed": (0, (5.0, 1.8)),
     "shrunk": (0, (8.0, 1.5, 1.2, 1.5, 1.2, 1.5)),
+    "constant_speed": (0, (1.2, 1.4)),
+    "constant_acceleration": (0, (5.0, 1.8)),
+    "population_residual": (0, (6.0, 1.5, 1.2, 1.5)),
+    "fixed_residual": (0, (5.0, 1.8)),
 }
 _WIDTHS = {"real": 1.8, "leader": 1.0, "policy": 1.8}
 _ORDER = ("leader", "default", "population", "fixed", "shrunk", "real", "policy")
 """The real driver lies on top of leader and baselines, and below the policy compared with it."""
+
+_LEGEND_ROW = 5
+"""Methods that fit into one row of a legend."""
 
 _STYLE: dict[str, Any] = {
     "font.family": "DejaVu Sans",  # comes with matplotlib: the same figure on every machine
@@ -122,11 +129,12 @@ def method_handles(methods: Iterable[str]) -> list[Line2D]:
 
 
 def method_legend(figure: Figure, methods: Sequence[str], title: str | None = None) -> None:
-    """Puts a legend of methods above a figure, in one row."""
+    """Puts a legend of methods above a figure, in one row; many take two."""
+    rows = 1 if len(methods) <= _LEGEND_ROW else 2
     figure.legend(
         handles=method_handles(methods),
         loc="outside upper center",
-        ncols=len(methods),
+        ncols=-(-len(methods) // rows),
         columnspacing=1.4,
         handlelength=2.2,
         title=title,

@@ -9,10 +9,17 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from cfx.errors import ConfigError, nearest
+from cfx.evaluation.forecasts import Forecasts, errors_by_history
 from cfx.evaluation.result import Evaluation, PairTrajectory, Platoon
 from cfx.metrics.base import TRANSIENT_S
 from cfx.plots.choice.calibration import correlations, parameter_spreads
 from cfx.plots.choice.errors import error_panels
+from cfx.plots.choice.forecasts import (
+    HISTORY_TITLE,
+    HORIZON_TITLE,
+    history_panels,
+    horizon_panels,
+)
 from cfx.plots.choice.history import amounts_of, history_curves
 from cfx.plots.choice.improvements import improvement_bars
 from cfx.plots.choice.learning import learning_curves
@@ -29,6 +36,7 @@ from cfx.plots.choice.trajectories import (
 )
 from cfx.plots.matplotlib.calibration import draw_calibration
 from cfx.plots.matplotlib.errors import draw_errors
+from cfx.plots.matplotlib.forecasts import draw_forecasts
 from cfx.plots.matplotlib.history import draw_history
 from cfx.plots.matplotlib.improvements import draw_improvements
 from cfx.plots.matplotlib.learning import draw_learning
@@ -151,6 +159,27 @@ def platoons(platoon: Platoon) -> Figure:
 def history(table: pd.DataFrame) -> Figure:
     """Improvement by the amount of burn-in; `table` as `Evaluation.history`."""
     return draw_history(history_curves(table), amounts_of(table))
+
+
+def forecasts(result: Forecasts) -> Figure:
+    """Errors of speed and position against the horizon."""
+    panels = horizon_panels(result.summary, result.methods)
+    return draw_forecasts(panels, result.methods, HORIZON_TITLE)
+
+
+def forecasts_by_history(result: Forecasts) -> Figure:
+    """Errors of speed against how much of a driver had been measured.
+
+    Raises:
+        ConfigError: all origins have about the same history.
+    """
+    panels = history_panels(errors_by_history(result.table), result.methods)
+    if not panels:
+        raise ConfigError(
+            "all origins have about the same history: lower protocol.min_history, or use longer"
+            " trajectories"
+        )
+    return draw_forecasts(panels, result.methods, HISTORY_TITLE)
 
 
 def _chosen(

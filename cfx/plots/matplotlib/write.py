@@ -30,8 +30,8 @@ def write_figures(
 
     Args:
         folder: made if it is not there.
-        evaluation: of the job; without a platoon or a history there is no `platoon.png` or
-            `history.png`.
+        evaluation: of the job; without a platoon, a history or forecasts there is no `platoon.png`,
+            `history.png`, `forecasts.png` or `forecasts_by_history.png`.
         style: of its drivers.
         curves: columns `network`, `epoch`, `train_loss`, `validation_loss`; if it is empty there is
             no `learning_curve.png`.
@@ -58,6 +58,12 @@ def write_figures(
         draw["platoon"] = partial(figures.platoons, evaluation.platoon)
     if evaluation.history is not None:
         draw["history"] = partial(figures.history, evaluation.history)
+    if evaluation.forecasts is not None:
+        draw["forecasts"] = partial(figures.forecasts, evaluation.forecasts)
+        if evaluation.forecasts.varies_history:
+            draw["forecasts_by_history"] = partial(
+                figures.forecasts_by_history, evaluation.forecasts
+            )
     # One after the other, so that only one figure is in memory.
     return [write_figure(make(), folder / f"{name}.png") for name, make in draw.items()]
 

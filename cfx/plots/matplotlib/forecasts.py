@@ -1,0 +1,38 @@
+"""Errors of forecasts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from matplotlib.figure import Figure
+from matplotlib.ticker import ScalarFormatter
+
+from cfx.plots.choice.forecasts import ForecastPanel
+from cfx.plots.matplotlib.canvas import canvas, draw_lines, method_legend, styled
+
+
+@styled
+def draw_forecasts(panels: Sequence[ForecastPanel], methods: Sequence[str], against: str) -> Figure:
+    """Draws mean errors over drivers, a panel for each error.
+
+    Args:
+        panels: the panels, side by side.
+        methods: of the legend.
+        against: title of the horizontal axes.
+    """
+    figure = canvas(4.4)
+    grid = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axes, panel in zip(grid, panels, strict=True):
+        draw_lines(axes, panel.lines)
+        for line in axes.lines:
+            line.set_marker("o")
+            line.set_markersize(3.5)
+        axes.set_xlabel(against)
+        axes.set_ylabel(panel.title)
+        if panel.logarithmic:
+            axes.set_yscale("log")
+            axes.yaxis.set_major_formatter(ScalarFormatter())
+        else:
+            axes.set_ylim(bottom=0)
+    method_legend(figure, methods)
+    return figure

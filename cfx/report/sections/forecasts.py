@@ -1,0 +1,119 @@
+"""Forecasts from many moments: errors against the horizon and against the history that was read."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import pandas as pd
+
+from cfx.evaluation.forecasts import SCOPE, errors_by_history, forecast_methods, metric_name
+from cfx.metrics.base import key_of
+from cfx.plots.choice.forecasts import (
+    HISTORY_TITLE,
+    HORIZON_TITLE,
+    history_panels,
+    horizon_panels,
+)
+from cfx.plots.plotly.forecasts import forecasts_plot
+from cfx.report.blocks import Block, Figure, Grid, Group, Heading, Section, Table, Text
+from cfx.report.job import Job, Runs
+from cfx.report.tables import Cell, Column, Sheet, formatted, method_cell, methods_explained, number
+
+_INTRODUCTION = (
+    "From each of many moments (origins) of the test trajectories, knowing what was measured up to"
+    " it, where will the driver be some seconds later? RMSE over the origins of each driver, then"
+    " the mean over drivers; in brackets its 95 % bootstrap interval over drivers. Origins of one"
+    " driver overlap, so they are never counted as independent."
+)
+
+_LEADERS = {
+    "given": "The leader's future is given: the errors are the follower's alone.",
+    "constant_speed": "The leader is predicted at constant speed.",
+    "constant_acceleration": "The leader is predicted at constant acceleration.",
+}
+
+
+def blocks(runs: Runs) -> list[Block]:
+    """Returns plots and a table for each job with forecasts."""
+    found: list[Group] = []
+    for job in runs.jobs:
+        if job.forecasts is not None:
+            found.append(Group(tuple(_job_blocks(job, job.forecasts)), "card"))
+    if not found:
+        return []
+    return [Text(_INTRODUCTION), Grid(tuple(found))]
+
+
+def _job_blocks(job: Job, table: pd.DataFrame) -> list[Block]:
+    methods = forecast_methods(table)
+    leader = str(job.setting("protocol.leader"))
+    shown: list[Block] = [
+        Heading(job.name),
+        Text(f"{_LEADERS.get(leader, '')} {methods_explained(methods)}"),
+        Figure(forecasts_plot(horizon_panels(summary_of(job, table), methods), HORIZON_TITLE)),
+        Table(errors(job, table, "rmse_speed", "m/s")),
+        Table(errors(job, table, "rmse_position", "m")),
+    ]
+    panels = history_panels(errors_by_history(table), methods)
+    if panels:
+        shown.append(Figure(forecasts_plot(panels, HISTORY_TITLE)))
+    return shown
+
+
+def summary_of(job: Job, table: pd.DataFrame) -> pd.DataFrame:
+    """Returns mean errors by method and horizon, as the job has written them.
+
+    Args:
+        job: of the report.
+        table: its forecasts.
+    """
+    rows = []
+    for method in forecast_methods(table):
+        for horizon in _horizons(table):
+            row: dict[str, object] = {"method": method, "horizon_s": horizon}
+            for error in ("rmse_speed", "rmse_position"):
+                row[error] = job.metric(metric_name(error, horizon), method, SCOPE)
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def errors(job: Job, table: pd.DataFrame, error: str, unit: str) -> Sheet:
+    """Returns a row per method and a column per horizon.
+
+    Args:
+        job: of the report.
+        table: its forecasts.
+        error: which.
+        unit: of it.
+    """
+    horizons = _horizons(table)
+    of_what = error.removeprefix("rmse_")
+    columns = [Column("Method", number=False)]
+    for horizon in horizons:
+        meaning = f"RMSE of {of_what} {horizon:g} s after the origin, {unit}; mean over drivers."
+        columns.append(Column(f"{of_what}, {horizon:g} s ({unit})", meaning))
+    rows: list[tuple[Cell, ...]] = []
+    for method in forecast_methods(table):
+        cells = [method_cell(method)]
+        cells += [_cell(job, metric_name(error, horizon), method) for horizon in horizons]
+        rows.append(tuple(cells))
+    return Sheet(tuple(columns), tuple(rows))
+
+
+def _cell(job: Job, metric: str, method: str) -> Cell:
+    key = key_of(metric, method, SCOPE)
+    value = job.metrics.get(key, math.nan)
+    low = job.metrics.get(f"{key}/ci95_low", math.nan)
+    high = job.metrics.get(f"{key}/ci95_high", math.nan)
+    shown = formatted(value, ".3f")
+    if math.isfinite(low) and math.isfinite(high):
+        shown += f" ({formatted(low, '.3f')} to {formatted(high, '.3f')})"
+    return number(value, shown)
+
+
+def _horizons(table: pd.DataFrame) -> Sequence[float]:
+    return sorted(float(horizon) for horizon in table["horizon_s"].unique())
+
+
+SECTION = Section("forecasts", "Forecasts from every moment", "Forecasts", blocks)
