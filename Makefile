@@ -7,7 +7,9 @@
 #   make kills [KILLS=100]                    kill a sweep at random moments, with each launcher
 #   make hydra-next                           the sweeps' tests with the newest release candidate of Hydra
 #   make policies                             train the ready-made policies anew from ../shared/data (an hour)
+#   make dist                                 build cfx and the plugins into dist/, install them into a clean environment, try them
 #   make docs                                 build the site from docs/ and the docstrings into site/; warnings are errors
+#   make tutorials                            run the tutorials and write their pages anew (a quarter of an hour)
 #   make conf                                 write conf/<group>/<name>.yaml anew from the built-in classes
 #   make lock                                 write constraints.txt anew from what resolves today
 #   make clean                                remove .venv and every cache; outputs/ stays
@@ -24,7 +26,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 TORCH = $(shell sed -n 's/^torch==//p' constraints.txt)
 
-.PHONY: run test test-slow fuzz kills hydra-next bench policies docs conf lock clean
+.PHONY: run test test-slow fuzz kills hydra-next bench policies docs tutorials dist conf lock clean
 
 run: $(VENV)/.ready
 	$(BIN)/python -m cfx $(ARGS)
@@ -63,6 +65,21 @@ policies: $(VENV)/.ready-test
 docs: $(VENV)/.ready-docs
 	$(BIN)/zensical build --clean --strict >site.log 2>&1 || { cat site.log; exit 1; }
 	@cat site.log; ! grep -qE "^(griffe|mkdocstrings):" site.log && rm site.log
+
+tutorials: $(VENV)/.ready-test
+	$(BIN)/python docs/tutorials/run.py
+
+# Wheels are built from the sdists. The clean environment has what a user's pip would install, at the pinned versions.
+dist: $(VENV)/.ready-test
+	rm -rf dist .venv-dist
+	$(PIP) install --quiet --constraint constraints.txt --editable '.[dist]'
+	for folder in . plugins/*/; do $(BIN)/python -m build --quiet --outdir dist $$folder || exit 1; done
+	$(BIN)/python -m twine check --strict dist/*
+	$(MAKE) VENV=.venv-dist .venv-dist/.torch
+	.venv-dist/bin/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt \
+	  dist/cfx_*.whl "cfx-driving[joblib,sumo] @ file://$$(echo $(CURDIR)/dist/cfx_driving-*.whl)"
+	.ci/smoke .venv-dist/bin
+	rm -rf .venv-dist
 
 conf: $(VENV)/.ready
 	$(BIN)/python -m cfx.nodes
@@ -104,12 +121,12 @@ lock:
 	rm -rf .venv-lock
 	$(PYTHON) -m venv .venv-lock
 	$(MAKE) VENV=.venv-lock .venv-lock/.torch
-	.venv-lock/bin/python -m pip install --quiet --upgrade --editable '.[test,docs]'
+	.venv-lock/bin/python -m pip install --quiet --upgrade --editable '.[test,docs,dist]'
 	{ echo "# Versions that were tested together; make lock writes this file. pip install --constraint constraints.txt ..."; \
 	  .venv-lock/bin/python -m pip freeze --exclude-editable | sed 's/+cpu$$//'; } > constraints.new
 	mv constraints.new constraints.txt
 	rm -rf .venv-lock
 
 clean:
-	rm -rf $(VENV) .venv-lock .mypy_cache .ruff_cache .pytest_cache .hypothesis .benchmarks dist site site.log
+	rm -rf $(VENV) .venv-lock .venv-dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .benchmarks dist site site.log
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

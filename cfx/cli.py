@@ -33,9 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with terminable():
             if command is None:
-                from cfx.application import start
-
-                return start(arguments)
+                return _hydra(arguments)
             return command(arguments[1:])
     except CfxError as error:
         print(error, file=sys.stderr)
@@ -47,6 +45,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # `cfx plugins | head`: the reader has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+
+
+def _hydra(arguments: Sequence[str]) -> int:
+    """Runs the Hydra application, or completes what a shell asks for."""
+
+    def start() -> int:
+        from cfx import application
+
+        return application.start(arguments)
+
+    from cfx import completion
+
+    if completion.is_query(arguments):
+        return completion.answer(PARSERS, start)
+    return start()
 
 
 def program() -> NoReturn:
@@ -70,10 +83,22 @@ def _print_anything() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
+def _plugins_parser() -> argparse.ArgumentParser:
+    from cfx.plugins import parser
+
+    return parser()
+
+
 def _plugins(arguments: Sequence[str]) -> int:
     from cfx.plugins import main as plugins
 
     return plugins(arguments)
+
+
+def _policies_parser() -> argparse.ArgumentParser:
+    from cfx.publish.command import parser
+
+    return parser()
 
 
 def _policies(arguments: Sequence[str]) -> int:
@@ -82,7 +107,7 @@ def _policies(arguments: Sequence[str]) -> int:
     return policies(arguments)
 
 
-def _data(arguments: Sequence[str]) -> int:
+def _data_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("cfx data", description="Looks at recordings.")
     actions = parser.add_subparsers(dest="action", required=True)
     describe = actions.add_parser("describe", help="what recordings hold")
@@ -100,7 +125,11 @@ def _data(arguments: Sequence[str]) -> int:
     fetch.add_argument("--folder", default="data", help="where the file goes; default: data")
     fetch.add_argument("--url", help="of a mirror that speaks SODA, ending in .csv")
     fetch.add_argument("--force", action="store_true", help="download again and replace the file")
-    options = parser.parse_args(list(arguments))
+    return parser
+
+
+def _data(arguments: Sequence[str]) -> int:
+    options = _data_parser().parse_args(list(arguments))
     if options.action == "fetch":
         return _fetch(options)
     from pathlib import Path
@@ -133,7 +162,7 @@ def _fetch(options: argparse.Namespace) -> int:
     return 0
 
 
-def _ui(arguments: Sequence[str]) -> int:
+def _ui_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "cfx ui", description="Opens the tracked jobs in MLflow, on this machine only."
     )
@@ -142,14 +171,18 @@ def _ui(arguments: Sequence[str]) -> int:
     )
     parser.add_argument("--port", type=int, default=5000)
     parser.add_argument("--open", action="store_true", help="open the first page in the browser")
-    options = parser.parse_args(list(arguments))
+    return parser
+
+
+def _ui(arguments: Sequence[str]) -> int:
+    options = _ui_parser().parse_args(list(arguments))
     from cfx.ui import serve
 
     serve(options.uri, options.port, open_browser=options.open)
     return 0
 
 
-def _report(arguments: Sequence[str]) -> int:
+def _report_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "cfx report", description="Writes one HTML page about finished jobs, complete in itself."
     )
@@ -174,7 +207,11 @@ def _report(arguments: Sequence[str]) -> int:
         help="with --tables: jobs that differ in this setting alone, for instance seed, share a row"
         " with mean and standard deviation",
     )
-    options = parser.parse_args(list(arguments))
+    return parser
+
+
+def _report(arguments: Sequence[str]) -> int:
+    options = _report_parser().parse_args(list(arguments))
     from cfx.report.command import report
 
     chosen = {"tables": options.tables, "group_by": options.group_by}
@@ -183,7 +220,7 @@ def _report(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _drive(arguments: Sequence[str]) -> int:
+def _drive_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "cfx drive",
         description="Runs a SUMO scenario in which policies drive the vehicles of some vTypes.",
@@ -228,18 +265,22 @@ def _drive(arguments: Sequence[str]) -> int:
         default=31,
         help="SUMO's bit set; 31 (default): SUMO's own checks bound each speed; 0: none, exact",
     )
+    return parser
+
+
+def _drive(arguments: Sequence[str]) -> int:
     given = list(arguments)
     cut = len(given)
     if "--" in given:
         cut = given.index("--")
-    options = parser.parse_args(given[:cut])
+    options = _drive_parser().parse_args(given[:cut])
     from cfx.sumo.command import drive_scenario
 
     drive_scenario(options, given[cut + 1 :])
     return 0
 
 
-def _export(arguments: Sequence[str]) -> int:
+def _export_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "cfx export", description="Writes a job's fixed parameters for another program."
     )
@@ -257,11 +298,27 @@ def _export(arguments: Sequence[str]) -> int:
         metavar="FILE",
         help="default: drivers.add.xml in the job's folder; for an MLflow run: here",
     )
-    options = parser.parse_args(list(arguments))
+    return parser
+
+
+def _export(arguments: Sequence[str]) -> int:
+    options = _export_parser().parse_args(list(arguments))
     from cfx.sumo.export import export
 
     for line in export(options.run, options.output):
         print(line)
+    return 0
+
+
+def _cite_parser() -> argparse.ArgumentParser:
+    return argparse.ArgumentParser("cfx cite", description="Prints how to cite cfx, as BibTeX.")
+
+
+def _cite(arguments: Sequence[str]) -> int:
+    _cite_parser().parse_args(list(arguments))
+    from cfx.cite import bibtex
+
+    print(bibtex())
     return 0
 
 
@@ -273,5 +330,18 @@ COMMANDS = {
     "ui": _ui,
     "drive": _drive,
     "export": _export,
+    "cite": _cite,
 }
 """The sub-commands, by name; whatever else comes first on the command line is Hydra's."""
+
+PARSERS = {
+    "plugins": _plugins_parser,
+    "policies": _policies_parser,
+    "data": _data_parser,
+    "report": _report_parser,
+    "ui": _ui_parser,
+    "drive": _drive_parser,
+    "export": _export_parser,
+    "cite": _cite_parser,
+}
+"""What each sub-command takes, for completion."""

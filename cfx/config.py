@@ -62,6 +62,9 @@ class FigureSettings(Settings):
     """What is drawn."""
 
     enabled: bool = Field(True, description="write figures")
+    formats: tuple[Literal["png", "pdf", "svg"], ...] = Field(
+        ("png",), min_length=1, description="files of each figure; pdf and svg for a paper"
+    )
 
 
 class DemoSettings(Settings):

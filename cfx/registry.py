@@ -33,6 +33,7 @@ from pydantic.fields import FieldInfo
 from cfx import renamed
 from cfx.component import API_VERSION, Component, Settings, validate
 from cfx.errors import CfxError, ConfigError, PluginError, nearest
+from cfx.extras import advice
 
 log = logging.getLogger(__name__)
 
@@ -213,7 +214,7 @@ def entry(kind: str, name: str) -> Entry:
                 " run make run, or pip install -e ."
             )
         raise PluginError(
-            f"{group}={name}: there is no {what} '{name}'.{nearest(name, known)}"
+            f"{group}={name}: there is no {what} '{name}'.{advice(group, name, known)}"
             f" Known: {', '.join(known)}."
         )
     if len(found) > 1:

@@ -14,6 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from cfx import hydra_source
 from cfx.errors import CfxError, nearest
+from cfx.extras import advice
 
 
 def is_user_error(error: BaseException) -> bool:
@@ -71,7 +72,7 @@ def _reworded(error: BaseException, overrides: Sequence[str]) -> str:
 
 def _unknown_option(path: str, options: Sequence[str]) -> str:
     group, _, name = path.rpartition("/")
-    text = f"{group}={name}: there is no {group} '{name}'.{nearest(name, options)}"
+    text = f"{group}={name}: there is no {group} '{name}'.{advice(group, name, options)}"
     if options:
         text += f" Known: {', '.join(options)}."
     return text

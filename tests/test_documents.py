@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
-import subprocess
-import sysconfig
-import venv
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -22,23 +18,13 @@ from cfx.hydra_source import composed
 from cfx.models.base import DrivingModel
 from tests.conftest import ROOT
 from tests.drives import straight_pairs
+from tests.printed import Reader, blocks
 from tests.test_imports import FLOORS
 
 PAGES = sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").rglob("*.md"))
 DOCUMENTS = ["README.md", "CONTRIBUTING.md", *PAGES]
 GUIDES = {"docs/plugins.md", "docs/how-to/own-model.md"}
 """Their commands need packages that they write before."""
-
-
-def blocks(name: str, language: str) -> list[str]:
-    text = (ROOT / name).read_text(encoding="utf-8")
-    return [
-        body
-        for found, body in re.findall(
-            r"^```(\w*)\n(.*?)^```$", text, flags=re.DOTALL | re.MULTILINE
-        )
-        if found == language
-    ]
 
 
 def printed(language: str) -> Iterator[str]:
@@ -249,45 +235,14 @@ def guide() -> list[tuple[str, str]]:
 
 @pytest.mark.slow
 def test_the_guide_to_a_plugin_works_as_printed(tmp_path: Path) -> None:
-    """An environment of its own that sees this one's packages; pip stays off the network."""
-    home = tmp_path / "env"
-    venv.create(home, with_pip=False, symlinks=True)
-    (site,) = home.glob("lib/python*/site-packages")
-    (site / "all.pth").write_text(
-        f"import site; site.addsitedir({sysconfig.get_path('purelib')!r})\n", encoding="utf-8"
-    )
-    pip = home / "bin" / "pip"
-    pip.write_text(f'#!/bin/sh\nexec {home}/bin/python -m pip "$@"\n', encoding="utf-8")
-    pip.chmod(0o755)
-    offline = {
-        "PIP_NO_INDEX": "1",
-        "PIP_NO_DEPS": "1",
-        "PIP_NO_BUILD_ISOLATION": "0",
-        "PIP_DISABLE_PIP_VERSION_CHECK": "1",
-    }
-    search = f"{home / 'bin'}{os.pathsep}{os.environ['PATH']}"
-    environment = {
-        **os.environ,
-        **offline,
-        "PATH": search,
-        "MLFLOW_TRACKING_URI": f"sqlite:///{tmp_path}/mlflow.db",
-    }
+    reader = Reader(tmp_path)
     steps = guide()
     assert [language for language, _ in steps] == ["sh", "python", "python", "sh"]
     for language, block in steps:
-        if language == "python":
-            (tmp_path / block.partition("\n")[0].removeprefix("# ")).write_text(
-                block, encoding="utf-8"
-            )
+        if language == "sh":
+            reader.shell(block)
             continue
-        done = subprocess.run(
-            ["sh", "-ec", block],
-            cwd=tmp_path,
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
-    assert (tmp_path / "outputs" / "pipes" / "report.html").is_file()
-    assert "pipes" in (tmp_path / "outputs" / "pipes" / "report.html").read_text(encoding="utf-8")
+        name = block.partition("\n")[0].removeprefix("# ")
+        (tmp_path / name).write_text(block, encoding="utf-8")
+    report = tmp_path / "outputs" / "pipes" / "report.html"
+    assert "pipes" in report.read_text(encoding="utf-8")

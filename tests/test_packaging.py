@@ -65,7 +65,7 @@ def test_the_wheel_holds_the_package_and_its_config_files(tmp_path: Path) -> Non
         for path in (ROOT / "conf").rglob("*.yaml")
     }
     assert conf <= names
-    assert {"cfx/cli.py", "cfx/py.typed", "cfx/models/krauss.py"} <= names
+    assert {"cfx/CITATION.cff", "cfx/cli.py", "cfx/py.typed", "cfx/models/krauss.py"} <= names
     for room in ("report", "sumo"):
         assets = ROOT / "cfx" / room / "assets"
         found = {

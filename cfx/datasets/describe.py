@@ -45,6 +45,9 @@ _TYPES = {"driver_type": "followers", "leader_driver_type": "leaders"}
 
 _WIDTH = 110
 
+_ROUND = 50
+"""Frames; a least length that is advised is a multiple of it, if pairs are that long."""
+
 
 def describe(path: Path) -> str:
     """Says what a recording holds.
@@ -59,7 +62,8 @@ def describe(path: Path) -> str:
     path = path.expanduser()
     name = _dataset_of(path)
     cls = cast(type[Dataset], registry.get("dataset", name))
-    contents = cls(path=path).contents()
+    dataset = cls(path=path)
+    contents = dataset.contents()
     pieces: list[RenderableType] = [str(path), "", _overview(cls.layout, contents)]
     if len(contents.pairs):
         pieces += ["", _motion(contents.pairs)]
@@ -67,7 +71,8 @@ def describe(path: Path) -> str:
     if contents.pairs.ends:
         pieces += ["", "Why pairs end:", *_counts(contents.pairs.ends)]
     pieces += ["", *_problems(contents)]
-    pieces += ["", f"Use it: data={name} data.path={path}"]
+    shorter = _shorter(contents.pairs, dataset.settings.min_frames)
+    pieces += ["", f"Use it: data={name} data.path={path}{shorter}"]
     text = io.StringIO()
     console = Console(file=text, width=_WIDTH, highlight=False, markup=False, emoji=False)
     for piece in pieces:
@@ -115,6 +120,21 @@ def _usable(found: Entry) -> type[Dataset] | None:
 
 def _frames(pairs: PairSet) -> int:
     return sum(len(pair) for pair in pairs)
+
+
+def _shorter(pairs: PairSet, usual: int) -> str:
+    """Returns ` data.min_frames=N` where no pair is as long as usual; half of the pairs are.
+
+    Args:
+        pairs: of the file.
+        usual: shortest pair, in frames, that a job keeps unless told otherwise.
+    """
+    lengths = sorted(len(pair) for pair in pairs)
+    if not lengths or lengths[-1] >= usual:
+        return ""
+    median = lengths[(len(lengths) - 1) // 2]
+    least = max(median // _ROUND * _ROUND, min(median, _ROUND))
+    return f" data.min_frames={least}"
 
 
 def _overview(layout: str, contents: Contents) -> Table:

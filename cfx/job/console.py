@@ -70,6 +70,9 @@ def report(
         text = f"Not measured: {one.name} of the distribution {one.distribution} ({one.reason})."
         console.print(text, soft_wrap=True, highlight=False)
     console.print(f"Results: {result.folder}", soft_wrap=True, highlight=False)
+    animation = result.folder / "sumo" / "demo.html"
+    if animation.is_file():
+        console.print(f"Animation, for any browser: {animation}", soft_wrap=True, highlight=False)
     for line in tracker.how_to_open():
         console.print(line, soft_wrap=True, highlight=False)
 

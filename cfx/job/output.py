@@ -22,7 +22,7 @@ from cfx.metrics.base import TRANSIENT_S
 from cfx.pairs import PairSet
 from cfx.protocols.base import ProtocolResult
 from cfx.style.result import StyleResult
-from cfx.tracking.provenance import version
+from cfx.tracking.provenance import commit, version
 
 TRACKED = (
     "config.yaml",
@@ -240,6 +240,7 @@ def write_figures(
                     style,
                     protocol_result.curves,
                     adapts=adapts,
+                    formats=config.figures.formats,
                 )
             )
 
@@ -317,6 +318,7 @@ def write_provenance(
         "outside": dict(evaluation.outside),
         "metrics_left_out": [asdict(one) for one in evaluation.left_out],
         "cfx": version(),
+        "commit": commit(Path.cwd()),
     }
     output.json("data.json", values)
 

@@ -83,7 +83,7 @@ def load(folder_or_run: str | Path) -> JobResult:
             f"{folder} holds no finished job ({error}); give the output folder that a job printed"
         ) from error
     metrics = read_metrics(folder / "metrics.json")
-    figures = tuple(sorted((folder / "figures").glob("*.png")))
+    figures = tuple(sorted((folder / "figures").glob("*.*")))
     policy = checkpoint.load(folder / "policy")
     return JobResult(metrics, pairs, policy, figures, folder)
 

@@ -6,6 +6,8 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from cfx.completion import complete_with, kinds, names
+
 _KINDS = (
     "dataset (or data), model, simulator, optimizer, objective, policy, learner, protocol or metric"
 )
@@ -20,7 +22,7 @@ def main(arguments: Sequence[str]) -> int:
     Raises:
         CfxError: the user's mistake.
     """
-    options = _parser().parse_args(list(arguments))
+    options = parser().parse_args(list(arguments))
     if options.action == "show":
         from cfx.plugins.tables import show
 
@@ -41,23 +43,26 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+def parser() -> argparse.ArgumentParser:
+    """Returns the parser of the sub-command."""
+    made = argparse.ArgumentParser(
         "cfx plugins", description="Shows the installed components, without importing any."
     )
-    actions = parser.add_subparsers(dest="action")
+    actions = made.add_subparsers(dest="action")
     check = actions.add_parser(
         "check", help="load components and try each for a moment; exit code 1 if one is broken"
     )
-    check.add_argument("kind", nargs="?", help=f"{_KINDS}; all kinds if left out")
-    check.add_argument("name", nargs="?", help="one component; all of the kind if left out")
+    kind = check.add_argument("kind", nargs="?", help=f"{_KINDS}; all kinds if left out")
+    complete_with(kind, kinds)
+    name = check.add_argument("name", nargs="?", help="one component; all of the kind if left out")
+    complete_with(name, names)
     show = actions.add_parser("show", help="a component's parameters, settings and reference")
-    show.add_argument("kind", help=_KINDS)
-    show.add_argument("name")
+    complete_with(show.add_argument("kind", help=_KINDS), kinds)
+    complete_with(show.add_argument("name"), names)
     new = actions.add_parser(
         "new", help="write a package for a component of your own, with tests that pass"
     )
-    new.add_argument("kind", help=_KINDS)
+    complete_with(new.add_argument("kind", help=_KINDS), kinds)
     new.add_argument("name", help="as in model=NAME: lower-case letters, digits and _")
     new.add_argument("--folder", type=Path, help="where to write it; default: cfx-NAME, here")
-    return parser
+    return made

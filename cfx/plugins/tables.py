@@ -5,12 +5,13 @@ from __future__ import annotations
 import inspect
 import json
 from collections.abc import Iterator
-from typing import Any, cast, get_args
+from typing import Any, cast, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import to_jsonable_python
 from rich.table import Table
+from rich.text import Text
 
 from cfx import registry
 from cfx.component import Component
@@ -71,6 +72,7 @@ def show(kind: str, name: str) -> None:
         put(_metric(cls))
     title = f"Settings (set with {group}.SETTING=VALUE)"
     settings = blank_table("setting", "default", "values", "meaning", title=title)
+    settings.columns[0].no_wrap = True
     for row in _settings(cls.schema):
         if entry.kind != "model" or row[0] != "parameters":
             settings.add_row(*row)
@@ -100,16 +102,25 @@ def _metric(cls: Any) -> Table:
 
 
 def _parameters(cls: Any) -> Table:
-    """Returns a model's parameters as a table."""
+    """Returns a model's parameters as a table; sources stand below it, so that lines stay short."""
     headings = ("parameter", "unit", "low", "high", "default", "tuned", "meaning", "source")
     rows = blank_table(*headings, title="Parameters")
+    rows.columns[0].no_wrap = True
+    sources = list(dict.fromkeys(p.source for p in cls.parameters if p.source))
     for p in cls.parameters:
         numbers = [f"{value:g}" for value in (p.low, p.high, p.default)]
         tuned = "constant"
         if p.tuned:
             tuned = "yes"
-        rows.add_row(p.name, p.unit, *numbers, tuned, p.meaning, p.source)
-    rows.caption = "Change one with model.parameters.NAME.{low,high,default,tuned}=VALUE"
+        mark = ""
+        if p.source:
+            mark = f"[{sources.index(p.source) + 1}]"
+        rows.add_row(p.name, p.unit, *numbers, tuned, p.meaning, mark)
+    below = []
+    for number, source in enumerate(sources, start=1):
+        below.append(f"[{number}] {source}")
+    below.append("Change one with model.parameters.NAME.{low,high,default,tuned}=VALUE")
+    rows.caption = Text("\n".join(below))
     rows.caption_justify = "left"
     return rows
 
@@ -156,6 +167,8 @@ def _type(kind: Any) -> str:
     if kind is type(None):
         return "null"
     choices = get_args(kind)
+    if get_origin(kind) is dict:
+        return "mapping"
     if choices and all(isinstance(choice, str) for choice in choices):
         return "|".join(cast("tuple[str, ...]", choices))
     if choices:

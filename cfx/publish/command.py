@@ -7,11 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cfx import ready
+from cfx.completion import complete_with
 
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the sub-command; returns the exit code."""
-    options = _parser().parse_args(list(arguments))
+    options = parser().parse_args(list(arguments))
     if options.action == "show":
         print((ready.folder_of_ready_made(f"cfx://{options.name}") / "CARD.md").read_text("utf-8"))
         return 0
@@ -24,13 +25,15 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+def parser() -> argparse.ArgumentParser:
+    """Returns the parser of the sub-command."""
+    made = argparse.ArgumentParser(
         "cfx policies", description="Lists the ready-made policies that come with cfx."
     )
-    actions = parser.add_subparsers(dest="action")
+    actions = made.add_subparsers(dest="action")
     show = actions.add_parser("show", help="the card of a policy: what it knows, and how well")
-    show.add_argument("name", help="such as i80-idm")
+    name = show.add_argument("name", help="such as i80-idm")
+    complete_with(name, lambda _: ready.names())
     make = actions.add_parser("make", help="train policies anew and write them into the package")
     make.add_argument("names", nargs="*", help="such as i80-idm; all if left out")
     make.add_argument("--data", type=Path, required=True, help="the recordings, a tidy table")
@@ -40,7 +43,7 @@ def _parser() -> argparse.ArgumentParser:
         default=Path("outputs/policies"),
         help="where jobs run; finished ones are not run again",
     )
-    return parser
+    return made
 
 
 def _overview() -> None:

@@ -97,9 +97,18 @@ def read_job(folder: Path, origin: Origin) -> Job:
         experiment=_experiment(config, hydra),
         started=started,
         seconds=seconds,
-        version=str(origin.version or data.get("cfx", "") or ""),
+        version=_version(data, origin),
         missing=tuple(name for name in _EXPECTED if tables[name] is None),
     )
+
+
+def _version(data: Mapping[str, Any], origin: Origin) -> str:
+    """Returns cfx's version and the commit of the folder that the job was started in."""
+    version = str(origin.version or data.get("cfx", "") or "")
+    commit = str(data.get("commit", "") or "")
+    if not commit:
+        return version
+    return f"{version}, commit {commit}".removeprefix(", ")
 
 
 def _table(folder: Path, name: str) -> pd.DataFrame | None:

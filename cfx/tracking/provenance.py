@@ -37,6 +37,18 @@ def git_state(folder: Path) -> dict[str, str]:
     return {"cfx.git_commit": commit, "cfx.git_dirty": dirty, "mlflow.source.git.commit": commit}
 
 
+def commit(folder: Path) -> str:
+    """Returns the commit of the git checkout around `folder`, `+` behind it if files have changed.
+
+    It is "" where there is no checkout.
+    """
+    state = git_state(folder)
+    changed = ""
+    if state.get("cfx.git_dirty") == "true":
+        changed = "+"
+    return state.get("cfx.git_commit", "")[:12] + changed
+
+
 def _git(folder: Path, *arguments: str) -> str | None:
     command = ["git", "-C", str(folder), *arguments]
     try:

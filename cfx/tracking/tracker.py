@@ -317,11 +317,10 @@ class MlflowTracker(Tracker):
 
     def how_to_open(self) -> tuple[str, ...]:
         address, first = _address(self.store.uri)
-        lines = [*first, f"MLflow: {address}/{self.link}"]
+        here = f"MLflow: {address}/{self.link}"
         if self._sweep is not None:
-            link = sweep_link(self.store.experiment_id, self._sweep)
-            lines.append(f"All jobs of this sweep: {address}/{link}")
-        return tuple(lines)
+            return (here,)  # the sweep says the rest, once, at its end
+        return (*first, here)
 
     def _log_metrics(self, points: Sequence[tuple[str, float, int]]) -> None:
         from mlflow.entities import Metric

@@ -13,6 +13,7 @@ from cfx.datasets.synthetic import SyntheticDataset
 from cfx.datasets.tidy import write_tidy
 from cfx.errors import DataError
 from tests.conftest import Installer
+from tests.drives import straight_pairs
 
 
 def test_describes_real_tidy_pairs(shared_data: Path) -> None:
@@ -110,3 +111,16 @@ def test_a_broken_plugin_is_warned_of_and_stops_nothing(
     with pytest.raises(DataError, match="no dataset knows this layout"):
         describe(tmp_path / "m.csv")
     assert "cfx-bad" in caplog.text
+
+
+def test_the_advice_is_one_that_keeps_pairs(tmp_path: Path) -> None:
+    """A job leaves out pairs of fewer than 700 frames, unless told otherwise."""
+    short = tmp_path / "short.parquet"
+    write_tidy(straight_pairs([430, 260, 380]), short)
+    assert describe(short).endswith(f"Use it: data=tidy data.path={short} data.min_frames=350")
+    shorter = tmp_path / "shorter.parquet"
+    write_tidy(straight_pairs([30, 20]), shorter)
+    assert describe(shorter).endswith("data.min_frames=20")
+    long = tmp_path / "long.parquet"
+    write_tidy(straight_pairs([700, 20]), long)
+    assert describe(long).endswith(f"data.path={long}")

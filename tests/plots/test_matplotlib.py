@@ -327,3 +327,16 @@ def test_a_policy_that_does_not_adapt_has_no_figure_of_improvements(tmp_path: Pa
     names = {path.name for path in drawn}
     assert "improvement_per_driver.png" not in names
     assert "calibration.png" in names
+
+
+def test_figures_for_a_paper_are_vector_graphics_without_dates(tmp_path: Path) -> None:
+    results = make_results(pairs=2, frames=10)
+    arguments = (results.evaluation, results.style, results.curves)
+    paths = write_figures(tmp_path / "a", *arguments, formats=("pdf", "svg"))
+    again = write_figures(tmp_path / "b", *arguments, formats=("pdf", "svg"))
+    assert {path.suffix for path in paths} == {".pdf", ".svg"}
+    by_name = {path.name: path.read_bytes() for path in paths}
+    assert {path.name: path.read_bytes() for path in again} == by_name
+    assert by_name["speeds.pdf"].startswith(b"%PDF-")
+    assert b"<svg" in by_name["speeds.svg"]
+    assert b"TrueType" in by_name["speeds.pdf"] or b"CIDFontType2" in by_name["speeds.pdf"]

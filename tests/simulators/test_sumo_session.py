@@ -19,6 +19,7 @@ import psutil
 import pytest
 
 from cfx.errors import SumoError
+from cfx.extras import install_line
 from cfx.simulators.sumo import installed
 from cfx.simulators.sumo.channel import Message
 from cfx.simulators.sumo.session import Session
@@ -158,7 +159,7 @@ def test_a_missing_sumo_says_what_to_install(monkeypatch: pytest.MonkeyPatch) ->
         Session(1)
     assert str(error.value) == (
         "SUMO is not installed; SUMO 1.28 or newer, below 2, comes with:"
-        ' pip install "cfx-driving[sumo]"'
+        f" {install_line('cfx-driving[sumo]')}"
     )
 
 

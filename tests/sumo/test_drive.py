@@ -15,6 +15,7 @@ from cfx import cli
 from cfx.agents import checkpoint
 from cfx.console import ConsoleHandler
 from cfx.errors import ConfigError
+from cfx.extras import install_line
 from cfx.sumo.drive import ScenarioRun, Tally, parse_drivers, report
 from cfx.sumo.motorway import SHIPPED
 from tests.sumo.policies import adaptive
@@ -172,7 +173,7 @@ def test_mistakes_are_reported_before_sumo_starts(
     with monkeypatch.context() as without:
         without.setattr("importlib.metadata.version", _not_found)
         assert cli.main(["drive", "motorway.sumocfg", "--drivers", "calm=calm"]) == 2
-    assert 'pip install "cfx-driving[sumo]"' in capsys.readouterr().err
+    assert install_line("cfx-driving[sumo]") in capsys.readouterr().err
     assert not any(
         isinstance(handler, ConsoleHandler) for handler in logging.getLogger("cfx").handlers
     )  # nothing is left behind

@@ -65,6 +65,8 @@ _STYLE: dict[str, Any] = {
     "legend.fontsize": 10.0,
     "figure.dpi": DPI,
     "savefig.dpi": DPI,
+    "pdf.fonttype": 42,  # letters stay letters, as journals ask
+    "svg.hashsalt": "cfx",  # the same figure has the same ids
     # A pair id may hold a dollar sign: it is text, never a formula.
     "text.parse_math": False,
 }

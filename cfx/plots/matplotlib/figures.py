@@ -21,7 +21,7 @@ from cfx.plots.choice.forecasts import (
     horizon_panels,
 )
 from cfx.plots.choice.history import amounts_of, history_curves
-from cfx.plots.choice.improvements import improvement_bars
+from cfx.plots.choice.improvements import improvement_bars, improvement_title
 from cfx.plots.choice.learning import learning_curves
 from cfx.plots.choice.pairs import RankedPair, rank_pairs
 from cfx.plots.choice.platoon import platoon_panels
@@ -74,17 +74,19 @@ def pairs(
         ConfigError: a pair id is not in the evaluation.
     """
     titles, panels = [], []
+    explained: str | None = None
     for ranked, trajectory in _chosen(evaluation, pair_id, count):
         name = RankedPair(short(ranked.pair_id), ranked.rank, ranked.improvement).title
         if np.isfinite(ranked.improvement):
             name += f":  {percent(ranked.improvement)}"
+            explained = f"percentages: {improvement_title('fixed')}"
         elif "fixed" in evaluation.methods:
             name += ":  improvement undefined"
         rmse = errors_text("speed", "m/s", _errors(evaluation, trajectory.pair_id, "rmse_speed"))
         rmse_gap = errors_text("gap", "m", _errors(evaluation, trajectory.pair_id, "rmse_gap"))
         titles.append((name, rmse, rmse_gap))
         panels.append(_panels(evaluation, trajectory))
-    return draw_pairs(titles, panels, evaluation.methods)
+    return draw_pairs(titles, panels, evaluation.methods, explained)
 
 
 def speeds(evaluation: Evaluation, pair_id: str | None = None) -> Figure:

@@ -23,7 +23,10 @@ from cfx.plots.words import short
 
 @styled
 def draw_pairs(
-    titles: Sequence[tuple[str, str, str]], pairs: Sequence[PairPanels], methods: Sequence[str]
+    titles: Sequence[tuple[str, str, str]],
+    pairs: Sequence[PairPanels],
+    methods: Sequence[str],
+    explained: str | None = None,
 ) -> Figure:
     """Draws speed and gap of some pairs over the test part, a row per pair.
 
@@ -31,6 +34,7 @@ def draw_pairs(
         titles: of each pair: its own, that of its speeds, that of its gaps.
         pairs: what is shown.
         methods: for the legend.
+        explained: what percentages in the titles mean; stands above the legend.
     """
     figure = canvas(0.75 + 2.35 * len(pairs))
     grid = figure.subplots(len(pairs), 2, squeeze=False, sharex="row", width_ratios=(1.12, 1.0))
@@ -41,7 +45,7 @@ def draw_pairs(
         _two_line_title(gap_axes, "", title[2])
     for axes in grid[-1]:
         axes.set_xlabel(TIME_TITLE)
-    method_legend(figure, ["real", "leader", *_visible(methods)])
+    method_legend(figure, ["real", "leader", *_visible(methods)], explained)
     return figure
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -17,6 +17,13 @@ from cfx.plots.matplotlib import figures
 from cfx.plots.matplotlib.canvas import DPI, look
 from cfx.style.result import StyleResult
 
+_METADATA: dict[str, dict[str, None]] = {
+    "png": {"Software": None},
+    "pdf": {"Creator": None, "Producer": None, "CreationDate": None},
+    "svg": {"Creator": None, "Date": None},
+}
+"""What Matplotlib writes of itself and of today into each format, left out."""
+
 
 def write_figures(
     folder: Path,
@@ -25,8 +32,9 @@ def write_figures(
     curves: pd.DataFrame,
     *,
     adapts: bool = True,
+    formats: Sequence[str] = ("png",),
 ) -> list[Path]:
-    """Draws and writes all figures of a job as PNG; returns their paths.
+    """Draws and writes all figures of a job; returns their paths.
 
     Args:
         folder: made if it is not there.
@@ -36,6 +44,7 @@ def write_figures(
         curves: columns `network`, `epoch`, `train_loss`, `validation_loss`; if it is empty there is
             no `learning_curve.png`.
         adapts: as `Policy.adapts`; if it does not, there is no `improvement_per_driver.png`.
+        formats: files of each figure: `png`, `pdf`, `svg`.
 
     Raises:
         OutputError: a file cannot be written.
@@ -65,11 +74,22 @@ def write_figures(
                 figures.forecasts_by_history, evaluation.forecasts
             )
     # One after the other, so that only one figure is in memory.
-    return [write_figure(make(), folder / f"{name}.png") for name, make in draw.items()]
+    paths = []
+    for name, make in draw.items():
+        figure = make()
+        for form in formats:
+            paths.append(write_figure(figure, folder / f"{name}.{form}"))
+    return paths
 
 
 def write_figure(figure: Figure, path: Path) -> Path:
     """Writes one figure under its final name only once it is complete; returns the path.
+
+    The same figure gives the same bytes: no date and no version of Matplotlib is in it.
+
+    Args:
+        figure: what is drawn.
+        path: its ending says the format.
 
     Raises:
         OutputError: the file cannot be written.
@@ -79,7 +99,8 @@ def write_figure(figure: Figure, path: Path) -> Path:
         with atomic_write(path) as unfinished, look(), warnings.catch_warnings():
             # A name in a script that the font lacks shows boxes; the names are in pairs.csv.
             warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
-            figure.savefig(unfinished, format="png", dpi=DPI, metadata={"Software": None})
+            form = path.suffix.removeprefix(".")
+            figure.savefig(unfinished, format=form, dpi=DPI, metadata=_METADATA[form])
     except OSError as error:
         raise OutputError(
             f"{path}: this figure cannot be written ({error.strerror or error});"

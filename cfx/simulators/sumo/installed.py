@@ -9,6 +9,9 @@ import importlib.metadata
 import re
 
 from cfx.errors import SumoError
+from cfx.extras import install_line
+
+EXTRA = "cfx-driving[sumo]"
 
 OLDEST, BELOW = (1, 28), (2, 0)
 """Versions that cfx works with, as the extra `sumo` in pyproject.toml asks for them."""
@@ -26,13 +29,13 @@ def require_sumo() -> str:
         version = importlib.metadata.version("libsumo")
     except importlib.metadata.PackageNotFoundError:
         raise SumoError(
-            f'SUMO is not installed; {wanted}, comes with: pip install "cfx-driving[sumo]"'
+            f"SUMO is not installed; {wanted}, comes with: {install_line(EXTRA)}"
         ) from None
     number = re.match(r"(\d+)\.(\d+)", version)
     if number is None or not OLDEST <= (int(number[1]), int(number[2])) < BELOW:
         raise SumoError(
-            f"SUMO {version} is installed (the package libsumo), but cfx works with {wanted}: pip"
-            ' install "cfx-driving[sumo]"'
+            f"SUMO {version} is installed (the package libsumo), but cfx works with {wanted}:"
+            f" {install_line(EXTRA)}"
         )
     return version
 

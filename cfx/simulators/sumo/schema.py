@@ -13,6 +13,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from cfx.errors import ConfigError, SumoError, nearest
+from cfx.extras import install_line
 from cfx.models.vtype import VType
 
 _XS = "{http://www.w3.org/2001/XMLSchema}"
@@ -75,7 +76,7 @@ def car_following() -> dict[str, frozenset[str]]:
         if path.is_file():
             return _read(path)
     raise SumoError(
-        'SUMO\'s schema (the package sumo-data) is not there: pip install "cfx-driving[sumo]"'
+        "SUMO's schema (the package sumo-data) is not there: " + install_line("cfx-driving[sumo]")
     )
 
 

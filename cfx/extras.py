@@ -1,0 +1,71 @@
+"""What is not installed, and the line that installs it: cfx's extras, and the plugins beside it."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+from cfx.errors import nearest
+
+OWN = "cfx-driving"
+
+EXTRAS: dict[tuple[str, str], str] = {
+    ("hydra/launcher", "joblib"): f"{OWN}[joblib]",
+    ("model", "fvdm"): "cfx-classics",
+    ("model", "gipps"): "cfx-classics",
+    ("model", "gipps_delay"): "cfx-classics",
+    ("model", "idm_city"): "cfx-idm",
+    ("model", "iidm"): "cfx-idm",
+    ("model", "newell"): "cfx-classics",
+    ("model", "ovm"): "cfx-classics",
+    ("model", "ovm_city"): "cfx-classics",
+    ("optimizer", "cma"): "cfx-cma",
+    ("optimizer", "differential_evolution"): "cfx-scipy",
+    ("policy", "tcn"): "cfx-tcn",
+}
+"""Options that come with another distribution or an extra, by group and name."""
+
+
+def advice(group: str, name: str, known: Iterable[str]) -> str:
+    """Returns what to do about an option that is not there: install it, or the nearest name.
+
+    Args:
+        group: such as `model`.
+        name: what was asked for.
+        known: the options that are installed.
+    """
+    if (group, name) in EXTRAS:
+        wanted = EXTRAS[group, name]
+        return f" It comes with {wanted}: {install_line(wanted)}"
+    others = [option for where, option in EXTRAS if where == group]
+    return nearest(name, [*known, *others])
+
+
+def install_line(wanted: str) -> str:
+    """Returns the command that installs a distribution, or an extra of cfx's, for this Python.
+
+    In a checkout it is the folder's: `pip install --editable plugins/cfx-classics`.
+    """
+    name, bracket, extra = wanted.partition("[")
+    checkout = Path(__file__).resolve().parent.parent
+    if name != OWN:
+        checkout = checkout / "plugins" / name
+    source = shlex.quote(wanted)
+    if bracket:
+        source = f'"{wanted}"'
+    if (checkout / "pyproject.toml").is_file():
+        folder = os.path.relpath(checkout)
+        source = f"--editable {shlex.quote(folder + bracket + extra)}"
+    return f"{_pip()} install {source}"
+
+
+def _pip() -> str:
+    """Returns `pip`, or how to call this Python's where the shell has another."""
+    found = shutil.which("pip")
+    if found is not None and Path(found).parent == Path(sys.executable).parent:
+        return "pip"
+    return f"{shlex.quote(os.path.relpath(sys.executable))} -m pip"

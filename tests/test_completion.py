@@ -1,0 +1,47 @@
+"""Tab after a sub-command, as the shell asks for it."""
+
+from __future__ import annotations
+
+import pytest
+
+from cfx import cli
+
+
+@pytest.fixture
+def complete(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    def ask(line: str) -> list[str]:
+        monkeypatch.setenv("COMP_LINE", line)
+        monkeypatch.setenv("COMP_POINT", str(len(line)))
+        assert cli.main(["-sc", "query=bash"]) == 0
+        said = capsys.readouterr()
+        assert said.err == ""
+        return said.out.split()
+
+    return ask
+
+
+def test_every_sub_command_can_be_completed() -> None:
+    assert set(cli.PARSERS) == set(cli.COMMANDS)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("cfx dr", {"drive"}),
+        ("cfx data d", {"describe"}),
+        ("cfx data fetch --f", {"--folder", "--force"}),
+        ("cfx plugins show mod", {"model"}),
+        ("cfx plugins show model kraus", {"krauss", "krauss_sumo"}),
+        ("cfx policies show i80-w", {"i80-w99"}),
+        ("cfx report outputs/some --tables ", {"latex", "csv"}),
+        ("cfx data describe ", set()),  # the shell's own completion of files
+        ("cfx nonsense more", set()),
+    ],
+)
+def test_words_of_a_line(complete, line: str, words: set[str]) -> None:
+    assert set(complete(line)) == words
+
+
+def test_the_first_word_may_be_a_sub_command_or_a_group(complete) -> None:
+    found = set(complete("cfx "))
+    assert {"plugins", "report", "model=", "policy="} <= found

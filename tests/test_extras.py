@@ -1,0 +1,76 @@
+"""Options that are not installed say the line that installs them."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+from hydra.errors import MissingConfigException
+
+from cfx import extras, registry
+from cfx.errors import PluginError
+from cfx.user_errors import explain
+from tests.conftest import ROOT
+
+
+def options_of(folder: Path) -> set[tuple[str, str]]:
+    """Returns what a plugin in this repository brings, by group and name."""
+    points = tomllib.loads((folder / "pyproject.toml").read_text("utf-8"))["project"][
+        "entry-points"
+    ]
+    found = set()
+    for kind in registry.KINDS.values():
+        for name in points.get(kind.entry_points, ()):
+            found.add((kind.group, name))
+    for path in folder.glob("cfx_*/conf/*/*.yaml"):
+        found.add((path.parent.name, path.stem))
+    return found
+
+
+def test_the_table_holds_what_the_plugins_here_bring() -> None:
+    brought = {}
+    for folder in sorted((ROOT / "plugins").iterdir()):
+        if (folder / "pyproject.toml").is_file():
+            for option in options_of(folder):
+                brought[option] = folder.name
+    own = {option: where for option, where in extras.EXTRAS.items() if "[" not in where}
+    assert own == brought
+
+
+def test_the_extras_are_those_of_pyproject() -> None:
+    known = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"][
+        "optional-dependencies"
+    ]
+    for where in extras.EXTRAS.values():
+        if "[" in where:
+            assert where.partition("[")[2].rstrip("]") in known
+
+
+def test_an_option_that_is_not_installed_says_what_installs_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(ROOT)
+    error = MissingConfigException("", missing_cfg_file="model/gipps", options=["idm", "krauss"])
+    said = explain(error, ["model=gipps"])
+    assert "It comes with cfx-classics: " in said
+    assert said.split(" install ")[1].startswith("--editable plugins/cfx-classics")
+    error = MissingConfigException("", missing_cfg_file="hydra/launcher/joblib", options=["basic"])
+    assert "--editable '.[joblib]'" in explain(error, [])
+    error = MissingConfigException("", missing_cfg_file="model/gips", options=["idm"])
+    assert "Did you mean 'gipps'?" in explain(error, [])
+
+
+def test_the_registry_says_it_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    entries = [one for one in registry.entries("optimizer") if one.name != "cma"]
+    monkeypatch.setattr(registry, "entries", lambda kind: entries)
+    with pytest.raises(PluginError, match=r"optimizer=cma: .* It comes with cfx-cma: .* install"):
+        registry.entry("optimizer", "cma")
+
+
+def test_outside_a_checkout_the_line_names_the_distribution(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(extras, "__file__", str(tmp_path / "cfx" / "extras.py"))
+    assert extras.install_line("cfx-cma").endswith(" install cfx-cma")
+    assert extras.install_line("cfx-driving[sumo]").endswith(' install "cfx-driving[sumo]"')
