@@ -107,7 +107,9 @@ class JobConfig(Settings):
     device: str = Field("auto", description="auto, cpu, cuda or cuda:N")
     dtype: Literal["float32", "float64"] = Field("float64", description="precision of simulations")
     cores: int | None = Field(
-        None, ge=1, description="cores that calibration shares its work among; null: all"
+        None,
+        ge=1,
+        description="cores that calibration and training share their work among; null: all",
     )
     threads: int | None = Field(1, ge=1, description="torch's threads; null: torch's own choice")
     split: float = Field(

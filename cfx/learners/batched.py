@@ -26,7 +26,6 @@ from cfx.files import atomic_write
 from cfx.learners.base import CURVE_COLUMNS
 from cfx.learners.curves import networks_without_loss
 from cfx.policies.base import PolicyNetwork
-from cfx.progress import Task
 from cfx.simulation.threads import one_thread
 
 log = logging.getLogger(__name__)
@@ -201,7 +200,6 @@ def fit(
     epochs: int,
     seed: int,
     device: torch.device,
-    task: Task,
     checkpoint: Path | None = None,
 ) -> None:
     """Trains with Lightning, quietly, and puts the best weights back.
@@ -212,7 +210,6 @@ def fit(
         epochs: at most.
         seed: of the global generator, from which dropout draws.
         device: where.
-        task: its progress.
         checkpoint: written after every epoch, so that interrupted training goes on there, and
             training that ended gives the same at once. None: no such file.
     """
@@ -238,7 +235,7 @@ def fit(
             # Nothing random happens between batches, and they must come in order.
             use_distributed_sampler=False,
         )
-        with warnings.catch_warnings(), one_thread(), task:
+        with warnings.catch_warnings(), one_thread():
             warnings.filterwarnings("ignore", module=r"lightning\.")
             # torch's compiler looks at everything that it is given.
             of_compiler = r"The \.grad attribute of a Tensor that is not a leaf"
@@ -246,10 +243,10 @@ def fit(
             _run(trainer, module, data, checkpoint)
     module.restore_best()
     module.network.to(device).eval()
-    _warn_of_nothing_learned(module.curves())
 
 
-def _warn_of_nothing_learned(curves: pd.DataFrame) -> None:
+def warn_of_nothing_learned(curves: pd.DataFrame) -> None:
+    """Warns of networks whose loss was never a number."""
     lost = networks_without_loss(curves)
     if lost:
         log.warning(

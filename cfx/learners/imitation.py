@@ -28,7 +28,7 @@ from cfx.agents.scaler import Scaler
 from cfx.component import Settings
 from cfx.errors import DataError
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
-from cfx.learners.batched import BatchedModule, Grid, fit
+from cfx.learners.batched import BatchedModule, Grid, fit, warn_of_nothing_learned
 from cfx.learners.situations import learned_range
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import measured_history, tokens
@@ -127,17 +127,18 @@ class ImitationLearner(Learner):
         )
         task = Task(f"Training ({len(names)} networks, at most {s.epochs} epochs)", s.epochs)
         module = ImitationModule(network, dataset, head, s, names, on_epoch=task.advance)
-        fit(
-            module,
-            SegmentData(dataset.windows, s.batch_size),
-            epochs=s.epochs,
-            seed=training_data.seed,
-            device=device,
-            task=task,
-        )
-        scaler = dataset.scaler.to(device)
+        with task:
+            fit(
+                module,
+                SegmentData(dataset.windows, s.batch_size),
+                epochs=s.epochs,
+                seed=training_data.seed,
+                device=device,
+            )
+        scaler, curves = dataset.scaler.to(device), module.curves()
+        warn_of_nothing_learned(curves)
         found = learned_range(training_data)
-        return TrainingResult(module.network, scaler, module.curves(), base, head.name, found)
+        return TrainingResult(module.network, scaler, curves, base, head.name, found)
 
 
 class _Rows(NamedTuple):

@@ -69,6 +69,8 @@ class RolloutDataset:
         scaler: normalises tokens and conditioning, f + c features; alike for all members of an
             ensemble.
         ensemble_size: networks of an ensemble, which stand behind one another.
+        networks: which of all networks of the training these are; None: all.
+        total: how many networks there are in all, where these are some.
     """
 
     batch: PairBatch
@@ -84,6 +86,8 @@ class RolloutDataset:
     time_gap: Tensor
     scaler: Scaler
     ensemble_size: int = 1
+    networks: slice | None = None
+    total: int = 0
 
     @classmethod
     def of(
@@ -152,6 +156,53 @@ class RolloutDataset:
             ensemble_size=ensemble_size,
         )
 
+    def only(self, networks: slice) -> tuple[RolloutDataset, Tensor]:
+        """Returns some of all networks, and which pairs they learn from.
+
+        What is sampled for a network does not depend on which others stand beside it.
+        """
+        rows, pair = torch.unique(self.pair[networks], return_inverse=True)
+        part = replace(
+            self,
+            batch=self.batch[rows],
+            pair=pair,
+            trains=self.trains[networks],
+            validates=self.validates[networks],
+            until=self.until[networks],
+            last=self.last[networks],
+            base=self.base[networks],
+            pooled=self.pooled[networks],
+            tokens=self.tokens[rows],
+            driver_features=self.driver_features[rows],
+            time_gap=self.time_gap[rows],
+            scaler=Scaler(self.scaler.mean[networks], self.scaler.scale[networks]),
+            networks=networks,
+            total=len(self.pair),
+        )
+        return part, rows
+
+    def lots(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+        """Returns uniform random numbers from 0 to 1 for these networks, `(N, *shape)`.
+
+        Args:
+            shape: of each network's.
+            generator: on the CPU; it goes on as if they were for all networks.
+        """
+        return self._of_these(torch.rand((self._total, *shape), generator=generator))
+
+    def normal(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+        """As `lots`, from the standard normal distribution."""
+        return self._of_these(torch.randn((self._total, *shape), generator=generator))
+
+    @property
+    def _total(self) -> int:
+        return self.total if self.networks is not None else len(self.pair)
+
+    def _of_these(self, values: Tensor) -> Tensor:
+        if self.networks is not None:
+            values = values[self.networks]
+        return values.to(self.pair.device)
+
     def for_base(self, base: Tensor) -> RolloutDataset:
         """Returns the same drivers with one base of another model, `(n,)` in its unit space."""
         networks, drivers = self.pair.shape
@@ -180,7 +231,7 @@ class RolloutDataset:
         networks, drivers = self.pair.shape
         if most is None or drivers <= most:
             return torch.arange(drivers, device=self.pair.device).expand(networks, drivers)
-        return _sample(self.trains, most, generator)
+        return self._sample(self.trains, most, generator)
 
     def validation_places(self, most: int | None, generator: torch.Generator) -> Tensor:
         """Returns the drivers kept for validation, at most `most` of each network, `(N, D)`.
@@ -191,7 +242,18 @@ class RolloutDataset:
         count = int(self.validates.sum(1).max())
         if most is not None:
             count = min(most, count)
-        return _sample(self.validates, count, generator)
+        return self._sample(self.validates, count, generator)
+
+    def _sample(self, wanted: Tensor, count: int, generator: torch.Generator) -> Tensor:
+        """Samples `count` places of each network, `(N, count)`, in order.
+
+        Args:
+            wanted: places to take first, bool `(N, B)`; others follow where there are too few.
+            count: how many.
+            generator: on the CPU.
+        """
+        lots = self.lots(tuple(wanted.shape[1:]), generator)
+        return torch.where(wanted, lots, -1.0).topk(count, dim=1).indices.sort(1).values
 
     def condition(self, batch: RolloutBatch) -> Conditioning:
         """Returns what is known of the drivers of these trajectories.
@@ -315,15 +377,3 @@ def _scaler(
     mean = torch.cat([of_base.mean, of_driver.mean], -1)
     scale = torch.cat([of_base.scale, of_driver.scale], -1)
     return Scaler(mean, scale)
-
-
-def _sample(wanted: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Samples `count` places of each network, `(N, count)`, in order.
-
-    Args:
-        wanted: places to take first, bool `(N, B)`; others follow where there are too few.
-        count: how many.
-        generator: on the CPU.
-    """
-    lots = torch.rand(wanted.shape, generator=generator).to(wanted.device)
-    return torch.where(wanted, lots, -1.0).topk(count, dim=1).indices.sort(1).values

@@ -12,7 +12,7 @@ Shapes: N networks (each member of an ensemble counts), n tuned parameters.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -22,24 +22,27 @@ import torch
 
 from cfx.agents.heads import HEADS
 from cfx.agents.heads.base import ParameterHead
-from cfx.agents.heads.offset import OffsetHead
 from cfx.agents.scaler import Scaler
 from cfx.component import Settings
+from cfx.engine.base import Engine
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
-from cfx.learners.batched import fit
+from cfx.learners.batched import warn_of_nothing_learned
 from cfx.learners.rollout.augmentation import Augmentation
-from cfx.learners.rollout.base_errors import BaseErrors
 from cfx.learners.rollout.checkpoint import checkpoint_path
 from cfx.learners.rollout.dataset import RolloutDataset
-from cfx.learners.rollout.distillation import Expert
-from cfx.learners.rollout.module import RolloutModule, StepNumbers
 from cfx.learners.rollout.settings import RolloutSettings
+from cfx.learners.rollout.shard import (
+    TrainedShard,
+    TrainingShard,
+    cut,
+    epochs,
+    train,
+    untrained,
+)
 from cfx.learners.situations import learned_range
-from cfx.models.direct import Direct
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.ensemble import Ensemble
 from cfx.progress import Task
-from cfx.simulation.rollout import MemoryStepper
 
 log = logging.getLogger(__name__)
 
@@ -99,25 +102,42 @@ class RolloutLearner(Learner):
         dataset = RolloutDataset.of(
             training_data, policy, s.validation, generator, s.ensemble_size, head
         )
-        network = _untrained(policy, dataset, head, generator)
+        network = untrained(policy, dataset, head, generator)
         if not any(parameter.requires_grad for parameter in network.parameters()):
             curves = pd.DataFrame(columns=CURVE_COLUMNS)
             return self._result(network.eval(), dataset, training_data, curves)
-        errors = BaseErrors.of(training_data, dataset, s.horizon)
         checkpoint = self.checkpoint(policy, training_data)
-        expert_checkpoint = None
-        if checkpoint is not None:
-            expert_checkpoint = checkpoint.with_suffix(".expert.ckpt")
-        expert = None
-        if s.distillation_epochs:
-            expert = self._expert(policy, training_data, dataset, errors, expert_checkpoint)
-        module = self._trained(
-            "Training", network, policy, training_data, dataset, errors, checkpoint, expert
-        )
-        for file in (checkpoint, expert_checkpoint):
-            if file is not None:
+        shards = list(cut(s, policy, training_data, dataset, network, checkpoint))
+        curves = self._train(shards, training_data.engine, network, dataset)
+        for shard in shards:
+            for file in shard.files:
                 file.unlink(missing_ok=True)
-        return self._result(module.network, dataset, training_data, module.curves())
+        return self._result(network.eval(), dataset, training_data, curves)
+
+    def _train(
+        self,
+        shards: Sequence[TrainingShard],
+        engine: Engine,
+        network: PolicyNetwork,
+        dataset: RolloutDataset,
+    ) -> pd.DataFrame:
+        """Trains all networks in place; returns the learning curves."""
+        at_most = epochs(self.settings)
+        title = f"Training ({len(dataset.pair)} networks, at most {at_most} epochs)"
+        alone = len(shards) == 1
+        with Task(title, at_most * len(shards)) as task:
+            trained: dict[int, TrainedShard] = dict(
+                engine.map(train, shards, task.advance, shares_cores=alone)
+            )
+        in_order = [trained[number] for number in range(len(shards))]
+        weights = {}
+        for name in network.state_dict():
+            weights[name] = torch.cat([found.weights[name] for found in in_order])
+        network.load_state_dict(weights)
+        curves = pd.concat([found.curves for found in in_order], ignore_index=True)
+        curves = curves.sort_values("epoch", kind="stable", ignore_index=True)
+        warn_of_nothing_learned(curves)
+        return curves
 
     def _result(
         self,
@@ -139,81 +159,6 @@ class RolloutLearner(Learner):
     def checkpoint(self, policy: Policy, training_data: TrainingData) -> Path | None:
         """Returns the file from which this very training goes on, or None without a workspace."""
         return checkpoint_path(self.identity(), policy, training_data)
-
-    def _trained(
-        self,
-        title: str,
-        network: PolicyNetwork,
-        policy: Policy,
-        training_data: TrainingData,
-        dataset: RolloutDataset,
-        errors: BaseErrors,
-        checkpoint: Path | None,
-        expert: Expert | None = None,
-    ) -> RolloutModule:
-        """Trains, from the checkpoint on if it is there, and leaves it behind."""
-        s = self.settings
-        task = Task(f"{title} ({len(dataset.pair)} networks, at most {s.epochs} epochs)", s.epochs)
-        module = RolloutModule(
-            network, dataset, policy, training_data, s, errors, expert, on_epoch=task.advance
-        )
-        fit(
-            module,
-            StepNumbers(s.steps),
-            epochs=s.epochs,
-            seed=training_data.seed,
-            device=training_data.batch.lengths.device,
-            task=task,
-            checkpoint=checkpoint,
-        )
-        return module
-
-    def _expert(
-        self,
-        policy: Policy,
-        training_data: TrainingData,
-        dataset: RolloutDataset,
-        errors: BaseErrors,
-        checkpoint: Path | None,
-    ) -> Expert:
-        """Returns experts trained on the same trajectories; from the checkpoint if it is there."""
-        s, simulator = self.settings, MemoryStepper(Direct(), training_data.simulator.dt)
-        space = simulator.model.adaptation_space
-        fixed = training_data.fixed
-        default = space.defaults(dtype=fixed.dtype, device=fixed.device)
-        expert_fixed = default.expand(len(fixed), -1)
-        expert_data = replace(
-            training_data,
-            simulator=simulator,
-            fixed=expert_fixed,
-            base=None if training_data.base is None else expert_fixed,
-        )
-        expert_dataset = dataset.for_base(space.to_unit(default).float())
-        generator = torch.Generator().manual_seed(training_data.seed)
-        head = OffsetHead.for_model(simulator.model)
-        network = _untrained(policy, expert_dataset, head, generator)
-        changes = {
-            "head": head.name,
-            "distillation_epochs": 0,
-            "epochs": s.epochs - s.distillation_epochs,
-        }
-        learner = RolloutLearner(s.model_copy(update=changes))
-        module = learner._trained(
-            "Training experts", network, policy, expert_data, expert_dataset, errors, checkpoint
-        )
-        module.network.requires_grad_(False)
-        return Expert(module.training_window, expert_dataset)
-
-
-def _untrained(
-    policy: Policy, dataset: RolloutDataset, head: ParameterHead, generator: torch.Generator
-) -> PolicyNetwork:
-    """Returns networks that answer no offset, on the device of the dataset."""
-    device = dataset.pair.device
-    default = head.space.to_unit(head.space.defaults()).float()
-    start = head.untrained_answer(default.expand(len(dataset.pair), -1))
-    features = dataset.scaler.mean.shape[-1]
-    return policy.build(features, default, start, generator).to(device)
 
 
 def _training_result(

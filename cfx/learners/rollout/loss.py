@@ -26,7 +26,7 @@ frames after the start nothing can be wrong."""
 
 
 class FrameWeights(NamedTuple):
-    """How much each frame after the start counts, `(K,)` each, 1 in the mean error.
+    """How much each frame after the start counts, `(N, 1, K)` each, 1 in the mean error.
 
     Frames after the last count as the last.
 
@@ -43,7 +43,7 @@ class FrameWeights(NamedTuple):
         """Returns weights that let each frame count alike relative to these errors.
 
         Args:
-            speed_error: mean square at each frame, `(K,)`, (m/s)2.
+            speed_error: of each network, mean square at each frame, `(N, 1, K)`, (m/s)2.
             gap_error: the same, m2.
         """
         return cls(_relative(speed_error), _relative(gap_error))
@@ -51,12 +51,12 @@ class FrameWeights(NamedTuple):
     def at(self, first: int, count: int) -> FrameWeights:
         """Returns the weights of `count` frames from frame `first` on."""
         index = torch.arange(first, first + count, device=self.speed.device)
-        index = index.clamp(max=len(self.speed) - 1)
-        return FrameWeights(self.speed[index], self.gap[index])
+        index = index.clamp(max=self.speed.shape[-1] - 1)
+        return FrameWeights(self.speed[..., index], self.gap[..., index])
 
 
 def _relative(error: Tensor) -> Tensor:
-    mean = error.mean()
+    mean = error.mean(-1, keepdim=True)
     return mean / error.clamp(min=_LEAST_ERROR**2 * mean)
 
 
@@ -115,7 +115,7 @@ class TrajectoryLoss:
 def _loss(
     objective: Objective, values: FrameValues, counted: Tensor, weight: Tensor | None
 ) -> Tensor:
-    """Returns an objective of trajectories, `(N, D)`, whose frames have a weight `(K,)`."""
+    """Returns an objective of trajectories, `(N, D)`, whose frames have a weight `(N, 1, K)`."""
     if weight is None:
         return objective(values, counted, dim=-1, epsilon=_EPSILON)
     sums = objective.sums(values, counted * weight, dim=-1)

@@ -196,16 +196,18 @@ class RolloutModule(BatchedModule):
 
     @torch.no_grad()
     def _frame_weights(self) -> FrameWeights:
-        """Returns weights relative to the errors of the untrained networks."""
+        """Returns weights relative to the errors of each untrained network."""
         batch = self.sampler.training(0)
         windows = self.settings.horizon
         segments = simulate(self.exact_step, self.dataset, batch, windows, NoGradients())
         segment = next(segments)
         weight = segment.measured.counted * batch.weight[..., None]
-        count = weight.sum((0, 1)).clamp(min=1.0)
+        count = weight.sum(1, keepdim=True).clamp(min=1.0)
         speed = (segment.speed - segment.measured.speed).square() * weight
         gap = (segment.gap - segment.measured.gap).square() * weight
-        return FrameWeights.relative_to(speed.sum((0, 1)) / count, gap.sum((0, 1)) / count)
+        return FrameWeights.relative_to(
+            speed.sum(1, keepdim=True) / count, gap.sum(1, keepdim=True) / count
+        )
 
     @property
     def burn_in_windows(self) -> int | None:

@@ -68,15 +68,15 @@ class TrajectorySampler:
         s, dataset = self.settings, self.dataset
         generator = torch.Generator().manual_seed(self.step_seed(step))
         place = dataset.training_places(s.drivers, generator).repeat(1, s.draws)
-        shape, device = place.shape, place.device
-        share = torch.rand(shape, generator=generator).to(device)
+        shape = tuple(place.shape[1:])
+        share = dataset.lots(shape, generator)
         until = dataset.until.gather(1, place)
         latest = (until // self.stride - s.horizon // 2).clamp(min=1)
-        lots = torch.rand(shape, generator=generator).to(device)
+        lots = dataset.lots(shape, generator)
         cold_start = lots < self.cold_start_fraction
         scale = None
         if self.cold_start_fraction > 0 and s.scaling > 0:
-            factor = torch.exp(s.scaling * torch.randn(shape, generator=generator)).to(device)
+            factor = torch.exp(s.scaling * dataset.normal(shape, generator))
             scale = torch.where(cold_start, factor, 1.0)
         shift, wider = self._shift(place, cold_start, generator)
         weight = dataset.trains.gather(1, place).float()
@@ -88,12 +88,13 @@ class TrajectorySampler:
         self, place: Tensor, cold_start: Tensor, generator: torch.Generator
     ) -> tuple[Tensor | None, Tensor | None]:
         """Returns the speed (m/s) and the gap (m) added to trajectories, `(N, D)` each."""
-        s, device = self.settings, place.device
+        s, dataset = self.settings, self.dataset
         if self.cold_start_fraction == 0 or s.speed_shift == 0:
             return None, None
-        lots = torch.rand((2, *place.shape), generator=generator).to(device)
-        shift = torch.where(cold_start & (lots[0] < SHIFTED), s.speed_shift * lots[1], 0.0)
-        time_gap = self.dataset.time_gap[self.dataset.pair.gather(1, place)]
+        shape = tuple(place.shape[1:])
+        lots, speed = dataset.lots(shape, generator), dataset.lots(shape, generator)
+        shift = torch.where(cold_start & (lots < SHIFTED), s.speed_shift * speed, 0.0)
+        time_gap = dataset.time_gap[dataset.pair.gather(1, place)]
         return shift, shift * time_gap
 
     def validation_with_history(self) -> RolloutBatch:

@@ -1,0 +1,320 @@
+"""Training of some of the networks: in this process, in another one, or on another machine.
+
+Networks are independent: each learns from its own loss. So a training is cut into shards of some
+networks each, and what a network learns does not depend on where its shard is trained.
+
+Shapes: N networks (each member of an ensemble counts), D trajectories of each.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pandas as pd
+import torch
+from torch import Tensor
+
+from cfx.agents.heads import HEADS
+from cfx.agents.heads.base import ParameterHead
+from cfx.agents.heads.offset import OffsetHead
+from cfx.engine.base import Report
+from cfx.engine.local import LocalEngine
+from cfx.learners.base import TrainingData
+from cfx.learners.batched import fit
+from cfx.learners.rollout.base_errors import BaseErrors
+from cfx.learners.rollout.dataset import RolloutDataset
+from cfx.learners.rollout.distillation import Expert
+from cfx.learners.rollout.module import RolloutModule, StepNumbers
+from cfx.learners.rollout.settings import RolloutSettings
+from cfx.models.direct import Direct
+from cfx.policies.base import Policy, PolicyNetwork
+from cfx.simulation.rollout import MemoryStepper
+
+_TRAJECTORIES = 3_000
+"""Of a shard's gradient step at most. A window costs as much per trajectory with 1,500 of them as
+with 6,000, and a tenth more with 700."""
+
+_WORTH_A_PROCESS = 8_000_000
+"""Simulated windows of all trajectories and gradient steps from which a training is cut: some
+twenty seconds on one core. A process needs five of them to begin."""
+
+
+@dataclass(frozen=True)
+class TrainingShard:
+    """Some networks, and all that they learn from.
+
+    Attributes:
+        settings: of the learner.
+        policy: the component that built the networks.
+        training_data: of these networks alone.
+        dataset: the same, placed; it knows which of all networks these are.
+        weights: of the untrained networks.
+        expert_weights: of their untrained experts; None: without distillation.
+        checkpoint: the file from which interrupted training goes on; None: no such file.
+    """
+
+    settings: RolloutSettings
+    policy: Policy
+    training_data: TrainingData
+    dataset: RolloutDataset
+    weights: dict[str, Tensor]
+    expert_weights: dict[str, Tensor] | None
+    checkpoint: Path | None
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """What training leaves behind so that it can go on."""
+        if self.checkpoint is None:
+            return ()
+        return self.checkpoint, self.checkpoint.with_suffix(".expert.ckpt")
+
+
+@dataclass(frozen=True)
+class TrainedShard:
+    """What the networks of a shard have learned.
+
+    Attributes:
+        weights: of each one's best epoch.
+        curves: as `TrainingResult` has them.
+    """
+
+    weights: dict[str, Tensor]
+    curves: pd.DataFrame
+
+
+def networks_of_shards(settings: RolloutSettings, dataset: RolloutDataset) -> list[slice]:
+    """Returns which networks train together, as slices of `range(N)`.
+
+    It follows from the size of the training alone and not from this machine, so that the result
+    does not either. Ensembles stay together.
+    """
+    networks, drivers = dataset.pair.shape
+    if settings.drivers is not None:
+        drivers = min(drivers, settings.drivers)
+    trajectories = networks * drivers * settings.draws
+    windows = trajectories * settings.horizon * settings.steps * settings.epochs
+    ensembles = networks // dataset.ensemble_size
+    count = 1
+    if windows >= _WORTH_A_PROCESS and dataset.pair.device.type == "cpu":
+        count = min(ensembles, max(2, math.ceil(trajectories / _TRAJECTORIES)))
+    size = math.ceil(ensembles / count) * dataset.ensemble_size
+    return [slice(first, min(first + size, networks)) for first in range(0, networks, size)]
+
+
+def cut(
+    settings: RolloutSettings,
+    policy: Policy,
+    training_data: TrainingData,
+    dataset: RolloutDataset,
+    network: PolicyNetwork,
+    checkpoint: Path | None,
+) -> Iterator[TrainingShard]:
+    """Yields the shards of a training; a training that is not cut is one shard.
+
+    Args:
+        settings: of the learner.
+        policy: the component that built the networks.
+        training_data: of all networks.
+        dataset: of all networks.
+        network: all networks, untrained.
+        checkpoint: of the whole training; each shard has a file of its own beside it.
+    """
+    slices = networks_of_shards(settings, dataset)
+    experts = None
+    if settings.distillation_epochs:
+        expert_data, expert_dataset = _for_experts(training_data, dataset)
+        generator = torch.Generator().manual_seed(training_data.seed)
+        head = OffsetHead.for_model(expert_data.simulator.model)
+        experts = untrained(policy, expert_dataset, head, generator)
+    for networks in slices:
+        part, rows = dataset.only(networks)
+        own = checkpoint
+        if checkpoint is not None and len(slices) > 1:
+            own = checkpoint.with_suffix(f".{networks.start}-{networks.stop}.ckpt")
+        yield TrainingShard(
+            settings=settings,
+            policy=policy,
+            training_data=_of_rows(training_data, part, rows, networks),
+            dataset=part,
+            weights=_weights(network, networks),
+            expert_weights=None if experts is None else _weights(experts, networks),
+            checkpoint=own,
+        )
+
+
+def _weights(network: PolicyNetwork, networks: slice) -> dict[str, Tensor]:
+    """Returns the weights of some of all networks."""
+    weights = {}
+    for name, value in network.state_dict().items():
+        weights[name] = value[networks].clone()
+    return weights
+
+
+def _of_rows(
+    training_data: TrainingData, part: RolloutDataset, rows: Tensor, networks: slice
+) -> TrainingData:
+    """Returns the training data of some networks, whose pairs are `rows`."""
+    size = part.ensemble_size
+    first, last = networks.start // size, networks.stop // size
+    at = rows.to(training_data.fixed.device)
+    base = training_data.base
+    return replace(
+        training_data,
+        batch=part.batch,
+        split=training_data.split[rows.to(training_data.split.frame.device)],
+        fixed=training_data.fixed[at],
+        base=None if base is None else base[at],
+        labels=None,
+        network=training_data.network[rows.to(training_data.network.device)] - first,
+        names=training_data.names[first:last],
+        drivers=None,
+        workspace=None,
+        engine=LocalEngine(),
+    )
+
+
+def epochs(settings: RolloutSettings) -> int:
+    """Returns how many epochs a shard trains at most, those of experts among them."""
+    if settings.distillation_epochs:
+        return settings.epochs + _expert_settings(settings).epochs
+    return settings.epochs
+
+
+def train(shard: TrainingShard, report: Report) -> TrainedShard:
+    """Trains the networks of a shard.
+
+    Training goes on from the shard's checkpoint, and leaves it behind.
+
+    Args:
+        shard: which networks, and what they learn from.
+        report: called with how many epochs are done.
+    """
+    progress = _Epochs(report, epochs(shard.settings))
+    dataset, training_data, s = shard.dataset, shard.training_data, shard.settings
+    head = HEADS[s.head].for_model(training_data.simulator.model)
+    network = untrained(shard.policy, dataset, head)
+    network.load_state_dict(shard.weights)
+    errors = BaseErrors.of(training_data, dataset, s.horizon)
+    checkpoint, expert_checkpoint = None, None
+    if shard.files:
+        checkpoint, expert_checkpoint = shard.files
+    expert = None
+    if s.distillation_epochs:
+        expert = _expert(shard, errors, expert_checkpoint, progress.one_more)
+    module = RolloutModule(
+        network,
+        dataset,
+        shard.policy,
+        training_data,
+        s,
+        errors,
+        expert,
+        on_epoch=progress.one_more,
+    )
+    _fit(module, checkpoint)
+    progress.end()
+    return TrainedShard(module.network.state_dict(), module.curves())
+
+
+def untrained(
+    policy: Policy,
+    dataset: RolloutDataset,
+    head: ParameterHead,
+    generator: torch.Generator | None = None,
+) -> PolicyNetwork:
+    """Returns networks that answer no offset, on the device of the dataset.
+
+    Args:
+        policy: builds them.
+        dataset: what they will read.
+        head: makes parameters of their answers.
+        generator: of their weights; None: weights that are replaced, always the same.
+    """
+    if generator is None:
+        generator = torch.Generator().manual_seed(0)
+    default = head.space.to_unit(head.space.defaults()).float()
+    start = head.untrained_answer(default.expand(len(dataset.pair), -1))
+    features = dataset.scaler.mean.shape[-1]
+    return policy.build(features, default, start, generator).to(dataset.pair.device)
+
+
+class _Epochs:
+    """Reports epochs, in the end all that were planned."""
+
+    def __init__(self, report: Report, planned: int) -> None:
+        self.report = report
+        self.left = planned
+
+    def one_more(self) -> None:
+        self.left -= 1
+        self.report(1)
+
+    def end(self) -> None:
+        self.report(self.left)
+
+
+def _fit(module: RolloutModule, checkpoint: Path | None) -> None:
+    s = module.settings
+    fit(
+        module,
+        StepNumbers(s.steps),
+        epochs=s.epochs,
+        seed=module.sampler.seed,
+        device=module.dataset.pair.device,
+        checkpoint=checkpoint,
+    )
+
+
+def _expert_settings(settings: RolloutSettings) -> RolloutSettings:
+    changes = {
+        "head": OffsetHead.name,
+        "distillation_epochs": 0,
+        "epochs": settings.epochs - settings.distillation_epochs,
+    }
+    return settings.model_copy(update=changes)
+
+
+def _expert(
+    shard: TrainingShard,
+    errors: BaseErrors,
+    checkpoint: Path | None,
+    on_epoch: Callable[[], None],
+) -> Expert:
+    """Returns experts trained on the same trajectories; from the checkpoint if it is there."""
+    assert shard.expert_weights is not None
+    expert_data, expert_dataset = _for_experts(shard.training_data, shard.dataset)
+    head = OffsetHead.for_model(expert_data.simulator.model)
+    network = untrained(shard.policy, expert_dataset, head)
+    network.load_state_dict(shard.expert_weights)
+    module = RolloutModule(
+        network,
+        expert_dataset,
+        shard.policy,
+        expert_data,
+        _expert_settings(shard.settings),
+        errors,
+        on_epoch=on_epoch,
+    )
+    _fit(module, checkpoint)
+    module.network.requires_grad_(False)
+    return Expert(module.training_window, expert_dataset)
+
+
+def _for_experts(
+    training_data: TrainingData, dataset: RolloutDataset
+) -> tuple[TrainingData, RolloutDataset]:
+    """Returns what experts learn from: the same trajectories, to be driven by `Direct`."""
+    simulator = MemoryStepper(Direct(), training_data.simulator.dt)
+    space, fixed = simulator.model.adaptation_space, training_data.fixed
+    default = space.defaults(dtype=fixed.dtype, device=fixed.device)
+    expert_fixed = default.expand(len(fixed), -1)
+    expert_data = replace(
+        training_data,
+        simulator=simulator,
+        fixed=expert_fixed,
+        base=None if training_data.base is None else expert_fixed,
+    )
+    return expert_data, dataset.for_base(space.to_unit(default).float())

@@ -1,0 +1,65 @@
+"""Workers of the engine `local` end with the job, and say how far they are."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+_SCRIPT = """
+import os, sys, time
+from cfx.engine.processes import in_processes
+
+def work(shard, report):
+    open(f"{shard}.{os.getpid()}", "w").close()
+    for _ in range(100):
+        report(1)
+        time.sleep(0.1)
+
+for _ in in_processes(work, [r"%s/a", r"%s/b"], lambda units: print(units, flush=True), 2):
+    pass
+"""
+
+
+def _workers(folder: Path) -> list[int]:
+    return [int(file.suffix[1:]) for file in folder.glob("[ab].*")]
+
+
+def _is_running(pid: int) -> bool:
+    try:
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_workers_end_with_the_job(how: signal.Signals, tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(_SCRIPT % (tmp_path, tmp_path))
+    root = Path(__file__).parents[2]
+    job = subprocess.Popen(
+        [sys.executable, str(script)],
+        env={"PYTHONPATH": str(root), "PATH": "/usr/bin:/bin"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    assert job.stdout is not None
+    assert job.stdout.readline() == "1\n", "progress is reported while work goes on"
+    deadline = time.monotonic() + 60
+    while len(_workers(tmp_path)) < 2 and time.monotonic() < deadline:
+        time.sleep(0.1)
+    workers = _workers(tmp_path)
+    assert len(workers) == 2
+    os.kill(job.pid, how)
+    job.communicate(timeout=60)
+    while any(map(_is_running, workers)) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not any(map(_is_running, workers))
