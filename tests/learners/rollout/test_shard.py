@@ -132,7 +132,7 @@ def test_small_trainings_are_not_cut() -> None:
     assert networks_of_shards(learner.settings, dataset) == [slice(0, 8)]
     longer = learner.settings.model_copy(update={"epochs": 10_000, "horizon": 30})
     assert networks_of_shards(longer, dataset) == [slice(0, 4), slice(4, 8)]
-    many = longer.model_copy(update={"draws": 100})
+    many = longer.model_copy(update={"draws": 200})
     assert networks_of_shards(many, dataset) == [
         slice(0, 2),
         slice(2, 4),
