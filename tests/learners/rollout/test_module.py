@@ -102,14 +102,14 @@ def test_weights_let_each_time_after_the_start_count_alike() -> None:
     counted = segment.measured.counted * batch.weight[..., None]
     square = (segment.speed - segment.measured.speed).square() * counted
     error = square.sum((0, 1)) / counted.sum((0, 1))
-    weighted = error * weights.speed
+    weighted = error * weights.speed[0, 0]
     assert float(error[1] / error.mean()) < 0.05, "the residual makes the start nearly exact"
     late = error > 0.01 * error.mean()
     expected = error.mean().expand(int(late.sum()))
     torch.testing.assert_close(weighted[late], expected, rtol=1e-4, atol=0)
     assert float(weighted.max()) < 1.001 * float(error.mean())
     beyond = weights.at(55, 20)
-    assert torch.equal(beyond.speed[5:], weights.speed[-1].expand(15))
+    assert torch.equal(beyond.speed[0, 0, 5:], weights.speed[0, 0, -1].expand(15))
 
 
 def exact_losses(module: RolloutModule, batch: RolloutBatch, windows: int, full: bool) -> Any:
