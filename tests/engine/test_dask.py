@@ -43,7 +43,7 @@ def test_wrong_settings_are_said_before_any_work(
     [
         ("distributed", {}, r'pip install "cfx-driving\[dask\]"'),
         ("dask_jobqueue", {"cluster": "slurm"}, r'pip install "cfx-driving\[dask\]"'),
-        ("dask_kubernetes", {"cluster": "kubernetes"}, r'pip install "cfx-driving\[kubernetes\]"'),
+        ("dask_kubernetes", {"cluster": "kubernetes"}, 'pip install "dask-kubernetes"'),
     ],
 )
 def test_what_is_not_installed_is_said_with_the_line_that_installs_it(

@@ -14,19 +14,22 @@ from cfx.simulation.threads import cores
 _WORKERS_ELSEWHERE = 4
 
 
+_DASK = "cfx-driving[dask]"
+
+
 class _Package(NamedTuple):
     """Where a cluster's class comes from."""
 
     module: str
     name: str
-    extra: str
+    distribution: str
 
 
 _PACKAGES = {
-    "slurm": _Package("dask_jobqueue", "SLURMCluster", "dask"),
-    "pbs": _Package("dask_jobqueue", "PBSCluster", "dask"),
-    "lsf": _Package("dask_jobqueue", "LSFCluster", "dask"),
-    "kubernetes": _Package("dask_kubernetes.operator", "KubeCluster", "kubernetes"),
+    "slurm": _Package("dask_jobqueue", "SLURMCluster", _DASK),
+    "pbs": _Package("dask_jobqueue", "PBSCluster", _DASK),
+    "lsf": _Package("dask_jobqueue", "LSFCluster", _DASK),
+    "kubernetes": _Package("dask_kubernetes.operator", "KubeCluster", "dask-kubernetes"),
 }
 
 
@@ -36,16 +39,16 @@ def require_installed(settings: DaskSettings) -> None:
     Raises:
         EngineError: it is not; says what to type.
     """
-    _require("distributed", "engine=dask", "dask")
+    _require("distributed", "engine=dask", _DASK)
     if settings.cluster in _PACKAGES:
         package = _PACKAGES[settings.cluster]
         module = package.module.partition(".")[0]
-        _require(module, f"engine.cluster={settings.cluster}", package.extra)
+        _require(module, f"engine.cluster={settings.cluster}", package.distribution)
 
 
-def _require(module: str, what: str, extra: str) -> None:
+def _require(module: str, what: str, distribution: str) -> None:
     if importlib.util.find_spec(module) is None:
-        raise EngineError(f'{what} needs the package {module}: pip install "cfx-driving[{extra}]"')
+        raise EngineError(f'{what} needs the package {module}: pip install "{distribution}"')
 
 
 def workers_of(settings: DaskSettings) -> int:
