@@ -14,7 +14,10 @@ from cfx.errors import nearest
 OWN = "cfx-driving"
 
 EXTRAS: dict[tuple[str, str], str] = {
+    ("hydra/launcher", "dask"): "cfx-dask",
     ("hydra/launcher", "joblib"): f"{OWN}[joblib]",
+    ("hydra/launcher", "submitit_local"): f"{OWN}[submitit]",
+    ("hydra/launcher", "submitit_slurm"): f"{OWN}[submitit]",
     ("model", "fvdm"): "cfx-classics",
     ("model", "gipps"): "cfx-classics",
     ("model", "gipps_delay"): "cfx-classics",

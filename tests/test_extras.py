@@ -25,6 +25,8 @@ def options_of(folder: Path) -> set[tuple[str, str]]:
             found.add((kind.group, name))
     for path in folder.glob("cfx_*/conf/*/*.yaml"):
         found.add((path.parent.name, path.stem))
+    for path in folder.glob("hydra_plugins/cfx_*_launcher.py"):
+        found.add(("hydra/launcher", path.stem.removeprefix("cfx_").removesuffix("_launcher")))
     return found
 
 

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -60,6 +61,15 @@ JOB = """
 """
 
 Run = Callable[..., int]
+
+JOBS = 6
+LAUNCHERS = {
+    "basic": [],
+    "joblib": ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
+    "submitit": ["hydra/launcher=submitit_local", "hydra.launcher.timeout_min=5"],
+    "dask": ["hydra/launcher=dask", "hydra.launcher.workers=2"],
+}
+"""Each with what makes it run two jobs at once; submitit's local executor starts all of them."""
 
 
 @pytest.fixture
@@ -390,6 +400,40 @@ def processes() -> Iterator[list[subprocess.Popen[str]]]:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
             process.communicate()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", LAUNCHERS)
+def test_every_launcher_ends_what_was_broken_off(
+    launcher: str, install: Any, run: Run, processes: list[Any]
+) -> None:
+    script = (
+        "import sys; from cfx.application import start;"
+        " sys.exit(start(sys.argv[1:], target='sweep_stub:run_job'))"
+    )
+    command = ["-c", script, "-m", f"seed=range({JOBS})", *LAUNCHERS[launcher]]
+    wait = Path(f"wait-{JOBS - 2}")
+    wait.touch()
+    first = started(command, install.folder)
+    processes.append(first)
+    while not Path(f"waits-{JOBS - 2}").exists():
+        assert first.poll() is None, first.communicate()
+        time.sleep(0.05)
+    os.killpg(first.pid, signal.SIGKILL)
+    first.communicate()
+    # Workers in sessions of their own, as of submitit, may still run that job.
+    wait.unlink()
+    second = started(command, install.folder)
+    processes.append(second)
+    out, _ = second.communicate(timeout=250)
+    assert second.returncode == 0, out
+    assert f"{JOBS} of {JOBS} jobs done" in out
+    (folder,) = sweeps()
+    assert len(jobs(folder)) == len(list(folder.glob("*/metrics.json"))) == JOBS
+    counts = Counter(ran())
+    assert set(counts) == {str(seed) for seed in range(JOBS)}
+    # What was at work when the sweep was killed is the only thing that ran twice.
+    assert counts.total() <= JOBS + 2
 
 
 @pytest.mark.parametrize("killed", ["everything", "the main process"])

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from cfx.engine.dask.settings import DaskSettings
 from cfx.errors import EngineError
+from cfx.extras import install_line
 from cfx.simulation.threads import cores
 
 _WORKERS_ELSEWHERE = 4
@@ -48,7 +49,7 @@ def require_installed(settings: DaskSettings) -> None:
 
 def _require(module: str, what: str, distribution: str) -> None:
     if importlib.util.find_spec(module) is None:
-        raise EngineError(f'{what} needs the package {module}: pip install "{distribution}"')
+        raise EngineError(f"{what} needs the package {module}: {install_line(distribution)}")
 
 
 def workers_of(settings: DaskSettings) -> int:
