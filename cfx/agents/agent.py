@@ -384,7 +384,8 @@ class Agent:
             return state.base
         if self.population is None:
             return None
-        return self.space.to_unit(self.population[state.network].double())
+        population = self.population[state.network].double()
+        return self.space.to_unit(self.head.completed(population))
 
     def _unit_base(self, network: Tensor, context: DriverContext) -> Tensor | None:
         """Returns the drivers' base in unit space, `(D, n)`, in double precision."""

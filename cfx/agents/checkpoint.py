@@ -157,9 +157,7 @@ def _agent(
     for name, value in weights.items():
         if name.startswith("network."):
             trained[name.removeprefix("network.")] = value
-    network = network_with_weights(
-        policy, trained, description.ensemble_size, scaler, len(head.space)
-    )
+    network = network_with_weights(policy, trained, description.ensemble_size, scaler, head.answers)
     return Agent(
         core=AgentCore(policy, network, scaler, head),
         model_node=model_node,

@@ -64,7 +64,7 @@ class AgentCore:
         weights = {}
         for name, value in self.network.state_dict().items():
             weights[name] = value[members]
-        network = network_with_weights(self.policy, weights, size, scaler, len(self.head.space))
+        network = network_with_weights(self.policy, weights, size, scaler, self.head.answers)
         return AgentCore(self.policy, network.to(at.device), scaler, self.head)
 
     def condition(self, base: Tensor, driver_features: Tensor | None) -> Tensor:

@@ -81,6 +81,16 @@ class PolicySettings(Settings):
     )
 
 
+class ResidualSettings(Settings):
+    """Settings of policies that are not trained, beside parameters."""
+
+    residual: bool = Field(
+        False,
+        description="start with the acceleration that the driver has: what the parameters miss of"
+        " it is added, and decays in two seconds",
+    )
+
+
 class Policy(Component):
     """Base of every policy.
 
@@ -105,6 +115,13 @@ class Policy(Component):
         if isinstance(self.settings, PolicySettings):
             check_inputs(self.settings.inputs)
             check_driver_features(self.settings.driver_features)
+
+    @property
+    def untrained_head(self) -> str | None:
+        """The head of networks that are used as built; None: the direct one."""
+        if isinstance(self.settings, ResidualSettings) and self.settings.residual:
+            return "direct_residual"
+        return None
 
     @property
     def inputs(self) -> tuple[str, ...]:

@@ -8,13 +8,14 @@ import torch
 from torch import Tensor
 
 from cfx.component import Settings
-from cfx.policies.base import ConstantNetwork, Policy, PolicyNetwork
+from cfx.policies.base import ConstantNetwork, Policy, PolicyNetwork, ResidualSettings
 
 
 class FixedPolicy(Policy):
     """Answers the fixed parameters that calibration found."""
 
-    schema: ClassVar[type[Settings]] = Settings
+    schema: ClassVar[type[Settings]] = ResidualSettings
+    settings: ResidualSettings
     trainable = False
     adapts = False
 

@@ -18,6 +18,7 @@ from cfx.calibration.losses import SegmentLosses
 from cfx.component import Settings
 from cfx.objectives.base import Objective
 from cfx.optimizers.base import Optimizer
+from cfx.policies.base import ResidualSettings
 from cfx.policies.estimator import DrivenModel, EstimatorNetwork, EstimatorPolicy, squashed
 from cfx.policies.features import History
 from cfx.simulation.rollout import MemoryStepper
@@ -31,7 +32,7 @@ _SEED = 0
 """Of the optimizer's points: the same for every driver and moment."""
 
 
-class RecalibrateSettings(Settings):
+class RecalibrateSettings(ResidualSettings):
     """Settings of `recalibrate`."""
 
     window_s: float = Field(

@@ -18,6 +18,7 @@ from pydantic import Field
 from torch import Tensor
 
 from cfx.component import Settings
+from cfx.policies.base import ResidualSettings
 from cfx.policies.estimator import (
     DrivenModel,
     EstimatorNetwork,
@@ -30,7 +31,7 @@ _JITTER = 1e-9
 """Added to the diagonal of a covariance before its root is taken."""
 
 
-class FilterSettings(Settings):
+class FilterSettings(ResidualSettings):
     """What filters of parameters assume; parameters are in the squashed space (logits)."""
 
     spread: float = Field(

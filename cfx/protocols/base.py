@@ -152,7 +152,10 @@ class ProtocolContext:
         scaler = Scaler(unit.new_zeros((len(unit), width)), unit.new_ones((len(unit), width)))
         device = parameters.device
         return TrainingResult(
-            network.to(device).eval(), scaler.to(device), pd.DataFrame(columns=CURVE_COLUMNS)
+            network.to(device).eval(),
+            scaler.to(device),
+            pd.DataFrame(columns=CURVE_COLUMNS),
+            head=policy.untrained_head,
         )
 
     def ready(
@@ -166,7 +169,7 @@ class ProtocolContext:
         who = registry.origin(self.learner if policy.trainable else policy)
         _check_training_result(who, training_result)
         head = self._head(policy, training_result)
-        _check_networks(who, training_result, len(names), len(head.space))
+        _check_networks(who, training_result, len(names), head.answers)
         # Constant parameters are calibrated on these pairs, too.
         learned_from = {pair.content: pair.driver for pair in self.pairs}
         return Agent(

@@ -10,6 +10,7 @@ import pandas as pd
 import torch
 from pydantic import AfterValidator, Field
 
+from cfx.agents.agent import Agent
 from cfx.component import Settings
 from cfx.errors import ConfigError, DataError
 from cfx.evaluation.forecast_paths import (
@@ -26,6 +27,7 @@ from cfx.policies.fixed import FixedPolicy
 from cfx.protocols.across_drivers import AcrossDrivers, AcrossDriversSettings
 from cfx.protocols.base import ProtocolContext, ProtocolResult
 from cfx.protocols.held_out import HeldOut
+from cfx.simulation.base import Stepper
 
 log = logging.getLogger(__name__)
 
@@ -71,6 +73,8 @@ class Forecast(AcrossDrivers):
     - `population`: pooled parameters, calibrated on the drivers of the other folds;
     - `fixed`: driver-specific parameters, calibrated on the driver's trajectory up to their first
       origin: what every origin may read, and nothing after it;
+    - `population_residual`, `fixed_residual`: the same with a residual: what they miss of the
+      acceleration at the origin is added to theirs, and decays in two seconds;
     - `policy`: observes all history up to each origin (`history` bounds it) and drives on from
       there, seeing the simulated follower.
 
@@ -179,6 +183,13 @@ class Forecast(AcrossDrivers):
             agents[name] = (agent, test.network)
         each = torch.arange(len(batch), device=origins.pair.device)
         agents["fixed"] = (context.constant(FixedPolicy(), test.fixed), each)
+        residual = {"fixed_residual": (test.fixed, each)}
+        if test.population is not None:
+            residual["population_residual"] = (test.population, test.network)
+        for name, (parameters, network) in residual.items():
+            agent = context.constant(FixedPolicy(residual=True), parameters)
+            if _can_drive(context.simulator, agent):
+                agents[name] = (agent, network)
         base = test.unseen_base if test.base is None else test.base
         for name, (agent, network) in agents.items():
             paths[name] = simulate_from_origins(
@@ -193,6 +204,16 @@ class Forecast(AcrossDrivers):
                 leader=self.settings.leader,
             )
         return paths
+
+
+def _can_drive(simulator: Stepper, agent: Agent) -> bool:
+    """Says whether a simulator takes the steps of the model that an agent drives."""
+    try:
+        agent.stepper(simulator)
+    except ConfigError as error:
+        log.info("Left out of the forecasts: %s", error)
+        return False
+    return True
 
 
 def _with_forecasts(evaluation: Evaluation, forecasts: Forecasts) -> Evaluation:

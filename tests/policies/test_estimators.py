@@ -13,6 +13,7 @@ from torch import Tensor
 import cfx
 from cfx.agents.agent import Agent
 from cfx.agents.core import AgentCore
+from cfx.agents.heads import HEADS
 from cfx.agents.heads.direct import DirectHead
 from cfx.agents.scaler import Scaler
 from cfx.calibration.cache import Cache
@@ -245,6 +246,23 @@ def test_extreme_driving_leaves_estimates_within_their_bounds() -> None:
         assert bool(((loop.parameters >= low) & (loop.parameters <= high)).all())
 
 
+@pytest.mark.parametrize("residual", [False, True])
+def test_with_a_residual_a_forecast_starts_with_the_drivers_acceleration(residual: bool) -> None:
+    """However wrong the parameters are; after ten seconds nothing of it is left."""
+    batch, _, _ = krauss_drivers()
+    model = IDM()
+    agent = agent_of(UkfPolicy(), model, model.space.defaults()[None])
+    head = HEADS["direct_residual" if residual else "direct"].for_model(model)
+    agent = replace(agent, core=AgentCore(agent.policy, agent.network, agent.scaler, head))
+    origins = Origins(torch.tensor([0, 1, 2]), torch.tensor([100, 120, 150]))
+    paths = simulate_from_origins(
+        MemoryStepper(model, 0.1), agent, batch, origins, 1, torch.zeros(3).long()
+    )
+    first = (paths.speed[:, 1] - paths.speed[:, 0]) / 0.1
+    driver = batch.follower_acceleration[origins.pair, origins.frame].clamp(-9.0, 2.6)
+    assert torch.allclose(first, driver, atol=1e-9) == residual
+
+
 def test_a_model_without_equations_is_refused() -> None:
     model = SumoVType(
         car_follow_model="EIDM", parameters={"tau": {"low": 0.5, "high": 3, "default": 1}}
@@ -257,7 +275,9 @@ def test_an_estimator_is_saved_and_loaded(
     monkeypatch: pytest.MonkeyPatch, tmp_path: object
 ) -> None:
     monkeypatch.chdir(str(tmp_path))
-    result = cfx.run([*FORECAST, "policy=particle_filter", "policy.particles=50"])
+    result = cfx.run(
+        [*FORECAST, "policy=particle_filter", "policy.particles=50", "policy.residual=true"]
+    )
     assert result.metrics["forecast/rmse_speed_2s/policy"] > 0
     again = cfx.load(result.folder).policy
     batch, _, _ = krauss_drivers()

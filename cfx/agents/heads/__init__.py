@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from cfx.agents.heads.base import ParameterHead
 from cfx.agents.heads.direct import DirectHead
+from cfx.agents.heads.direct_residual import DirectResidualHead
 from cfx.agents.heads.offset import OffsetHead
 from cfx.agents.heads.residual import ResidualHead
 
@@ -14,6 +15,7 @@ HEADS: dict[str, type[ParameterHead]] = {
     DirectHead.name: DirectHead,
     OffsetHead.name: OffsetHead,
     ResidualHead.name: ResidualHead,
+    DirectResidualHead.name: DirectResidualHead,
 }
 """Heads by the names that saved policies give."""
 

@@ -63,6 +63,11 @@ class ParameterHead(ABC):
         return parameters
 
     @property
+    def answers(self) -> int:
+        """How many numbers networks answer; n, unless the head fills in some itself."""
+        return len(self.space)
+
+    @property
     def width(self) -> int:
         """The number of features by which networks learn of the base, c."""
         return 0
