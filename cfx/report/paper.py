@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,10 +16,25 @@ from cfx.files import write_output
 from cfx.plots.words import short_label
 from cfx.report.job import Job, Runs, any_baselines
 from cfx.report.names import SEPARATOR, differences
+from cfx.report.sections.calibration import sheet, spreads_of
 from cfx.tracking.provenance import flatten
 
 FORMS = {"latex": ".tex", "csv": ".csv"}
 """What a table can be written as, and how its file ends."""
+
+_ESCAPED = re.compile(r"[&%$#_{}]")
+"""Characters of a name that LaTeX takes for commands in a caption."""
+
+_LETTERS = {
+    "\N{MINUS SIGN}": "$-$",
+    "\N{SUPERSCRIPT TWO}": "$^2$",
+    "\N{SUPERSCRIPT THREE}": "$^3$",
+    "\N{SUPERSCRIPT MINUS}\N{SUPERSCRIPT FOUR}": "$^{-4}$",
+    "\N{PLUS-MINUS SIGN}": "$\\pm$",
+    "\N{MIDDLE DOT}": "$\\cdot$",
+    "\N{HORIZONTAL ELLIPSIS}": "\\ldots",
+}
+"""Letters that pdfLaTeX does not know by itself, or only with packages."""
 
 _ABSOLUTE = re.compile(r"(?<![\w.~-])/(?:[^/\s'\",\]]+/)+")
 """The folders of an absolute path, which nobody else has."""
@@ -140,30 +155,62 @@ def latex(rows: Sequence[Row]) -> str:
         line["drivers"] = str(_amounts(row)["drivers"])
         for method in _methods(rows):
             line[short_label(method)] = _text(row.values("rmse_speed", method))
-        line["gap of the policy [m]"] = _text(row.values("rmse_gap", "policy"), 2)
+        last = _methods(rows)[-1]
+        line[f"gap, {short_label(last)} [m]"] = _text(row.values("rmse_gap", last), 2)
         for baseline in _baselines(rows):
             line[f"over {short_label(baseline)}"] = _improvement(row, baseline)
         cells.append(line)
-    table = pd.DataFrame(cells).fillna("--")
-    styled = table.style.hide(axis="index").format(escape="latex")
-    styled = styled.format_index(escape="latex", axis=1)
-    spread = "mean and standard deviation over the jobs of a row"
-    if not several:
-        spread = "improvements with their 95 \\% bootstrap interval over drivers"
-    body: str = styled.to_latex(
-        hrules=True,
-        column_format="l" + "r" * (table.shape[1] - 1),
-        position_float="centering",
-        caption=f"RMSE of speed [m/s] by method, in closed loop on the test part of each"
-        f" trajectory; improvement of the policy; {spread}.",
-        label="tab:cfx",
-    )
+    caption = "RMSE of speed [m/s] by method, in closed loop on the test part of each trajectory"
+    if _any_adapts(rows):
+        caption += "; improvement of the policy"
+    if several:
+        caption += "; mean and standard deviation over the jobs of a row"
+    elif _any_adapts(rows):
+        caption += "; improvements with their 95 \\% bootstrap interval over drivers"
+    body = _latex_table(pd.DataFrame(cells).fillna("--"), f"{caption}.", "tab:cfx")
     comments = ["% Needs \\usepackage{booktabs}."]
     for row in rows:
         for job in row.jobs:
             said = f"cfx {job.version}: {_command(job)}".replace("\n", " ")
             comments.append(f"% {row.name}: {said}")
-    return "\n".join([*comments, body])
+    return "\n".join([*comments, body, *_parameter_tables(rows)])
+
+
+def _latex_table(table: pd.DataFrame, caption: str, label: str) -> str:
+    """Returns a table of text: the first column to the left, the others to the right."""
+    styled = table.style.hide(axis="index").format(escape="latex")
+    styled = styled.format_index(escape="latex", axis=1)
+    body: str = styled.to_latex(
+        hrules=True,
+        column_format="l" + "r" * (table.shape[1] - 1),
+        position_float="centering",
+        caption=caption,
+        label=label,
+    )
+    for letter, command in _LETTERS.items():
+        body = body.replace(letter, command)
+    return body
+
+
+def _parameter_tables(rows: Sequence[Row]) -> Iterator[str]:
+    """Yields a table of the calibrated parameters of each calibration."""
+    for row in rows:
+        job = row.jobs[0]
+        spreads = () if job.adapts else spreads_of(job)
+        if not spreads:
+            continue
+        found = sheet(spreads)
+        table = pd.DataFrame(
+            [[cell.text for cell in line] for line in found.rows],
+            columns=[column.heading for column in found.columns],
+        )
+        name = _ESCAPED.sub(r"\\\g<0>", row.name)
+        caption = (
+            f"Calibrated parameters, {name}: the model's default, the mean of the folds' pooled"
+            " parameters, and median and quantiles of the driver-specific ones."
+        )
+        label = re.sub(r"\W+", "-", row.name).strip("-")
+        yield _latex_table(table, caption, f"tab:cfx-parameters-{label}")
 
 
 def _amounts(row: Row) -> dict[str, int]:
@@ -181,7 +228,18 @@ def _methods(rows: Sequence[Row]) -> list[str]:
         for job in row.jobs:
             found |= dict.fromkeys(job.meaningful_methods)
     found.pop("policy", None)
-    return [*found, "policy"]
+    if _any_adapts(rows):
+        return [*found, "policy"]
+    return [method for method in found if method != "fixed"] + ["fixed"]
+
+
+def _any_adapts(rows: Sequence[Row]) -> bool:
+    """Says whether any job has a policy that adapts; without one they are calibrations."""
+    for row in rows:
+        for job in row.jobs:
+            if job.adapts:
+                return True
+    return False
 
 
 def _baselines(rows: Sequence[Row]) -> list[str]:

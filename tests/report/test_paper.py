@@ -72,7 +72,7 @@ def test_latex_has_a_row_each_and_says_how_it_came_about(sweep: Path) -> None:
     body = text[text.index("\\midrule") : text.index("\\bottomrule")].strip().splitlines()[1:]
     assert len(body) == 2
     assert body[0].startswith("krauss & 3 & ")
-    assert body[0].count("±") >= 5
+    assert body[0].count("$\\pm$") >= 5
     columns = text[text.index("\\toprule") :].splitlines()[1].count("&")
     assert all(line.count("&") == columns for line in body)
     comments = [line for line in text.splitlines() if line.startswith("%")]
@@ -88,6 +88,24 @@ def test_names_are_text_and_no_commands_of_latex(tmp_path: Path) -> None:
     rows = [line for line in text.splitlines() if "&" in line and not line.startswith("%")]
     assert any("a\\_b\\%0\\textbackslash" in line for line in rows)
     assert not any("\\input" in line for line in rows)
+
+
+def test_a_calibration_has_its_parameters_in_a_table_and_no_policy(tmp_path: Path) -> None:
+    folder = tmp_path / "calibrated"
+    write_job(folder, model="w99", methods=ACROSS)
+    about = json.loads((folder / "data.json").read_text(encoding="utf-8"))
+    (folder / "data.json").write_text(json.dumps({**about, "adapts": False}), encoding="utf-8")
+    text = written(folder, "--tables", "latex")
+    assert text.count("\\begin{table}") == 2
+    first, _, second = text.partition("\\end{table}")
+    assert "policy" not in first[first.index("\\begin") :]
+    assert "gap, driver-specific [m]" in first
+    assert "tab:cfx-parameters-w99" in second
+    assert second.count("\n") > len(about["parameters"])
+    assert text[text.index("\\begin") :].isascii(), "pdfLaTeX knows no other letters by itself"
+    table = pd.read_csv(io.StringIO(written(folder, "--tables", "csv")))
+    assert "rmse_speed_mps/policy" not in table
+    assert "rmse_speed_mps/fixed" in table
 
 
 @pytest.mark.parametrize(
