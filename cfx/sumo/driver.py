@@ -371,9 +371,9 @@ class Driver:
         return (gap / speed)[speed > _WALKING_MPS]
 
     def parameters(self, vehicle: str) -> dict[str, float]:
-        """Returns the parameters of a vehicle now, SI units; empty if it has no leader."""
+        """Returns the parameters of a vehicle now, SI units; empty if the policy drives it not."""
         slot = self._slots.get(vehicle)
-        if slot is None:
+        if slot is None or not bool(self._store.driven[slot]):
             return {}
         values = self._store.parameters[slot].tolist()
         return dict(zip(self.policy.space.names, values, strict=True))
@@ -409,7 +409,11 @@ class Driver:
         if drive:
             self._take_over(connection, following, slots)
         store = self._store
-        self._choose(slots[store.steps[slots] % self.policy.windows.stride == 0])
+        due = slots[store.steps[slots] % self.policy.windows.stride == 0]
+        if drive:
+            self._choose(due)
+        else:
+            self._observe(due)
         store.steps[slots] += 1
         if drive:
             self.counts.add(store.score[slots], store.beyond[slots])
@@ -570,14 +574,26 @@ class Driver:
         if len(slots) == 0:
             return
         store = self._store
-        begun = self._begun(slots)
-        state = begun.state.clone()
-        state[begun.network, begun.place] = store.state[slots]
-        history = History(*store.history[slots].unbind(1))
-        chosen, after = self.policy.act(history, begun._replace(state=state))
+        chosen, after = self.policy.act(*self._known(slots))
         store.parameters[slots] = chosen
         store.score[slots], store.beyond[slots] = after.score, after.beyond
         store.state[slots] = after.state[after.network, after.place]
+
+    def _observe(self, slots: Tensor) -> None:
+        """Lets the policy see windows of vehicles that somebody else drives."""
+        if len(slots) == 0:
+            return
+        history, state = self._known(slots)
+        after = self.policy.observe(history, state, torch.ones(len(slots), dtype=torch.bool))
+        self._store.state[slots] = after.state[after.network, after.place]
+
+    def _known(self, slots: Tensor) -> tuple[History, AgentState]:
+        """Returns the last frames of vehicles, and where the policy stands with them."""
+        store = self._store
+        begun = self._begun(slots)
+        state = begun.state.clone()
+        state[begun.network, begun.place] = store.state[slots]
+        return History(*store.history[slots].unbind(1)), begun._replace(state=state)
 
     def _speeds(
         self, connection: Connection, names: list[str], slots: Tensor, seen: Seen
