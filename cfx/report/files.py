@@ -39,6 +39,8 @@ TEXT_COLUMNS = frozenset(
     }
 )
 _NAMES = TEXT_COLUMNS | {"cluster", "cluster_name"}
+_FOLDERS = re.compile(r"(?<![\w.~:/-])/(?:[^/\s'\",\]]+/)+")
+_OF_DATABASE = re.compile(r"(sqlite:///)/(?:[^/\s'\",\]]+/)+")
 _PASSWORD = re.compile(r"(://[^/@\s:]*):[^/@\s]+@")
 
 
@@ -190,6 +192,11 @@ def _clean(value: Any) -> Any:
     if isinstance(value, str):
         return without_password(value)
     return value
+
+
+def without_folders(text: str) -> str:
+    """Returns a text without the folders of absolute paths, which nobody else has."""
+    return _OF_DATABASE.sub(r"\1", _FOLDERS.sub("", text))
 
 
 def without_password(text: str) -> str:

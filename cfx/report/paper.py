@@ -14,6 +14,7 @@ import pandas as pd
 from cfx.errors import ConfigError
 from cfx.files import write_output
 from cfx.plots.words import short_label
+from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs, any_baselines
 from cfx.report.names import SEPARATOR, differences
 from cfx.report.sections.calibration import sheet, spreads_of
@@ -35,9 +36,6 @@ _LETTERS = {
     "\N{HORIZONTAL ELLIPSIS}": "\\ldots",
 }
 """Letters that pdfLaTeX does not know by itself, or only with packages."""
-
-_ABSOLUTE = re.compile(r"(?<![\w.~-])/(?:[^/\s'\",\]]+/)+")
-"""The folders of an absolute path, which nobody else has."""
 
 
 @dataclass(frozen=True)
@@ -287,4 +285,4 @@ def _command(job: Job) -> str:
     if job.overrides is None:
         return "not known"
     typed = " ".join(("python -m cfx", *job.overrides))
-    return _ABSOLUTE.sub("", typed)
+    return without_folders(typed)

@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 from cfx.cli import main
+from cfx.report.files import without_folders
 from cfx.report.runs import read_runs
 from tests.report.folders import ACROSS, write_job
 
@@ -121,3 +122,26 @@ def test_what_cannot_be_grouped_is_one_sentence(
     assert main(["report", str(sweep), *arguments]) == 2
     assert said in capsys.readouterr().err
     assert not list(sweep.glob("report.*"))
+
+
+@pytest.mark.parametrize(
+    ("text", "kept"),
+    [
+        ("data.path=/home/ann/secret/pairs.parquet", "data.path=pairs.parquet"),
+        ("[/home/ann/a.csv,/home/ann/b.csv]", "[a.csv,b.csv]"),
+        ("data.path=recordings/pairs.parquet", "data.path=recordings/pairs.parquet"),
+        ("data.path=../shared/data/pairs.parquet", "data.path=../shared/data/pairs.parquet"),
+        ("sqlite:////home/ann/mlflow.db", "sqlite:///mlflow.db"),
+        ("https://example.org/some/page", "https://example.org/some/page"),
+        ("cfx://i80-idm, m/s, 1/2", "cfx://i80-idm, m/s, 1/2"),
+    ],
+)
+def test_folders_of_absolute_paths_are_left_out(text: str, kept: str) -> None:
+    assert without_folders(text) == kept
+
+
+def test_the_page_names_no_folder_of_this_machine(sweep: Path) -> None:
+    assert main(["report", str(sweep), "--output", str(sweep / "page.html")]) == 0
+    text = (sweep / "page.html").read_text(encoding="utf-8")
+    assert str(sweep.parent) not in text
+    assert "/home/ann" not in text

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import yaml
 
 from cfx.report.blocks import Block, Fold, Listing, Section, Text
+from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs
 
 
@@ -14,7 +15,9 @@ def blocks(runs: Runs) -> list[Block]:
     """Returns a fold for each job."""
     found: list[Block] = [Text("The whole configuration of each job, as it ran.")]
     for job in runs.jobs:
-        found.append(Fold(job.name, (Text(job.place, "fine"), Listing(_configuration(job)))))
+        found.append(
+            Fold(job.name, (Text(without_folders(job.place), "fine"), Listing(_configuration(job))))
+        )
     return found
 
 
@@ -25,7 +28,8 @@ def _configuration(job: Job) -> str:
     if isinstance(notes, Mapping):
         for name, value in notes.items():
             design += f"# {str(name).replace('_', ' ')}: {value}\n"
-    return design + str(yaml.safe_dump(dict(job.config), sort_keys=False, allow_unicode=True))
+    text = yaml.safe_dump(dict(job.config), sort_keys=False, allow_unicode=True)
+    return design + without_folders(str(text))
 
 
 SECTION = Section("configs", "Configurations", "Configurations", blocks)

@@ -14,6 +14,7 @@ from cfx.plots.plotly.figure import Plot, safe, safe_all
 from cfx.plots.plotly.improvements import improvements_view
 from cfx.plots.words import label, percent_or_undefined, short_label
 from cfx.report.blocks import Block, Figure, Section, Text
+from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs, any_baselines, with_baseline
 
 _INTRODUCTION = (
@@ -52,7 +53,7 @@ def _keyed(job: Job, jobs: Sequence[Job]) -> pd.DataFrame:
     table = job.by_pair.copy()
     keys = table["pair_id"].astype(str)
     if len({str(one.data.get("source", "")) for one in jobs}) > 1:
-        keys = keys + f" ({job.data.get('source', '')})"
+        keys = keys + f" ({without_folders(str(job.data.get('source', '')))})"
     table["key"] = keys
     return table
 

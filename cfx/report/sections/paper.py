@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from cfx.plots.words import MINUS, percent
 from cfx.report.blocks import Block, Heading, Items, Section, Table, Text
+from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs
 from cfx.report.tables import Cell, Column, Sheet, number, share, text
 from cfx.style.result import CLUSTERS
@@ -256,7 +257,7 @@ def _explanation(jobs: Sequence[Job], pairs: int) -> str:
     sources, counts = set(), set()
     optimizers, learners, epochs, batches = set(), set(), set(), set()
     for job in jobs:
-        sources.add(str(job.data.get("source", "")))
+        sources.add(without_folders(str(job.data.get("source", ""))))
         counts.add(job.pairs["pair_id"].nunique())
         optimizers.add(job.component("optimizer"))
         learners.add(job.component("learner"))

@@ -10,6 +10,7 @@ import pandas as pd
 
 from cfx.plots.words import NOTHING
 from cfx.report.blocks import Block, Facts, Heading, Items, Section, Table, Text
+from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs
 from cfx.report.tables import Column, Sheet, text
 
@@ -21,7 +22,9 @@ def blocks(runs: Runs) -> list[Block]:
     found: list[Block] = []
     if runs.unfinished:
         found.append(Text("Not in this page, because they have not finished:", "lacking"))
-        found.append(Items(tuple(f"{one.place}: {one.reason}" for one in runs.unfinished)))
+        found.append(
+            Items(tuple(f"{without_folders(one.place)}: {one.reason}" for one in runs.unfinished))
+        )
     common, own = facts(runs.jobs)
     found.append(Facts(tuple(common)))
     if own is not None:
@@ -79,7 +82,7 @@ def _facts(job: Job, jobs: Sequence[Job]) -> dict[str, str]:
     if job.experiment:
         found["Preset"] = job.experiment
     return found | {
-        "Data": str(job.data.get("source") or job.component("data") or NOTHING),
+        "Data": without_folders(str(job.data.get("source") or job.component("data") or NOTHING)),
         "Pairs": f"{len(table)} pairs of {table['driver'].nunique()} drivers",
         "Left out": _left_out(job),
         "Test frames of a pair": _range(table["frames"]),
@@ -90,7 +93,7 @@ def _facts(job: Job, jobs: Sequence[Job]) -> dict[str, str]:
         "Calibrated by": _calibration(job),
         "Seed": str(job.config.get("seed", NOTHING)),
         "cfx": job.version or "version not recorded",
-        "Read from": job.place,
+        "Read from": without_folders(job.place),
     }
 
 
@@ -115,16 +118,21 @@ def _typed(job: Job, jobs: Sequence[Job]) -> dict[str, str]:
     if job.overrides is None:
         return {"Command": "not recorded"}
     if len(jobs) == 1:
-        return {"Command": shlex.join(["python", "-m", "cfx", *job.overrides])}
+        return {"Command": _command(job.overrides)}
     shared = _shared_overrides(jobs)
     own = []
     for override in job.overrides:
         if override not in shared:
             own.append(override)
     return {
-        "Command": f"{shlex.join(['python', '-m', 'cfx', *shared])} …",
-        "Overrides of its own": shlex.join(own) or "none",
+        "Command": f"{_command(shared)} …",
+        "Overrides of its own": without_folders(shlex.join(own)) or "none",
     }
+
+
+def _command(overrides: Sequence[str]) -> str:
+    """Returns what was typed, without the folders of absolute paths."""
+    return without_folders(shlex.join(["python", "-m", "cfx", *overrides]))
 
 
 def _shared_overrides(jobs: Sequence[Job]) -> list[str]:
