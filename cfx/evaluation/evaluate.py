@@ -93,6 +93,7 @@ def evaluate(
         trajectories=_pair_trajectories(pairs, batch, first, loops),
         names=space.names,
         units=tuple(parameter.unit for parameter in space.tuned),
+        meanings=tuple(parameter.meaning for parameter in space.tuned),
         bounds=policy_space.bounds().numpy(),
         full_trajectory_improvements=improvements["full_trajectory"],
         platoon=platoon,

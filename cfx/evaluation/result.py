@@ -195,6 +195,7 @@ class Evaluation:
         outside: how much of the test part, and of full trajectories, the policy drove outside what
             it has learned from, in words by scope; empty if it did not.
         forecasts: from many moments of each trajectory; None if there were none.
+        meanings: what the tuned parameters are, in words; empty if that is not known.
     """
 
     about: pd.DataFrame
@@ -212,6 +213,7 @@ class Evaluation:
     left_out: tuple[LeftOut, ...] = ()
     outside: Mapping[str, str] = field(default_factory=dict)
     forecasts: Forecasts | None = None
+    meanings: tuple[str, ...] = ()
 
     @cached_property
     def table(self) -> pd.DataFrame:

@@ -301,8 +301,10 @@ def write_provenance(
         dropped.append({"reason": drop.reason, "count": drop.count, "unit": drop.unit})
     parameters = []
     lows, highs = evaluation.bounds
-    for name, unit, low, high in zip(evaluation.names, evaluation.units, lows, highs, strict=True):
-        parameters.append({"name": name, "unit": unit, "low": float(low), "high": float(high)})
+    meanings = evaluation.meanings or ("",) * len(evaluation.names)
+    for k, name in enumerate(evaluation.names):
+        about = {"name": name, "unit": evaluation.units[k], "meaning": meanings[k]}
+        parameters.append({**about, "low": float(lows[k]), "high": float(highs[k])})
     values = {
         "source": pairs.source,
         "fingerprint": pairs.fingerprint,

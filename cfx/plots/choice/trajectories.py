@@ -92,12 +92,16 @@ class Panel:
 
 @dataclass(frozen=True)
 class ParameterAxis:
-    """A tuned parameter: its name, its unit, and the bounds within which policies choose."""
+    """A tuned parameter: its name, its unit, and the bounds within which policies choose.
+
+    `meaning` says in words what it is.
+    """
 
     name: str
     unit: str = ""
     low: float | None = None
     high: float | None = None
+    meaning: str = ""
 
 
 def parameter_axes(

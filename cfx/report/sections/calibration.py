@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 
 import numpy as np
 
@@ -54,11 +55,9 @@ def _axes(job: Job) -> list[ParameterAxis]:
     for about in job.data.get("parameters") or ():
         low, high = about.get("low"), about.get("high")
         if isinstance(low, int | float) and isinstance(high, int | float):
-            axes.append(
-                ParameterAxis(
-                    str(about.get("name")), str(about.get("unit", "")), float(low), float(high)
-                )
-            )
+            name, unit = str(about.get("name")), str(about.get("unit", ""))
+            meaning = str(about.get("meaning", ""))
+            axes.append(ParameterAxis(name, unit, float(low), float(high), meaning))
     return axes
 
 
@@ -95,7 +94,7 @@ def _row(spread: ParameterSpread) -> tuple[Cell, ...]:
     low, median, high = np.quantile(spread.values, (0.05, 0.5, 0.95))
     pooled = float(spread.pooled.mean()) if len(spread.pooled) else float("nan")
     return (
-        text(axis.name),
+        replace(text(axis.name), second=axis.meaning),
         text(pretty_unit(axis.unit)),
         text(f"{shown_number(axis.low)} to {shown_number(axis.high)}"),
         number(spread.default, shown_number(spread.default)),
