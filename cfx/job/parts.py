@@ -59,7 +59,8 @@ class Parts:
         simulator.require(model)
         learner = cast(Learner, registry.create("learner", config.learner))
         policy = cast(Policy, registry.create("policy", config.policy))
-        learner.require_gradients(model, simulator.differentiable)
+        if policy.adapts:
+            learner.require_gradients(model, simulator.differentiable)
         if "policy" not in protocol.determines():  # else the policy has been trained already
             learner.require_no_driver_features(policy)
         return cls(

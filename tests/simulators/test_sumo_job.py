@@ -69,6 +69,16 @@ def test_any_model_of_sumo_is_calibrated_by_its_name(tmp_path: Path) -> None:
 
 
 @needs_sumo
+def test_a_calibration_in_sumo_asks_no_learner_for_gradients(tmp_path: Path) -> None:
+    """Nothing is learned, so the default learner, which needs them, does as well as any."""
+    small = ["data.max_pairs=1", "optimizer.samples=2", "learner=rollout_short"]
+    result = job(tmp_path / "job", "model=krauss_sumo", "simulator=sumo", *small)
+    assert result.pairs["rmse_speed"].notna().all()
+    with pytest.raises(ConfigError, match="this learner needs gradients"):
+        job(tmp_path / "gru", "model=krauss_sumo", "simulator=sumo", "policy=gru", *small)
+
+
+@needs_sumo
 def test_the_preset_of_eidm_is_what_sumo_knows(tmp_path: Path) -> None:
     result = job(
         tmp_path / "eidm", "model=eidm", "simulator=sumo", "data.max_pairs=1", "optimizer.samples=2"

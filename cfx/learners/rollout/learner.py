@@ -92,7 +92,8 @@ class RolloutLearner(Learner):
             ConfigError: the simulator or the model has no gradients.
         """
         simulator, s = training_data.simulator, self.settings
-        self.require_gradients(simulator.model, simulator.differentiable)
+        if policy.adapts:
+            self.require_gradients(simulator.model, simulator.differentiable)
         if not {"gap", "time_headway"} & set(policy.inputs):
             log.info(
                 "The policy does not see the gap; policy.inputs=situation gives smaller errors"
