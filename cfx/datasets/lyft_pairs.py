@@ -21,6 +21,7 @@ from cfx.datasets.files import FileStart, Floats, Ints
 from cfx.datasets.ngsim_file import stem
 from cfx.datasets.series import Series, frames_at, pairs_of
 from cfx.errors import DataError
+from cfx.extras import install_line
 from cfx.pairs import PairSet
 
 DT = 0.1
@@ -107,7 +108,7 @@ def _read(path: Path, automated_length: float) -> _Store:
         import zarr
     except ImportError:
         raise DataError(
-            'data=lyft_pairs needs the package zarr: pip install "cfx-driving[zarr]"'
+            f"data=lyft_pairs needs the package zarr: {install_line('cfx-driving[zarr]')}"
         ) from None
     if not path.is_dir():
         raise DataError(f"{path}: is no folder; a Zarr store such as trainHH.zarr is one")
