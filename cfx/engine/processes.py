@@ -62,6 +62,7 @@ def in_processes(
         env={"OMP_NUM_THREADS": "1"},
     )
     running: dict[Future[ResultT], int] = {}
+    is_done = False
     try:
         for number, shard in enumerate(shards):
             running[pool.submit(_do, work, shard)] = number
@@ -70,13 +71,15 @@ def in_processes(
         while running:
             yield from _finished(running, units, report)
         _drain(units, report)
+        is_done = True
     except BrokenProcessPool as error:
         raise EngineError(
             "a worker process was killed, perhaps because memory ran out; cores=N makes fewer at a"
             " time, and what was finished is kept"
         ) from error
     finally:
-        pool.shutdown(wait=True, kill_workers=True)
+        # A worker that ends by itself also ends what libraries have started in it.
+        pool.shutdown(wait=True, kill_workers=not is_done)
 
 
 def _finished(
