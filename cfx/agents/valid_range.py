@@ -204,7 +204,7 @@ def _measured(learned: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     covariance = away.T @ away / max(1, len(learned) - 1)
     covariance = covariance + _LEAST_VARIANCE * torch.eye(len(mean)).to(covariance)
     precision = torch.linalg.inv(covariance)
-    distances = torch.einsum("di,ij,dj->d", away, precision, away).clamp(min=0.0).sqrt()
+    distances = ((away @ precision) * away).sum(-1).clamp(min=0.0).sqrt()
     inside = _quantile(distances, _INSIDE).clamp(min=1.0)
     low, high = _quantile(learned, _EXTREMES[0]), _quantile(learned, _EXTREMES[1])
     return mean, precision, inside, low, high

@@ -13,7 +13,7 @@ import math
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import lightning.pytorch as pl
 import pandas as pd
@@ -76,7 +76,13 @@ class BatchedModule(pl.LightningModule):
         settings: of the learner.
         on_epoch: called after each epoch.
         ensemble_size: networks of an ensemble.
+
+    Attributes:
+        fused: the optimiser updates all weights in one pass; where steps are tiny, most of a step
+            is the optimiser otherwise.
     """
+
+    fused: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -104,7 +110,9 @@ class BatchedModule(pl.LightningModule):
     def configure_optimizers(self) -> Any:
         s = self.training_settings
         parameters = self.network.parameters()
-        return torch.optim.AdamW(parameters, lr=s.learning_rate, weight_decay=s.weight_decay)
+        return torch.optim.AdamW(
+            parameters, lr=s.learning_rate, weight_decay=s.weight_decay, fused=self.fused
+        )
 
     def configure_gradient_clipping(self, optimizer: Any, *args: Any, **kwargs: Any) -> None:
         """Clips each network's gradient on its own: a norm over all would couple them."""

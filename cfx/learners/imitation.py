@@ -33,8 +33,13 @@ from cfx.learners.situations import learned_range
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import measured_history, tokens
 from cfx.progress import Task
+from cfx.simulation.compiling import torch_compiled
+from cfx.simulation.rollout import Compile, can_compile
 
 log = logging.getLogger(__name__)
+
+_WORTH_COMPILING = 20_000
+"""Gradient steps from which compiling pays: some ten seconds of eager work."""
 
 
 class ImitationSettings(Settings):
@@ -75,6 +80,9 @@ class ImitationSettings(Settings):
     )
     gradient_clip: float | None = Field(
         1.0, gt=0, description="largest gradient norm of a network; null: none"
+    )
+    compile: Compile = Field(
+        "auto", description="a gradient step's loss: auto: where it pays; always; never"
     )
 
 
@@ -285,7 +293,11 @@ def _sensitivity_weight(sensitivity: Tensor, train: Tensor) -> Tensor:
 
 
 class SegmentData(pl.LightningDataModule):
-    """Segments of consecutive windows, in order: pairs of first window and end."""
+    """Segments of consecutive windows, in order: pairs of first window and end.
+
+    A training batch is all segments of an epoch: a gradient step is so short that Lightning's own
+    work around it would be a third of it.
+    """
 
     def __init__(self, windows: int, batch_size: int | None) -> None:
         super().__init__()
@@ -296,8 +308,8 @@ class SegmentData(pl.LightningDataModule):
             self.segments.append((first, min(first + size, windows)))
 
     def train_dataloader(self) -> DataLoader[Any]:
-        segments: Any = self.segments
-        return DataLoader(segments, batch_size=None, shuffle=False)
+        epoch: Any = [self.segments]
+        return DataLoader(epoch, batch_size=None, shuffle=False)
 
     def val_dataloader(self) -> DataLoader[Any]:
         whole: Any = [(0, self.windows)]
@@ -305,7 +317,9 @@ class SegmentData(pl.LightningDataModule):
 
 
 class ImitationModule(BatchedModule):
-    """Trains N networks on their segments."""
+    """Trains N networks on their segments, a gradient step for each."""
+
+    fused = True
 
     def __init__(
         self,
@@ -317,40 +331,77 @@ class ImitationModule(BatchedModule):
         on_epoch: Callable[[], None] = lambda: None,
     ) -> None:
         super().__init__(network, names, settings, on_epoch)
+        self.automatic_optimization = False
         self.dataset = dataset
         self.head = head
-        self.state: Tensor | None = None
-        self.train_sum = torch.zeros(len(names))
-        self.train_weight = torch.zeros(len(names))
+        self.train_loss = torch.zeros(len(names))
+        if _is_worth_compiling(settings, dataset):
+            # The compiled function takes the method's place.
+            self.segment_error = torch_compiled(self.segment_error, dynamic=False)  # type: ignore[method-assign]
 
-    def training_step(self, segment: tuple[int, int], index: int) -> Tensor:
-        first, last = segment
-        networks, drivers = self.dataset.features.shape[:2]
-        if first == 0 or self.state is None:
-            self.state = self.network.initial_state(networks, drivers)
-        windows = slice(first, last)
-        answer, state = self.network(self.dataset.features[:, :, windows], self.state)
-        self.state = state.detach()
-        weight = self.dataset.train_weight[:, :, windows]
-        error = self._weighted_error(answer, self.dataset.labels[:, :, windows], weight)
-        total = weight.sum((1, 2))
-        self.train_sum += error.detach().cpu()
-        self.train_weight += total.detach().cpu()
-        return (error / total.clamp(min=1e-9)).sum()
+    def training_step(self, segments: list[tuple[int, int]], index: int) -> None:
+        dataset, optimizer = self.dataset, self.optimizers(use_pl_optimizer=False)
+        assert isinstance(optimizer, torch.optim.Optimizer)
+        networks, drivers = dataset.features.shape[:2]
+        state = self.network.initial_state(networks, drivers)
+        base = dataset.base[:, :, None]
+        errors, weights = torch.zeros_like(self.train_loss), torch.zeros_like(self.train_loss)
+        errors, weights = errors.to(base.device), weights.to(base.device)
+        for first, last in segments:
+            windows = slice(first, last)
+            weight = dataset.train_weight[:, :, windows]
+            error, after = self.segment_error(
+                dataset.features[:, :, windows], dataset.labels[:, :, windows], weight, base, state
+            )
+            total = weight.sum((1, 2))
+            optimizer.zero_grad()
+            torch.autograd.backward((error / total.clamp(min=1e-9)).sum())
+            self.configure_gradient_clipping(optimizer)
+            optimizer.step()
+            state = after.detach()
+            errors += error.detach()
+            weights += total
+        self.train_loss = (errors / weights.clamp(min=1e-9)).cpu()
 
     def validation_step(self, segment: tuple[int, int], index: int) -> None:
-        networks, drivers = self.dataset.features.shape[:2]
+        dataset = self.dataset
+        networks, drivers = dataset.features.shape[:2]
         state = self.network.initial_state(networks, drivers)
-        answer, _ = self.network(self.dataset.features, state)
-        weight = self.dataset.validation_weight
+        answer, _ = self.network(dataset.features, state)
+        weight = dataset.validation_weight
         total = weight.sum((1, 2))
-        error = self._weighted_error(answer, self.dataset.labels, weight)
+        error = self._weighted_error(answer, dataset.labels, weight, dataset.base[:, :, None])
         validation = torch.where(total > 0, error / total.clamp(min=1e-9), math.nan)
-        self.judge(self.train_sum / self.train_weight.clamp(min=1e-9), validation.cpu())
-        self.train_sum.zero_()
-        self.train_weight.zero_()
+        self.judge(self.train_loss, validation.cpu())
 
-    def _weighted_error(self, answer: Tensor, labels: Tensor, weight: Tensor) -> Tensor:
+    def segment_error(
+        self, features: Tensor, labels: Tensor, weight: Tensor, base: Tensor, state: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Lets the networks answer S consecutive windows.
+
+        Args:
+            features: `(N, B, S, f + c)`.
+            labels: in unit space, `(N, B, S, n)`.
+            weight: `(N, B, S)`.
+            base: in unit space, `(N, B, 1, n)`.
+            state: of the networks before, `(N, B, s)`.
+
+        Returns:
+            Each network's weighted sum of squared errors, `(N,)`, and the state afterwards.
+        """
+        answer, after = self.network(features, state)
+        return self._weighted_error(answer, labels, weight, base), after
+
+    def _weighted_error(
+        self, answer: Tensor, labels: Tensor, weight: Tensor, base: Tensor
+    ) -> Tensor:
         """Returns each network's weighted sum of squared errors, `(N,)`; mean over parameters."""
-        unit = self.head.unit_parameters(answer, self.dataset.base[:, :, None])
+        unit = self.head.unit_parameters(answer, base)
         return ((unit - labels).square().mean(-1) * weight).sum((1, 2))
+
+
+def _is_worth_compiling(settings: ImitationSettings, dataset: _ImitationDataset) -> bool:
+    if settings.compile == "never" or not can_compile(dataset.base.device):
+        return False
+    steps = settings.epochs * -(-dataset.windows // (settings.batch_size or dataset.windows))
+    return settings.compile == "always" or steps >= _WORTH_COMPILING
