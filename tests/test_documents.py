@@ -82,6 +82,24 @@ def test_the_site_names_pages_that_exist() -> None:
     assert not [page for page in pages if not (ROOT / "docs" / page).is_file()]
 
 
+def test_every_public_name_is_in_the_reference() -> None:
+    text = ""
+    for path in sorted((ROOT / "docs" / "api").glob("*.md")):
+        text += path.read_text(encoding="utf-8")
+    known = set(re.findall(r"^::: cfx\.(\w+)$", text, flags=re.MULTILINE))
+    assert known >= set(cfx.__all__) - {"__version__"}
+
+
+def test_every_option_is_in_the_table_of_all_options() -> None:
+    text = (ROOT / "docs" / "choose.md").read_text(encoding="utf-8")
+    section = text.partition("## All options\n")[2]
+    for group in (*registry.GROUPS, "experiment"):
+        (row,) = re.findall(rf"^\| `{group}` \| (.*) \|$", section, flags=re.MULTILINE)
+        folder = ROOT / "conf" / group
+        for path in folder.glob("*.yaml"):
+            assert f"`{path.stem}`" in row, f"{group}={path.stem}"
+
+
 def test_the_list_of_how_tos_is_the_one_of_the_site() -> None:
     folder = ROOT / "docs" / "how-to"
     index = (folder / "index.md").read_text(encoding="utf-8")
