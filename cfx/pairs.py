@@ -257,6 +257,14 @@ class PairBatch:
         """Bumper-to-bumper gap `(P, T)`, m."""
         return self.leader_position - self.leader_length[:, None] - self.follower_position
 
+    def trimmed(self) -> PairBatch:
+        """Returns the same pairs without the frames that none of them has."""
+        frames = int(self.lengths.max())
+        signals: dict[str, Any] = {}
+        for name in (*SIGNALS, "mask"):
+            signals[name] = getattr(self, name)[:, :frames]
+        return replace(self, **signals)
+
     def __getitem__(self, index: Any) -> PairBatch:
         """Selects pairs (a slice, an index tensor or a boolean mask over P); time stays whole."""
         chosen: dict[str, Any] = {}

@@ -94,7 +94,11 @@ def sweeps() -> list[Path]:
 
 
 def jobs(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.is_dir())
+    found = []
+    for path in folder.iterdir():
+        if path.is_dir() and not path.name.startswith("."):  # submitit keeps its logs there
+            found.append(path)
+    return sorted(found)
 
 
 def summary(folder: Path) -> list[dict[str, str]]:

@@ -27,7 +27,6 @@ from cfx.calibration.shards import (
     PooledShard,
     Solver,
     WindowShard,
-    cut,
     solve_shard,
 )
 from cfx.calibration.windows import Windows, WindowSettings
@@ -190,7 +189,9 @@ class Calibrator:
 
         def shard(chosen: Tensor) -> DriverShard:
             chosen = chosen.to(device)
-            return DriverShard(self.solver, self._code, compiled, cut(batch, chosen), last[chosen])
+            return DriverShard(
+                self.solver, self._code, compiled, batch[chosen].trimmed(), last[chosen]
+            )
 
         results = self._cached("Driver-specific parameters", keys, [1] * len(pairs), shard)
         return _stacked(results, device)
@@ -221,7 +222,7 @@ class Calibrator:
         def shard(chosen: Tensor) -> PooledShard:
             groups = members[chosen].to(device)
             used = groups.any(0).nonzero()[:, 0]
-            trajectories = cut(batch, used)
+            trajectories = batch[used].trimmed()
             return PooledShard(
                 self.solver, self._code, compiled, trajectories, last[used], groups[:, used]
             )
@@ -259,7 +260,7 @@ class Calibrator:
                 self.solver,
                 self._code,
                 compiled,
-                cut(batch, chosen),
+                batch[chosen].trimmed(),
                 pair=own.pair.to(device),
                 first=own.first.to(device),
                 length=windows.settings.length,

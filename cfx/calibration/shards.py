@@ -8,7 +8,7 @@ Shapes: P pairs of a shard, T frames of the longest, W windows, K groups, n tune
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -262,18 +262,6 @@ def solve_shard(shard: CalibrationShard, report: Report) -> list[Arrays]:
             " results would differ in their last bits"
         )
     return shard.solve(report)
-
-
-def cut(batch: PairBatch, pairs: Tensor) -> PairBatch:
-    """Returns some pairs of a batch, `(P,)`, without the frames that none of them has."""
-    chosen = batch[pairs]
-    frames = int(chosen.lengths.max())
-    signals: dict[str, Any] = {}
-    for field in fields(chosen):
-        value = getattr(chosen, field.name)
-        if isinstance(value, Tensor) and value.dim() == 2:
-            signals[field.name] = value[:, :frames]
-    return replace(chosen, **signals)
 
 
 def _rows(found: Arrays) -> list[Arrays]:

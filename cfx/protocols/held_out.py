@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 
 from cfx.agents.agent import Agent
-from cfx.evaluation.closed_loop import ClosedLoop, simulate_closed_loop
+from cfx.evaluation.closed_loop import ClosedLoop
 from cfx.evaluation.evaluate import closed_loop_errors, evaluate
 from cfx.evaluation.platoon import measure_platoons
 from cfx.evaluation.result import Evaluation, Platoon
+from cfx.evaluation.shards import simulate_in_shards
 from cfx.pairs import PairBatch, PairSet
 from cfx.policies.default import DefaultPolicy
 from cfx.policies.fixed import FixedPolicy
@@ -107,7 +108,8 @@ class HeldOut:
         base = self.unseen_base if self.base is None else self.base
         loops = {}
         for name, agent in methods.items():
-            loops[name] = simulate_closed_loop(
+            loops[name] = simulate_in_shards(
+                context.engine,
                 context.simulator,
                 agent,
                 self.batch,
@@ -125,15 +127,22 @@ class HeldOut:
         """Simulates the test part with constant parameters of each driver, `(Q, n)`."""
         agent = self.context.constant(FixedPolicy(), parameters)
         each = torch.arange(len(self.first), device=self.first.device)
-        return simulate_closed_loop(self.context.simulator, agent, self.batch, self.first, each)
+        return simulate_in_shards(
+            self.context.engine, self.context.simulator, agent, self.batch, self.first, each
+        )
 
     def _full_trajectory(self, methods: Mapping[str, Agent]) -> dict[str, ClosedLoop]:
         """Simulates the test trajectories from their first frame on."""
         begin = torch.zeros_like(self.first)
         loops = {}
         for name, agent in methods.items():
-            loops[name] = simulate_closed_loop(
-                self.context.simulator, agent, self.batch, begin, self.network
+            loops[name] = simulate_in_shards(
+                self.context.engine,
+                self.context.simulator,
+                agent,
+                self.batch,
+                begin,
+                self.network,
             )
         return loops
 
@@ -171,7 +180,8 @@ class HeldOut:
     ) -> pd.DataFrame:
         """Simulates the test part after one amount of history, s; None: all there is."""
         context = self.context
-        loop = simulate_closed_loop(
+        loop = simulate_in_shards(
+            context.engine,
             context.simulator,
             self.policy,
             self.batch,

@@ -12,10 +12,11 @@ from cfx.agents.agent import Agent
 from cfx.agents.placement import ALL, group_by
 from cfx.calibration.windows import Split
 from cfx.component import Settings
-from cfx.evaluation.closed_loop import ClosedLoop, simulate_closed_loop
+from cfx.evaluation.closed_loop import ClosedLoop
 from cfx.evaluation.evaluate import evaluate
 from cfx.evaluation.platoon import measure_platoons
 from cfx.evaluation.result import Platoon
+from cfx.evaluation.shards import simulate_in_shards
 from cfx.learners.base import TrainingData
 from cfx.policies.default import DefaultPolicy
 from cfx.policies.fixed import FixedPolicy
@@ -123,12 +124,12 @@ def _test_part(
         first: the last measured frame before the test part, `(P,)`.
         fixed: driver-specific parameters, `(P, n)`.
     """
-    simulator, batch = context.simulator, context.batch
     default = context.constant(DefaultPolicy(), fixed)
     constant = context.constant(FixedPolicy(), fixed)
     each = torch.arange(len(first), device=first.device)
+    together = (context.engine, context.simulator)
     return {
-        "default": simulate_closed_loop(simulator, default, batch, first, each),
-        "fixed": simulate_closed_loop(simulator, constant, batch, first, each),
-        "policy": simulate_closed_loop(simulator, policy, batch, first, network, base=fixed),
+        "default": simulate_in_shards(*together, default, context.batch, first, each),
+        "fixed": simulate_in_shards(*together, constant, context.batch, first, each),
+        "policy": simulate_in_shards(*together, policy, context.batch, first, network, base=fixed),
     }
