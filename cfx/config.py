@@ -16,6 +16,7 @@ from cfx import registry, renamed
 from cfx.calibration.settings import CalibrationSettings, WindowSettings
 from cfx.component import Settings, validate
 from cfx.errors import ConfigError, without_passwords
+from cfx.storage import is_url
 from cfx.style.settings import StyleSettings
 
 Node = dict[str, Any]
@@ -27,7 +28,16 @@ class CacheSettings(Settings):
     """Where calibrations are kept, so that each is done once."""
 
     enabled: bool = Field(True, description="read and write the cache")
-    folder: Path = Field(Path("outputs/cache"), description="where it lies")
+    folder: Path | str = Field(
+        Path("outputs/cache"), description="where it lies: a path, or a URL such as s3://bucket/cfx"
+    )
+
+    @field_validator("folder", mode="before")
+    @classmethod
+    def _path_or_url(cls, folder: Any) -> Any:
+        if isinstance(folder, str) and not is_url(folder):
+            return Path(folder)
+        return folder
 
 
 SAYS_TOO_MUCH = (

@@ -23,6 +23,8 @@ FLOORS = (
         "progress",
         "console",
         "files",
+        "storage",
+        "locks",
         "ready",
         "signals",
         "memory",

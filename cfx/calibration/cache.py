@@ -23,11 +23,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from filelock import FileLock, Timeout
+from filelock import Timeout
 from numpy.typing import NDArray
 
 from cfx.errors import OutputError
 from cfx.files import atomic_write
+from cfx.locks import lock_for
+from cfx.storage import RemoteFolder
 
 log = logging.getLogger(__name__)
 
@@ -48,13 +50,27 @@ _POLL_S = 0.2
 
 
 class Cache:
-    """Named arrays by content key, in one folder; with `folder=None` nothing is kept."""
+    """Named arrays by content key, in one folder.
 
-    def __init__(self, folder: Path | None) -> None:
-        self.folder = folder
+    Behind a URL nothing is claimed: object stores have no locks. Processes that need the same entry
+    at the same moment then each compute it, and write the same.
+
+    Args:
+        folder: of the entries: a path, or the URL of a store; None: nothing is kept.
+    """
+
+    def __init__(self, folder: Path | str | None) -> None:
+        self.folder: Path | None = None
+        self._remote: RemoteFolder | None = None
+        if isinstance(folder, str):
+            self._remote = RemoteFolder(folder)
+        else:
+            self.folder = folder
 
     def get(self, key: str) -> Arrays | None:
         """Returns the entry, or None if there is none or it is damaged."""
+        if self._remote is not None:
+            return self._remote_entry(self._remote, key)
         path = self._path(key)
         if path is None or not path.is_file():
             return None
@@ -73,18 +89,41 @@ class Cache:
             OutputError: the folder cannot be written.
         """
         path = self._path(key)
-        if path is None:
+        if path is None and self._remote is None:
             return
+        archive = io.BytesIO()
+        # NumPy's stubs take every name for `allow_pickle`.
+        np.savez(archive, **arrays)  # type: ignore[arg-type]
+        content = archive.getvalue()
+        whole = _head(content) + content
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with atomic_write(path) as temporary:
-                archive = io.BytesIO()
-                # NumPy's stubs take every name for `allow_pickle`.
-                np.savez(archive, **arrays)  # type: ignore[arg-type]
-                content = archive.getvalue()
-                temporary.write_bytes(_head(content) + content)
+            if self._remote is not None:
+                self._remote.write(_name(key), whole)
+            if path is not None:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with atomic_write(path) as temporary:
+                    temporary.write_bytes(whole)
         except OSError as error:
             raise self._unwritable(error) from error
+
+    def _remote_entry(self, remote: RemoteFolder, key: str) -> Arrays | None:
+        """Returns an entry behind a URL, or None.
+
+        Raises:
+            OutputError: the store cannot be read.
+        """
+        try:
+            whole = remote.read(_name(key))
+        except OSError as error:
+            raise self._unwritable(error) from error
+        if whole is None:
+            return None
+        try:
+            with np.load(io.BytesIO(_checked(whole)), allow_pickle=False) as archive:
+                return {name: archive[name] for name in archive.files}
+        except (ValueError, zipfile.BadZipFile, EOFError):
+            log.warning("The cached calibration %s is damaged; it is computed again.", key)
+            return None
 
     def shares(self, keys: Sequence[str], scope: str) -> dict[str, list[int]]:
         """Returns the parts in which entries are claimed: the part's name -> positions in `keys`.
@@ -141,7 +180,7 @@ class Cache:
     def _acquire(self, held: ExitStack, name: str, *, wait: bool) -> bool:
         if self.folder is None:
             return True
-        lock = FileLock(self.folder / "claims" / f"{name}.lock")
+        lock = lock_for(self.folder / "claims" / f"{name}.lock")
         timeout = 0
         if wait:
             timeout = -1
@@ -155,15 +194,18 @@ class Cache:
         return True
 
     def _unwritable(self, error: OSError) -> OutputError:
+        where: Path | str | None = self.folder
+        if self._remote is not None:
+            where = self._remote.url
         return OutputError(
-            f"cannot write the calibration cache {self.folder}: {error.strerror};"
+            f"cannot write the calibration cache {where}: {error.strerror or error};"
             " set cache.folder to a folder that can be written, or cache.enabled=false"
         )
 
     def _path(self, key: str) -> Path | None:
         if self.folder is None:
             return None
-        return self.folder / key[:2] / f"{key}.entry"
+        return self.folder / _name(key)
 
 
 def first_fit(sizes: Mapping[str, int], enough: int) -> list[list[str]]:
@@ -188,6 +230,11 @@ def first_fit(sizes: Mapping[str, int], enough: int) -> list[list[str]]:
     return bundles
 
 
+def _name(key: str) -> str:
+    """Returns where an entry lies in its folder."""
+    return f"{key[:2]}/{key}.entry"
+
+
 def _head(content: bytes) -> bytes:
     """Returns the line before an archive."""
     return _MARK + hashlib.sha256(content).hexdigest().encode() + b"\n"
@@ -202,7 +249,15 @@ def _content(path: Path) -> bytes:
     """
     if path.stat().st_size > _LARGEST:
         raise ValueError("larger than any entry")
-    whole = path.read_bytes()
+    return _checked(path.read_bytes())
+
+
+def _checked(whole: bytes) -> bytes:
+    """Returns the archive of an entry whose checksum is right.
+
+    Raises:
+        ValueError: it is not.
+    """
     length = len(_head(b""))
     content = whole[length:]
     if whole[:length] != _head(content):

@@ -20,10 +20,11 @@ from cfx.datasets.tracks import summed
 from cfx.errors import DataError, PluginError, nearest
 from cfx.files import absolute
 from cfx.pairs import SIGNALS, Dropped, Pair, PairSet
+from cfx.storage import is_url, local_copies
 
 
-def _files(value: Any) -> Path | tuple[Path, ...]:
-    """Returns one path, or several, as absolute ones."""
+def _files(value: Any) -> Path | str | tuple[Path | str, ...]:
+    """Returns one path, or several, as absolute ones; URLs as they are."""
     several = isinstance(value, list | tuple)
     written = value if several else [value]
     if not written:
@@ -33,14 +34,14 @@ def _files(value: Any) -> Path | tuple[Path, ...]:
             raise PydanticCustomError(
                 "path", "write a file, a list of files, or a pattern such as 'i-80/*.txt'"
             )
-    paths = tuple(absolute(one) for one in written)
+    paths = tuple(one if is_url(one) else absolute(one) for one in written)
     if several:
         return paths
     return paths[0]
 
 
-FilePaths = Annotated[Path | tuple[Path, ...], BeforeValidator(_files)]
-"""One or several paths that a user writes.
+FilePaths = Annotated[Path | str | tuple[Path | str, ...], BeforeValidator(_files)]
+"""One or several paths or URLs that a user writes.
 
 `~` is their home, and a relative path starts at the working directory.
 """
@@ -87,19 +88,19 @@ class FileDatasetSettings(DatasetSettings):
 
     path: FilePaths = Field(
         description="the file to read, a list of files, or a pattern such as 'i-80/*.txt';"
-        " ~ and relative paths work"
+        " ~, relative paths and URLs such as s3://bucket/file work"
     )
 
     def files(self) -> list[Path]:
         """Returns the files in the order in which they are written.
 
-        The files of a pattern are sorted by name.
+        The files of a pattern are sorted by name. Those behind URLs are copied to this machine.
 
         Raises:
             DataError: no file matches a pattern, or a file is named twice.
         """
         written = self.path
-        if isinstance(written, Path):
+        if isinstance(written, Path | str):
             written = (written,)
         files: list[Path] = []
         for path in written:
@@ -112,8 +113,10 @@ class FileDatasetSettings(DatasetSettings):
         return files
 
 
-def _matching(path: Path) -> list[Path]:
-    """Returns the files that a path or a pattern stands for, sorted by name."""
+def _matching(path: Path | str) -> list[Path]:
+    """Returns the files that a path, a URL or a pattern stands for, sorted by name."""
+    if isinstance(path, str):
+        return local_copies(path)
     is_pattern = any(mark in str(path) for mark in "*?[")
     if path.exists() or not is_pattern:
         return [path]

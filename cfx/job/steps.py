@@ -138,11 +138,15 @@ def _context(
     require_memory(bound, f"simulator.memory_mb={parts.simulator.settings.memory_mb}")
     batch = PairBatch.of(pairs, dtype=getattr(torch, config.dtype), device=device)
     stepper = parts.simulator.stepper(parts.model, batch.dt)
-    cache_folder = None
+    cache_folder: Path | str | None = None
     workspace = None
     if config.cache.enabled:
-        cache_folder = Path(config.cache.folder).expanduser()
-        workspace = cache_folder / "training"
+        cache_folder = config.cache.folder
+        # Behind a URL there is no place for what a training writes every few seconds.
+        workspace = Path("outputs") / "training"
+        if isinstance(cache_folder, Path):
+            cache_folder = cache_folder.expanduser()
+            workspace = cache_folder / "training"
     calibrator = Calibrator(
         stepper,
         parts.optimizer,

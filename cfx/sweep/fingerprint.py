@@ -18,6 +18,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from cfx.component import content_key
+from cfx.errors import CfxError
+from cfx.storage import is_url, state
 
 
 def fingerprint(values: Mapping[str, Any]) -> str:
@@ -88,14 +90,21 @@ def command_of(config: DictConfig) -> tuple[tuple[str, ...], str, int | None]:
     return command, content_key([values, sweeper, *_sources(config)]), jobs
 
 
-def _state_of_data(node: Any) -> list[list[int]] | None:
-    """Returns size and time of change (ns) of each data file; None if the dataset names none."""
+def _state_of_data(node: Any) -> list[list[Any]] | None:
+    """Returns size and time of change (ns) of each data file; None if the dataset names none.
+
+    Of files behind a URL it is what their store says that they are.
+    """
     if not isinstance(node, Mapping) or not node.get("path"):
         return None
     named = node["path"]
     patterns = named if isinstance(named, list | tuple) else [named]
-    states = []
+    states: list[list[Any]] = []
     for pattern in patterns:
+        if is_url(pattern):
+            with contextlib.suppress(CfxError):
+                states.append(state(pattern))
+            continue
         path = Path(str(pattern)).expanduser()
         files = [str(path)] if path.exists() else sorted(glob.glob(str(path)))  # noqa: PTH207 - the pattern may be absolute, Path.glob takes none
         for file in files:

@@ -13,9 +13,10 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from filelock import FileLock, Timeout
+from filelock import BaseFileLock, Timeout
 
 from cfx.errors import ConfigError
+from cfx.locks import lock_for
 from cfx.sweep.record import Record
 
 log = logging.getLogger(__name__)
@@ -33,7 +34,7 @@ def only_one(folder: Path) -> Iterator[None]:
 
     The worker of a sweep that was killed may still run that job; this process then waits for it.
     """
-    lock = FileLock(folder / LOCK)
+    lock = lock_for(folder / LOCK)
     try:
         lock.acquire(timeout=0)
     except Timeout:
@@ -47,7 +48,7 @@ def only_one(folder: Path) -> Iterator[None]:
 
 def find_folder(
     configured: str, wanted: Path, command_hash: str, *, resumable: bool
-) -> tuple[Path, FileLock]:
+) -> tuple[Path, BaseFileLock]:
     """Returns the folder of a sweep, locked: one that is not complete yet, or a new one.
 
     Args:
@@ -80,7 +81,7 @@ def _pattern(folder: str) -> str:
     return "*".join(glob.escape(part) for part in text.split("\0"))
 
 
-def _incomplete_folder(pattern: str, command_hash: str) -> tuple[Path, FileLock] | None:
+def _incomplete_folder(pattern: str, command_hash: str) -> tuple[Path, BaseFileLock] | None:
     """Returns the newest sweep of this command that no other process runs, locked.
 
     None if there is no such sweep, or if it is complete.
@@ -102,7 +103,7 @@ def _incomplete_folder(pattern: str, command_hash: str) -> tuple[Path, FileLock]
     return None
 
 
-def _new_folder(wanted: Path) -> tuple[Path, FileLock]:
+def _new_folder(wanted: Path) -> tuple[Path, BaseFileLock]:
     """Returns a new folder, locked."""
     folder = wanted
     number = 1
@@ -116,7 +117,7 @@ def _new_folder(wanted: Path) -> tuple[Path, FileLock]:
         folder = wanted.with_name(f"{wanted.name}-{number}")
 
 
-def _named_folder(folder: Path, *, resumable: bool) -> tuple[Path, FileLock]:
+def _named_folder(folder: Path, *, resumable: bool) -> tuple[Path, BaseFileLock]:
     """Returns the folder that the user named, locked."""
     folder.mkdir(parents=True, exist_ok=True)
     lock = _try_lock(folder)
@@ -135,9 +136,9 @@ def _named_folder(folder: Path, *, resumable: bool) -> tuple[Path, FileLock]:
     return folder, lock
 
 
-def _try_lock(folder: Path) -> FileLock | None:
+def _try_lock(folder: Path) -> BaseFileLock | None:
     """Returns the lock of a folder, held by this process; None if another one holds it."""
-    lock = FileLock(folder / LOCK)
+    lock = lock_for(folder / LOCK)
     try:
         lock.acquire(timeout=0)
     except Timeout:

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self, cast
 
-from filelock import FileLock
+from filelock import BaseFileLock
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
@@ -43,7 +43,7 @@ class Sweep:
     def __init__(
         self,
         folder: Path,
-        lock: FileLock,
+        lock: BaseFileLock,
         record: Record,
         tracking: Mapping[str, Any],
         *,

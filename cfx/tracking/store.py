@@ -20,9 +20,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from filelock import FileLock, Timeout
+from filelock import BaseFileLock, Timeout
 
 from cfx.errors import TrackingError
+from cfx.locks import lock_for
 from cfx.ready import folder_of_ready_made, is_ready_made
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ class Store:
     uri: str
     client: MlflowClient
     experiment_id: str
-    lock: FileLock
+    lock: BaseFileLock
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -143,7 +144,7 @@ def open_store(uri: str, experiment: str, default: Path | None = None) -> Store:
     name = "mlflow"
     if file is not None:
         name = file.name
-    lock = FileLock(home / f"{name}.lock", timeout=4 * LOCK_SECONDS)
+    lock = lock_for(home / f"{name}.lock", timeout=4 * LOCK_SECONDS)
     with _held(lock):
         if file is not None:
             if _is_new(file):
@@ -310,7 +311,7 @@ def _import_mlflow() -> Any:
 
 
 @contextmanager
-def _held(lock: FileLock) -> Iterator[None]:
+def _held(lock: BaseFileLock) -> Iterator[None]:
     try:
         lock.acquire()
     except Timeout as error:

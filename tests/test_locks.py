@@ -1,0 +1,100 @@
+"""Locks on this machine's disks, and leases on shared ones."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from filelock import FileLock, SoftFileLease, Timeout
+
+from cfx import locks
+from cfx.calibration.cache import Cache
+from cfx.locks import is_shared, lock_for
+from cfx.sweep import only_one
+
+MOUNTS = """\
+/dev/sda1 / ext4 rw 0 0
+server:/home /home nfs4 rw 0 0
+/dev/sdb1 /home/local ext4 rw 0 0
+lustre /scratch\\040disk lustre rw 0 0
+s3 /mnt/bucket fuse.s3fs rw 0 0
+encfs /mnt/private fuse.encfs rw 0 0
+"""
+
+
+@pytest.mark.parametrize(
+    ("folder", "expected"),
+    [
+        ("/var/jobs", False),
+        ("/home/me/outputs", True),
+        ("/home/local/outputs", False),
+        ("/homework", False),
+        ("/scratch disk/x", True),
+        ("/mnt/bucket/cache", True),
+        ("/mnt/private", False),
+    ],
+)
+def test_network_file_systems_are_known_by_their_type(
+    folder: str, expected: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = Path.read_text
+    monkeypatch.setattr(
+        Path,
+        "read_text",
+        lambda path, **how: MOUNTS if str(path) == "/proc/self/mounts" else read(path, **how),
+    )
+    assert is_shared(Path(folder)) is expected
+
+
+def test_there_a_lock_is_a_lease_and_elsewhere_the_systems(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert isinstance(lock_for(tmp_path / "a"), FileLock)
+    monkeypatch.setenv("CFX_SHARED_STORAGE", "1")
+    assert isinstance(lock_for(tmp_path / "a"), SoftFileLease)
+
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from cfx import locks
+locks.LEASE_S = 2.0
+lock = locks.lock_for(Path(sys.argv[1]))
+lock.acquire()
+print("held", flush=True)
+time.sleep(60)
+"""
+
+
+def test_a_lease_is_held_while_it_is_renewed_and_free_after_its_process_is_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CFX_SHARED_STORAGE", "1")
+    monkeypatch.setattr(locks, "LEASE_S", 2.0)
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(tmp_path / "lock")],
+        stdout=subprocess.PIPE,
+        env={**os.environ, "CFX_SHARED_STORAGE": "1"},
+    ) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == b"held\n"
+        with pytest.raises(Timeout):
+            lock_for(tmp_path / "lock").acquire(timeout=3)
+        holder.kill()
+    lock = lock_for(tmp_path / "lock")
+    lock.acquire(timeout=10)
+    lock.release()
+
+
+def test_claims_and_jobs_work_with_leases(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CFX_SHARED_STORAGE", "1")
+    mine, theirs = Cache(tmp_path), Cache(tmp_path)
+    with mine.claim({"a": 1, "b": 1}, 1) as claimed:
+        assert claimed == ["a"]
+        with theirs.claim({"a": 1, "b": 1}, 10) as rest:
+            assert rest == ["b"]
+    with only_one(tmp_path):
+        assert list(tmp_path.glob("*.lease")) or list(tmp_path.glob(".*.lease"))
