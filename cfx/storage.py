@@ -22,7 +22,7 @@ _PACKAGES = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "abfs":
 """What fsspec needs for a kind of URL, where it is not fsspec itself."""
 
 _VERSIONS = ("ETag", "etag", "md5Hash", "content_md5", "mtime", "LastModified", "updated")
-"""What stores call the mark of a file's content or time, the surest first."""
+"""What stores call the version of a content, or its time, the surest first."""
 
 _CHARACTERS_OF_A_SCHEME = r"[a-zA-Z][a-zA-Z0-9+.-]+://"
 
@@ -126,7 +126,7 @@ def _copy(system: Any, path: str) -> Path:
 
 
 def _version(system: Any, path: str) -> str:
-    """Returns what changes when a file does: its size, and the mark that its store gives it."""
+    """Returns what changes when a file does: its size, and what its store calls its version."""
     about = system.info(path)
     for name in _VERSIONS:
         if name in about:
