@@ -6,7 +6,7 @@ import os
 import shlex
 import shutil
 import sys
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 
 from cfx.errors import nearest
@@ -33,8 +33,8 @@ EXTRAS: dict[tuple[str, str], str] = {
 """Options that come with another distribution or an extra, by group and name."""
 
 
-def advice(group: str, name: str, known: Iterable[str]) -> str:
-    """Returns what to do about an option that is not there: install it, or the nearest name.
+def advice(group: str, name: str, known: Sequence[str]) -> str:
+    """Returns what to do about an option that is not there: install it, or take another.
 
     Args:
         group: such as `model`.
@@ -45,7 +45,10 @@ def advice(group: str, name: str, known: Iterable[str]) -> str:
         wanted = EXTRAS[group, name]
         return f" It comes with {wanted}: {install_line(wanted)}"
     others = [option for where, option in EXTRAS if where == group]
-    return nearest(name, [*known, *others])
+    text = nearest(name, [*known, *others])
+    if known:
+        text += f" Known: {', '.join(known)}."
+    return text
 
 
 def install_line(wanted: str) -> str:
@@ -61,8 +64,7 @@ def install_line(wanted: str) -> str:
     if bracket:
         source = f'"{wanted}"'
     if (checkout / "pyproject.toml").is_file():
-        folder = os.path.relpath(checkout)
-        source = f"--editable {shlex.quote(folder + bracket + extra)}"
+        source = f"--editable {shlex.quote(_from_here(checkout) + bracket + extra)}"
     return f"{_pip()} install {source}"
 
 
@@ -71,4 +73,10 @@ def _pip() -> str:
     found = shutil.which("pip")
     if found is not None and Path(found).parent == Path(sys.executable).parent:
         return "pip"
-    return f"{shlex.quote(os.path.relpath(sys.executable))} -m pip"
+    return f"{shlex.quote(_from_here(Path(sys.executable)))} -m pip"
+
+
+def _from_here(path: Path) -> str:
+    """Returns a path from the working directory on, if it lies there, else the whole one."""
+    inside = path.is_relative_to(Path.cwd())
+    return os.path.relpath(path) if inside else str(path)

@@ -215,7 +215,6 @@ def entry(kind: str, name: str) -> Entry:
             )
         raise PluginError(
             f"{group}={name}: there is no {what} '{name}'.{advice(group, name, known)}"
-            f" Known: {', '.join(known)}."
         )
     if len(found) > 1:
         claims = " and ".join(f"{one.distribution} {one.version} ({one.target})" for one in found)

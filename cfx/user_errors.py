@@ -72,10 +72,7 @@ def _reworded(error: BaseException, overrides: Sequence[str]) -> str:
 
 def _unknown_option(path: str, options: Sequence[str]) -> str:
     group, _, name = path.rpartition("/")
-    text = f"{group}={name}: there is no {group} '{name}'.{advice(group, name, options)}"
-    if options:
-        text += f" Known: {', '.join(options)}."
-    return text
+    return f"{group}={name}: there is no {group} '{name}'.{advice(group, name, options)}"
 
 
 def _unreadable(error: OverrideParseException) -> str:
