@@ -1,4 +1,4 @@
-"""Labels per second: all windows as one batch against the plain BoTorch loop of its tutorials,
+"""Labels per second: all windows as one batch, by BoTorch and along gradients, against the plain BoTorch loop of its tutorials,
 window by window, in the same run.
 
 `pytest tests/benchmarks --benchmark-only`. What counts are the ratios in `extra_info`: they compare
@@ -26,11 +26,12 @@ from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.objectives.rmse import SpeedRmse
 from cfx.optimizers.botorch import BotorchOptimizer
+from cfx.optimizers.gradient import GradientSearch
 from cfx.optimizers.random import RandomSearch
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.trajectory import Start
 
-WINDOWS, STEPS, DT, LOOPED = 128, 5, 0.1, 2
+WINDOWS, STEPS, DT, LOOPED = 128, 5, 0.1, 6
 
 
 def windows(model: DrivingModel) -> SegmentLosses:
@@ -105,6 +106,11 @@ def test_labels_per_second(benchmark: Any, model: DrivingModel) -> None:
     searched = RandomSearch().minimize(objective, guesses, seed=0)
     random_seconds = (time.perf_counter() - began) / WINDOWS
 
+    GradientSearch().minimize(objective, guesses, seed=0)  # its kernel is compiled
+    began = time.perf_counter()
+    climbed = GradientSearch().minimize(objective, guesses, seed=0)
+    gradient_seconds = (time.perf_counter() - began) / WINDOWS
+
     began = time.perf_counter()
     with warnings.catch_warnings():
         # The plain loop warns of fits and climbs that did not converge: part of what is compared.
@@ -118,8 +124,13 @@ def test_labels_per_second(benchmark: Any, model: DrivingModel) -> None:
     benchmark.extra_info |= {
         "labels_per_second": 1 / seconds,
         "labels_per_second_random": 1 / random_seconds,
+        "labels_per_second_gradient": 1 / gradient_seconds,
         "labels_per_second_plain_loop": 1 / plain_seconds,
         "times_faster_than_plain_loop": plain_seconds / seconds,
+        "times_faster_than_plain_loop_gradient": plain_seconds / gradient_seconds,
+        "mean_loss_over_plain_loop_gradient": (
+            climbed.loss[:LOOPED].mean().item() / (sum(plain) / LOOPED)
+        ),
         "mean_loss_over_4096_random": (found.loss.mean() / searched.loss.mean()).item(),
         "mean_loss_over_plain_loop": found.loss[:LOOPED].mean().item() / (sum(plain) / LOOPED),
     }
