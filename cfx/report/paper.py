@@ -198,10 +198,10 @@ def _parameter_tables(rows: Sequence[Row]) -> Iterator[str]:
         if not spreads:
             continue
         found = sheet(spreads)
-        table = pd.DataFrame(
-            [[cell.text for cell in line] for line in found.rows],
-            columns=[column.heading for column in found.columns],
-        )
+        lines = []
+        for line in found.rows:
+            lines.append([cell.text for cell in line])
+        table = pd.DataFrame(lines, columns=[column.heading for column in found.columns])
         name = _ESCAPED.sub(r"\\\g<0>", row.name)
         caption = (
             f"Calibrated parameters, {name}: the model's default, the mean of the folds' pooled"
