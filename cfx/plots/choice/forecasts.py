@@ -10,7 +10,7 @@ import pandas as pd
 from cfx.plots.choice.trajectories import Line
 
 HORIZON_TITLE = "horizon (s)"
-HISTORY_TITLE = "history measured up to the origin (s)"
+HISTORY_TITLE = "measured history (s)"
 
 _ERRORS = (("rmse_speed", "RMSE of speed (m/s)"), ("rmse_position", "RMSE of position (m)"))
 _PANELS = 3

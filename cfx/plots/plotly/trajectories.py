@@ -17,6 +17,10 @@ DASHES: Mapping[str, str] = {
     "population": "dashdot",
     "fixed": "dash",
     "shrunk": "longdashdot",
+    "constant_speed": "dot",
+    "constant_acceleration": "dash",
+    "population_residual": "dashdot",
+    "fixed_residual": "dash",
 }
 WIDTHS: Mapping[str, float] = {"real": 2.2, "leader": 1.2, "policy": 2.2}
 

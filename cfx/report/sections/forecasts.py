@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import pandas as pd
 
@@ -16,14 +17,14 @@ from cfx.plots.choice.forecasts import (
     horizon_panels,
 )
 from cfx.plots.plotly.forecasts import forecasts_plot
-from cfx.report.blocks import Block, Figure, Grid, Group, Heading, Section, Table, Text
+from cfx.report.blocks import Block, Figure, Group, Heading, Section, Table, Text
 from cfx.report.job import Job, Runs
 from cfx.report.tables import Cell, Column, Sheet, formatted, method_cell, methods_explained, number
 
 _INTRODUCTION = (
     "From each of many moments (origins) of the test trajectories, knowing what was measured up to"
     " it, where will the driver be some seconds later? RMSE over the origins of each driver, then"
-    " the mean over drivers; in brackets its 95 % bootstrap interval over drivers. Origins of one"
+    " the mean over drivers; below it its 95 % bootstrap interval over drivers. Origins of one"
     " driver overlap, so they are never counted as independent."
 )
 
@@ -36,13 +37,15 @@ _LEADERS = {
 
 def blocks(runs: Runs) -> list[Block]:
     """Returns plots and a table for each job with forecasts."""
-    found: list[Group] = []
+    cards: list[Block] = []
+    methods: dict[str, None] = {}
     for job in runs.jobs:
         if job.forecasts is not None:
-            found.append(Group(tuple(_job_blocks(job, job.forecasts)), "card"))
-    if not found:
+            cards.append(Group(tuple(_job_blocks(job, job.forecasts)), "card"))
+            methods |= dict.fromkeys(forecast_methods(job.forecasts))
+    if not cards:
         return []
-    return [Text(_INTRODUCTION), Grid(tuple(found))]
+    return [Text(_INTRODUCTION), Text(f"Methods: {methods_explained(methods)}"), *cards]
 
 
 def _job_blocks(job: Job, table: pd.DataFrame) -> list[Block]:
@@ -50,7 +53,7 @@ def _job_blocks(job: Job, table: pd.DataFrame) -> list[Block]:
     leader = str(job.setting("protocol.leader"))
     shown: list[Block] = [
         Heading(job.name),
-        Text(f"{_LEADERS.get(leader, '')} {methods_explained(methods)}"),
+        Text(_LEADERS.get(leader, "")),
         Figure(forecasts_plot(horizon_panels(summary_of(job, table), methods), HORIZON_TITLE)),
         Table(errors(job, table, "rmse_speed", "m/s")),
         Table(errors(job, table, "rmse_position", "m")),
@@ -106,10 +109,10 @@ def _cell(job: Job, metric: str, method: str) -> Cell:
     value = job.metrics.get(key, math.nan)
     low = job.metrics.get(f"{key}/ci95_low", math.nan)
     high = job.metrics.get(f"{key}/ci95_high", math.nan)
-    shown = formatted(value, ".3f")
+    cell = number(value, formatted(value, ".3f"))
     if math.isfinite(low) and math.isfinite(high):
-        shown += f" ({formatted(low, '.3f')} to {formatted(high, '.3f')})"
-    return number(value, shown)
+        return replace(cell, second=f"{formatted(low, '.3f')} to {formatted(high, '.3f')}")
+    return cell
 
 
 def _horizons(table: pd.DataFrame) -> Sequence[float]:
