@@ -162,6 +162,18 @@ def _fetch(options: argparse.Namespace) -> int:
     return 0
 
 
+def _benchmark_parser() -> argparse.ArgumentParser:
+    from cfx.benchmark.command import parser
+
+    return parser()
+
+
+def _benchmark(arguments: Sequence[str]) -> int:
+    from cfx.benchmark.command import main as benchmark
+
+    return benchmark(arguments)
+
+
 def _ui_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "cfx ui", description="Opens the tracked jobs in MLflow, on this machine only."
@@ -326,6 +338,7 @@ COMMANDS = {
     "plugins": _plugins,
     "policies": _policies,
     "data": _data,
+    "benchmark": _benchmark,
     "report": _report,
     "ui": _ui,
     "drive": _drive,
@@ -338,6 +351,7 @@ PARSERS = {
     "plugins": _plugins_parser,
     "policies": _policies_parser,
     "data": _data_parser,
+    "benchmark": _benchmark_parser,
     "report": _report_parser,
     "ui": _ui_parser,
     "drive": _drive_parser,

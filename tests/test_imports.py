@@ -55,6 +55,7 @@ FLOORS = (
         "cite",
         "sumo",
         "publish",
+        "benchmark",
         "plugin_errors",
     ),
 )
