@@ -18,6 +18,7 @@ from cfx.datasets.tidy import write_tidy
 from cfx.errors import OutputError
 from cfx.evaluation.result import Evaluation
 from cfx.files import atomic_write, remove_leftovers
+from cfx.job.calibration_view import CalibrationView
 from cfx.metrics.base import TRANSIENT_S
 from cfx.pairs import PairSet
 from cfx.protocols.base import ProtocolResult
@@ -153,7 +154,11 @@ def write_config(output: Output, config: JobConfig) -> None:
 
 
 def write_tables(
-    output: Output, pairs: PairSet, style: StyleResult, protocol_result: ProtocolResult
+    output: Output,
+    pairs: PairSet,
+    style: StyleResult,
+    protocol_result: ProtocolResult,
+    view: CalibrationView | None = None,
 ) -> list[Path]:
     """Writes the tables of the results.
 
@@ -176,10 +181,12 @@ def write_tables(
         output.file("labels.parquet", lambda path: labels.to_parquet(path, index=False))
     if any(pair.truth for pair in pairs):
         output.file("data.parquet", lambda path: write_tidy(pairs, path))
-    return write_further_tables(output, evaluation)
+    return write_further_tables(output, evaluation, view)
 
 
-def write_further_tables(output: Output, evaluation: Evaluation) -> list[Path]:
+def write_further_tables(
+    output: Output, evaluation: Evaluation, view: CalibrationView | None = None
+) -> list[Path]:
     """Writes the tables that only some protocols deliver; returns their paths.
 
     Those that an earlier job left in the folder go.
@@ -194,6 +201,8 @@ def write_further_tables(output: Output, evaluation: Evaluation) -> list[Path]:
         "platoon.parquet": platoon,
         "history.parquet": evaluation.history,
         "forecasts.parquet": forecasts,
+        "slices.parquet": None if view is None else view.slices,
+        "fits.parquet": None if view is None else view.fits,
     }
     paths = []
     for name, table in tables.items():
@@ -209,8 +218,10 @@ def write_further_tables(output: Output, evaluation: Evaluation) -> list[Path]:
 def write_figures(
     output: Output,
     config: JobConfig,
+    pairs: PairSet,
     style: StyleResult,
     protocol_result: ProtocolResult,
+    view: CalibrationView | None,
     *,
     adapts: bool,
 ) -> list[Path]:
@@ -219,8 +230,10 @@ def write_figures(
     Args:
         output: the job's folder.
         config: of the job.
+        pairs: of the job.
         style: of its drivers.
         protocol_result: what is drawn.
+        view: slices and fits of the calibration; None without.
         adapts: as `Policy.adapts`.
 
     Raises:
@@ -231,18 +244,29 @@ def write_figures(
         from cfx.plots.matplotlib import write
 
         folder = output.folder / "figures"
+        formats = config.figures.formats
+        evaluation = protocol_result.evaluation
+        labels = None
+        if protocol_result.labels is not None:
+            labels = protocol_result.labels.to_frame(pairs, evaluation.names)
 
         def write_all() -> None:
             paths.extend(
                 write.write_figures(
                     folder,
-                    protocol_result.evaluation,
+                    evaluation,
                     style,
                     protocol_result.curves,
                     adapts=adapts,
-                    formats=config.figures.formats,
+                    formats=formats,
                 )
             )
+            if view is not None:
+                paths.extend(
+                    write.write_calibration(
+                        folder, evaluation, view.slices, view.fits, labels, formats=formats
+                    )
+                )
 
         output.run(write_all)
     return paths

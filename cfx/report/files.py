@@ -36,6 +36,7 @@ TEXT_COLUMNS = frozenset(
         "amount",
         "scope",
         "metric",
+        "parameter",
     }
 )
 _NAMES = TEXT_COLUMNS | {"cluster", "cluster_name"}

@@ -37,6 +37,9 @@ class Job:
         curves: the losses by network and epoch; None if the job left none.
         platoon: `Platoon.table`; None if no platoon was simulated.
         history: as `Evaluation.history`; None if that was not tried.
+        slices: the loss along each calibrated parameter; None if the job left none.
+        fits: errors of constant parameters on both parts of each trajectory; None if it left none.
+        labels: per-window calibrated parameters; None if the job left none.
         values: every metric of every pair, method and part of the trajectories (columns pair_id,
             driver, method, scope, metric, value); None if the job left none.
         forecasts: as `Forecasts.table`; None if there were none.
@@ -59,6 +62,9 @@ class Job:
     curves: pd.DataFrame | None
     platoon: pd.DataFrame | None = None
     history: pd.DataFrame | None = None
+    slices: pd.DataFrame | None = None
+    fits: pd.DataFrame | None = None
+    labels: pd.DataFrame | None = None
     values: pd.DataFrame | None = None
     forecasts: pd.DataFrame | None = None
     overrides: tuple[str, ...] | None = None

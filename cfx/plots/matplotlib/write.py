@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -13,8 +13,11 @@ from matplotlib.figure import Figure
 from cfx.errors import OutputError
 from cfx.evaluation.result import Evaluation
 from cfx.files import atomic_write
+from cfx.plots.choice.identifiability import fits_of, labels_of, slice_panels
+from cfx.plots.choice.trajectories import parameter_axes
 from cfx.plots.matplotlib import figures
 from cfx.plots.matplotlib.canvas import DPI, look
+from cfx.plots.matplotlib.identifiability import draw_fits, draw_labels, draw_slices
 from cfx.style.result import StyleResult
 
 _METADATA: dict[str, dict[str, None]] = {
@@ -73,13 +76,56 @@ def write_figures(
             draw["forecasts_by_history"] = partial(
                 figures.forecasts_by_history, evaluation.forecasts
             )
-    # One after the other, so that only one figure is in memory.
+    return _written(draw, folder, formats)
+
+
+def _written(
+    draw: Mapping[str, Callable[[], Figure]], folder: Path, formats: Sequence[str]
+) -> list[Path]:
+    """Draws and writes figures one after the other, so that only one is in memory."""
     paths = []
     for name, make in draw.items():
         figure = make()
         for form in formats:
             paths.append(write_figure(figure, folder / f"{name}.{form}"))
     return paths
+
+
+def write_calibration(
+    folder: Path,
+    evaluation: Evaluation,
+    slices: pd.DataFrame,
+    fits: pd.DataFrame,
+    labels: pd.DataFrame | None,
+    *,
+    formats: Sequence[str] = ("png",),
+) -> list[Path]:
+    """Draws and writes what calibration found beyond its parameters; returns their paths.
+
+    Args:
+        folder: made if it is not there.
+        evaluation: of the job.
+        slices: see `cfx.calibration.identifiability.slices`.
+        fits: errors of constant parameters on both parts.
+        labels: as `Labels.to_frame` returns them; None if there are none.
+        formats: as for `write_figures`.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    axes = parameter_axes(evaluation.names, evaluation.units, evaluation.bounds)
+    draw: dict[str, Callable[[], Figure]] = {}
+    panels = slice_panels(slices, axes)
+    if panels:
+        draw["identifiability"] = partial(draw_slices, panels)
+    found = fits_of(fits)
+    if found:
+        draw["fit_train_test"] = partial(draw_fits, found)
+    if labels is not None:
+        drivers = labels_of(labels, evaluation.table, axes)
+        if drivers:
+            draw["labels_over_time"] = partial(draw_labels, drivers[len(drivers) // 2], axes)
+    return _written(draw, folder, formats)
 
 
 def write_figure(figure: Figure, path: Path) -> Path:

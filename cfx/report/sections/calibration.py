@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,10 +14,19 @@ from cfx.plots.choice.calibration import (
     correlations,
     parameter_spreads,
 )
+from cfx.plots.choice.identifiability import (
+    NEAR,
+    Fit,
+    SlicePanel,
+    fits_of,
+    labels_of,
+    slice_panels,
+)
 from cfx.plots.choice.trajectories import ParameterAxis
 from cfx.plots.plotly.calibration import calibration_plot
+from cfx.plots.plotly.identifiability import fits_plot, labels_plot, slices_plot
 from cfx.plots.words import number as shown_number
-from cfx.plots.words import pretty_unit
+from cfx.plots.words import unit_label
 from cfx.report.blocks import Block, Figure, Section, Table, Text, job_fold
 from cfx.report.job import Job, Runs, with_constant_baseline
 from cfx.report.tables import Cell, Column, Sheet, formatted, job_names, number, text
@@ -25,6 +35,24 @@ _INTRODUCTION = (
     "Each driver's own parameters (a dot per pair), calibrated on the first part of their"
     " trajectory; pooled and default parameters beside them. Where values gather at a bound, or"
     " spread over the whole range, these recordings may hardly determine the parameter."
+)
+
+_SLICES = (
+    "How well the recordings determine each parameter: one is moved from bound to bound, the others"
+    " stay at the driver's calibrated values. Where the loss stays near its best (dashed: 5 %"
+    " above), the parameter is not determined. Where it rises, others might still make up for it."
+)
+
+_FITS = (
+    "Each driver's error on the part of their trajectory that was calibrated on, against that on"
+    " the test part. Where a driver-specific dot lies far above the line, its parameters were"
+    " fitted to more than the driver's style."
+)
+
+_LABELS = (
+    "Per-window calibrated parameters (labels) over time. Pale ones hardly mattered in their"
+    " window, so that their values are arbitrary. The sensitivity below says how much a choice"
+    " mattered, in the objective's unit."
 )
 
 
@@ -39,9 +67,37 @@ def blocks(runs: Runs) -> list[Block]:
     for k, jobs in enumerate(together.values()):
         spreads = spreads_of(jobs[0])
         table = correlations(jobs[0].pairs, [spread.axis for spread in spreads])
-        parts = [Figure(calibration_plot(spreads, table)), Table(sheet(spreads), explain=k == 0)]
+        parts: list[Block] = [Figure(calibration_plot(spreads, table))]
+        panels = slices_of(jobs[0])
+        parts += [Table(sheet(spreads, panels), explain=k == 0), *_beyond(jobs, panels)]
         found.append(job_fold(job_names(jobs), parts, first=k == 0))
     return [Text(_INTRODUCTION), *found] if found else []
+
+
+def _beyond(jobs: Sequence[Job], panels: Sequence[SlicePanel]) -> list[Block]:
+    """Returns what calibration found beyond its parameters, as far as a job has kept it."""
+    found: list[Block] = []
+    if panels:
+        found += [Text(_SLICES), Figure(slices_plot(panels))]
+    fits: tuple[Fit, ...] = ()
+    if jobs[0].fits is not None:
+        fits = fits_of(jobs[0].fits)
+    if fits:
+        found += [Text(_FITS), Figure(fits_plot(fits))]
+    for job in jobs:
+        if job.labels is not None:
+            drivers = labels_of(job.labels, job.pairs, _axes(job))
+            if drivers:
+                found += [Text(_LABELS), Figure(labels_plot(drivers, _axes(job)))]
+                break
+    return found
+
+
+def slices_of(job: Job) -> tuple[SlicePanel, ...]:
+    """Returns the loss along each tuned parameter of a job; () if it has kept none."""
+    if job.slices is None:
+        return ()
+    return slice_panels(job.slices, _axes(job))
 
 
 def spreads_of(job: Job) -> tuple[ParameterSpread, ...]:
@@ -70,32 +126,37 @@ def _fingerprint(spreads: tuple[ParameterSpread, ...]) -> str:
     return found.hexdigest()
 
 
-def sheet(spreads: tuple[ParameterSpread, ...]) -> Sheet:
+def sheet(spreads: Sequence[ParameterSpread], panels: Sequence[SlicePanel] = ()) -> Sheet:
     """Returns a row per parameter."""
-    near = f"{AT_BOUND:.0%}".replace("%", " %")
+    at = f"{AT_BOUND:.0%}".replace("%", " %")
     columns = (
         Column("Parameter", number=False),
-        Column("Unit", number=False),
         Column("Bounds", "Within them calibration has searched.", number=False),
         Column("Default", "The model's."),
         Column("Pooled", "Mean over the folds' pooled parameters."),
         Column("Median", "Of the driver-specific values: half of the pairs have more."),
         Column("5 % to 95 %", "Quantiles of the driver-specific values.", number=False),
-        Column("At the lower bound", f"Share of the pairs within {near} of the range of it."),
+        Column("At the lower bound", f"Share of the pairs within {at} of the range of it."),
         Column("At the upper bound", "The same."),
+        Column(
+            "Flat on",
+            f"Share of the range on which the loss is within {NEAR:.0%} of its best, the others"
+            " held; median over pairs.".replace("%", " %", 1),
+        ),
     )
-    return Sheet(columns, tuple(_row(spread) for spread in spreads))
+    near = {panel.axis.name: panel.near for panel in panels}
+    return Sheet(columns, tuple(_row(spread, near) for spread in spreads))
 
 
-def _row(spread: ParameterSpread) -> tuple[Cell, ...]:
+def _row(spread: ParameterSpread, near: Mapping[str, float]) -> tuple[Cell, ...]:
     axis = spread.axis
     assert axis.low is not None
     assert axis.high is not None
+    share = near.get(axis.name, float("nan"))
     low, median, high = np.quantile(spread.values, (0.05, 0.5, 0.95))
     pooled = float(spread.pooled.mean()) if len(spread.pooled) else float("nan")
     return (
-        replace(text(axis.name), second=axis.meaning),
-        text(pretty_unit(axis.unit)),
+        replace(text(unit_label(axis.name, axis.unit)), second=axis.meaning),
         text(f"{shown_number(axis.low)} to {shown_number(axis.high)}"),
         number(spread.default, shown_number(spread.default)),
         number(pooled, shown_number(pooled)),
@@ -103,6 +164,7 @@ def _row(spread: ParameterSpread) -> tuple[Cell, ...]:
         text(f"{shown_number(float(low))} to {shown_number(float(high))}"),
         number(spread.at_low, formatted(spread.at_low, ".0%")),
         number(spread.at_high, formatted(spread.at_high, ".0%")),
+        number(share, formatted(share, ".0%")),
     )
 
 

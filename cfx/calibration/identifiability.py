@@ -1,0 +1,109 @@
+"""How well recordings determine calibrated parameters, and how they fit where they were calibrated.
+
+**Slices.** From a driver's calibrated parameters one is moved from bound to bound, the others stay.
+Where the loss hardly rises, these recordings do not determine the parameter. Where it rises, others
+might still make up for the move: a full profile, which calibrates the others anew at every place,
+is never higher than the slice.
+
+**Fit.** The errors of constant parameters on the part of each trajectory that was calibrated on.
+
+Shapes: P pairs, n tuned parameters, G places.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pandas as pd
+import torch
+from torch import Tensor
+
+from cfx.calibration.calibrator import Calibrator
+from cfx.calibration.losses import SegmentLosses
+from cfx.objectives.base import Objective
+from cfx.objectives.rmse import GapRmse, SpeedRmse
+from cfx.pairs import PairBatch
+
+PLACES = 21
+"""G: places between a parameter's bounds, both included."""
+
+
+def slices(
+    calibrator: Calibrator,
+    batch: PairBatch,
+    last: Tensor,
+    parameters: Tensor,
+    pair_ids: Sequence[str],
+) -> pd.DataFrame:
+    """Returns the loss along each parameter's slice.
+
+    Args:
+        calibrator: whose model and objective count.
+        batch: P pairs.
+        last: `(P,)`, the last frame that is compared; simulated from frame 0 in one closed loop.
+        parameters: `(P, n)`, the calibrated ones, SI units.
+        pair_ids: of the pairs.
+
+    Returns:
+        Columns: pair_id, parameter, place (0 at the lower bound, 1 at the upper, in the space that
+        is calibrated in), value (SI units), loss, best_loss (with the calibrated parameters), both
+        in the objective's unit and without the prior.
+    """
+    space = calibrator.space
+    best = space.to_unit(parameters)
+    pairs, count = best.shape
+    places = torch.linspace(0, 1, PLACES, dtype=best.dtype, device=best.device)
+    moved = best[:, None, None].repeat(1, count, PLACES, 1)
+    for column in range(count):
+        moved[:, column, :, column] = places
+    candidates = torch.cat([best[:, None], moved.reshape(pairs, count * PLACES, count)], dim=1)
+    losses = losses_of(calibrator, calibrator.objective, batch, last, candidates)
+    values = torch.diagonal(space.from_unit(moved), dim1=1, dim2=3)  # (P, G, n)
+    per_pair = count * PLACES
+    return pd.DataFrame(
+        {
+            "pair_id": pd.Series(list(pair_ids)).repeat(per_pair).to_numpy(),
+            "parameter": pd.Series(list(space.names)).repeat(PLACES).tolist() * pairs,
+            "place": places.cpu().tolist() * count * pairs,
+            "value": values.transpose(1, 2).reshape(-1).cpu().numpy(),
+            "loss": losses[:, 1:].reshape(-1).cpu().numpy(),
+            "best_loss": losses[:, :1].repeat(1, per_pair).reshape(-1).cpu().numpy(),
+        }
+    )
+
+
+def training_errors(
+    calibrator: Calibrator, batch: PairBatch, last: Tensor, parameters: Tensor
+) -> dict[str, Tensor]:
+    """Returns `rmse_speed` (m/s) and `rmse_gap` (m) up to a last frame, `(P,)` each.
+
+    Args:
+        calibrator: whose model counts.
+        batch: P pairs.
+        last: `(P,)`, the last frame that is compared.
+        parameters: `(P, n)`, SI units.
+    """
+    unit = calibrator.space.to_unit(parameters)[:, None]
+    objectives: dict[str, Objective] = {"rmse_speed": SpeedRmse(), "rmse_gap": GapRmse()}
+    found = {}
+    for name, objective in objectives.items():
+        found[name] = losses_of(calibrator, objective, batch, last, unit)[:, 0]
+    return found
+
+
+@torch.no_grad()
+def losses_of(
+    calibrator: Calibrator, objective: Objective, batch: PairBatch, last: Tensor, candidates: Tensor
+) -> Tensor:
+    """Returns losses `(P, q)` of candidates `(P, q, n)` in unit space, pair by pair in chunks."""
+    pair = torch.arange(len(batch), device=candidates.device)
+    first = torch.zeros_like(pair)
+    segments = SegmentLosses.of_segments(
+        calibrator.simulator, objective, batch, pair, first, last.to(pair.device)
+    )
+    per_pair = segments.bytes_per_candidate * candidates.shape[1]
+    size = max(1, calibrator.memory // max(1, per_pair))
+    parts = []
+    for part in torch.split(pair, size):
+        parts.append(segments.take(part)(candidates[part]))
+    return torch.cat(parts)
