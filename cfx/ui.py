@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from cfx.errors import ConfigError, TrackingError
+from cfx.tracking.headline import PERCENT, RESULT, SPEED_ERROR
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -36,25 +37,47 @@ IMPROVEMENT = "metrics.`rmse_improvement/mean`"
 """What the tables of jobs are sorted by."""
 
 _COLUMNS = (
-    IMPROVEMENT,
-    "metrics.`rmse_improvement/ci95_low`",
-    "metrics.`rmse_improvement/ci95_high`",
-    "metrics.`rmse_improvement/win_rate`",
-    "metrics.`rmse_speed/policy`",
-    "metrics.`rmse_speed/fixed`",
-    "metrics.`rmse_speed/default`",
-    "metrics.`collisions/policy`",
     "tags.`model`",
     "tags.`policy`",
-    "tags.`optimizer`",
+    "tags.`learner`",
+    f"tags.`{RESULT}`",
+    f"metrics.`{PERCENT}`",
+    f"metrics.`{SPEED_ERROR}`",
+    "metrics.`collisions/policy`",
+    IMPROVEMENT,
+    "metrics.`rmse_speed/fixed`",
+    "metrics.`rmse_speed/default`",
+    "tags.`protocol`",
     "tags.`data`",
+    "tags.`optimizer`",
+    "tags.`objective`",
     "tags.`style.cluster`",
     "tags.`seed`",
 )
-"""Columns of those tables."""
+"""Columns of those tables: what it is, and the improvement with its interval, come first."""
 
-_CHARTS = "rmse_(improvement/mean|speed)"
+_WIDTHS = {f"tags.`{RESULT}`": 260}
+"""Pixels of columns that need more than MLflow gives them."""
+
+_CHARTS = f"{PERCENT}|{SPEED_ERROR}|rmse_(improvement/mean|speed)"
 """Metrics that MLflow's charts show, a regular expression."""
+
+_SECTION = "cfx"
+
+_FIRST_CHARTS = (
+    {"uuid": "cfx-improvement", "type": "BAR", "metricKey": PERCENT, "runsCountToCompare": 20},
+    {
+        "uuid": "cfx-difference",
+        "type": "DIFFERENCE",
+        "chartName": "Settings that differ",
+        "compareGroups": ["Parameters"],
+        "showChangeFromBaseline": False,
+        "showDifferencesOnly": True,
+        "baselineColumnUuid": "",
+        "runsCountToCompare": 10,
+    },
+)
+"""Charts that come before those that MLflow makes of every metric."""
 
 _READY_S = 120.0
 """How long the server may take to answer, s."""
@@ -246,10 +269,13 @@ def _shared_view(client: MlflowClient, experiment: str, chosen: str) -> str:
     Args:
         chosen: MLflow's search for the runs to show.
     """
-    widths = {}
+    widths = dict(_WIDTHS)
     for column in _COLUMNS:
         if column.startswith("metrics"):
             widths[column] = 8 * len(column) - 40
+    section = {"uuid": _SECTION, "name": "Improvement, and what differs", "display": True}
+    always = {"deleted": False, "isGenerated": False}
+    charts = [{**chart, "metricSectionId": _SECTION, **always} for chart in _FIRST_CHARTS]
     view = {
         "searchFilter": chosen,
         "orderByKey": IMPROVEMENT,  # sorted by date, MLflow would fold jobs away under their sweep
@@ -258,6 +284,9 @@ def _shared_view(client: MlflowClient, experiment: str, chosen: str) -> str:
         "columnOrder": list(_COLUMNS),
         "columnWidths": widths,
         "chartsSearchFilter": _CHARTS,
+        "isAccordionReordered": True,  # else MLflow sorts the sections by their names
+        "compareRunSections": [{**section, "isReordered": False, **always}],
+        "compareRunCharts": charts,
     }
     key = "cfx-" + hashlib.sha256(chosen.encode()).hexdigest()[:12]
     client.set_experiment_tag(experiment, f"mlflow.sharedViewState.{key}", json.dumps(view))

@@ -209,6 +209,12 @@ def write_tidy(pairs: PairSet, path: Path | str) -> None:
         ) from None
 
 
+def frame_of(pairs: PairSet) -> pd.DataFrame:
+    """Returns pairs as a table in the tidy layout."""
+    frame: pd.DataFrame = _as_table(pairs).to_pandas()
+    return frame
+
+
 def _write(table: Any, temporary: Path, name: str) -> None:
     if name.endswith(".parquet"):
         pq.write_table(table, temporary, compression="zstd")

@@ -19,7 +19,9 @@ from cfx.calibration.settings import WindowSettings
 from cfx.config import JobConfig
 from cfx.errors import PluginError
 from cfx.job import output as files
+from cfx.job.calibration_view import CalibrationView, calibration_view
 from cfx.job.console import report
+from cfx.job.description import described
 from cfx.job.output import Output
 from cfx.job.parts import (
     Parts,
@@ -93,7 +95,10 @@ def take_steps(
         context = _context(config, parts, pairs, style, device)
         with closing(context.simulator), closing(parts.engine):
             protocol_result = _run_protocol(parts.protocol, context)
-        result = _keep(config, parts, output, pairs, style, protocol_result, tracker)
+            view = None
+            if config.figures.enabled:
+                view = calibration_view(context, protocol_result.evaluation)
+        result = _keep(config, parts, output, pairs, style, protocol_result, view, tracker)
     report(
         result,
         protocol_result.evaluation,
@@ -194,6 +199,7 @@ def _keep(
     pairs: PairSet,
     style: StyleResult,
     protocol_result: ProtocolResult,
+    view: CalibrationView | None,
     tracker: Tracker,
 ) -> JobResult:
     """Writes everything into the folder, then into MLflow."""
@@ -207,10 +213,10 @@ def _keep(
 
     output.replace(config)
     policy_folder = output.folder / "policy"
-    further = files.write_tables(output, pairs, style, protocol_result)
+    further = files.write_tables(output, pairs, style, protocol_result, view)
     output.run(lambda: checkpoint.save(protocol_result.policy, policy_folder))
     figures = files.write_figures(
-        output, config, style, protocol_result, adapts=parts.policy.adapts
+        output, config, pairs, style, protocol_result, view, adapts=parts.policy.adapts
     )
     demo = files.write_demo(output, config, pairs, protocol_result)
     files.write_provenance(
@@ -224,11 +230,13 @@ def _keep(
     # Before MLflow, so that no failure there loses it.
     files.write_metrics(output, metrics)
 
-    tracker.log_evaluation(evaluation)
+    tracker.log_evaluation(evaluation, adapts=parts.policy.adapts)
+    tracker.log_data(pairs, str(config.data["name"]))
+    tracker.describe(described(config, pairs, metrics, adapts=parts.policy.adapts))
     tracker.log_metrics(of_training)
     tracker.log_curves(protocol_result.curves)
     tracker.log_figures(figures)
-    tracker.log_policy(policy_folder)
+    tracker.log_policy(policy_folder, pairs)
     tracked = [output.folder / name for name in files.TRACKED]
     tracker.log_files(tracked + further + demo)
     return JobResult(

@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 from urllib.parse import quote, urlencode
@@ -19,10 +20,12 @@ from urllib.parse import quote, urlencode
 import numpy as np
 import pandas as pd
 
-from cfx.errors import TrackingError
+from cfx.errors import CfxError, TrackingError
 from cfx.evaluation.result import Evaluation
 from cfx.learners.curves import over_networks
+from cfx.pairs import SIGNALS, PairSet
 from cfx.tracking import provenance
+from cfx.tracking.headline import RESULT, headline, without_improvements
 from cfx.tracking.store import Store, open_store, tracking_uri, translate_errors
 
 if TYPE_CHECKING:
@@ -36,6 +39,10 @@ CURVE_POINTS = 200
 _PARAMETER_LENGTH = 6000  # MLflow's limit for a parameter's value
 _TAG_LENGTH = 5000  # what MLflow's servers of every version take
 _KEY_LENGTH = 250
+_DATASET_NAME = 500  # MLflow's limit for a dataset's name
+_EXAMPLE_FRAMES = 50
+"""Frames of a model's input example."""
+
 _SERVED = Path(__file__).with_name("served_policy.py")
 
 
@@ -105,8 +112,18 @@ class Tracker:
     def log_metrics(self, metrics: Mapping[str, float]) -> None:
         """Logs further metrics."""
 
-    def log_evaluation(self, evaluation: Evaluation) -> None:
-        """Logs `Evaluation.metrics()` and the table of all pairs."""
+    def log_evaluation(self, evaluation: Evaluation, *, adapts: bool = True) -> None:
+        """Logs `Evaluation.metrics()`, the headline, and the table of all pairs.
+
+        Args:
+            adapts: as `Policy.adapts`; a policy that does not adapt improves nothing.
+        """
+
+    def log_data(self, pairs: PairSet, name: str) -> None:
+        """Logs which recordings the job used, as MLflow's dataset of the run."""
+
+    def describe(self, text: str) -> None:
+        """Gives the run its description, Markdown."""
 
     def log_curves(self, curves: pd.DataFrame) -> None:
         """Logs `train_loss` and `validation_loss`, means over the networks, by epoch.
@@ -130,13 +147,15 @@ class Tracker:
     def log_files(self, paths: Sequence[Path]) -> None:
         """Logs files at the top of the run's artifacts."""
 
-    def log_policy(self, folder: Path) -> None:
+    def log_policy(self, folder: Path, example: PairSet | None = None) -> None:
         """Logs a saved policy as a model.
 
         `mlflow.pyfunc.load_model(tracker.model_uri).predict(frame)` uses it.
 
         Args:
             folder: what `Agent.save` wrote.
+            example: pairs of which a few seconds show what the model takes; with them the model has
+                a signature and an input example.
         """
 
     def how_to_open(self) -> tuple[str, ...]:
@@ -241,9 +260,40 @@ class MlflowTracker(Tracker):
             points.append((name, value, 0))
         self._log_metrics(points)
 
-    def log_evaluation(self, evaluation: Evaluation) -> None:
-        self.log_metrics(evaluation.metrics())
+    def log_evaluation(self, evaluation: Evaluation, *, adapts: bool = True) -> None:
+        metrics = evaluation.metrics()
+        values, result = headline(metrics, adapts=adapts)
+        tags = {RESULT: result}
+        if not adapts:
+            metrics = without_improvements(metrics)
+            tags["learner"] = "none"
+        self.log_metrics(values | metrics)
+        self.set_tags(tags)
         self.log_table(evaluation.table, "pairs.json")
+
+    def log_data(self, pairs: PairSet, name: str) -> None:
+        from mlflow.entities import Dataset, DatasetInput, InputTag
+
+        profile = {
+            "pairs": len(pairs),
+            "drivers": len({pair.driver for pair in pairs}),
+            "frames": sum(len(pair) for pair in pairs),
+            "time_step_s": pairs.dt,
+            "fingerprint": pairs.fingerprint,
+        }
+        dataset = Dataset(
+            name=_dataset_name(name, Path(pairs.source).name),
+            digest=pairs.fingerprint[:8],
+            source_type="local",
+            source=json.dumps({"uri": pairs.source}),
+            profile=json.dumps(profile),
+        )
+        tags = [InputTag("mlflow.data.context", "calibration and test")]
+        with translate_errors("log the dataset"):
+            self.store.client.log_inputs(self.run_id, [DatasetInput(dataset, tags)])
+
+    def describe(self, text: str) -> None:
+        self.set_tags({"mlflow.note.content": text})
 
     def log_curves(self, curves: pd.DataFrame) -> None:
         points = []
@@ -275,7 +325,7 @@ class MlflowTracker(Tracker):
     def log_files(self, paths: Sequence[Path]) -> None:
         self._log_artifacts(paths, None)
 
-    def log_policy(self, folder: Path) -> None:
+    def log_policy(self, folder: Path, example: PairSet | None = None) -> None:
         if not folder.is_dir():
             raise TrackingError(f"{folder} holds no policy to log")
         self._log_artifacts(sorted(folder.iterdir()), "policy")
@@ -299,6 +349,7 @@ class MlflowTracker(Tracker):
                 path,
                 python_model=str(_SERVED),
                 artifacts={"policy": str(folder.absolute())},
+                **_example(folder, example),
                 pip_requirements=[
                     f"cfx-driving=={provenance.version()}",
                     *(f"{name}=={found}" for name, found in self._plugins.items()),
@@ -359,6 +410,34 @@ class MlflowTracker(Tracker):
             if self._parent_id is not None and self._sweep is not None:
                 with self.store.locked():
                     _settle(self.store, self._parent_id, _safe(self._sweep))
+
+
+def _dataset_name(name: str, source: str) -> str:
+    """Returns what MLflow calls the recordings: the dataset's name and the file's."""
+    if source.startswith(name):
+        return source[:_DATASET_NAME]
+    return f"{name}: {source}"[:_DATASET_NAME]
+
+
+def _example(folder: Path, pairs: PairSet | None) -> dict[str, Any]:
+    """Returns the signature and the input example of a saved policy; {} without pairs."""
+    if pairs is None or not len(pairs):
+        return {}
+    from mlflow.models import infer_signature
+
+    from cfx.agents import checkpoint
+    from cfx.datasets.tidy import frame_of
+
+    first = pairs[0]
+    length = min(len(first), _EXAMPLE_FRAMES)
+    cut = {name: getattr(first, name)[:length] for name in SIGNALS}
+    frame = frame_of(PairSet((replace(first, truth={}, truth_model="", **cut),), pairs.source))
+    try:
+        answer = checkpoint.load(folder).predict_frame(frame)
+    except CfxError as error:
+        log.info("The policy has no input example in MLflow: %s", error)
+        return {}
+    return {"signature": infer_signature(frame, answer), "input_example": frame}
 
 
 def sweep_link(experiment_id: str, sweep: str) -> str:
