@@ -423,7 +423,8 @@ def _example(folder: Path, pairs: PairSet | None) -> dict[str, Any]:
     """Returns the signature and the input example of a saved policy; {} without pairs."""
     if pairs is None or not len(pairs):
         return {}
-    from mlflow.models import infer_signature
+    from mlflow.models import ModelSignature
+    from mlflow.types.schema import AnyType, ColSpec, Schema
 
     from cfx.agents import checkpoint
     from cfx.datasets.tidy import frame_of
@@ -437,7 +438,13 @@ def _example(folder: Path, pairs: PairSet | None) -> dict[str, Any]:
     except CfxError as error:
         log.info("The policy has no input example in MLflow: %s", error)
         return {}
-    return {"signature": infer_signature(frame, answer), "input_example": frame}
+    # MLflow would refuse a whole number where a signature says a float, and a number where it says
+    # a text; the table's own checks convert both.
+    taken = Schema([ColSpec(AnyType(), str(name)) for name in frame])
+    given = [ColSpec("string", "pair_id")]
+    for name in answer.columns[1:]:
+        given.append(ColSpec("double", str(name)))
+    return {"signature": ModelSignature(taken, Schema(given)), "input_example": frame}
 
 
 def sweep_link(experiment_id: str, sweep: str) -> str:

@@ -30,6 +30,7 @@ from cfx.models.krauss import Krauss
 from cfx.policies.features import token_width
 from cfx.policies.gru import GruPolicy
 from cfx.tracking import provenance
+from cfx.tracking.headline import headline
 from cfx.tracking.store import download_run, quiet, translate_errors
 from cfx.tracking.tracker import CURVE_POINTS, MlflowTracker, Tracker, sweep_link
 from tests.drives import wavy_pairs
@@ -119,7 +120,9 @@ def test_a_job_is_kept_under_the_names_of_the_contract(
     assert kept.info.run_name == "krauss-gru-random-synthetic"
     losses = {"train_loss", "validation_loss"}
     metrics = {name: value for name, value in kept.data.metrics.items() if name not in losses}
-    assert metrics == pytest.approx(results.evaluation.metrics())
+    first, words = headline(results.evaluation.metrics(), adapts=True)
+    assert metrics == pytest.approx(first | results.evaluation.metrics())
+    assert kept.data.tags["result"] == words
     assert losses <= set(kept.data.metrics)
     expected = provenance.flatten(config_of(uri).model_dump(mode="json"))
     assert kept.data.params == expected
@@ -401,6 +404,7 @@ def saved_policy(tmp_path: Path) -> SimpleNamespace:
         policy=trained,
         folder=tmp_path / "policy",
         frame=pd.read_parquet(tmp_path / "pairs.parquet"),
+        pairs=pairs,
     )
 
 
@@ -408,7 +412,7 @@ def test_a_logged_policy_loads_again_and_predicts_the_same(
     uri: str, client: Any, saved_policy: SimpleNamespace, tmp_path: Path
 ) -> None:
     with begin(uri) as run:
-        run.log_policy(saved_policy.folder)
+        run.log_policy(saved_policy.folder, saved_policy.pairs)
     (output,) = client.get_run(run.run_id).outputs.model_outputs
     assert run.model_uri == f"models:/{output.model_id}"
     expected = saved_policy.policy.predict_frame(saved_policy.frame)
@@ -423,6 +427,12 @@ def test_a_logged_policy_loads_again_and_predicts_the_same(
             mlflow.set_tracking_uri(before)
             os.environ.pop("MLFLOW_TRACKING_URI", None)  # MLflow sets it too
         pd.testing.assert_frame_equal(loaded.predict(saved_policy.frame), expected)
+        # Ids and lengths as whole numbers, as a user's CSV has them.
+        plain = saved_policy.frame.assign(leader_id=1, leader_length_m=5)
+        assert list(loaded.predict(plain).columns) == list(expected.columns)
+        assert "leader_speed_mps" in loaded.metadata.get_input_schema().input_names()
+        assert loaded.metadata.get_output_schema().input_names() == list(expected.columns)
+        assert len(loaded.input_example) == 50
     files = {path.name for path in (tmp_path / "store").rglob("*") if path.is_file()}
     assert {"served_policy.py", "policy.safetensors", "policy.json", "requirements.txt"} <= files
     assert not any(name.endswith(".pkl") for name in files)
@@ -463,7 +473,7 @@ def test_nothing_is_printed_and_nothing_global_changes(
     with begin(f"sqlite:///{tmp_path}/fresh.db") as run:
         run.log_evaluation(results.evaluation)
         run.log_curves(results.curves)
-        run.log_policy(saved_policy.folder)
+        run.log_policy(saved_policy.folder, saved_policy.pairs)
     assert tuple(capfd.readouterr()) == ("", "")
     assert (root.handlers[:], root.level, ours.level, dict(os.environ)) == state
     assert mlflow.get_tracking_uri() == before
@@ -558,3 +568,27 @@ def test_flatten() -> None:
     assert provenance.flatten(nested) == {
         "a.b": "1", "a.c": "{}", "d": "[1, 2]", "e.0.f": "null", "g": "true", "h": "0.5",
     }  # fmt: skip
+
+
+def test_the_recordings_and_a_description_are_the_runs(
+    uri: str, client: Any, saved_policy: SimpleNamespace
+) -> None:
+    pairs = saved_policy.pairs
+    with begin(uri) as run:
+        run.log_data(pairs, "tidy")
+        run.describe("**What** it is.")
+    kept = client.get_run(run.run_id)
+    (one,) = kept.inputs.dataset_inputs
+    assert one.dataset.digest == pairs.fingerprint[:8]
+    assert json.loads(one.dataset.profile)["pairs"] == 2
+    assert kept.data.tags["mlflow.note.content"] == "**What** it is."
+
+
+def test_a_calibration_logs_no_improvement(uri: str, client: Any) -> None:
+    results = make_results(pairs=2, frames=10)
+    with begin(uri) as run:
+        run.log_evaluation(results.evaluation, adapts=False)
+    kept = client.get_run(run.run_id).data
+    assert not [name for name in kept.metrics if "improvement" in name]
+    assert kept.tags["result"].startswith("calibration; driver-specific")
+    assert kept.tags["learner"] == "none"
