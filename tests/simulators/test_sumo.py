@@ -116,6 +116,17 @@ def test_longer_time_steps_are_sumos_too(model: DrivingModel, dt: float, case: C
     sumo.close()
 
 
+def test_a_leader_of_length_0_is_where_its_rear_bumper_is(case: Case) -> None:
+    model = IdmSumo(limits=None)
+    p = case.parameters(model)
+    rear = case.leader.position - case.leader.length
+    net = Leader(rear, case.leader.speed, case.leader.acceleration, torch.zeros(PAIRS).double())
+    for sumo in in_sumo(model):
+        expected = sumo.advance(sumo.begin(case.start), case.leader, p)[2]
+        found = sumo.advance(sumo.begin(case.start), net, p)[2]
+        torch.testing.assert_close(found, expected, rtol=0.0, atol=1e-9)
+
+
 def test_a_drive_in_parts_is_the_drive_in_one(case: Case) -> None:
     model = KraussSumo()
     p = case.parameters(model)
