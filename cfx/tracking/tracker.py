@@ -440,11 +440,12 @@ def _example(folder: Path, pairs: PairSet | None) -> dict[str, Any]:
         return {}
     # MLflow would refuse a whole number where a signature says a float, and a number where it says
     # a text; the table's own checks convert both.
-    taken = Schema([ColSpec(AnyType(), str(name)) for name in frame])
-    given = [ColSpec("string", "pair_id")]
+    taken: list[Any] = [ColSpec(AnyType(), str(name)) for name in frame]
+    given: list[Any] = [ColSpec("string", "pair_id")]
     for name in answer.columns[1:]:
         given.append(ColSpec("double", str(name)))
-    return {"signature": ModelSignature(taken, Schema(given)), "input_example": frame}
+    signature = ModelSignature(Schema(taken), Schema(given))
+    return {"signature": signature, "input_example": frame}
 
 
 def sweep_link(experiment_id: str, sweep: str) -> str:
