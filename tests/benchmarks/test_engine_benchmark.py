@@ -1,0 +1,81 @@
+"""What a cluster costs: milliseconds for each shard, and the share of two cores that is used.
+
+Run alone: `make bench`, or with pytest's `-k engine`. Other work on the machine makes both worse.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import pytest
+import torch
+
+from cfx.calibration.cache import Cache
+from cfx.calibration.calibrator import Calibrator
+from cfx.calibration.windows import Windows, WindowSettings
+from cfx.engine.base import Engine
+from cfx.engine.dask.engine import DaskEngine
+from cfx.engine.local import LocalEngine
+from cfx.models.w99 import W99
+from cfx.optimizers.random import RandomSearch
+from cfx.pairs import PairBatch
+from cfx.progress import Task
+from cfx.simulation import threads
+from cfx.simulation.rollout import MemoryStepper
+from tests.drives import wavy_pairs
+from tests.engine.work import slowly
+
+SHARDS = 200
+
+
+def nothing(_units: int) -> None:
+    """Reports to nobody."""
+
+
+@pytest.fixture(scope="module")
+def engine() -> Iterator[Engine]:
+    made = DaskEngine(workers=2)
+    list(made.map(slowly, [(0, 0.0)] * 4, nothing))
+    yield made
+    made.close()
+
+
+def test_overhead_of_a_shard(benchmark, engine: Engine) -> None:
+    """Shards that do nothing: all of it is overhead."""
+
+    def work() -> None:
+        assert len(list(engine.map(slowly, [(1, 0.0)] * SHARDS, nothing))) == SHARDS
+
+    benchmark.pedantic(work, rounds=3)
+    benchmark.extra_info["ms per shard"] = 1000 * benchmark.stats["min"] / SHARDS
+
+
+def test_efficiency_of_two_workers(benchmark, engine: Engine, monkeypatch) -> None:
+    """Labels of 60 drivers with W99: one core here against two workers."""
+    model = W99()
+    truth = model.space.defaults().expand(60, -1).clone()
+    truth[:, 1] += torch.linspace(0, 0.5, 60, dtype=torch.float64)
+    pairs = wavy_pairs(model, truth, frames=1210)
+    batch = PairBatch.of(pairs)
+    windows = Windows.of(torch.full((len(pairs),), 240), WindowSettings())
+
+    def seconds(where: Engine) -> float:
+        calibrator = Calibrator(
+            MemoryStepper(model, 0.1),
+            RandomSearch(samples=16384),
+            seed=0,
+            cache=Cache(None),
+            memory=1 << 28,
+            progress=Task,
+            engine=where,
+        )
+        began = time.perf_counter()
+        calibrator.labels(pairs, batch, windows, truth)
+        return time.perf_counter() - began
+
+    monkeypatch.setattr(threads, "_LIMIT", [1])
+    seconds(engine)
+    alone = seconds(LocalEngine())
+    together = benchmark.pedantic(seconds, args=(engine,), rounds=2)
+    benchmark.extra_info["efficiency"] = alone / (2 * together)

@@ -1,0 +1,71 @@
+"""Training on a cluster whose workers are killed ends with the same networks as on this machine."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+import torch
+
+from cfx.engine.base import Engine
+from cfx.engine.dask.engine import DaskEngine
+from cfx.engine.local import LocalEngine
+from cfx.learners.base import TrainingResult
+from cfx.learners.rollout import RolloutLearner, shard
+from cfx.simulation import threads
+from tests.engine.clusters import Cluster
+from tests.engine.test_dask_faults import meanwhile
+from tests.learners.made import QUICK, gru, training_data
+
+KILLS = 10
+SETTINGS = QUICK | {"epochs": 30, "steps": 10, "horizon": 12}
+
+
+@pytest.fixture
+def cluster() -> Iterator[Cluster]:
+    made = Cluster()
+    made.start_worker()
+    made.start_worker()
+    yield made
+    made.stop()
+
+
+def trained(engine: Engine, workspace: Path | None) -> TrainingResult:
+    """Returns four networks, which train in two shards."""
+    data = training_data(networks=4, frames=300, engine=engine, workspace=workspace)
+    return RolloutLearner(**SETTINGS).fit(gru(), data)
+
+
+@pytest.mark.slow
+def test_workers_that_are_killed_ten_times_change_nothing(
+    cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shard, "_WORTH_A_PROCESS", 0)
+    monkeypatch.setattr(threads, "_LIMIT", [1])
+    expected = trained(LocalEngine(), None)
+    killed: list[int] = []
+
+    def kill_ten() -> None:
+        while len(killed) < KILLS:
+            # A worker needs some seconds to import PyTorch; some epochs pass between two kills.
+            time.sleep(3.0)
+            for child in cluster.children(cluster.workers[len(killed) % 2]):
+                with suppress(ProcessLookupError):
+                    os.kill(child, signal.SIGKILL)
+                    killed.append(child)
+
+    engine = DaskEngine(address=cluster.address)
+    with meanwhile(kill_ten) as killing:
+        found = trained(engine, tmp_path)
+        was_over = not killing.is_alive()
+    engine.close()
+    assert was_over, "the training ended before ten workers were killed"
+    weights = expected.network.state_dict()
+    for name, value in found.network.state_dict().items():
+        assert torch.equal(value, weights[name]), name
+    assert found.curves.equals(expected.curves)
