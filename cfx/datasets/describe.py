@@ -17,6 +17,7 @@ from rich.table import Table
 from cfx import registry
 from cfx.datasets.base import Contents, Dataset, listed
 from cfx.datasets.files import Floats, beginning
+from cfx.datasets.partitions import partitions
 from cfx.errors import DataError, PluginError
 from cfx.pairs import Dropped, Pair, PairSet
 from cfx.registry import Entry
@@ -62,6 +63,8 @@ def describe(path: Path) -> str:
     path = path.expanduser()
     name = _dataset_of(path)
     cls = cast(type[Dataset], registry.get("dataset", name))
+    if name == "tidy" and path.is_dir():
+        return _describe_partitions(path, cls)
     dataset = cls(path=path)
     contents = dataset.contents()
     pieces: list[RenderableType] = [str(path), "", _overview(cls.layout, contents)]
@@ -73,6 +76,46 @@ def describe(path: Path) -> str:
     pieces += ["", *_problems(contents)]
     shorter = _shorter(contents.pairs, dataset.settings.min_frames)
     pieces += ["", f"Use it: data={name} data.path={path}{shorter}"]
+    return _text(pieces)
+
+
+def _describe_partitions(folder: Path, cls: type[Dataset]) -> str:
+    """Says what each file of a folder holds; reads one file after the other."""
+    table = Table(box=None, padding=(0, 2), header_style="")
+    table.add_column("file")
+    for heading in ("recordings", "rows", "pairs", "drivers", "frames", "of at least 700 frames"):
+        table.add_column(heading, justify="right")
+    totals = [0] * 5
+    names: set[str] = set()
+    files = partitions(folder)
+    for file in files:
+        contents = cls(path=file).contents()
+        pairs = contents.pairs
+        recordings = {pair.recording for pair in pairs}
+        drivers = {pair.driver for pair in pairs}
+        long = sum(len(pair) >= _THRESHOLDS[-1] for pair in pairs)
+        counts = [contents.rows, len(pairs), len(drivers), _frames(pairs), long]
+        totals = [before + count for before, count in zip(totals, counts, strict=True)]
+        names |= recordings
+        cells = [f"{count:,}" for count in counts]
+        table.add_row(str(file.relative_to(folder)), listed(sorted(recordings), 2), *cells)
+    table.add_row("all", f"{len(names):,}", *[f"{count:,}" for count in totals])
+    return _text(
+        [
+            str(folder),
+            "",
+            f"{cls.layout}, {len(files)} files, read one after the other",
+            "",
+            table,
+            "",
+            "A recording alone: python -m cfx data describe FILE",
+            f"Use it: data=tidy data.path={folder}, or one recording with data.recording=NAME",
+        ]
+    )
+
+
+def _text(pieces: Sequence[RenderableType]) -> str:
+    """Returns paragraphs and tables as one text."""
     text = io.StringIO()
     console = Console(file=text, width=_WIDTH, highlight=False, markup=False, emoji=False)
     for piece in pieces:

@@ -36,6 +36,7 @@ import pyarrow.parquet as pq
 from cfx.component import Settings
 from cfx.datasets.base import Dataset, FileDatasetSettings, joined, listed
 from cfx.datasets.files import PARQUET, FileStart, Floats, Ints
+from cfx.datasets.partitions import are_partitions, of_recording, partitions
 from cfx.datasets.tidy_checks import check
 from cfx.datasets.tidy_gaps import time_steps
 from cfx.datasets.tidy_table import (
@@ -58,6 +59,9 @@ from cfx.pairs import Dropped, Pair, PairSet
 class TidyDataset(Dataset):
     """Pairs in the tidy layout (see the module), from parquet or CSV; gzipped CSV is fine.
 
+    A folder stands for the parquet files in it, one recording each (`cfx.datasets.partitions`).
+    With `data.recording` the others are not read.
+
     Rows may be in any order. Several files are read as one: a recording may go on in another file,
     a pair may not.
 
@@ -71,10 +75,16 @@ class TidyDataset(Dataset):
 
     @classmethod
     def recognises(cls, start: FileStart) -> bool:
+        if are_partitions(start.path):
+            return True
         return start.magic == PARQUET or len(set(start.columns) & {*LABELS, *NUMBERS}) >= 3
 
     def read(self) -> PairSet:
-        return joined([read_tidy(path) for path in self.settings.files()])
+        files: list[Path] = []
+        for path in self.settings.files():
+            files += partitions(path)
+        files = of_recording(files, self.settings.recording)
+        return joined([read_tidy(file) for file in files])
 
 
 def read_tidy(path: Path) -> PairSet:

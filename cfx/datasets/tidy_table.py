@@ -24,6 +24,7 @@ from cfx.datasets.files import (
     read_columns,
     sniff,
 )
+from cfx.datasets.partitions import recording_of
 from cfx.errors import DataError, nearest
 
 LABELS = ("recording", "pair_id", "leader_id", "follower_id")
@@ -195,8 +196,17 @@ def _read_text(path: Path) -> TidyTable:
 def _read_parquet(path: Path) -> TidyTable:
     try:
         file = pq.ParquetFile(path)
-        numbers, labels, ignored = _roles(str(path), file.schema_arrow.names)
-        columns = file.read(columns=[*numbers, *labels])
+        names = file.schema_arrow.names
+        recording = None
+        if "recording" not in names:
+            recording = recording_of(path)
+        if recording is not None:
+            names = ["recording", *names]
+        numbers, labels, ignored = _roles(str(path), names)
+        stored = set(file.schema_arrow.names)
+        columns = file.read(columns=[name for name in (*numbers, *labels) if name in stored])
+        if recording is not None:
+            columns = columns.append_column("recording", pa.array([recording] * len(columns)))
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise DataError(
             f"{path}: the parquet file is cut off or damaged ({_first_line(error)}); write it again"

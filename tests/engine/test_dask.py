@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import psutil
 import pytest
 
 from cfx import registry
@@ -139,5 +140,18 @@ def test_a_shard_that_kills_every_worker_is_given_up(cluster: Cluster) -> None:
 def test_a_cluster_of_its_own_starts_works_and_ends() -> None:
     engine = DaskEngine(workers=1, memory="1GB")
     found = dict(engine.map(slowly, [(2, 0.0), (3, 0.0)], nothing))
+    places = listening()
     engine.close()
     assert found == {0: 4, 1: 9}
+    assert places == {"127.0.0.1"}, "nobody outside this machine may reach a cluster of its own"
+
+
+def listening() -> set[str]:
+    """Returns the addresses at which this process and its children listen."""
+    me = psutil.Process()
+    found = set()
+    for process in (me, *me.children(recursive=True)):
+        for connection in process.net_connections(kind="inet"):
+            if connection.status == psutil.CONN_LISTEN:
+                found.add(connection.laddr.ip)
+    return found

@@ -91,7 +91,9 @@ def _local(settings: DaskSettings) -> Any:
         "threads_per_worker": 1,
         "memory_limit": settings.memory,
         "host": "127.0.0.1",
-        "dashboard_address": None,
+        # Without an address its page would listen on all interfaces, at a port of its own choice.
+        "dashboard_address": "127.0.0.1:0",
+        "scheduler_kwargs": {"dashboard": False},
         "silence_logs": logging.CRITICAL,
         "security": _security(settings),
     }
@@ -107,7 +109,7 @@ def _in_queue(settings: DaskSettings) -> Any:
         "cores": together,
         "processes": together,
         "memory": format_bytes(together * parse_bytes(settings.memory)),
-        "scheduler_options": {"dashboard": False},
+        "scheduler_options": {"dashboard": False, "dashboard_address": "127.0.0.1:0"},
         "silence_logs": logging.CRITICAL,
         "security": _security(settings),
     }
