@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pkgutil
 import re
 import shlex
 from collections.abc import Iterable, Iterator
@@ -86,8 +87,10 @@ def test_every_public_name_is_in_the_reference() -> None:
     text = ""
     for path in sorted((ROOT / "docs" / "api").glob("*.md")):
         text += path.read_text(encoding="utf-8")
-    known = set(re.findall(r"^::: cfx\.(\w+)$", text, flags=re.MULTILINE))
-    assert known >= set(cfx.__all__) - {"__version__"}
+    known = set(re.findall(r"^::: (\S+)$", text, flags=re.MULTILINE))
+    assert known >= {f"cfx.{name}" for name in cfx.__all__} - {"cfx.__version__"}
+    for name in known:
+        assert pkgutil.resolve_name(name) is not None
 
 
 def test_every_option_is_in_the_table_of_all_options() -> None:
