@@ -14,15 +14,13 @@ from cfx.evaluation.forecasts import Forecasts
 from cfx.evaluation.result import Evaluation, Improvement
 from cfx.job.results import JobResult
 from cfx.metrics.base import TRANSIENT_S, MetricInfo, key_of
+from cfx.plots.words import few_drivers
 
 if TYPE_CHECKING:
     from cfx.tracking.tracker import Tracker
 
 _SCOPES = {"test": "test part", "full_trajectory": "full trajectories"}
 """The scopes that have a table of their own, in words."""
-
-_FEW_DRIVERS = 20
-"""With fewer, a bootstrap interval over drivers is too narrow."""
 
 
 def report(
@@ -151,14 +149,9 @@ def _print_improvements(evaluation: Evaluation, console: Console) -> None:
                 highlight=False,
             )
     drivers = max(one.drivers for one in compared.values())
-    if 0 < drivers < _FEW_DRIVERS:
-        plural = "" if drivers == 1 else "s"
-        console.print(
-            f"{drivers} driver{plural}: with fewer than {_FEW_DRIVERS}, means and intervals say"
-            " little about other drivers.",
-            soft_wrap=True,
-            highlight=False,
-        )
+    warning = few_drivers(drivers)
+    if warning:
+        console.print(warning, soft_wrap=True, highlight=False)
 
 
 def _comparisons(evaluation: Evaluation) -> dict[str, Improvement]:

@@ -53,6 +53,8 @@ EXPLAINED = {
 }
 """Methods in words that end a sentence."""
 
+FEW_DRIVERS = 20
+
 TEST, STEADY, FULL_TRAJECTORY = SCOPES
 """Parts of trajectories that metrics are of."""
 
@@ -108,6 +110,19 @@ def number(value: float) -> str:
 def plural(count: int, noun: str) -> str:
     """Returns "1 pair" or "3 pairs"."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def few_drivers(drivers: int) -> str:
+    """Returns a warning where statistics are over few drivers, else "".
+
+    A bootstrap interval over fewer than twenty is too narrow.
+    """
+    if not 0 < drivers < FEW_DRIVERS:
+        return ""
+    return (
+        f"{plural(drivers, 'driver')}: with fewer than {FEW_DRIVERS}, means and intervals say"
+        " little about other drivers."
+    )
 
 
 def short(name: str, limit: int = 26) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cfx.plots.words import explained, percent, plural, short_label
+from cfx.plots.words import explained, few_drivers, percent, plural, short_label
 from cfx.report.job import Job, calibrations, with_baseline, without_baseline
 
 _MOST = 3
@@ -21,6 +21,7 @@ def summary(jobs: Sequence[Job]) -> list[str]:
         f" {explained('fixed')}?"
     )
     compared = with_baseline(jobs)
+    warnings = _few(compared)
     references = [_reference(job) for job in without_baseline(jobs)]
     constant = calibrations(jobs)
     if not compared and not references:
@@ -30,10 +31,19 @@ def summary(jobs: Sequence[Job]) -> list[str]:
     else:
         references.append(f"{len(constant)} jobs are calibrations, without adaptation.")
     if len(compared) <= _MOST:
-        return [first, *map(_verdict, compared), *references]
+        return [first, *map(_verdict, compared), *warnings, *references]
     best = max(compared, key=_mean_for_ranking)
     counts = f"{_counts(compared)} (by the 95 % interval of the mean improvement)."
-    return [first, counts, f"The best mean: {_verdict(best)}", *references]
+    return [first, counts, f"The best mean: {_verdict(best)}", *warnings, *references]
+
+
+def _few(jobs: Sequence[Job]) -> list[str]:
+    """Returns a warning if any of the jobs compares its policy on few drivers."""
+    if not jobs:
+        return []
+    fewest = min(job.pairs["driver"].nunique() for job in jobs)
+    warning = few_drivers(fewest)
+    return [warning] if warning else []
 
 
 def _counts(jobs: Sequence[Job]) -> str:

@@ -367,7 +367,8 @@ def test_the_summary_answers_by_the_interval(tmp_path: Path) -> None:
             "rmse_improvement/ci95_high": high,
         }
         path.write_text(json.dumps(metrics | changed), encoding="utf-8")
-        question, said = summary(read_runs([str(tmp_path)]).jobs)
+        question, said, warning = summary(read_runs([str(tmp_path)]).jobs)
+        assert "with fewer than 20, means and intervals say little" in warning
         assert question.startswith("8 pairs of leader and follower from recording.parquet")
         assert said.startswith(
             f"krauss: {answer}. Improvement of the RMSE of speed: +12.3 % on average"
