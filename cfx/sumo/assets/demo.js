@@ -193,7 +193,8 @@
 
   function tick(now) {
     if (!playing) return;
-    frame = Math.min(last(pair), frame + ((now - before) / 1000) * (Number(rate.value) / pair.dt));
+    const passed = Math.max(0, now - before); // a frame's time may lie before the click that started it
+    frame = Math.min(last(pair), frame + (passed / 1000) * (Number(rate.value) / pair.dt));
     before = now;
     draw();
     if (frame >= last(pair)) play(false);
