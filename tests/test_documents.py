@@ -81,6 +81,10 @@ def test_the_site_names_pages_that_exist() -> None:
     pages = list(nav_of(nav))
     assert len(set(pages)) == len(pages) > 30
     assert not [page for page in pages if not (ROOT / "docs" / page).is_file()]
+    for name in PAGES:
+        page = name.removeprefix("docs/")
+        is_record = page.startswith("decisions/0")  # the index of decisions names them
+        assert page in pages or is_record, f"{name} is in no menu of mkdocs.yml"
 
 
 def test_every_public_name_is_in_the_reference() -> None:
