@@ -91,6 +91,8 @@ class Agent:
         valid_range: the situations that each network learned from; None if they are not known.
             Outside, answers fade towards the base, or towards the pooled parameters where the head
             has no base.
+        dispersion: factor on the noise of each network, `(N,)`, found on drivers kept for
+            validation; None: 1.
     """
 
     core: AgentCore
@@ -104,6 +106,7 @@ class Agent:
     population: Tensor | None = None
     learned_from: Mapping[str, str] = field(default_factory=dict)
     valid_range: ValidRange | None = None
+    dispersion: Tensor | None = None
     recorded: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     @property
@@ -141,6 +144,11 @@ class Agent:
         if new is None:
             raise AttributeError(f"an agent has no attribute '{name}'")
         return getattr(self, new)
+
+    @property
+    def is_stochastic(self) -> bool:
+        """Whether it leaves something to chance."""
+        return self.head.noise_width > 0
 
     def stepper(self, simulator: Stepper) -> Stepper:
         """Returns what takes the steps of the model that this agent drives.
@@ -219,7 +227,9 @@ class Agent:
             return state._replace(state=self.core.observe(grid, state.state, seen))
 
     @torch.no_grad()
-    def act(self, history: History, state: AgentState) -> tuple[Tensor, AgentState]:
+    def act(
+        self, history: History, state: AgentState, generator: torch.Generator | None = None
+    ) -> tuple[Tensor, AgentState]:
         """Chooses the parameters of the next window.
 
         Outside the situations that were learned from, the answer fades towards the base.
@@ -227,6 +237,8 @@ class Agent:
         Args:
             history: the last `windows.length` frames of D drivers, `(D, L)` each, SI units.
             state: where they stand.
+            generator: draws, on the CPU, what a stochastic head leaves to chance; None: nothing is
+                drawn.
 
         Returns:
             Parameters `(D, n)` in SI units, in the dtype of the history, and the state afterwards.
@@ -241,7 +253,14 @@ class Agent:
             )
         state = self._judged(history, state)
         unit = self._faded(answer.double(), state).to(dtype)
-        return self.space.from_unit(unit), state._replace(state=after)
+        chosen = self.space.from_unit(unit)
+        if generator is not None and self.head.noise_width > 0:
+            shape = (len(chosen), self.head.noise_width)
+            noise = torch.randn(shape, generator=generator, dtype=torch.float64).to(chosen)
+            if self.dispersion is not None:
+                noise = noise * self.dispersion[state.network, None].to(noise)
+            chosen = self.head.sampled(chosen, noise, self.windows.stride * self.dt)
+        return chosen, state._replace(state=after)
 
     def burn_in(
         self, batch: PairBatch, until: Tensor, state: AgentState, since: Tensor | None = None
@@ -347,6 +366,7 @@ class Agent:
             base=None if self.base is None else self.base[row],
             population=None if self.population is None else self.population[row],
             valid_range=None if self.valid_range is None else self.valid_range.only(number),
+            dispersion=None if self.dispersion is None else self.dispersion[row],
         )
 
     def to(self, device: torch.device) -> Agent:
@@ -357,6 +377,7 @@ class Agent:
             base=None if self.base is None else self.base.to(device),
             population=None if self.population is None else self.population.to(device),
             valid_range=None if self.valid_range is None else self.valid_range.to(device),
+            dispersion=None if self.dispersion is None else self.dispersion.to(device),
         )
 
     def _judged(self, history: History, state: AgentState) -> AgentState:

@@ -150,6 +150,8 @@ def _agent(
     for name, width in widths.items():
         if name in weights and weights[name].shape != (networks, width):
             raise ValueError(f"'{name}' has the shape {tuple(weights[name].shape)}")
+    if "dispersion" in weights and weights["dispersion"].shape != (networks,):
+        raise ValueError(f"'dispersion' has the shape {tuple(weights['dispersion'].shape)}")
     for name, value in weights.items():
         if not bool(value.isfinite().all()):
             raise ValueError(f"'{name}' holds a number that is not finite")
@@ -174,6 +176,7 @@ def _agent(
         population=weights.get("population"),
         learned_from=description.learned_from,
         valid_range=_valid_range(weights),
+        dispersion=weights.get("dispersion"),
         recorded=description.recorded,
     )
 
@@ -188,6 +191,8 @@ def _tensors(agent: Agent) -> dict[str, Tensor]:
         tensors["base"] = agent.base.cpu()
     if agent.population is not None:
         tensors["population"] = agent.population.cpu()
+    if agent.dispersion is not None:
+        tensors["dispersion"] = agent.dispersion.cpu()
     if agent.valid_range is not None:
         for name, value in agent.valid_range.state_dict().items():
             tensors[f"{_RANGE}{name}"] = value.cpu()

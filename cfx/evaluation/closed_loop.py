@@ -64,6 +64,7 @@ def simulate_closed_loop(
     history: float | None = None,
     steps: int | None = None,
     state: AgentState | None = None,
+    generator: torch.Generator | None = None,
 ) -> ClosedLoop:
     """Simulates the test part of P pairs with an agent in the loop.
 
@@ -78,6 +79,8 @@ def simulate_closed_loop(
             driver features are measured; None: all there is.
         steps: K, how many steps are simulated at most; None: to the end of the longest pair.
         state: of the agent after what it has observed up to `first`; None: it observes that here.
+        generator: draws, on the CPU, what a stochastic agent leaves to chance; None: nothing is
+            drawn.
     """
     simulator = agent.stepper(simulator)
     if state is None:
@@ -92,7 +95,7 @@ def simulate_closed_loop(
     _, _, counted = track.result()
     for begin in range(0, track.steps, agent.windows.stride):
         end = min(begin + agent.windows.stride, track.steps)
-        chosen, state = agent.act(track.history(begin), state)
+        chosen, state = agent.act(track.history(begin), state, generator)
         p = agent.space.unpack(chosen)
         follower, positions, speeds = simulator.advance(follower, track.leader(begin, end), p)
         track.write(begin, end, positions.T, speeds.T, simulator.dt)

@@ -11,7 +11,7 @@ Shapes: P pairs, Q origins, K simulated steps, T frames, n tuned parameters. SI 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -161,6 +161,47 @@ def simulate_from_origins(
         history: s of measured history before an origin that the agent observes; None: all there is.
         leader: what is known of the leader after the origin.
     """
+    sampled = sample_from_origins(
+        simulator,
+        agent,
+        batch,
+        origins,
+        steps,
+        network,
+        (None,),
+        base=base,
+        history=history,
+        leader=leader,
+    )
+    return Paths(sampled.speed[0], sampled.travelled[0])
+
+
+def sample_from_origins(
+    simulator: Stepper,
+    agent: Agent,
+    batch: PairBatch,
+    origins: Origins,
+    steps: int,
+    network: Tensor,
+    generators: Sequence[torch.Generator | None],
+    *,
+    base: Tensor | None = None,
+    history: float | None = None,
+    leader: LeaderFuture = "given",
+) -> Paths:
+    """Samples paths of followers from origins on; see `simulate_from_origins`.
+
+    What was measured is observed once for all paths. One path of all origins is one batch.
+
+    Args:
+        simulator, agent, batch, origins, steps, network: as there.
+        generators: S of them, on the CPU, one for each path; None: what a stochastic agent does if
+            nothing is drawn.
+        base, history, leader: as there.
+
+    Returns:
+        Paths `(S, Q, K + 1)`.
+    """
     speeds, travelled = [], []
     for chunk in _chunks(agent, batch, origins):
         state = None
@@ -170,23 +211,29 @@ def simulate_from_origins(
         own_base = None
         if base is not None:
             own_base = base[chunk.pair]
-        loop = simulate_closed_loop(
-            simulator,
-            agent,
-            part,
-            chunk.frame,
-            network[chunk.pair],
-            base=own_base,
-            history=history,
-            steps=steps,
-            state=state,
-        )
         index = chunk.frame[:, None] + torch.arange(steps + 1, device=chunk.frame.device)
         index = index.clamp(max=part.mask.shape[1] - 1)
-        position = part.leader_position.gather(1, index) - loop.gap
-        speeds.append(loop.speed)
-        travelled.append(position - position[:, :1])
-    return Paths(torch.cat(speeds), torch.cat(travelled))
+        leader_position = part.leader_position.gather(1, index)
+        speed, moved = [], []
+        for generator in generators:
+            loop = simulate_closed_loop(
+                simulator,
+                agent,
+                part,
+                chunk.frame,
+                network[chunk.pair],
+                base=own_base,
+                history=history,
+                steps=steps,
+                state=state,
+                generator=generator,
+            )
+            position = leader_position - loop.gap
+            speed.append(loop.speed)
+            moved.append(position - position[:, :1])
+        speeds.append(torch.stack(speed))
+        travelled.append(torch.stack(moved))
+    return Paths(torch.cat(speeds, 1), torch.cat(travelled, 1))
 
 
 @torch.no_grad()

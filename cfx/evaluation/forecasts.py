@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 from torch import Tensor
 
+from cfx.evaluation.distributions import distribution_metrics
 from cfx.evaluation.forecast_paths import Origins, Paths
 from cfx.pairs import PairSet
 
@@ -76,12 +77,15 @@ class Forecasts:
         horizons: s.
         leader: what was known of the leader (`LeaderFuture`).
         seed: of the bootstrap.
+        distributions: scores of sampled paths (`cfx.evaluation.distributions`); None: none were
+            sampled. Their metrics are `distribution/SCORE_HORIZON/METHOD`, means over drivers.
     """
 
     table: pd.DataFrame
     horizons: tuple[float, ...]
     leader: str
     seed: int
+    distributions: pd.DataFrame | None = None
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -138,6 +142,8 @@ class Forecasts:
                 for end in ("low", "high"):
                     if error in _QUADRATIC:
                         found[f"{key}/ci95_{end}"] = float(row[f"{error}_{end}"])
+        if self.distributions is not None:
+            found |= distribution_metrics(self.distributions)
         return found
 
 

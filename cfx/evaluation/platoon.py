@@ -195,7 +195,10 @@ def _grouped(model: DrivingModel, agents: Sequence[Agent]) -> list[list[Agent]]:
 @torch.no_grad()
 @one_thread()
 def simulate_platoons(
-    model: DrivingModel, agents: Sequence[Agent], manoeuvre: Manoeuvre
+    model: DrivingModel,
+    agents: Sequence[Agent],
+    manoeuvre: Manoeuvre,
+    generator: torch.Generator | None = None,
 ) -> list[tuple[Tensor, Tensor]]:
     """Simulates a platoon for each network of each agent, without any history before.
 
@@ -204,6 +207,8 @@ def simulate_platoons(
         agents: what chooses the parameters; their windows and time steps are the same, and so is
             the model that each drives (`Agent.stepper`).
         manoeuvre: what the leader does.
+        generator: draws, on the CPU, what stochastic agents leave to chance; None: nothing is
+            drawn, as in `measure_platoons`, where noise would pass for instability.
 
     Returns:
         For each agent the speeds of its N platoons `(V + 1, N, T)`, vehicle 0 being the leader, and
@@ -223,21 +228,24 @@ def simulate_platoons(
     for frame in range(road.speed.shape[-1] - 1):
         if frame % windows.stride == 0:
             seen = [road.history(frame, windows.length, part) for part in parts]
-            chosen, states = _choose(agents, seen, states)
-            parameters = simulator.model.space.unpack(chosen)
+            chosen, states = _choose(agents, seen, states, generator)
+            parameters = agents[0].space.unpack(chosen)
         follower, _, _ = simulator.advance(follower, road.leader(frame), parameters)
         road.write(frame + 1, follower)
     return [(road.speed[:, part], road.gap[:, part]) for part in parts]
 
 
 def _choose(
-    agents: Sequence[Agent], seen: Sequence[History], states: Sequence[AgentState]
+    agents: Sequence[Agent],
+    seen: Sequence[History],
+    states: Sequence[AgentState],
+    generator: torch.Generator | None,
 ) -> tuple[Tensor, list[AgentState]]:
     """Returns the parameters of all followers `(V N, n)` and each agent's state afterwards."""
     chosen = []
     after = []
     for agent, history, state in zip(agents, seen, states, strict=True):
-        parameters, state_after = agent.act(history, state)
+        parameters, state_after = agent.act(history, state, generator)
         chosen.append(parameters.view(VEHICLES, len(agent.names), -1))
         after.append(state_after)
     return torch.cat(chosen, dim=1).flatten(0, 1), after

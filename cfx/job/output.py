@@ -194,15 +194,17 @@ def write_further_tables(
     platoon = None
     if evaluation.platoon is not None:
         platoon = evaluation.platoon.table
-    forecasts = None
+    forecasts, distributions = None, None
     if evaluation.forecasts is not None:
         forecasts = evaluation.forecasts.table
+        distributions = evaluation.forecasts.distributions
     tables = {
         "platoon.parquet": platoon,
         "history.parquet": evaluation.history,
         "forecasts.parquet": forecasts,
         "slices.parquet": None if view is None else view.slices,
         "fits.parquet": None if view is None else view.fits,
+        "distributions.parquet": distributions,
     }
     paths = []
     for name, table in tables.items():

@@ -88,6 +88,7 @@ class TrainingResult:
             there is a base, otherwise `direct`.
         valid_range: the situations that each network learned from; None: those of its training
             parts (`cfx.learners.situations`).
+        dispersion: factor on each network's noise, `(N,)`; None: 1, or a head without noise.
     """
 
     network: PolicyNetwork
@@ -96,6 +97,7 @@ class TrainingResult:
     base: Tensor | None = None
     head: str | None = None
     valid_range: ValidRange | None = None
+    dispersion: Tensor | None = None
 
 
 class Learner(Component):

@@ -58,8 +58,8 @@ _NEAR_M = 0.5
 """m: room to brake in counts as this at least."""
 
 _TIGHT_M = 1.0
-"""m: gap below which no residual makes a vehicle faster. It is not wider: drivers in congestion
-follow closely, and start again from there."""
+"""m: gap below which no residual makes a vehicle faster than its leader. It is not wider: drivers
+in congestion follow closely."""
 
 _HARD = 2.0
 """m/s2: from this needed deceleration on, the residual lessens no braking that is needed."""
@@ -72,7 +72,7 @@ class WithResidual(DrivingModel):
     is the model's, the residual (m/s2), and whether it has begun (0 or 1).
 
     A positive residual could keep a vehicle from braking. So it counts for nothing where the gap is
-    below 1 m; and where a deceleration of more than 2 m/s2 is needed to reach the
+    below 1 m and does not grow; and where a deceleration of more than 2 m/s2 is needed to reach the
     leader's speed within the gap, b = (v - v_l)^2 / (2 s), the vehicle brakes at least as hard as
     that, or as hard as the model wants if that is less.
 
@@ -163,8 +163,9 @@ def _braked(alone: Tensor, residual: Tensor, follower: Follower, leader: Leader)
     both = alone + residual
     no_more = torch.minimum(both, alone)
     gap = bumper_gap(follower, leader)
-    closing = (follower.speed - leader.speed).clamp(min=0.0)
+    difference = follower.speed - leader.speed
+    closing = difference.clamp(min=0.0)
     needed = closing.square() / (2.0 * gap.clamp(min=_NEAR_M))
     most = torch.maximum(alone, -needed)
     bounded = torch.where(needed > _HARD, torch.minimum(both, most), both)
-    return torch.where(gap < _TIGHT_M, no_more, bounded)
+    return torch.where((gap < _TIGHT_M) & (difference >= 0.0), no_more, bounded)

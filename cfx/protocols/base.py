@@ -15,9 +15,10 @@ from torch import Tensor
 
 from cfx import registry
 from cfx.agents.agent import Agent
-from cfx.agents.core import AgentCore
+from cfx.agents.core import AgentCore, features_read
 from cfx.agents.heads import HEADS, head_name
 from cfx.agents.heads.base import ParameterHead
+from cfx.agents.heads.stochastic import SCALE, StochasticHead
 from cfx.agents.scaler import Scaler
 from cfx.agents.valid_range import recorded_quantiles
 from cfx.calibration.calibrator import Calibrator, Labels
@@ -28,11 +29,13 @@ from cfx.errors import PluginError
 from cfx.evaluation.result import Evaluation
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingResult
 from cfx.metrics.installed import MetricSet
+from cfx.models.residual import TIME
 from cfx.objectives.base import Objective
 from cfx.pairs import PairBatch, PairSet
 from cfx.parameters import ParameterSpace
-from cfx.policies.base import Policy
+from cfx.policies.base import ConstantNetwork, Policy
 from cfx.policies.features import token_width
+from cfx.policies.fixed import FixedPolicy
 from cfx.simulation.base import Stepper
 from cfx.style.result import StyleResult
 
@@ -138,6 +141,36 @@ class ProtocolContext:
         names = tuple(str(number) for number in range(len(parameters)))
         return self.ready(policy, self.untrained(policy, parameters), names)
 
+    def constant_with_noise(self, parameters: Tensor, time: Tensor, scale: Tensor) -> Agent:
+        """Returns an agent with constant parameters and auto-regressive noise on the acceleration.
+
+        Args:
+            parameters: `(N, n)`, SI units; one network for each row.
+            time: time constant with which the noise forgets, `(N,)`, s.
+            scale: standard deviation of the noise, `(N,)`, m/s2.
+
+        Raises:
+            ConfigError: the model has equations in a simulator only.
+        """
+        head = StochasticHead.for_model(self.simulator.model, parameters.device)
+        complete = head.completed(parameters).clone()
+        for parameter, values in ((TIME, time), (SCALE, scale)):
+            column = head.space.names.index(parameter.name)
+            complete[:, column] = values.clamp(parameter.low, parameter.high)
+        policy = FixedPolicy()
+        width = features_read(policy, head, self.windows.length)
+        blank = complete.new_zeros((len(complete), width))
+        network = ConstantNetwork(head.untrained_answer(complete))
+        return Agent(
+            core=AgentCore(policy, network, Scaler(blank, blank + 1.0), head),
+            model_node=self.model_node,
+            policy_node={"name": "fixed"},
+            windows=self.windows,
+            dt=self.simulator.dt,
+            names=tuple(str(number) for number in range(len(complete))),
+            base=complete,
+        )
+
     def untrained(self, policy: Policy, parameters: Tensor) -> TrainingResult:
         """Returns a policy's networks as built; see `constant`.
 
@@ -182,6 +215,7 @@ class ProtocolContext:
             base=training_result.base,
             learned_from=learned_from,
             valid_range=training_result.valid_range,
+            dispersion=training_result.dispersion,
             recorded=recorded_quantiles(self.batch),
         )
 

@@ -3,26 +3,31 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated, Any, ClassVar
 
 import pandas as pd
 import torch
 from pydantic import AfterValidator, Field
+from torch import Tensor
 
 from cfx.agents.agent import Agent
+from cfx.calibration.residuals import measure_residuals
 from cfx.component import Settings
 from cfx.errors import ConfigError, DataError
+from cfx.evaluation.distributions import Recorded, score_distributions
 from cfx.evaluation.forecast_paths import (
     LeaderFuture,
     Origins,
     Paths,
     kinematic_paths,
     measured_paths,
-    simulate_from_origins,
+    sample_from_origins,
 )
 from cfx.evaluation.forecasts import Forecasts, forecast_errors
 from cfx.evaluation.result import Evaluation
+from cfx.models.residual import TIME
 from cfx.policies.fixed import FixedPolicy
 from cfx.protocols.across_drivers import AcrossDrivers, AcrossDriversSettings
 from cfx.protocols.base import ProtocolContext, ProtocolResult
@@ -58,6 +63,13 @@ class ForecastSettings(AcrossDriversSettings):
         description="what is known of the leader after an origin: given: what they did;"
         " constant_speed, constant_acceleration: they go on as at the origin",
     )
+    samples: int = Field(
+        0,
+        ge=0,
+        le=1000,
+        description="paths sampled from each origin, of a stochastic policy and of constant"
+        " parameters with auto-regressive noise, for scores of distributions; 0: none",
+    )
 
 
 class Forecast(AcrossDrivers):
@@ -77,6 +89,11 @@ class Forecast(AcrossDrivers):
       acceleration at the origin is added to theirs, and decays in two seconds;
     - `policy`: observes all history up to each origin (`history` bounds it) and drives on from
       there, seeing the simulated follower.
+
+    With `samples` there are also paths that are sampled from each origin (scores of them:
+    `cfx.evaluation.distributions`): of a stochastic policy (`learner.head=stochastic`), and
+    `population_ar`, `fixed_ar`, constant parameters with AR(1) noise on the acceleration, measured
+    on drivers of the other folds or on the driver's own history.
 
     Errors of speed and position at each horizon are the RMSE over the origins of a driver, then the
     mean over drivers, with a bootstrap interval over drivers: origins of one driver overlap and are
@@ -146,16 +163,15 @@ class Forecast(AcrossDrivers):
         steps = round(s.horizons[-1] / dt)
         measured, recorded = measured_paths(batch, origins, steps)
         log.info("Forecasts from %d origins of %d drivers", len(origins), len(set(test.drivers)))
-        table = forecast_errors(
-            test.pairs,
-            origins,
-            self._paths(test, origins, steps),
-            measured,
-            recorded,
-            s.horizons,
-            dt,
-        )
-        return Forecasts(table, s.horizons, s.leader, test.context.seed)
+        paths = self._paths(test, origins, steps)
+        about = (test.pairs, origins)
+        table = forecast_errors(*about, paths, measured, recorded, s.horizons, dt)
+        distributions = None
+        if s.samples > 0:
+            happened = Recorded.of(batch, origins, measured, recorded.cpu())
+            paths |= self._sampled(test, origins, steps)
+            distributions = score_distributions(*about, paths, happened, s.horizons, dt)
+        return Forecasts(table, s.horizons, s.leader, test.context.seed, distributions)
 
     def _from_history(self, test: HeldOut) -> HeldOut:
         """Returns the test with driver-specific parameters of the history before first origins."""
@@ -173,15 +189,15 @@ class Forecast(AcrossDrivers):
 
     def _paths(self, test: HeldOut, origins: Origins, steps: int) -> dict[str, Paths]:
         """Returns the paths of all methods."""
-        batch, context, rule = test.batch, test.context, test.policy.context_rule
+        batch, context = test.batch, test.context
         paths = {
             "constant_speed": kinematic_paths(batch, origins, steps, accelerates=False),
             "constant_acceleration": kinematic_paths(batch, origins, steps, accelerates=True),
         }
+        each = torch.arange(len(batch), device=origins.pair.device)
         agents = {}
         for name, agent in test.methods_without_history().items():
             agents[name] = (agent, test.network)
-        each = torch.arange(len(batch), device=origins.pair.device)
         agents["fixed"] = (context.constant(FixedPolicy(), test.fixed), each)
         residual = {"fixed_residual": (test.fixed, each)}
         if test.population is not None:
@@ -190,20 +206,89 @@ class Forecast(AcrossDrivers):
             agent = context.constant(FixedPolicy(residual=True), parameters)
             if _can_drive(context.simulator, agent):
                 agents[name] = (agent, network)
-        base = test.unseen_base if test.base is None else test.base
         for name, (agent, network) in agents.items():
-            paths[name] = simulate_from_origins(
-                context.simulator,
-                agent,
-                batch,
-                origins,
-                steps,
-                network,
-                base=base,
-                history=rule.history_s,
-                leader=self.settings.leader,
-            )
+            found = self._from_origins(test, agent, origins, steps, network, (None,))
+            paths[name] = Paths(found.speed[0], found.travelled[0])
         return paths
+
+    def _sampled(self, test: HeldOut, origins: Origins, steps: int) -> dict[str, Paths]:
+        """Returns sampled paths `(S, Q, K + 1)` of the methods that leave something to chance."""
+        context, each = test.context, torch.arange(len(test.batch), device=origins.pair.device)
+        agents = {}
+        for name, parameters in _constants(test).items():
+            noise = _noise(test, parameters, own=name == "fixed")
+            agent = context.constant_with_noise(parameters, *noise)
+            if _can_drive(context.simulator, agent):
+                agents[f"{name}_ar"] = (agent, each)
+        if test.policy.is_stochastic:
+            agents["policy"] = (test.policy, test.network)
+        paths = {}
+        for name, (agent, network) in agents.items():
+            generators = []
+            for number in range(self.settings.samples):
+                seed = context.seed * 1_000_003 + number
+                generators.append(torch.Generator().manual_seed(seed))
+            log.info("Sampling %d paths of %s", len(generators), name)
+            paths[name] = self._from_origins(test, agent, origins, steps, network, generators)
+        return paths
+
+    def _from_origins(
+        self,
+        test: HeldOut,
+        agent: Agent,
+        origins: Origins,
+        steps: int,
+        network: Tensor,
+        generators: Sequence[torch.Generator | None],
+    ) -> Paths:
+        """Returns paths `(S, Q, K + 1)` of an agent."""
+        base: Tensor | None = test.unseen_base if test.base is None else test.base
+        if agent is not test.policy:
+            base = None  # it has a base for each driver, or needs none
+        return sample_from_origins(
+            test.context.simulator,
+            agent,
+            test.batch,
+            origins,
+            steps,
+            network,
+            generators,
+            base=base,
+            history=test.policy.context_rule.history_s,
+            leader=self.settings.leader,
+        )
+
+
+def _constants(test: HeldOut) -> dict[str, Tensor]:
+    """Returns constant parameters of each test driver, `(P, n)`, that a residual can go with."""
+    if test.context.simulator.model.needs_simulator:
+        return {}
+    found = {"fixed": test.fixed}
+    if test.population is not None:
+        found["population"] = test.population[test.network]
+    return found
+
+
+def _noise(test: HeldOut, parameters: Tensor, *, own: bool) -> tuple[Tensor, Tensor]:
+    """Returns the AR(1) process of each driver's residual: time, s, and scale, m/s2, `(P,)` each.
+
+    Args:
+        test: the drivers, of whom what was measured before the first origin is read.
+        parameters: `(P, n)`.
+        own: measured on each driver; otherwise the mean over those of the other folds.
+    """
+    model, windows = test.context.simulator.model, test.context.windows
+    lag = windows.stride * test.batch.dt
+    found = measure_residuals(model, test.batch, parameters, test.first, lag)
+    usual = found.time.nanmean().nan_to_num(TIME.default)
+    time = torch.where(found.time.isnan(), usual, found.time)
+    if own:
+        return time, found.scale
+    others = (test.network[:, None] != test.network[None, :]).to(time)
+    if not bool(others.any()):
+        others = torch.ones_like(others)
+    share = others / others.sum(1, keepdim=True)
+    return share @ time, (share @ found.scale.square()).sqrt()
 
 
 def _can_drive(simulator: Stepper, agent: Agent) -> bool:

@@ -133,7 +133,7 @@ def run_scenario(
         runs: vType -> a job's output folder, the id of its MLflow run, or a ready-made policy
             (`cfx://NAME`).
         end: s of simulated time.
-        seed: SUMO's; None for the scenario's.
+        seed: SUMO's, and that of stochastic policies; None for the scenario's, and 0.
         output: a CSV file with a row for each driven vehicle and step.
         look_ahead: as in `Driver`.
         speed_mode: as in `Driver`; 31 lets SUMO's own checks bound each speed.
@@ -149,7 +149,7 @@ def run_scenario(
     require_sumo()
     with ExitStack() as stack:
         path, actor = _prepared(scenario, end, stack)
-        fleet = Fleet.load(runs, look_ahead=look_ahead, speed_mode=speed_mode)
+        fleet = Fleet.load(runs, look_ahead=look_ahead, speed_mode=speed_mode, seed=seed or 0)
         connection = stack.enter_context(started(path, _command(path, seed, gui, options), gui))
         rows = _Rows.opened(stack, output, fleet) if output is not None else None
         try:

@@ -146,6 +146,7 @@ class Driver:
         speed_mode: int = 0,
         model: DrivingModel | None = None,
         source: str = "this policy",
+        seed: int | None = 0,
     ) -> None:
         """Makes a driver.
 
@@ -157,6 +158,7 @@ class Driver:
             speed_mode: SUMO's bit set of `vehicle.setSpeedMode` while a vehicle is driven.
             model: the driving model; None for the one that the policy was trained for.
             source: where the policy comes from, for messages.
+            seed: of what a stochastic policy leaves to chance; None: nothing is drawn.
 
         Raises:
             DataError: the policy has no such network; or its driving model has equations in SUMO
@@ -180,6 +182,9 @@ class Driver:
                 " (or model.variant=sumo) to drive live"
             )
         self._driven = policy.head.driven_model(self.model)
+        self._generator: torch.Generator | None = None
+        if seed is not None:
+            self._generator = torch.Generator().manual_seed(seed)
         self._network = None
         if network is not None:
             self._network = self._number(network)
@@ -204,6 +209,7 @@ class Driver:
         model: str | None = None,
         look_ahead: float = 200.0,
         speed_mode: int = 0,
+        seed: int | None = 0,
     ) -> Driver:
         """Reads a job's policy.
 
@@ -214,6 +220,7 @@ class Driver:
             model: refuse a policy of another driving model than this.
             look_ahead: m; a vehicle farther ahead is no leader.
             speed_mode: SUMO's bit set of `vehicle.setSpeedMode` while a vehicle is driven.
+            seed: of what a stochastic policy leaves to chance; None: nothing is drawn.
 
         Raises:
             DataError: there is no such policy, it has no such network, or it is one of another
@@ -227,7 +234,12 @@ class Driver:
                 f" model={model}"
             )
         return cls(
-            policy, network=network, look_ahead=look_ahead, speed_mode=speed_mode, source=str(run)
+            policy,
+            network=network,
+            look_ahead=look_ahead,
+            speed_mode=speed_mode,
+            source=str(run),
+            seed=seed,
         )
 
     @classmethod
@@ -574,7 +586,7 @@ class Driver:
         if len(slots) == 0:
             return
         store = self._store
-        chosen, after = self.policy.act(*self._known(slots))
+        chosen, after = self.policy.act(*self._known(slots), self._generator)
         store.parameters[slots] = chosen
         store.score[slots], store.beyond[slots] = after.score, after.beyond
         store.state[slots] = after.state[after.network, after.place]

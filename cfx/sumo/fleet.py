@@ -49,17 +49,22 @@ class Fleet:
         network: str = ALL,
         look_ahead: float = 200.0,
         speed_mode: int = 0,
+        seed: int = 0,
     ) -> Fleet:
         """Reads the policy of a run for each vType; types with the same run share a driver.
 
-        A run may be followed by `#` and the name of one of its networks, which drives then. The
-        other arguments are those of `Driver.load`.
+        A run may be followed by `#` and the name of one of its networks, which drives then. Each
+        driver has a seed of its own. The other arguments are those of `Driver.load`.
         """
-        loaded = {}
+        loaded: dict[str | Path, Driver] = {}
         for run in dict.fromkeys(runs.values()):
             folder, chosen = _network_of(run, network)
             loaded[run] = Driver.load(
-                folder, network=chosen, look_ahead=look_ahead, speed_mode=speed_mode
+                folder,
+                network=chosen,
+                look_ahead=look_ahead,
+                speed_mode=speed_mode,
+                seed=seed + len(loaded),
             )
         return cls({name: loaded[run] for name, run in runs.items()})
 

@@ -146,7 +146,7 @@ def _scene(
     """Simulates the pairs of one scene."""
     from cfx.sumo.driver import Driver
 
-    policy = Driver.load(header["policy"], network=None, look_ahead=LOOK_AHEAD)
+    policy = Driver.load(header["policy"], network=None, look_ahead=LOOK_AHEAD, seed=None)
     default = Driver.constant(policy.model, dt=header["dt"], look_ahead=LOOK_AHEAD)
     drivers = {"policy": policy, "default": default}
     roads = []

@@ -165,6 +165,19 @@ def test_an_agent_with_a_residual_drives_its_own_model_beside_others() -> None:
     assert float((speed[1:, 0, 5] - 15.0).abs().max()) > 1e-3
 
 
+def test_a_stochastic_agent_draws_from_a_generator_only() -> None:
+    stochastic = live({"name": "krauss"}, stochastic=True)
+    short = Manoeuvre(settle=2, after=1, hold=1)
+    found = {}
+    for seed in (0, 1):
+        generator = torch.Generator().manual_seed(seed)
+        ((found[seed], _),) = simulate_platoons(Krauss(), [stochastic], short, generator)
+    ((centre, _),) = simulate_platoons(Krauss(), [stochastic], short)
+    assert torch.equal(found[0][0], centre[0]), "the leader"
+    assert not torch.equal(found[0], found[1])
+    assert not torch.equal(found[0], centre)
+
+
 def test_what_a_vehicle_overshoots_on_the_way_back_is_no_slowing() -> None:
     speed = torch.tensor(
         [[15.0, 14.0, 9.0, 12.0, 17.0, 15.0], [15.0, 16.0, 14.5, 15.5, 18.0, 15.0]]

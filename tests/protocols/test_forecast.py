@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -110,3 +111,30 @@ def test_what_cannot_be_is_refused(
     monkeypatch.chdir(str(tmp_path))
     with pytest.raises(CfxError, match=message):
         cfx.run([*FORECAST, "policy=fixed", *changes])
+
+
+def test_sampled_paths_are_scored_as_distributions(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Of a stochastic policy and of constants with noise; single paths by their absolute error."""
+    learner = ["learner=rollout", "learner.head=stochastic", "learner.epochs=1", "learner.steps=2"]
+    small = ["learner.ensemble_size=1", "learner.horizon=4", "learner.compile=never"]
+    monkeypatch.chdir(tmp_path)
+    result = cfx.run([*FORECAST, "policy=gru", "protocol.samples=6", *learner, *small])
+    table = pd.read_parquet(result.folder / "distributions.parquet")
+    single = pd.read_parquet(result.folder / "forecasts.parquet")
+    sampled = {"policy", "population_ar", "fixed_ar"}
+    assert sampled | set(single["method"]) == set(table["method"])
+    covered = table.groupby("method")["coverage"].mean()
+    assert covered[list(sampled)].between(0, 1).all()
+    assert covered.drop(list(sampled)).isna().all()
+    key = ["pair_id", "method", "horizon_s"]
+    errors = single.assign(error=single["speed_error"].abs()).groupby(key)["error"].mean()
+    scores = table.groupby(key)["crps_speed"].mean()
+    for method in ("fixed", "fixed_residual", "constant_speed"):
+        both = errors.xs(method, level="method"), scores.xs(method, level="method")
+        pd.testing.assert_series_equal(*both, check_names=False, atol=1e-9)
+    name = "distribution/crps_speed_0.5s/policy"
+    by_driver = table[(table["method"] == "policy") & (table["horizon_s"] == 0.5)]
+    expected = by_driver.groupby("driver")["crps_speed"].mean().mean()
+    assert result.metrics[name] == pytest.approx(expected)

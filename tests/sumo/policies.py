@@ -14,6 +14,7 @@ from cfx.agents.heads.base import ParameterHead
 from cfx.agents.heads.direct import DirectHead
 from cfx.agents.heads.offset import OffsetHead
 from cfx.agents.heads.residual import ResidualHead
+from cfx.agents.heads.stochastic import StochasticHead
 from cfx.agents.scaler import Scaler
 from cfx.calibration.windows import WindowSettings
 from cfx.models.base import DrivingModel
@@ -30,19 +31,23 @@ def adaptive(
     length: int = 5,
     offsets: bool = False,
     residual: bool = False,
+    stochastic: bool = False,
     driver_features: tuple[str, ...] = (),
 ) -> Agent:
     """Returns a GRU for each name; what it chooses depends on all it sees.
 
     With `offsets` it answers offsets, from the middle between the bounds for who brings no base;
-    with `residual` also how the residual acceleration decays.
+    with `residual` also how the residual acceleration decays, and with
+    `stochastic` how much it varies.
     """
     model = registry.create("model", dict(node))
     assert isinstance(model, DrivingModel)
     policy = GruPolicy(inputs=INPUTS, driver_features=driver_features, start="middle")
     networks = len(names)
     head: ParameterHead = DirectHead(model.space)
-    if residual:
+    if stochastic:
+        head = StochasticHead.for_model(model)
+    elif residual:
         head = ResidualHead.for_model(model)
     elif offsets:
         head = OffsetHead(model.space)

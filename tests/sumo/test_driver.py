@@ -129,9 +129,9 @@ def counted(policy: Agent, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     calls: list[int] = []
     original = Agent.act
 
-    def act(self: Agent, history: Any, state: Any) -> tuple[Tensor, Any]:
+    def act(self: Agent, history: Any, state: Any, generator: Any) -> tuple[Tensor, Any]:
         calls.append(len(history.gap))
-        return original(self, history, state)
+        return original(self, history, state, generator)
 
     monkeypatch.setattr(Agent, "act", act)
     return calls
@@ -449,6 +449,26 @@ def test_steps_outside_the_valid_range_and_at_limits_are_counted() -> None:
     assert driver.counts.limited > 0
     assert len(driver.time_gaps(["v0", "v1"])) == 2
     assert Driver(adaptive({"name": "krauss"})).outside_in_words() == ""
+
+
+def test_a_stochastic_policy_draws_live_with_a_seed() -> None:
+    told: dict[int | None, list[list[float]]] = {}
+    policy = adaptive({"name": "krauss"}, stochastic=True)
+    for seed in (0, 1, None):
+        told[seed] = []
+        for _ in range(2):
+            road = platoon(2)
+            road.cars["v1"].speed, road.cars["v1"].gap = road.cars["v0"].speed, road.cars["v0"].gap
+            driver = Driver(policy, seed=seed)
+            for _ in range(4):
+                driver.step(road, ["v0", "v1"])
+                road.advance()
+            told[seed].append([*road.cars["v0"].told, *road.cars["v1"].told])
+    for twice in told.values():
+        assert twice[0] == twice[1], "the same seed, the same drive"
+    assert told[0][0] != told[1][0] != told[None][0]
+    assert told[0][0][:4] != told[0][0][4:], "equal vehicles differ"
+    assert told[None][0][:4] == told[None][0][4:]
 
 
 def test_a_network_may_be_named_behind_the_run(tmp_path: Path) -> None:

@@ -10,12 +10,14 @@ from cfx.agents.heads.direct import DirectHead
 from cfx.agents.heads.direct_residual import DirectResidualHead
 from cfx.agents.heads.offset import OffsetHead
 from cfx.agents.heads.residual import ResidualHead
+from cfx.agents.heads.stochastic import StochasticHead
 
 HEADS: dict[str, type[ParameterHead]] = {
     DirectHead.name: DirectHead,
     OffsetHead.name: OffsetHead,
     ResidualHead.name: ResidualHead,
     DirectResidualHead.name: DirectResidualHead,
+    StochasticHead.name: StochasticHead,
 }
 """Heads by the names that saved policies give."""
 

@@ -24,11 +24,13 @@ class ParameterHead(ABC):
     Attributes:
         name: in saved policies.
         needs_base: whether parameters depend on each driver's base parameters.
+        noise_width: how many random numbers a window of a driver takes; 0: nothing is drawn.
         space: the parameters that it answers, with their bounds.
     """
 
     name: ClassVar[str]
     needs_base: ClassVar[bool] = False
+    noise_width: ClassVar[int] = 0
 
     def __init__(self, space: ParameterSpace, device: torch.device | str | None = None) -> None:
         self.space = space
@@ -50,6 +52,19 @@ class ParameterHead(ABC):
     def model_space(self) -> ParameterSpace:
         """The driving model's parameters, which stand first in `space`."""
         return self.space
+
+    def sampled(self, parameters: Tensor, noise: Tensor, window_s: float) -> Tensor:
+        """Draws the parameters of a window.
+
+        Args:
+            parameters: what the head says of their distribution, `(*batch, n)`, SI units.
+            noise: standard normal, `(*batch, noise_width)`.
+            window_s: how long they hold, s.
+
+        Returns:
+            `(*batch, n)`, SI units.
+        """
+        return parameters
 
     def completed(self, parameters: Tensor) -> Tensor:
         """Returns the driving model's parameters with defaults for all else that the head answers.

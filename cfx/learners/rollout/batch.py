@@ -39,6 +39,25 @@ class RolloutBatch(NamedTuple):
         """The network of each trajectory, `(N, 1)`: the first index of tables `(N, B, ...)`."""
         return torch.arange(len(self.place), device=self.place.device)[:, None]
 
+    def repeated(self, times: int) -> RolloutBatch:
+        """Returns the trajectories `times` times, all of them behind one another."""
+
+        def copies(values: Tensor | None) -> Tensor | None:
+            if values is None:
+                return None
+            return values.repeat(1, times)
+
+        return RolloutBatch(
+            place=self.place.repeat(1, times),
+            start=self.start.repeat(1, times),
+            cold_start=self.cold_start.repeat(1, times),
+            last=self.last.repeat(1, times),
+            weight=self.weight.repeat(1, times),
+            scale=copies(self.scale),
+            shift=copies(self.shift),
+            wider=copies(self.wider),
+        )
+
     def without_unweighted(self) -> RolloutBatch:
         """Returns the trajectories that have weight, in order.
 

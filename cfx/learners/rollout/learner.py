@@ -19,6 +19,7 @@ from typing import Any, ClassVar
 
 import pandas as pd
 import torch
+from torch import Tensor
 
 from cfx.agents.heads import HEADS
 from cfx.agents.heads.base import ParameterHead
@@ -109,11 +110,12 @@ class RolloutLearner(Learner):
             return self._result(network.eval(), dataset, training_data, curves)
         checkpoint = self.checkpoint(policy, training_data)
         shards = list(cut(s, policy, training_data, dataset, network, checkpoint))
-        curves = self._train(shards, training_data.engine, network, dataset)
+        curves, dispersion = self._train(shards, training_data.engine, network, dataset)
         for shard in shards:
             for file in shard.files:
                 file.unlink(missing_ok=True)
-        return self._result(network.eval(), dataset, training_data, curves)
+        found = self._result(network.eval(), dataset, training_data, curves)
+        return replace(found, dispersion=dispersion)
 
     def _train(
         self,
@@ -121,8 +123,13 @@ class RolloutLearner(Learner):
         engine: Engine,
         network: PolicyNetwork,
         dataset: RolloutDataset,
-    ) -> pd.DataFrame:
-        """Trains all networks in place; returns the learning curves."""
+    ) -> tuple[pd.DataFrame, Tensor | None]:
+        """Trains all networks in place.
+
+        Returns:
+            The learning curves, and the dispersion of each ensemble's noise; None for a head
+            without noise.
+        """
         at_most = epochs(self.settings)
         title = f"Training ({len(dataset.pair)} networks, at most {at_most} epochs)"
         alone = len(shards) == 1
@@ -138,7 +145,16 @@ class RolloutLearner(Learner):
         curves = pd.concat([found.curves for found in in_order], ignore_index=True)
         curves = curves.sort_values("epoch", kind="stable", ignore_index=True)
         warn_of_nothing_learned(curves)
-        return curves
+        factors = []
+        for found in in_order:
+            if found.dispersion is not None:
+                factors.append(found.dispersion)
+        dispersion = None
+        if factors:
+            # The geometric mean of an ensemble's members.
+            of_members = torch.cat(factors).log().view(-1, dataset.ensemble_size)
+            dispersion = of_members.mean(1).exp()
+        return curves, dispersion
 
     def _result(
         self,

@@ -84,6 +84,7 @@ def simulate(
     *,
     burn_in_windows: int | None = None,
     expert: Expert | None = None,
+    noise: Tensor | None = None,
 ) -> Iterator[Segment]:
     """Simulates trajectories in closed loop.
 
@@ -95,6 +96,7 @@ def simulate(
         path: the way that gradients take back.
         burn_in_windows: windows of history that are observed at most; None: all.
         expert: says how it would have driven each window; None: nothing is asked.
+        noise: what a stochastic head draws from, `(H, N, D, k)`; None: nothing is drawn.
 
     Yields:
         What was simulated between two cuts of the gradients.
@@ -114,9 +116,11 @@ def simulate(
             if expert is not None and expert_state is not None:
                 label, expert_state = expert.label(expert_state, now, leader)
                 wanted.append(label)
-            now, speed, gap = step.drive_window(
-                now, leader, inputs.leader_length, conditioning.base, conditioning.features
-            )
+            known = (inputs.leader_length, conditioning.base, conditioning.features)
+            if noise is None:
+                now, speed, gap = step.drive_window(now, leader, *known)
+            else:
+                now, speed, gap = step.drive_window(now, leader, *known, noise[window])
             now = path.after_window(now)
             speeds.append(speed)
             gaps.append(gap)

@@ -101,6 +101,38 @@ class TrajectoryLoss:
         difference = _loss(self.speed_rmse, values, counted, weights and weights.speed)
         return loss.detach() + (difference - difference.detach())
 
+    def of_paths(self, segment: Segment, divisors: Divisors, paths: int) -> Tensor:
+        """Returns the CRPS of sampled paths over a segment, `(N, D)`, in the loss's terms.
+
+        It is the mean over frames of the CRPS of speed, plus `gap_weight` times that of the gap,
+        each with the divisors and the square roots of the weights of `__call__`. The estimator is
+        fair: with one neighbour of each path it has the mean that all pairs of paths have (C. A. T.
+        Ferro, 2014, *Fair scores for ensemble forecasts*, Q. J. R. Meteorol. Soc. 140).
+
+        Args:
+            segment: `(N, paths D, frames)`, each path of all trajectories behind the one before.
+            divisors: of the trajectories, `(N, D)` each.
+            paths: sampled of each trajectory, at least 2.
+        """
+        weights = None
+        if self.frame_weights is not None:
+            weights = self.frame_weights.at(segment.first, segment.speed.shape[-1])
+        measured = segment.measured
+        terms = []
+        for signal, truth, weight, divisor in (
+            (segment.speed, measured.speed, weights and weights.speed, divisors.objective),
+            (segment.gap, measured.gap, weights and weights.gap, divisors.gap),
+        ):
+            score = _fair_crps(_paths(signal, paths), _paths(truth, paths))
+            if weight is not None:
+                score = score * weight.sqrt()
+            counted = _paths(measured.counted, paths)[:, 0]
+            mean = (score * counted).sum(-1) / counted.sum(-1).clamp(min=1)
+            terms.append(mean / divisor)
+        jerk = _rms_jerk(segment.speed, measured.counted, self.dt)
+        loss = terms[0] + self.settings.gap_weight * terms[1]
+        return loss + self.settings.jerk_weight * _paths(jerk[..., None], paths)[..., 0].mean(1)
+
     def _values(self, segment: Segment, speed: Tensor) -> FrameValues:
         """Returns what objectives compare with these speeds, m/s, and with the measured gap."""
         return FrameValues(
@@ -120,6 +152,17 @@ def _loss(
         return objective(values, counted, dim=-1, epsilon=_EPSILON)
     sums = objective.sums(values, counted * weight, dim=-1)
     return objective.finish(sums, counted.sum(-1).clamp(min=1), _EPSILON)
+
+
+def _paths(values: Tensor, paths: int) -> Tensor:
+    """Returns `(N, paths D, K)` as `(N, paths, D, K)`."""
+    return values.view(len(values), paths, -1, values.shape[-1])
+
+
+def _fair_crps(sampled: Tensor, truth: Tensor) -> Tensor:
+    """Returns the CRPS of each frame, `(N, D, K)`, of paths `(N, paths, D, K)`."""
+    error = (sampled - truth).abs().mean(1)
+    return error - 0.5 * (sampled - sampled.roll(1, 1)).abs().mean(1)
 
 
 def _rms_jerk(speeds: Tensor, counted: Tensor, dt: float) -> Tensor:

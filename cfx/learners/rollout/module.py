@@ -40,6 +40,9 @@ eager work."""
 _LEAST_TEMPERATURE = 0.02
 """Below this a smoothed switch has no gradient that single precision resolves."""
 
+DISPERSIONS = (1.0, 1.2, 1.4, 1.7, 2.0, 2.5, 3.0)
+"""Factors on the noise of a stochastic head that are tried on validation drivers."""
+
 _WARM_UP = 20
 """Gradient steps over which the learning rate rises."""
 
@@ -124,6 +127,8 @@ class RolloutModule(BatchedModule):
         self.through_time = ThroughTime(*bounds)
         self.through_memory = ThroughMemory(*bounds)
         self.losses: list[Tensor] = []
+        self._noise_of = 0  # the gradient step whose noise is drawn
+        self.dispersion = torch.ones(len(dataset.pair), device=device)
 
     def configure_optimizers(self) -> Any:
         optimizer = super().configure_optimizers()
@@ -155,6 +160,7 @@ class RolloutModule(BatchedModule):
     def step_losses(self, step: int) -> Iterator[Tensor]:
         """Yields each network's loss in a gradient step, `(N,)`, of each segment."""
         batch = self.sampler.training(step)
+        self._noise_of = step
         count = batch.weight.sum(1).clamp(min=1.0)
         divisors = self.errors.over_horizon(batch)
         expert, path = None, self.through_time
@@ -188,11 +194,56 @@ class RolloutModule(BatchedModule):
         most = None
         if not isinstance(path, NoGradients):
             most = self.burn_in_windows
+        paths = 1
+        noise = None
+        if self.exact_step.core.head.noise_width > 0 and expert is None:
+            paths = self.settings.paths
+            noise = self._noise(batch, windows)
         segments = simulate(
-            step, self.dataset, batch, windows, path, burn_in_windows=most, expert=expert
+            step,
+            self.dataset,
+            batch.repeated(paths),
+            windows,
+            path,
+            burn_in_windows=most,
+            expert=expert,
+            noise=noise,
         )
         for segment in segments:
-            yield self.loss(segment, divisors)
+            if paths == 1:
+                yield self.loss(segment, divisors)
+            else:
+                yield self.loss.of_paths(segment, divisors, paths)
+
+    def _noise(self, batch: RolloutBatch, windows: int) -> Tensor:
+        """Returns what sampled paths draw from, `(windows, N, paths D, k)`.
+
+        In training it follows from the gradient step; in validation it is always the same.
+        """
+        s, dataset = self.settings, self.dataset
+        count, width = batch.place.shape[1], self.exact_step.core.head.noise_width
+        most = max(count, self.sampler.trajectories)
+        generator = torch.Generator().manual_seed(self.sampler.step_seed(self._noise_of))
+        drawn = dataset.normal((windows, s.paths, most, width), generator)[:, :, :, :count]
+        drawn = drawn * self.dispersion.view(-1, 1, 1, 1, 1)
+        return drawn.flatten(2, 3).transpose(0, 1).contiguous()
+
+    @torch.no_grad()
+    def fit_dispersion(self) -> Tensor | None:
+        """Returns a factor on each network's noise, `(N,)`; None for a head without noise.
+
+        It is the one of `DISPERSIONS` with the smallest CRPS of validation drivers: networks are
+        surer of drivers that they learned from than of others. 1 where none was kept.
+        """
+        if self.exact_step.core.head.noise_width == 0:
+            return None
+        losses = []
+        for factor in DISPERSIONS:
+            self.dispersion.fill_(factor)
+            losses.append(self._loss_with_history())
+        self.dispersion.fill_(1.0)
+        found = torch.stack(losses).nan_to_num(nan=0.0)
+        return torch.tensor(DISPERSIONS, device=found.device)[found.argmin(0)]
 
     @torch.no_grad()
     def _frame_weights(self) -> FrameWeights:
@@ -257,6 +308,7 @@ class RolloutModule(BatchedModule):
         return self._exact_loss(batch, windows, self.errors.over_full_trajectory(batch))
 
     def _exact_loss(self, batch: RolloutBatch, windows: int, divisors: Divisors) -> Tensor:
+        self._noise_of = 0
         losses = self.trajectory_losses(self.exact_step, batch, windows, divisors, NoGradients())
         return _weighted_mean(next(losses), batch.weight)
 

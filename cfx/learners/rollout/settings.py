@@ -17,11 +17,18 @@ from cfx.simulation.rollout import Compile
 class HeadSettings(Settings):
     """What networks answer."""
 
-    head: Literal["offset", "residual"] = Field(
+    head: Literal["offset", "residual", "stochastic"] = Field(
         "offset",
         description="offset: offsets from each driver's base parameters; residual: also how the"
         " acceleration that the model misses at the start decays, so that the policy starts with"
-        " exactly the acceleration that the driver has",
+        " exactly the acceleration that the driver has; stochastic: also how much it varies,"
+        " trained by the CRPS of sampled paths",
+    )
+    paths: int = Field(
+        2,
+        ge=2,
+        le=64,
+        description="sampled paths of each trajectory in training, for head=stochastic",
     )
 
 

@@ -79,10 +79,12 @@ class TrainedShard:
     Attributes:
         weights: of each one's best epoch.
         curves: as `TrainingResult` has them.
+        dispersion: of each one's noise, `(N,)`; None for a head without noise.
     """
 
     weights: dict[str, Tensor]
     curves: pd.DataFrame
+    dispersion: Tensor | None = None
 
 
 def networks_of_shards(settings: RolloutSettings, dataset: RolloutDataset) -> list[slice]:
@@ -216,7 +218,8 @@ def train(shard: TrainingShard, report: Report) -> TrainedShard:
     )
     _fit(module, checkpoint)
     progress.end()
-    return TrainedShard(module.network.state_dict(), module.curves())
+    dispersion = module.fit_dispersion()
+    return TrainedShard(module.network.state_dict(), module.curves(), dispersion)
 
 
 def untrained(

@@ -74,6 +74,7 @@ class WindowStep:
         leader_length: Tensor,
         base: Tensor,
         conditioning: Tensor,
+        noise: Tensor | None = None,
     ) -> tuple[LoopState, Tensor, Tensor]:
         """Simulates one window.
 
@@ -83,6 +84,7 @@ class WindowStep:
             leader_length: `(N, D)`, m.
             base: in unit space, `(N, D, n)`.
             conditioning: `(N, D, c)`, not normalised.
+            noise: what a stochastic head draws from, `(N, D, k)`; None: nothing is drawn.
 
         Returns:
             Where the trajectories stand afterwards; speed (m/s) and gap (m) at the S frames,
@@ -90,7 +92,10 @@ class WindowStep:
         """
         history = self._history(now, leader, leader_length)
         unit, state = self.core.act(history, base, conditioning, now.state)
-        p = self.space.unpack(self.low + unit * self.range)
+        chosen = self.low + unit * self.range
+        if noise is not None:
+            chosen = self.core.head.sampled(chosen, noise, self.stride * self.dt)
+        p = self.space.unpack(chosen)
         last = self.length - 1
         follower = Follower(
             now.position[..., last], now.speed[..., last], now.acceleration[..., last], now.memory

@@ -213,6 +213,7 @@ def test_an_ensemble_learns_and_drives_as_one() -> None:
         {"temperature": 0.0},
         {"distillation_epochs": 1},
         {"head": "residual", "time_weighting": "relative", "distillation_epochs": 1},
+        {"head": "stochastic", "time_weighting": "relative", "jerk_weight": 0.01},
     ],
     ids=lambda options: next(iter(options)),
 )

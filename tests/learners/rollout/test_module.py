@@ -12,6 +12,7 @@ from cfx.learners.rollout import RolloutLearner, RolloutModule, RolloutSettings
 from cfx.learners.rollout.batch import RolloutBatch
 from cfx.learners.rollout.gradients import NoGradients
 from cfx.learners.rollout.loop import burn_in, simulate
+from cfx.learners.rollout.module import DISPERSIONS
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.policies.driver_features import measure
@@ -110,6 +111,27 @@ def test_weights_let_each_time_after_the_start_count_alike() -> None:
     assert float(weighted.max()) < 1.001 * float(error.mean())
     beyond = weights.at(55, 20)
     assert torch.equal(beyond.speed[0, 0, 5:], weights.speed[0, 0, -1].expand(15))
+
+
+def test_the_noise_is_as_wide_as_validation_drivers_want_it() -> None:
+    """Of the factors the one with the smallest CRPS; the noise that is drawn grows with it."""
+    policy, data = gru(), training_data(networks=2)
+    settings = RolloutSettings(**(QUICK | {"head": "stochastic"}))
+    dataset = placed(data, policy, settings.validation, head="stochastic")
+    result = untrained(data, policy, head="stochastic")
+    module = RolloutModule(result.network, dataset, policy, data, settings)
+    found = module.fit_dispersion()
+    assert found is not None
+    losses = []
+    with torch.no_grad():
+        for factor in DISPERSIONS:
+            module.dispersion.fill_(factor)
+            losses.append(module._loss_with_history())
+    best = torch.stack(losses).argmin(0)
+    assert found.tolist() == [pytest.approx(DISPERSIONS[index]) for index in best.tolist()]
+    assert len({round(float(loss.sum()), 6) for loss in losses}) == len(DISPERSIONS)
+    assert result.dispersion is not None
+    assert result.dispersion.shape == (2,)
 
 
 def exact_losses(module: RolloutModule, batch: RolloutBatch, windows: int, full: bool) -> Any:
