@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import torch
 from filterpy.kalman import KalmanFilter
 from torch import Tensor
 
-import cfx
+from cfx.agents import checkpoint
 from cfx.agents.agent import Agent
 from cfx.agents.core import AgentCore
 from cfx.agents.heads import HEADS
@@ -38,12 +39,11 @@ from cfx.progress import Task
 from cfx.simulation.rollout import MemoryStepper
 from cfx.testing.policies import PolicyContract
 from tests.drives import wavy_pairs
-from tests.protocols.test_forecast import FORECAST
 
 WINDOWS = WindowSettings()
 ESTIMATORS = {
     "ukf": UkfPolicy(spread=1.0, drift=0.0, noise=0.05),
-    "particle_filter": ParticleFilterPolicy(spread=1.0, drift=0.02, noise=0.2, particles=500),
+    "particle_filter": ParticleFilterPolicy(spread=1.0, drift=0.02, noise=0.2, particles=200),
     "recalibrate": RecalibratePolicy(prior=0.0),
 }
 
@@ -166,16 +166,16 @@ def test_without_history_a_driver_has_the_pooled_parameters(name: str) -> None:
     )
     wide = 0.0
     if name == "particle_filter":
-        wide = 0.2  # the mean of five hundred draws around it
+        wide = 0.2  # the mean of two hundred draws around it
     torch.testing.assert_close(loop.parameters[:, -1], prior.expand(3, -1), atol=wide, rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_origins_that_share_their_observation_are_as_each_alone(name: str) -> None:
-    batch, _, _ = krauss_drivers()
+    batch, _, _ = krauss_drivers(150)
     agent = agent_of(ESTIMATORS[name], Krauss(), torch.tensor([[1.5, 0.15]]).double())
     stepper, network = MemoryStepper(Krauss(), 0.1), torch.zeros(3).long()
-    origins = Origins(torch.tensor([0, 0, 2]), torch.tensor([60, 200, 145]))
+    origins = Origins(torch.tensor([0, 0, 2]), torch.tensor([40, 90, 65]))
     paths = simulate_from_origins(stepper, agent, batch, origins, 30, network)
     for k, (pair, frame) in enumerate(zip(origins.pair, origins.frame, strict=True)):
         alone = simulate_closed_loop(
@@ -271,25 +271,27 @@ def test_a_model_without_equations_is_refused() -> None:
         UkfPolicy().for_model(model, 0.1, WINDOWS)
 
 
-def test_an_estimator_is_saved_and_loaded(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: object
-) -> None:
-    monkeypatch.chdir(str(tmp_path))
-    result = cfx.run(
-        [*FORECAST, "policy=particle_filter", "policy.particles=50", "policy.residual=true"]
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_an_estimator_is_saved_and_loaded(name: str, tmp_path: Path) -> None:
+    batch, _, _ = krauss_drivers(150)
+    policy = ESTIMATORS[name]
+    agent = agent_of(policy, Krauss(), torch.tensor([[1.5, 0.15]]).double())
+    head = HEADS["direct_residual"].for_model(Krauss())
+    agent = replace(
+        agent,
+        core=AgentCore(agent.policy, agent.network, agent.scaler, head),
+        policy_node={"name": name, **policy.settings.model_dump(), "residual": True},
     )
-    assert result.metrics["forecast/rmse_speed_2s/policy"] > 0
-    again = cfx.load(result.folder).policy
-    batch, _, _ = krauss_drivers()
-    loops = []
-    for agent in (result.policy, again):
-        loops.append(
-            simulate_closed_loop(
-                MemoryStepper(Krauss(), 0.1),
-                agent,
-                batch,
-                torch.full((3,), 250),
-                torch.zeros(3).long(),
-            ).speed
+    checkpoint.save(agent, tmp_path)
+    speeds = []
+    for one in (agent, checkpoint.load(tmp_path)):
+        loop = simulate_closed_loop(
+            MemoryStepper(Krauss(), 0.1), one, batch, torch.full((3,), 100), torch.zeros(3).long()
         )
-    assert torch.equal(*loops)
+        speeds.append(loop.speed)
+    assert torch.equal(*speeds)
+
+
+def test_the_policy_says_whether_it_starts_with_a_residual() -> None:
+    assert UkfPolicy(residual=True).untrained_head == "direct_residual"
+    assert UkfPolicy().untrained_head is None

@@ -28,6 +28,7 @@ class TestAcrossDrivers(ProtocolContract):
         return ACROSS
 
 
+@pytest.mark.slow  # calibration and training are those of across_drivers, which stands above
 class TestForecast(ProtocolContract):
     @pytest.fixture
     def protocol(self) -> Protocol:
