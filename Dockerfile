@@ -16,7 +16,7 @@ RUN python -m venv /opt/cfx
 RUN if [ -n "$TORCH_INDEX" ]; then \
       /opt/cfx/bin/pip install --no-cache-dir --no-deps --index-url "$TORCH_INDEX" "$(grep '^torch==' constraints.txt)"; \
     fi
-COPY pyproject.toml README.md LICENSE ./
+COPY pyproject.toml README.md LICENSE CITATION.cff ./
 COPY cfx ./cfx
 COPY conf ./conf
 COPY plugins/cfx-dask ./plugins/cfx-dask

@@ -113,3 +113,20 @@ def test_the_licence_is_whole() -> None:
     text = (ROOT / "LICENSE").read_text(encoding="utf-8")
     assert text.startswith("MIT License")
     assert "WITHOUT WARRANTY OF ANY KIND" in text
+
+
+def test_the_image_is_built_from_all_that_the_wheel_needs() -> None:
+    copied = set()
+    for line in (ROOT / "Dockerfile").read_text(encoding="utf-8").splitlines():
+        words = line.split()
+        if words[:1] == ["COPY"] and "--from=build" not in words:
+            copied |= set(words[1:-1])
+    let_through = set()
+    for line in (ROOT / ".dockerignore").read_text(encoding="utf-8").splitlines():
+        if line.startswith("!"):
+            let_through.add(line.removeprefix("!"))
+    assert copied == let_through
+    wheel = PYPROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]
+    needed = {*wheel["only-include"], *wheel.get("force-include", {})}
+    needed |= {PYPROJECT["project"]["readme"], *PYPROJECT["project"]["license-files"]}
+    assert needed <= copied
