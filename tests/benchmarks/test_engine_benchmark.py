@@ -51,6 +51,7 @@ def test_overhead_of_a_shard(benchmark, engine: Engine) -> None:
     benchmark.extra_info["ms per shard"] = 1000 * benchmark.stats["min"] / SHARDS
 
 
+@pytest.mark.timeout(1200)
 def test_efficiency_of_two_workers(benchmark, engine: Engine, monkeypatch) -> None:
     """Labels of 60 drivers with W99: one core here against two workers."""
     model = W99()
@@ -63,7 +64,7 @@ def test_efficiency_of_two_workers(benchmark, engine: Engine, monkeypatch) -> No
     def seconds(where: Engine) -> float:
         calibrator = Calibrator(
             MemoryStepper(model, 0.1),
-            RandomSearch(samples=16384),
+            RandomSearch(samples=4096),
             seed=0,
             cache=Cache(None),
             memory=1 << 28,

@@ -91,6 +91,7 @@ def meanwhile(what: Callable[[], None]) -> Iterator[threading.Thread]:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_workers_that_are_killed_ten_times_change_nothing(
     cluster: Cluster, expected: Tensor, tmp_path: Path
 ) -> None:
@@ -114,6 +115,7 @@ def test_workers_that_are_killed_ten_times_change_nothing(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_a_scheduler_that_is_started_again_changes_nothing(
     cluster: Cluster, expected: Tensor, tmp_path: Path
 ) -> None:
@@ -134,6 +136,7 @@ def test_a_scheduler_that_is_started_again_changes_nothing(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 @pytest.mark.parametrize("whose", ["scheduler", "worker"])
 def test_a_network_that_is_gone_for_20_s_changes_nothing(
     cluster: Cluster, expected: Tensor, tmp_path: Path, whose: str
@@ -159,6 +162,7 @@ def test_a_network_that_is_gone_for_20_s_changes_nothing(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_what_was_finished_before_the_cluster_went_is_not_done_again(
     cluster: Cluster, expected: Tensor, tmp_path: Path
 ) -> None:

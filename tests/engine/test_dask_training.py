@@ -42,6 +42,7 @@ def trained(engine: Engine, workspace: Path | None) -> TrainingResult:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_workers_that_are_killed_ten_times_change_nothing(
     cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
