@@ -160,7 +160,7 @@ def test_every_decision_is_in_the_index_and_has_its_three_parts() -> None:
 def test_the_documents_commands_compose(command: str) -> None:
     overrides = []
     for word in shlex.split(command)[3:]:
-        if re.match(r"[\w./]+=[^\[{]*,", word):  # a sweep: its first value
+        if re.match(r"\+{0,2}[\w./]+=[^\[{]*,", word):  # a sweep: its first value
             overrides.append(word.partition(",")[0])
         elif word != "-m":
             overrides.append(word)
