@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from cfx.models.base import DrivingModel, Follower, Leader
-from cfx.models.limits import limited_speed
 from cfx.pairs import PairBatch
+from cfx.simulation.step import advance_vehicle
 
 
 class ResidualStatistics(NamedTuple):
@@ -64,9 +64,7 @@ def measure_residuals(
     p = {}
     for name, value in model.space.unpack(parameters).items():
         p[name] = value[:, None] if value.dim() else value
-    wanted = model.next_speed(follower, leader, p, batch.dt)
-    possible = limited_speed(model.limits, speed, follower.acceleration, wanted, batch.dt)
-    alone = (possible - speed) / batch.dt
+    alone = (advance_vehicle(model, follower, leader, p, batch.dt).speed - speed) / batch.dt
     residual = speed.diff(dim=1) / batch.dt - alone[:, :-1]
     counted = torch.arange(residual.shape[1], device=last.device) < last[:, None]
     residual = torch.where(counted, residual, 0.0)

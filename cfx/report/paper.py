@@ -27,6 +27,7 @@ _ESCAPED = re.compile(r"[&%$#_{}]")
 """Characters of a name that LaTeX takes for commands in a caption."""
 
 _LETTERS = {
+    "\N{EN DASH}": "--",
     "\N{MINUS SIGN}": "$-$",
     "\N{SUPERSCRIPT TWO}": "$^2$",
     "\N{SUPERSCRIPT THREE}": "$^3$",
