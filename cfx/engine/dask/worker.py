@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cfx.engine.base import ResultT, ShardT, Unfit, Work
-from cfx.engine.counting import Counted, counted
+from cfx.engine.dask.counting import Counted, counted
 
 
 class WorkerTrouble(Exception):  # noqa: N818 - the shard is well, its worker is not
