@@ -71,6 +71,10 @@ class EngineError(CfxError):
     """The workers of an engine cannot be reached, or were lost for good."""
 
 
+class NotInstalledError(EngineError):
+    """An extra that an engine needs is not installed; its words say how to install it."""
+
+
 class SumoError(CfxError):
     """SUMO is missing, or does not do what is asked of it."""
 

@@ -14,12 +14,12 @@ import yaml
 
 import cfx
 from cfx import registry, renamed
-from cfx.cli import COMMANDS
+from cfx.cli import COMMANDS, PARSERS
 from cfx.hydra_source import composed
 from cfx.models.base import DrivingModel
 from tests.conftest import ROOT
 from tests.drives import straight_pairs
-from tests.printed import Reader, blocks
+from tests.printed import Reader, all_blocks, blocks
 from tests.test_imports import FLOORS
 
 PAGES = sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").rglob("*.md"))
@@ -48,6 +48,21 @@ def commands() -> list[str]:
     return sorted(set(found))
 
 
+def of_sub_commands() -> list[str]:
+    """Returns the calls of sub-commands that documents print, in guides too, each once."""
+    found = set()
+    for name in DOCUMENTS:
+        for language, block in all_blocks(name):
+            if language not in {"", "sh", "text"}:
+                continue
+            for line in block.splitlines():
+                call = line.partition("  # ")[0].strip()
+                words = call.split()
+                if words[:3] == ["python", "-m", "cfx"] and words[3:] and words[3] in COMMANDS:
+                    found.add(call)
+    return sorted(found)
+
+
 def summarised() -> list[str]:
     """Returns what follows `python -m cfx` in the table that sums up the results."""
     text = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
@@ -70,6 +85,7 @@ def nav_of(entries: Iterable[object]) -> Iterator[str]:
 def test_there_are_commands_to_check() -> None:
     assert len(commands()) >= 40
     assert len(summarised()) == 6
+    assert {call.split()[3] for call in of_sub_commands()} == set(COMMANDS)
 
 
 def test_the_readme_is_short() -> None:
@@ -165,6 +181,18 @@ def test_the_documents_commands_compose(command: str) -> None:
         elif word != "-m":
             overrides.append(word)
     assert composed(overrides)
+
+
+@pytest.mark.parametrize("call", of_sub_commands())
+def test_the_documents_sub_commands_have_these_options(call: str) -> None:
+    name, *arguments = shlex.split(call)[3:]
+    if "--" in arguments:  # what follows is SUMO's
+        arguments = arguments[: arguments.index("--")]
+    parser = PARSERS[name]()
+    if name == "benchmark":  # its overrides may stand between options
+        parser.parse_intermixed_args(arguments)
+    else:
+        parser.parse_args(arguments)
 
 
 def test_the_readmes_python_runs(

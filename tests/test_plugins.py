@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import re
@@ -174,6 +175,23 @@ def test_check_exits_with_1_only_if_something_is_broken(
         "twin-one 1.0 cannot be used, because twin-two 2.0 brings a model of that name too"
         in complaints[0]
     )
+
+
+def test_check_names_the_extra_that_is_not_installed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What lacks an extra is not broken."""
+    found = importlib.util.find_spec
+    without = {"distributed": None}
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *more: without.get(name, found(name, *more))
+    )
+    assert cli.main(["plugins", "check", "engine", "dask"]) == 0
+    printed = capsys.readouterr()
+    assert re.search(r"^ *engine +dask .* not installed *$", printed.out, re.MULTILINE)
+    assert "Hint: engine=dask needs the package distributed: " in printed.out
+    assert "[dask]" in printed.out
+    assert printed.err == ""
 
 
 def test_check_runs_the_contract_and_hints_at_what_could_be_better(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from cfx import nodes, registry
 from cfx.component import API_VERSION
 from cfx.console import blank_table, put
-from cfx.errors import CfxError, ConfigError
+from cfx.errors import CfxError, ConfigError, NotInstalledError
 from cfx.progress import Task
 
 
@@ -18,7 +18,7 @@ class Verdict:
 
     Attributes:
         entry: which component.
-        state: fine, broken or shadowed.
+        state: fine, broken, shadowed, or not installed: an extra that it needs is not there.
         complaint: what is wrong, in one sentence that names the distribution; "" if nothing is.
         hint: what could be better; "" if nothing could.
     """
@@ -114,6 +114,8 @@ def examine(entry: registry.Entry) -> Verdict:
             return Verdict(entry, "fine", hint=_not_tried(entry, required))
         component = registry.create(entry.kind, {"name": entry.name, **cls.trial})
         complaint = _broken_contract(entry, component)
+    except NotInstalledError as error:
+        return Verdict(entry, "not installed", hint=str(error))
     except CfxError as error:
         complaint = " ".join(str(error).split())
         if entry.distribution not in complaint:

@@ -216,7 +216,7 @@ class Job:
 
     @property
     def parameters(self) -> tuple[ParameterAxis, ...]:
-        """The tuned parameters of the trajectories, with units and bounds where they are known."""
+        """The tuned parameters of the trajectories, with what is known of them."""
         if self.trajectories is None:
             return ()
         known = {}
@@ -227,7 +227,8 @@ class Job:
         for name in _parameter_names(self.trajectories, self._simulated):
             about = known.get(name, {})
             low, high = _number(about.get("low")), _number(about.get("high"))
-            axes.append(ParameterAxis(name, str(about.get("unit", "")), low, high))
+            unit, meaning = str(about.get("unit", "")), str(about.get("meaning", ""))
+            axes.append(ParameterAxis(name, unit, low, high, meaning))
         return tuple(axes)
 
     @cached_property

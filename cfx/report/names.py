@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from cfx.plots.words import common_prefix
 from cfx.report.job import Job
 from cfx.tracking.provenance import flatten
 
@@ -23,18 +24,21 @@ _NO_DIFFERENCE = (
 )
 """Settings that change where or how fast a job runs, not what comes out."""
 
-_MOST = 4
-"""Most parts of a name; more are replaced by a number."""
-
 SEPARATOR = " · "
+
+_MOST = 4
+"""Most parts of a name that are all shown; of more, those that tell the jobs apart are."""
+
+_LONG = 24
+"""Characters of a value from which on what all jobs' values begin with is left out."""
 
 
 def named(jobs: Sequence[Job]) -> tuple[Job, ...]:
     """Gives every job a short name: its driving model, and what else differs between the jobs."""
-    names = []
-    for parts in differences(jobs):
-        shown = parts if len(parts) <= _MOST else [*parts[: _MOST - 1], "…"]
-        names.append(SEPARATOR.join(shown))
+    columns = _columns(jobs, ())
+    if len(columns) > _MOST:
+        columns = _telling(columns)
+    names = _joined(columns)
     renamed = []
     for k, job in enumerate(jobs):
         name = names[k]
@@ -42,6 +46,34 @@ def named(jobs: Sequence[Job]) -> tuple[Job, ...]:
             name += f" ({names[: k + 1].count(name)})"
         renamed.append(replace(job, name=name))
     return tuple(renamed)
+
+
+def shortest_names(jobs: Sequence[Job], ignored: Sequence[str] = ()) -> list[str]:
+    """Returns names of as few parts as tell apart what `differences` tells apart."""
+    return _joined(_telling(_columns(jobs, ignored)))
+
+
+def _joined(columns: Sequence[Sequence[str]]) -> list[str]:
+    """Returns a name for each job: its values in the columns, without the absent ones."""
+    names = []
+    for values in zip(*columns, strict=True):
+        names.append(SEPARATOR.join(value for value in values if value))
+    return names
+
+
+def _telling(columns: Sequence[list[str]]) -> list[list[str]]:
+    """Returns the first column, and as few others as tell apart what all columns tell apart."""
+    left, kept = list(range(1, len(columns))), [0]
+    while left and _kinds(columns, kept) < _kinds(columns, range(len(columns))):
+        best = max(left, key=lambda one: _kinds(columns, [*kept, one]))
+        left.remove(best)
+        kept.append(best)
+    return [columns[one] for one in sorted(kept)]
+
+
+def _kinds(columns: Sequence[Sequence[str]], chosen: Sequence[int]) -> int:
+    """Returns how many jobs some columns tell apart."""
+    return len(set(zip(*(columns[one] for one in chosen), strict=True)))
 
 
 def differences(jobs: Sequence[Job], ignored: Sequence[str] = ()) -> list[list[str]]:
@@ -54,9 +86,17 @@ def differences(jobs: Sequence[Job], ignored: Sequence[str] = ()) -> list[list[s
         jobs: that are compared.
         ignored: full names of settings that do not count.
     """
-    parts = [[job.component("model") or "model"] for job in jobs]
+    parts = []
+    for values in zip(*_columns(jobs, ignored), strict=True):
+        parts.append([value for value in values if value])
+    return parts
+
+
+def _columns(jobs: Sequence[Job], ignored: Sequence[str]) -> list[list[str]]:
+    """Returns the models, and a column for everything else that differs; "" where it is absent."""
+    columns = [[job.component("model") or "model" for job in jobs]]
     for group in GROUPS[1:]:
-        _add(parts, [job.component(group) for job in jobs])
+        columns.append([job.component(group) for job in jobs])
     flat = [flatten(dict(job.config)) for job in jobs]
     keys: dict[str, None] = {}
     for values in flat:
@@ -64,8 +104,9 @@ def differences(jobs: Sequence[Job], ignored: Sequence[str] = ()) -> list[list[s
     for key in keys:
         counts = key not in ignored and not key.startswith(_NO_DIFFERENCE)
         if counts and not key.endswith(".name") and _differs(key, jobs, flat):
-            _add(parts, [_said(key, values) for values in flat])
-    return parts
+            columns.append(_said(key, flat))
+    first, *others = columns
+    return [first, *(column for column in others if len(set(column)) > 1)]
 
 
 def _differs(key: str, jobs: Sequence[Job], flat: Sequence[Mapping[str, Any]]) -> bool:
@@ -78,18 +119,19 @@ def _differs(key: str, jobs: Sequence[Job], flat: Sequence[Mapping[str, Any]]) -
     return any(len(values) > 1 for values in found.values())
 
 
-def _said(key: str, values: Mapping[str, Any]) -> str:
-    if key not in values:
-        return ""
-    if key == "style.cluster":
-        return str(values[key])
-    if key == "seed":
-        return f"seed {values[key]}"
-    return f"{key.partition('.')[2] or key}={values[key]}"
-
-
-def _add(parts: list[list[str]], values: Sequence[str]) -> None:
-    if len(set(values)) > 1:
-        for part, value in zip(parts, values, strict=True):
-            if value:
-                part.append(value)
+def _said(key: str, flat: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Returns a setting of each job in words; long values without what they all begin with."""
+    values = [str(one[key]) if key in one else "" for one in flat]
+    longest = max(map(len, values))
+    same = common_prefix([value for value in values if value])
+    said = []
+    if longest > _LONG and same:
+        values = [value and f"…{value.removeprefix(same)}" for value in values]
+    for value in values:
+        if not value or key == "style.cluster":
+            said.append(value)
+        elif key == "seed":
+            said.append(f"seed {value}")
+        else:
+            said.append(f"{key.partition('.')[2] or key}={value}")
+    return said

@@ -16,7 +16,7 @@ from cfx.files import write_output
 from cfx.plots.words import short_label
 from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs, any_baselines
-from cfx.report.names import SEPARATOR, differences
+from cfx.report.names import shortest_names
 from cfx.report.sections.calibration import sheet, spreads_of
 from cfx.tracking.provenance import flatten
 
@@ -99,22 +99,12 @@ def rows_of(jobs: Sequence[Job], group_by: str | None = None) -> tuple[Row, ...]
             f"--group-by {group_by}: no job has this setting; name one as config.yaml does, for"
             " instance seed or data.max_pairs"
         )
-    names = _short(differences(jobs, ignored))
+    names = shortest_names(jobs, ignored)
     found: dict[str, list[Job]] = {}
     for number, (name, job) in enumerate(zip(names, jobs, strict=True)):
         key = name if group_by is not None or names.count(name) == 1 else f"{name} ({number + 1})"
         found.setdefault(key, []).append(job)
     return tuple(Row(name, tuple(alike)) for name, alike in found.items())
-
-
-def _short(parts: Sequence[Sequence[str]]) -> list[str]:
-    """Returns names of as few parts as tell apart what all parts tell apart."""
-    kinds = len({tuple(one) for one in parts})
-    for length in range(1, max(map(len, parts)) + 1):
-        names = [SEPARATOR.join(one[:length]) for one in parts]
-        if len(set(names)) == kinds:
-            return names
-    return [SEPARATOR.join(one) for one in parts]
 
 
 def frame(rows: Sequence[Row]) -> pd.DataFrame:

@@ -98,7 +98,7 @@ def _content(road: Motorway, shown: Sequence[Shown], evaluation: Evaluation) -> 
     Positions are centimetres from a corner of the road, so that they are short integers.
     """
     corner = np.concatenate([lane.shape for lane in road.lanes]).min(axis=0)
-    axes = parameter_axes(evaluation.names, evaluation.units, evaluation.bounds)
+    axes = parameter_axes(evaluation)
     pairs = []
     for one, trajectory in zip(shown, evaluation.trajectories, strict=True):
         plot = pair_plot(pair_panels(trajectory, evaluation.methods, axes))

@@ -24,6 +24,7 @@ from cfx.errors import CfxError, TrackingError
 from cfx.evaluation.result import Evaluation
 from cfx.learners.curves import over_networks
 from cfx.pairs import SIGNALS, PairSet
+from cfx.plots.look import JOB_COLOURS
 from cfx.tracking import provenance
 from cfx.tracking.headline import RESULT, headline, without_improvements
 from cfx.tracking.store import Store, open_store, tracking_uri, translate_errors
@@ -42,6 +43,9 @@ _KEY_LENGTH = 250
 _DATASET_NAME = 500  # MLflow's limit for a dataset's name
 _EXAMPLE_FRAMES = 50
 """Frames of a model's input example."""
+
+_COLOUR = "mlflow.runColor"
+"""The tag with a run's colour in MLflow's tables and charts."""
 
 _SERVED = Path(__file__).with_name("served_policy.py")
 
@@ -98,7 +102,7 @@ class Tracker:
         with MlflowTracker.run(
             tracking_uri(config.tracking.uri),
             experiment=config.tracking.experiment,
-            run_name="-".join(names[kind] for kind in ("model", "policy", "optimizer", "data")),
+            run_name=_run_name(config, names),
             parameters=provenance.flatten(values),
             tags=tags,
             plugins=plugins,
@@ -367,11 +371,10 @@ class MlflowTracker(Tracker):
             self.model_uri = f"models:/{model.model_id}"
 
     def how_to_open(self) -> tuple[str, ...]:
-        address, first = _address(self.store.uri)
-        here = f"MLflow: {address}/{self.link}"
         if self._sweep is not None:
-            return (here,)  # the sweep says the rest, once, at its end
-        return (*first, here)
+            return ()  # the sweep says it once, at its end
+        address, first = _address(self.store.uri)
+        return (*first, f"MLflow: {address}/{self.link}")
 
     def _log_metrics(self, points: Sequence[tuple[str, float, int]]) -> None:
         from mlflow.entities import Metric
@@ -410,6 +413,14 @@ class MlflowTracker(Tracker):
             if self._parent_id is not None and self._sweep is not None:
                 with self.store.locked():
                     _settle(self.store, self._parent_id, _safe(self._sweep))
+
+
+def _run_name(config: JobConfig, names: Mapping[str, str]) -> str:
+    """Returns what a run is called: its components; in a sweep, whose jobs have many, its seed."""
+    parts = [names[kind] for kind in ("model", "policy", "optimizer", "data")]
+    if config.tracking.sweep is not None:
+        parts.append(f"seed{config.seed}")
+    return "-".join(parts)
 
 
 def _dataset_name(name: str, source: str) -> str:
@@ -510,7 +521,8 @@ def _begin(store: Store, name: str, parameters: Mapping[str, str], tags: Mapping
             client.delete_tag(run.info.run_id, "cfx.failure")
     else:
         # With its tags from the start: whoever finds it after a kill knows whose it was.
-        whose = {tag.key: tag.value for tag in _tags(tags)}
+        whose = {_COLOUR: _next_colour(store)}
+        whose |= {tag.key: tag.value for tag in _tags(tags)}
         run, known = client.create_run(store.experiment_id, run_name=name, tags=whose), {}
     run_id = str(run.info.run_id)
     try:
@@ -525,6 +537,19 @@ def _begin(store: Store, name: str, parameters: Mapping[str, str], tags: Mapping
         client.set_terminated(run_id, "FAILED")
         raise
     return run_id
+
+
+def _next_colour(store: Store) -> str:
+    """Returns the colour of jobs that the newest runs have least; MLflow's own often coincide."""
+    jobs = "tags.`cfx.sweep_parent` IS NULL"
+    newest = ["attributes.start_time DESC"]
+    runs = store.client.search_runs(
+        [store.experiment_id], jobs, order_by=newest, max_results=len(JOB_COLOURS)
+    )
+    ages: dict[str, int] = {}
+    for age, run in enumerate(runs):
+        ages.setdefault(run.data.tags.get(_COLOUR, ""), age)
+    return max(JOB_COLOURS, key=lambda colour: ages.get(colour, len(runs)))
 
 
 def _replace_earlier(store: Store, run_id: str, tags: Mapping[str, str]) -> None:

@@ -88,7 +88,7 @@ def make_panels(far: float = 0.0) -> tuple[Evaluation, PairPanels]:
     gap["default"] = gap["default"] + np.linspace(0, far, 31)
     gap["policy"] = trajectory.real_gap - np.linspace(0, 40, 31)
     trajectory = dataclasses.replace(trajectory, gap=gap)
-    axes = parameter_axes(evaluation.names, evaluation.units, evaluation.bounds)
+    axes = parameter_axes(evaluation)
     return evaluation, pair_panels(trajectory, evaluation.methods, axes)
 
 
@@ -128,10 +128,22 @@ def test_parameters_have_the_same_limits() -> None:
         assert layout[f"yaxis{k + 3}"]["range"] == pytest.approx(ends)
 
 
+def test_parameters_say_what_they_mean() -> None:
+    evaluation = make_results(pairs=1, frames=30).evaluation
+    meanings = ("reaction time; the equilibrium time gap", "")
+    evaluation = dataclasses.replace(evaluation, meanings=meanings)
+    axes = parameter_axes(evaluation)
+    panels = pair_panels(evaluation.trajectories[0], evaluation.methods, axes)
+    figure = draw_parameters(panels, evaluation.methods)
+    assert [one.get_title(loc="left") for one in figure.axes[1:]] == list(meanings)
+    headings = view_of(pair_plot(panels))["layout"]["annotations"]
+    assert meanings[0] in [one.get("hovertext") for one in headings]
+
+
 def test_a_hidden_method_is_left_out_or_waits_in_the_legend() -> None:
     methods = ("default", "fixed", "shrunk", "policy")
     evaluation = make_results(pairs=1, frames=30, methods=methods).evaluation
-    axes = parameter_axes(evaluation.names, evaluation.units, evaluation.bounds)
+    axes = parameter_axes(evaluation)
     panels = pair_panels(evaluation.trajectories[0], methods, axes)
     figure = draw_pairs([("", "", "")], [panels], methods)
     assert colour_of("shrunk") not in drawn_lines(figure.axes[0])
@@ -303,7 +315,7 @@ def test_calibrated_parameters_have_the_same_places_and_correlations() -> None:
     evaluation = make_results(
         pairs=9, frames=20, methods=("default", "population", "fixed")
     ).evaluation
-    axes = parameter_axes(evaluation.names, evaluation.units, evaluation.bounds)
+    axes = parameter_axes(evaluation)
     spreads = parameter_spreads(evaluation.table, axes)
     assert len(spreads) == len(axes)
     table = correlations(evaluation.table, axes)

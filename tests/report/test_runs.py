@@ -71,6 +71,27 @@ def test_jobs_are_named_by_what_differs(tmp_path: Path) -> None:
     ]
 
 
+def test_many_differences_are_shortened_where_jobs_are_alike(tmp_path: Path) -> None:
+    """What tells jobs apart stays in their names; what differs along with it is left out."""
+    for number, (split, epochs) in enumerate(((0.8, 10), (0.8, 20), (0.7, 10))):
+        path = f"/home/ann/recordings/of/2025/{'long' if split == 0.8 else 'short'}.parquet"
+        write_job(
+            tmp_path / str(number),
+            settings={
+                "data": {"name": "tidy", "path": path},
+                "split": split,
+                "learner": {"name": "imitation", "epochs": epochs, "steps": 2 * epochs},
+                "policy": {"name": "gru", "hidden_size": epochs},
+            },
+        )
+    names = [job.name for job in read_runs([str(tmp_path)]).jobs]
+    assert names == [
+        "krauss · path=…long.parquet · hidden_size=10",
+        "krauss · path=…long.parquet · hidden_size=20",
+        "krauss · path=…short.parquet · hidden_size=10",
+    ]
+
+
 def test_what_a_job_says_of_itself(tmp_path: Path) -> None:
     metrics = write_job(
         tmp_path / "job", methods=ACROSS, experiment="paper/clusters", overrides=["model=krauss"]

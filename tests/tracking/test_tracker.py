@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import operator
 import os
 import subprocess
 import sys
@@ -27,6 +28,7 @@ from cfx.config import JobConfig
 from cfx.datasets.tidy import write_tidy
 from cfx.errors import TrackingError
 from cfx.models.krauss import Krauss
+from cfx.plots.look import JOB_COLOURS
 from cfx.policies.features import token_width
 from cfx.policies.gru import GruPolicy
 from cfx.tracking import provenance
@@ -338,8 +340,19 @@ def test_a_sweep_has_the_status_of_its_jobs(uri: str, client: Any) -> None:
     assert sweep_link("1", "s").startswith(
         "#/experiments/1/runs?searchFilter=tags.%60cfx.sweep%60%20%3D%20%27s%27&orderByKey=metrics."
     )
-    (line,) = one.how_to_open()  # the sweep's own link comes once, at its end
-    assert line.startswith("MLflow: http://127.0.0.1:5000/#/experiments/")
+    assert one.how_to_open() == ()  # the sweep's own link comes once, at its end
+
+
+def test_neighbours_have_different_colours(uri: str, client: Any) -> None:
+    """Charts and tables tell the jobs of a sweep apart, also where one is run again."""
+    colours = []
+    for seed in range(len(JOB_COLOURS) + 2):
+        tags = {"cfx.folder": str(seed)}
+        with begin(uri, sweep="s", parameters={"seed": str(seed)}, tags=tags) as run:
+            pass
+        colours.append(client.get_run(run.run_id).data.tags["mlflow.runColor"])
+    assert set(colours) == set(JOB_COLOURS)
+    assert all(map(operator.ne, colours, colours[1:]))
 
 
 def test_long_values_and_odd_keys_are_kept(uri: str, client: Any) -> None:

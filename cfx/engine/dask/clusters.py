@@ -8,7 +8,7 @@ import logging
 from typing import Any, NamedTuple
 
 from cfx.engine.dask.settings import DaskSettings
-from cfx.errors import EngineError
+from cfx.errors import EngineError, NotInstalledError
 from cfx.extras import install_line
 from cfx.simulation.threads import cores
 
@@ -38,7 +38,7 @@ def require_installed(settings: DaskSettings) -> None:
     """Checks that what the settings need is installed. Imports none of it.
 
     Raises:
-        EngineError: it is not; says what to type.
+        NotInstalledError: it is not; says what to type.
     """
     _require("distributed", "engine=dask", _DASK)
     if settings.cluster in _PACKAGES:
@@ -49,7 +49,8 @@ def require_installed(settings: DaskSettings) -> None:
 
 def _require(module: str, what: str, distribution: str) -> None:
     if importlib.util.find_spec(module) is None:
-        raise EngineError(f"{what} needs the package {module}: {install_line(distribution)}")
+        line = install_line(distribution)
+        raise NotInstalledError(f"{what} needs the package {module}: {line}")
 
 
 def workers_of(settings: DaskSettings) -> int:

@@ -24,7 +24,7 @@ class DaskEngine(Engine):
     again. Whatever is finished lies in the cache, so that a job that had to stop goes on from it.
 
     Raises:
-        EngineError: Dask is not installed.
+        NotInstalledError: Dask is not installed.
     """
 
     schema: ClassVar[type[Settings]] = DaskSettings

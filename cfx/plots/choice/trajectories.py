@@ -12,7 +12,7 @@ from cfx.plots.choice.common import Array, finite, without_infinity
 from cfx.plots.words import label, number, short_label, unit_label
 
 if TYPE_CHECKING:
-    from cfx.evaluation.result import PairTrajectory
+    from cfx.evaluation.result import Evaluation, PairTrajectory
 
 HIDDEN = frozenset({"shrunk"})
 """Methods whose lines are left out at first: with one more nobody tells the lines apart."""
@@ -79,6 +79,7 @@ class Panel:
         notes: remarks.
         collisions: of a gap.
         bounds: of a parameter, if they are known.
+        meaning: of a parameter, in words.
     """
 
     title: str
@@ -88,6 +89,7 @@ class Panel:
     notes: tuple[Note, ...] = ()
     collisions: tuple[Collision, ...] = ()
     bounds: tuple[float, float] | None = None
+    meaning: str = ""
 
 
 @dataclass(frozen=True)
@@ -104,13 +106,14 @@ class ParameterAxis:
     meaning: str = ""
 
 
-def parameter_axes(
-    names: Sequence[str], units: Sequence[str], bounds: Array
-) -> tuple[ParameterAxis, ...]:
-    """Returns n parameters with their units and their bounds, `(2, n)`."""
+def parameter_axes(evaluation: Evaluation) -> tuple[ParameterAxis, ...]:
+    """Returns the tuned parameters of an evaluation."""
+    lows, highs = evaluation.bounds
+    meanings = evaluation.meanings or ("",) * len(evaluation.names)
     axes = []
-    for k, name in enumerate(names):
-        axes.append(ParameterAxis(name, units[k], float(bounds[0, k]), float(bounds[1, k])))
+    for k, name in enumerate(evaluation.names):
+        low, high = float(lows[k]), float(highs[k])
+        axes.append(ParameterAxis(name, evaluation.units[k], low, high, meanings[k]))
     return tuple(axes)
 
 
@@ -259,13 +262,13 @@ def _collisions(lines: Sequence[Line]) -> tuple[Collision, ...]:
 
 def _parameter_panel(parameter: ParameterAxis, lines: tuple[Line, ...]) -> Panel:
     """Chooses an axis of at least a fifth of the range: a small change looks small."""
-    title = unit_label(parameter.name, parameter.unit)
+    title, said = unit_label(parameter.name, parameter.unit), parameter.meaning
     lowest, highest = _range(lines)
     if parameter.low is None or parameter.high is None:
         if lowest is None or highest is None:
-            return Panel(title, lines, None, None)
+            return Panel(title, lines, None, None, meaning=said)
         margin = 0.15 * max(highest - lowest, 1e-3 * abs(highest), 1e-6)
-        return Panel(title, lines, lowest - margin, highest + margin)
+        return Panel(title, lines, lowest - margin, highest + margin, meaning=said)
     bounds = (parameter.low, parameter.high)
     if lowest is None or highest is None:
         lowest, highest = bounds
@@ -273,7 +276,7 @@ def _parameter_panel(parameter: ParameterAxis, lines: tuple[Line, ...]) -> Panel
     centre, margin = (highest + lowest) / 2, 0.06 * width
     low = max(centre - width / 2, min(bounds[0], lowest)) - margin
     high = min(centre + width / 2, max(bounds[1], highest)) + margin
-    return Panel(title, lines, low, high, bounds=bounds)
+    return Panel(title, lines, low, high, bounds=bounds, meaning=said)
 
 
 def bounds_text(panel: Panel) -> str:

@@ -131,7 +131,7 @@ def calibration(evaluation: Evaluation) -> Figure:
     Raises:
         ConfigError: no calibrated parameter of a driver is known.
     """
-    axes = parameter_axes(evaluation.names, evaluation.units, evaluation.bounds)
+    axes = parameter_axes(evaluation)
     spreads = parameter_spreads(evaluation.table, axes)
     if not spreads:
         raise ConfigError("the evaluation holds no driver-specific parameters")
@@ -215,5 +215,5 @@ def _errors(evaluation: Evaluation, pair_id: str, column: str) -> dict[str, floa
 
 
 def _panels(evaluation: Evaluation, trajectory: PairTrajectory) -> PairPanels:
-    axes = parameter_axes(evaluation.names, evaluation.units, evaluation.bounds)
+    axes = parameter_axes(evaluation)
     return pair_panels(trajectory, evaluation.methods, axes)

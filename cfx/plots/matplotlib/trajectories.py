@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 
 from matplotlib.axes import Axes
@@ -19,6 +20,9 @@ from cfx.plots.choice.trajectories import (
 from cfx.plots.look import BAND, EDGE, INK, colour_of
 from cfx.plots.matplotlib.canvas import canvas, draw_lines, method_legend, styled
 from cfx.plots.words import short
+
+_LINE = 150
+"""Characters of a small title that fit into the width of a figure."""
 
 
 @styled
@@ -75,12 +79,12 @@ def draw_parameters(pair: PairPanels, methods: Sequence[str]) -> Figure:
     """Draws the parameters that each method used over time, a small panel per parameter.
 
     The first panel shows the speeds, so that a reader sees what the policy answers to. What lies
-    outside a parameter's bounds is shaded, and the bounds stand in the title.
+    outside a parameter's bounds is shaded, and its bounds and its meaning stand in the title.
     """
     count = len(pair.parameters)
     columns = _columns(count)
     rows = -(-(count + 1) // columns)
-    figure = canvas(1.0 + (1.55 if columns == 1 else 1.75) * rows)
+    figure = canvas(1.0 + (1.75 if columns == 1 else 2.0) * rows)
     grid = figure.add_gridspec(rows, columns)
     # The speeds take the cells that the parameters leave over, so that the grid has no hole.
     span = rows * columns - count
@@ -92,7 +96,7 @@ def draw_parameters(pair: PairPanels, methods: Sequence[str]) -> Figure:
     for k, panel in enumerate(pair.parameters):
         axes = figure.add_subplot(grid[divmod(k + span, columns)], sharex=speeds)
         draw_panel(axes, panel)
-        axes.set_title(bounds_text(panel))
+        _titles_of_parameter(axes, panel, _LINE // columns)
         axes.set_ylabel("")
         panels.append(axes)
     # Shared by all; labels of small axes must not touch.
@@ -149,6 +153,22 @@ def _shade_outside(axes: Axes, bounds: tuple[float, float], low: float, high: fl
     for bound in bounds:
         axes.axhline(bound, color=EDGE, linewidth=0.9, zorder=1)
     axes.set_ylim(low, high)
+
+
+def _titles_of_parameter(axes: Axes, panel: Panel, length: int) -> None:
+    """Writes name, unit and bounds, and below them what the parameter means."""
+    lines = textwrap.wrap(panel.meaning, length, max_lines=2, placeholder=" …")
+    axes.set_title("\n".join(lines), fontsize=8, color=INK)
+    raised = 6 + 11 * len(lines)
+    axes.annotate(
+        bounds_text(panel),
+        (0, 1),
+        (0, raised),
+        xycoords="axes fraction",
+        textcoords="offset points",
+        fontsize=10.5,
+        color="black",
+    )
 
 
 def _two_line_title(axes: Axes, strong: str, fine: str) -> None:

@@ -113,7 +113,7 @@ def write_calibration(
     Raises:
         OutputError: a file cannot be written.
     """
-    axes = parameter_axes(evaluation.names, evaluation.units, evaluation.bounds)
+    axes = parameter_axes(evaluation)
     draw: dict[str, Callable[[], Figure]] = {}
     panels = slice_panels(slices, axes)
     if panels:

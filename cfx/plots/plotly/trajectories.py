@@ -42,7 +42,8 @@ def pair_plot(pair: PairPanels) -> Plot:
     for k, panel in enumerate(pair.parameters):
         across, down = grid.cell(k)
         _add_panel(data, layout, panel, str(k + 3), across, down, **small)
-        layout["annotations"].append(heading(safe(panel.title), across[0], down[1]))
+        said = heading(safe(panel.title), across[0], down[1])
+        layout["annotations"].append(said | {"hovertext": safe(panel.meaning)})
     place = {"x": 0.5, "y": 0, "yshift": -42, "xref": "paper", "yref": "paper"}
     layout["annotations"].append({"text": TIME_TITLE, "showarrow": False, **place})
     title = f"Speed, gap and parameters of pair {pair.pair_id}"
