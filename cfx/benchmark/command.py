@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,11 +18,11 @@ def main(arguments: Sequence[str]) -> int:
         return 0
     if options.data is None:
         parser().error(f"--data FILE is needed: the recordings ({DATA_NAME}) in the tidy layout")
-    _row(options)
+    _row(options, arguments)
     return 0
 
 
-def _row(options: argparse.Namespace) -> None:
+def _row(options: argparse.Namespace, arguments: Sequence[str]) -> None:
     from cfx.benchmark.compare import compared, lines_of, read_errors
     from cfx.benchmark.row import PAIRS, ROW, markdown
     from cfx.benchmark.run import overrides_of, row_name, run
@@ -35,11 +36,14 @@ def _row(options: argparse.Namespace) -> None:
         name=options.name or row_name(options.method, options.overrides),
         other_data=options.other_data,
     )
-    print(f"Benchmark {row.protocol}: {row.pairs} pairs of {row.drivers} unseen drivers")
+    print(f"\nThe row, on {row.pairs} pairs of {row.drivers} unseen drivers, full trajectories:\n")
     print("\n".join(markdown([row])))
     for file, table in others:
         print("\n".join(["", *lines_of(compared(read_errors(job / PAIRS), table, file))]))
-    print(f"The row: {job / ROW}; errors of each pair: {job / PAIRS}")
+    print(f"\nThe row: {job / ROW}\nErrors of each pair: {job / PAIRS}")
+    if not others:
+        again = shlex.join(["python", "-m", "cfx", "benchmark", *arguments])
+        print(f"Compare it, without running again: {again} --against FILE, another's {PAIRS}")
 
 
 def _table(files: Sequence[str]) -> None:

@@ -56,8 +56,9 @@ def run(
         about = f"{data.name}, {fingerprint[:12]}"
     job = folder or Path("outputs/benchmark") / _as_file_name(name)
     command = [*overrides, *OVERRIDES, f"data.path={data}"]
-    _run_job(command, job)
     protocol = protocol_name(fingerprint)
+    print(f"Benchmark {protocol}, row '{name}'; the job's folder: {job}", flush=True)
+    _run_job(command, job)
     errors = errors_of(job, name, protocol, _method(job))
     row = Row(
         name=name,
@@ -98,7 +99,7 @@ def overrides_of(method: str | None, given: Sequence[str]) -> list[str]:
 def row_name(method: str | None, given: Sequence[str]) -> str:
     """Returns what a row is called where its user gives it no name."""
     words = []
-    for one in given:
+    for one in _of_method(given):
         key, _, value = one.partition("=")
         if key in {"model", "policy", "learner", "experiment"}:
             words.append(value)

@@ -68,6 +68,7 @@ def test_a_model_alone_is_used_with_constant_parameters() -> None:
     assert row_name("closed_loop", ["model=mine", "objective=mixed"]) == (
         "mine, objective=mixed, closed loop"
     )
+    assert row_name(None, ["model=mine", "tracking.enabled=false"]) == "mine, constant"
 
 
 def made_job(folder: Path, speed: list[float]) -> Path:
