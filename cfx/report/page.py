@@ -62,7 +62,10 @@ def _content(runs: Runs, title: str | None) -> dict[str, Any]:
     subject = "Parameters that adapt"
     if len(calibrations(runs.jobs)) == len(runs.jobs):
         subject = "Calibration"
-    models = " and ".join(dict.fromkeys(job.component("model") for job in runs.jobs))
+    *others, last = dict.fromkeys(job.component("model") for job in runs.jobs)
+    models = last
+    if others:
+        models = f"{', '.join(others)} and {last}"
     return {
         "title": title or f"{subject}: {models}",
         "written": f"{datetime.now():%d %B %Y}".lstrip("0"),

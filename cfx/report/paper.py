@@ -5,20 +5,17 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from cfx.errors import ConfigError
 from cfx.files import write_output
 from cfx.plots.words import short_label
 from cfx.report.files import without_folders
-from cfx.report.job import Job, Runs, any_baselines
-from cfx.report.names import shortest_names
+from cfx.report.grouped import Row, any_adapts, baselines_of, methods_of, rows_of
+from cfx.report.job import Job, Runs
 from cfx.report.sections.calibration import sheet, spreads_of
-from cfx.tracking.provenance import flatten
 
 FORMS = {"latex": ".tex", "csv": ".csv"}
 """What a table can be written as, and how its file ends."""
@@ -37,34 +34,6 @@ _LETTERS = {
     "\N{HORIZONTAL ELLIPSIS}": "\\ldots",
 }
 """Letters that pdfLaTeX does not know by itself, or only with packages."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """Jobs that a row sums up: one, or several that differ in one setting.
-
-    Attributes:
-        name: what tells the row from the others.
-        jobs: at least one.
-    """
-
-    name: str
-    jobs: tuple[Job, ...]
-
-    def values(self, name: str, method: str) -> np.ndarray:
-        """Returns a metric of a method in each job, `(jobs,)`."""
-        return np.array([job.metric(name, method) for job in self.jobs])
-
-    def improvements(self, statistic: str, baseline: str) -> np.ndarray:
-        """Returns a statistic of the policy's improvement in each job, `(jobs,)`, a fraction.
-
-        NaN for jobs that do not compare their policy with the baseline.
-        """
-        values = np.full(len(self.jobs), math.nan)
-        for place, job in enumerate(self.jobs):
-            if baseline in job.baselines():
-                values[place] = job.improvement(statistic, baseline)
-        return values
 
 
 def write_table(runs: Runs, output: Path, form: str, group_by: str | None = None) -> Path:
@@ -87,26 +56,6 @@ def write_table(runs: Runs, output: Path, form: str, group_by: str | None = None
     return output
 
 
-def rows_of(jobs: Sequence[Job], group_by: str | None = None) -> tuple[Row, ...]:
-    """Returns the rows of a table, in the order of the jobs.
-
-    Raises:
-        ConfigError: no job has the setting `group_by`.
-    """
-    ignored = () if group_by is None else (group_by,)
-    if group_by is not None and not any(group_by in flatten(dict(job.config)) for job in jobs):
-        raise ConfigError(
-            f"--group-by {group_by}: no job has this setting; name one as config.yaml does, for"
-            " instance seed or data.max_pairs"
-        )
-    names = shortest_names(jobs, ignored)
-    found: dict[str, list[Job]] = {}
-    for number, (name, job) in enumerate(zip(names, jobs, strict=True)):
-        key = name if group_by is not None or names.count(name) == 1 else f"{name} ({number + 1})"
-        found.setdefault(key, []).append(job)
-    return tuple(Row(name, tuple(alike)) for name, alike in found.items())
-
-
 def frame(rows: Sequence[Row]) -> pd.DataFrame:
     """Returns a table of numbers in SI units, improvements as fractions.
 
@@ -118,10 +67,10 @@ def frame(rows: Sequence[Row]) -> pd.DataFrame:
     table = []
     for row in rows:
         values: dict[str, object] = {"row": row.name, "jobs": len(row.jobs), **_amounts(row)}
-        for method in _methods(rows):
+        for method in methods_of(rows):
             for metric, unit in (("rmse_speed", "_mps"), ("rmse_gap", "_m"), ("collisions", "")):
                 values |= _spread(f"{metric}{unit}/{method}", row.values(metric, method))
-        for baseline in _baselines(rows):
+        for baseline in baselines_of(rows):
             name = f"improvement/{baseline}"
             values |= _spread(name, row.improvements("mean", baseline))
             if len(row.jobs) == 1:
@@ -142,19 +91,19 @@ def latex(rows: Sequence[Row]) -> str:
         if several:
             line["jobs"] = str(len(row.jobs))
         line["drivers"] = str(_amounts(row)["drivers"])
-        for method in _methods(rows):
+        for method in methods_of(rows):
             line[short_label(method)] = _text(row.values("rmse_speed", method))
-        last = _methods(rows)[-1]
+        last = methods_of(rows)[-1]
         line[f"gap, {short_label(last)} [m]"] = _text(row.values("rmse_gap", last), 2)
-        for baseline in _baselines(rows):
+        for baseline in baselines_of(rows):
             line[f"over {short_label(baseline)}"] = _improvement(row, baseline)
         cells.append(line)
     caption = "RMSE of speed [m/s] by method, in closed loop on the test part of each trajectory"
-    if _any_adapts(rows):
+    if any_adapts(rows):
         caption += "; improvement of the policy"
     if several:
         caption += "; mean and standard deviation over the jobs of a row"
-    elif _any_adapts(rows):
+    elif any_adapts(rows):
         caption += "; improvements with their 95 \\% bootstrap interval over drivers"
     body = _latex_table(pd.DataFrame(cells).fillna("--"), f"{caption}.", "tab:cfx")
     comments = ["% Needs \\usepackage{booktabs}."]
@@ -209,34 +158,6 @@ def _amounts(row: Row) -> dict[str, int]:
         pairs |= set(job.pairs["pair_id"].astype(str))
         drivers |= set(job.pairs["driver"].astype(str))
     return {"pairs": len(pairs), "drivers": len(drivers)}
-
-
-def _methods(rows: Sequence[Row]) -> list[str]:
-    found: dict[str, None] = {}
-    for row in rows:
-        for job in row.jobs:
-            found |= dict.fromkeys(job.meaningful_methods)
-    found.pop("policy", None)
-    if _any_adapts(rows):
-        return [*found, "policy"]
-    return [method for method in found if method != "fixed"] + ["fixed"]
-
-
-def _any_adapts(rows: Sequence[Row]) -> bool:
-    """Says whether any job has a policy that adapts; without one they are calibrations."""
-    for row in rows:
-        for job in row.jobs:
-            if job.adapts:
-                return True
-    return False
-
-
-def _baselines(rows: Sequence[Row]) -> list[str]:
-    jobs: list[Job] = []
-    for row in rows:
-        jobs += row.jobs
-    found = any_baselines(jobs)
-    return [baseline for baseline in found if baseline in {"fixed", "population"}]
 
 
 def _spread(name: str, values: np.ndarray) -> dict[str, float]:

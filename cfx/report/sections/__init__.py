@@ -18,11 +18,13 @@ from cfx.report.sections import (
     results,
     run,
     safety,
+    seeds,
     style,
     trajectories,
 )
 
 SECTIONS: tuple[Section, ...] = (
+    seeds.SECTION,
     comparison.SECTION,
     run.SECTION,
     results.SECTION,

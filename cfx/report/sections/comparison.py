@@ -156,7 +156,10 @@ _GAINS = (
 def blocks(runs: Runs) -> list[Block]:
     """Returns the comparison of all jobs."""
     jobs = runs.jobs
-    introduction = "Errors in m/s and m compare across driving models and learners."
+    introduction = (
+        "Errors in m/s and m compare across driving models and learners; lower is closer to the"
+        " real driver."
+    )
     if len(jobs) > 1:
         introduction += " The best of a column is bold where all jobs are tested on the same pairs."
     found: list[Block] = [
@@ -287,7 +290,7 @@ def absolute(jobs: Sequence[Job]) -> Plot:
             if np.isfinite(errors).any():
                 values[method] = errors
         names = [job.name for job in jobs]
-        what = f"RMSE of {signal}, mean over pairs; lower is closer to the real driver"
+        what = f"RMSE of {signal}, mean over pairs"
         dots = error_dots(names, values, unit=unit, what=what)
         views[f"{signal}, {jobs[0].scope_label(scope)}"] = errors_view(dots)
     height = 134 + 30 * len(jobs)

@@ -8,6 +8,7 @@ from cfx.plots.words import plural
 from cfx.report.blocks import (
     Block,
     Figure,
+    Fold,
     Grid,
     Group,
     Heading,
@@ -22,6 +23,9 @@ _INTRODUCTION = (
     " several, the band between the quartiles. A network that stopped early keeps its last loss."
 )
 
+_OPEN = 6
+"""Jobs whose curves are shown at once, and jobs that are named in a sentence."""
+
 
 def blocks(runs: Runs) -> list[Block]:
     """Returns a plot for each job that learned something."""
@@ -35,8 +39,12 @@ def blocks(runs: Runs) -> list[Block]:
         chosen = learning_curves(job.curves)
         heading = Heading(job.name, f"({plural(chosen.networks, 'network')})")
         cards.append(Group((heading, Figure(learning_plot(chosen))), "card"))
-    found: list[Block] = [Text(_INTRODUCTION), Grid(tuple(cards))]
-    if without:
+    found: list[Block] = [Text(_INTRODUCTION), Grid(tuple(cards[:_OPEN]))]
+    if len(cards) > _OPEN:
+        found.append(Fold(f"{len(cards) - _OPEN} more jobs", (Grid(tuple(cards[_OPEN:])),)))
+    if len(without) > _OPEN:
+        found.append(Text(f"Nothing was learned in {len(without)} jobs.", "fine"))
+    elif without:
         found.append(Text(f"Nothing was learned in {', '.join(without)}.", "fine"))
     return [*found, *missing_file(runs, "curves.parquet", "the learning curves")]
 

@@ -153,6 +153,8 @@ def _range(values: pd.Series[Any]) -> str:
 def _learned(job: Job) -> str:
     """Says how the policy was learned."""
     learner = job.component("learner")
+    if not job.adapts:
+        return "constant parameters, nothing is learned"
     if learner:
         return f"learned by {learner}"
     return f"as it was learned in {job.setting('protocol.run')}"
