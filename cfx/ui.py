@@ -56,8 +56,13 @@ _COLUMNS = (
 )
 """Columns of those tables: what it is, and the improvement with its interval, come first."""
 
-_WIDTHS = {f"tags.`{RESULT}`": 260}
-"""Pixels of columns that need more than MLflow gives them."""
+_WIDTHS = {
+    "tags.`model`": 84,
+    "tags.`policy`": 64,
+    "tags.`learner`": 84,
+    f"tags.`{RESULT}`": 260,
+}
+"""Pixels of columns that need more or less than MLflow gives them."""
 
 _CHARTS = f"{PERCENT}|{SPEED_ERROR}|rmse_(improvement/mean|speed)"
 """Metrics that MLflow's charts show, a regular expression."""
@@ -273,7 +278,7 @@ def _shared_view(client: MlflowClient, experiment: str, chosen: str) -> str:
     for column in _COLUMNS:
         if column.startswith("metrics"):
             widths[column] = 8 * len(column) - 40
-    section = {"uuid": _SECTION, "name": "Improvement, and what differs", "display": True}
+    section = {"uuid": _SECTION, "name": "Improvement", "display": True}
     always = {"deleted": False, "isGenerated": False}
     charts = [{**chart, "metricSectionId": _SECTION, **always} for chart in _FIRST_CHARTS]
     view = {

@@ -416,11 +416,14 @@ class MlflowTracker(Tracker):
 
 
 def _run_name(config: JobConfig, names: Mapping[str, str]) -> str:
-    """Returns what a run is called: its components; in a sweep, whose jobs have many, its seed."""
-    parts = [names[kind] for kind in ("model", "policy", "optimizer", "data")]
+    """Returns what a run is called: its components; in a sweep, whose jobs have many, its seed.
+
+    What differs most often comes first: MLflow's tables cut names off.
+    """
+    parts = [names["model"], names["policy"]]
     if config.tracking.sweep is not None:
         parts.append(f"seed{config.seed}")
-    return "-".join(parts)
+    return "-".join([*parts, names["optimizer"], names["data"]])
 
 
 def _dataset_name(name: str, source: str) -> str:
