@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from cfx.plots.choice.common import finite
 from cfx.plots.words import explained, percent, short_label
 from cfx.report.blocks import Block, Section, Table, Text
 from cfx.report.grouped import Row, baselines_of, methods_of, rows_over_seeds
@@ -59,7 +60,7 @@ def over_seeds(rows: Sequence[Row]) -> Sheet:
 
 def _error(row: Row, method: str) -> Cell:
     """Returns a method's mean error and its range; empty where its jobs have no such method."""
-    known = _known(row.values("rmse_speed", method))
+    known = finite(row.values("rmse_speed", method))
     if not len(known) or (method == "policy" and not any(job.adapts for job in row.jobs)):
         return number(np.nan, "")
     cell = number(float(known.mean()), f"{known.mean():.3f}")
@@ -67,7 +68,7 @@ def _error(row: Row, method: str) -> Cell:
 
 
 def _gain(row: Row, baseline: str) -> Cell:
-    known = _known(row.improvements("mean", baseline))
+    known = finite(row.improvements("mean", baseline))
     if not len(known):
         return number(np.nan, "")
     cell = number(float(known.mean()), percent(float(known.mean()), 1))
@@ -80,10 +81,6 @@ def _with_range(cell: Cell, ends: Sequence[str]) -> Cell:
     if len(set(ends)) < 2:
         return cell
     return replace(cell, second=" to ".join(ends))
-
-
-def _known(values: np.ndarray) -> np.ndarray:
-    return values[np.isfinite(values)]
 
 
 SECTION = Section("seeds", "Over seeds", "Over seeds", blocks)
