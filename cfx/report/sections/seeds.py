@@ -11,7 +11,7 @@ from cfx.plots.choice.common import finite
 from cfx.plots.words import explained, percent, short_label
 from cfx.report.blocks import Block, Section, Table, Text
 from cfx.report.grouped import Row, baselines_of, methods_of, rows_over_seeds
-from cfx.report.job import Runs
+from cfx.report.job import Job, Runs
 from cfx.report.tables import Cell, Column, Sheet, number, tested, text
 
 _INTRODUCTION = (
@@ -32,7 +32,9 @@ def blocks(runs: Runs) -> list[Block]:
 
 def over_seeds(rows: Sequence[Row]) -> Sheet:
     """Returns a row per group of jobs: errors of each method, and the policy's improvement."""
-    jobs = [job for row in rows for job in row.jobs]
+    jobs: list[Job] = []
+    for row in rows:
+        jobs += row.jobs
     columns = [
         Column("Jobs", "Named by what differs between them, without the seed.", number=False),
         Column("Seeds", "Jobs of the row."),
