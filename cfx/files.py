@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import secrets
+import socket
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +17,12 @@ from pydantic import BeforeValidator
 from pydantic_core import PydanticCustomError
 
 from cfx.errors import OutputError
+
+_DAY_S = 86400.0
+"""Seconds after which another machine's temporary file that nobody has written to is left over."""
+
+_TEMPORARY = re.compile(r"\.(?P<process>\d+)@(?P<host>[\w-]*)-[0-9a-f]{8}\..")
+"""How names of temporary files begin: process, machine, and what tells those of one apart."""
 
 
 def absolute(value: Any) -> Path:
@@ -39,13 +49,15 @@ FilePath = Annotated[Path, BeforeValidator(absolute)]
 def atomic_write(path: Path) -> Iterator[Path]:
     """Gives the block a temporary file beside `path`, which takes its place if the block ends well.
 
-    The temporary file has the same suffixes. If the block fails, nothing of it is left and an
-    earlier file stays as it was.
+    The temporary file has the same suffixes, and is this block's own: other threads, processes and
+    machines may write the same file at the same time. If the block fails, nothing of it is left and
+    an earlier file stays as it was.
 
     Raises:
         OSError: the place cannot be written.
     """
-    partial = path.with_name(f".{os.getpid()}.{path.name}")
+    own = f"{os.getpid()}@{_host()}-{secrets.token_hex(4)}"
+    partial = path.with_name(f".{own}.{path.name}")
     try:
         yield partial
         partial.replace(path)
@@ -79,13 +91,26 @@ def write_output(path: Path, text: str, what: str) -> None:
 def remove_leftovers(folder: Path) -> None:
     """Removes temporary files of `atomic_write` whose processes have ended, here and below.
 
+    Nobody here knows which processes run on another machine: its files go when they are a day old.
+
     Raises:
         OSError: one cannot be removed.
     """
-    for path in sorted(folder.rglob(".*.*")):
-        number = path.name[1:].partition(".")[0]
-        if path.is_file() and number.isdecimal() and not _runs(int(number)):
+    for path in sorted(folder.rglob(".*@*.*")):
+        found = _TEMPORARY.match(path.name)
+        if found is not None and path.is_file() and _is_left_over(path, found):
             path.unlink(missing_ok=True)
+
+
+def _is_left_over(path: Path, found: re.Match[str]) -> bool:
+    if found["host"] == _host():
+        return not _runs(int(found["process"]))
+    return time.time() - path.stat().st_mtime > _DAY_S
+
+
+def _host() -> str:
+    """Returns this machine's name, as far as it is fit for the name of a file."""
+    return re.sub(r"[^\w-]", "", socket.gethostname())[:32]
 
 
 def _runs(process: int) -> bool:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import time
 from pathlib import Path
 
 import pytest
@@ -10,7 +12,7 @@ import yaml
 
 from cfx import cli
 from cfx.errors import CfxError
-from cfx.files import remove_leftovers
+from cfx.files import atomic_write, remove_leftovers
 from cfx.job import steps
 from tests.broken_plugins import QUICK
 
@@ -59,14 +61,40 @@ def test_while_results_are_replaced_nothing_says_that_they_are_complete(
 def test_what_killed_writers_left_goes(tmp_path: Path) -> None:
     figures = tmp_path / "figures"
     figures.mkdir()
-    dead, kept = figures / ".999999999.drives.png", figures / ".1.drives.png"
-    for path in (dead, kept, figures / ".hidden.png", figures / "drives.png"):
+    with atomic_write(figures / "drives.png") as own:
+        own.write_text("")
+        written = own.name
+    me = f".{os.getpid()}@"
+    elsewhere = f"@another-{'0' * 8}."
+    assert written.startswith(me)
+    dead = figures / written.replace(me, ".999999999@")
+    old = figures / f".999999999{elsewhere}old.png"
+    kept = {
+        figures / written: "its process still runs",
+        figures / f".999999999{elsewhere}new.png": "nobody here knows whether its process runs",
+        figures / ".hidden.png": "nobody's temporary file",
+        figures / "drives.png": "a file",
+    }
+    for path in (dead, old, *kept):
         path.write_text("")
+    yesterday = time.time() - 90000
+    os.utime(old, (yesterday, yesterday))
     remove_leftovers(tmp_path)
     assert not dead.exists()
-    assert kept.exists(), "process 1 still runs"
-    assert (figures / ".hidden.png").exists()
-    assert (figures / "drives.png").exists()
+    assert not old.exists()
+    for path, why in kept.items():
+        assert path.exists(), why
+
+
+def test_writers_of_one_file_have_a_temporary_file_each(tmp_path: Path) -> None:
+    target = tmp_path / "file.txt"
+    with atomic_write(target) as one, atomic_write(target) as other:
+        assert one != other
+        assert one.suffix == other.suffix == ".txt"
+        one.write_text("one")
+        other.write_text("other")
+    assert target.read_text() == "one", "the outer block ends last"
+    assert list(tmp_path.iterdir()) == [target]
 
 
 def test_a_folder_in_the_place_of_the_log_is_one_sentence(

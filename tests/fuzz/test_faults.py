@@ -113,7 +113,7 @@ def test_each_file_fails_once(
         assert len(said.strip().splitlines()) <= 3, where
         assert job(folder, Faults(), monkeypatch) == 0, where
         assert results(folder) == expected, where
-        assert not list(folder.rglob(f".{os.getpid()}.*")), where
+        assert not list(folder.rglob(f".{os.getpid()}@*")), where
         tried += 1
     assert tried >= 3
     print(f"{tried} faults of {counted.count} files tried, 0 failed")
