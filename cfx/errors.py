@@ -67,12 +67,12 @@ class OutputError(CfxError):
     """A result cannot be written."""
 
 
+class NotInstalledError(CfxError):
+    """A package that nothing else needs is not installed; says what installs it."""
+
+
 class EngineError(CfxError):
     """The workers of an engine cannot be reached, or were lost for good."""
-
-
-class NotInstalledError(EngineError):
-    """An extra that an engine needs is not installed; its words say how to install it."""
 
 
 class SumoError(CfxError):

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from cfx.errors import PluginError
+from cfx.errors import NotInstalledError, PluginError
 
 Check = Callable[..., None]
 """Takes a component and checks one statement of its kind's contract.
@@ -76,6 +76,7 @@ def violations(
         must not make a component raise.
 
     Raises:
+        NotInstalledError: what the component needs to run is not installed.
         RuntimeError: Python was started with -O, which removes the assertions that make a check.
     """
     if not __debug__:
@@ -91,6 +92,8 @@ def violations(
             check(component)
         except NotApplicable:
             continue
+        except NotInstalledError:
+            raise
         except (AssertionError, PluginError) as broken:
             yield check.__name__, str(broken)
         except Exception as error:  # a plugin may raise anything

@@ -13,7 +13,7 @@ import pytest
 
 from cfx import registry
 from cfx.engine.dask.engine import DaskEngine
-from cfx.errors import ConfigError, EngineError
+from cfx.errors import ConfigError, EngineError, NotInstalledError
 from cfx.extras import install_line
 from tests.engine.clusters import Cluster, free_port
 from tests.engine.work import dies, only_on_good, slowly, where
@@ -56,7 +56,7 @@ def test_what_is_not_installed_is_said_with_the_line_that_installs_it(
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name: None if name == missing else found(name)
     )
-    with pytest.raises(EngineError, match=re.escape(install_line(line))):
+    with pytest.raises(NotInstalledError, match=re.escape(install_line(line))):
         DaskEngine(**settings)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import psutil
 import pytest
 
-from cfx.errors import SumoError
+from cfx.errors import NotInstalledError, SumoError
 from cfx.extras import install_line
 from cfx.simulators.sumo import installed
 from cfx.simulators.sumo.channel import Message
@@ -155,7 +155,7 @@ def test_a_missing_sumo_says_what_to_install(monkeypatch: pytest.MonkeyPatch) ->
         raise importlib.metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(importlib.metadata, "version", missing)
-    with pytest.raises(SumoError) as error:
+    with pytest.raises(NotInstalledError) as error:
         Session(1)
     assert str(error.value) == (
         "SUMO is not installed; SUMO 1.28 or newer, below 2, comes with:"

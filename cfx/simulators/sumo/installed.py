@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib.metadata
 import re
 
-from cfx.errors import SumoError
+from cfx.errors import NotInstalledError, SumoError
 from cfx.extras import install_line
 
 EXTRA = "cfx-driving[sumo]"
@@ -21,14 +21,14 @@ def require_sumo() -> str:
     """Returns the version of the libsumo that is installed.
 
     Raises:
-        SumoError: it is not installed, or its version is not one that cfx works with; says what to
-            install.
+        NotInstalledError: it is not; says what to install.
+        SumoError: its version is not one that cfx works with.
     """
     wanted = f"SUMO {_text(OLDEST)} or newer, below {BELOW[0]}"
     try:
         version = importlib.metadata.version("libsumo")
     except importlib.metadata.PackageNotFoundError:
-        raise SumoError(
+        raise NotInstalledError(
             f"SUMO is not installed; {wanted}, comes with: {install_line(EXTRA)}"
         ) from None
     number = re.match(r"(\d+)\.(\d+)", version)
