@@ -21,11 +21,18 @@ log = logging.getLogger(__name__)
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 _LIMIT: list[int] = []
+_OWN: list[int] = []
+"""Cores of a process that has others beside it, such as the workers of a cluster."""
 
 
 def limit_cores(count: int | None) -> None:
-    """Bounds the cores that this process shares work among; None: all that it may use."""
+    """Bounds the cores that this process shares work among; None: all that it has."""
     _LIMIT[:] = [] if count is None else [count]
+
+
+def own_cores(count: int) -> None:
+    """Says how many of the machine's cores this process has, where no job asks for a number."""
+    _OWN[:] = [count]
 
 
 def cores() -> int:
@@ -34,7 +41,7 @@ def cores() -> int:
         available = len(os.sched_getaffinity(0))
     else:
         available = os.cpu_count() or 1
-    return min([available, *_LIMIT])
+    return min([available, *(_LIMIT or _OWN)])
 
 
 def set_threads(count: int) -> None:

@@ -8,7 +8,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -44,6 +44,21 @@ class Cluster:
         """Returns the processes that a nanny has started."""
         listed = Path(f"/proc/{worker.pid}/task/{worker.pid}/children").read_text()
         return [int(number) for number in listed.split()]
+
+    def kill_workers(self, rounds: int, when: Callable[[], object]) -> None:
+        """Kills all workers with signal 9, again and again; nannies start them again.
+
+        Args:
+            rounds: how often.
+            when: says that it is time for the next round; the work must have made some progress
+                since the last one, or it would never end.
+        """
+        for _ in range(rounds):
+            until(when, seconds=120.0)
+            for worker in self.workers:
+                for child in self.children(worker):
+                    with suppress(ProcessLookupError):
+                        os.kill(child, signal.SIGKILL)
 
     def stop(self) -> None:
         for process in [*self.workers, self.scheduler]:

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import time
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -22,7 +18,6 @@ from tests.engine.clusters import Cluster
 from tests.engine.test_dask_faults import meanwhile
 from tests.learners.made import QUICK, gru, training_data
 
-KILLS = 10
 SETTINGS = QUICK | {"epochs": 30, "steps": 10, "horizon": 12}
 
 
@@ -49,16 +44,17 @@ def test_workers_that_are_killed_ten_times_change_nothing(
     monkeypatch.setattr(shard, "_WORTH_A_PROCESS", 0)
     monkeypatch.setattr(threads, "_LIMIT", [1])
     expected = trained(LocalEngine(), None)
-    killed: list[int] = []
+    seen: list[int] = []
+
+    def an_epoch_has_ended() -> bool:
+        """Says whether a checkpoint was written since the last kill."""
+        times = sorted(file.stat().st_mtime_ns for file in tmp_path.rglob("[!.]*.ckpt"))
+        is_new = times > seen
+        seen[:] = times
+        return is_new
 
     def kill_ten() -> None:
-        while len(killed) < KILLS:
-            # A worker needs some seconds to import PyTorch; some epochs pass between two kills.
-            time.sleep(3.0)
-            for child in cluster.children(cluster.workers[len(killed) % 2]):
-                with suppress(ProcessLookupError):
-                    os.kill(child, signal.SIGKILL)
-                    killed.append(child)
+        cluster.kill_workers(5, an_epoch_has_ended)
 
     engine = DaskEngine(address=cluster.address)
     with meanwhile(kill_ten) as killing:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Generic
 
 from cfx.engine.base import Report, ResultT, ShardT, Work
+from cfx.engine.dask.code import installed_code
 from cfx.engine.dask.connection import Connection
 from cfx.engine.dask.settings import DaskSettings
 from cfx.engine.dask.worker import WorkerTrouble, work_on
@@ -105,6 +106,7 @@ class Run(Generic[ShardT, ResultT]):
                 work_on,
                 self._work,
                 attempt.shard,
+                installed_code(),
                 key=f"{self._name}-{attempt.number}-{self._submitted}",
                 workers=workers,
                 pure=False,

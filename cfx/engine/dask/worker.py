@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from cfx.engine.base import ResultT, ShardT, Unfit, Work
+from cfx.engine.dask.code import differing, installed_code
 from cfx.engine.dask.counting import Counted, counted
+from cfx.errors import EngineError
+from cfx.simulation.threads import limit_cores, own_cores
 
 
 class WorkerTrouble(Exception):  # noqa: N818 - the shard is well, its worker is not
@@ -21,18 +26,31 @@ class WorkerTrouble(Exception):  # noqa: N818 - the shard is well, its worker is
         return f"{self.worker}: {self.args[0]}"
 
 
-def work_on(work: Work[ShardT, ResultT], shard: ShardT) -> Counted[ResultT]:
+def work_on(
+    work: Work[ShardT, ResultT], shard: ShardT, code: Mapping[str, str]
+) -> Counted[ResultT]:
     """Does the work of one shard on one core: a worker has one for each of its threads.
 
+    Args:
+        work: what is done.
+        shard: with what.
+        code: of the job, as `installed_code` returns it.
+
     Raises:
+        EngineError: this worker has other code than the job.
         WorkerTrouble: this worker cannot do it; perhaps another one can.
     """
     import torch
     from distributed import get_worker
 
-    from cfx.simulation.threads import limit_cores
-
-    limit_cores(1)
+    others = differing(code, installed_code())
+    if others:
+        raise EngineError(
+            f"the worker {get_worker().address} has another {' and '.join(others)} than this job;"
+            " install the same on all workers, and start them again"
+        )
+    own_cores(1)
+    limit_cores(None)  # what a sweep's job asked for that ran here before
     torch.set_num_threads(1)
     try:
         return counted(work, shard)
