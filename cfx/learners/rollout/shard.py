@@ -8,8 +8,11 @@ Shapes: N networks (each member of an ensemble counts), D trajectories of each.
 
 from __future__ import annotations
 
+import logging
 import math
+import os
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -32,6 +35,8 @@ from cfx.learners.rollout.settings import RolloutSettings
 from cfx.models.direct import Direct
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.simulation.rollout import MemoryStepper
+
+log = logging.getLogger(__name__)
 
 _TRAJECTORIES = 3_000
 """Of a shard's gradient step at most. A window costs as much per trajectory with 1,500 of them as
@@ -188,7 +193,8 @@ def epochs(settings: RolloutSettings) -> int:
 def train(shard: TrainingShard, report: Report) -> TrainedShard:
     """Trains the networks of a shard.
 
-    Training goes on from the shard's checkpoint, and leaves it behind.
+    Training goes on from the shard's checkpoint, and leaves it behind. Where there is no place for
+    it, as on a worker without the job's disk, an interrupted training begins again.
 
     Args:
         shard: which networks, and what they learn from.
@@ -201,7 +207,7 @@ def train(shard: TrainingShard, report: Report) -> TrainedShard:
     network.load_state_dict(shard.weights)
     errors = BaseErrors.of(training_data, dataset, s.horizon)
     checkpoint, expert_checkpoint = None, None
-    if shard.files:
+    if shard.files and _has_place(shard.files[0]):
         checkpoint, expert_checkpoint = shard.files
     expert = None
     if s.distillation_epochs:
@@ -220,6 +226,17 @@ def train(shard: TrainingShard, report: Report) -> TrainedShard:
     progress.end()
     dispersion = module.fit_dispersion()
     return TrainedShard(module.network.state_dict(), module.curves(), dispersion)
+
+
+def _has_place(checkpoint: Path) -> bool:
+    """Says whether the folder of a checkpoint can be written to; makes it."""
+    folder = checkpoint.parent
+    with suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+    if os.access(folder, os.W_OK):
+        return True
+    log.warning("%s cannot be written to: if this training is interrupted, it begins again", folder)
+    return False
 
 
 def untrained(

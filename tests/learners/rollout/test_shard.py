@@ -125,6 +125,17 @@ def test_an_interrupted_shard_goes_on_and_finished_ones_are_not_done_again(
     assert not list(tmp_path.iterdir()), "checkpoints are removed in the end"
 
 
+def test_a_worker_without_a_place_for_checkpoints_trains_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    data = training_data(networks=2, frames=150, base=TRUE.repeat(2, 1))
+    expected, _ = fit(data, monkeypatch, cut=True)
+    (tmp_path / "gone").symlink_to(tmp_path / "nowhere")
+    found, _ = fit(replace(data, workspace=tmp_path / "gone"), monkeypatch, cut=True)
+    assert_same(expected, found)
+    assert "if this training is interrupted, it begins again" in caplog.text
+
+
 def test_small_trainings_are_not_cut() -> None:
     learner = RolloutLearner(**SHORT)
     data, generator = training_data(networks=4), torch.Generator().manual_seed(0)
