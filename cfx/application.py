@@ -33,6 +33,7 @@ from cfx.errors import CfxError, ConfigError, Terminated, printable, without_pas
 from cfx.memory import is_out_of_memory
 from cfx.plugin_errors import blame
 from cfx.signals import terminable
+from cfx.storage import is_url
 from cfx.sweep import (
     STATUS,
     JobStatus,
@@ -166,6 +167,7 @@ def start(arguments: Sequence[str], *, target: str = JOB) -> int:
     arguments = todays(arguments)
     _refuse_passwords(arguments)
     _refuse_interpolated_folder()
+    _refuse_urls_as_folders(arguments)
     job = JobFunction(target, uuid.uuid4().hex, wants_traceback(arguments))
     SweepFolder.take()
     code = _run_hydra(job, arguments)
@@ -204,6 +206,21 @@ def _refuse_interpolated_folder() -> None:
             f"the working directory {folder} holds '${{', which Hydra replaces in paths; start from"
             " another folder"
         )
+
+
+def _refuse_urls_as_folders(arguments: Sequence[str]) -> None:
+    """Refuses a URL where Hydra would make a folder of that name.
+
+    Raises:
+        ConfigError: there is one.
+    """
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        if key in {"hydra.run.dir", "hydra.sweep.dir"} and is_url(value.strip("'\"")):
+            raise ConfigError(
+                f"{key} is a folder of this machine; output.url={without_passwords(value)} copies"
+                " jobs there when they are done"
+            )
 
 
 def _run_hydra(job: JobFunction, arguments: Sequence[str]) -> int:

@@ -202,12 +202,12 @@ def _report_parser() -> argparse.ArgumentParser:
         "runs",
         nargs="+",
         metavar="RUN",
-        help="output folder of a job or a sweep, or id of an MLflow run",
+        help="output folder of a job or a sweep, its URL (output.url), or id of an MLflow run",
     )
     parser.add_argument(
         "--output",
         metavar="FILE",
-        help="default: report.html in the folder; for several, or a run: here",
+        help="default: report.html in the folder; for several, a URL or a run: here",
     )
     parser.add_argument("--title", help="of the page")
     parser.add_argument(
@@ -297,7 +297,9 @@ def _export_parser() -> argparse.ArgumentParser:
         "cfx export", description="Writes a job's fixed parameters for another program."
     )
     parser.add_argument(
-        "run", metavar="RUN", help="output folder of a job, or id of its MLflow run"
+        "run",
+        metavar="RUN",
+        help="output folder of a job, its URL (output.url), or id of its MLflow run",
     )
     parser.add_argument(
         "--to",
@@ -308,7 +310,7 @@ def _export_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--output",
         metavar="FILE",
-        help="default: drivers.add.xml in the job's folder; for an MLflow run: here",
+        help="default: drivers.add.xml in the job's folder; for a URL or an MLflow run: here",
     )
     return parser
 

@@ -47,6 +47,27 @@ SAYS_TOO_MUCH = (
 """What is said of a tracking URI that holds one."""
 
 
+class OutputSettings(Settings):
+    """Where a job's folder is copied to."""
+
+    url: str | None = Field(
+        None,
+        description="the job's folder is copied below this URL when it is done, such as"
+        " s3://bucket/jobs; null: it stays on this machine alone",
+    )
+
+    @field_validator("url")
+    @classmethod
+    def _is_url(cls, url: str | None) -> str | None:
+        if url is None:
+            return None
+        if not is_url(url):
+            raise ValueError("write a URL such as s3://bucket/jobs; hydra.run.dir names a folder")
+        if without_passwords(url) != url:
+            raise ValueError("holds a password, and a job's configuration is written to files")
+        return url
+
+
 class TrackingSettings(Settings):
     """What MLflow keeps."""
 
@@ -131,6 +152,7 @@ class JobConfig(Settings):
     )
     style: StyleSettings = Field(StyleSettings(), description="driving style")
     cache: CacheSettings = Field(CacheSettings(), description="cache of calibrations")
+    output: OutputSettings = Field(OutputSettings(), description="where results go")
     tracking: TrackingSettings = Field(TrackingSettings(), description="MLflow")
     figures: FigureSettings = Field(FigureSettings(), description="figures")
     demo: DemoSettings = Field(DemoSettings(), description="demonstration in SUMO")

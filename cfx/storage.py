@@ -9,12 +9,14 @@ import hashlib
 import importlib.util
 import os
 import re
+import secrets
+import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from cfx.errors import CfxError, DataError, without_passwords
+from cfx.errors import CfxError, DataError, NotInstalledError, without_passwords
 from cfx.extras import install_line
 from cfx.files import atomic_write
 
@@ -41,7 +43,7 @@ def local_copies(url: str) -> list[Path]:
     Raises:
         DataError: there is none, or it cannot be read.
     """
-    with _explained(url):
+    with _explained(f"data.path={url}"):
         system, path = _opened(url)
         found = [path]
         if any(mark in path for mark in "*?["):
@@ -51,15 +53,40 @@ def local_copies(url: str) -> list[Path]:
         return [_copy(system, one) for one in found]
 
 
+def local_folder(url: str) -> Path:
+    """Returns a copy of the folder behind a URL, with all that lies below it.
+
+    A copy is kept, as those of recordings are, as long as nothing in the folder has changed.
+
+    Raises:
+        DataError: there is none, or it cannot be read.
+    """
+    with _explained(url):
+        system, path = _opened(url)
+        files = {}
+        for name, about in system.find(path, detail=True).items():
+            inside = str(name).removeprefix(path).strip("/")
+            if inside and not str(name).endswith("/"):
+                files[inside] = about
+        if not files:
+            raise DataError(f"{url}: there is no such folder, or nothing in it")
+        marks = [f"{name} {_version(about)}" for name, about in sorted(files.items())]
+        home = _kept(f"{path} {marks}")
+        copy = home / path.rpartition("/")[2]
+        if not copy.is_dir():
+            _copy_files(system, path, list(files), copy)
+        return copy
+
+
 def state(url: str) -> list[str]:
     """Returns what changes when a file behind a URL or a pattern does.
 
     Raises:
         DataError: it cannot be looked at.
     """
-    with _explained(url):
+    with _explained(f"data.path={url}"):
         system, path = _opened(url)
-        return [_version(system, one) for one in sorted(system.glob(path))]
+        return [_version(system.info(one)) for one in sorted(system.glob(path))]
 
 
 class RemoteFolder:
@@ -80,7 +107,8 @@ class RemoteFolder:
             OSError: it cannot be read.
         """
         try:
-            content: bytes = self._system.cat_file(f"{self._path}/{name}")
+            with _os_errors():
+                content: bytes = self._system.cat_file(f"{self._path}/{name}")
         except FileNotFoundError:
             return None
         return content
@@ -91,21 +119,52 @@ class RemoteFolder:
         Raises:
             OSError: it cannot be written.
         """
-        self._system.pipe_file(f"{self._path}/{name}", content)
+        with _os_errors():
+            self._system.pipe_file(f"{self._path}/{name}", content)
+
+    def put(self, name: str, file: Path) -> None:
+        """Writes a copy of a file of this machine, as `write` does.
+
+        Raises:
+            OSError: the one cannot be read, or the other cannot be written.
+        """
+        with _os_errors():
+            self._system.put_file(str(file), f"{self._path}/{name}")
+
+    def names(self) -> list[str]:
+        """Returns the names of all files, here and below, sorted.
+
+        Raises:
+            OSError: the store cannot be read.
+        """
+        with _os_errors():
+            self._system.invalidate_cache()
+            found = self._system.find(self._path)
+        return sorted(str(name).removeprefix(self._path).strip("/") for name in found)
+
+    def remove(self, name: str) -> None:
+        """Removes a file; nothing happens where there is none.
+
+        Raises:
+            OSError: it cannot be removed.
+        """
+        with suppress(FileNotFoundError), _os_errors():
+            self._system.rm_file(f"{self._path}/{name}")
 
 
 def _opened(url: str) -> tuple[Any, str]:
     """Returns a file system and the path in it.
 
     Raises:
-        CfxError: its package is not installed, or nobody knows such URLs.
+        NotInstalledError: its package is not installed.
+        CfxError: nobody knows such URLs.
     """
     import fsspec
 
     scheme = url.partition("://")[0].lower()
     package = _PACKAGES.get(scheme)
     if package is not None and importlib.util.find_spec(package) is None:
-        raise CfxError(f"{url} needs the package {package}: {install_line(package)}")
+        raise NotInstalledError(f"{url} needs the package {package}: {install_line(package)}")
     try:
         system, path = fsspec.core.url_to_fs(url)
     except ValueError as error:
@@ -115,9 +174,7 @@ def _opened(url: str) -> tuple[Any, str]:
 
 
 def _copy(system: Any, path: str) -> Path:
-    kept = os.environ.get("CFX_DATA_CACHE") or "~/.cache/cfx/data"
-    mark = hashlib.sha256(f"{path} {_version(system, path)}".encode()).hexdigest()[:16]
-    copy = Path(kept).expanduser() / mark / path.rpartition("/")[2]
+    copy = _kept(f"{path} {_version(system.info(path))}") / path.rpartition("/")[2]
     if not copy.is_file():
         copy.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(copy) as partial:
@@ -125,9 +182,38 @@ def _copy(system: Any, path: str) -> Path:
     return copy
 
 
-def _version(system: Any, path: str) -> str:
+def _copy_files(system: Any, path: str, names: list[str], copy: Path) -> None:
+    """Copies files below a path to a folder, which appears whole.
+
+    Raises:
+        DataError: a name leads out of the folder.
+        OSError: the folder cannot be written.
+    """
+    copy.parent.mkdir(parents=True, exist_ok=True)
+    partial = copy.with_name(f".{secrets.token_hex(8)}")
+    try:
+        for name in names:
+            target = partial / name
+            if not target.resolve().is_relative_to(partial.resolve()):
+                raise DataError(f"{path}/{name}: leads out of its folder, and is not copied")
+            target.parent.mkdir(parents=True, exist_ok=True)
+            system.get_file(f"{path}/{name}", str(target))
+        with suppress(OSError):  # another process was faster
+            partial.rename(copy)
+        if not copy.is_dir():
+            raise OSError(f"{copy} cannot be made")
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _kept(what: str) -> Path:
+    """Returns the folder of this machine's copy of something, which need not be there."""
+    home = os.environ.get("CFX_DATA_CACHE") or "~/.cache/cfx/data"
+    return Path(home).expanduser() / hashlib.sha256(what.encode()).hexdigest()[:16]
+
+
+def _version(about: Any) -> str:
     """Returns what changes when a file does: its size, and what its store calls its version."""
-    about = system.info(path)
     for name in _VERSIONS:
         if name in about:
             mark = str(about[name]).strip('"')
@@ -136,16 +222,28 @@ def _version(system: Any, path: str) -> str:
 
 
 @contextmanager
-def _explained(url: str) -> Iterator[None]:
-    """Turns what object stores raise into a sentence."""
+def _os_errors() -> Iterator[None]:
+    """Turns what object stores raise besides OSError, such as missing credentials, into one."""
+    try:
+        yield
+    except OSError:
+        raise
+    except Exception as error:  # each store raises errors of its own
+        first = next(iter(str(error).splitlines()), "")
+        raise OSError(f"{type(error).__name__}: {first}") from error
+
+
+@contextmanager
+def _explained(what: str) -> Iterator[None]:
+    """Turns what object stores raise into a sentence about what was asked for."""
     try:
         yield
     except CfxError:
         raise
     except FileNotFoundError:
-        raise DataError(f"data.path={without_passwords(url)}: no such file") from None
+        raise DataError(f"{without_passwords(what)}: no such file") from None
     except Exception as error:  # each store raises errors of its own
         first = next(iter(str(error).splitlines()), type(error).__name__)
         raise DataError(
-            f"data.path={without_passwords(url)}: cannot be read ({type(error).__name__}: {first})"
+            f"{without_passwords(what)}: cannot be read ({type(error).__name__}: {first})"
         ) from error

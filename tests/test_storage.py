@@ -1,27 +1,33 @@
-"""Data and caches behind URLs, against an S3 store on this machine."""
+"""Data, caches and jobs' folders behind URLs, against an S3 store on this machine."""
 
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from cfx import registry, storage
+import cfx
+from cfx import cli, registry, storage
 from cfx.calibration.cache import Cache
 from cfx.config import JobConfig
 from cfx.datasets.tidy import TidyDataset, write_tidy
 from cfx.errors import CfxError, DataError, OutputError
 from cfx.extras import install_line
+from cfx.job.upload import place_of
+from cfx.report.runs import read_runs
 from cfx.storage import RemoteFolder, is_url, local_copies, state
 from cfx.sweep.fingerprint import fingerprint
+from tests.broken_plugins import QUICK
 from tests.drives import straight_pairs
 
 pytest.importorskip("moto", reason="moto stands in for S3")
 
 KEY = "ab" * 32
+JOB = (*QUICK, "data.pairs=3")
 
 
 @pytest.fixture(scope="module")
@@ -155,3 +161,101 @@ def test_a_job_takes_urls_for_its_data_and_its_cache() -> None:
     assert config.model_dump(mode="json")["cache"]["folder"] == "s3://bucket/cache"
     made = registry.create("dataset", config.data)
     assert made.settings.path == "s3://bucket/pairs.parquet"
+
+
+def job(folder: Path, url: str, *overrides: str) -> int:
+    return cli.main([*JOB, f"hydra.run.dir={folder}", f"output.url={url}/jobs", *overrides])
+
+
+def test_a_job_whose_folder_was_copied_is_read_from_its_url(
+    bucket: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "outputs" / "today" / "mine"
+    url = f"{bucket}/jobs/today/mine"
+    assert job(folder, bucket) == 0
+    assert f"Copied to: {url}\n" in capsys.readouterr().out
+    written = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert set(RemoteFolder(url).names()) == written
+    assert {"metrics.json", "policy/policy.json", ".hydra/overrides.yaml"} <= written
+    # A neighbour whose name begins alike is another folder.
+    RemoteFolder(f"{bucket}/jobs/today/mine-2").write("metrics.json", b"{}")
+
+    found, here = cfx.load(url), cfx.load(folder)
+    assert found.metrics == here.metrics
+    assert found.pairs.equals(here.pairs)
+    assert found.folder != folder
+    assert cfx.load(f"{url}/").folder == found.folder, "nothing is copied twice"
+
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["report", url]) == 0
+    assert cli.main(["report", url, "--tables", "csv"]) == 0
+    assert cli.main(["export", url, "--to", "sumo"]) == 0
+    assert url in (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert (tmp_path / "report.csv").is_file()
+    assert (tmp_path / "drivers.add.xml").is_file()
+
+
+def test_a_sweep_whose_jobs_were_copied_is_read_from_its_url(
+    bucket: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sweep = tmp_path / "sweep"
+    arguments = ["-m", *JOB, "seed=0,1", f"hydra.sweep.dir={sweep}", f"output.url={bucket}"]
+    assert cli.main(arguments) == 0
+    runs = read_runs([f"{bucket}/sweep"])
+    assert {found.place for found in runs.jobs} == {
+        f"{bucket}/sweep/{folder.name}" for folder in sweep.iterdir() if folder.is_dir()
+    }
+
+
+def test_what_an_earlier_job_left_at_a_url_goes_and_nothing_else(
+    bucket: str, tmp_path: Path
+) -> None:
+    foreign, mine = RemoteFolder(f"{bucket}/jobs/data"), RemoteFolder(f"{bucket}/jobs/mine")
+    foreign.write("pairs.parquet", b"recorded")
+    assert job(tmp_path / "data", bucket) == 0
+    assert foreign.read("pairs.parquet") == b"recorded"
+    assert job(tmp_path / "mine", bucket) == 0
+    mine.write("platoon.parquet", b"of an earlier job")
+    assert job(tmp_path / "mine", bucket, "seed=1") == 0
+    assert mine.read("platoon.parquet") is None
+    assert mine.read("metrics.json") == (tmp_path / "mine" / "metrics.json").read_bytes()
+
+
+def test_a_url_that_cannot_be_written_is_said_before_any_work(
+    bucket: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert job(tmp_path / "job", f"{bucket}-nobody-made") == 2
+    said = capsys.readouterr().err
+    assert re.match(r"cannot write to s3://.*/jobs/job \(.*\); set output\.url to a place", said)
+    assert not (tmp_path / "job" / "metrics.json").exists()
+    assert job(tmp_path / "job", "here") == 2
+    assert "output.url='here/jobs': write a URL such as" in capsys.readouterr().err
+    assert cli.main([*JOB, f"hydra.run.dir={bucket}/job"]) == 2
+    assert f"output.url={bucket}/job copies jobs there" in capsys.readouterr().err
+    with pytest.raises(DataError, match="there is no such folder"):
+        cfx.load(f"{bucket}/jobs/nothing")
+
+
+def test_a_name_that_leads_out_of_its_folder_is_not_copied(
+    bucket: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import s3fs
+
+    name = bucket.removeprefix("s3://")
+    about = {f"{name}/job/../../x": {"size": 1, "ETag": "1"}}
+    monkeypatch.setattr(s3fs.S3FileSystem, "find", lambda *_args, **_options: about)
+    with pytest.raises(DataError, match="leads out of its folder"):
+        storage.local_folder(f"{bucket}/job")
+
+
+@pytest.mark.parametrize(
+    ("folder", "place"),
+    [
+        ("/home/me/outputs/2026-11-24/10-00-idm-gru", "2026-11-24/10-00-idm-gru"),
+        ("/outputs/me/outputs/one", "one"),
+        ("/data/one", "one"),
+        ("/data/outputs", "outputs"),
+    ],
+)
+def test_a_copy_has_the_jobs_own_name(folder: str, place: str) -> None:
+    assert place_of(Path(folder)) == place

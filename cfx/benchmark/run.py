@@ -17,7 +17,17 @@ from cfx.datasets.base import Dataset
 from cfx.errors import ConfigError, DataError, nearest
 from cfx.files import atomic_write
 
-_CHANGE_NOTHING = ("tracking", "figures", "cores", "threads", "cache", "demo", "engine", "hydra")
+_CHANGE_NOTHING = (
+    "tracking",
+    "output",
+    "figures",
+    "cores",
+    "threads",
+    "cache",
+    "demo",
+    "engine",
+    "hydra",
+)
 """Keys of a configuration that results do not depend on."""
 
 _SECONDS = "benchmark_seconds.txt"

@@ -31,6 +31,7 @@ def report(
     *,
     has_constant_baseline: bool = True,
     adapts: bool = True,
+    copied_to: str | None = None,
 ) -> None:
     """Prints the table, where the results are and how to open them.
 
@@ -41,6 +42,7 @@ def report(
         tracker: says how to open the job's run.
         has_constant_baseline: as `DrivingModel.has_constant_baseline`.
         adapts: as `Policy.adapts`.
+        copied_to: URL of the folder's copy; None without.
     """
     console.print(methods_table(evaluation, result.metrics))
     if evaluation.full_trajectory_improvements:
@@ -68,6 +70,8 @@ def report(
         text = f"Not measured: {one.name} of the distribution {one.distribution} ({one.reason})."
         console.print(text, soft_wrap=True, highlight=False)
     console.print(f"Results: {result.folder}", soft_wrap=True, highlight=False)
+    if copied_to is not None:
+        console.print(f"Copied to: {copied_to}", soft_wrap=True, highlight=False)
     animation = result.folder / "sumo" / "demo.html"
     if animation.is_file():
         console.print(f"Animation, for any browser: {animation}", soft_wrap=True, highlight=False)

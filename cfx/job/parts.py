@@ -22,6 +22,7 @@ from cfx.policies.base import Policy
 from cfx.protocols.base import Protocol
 from cfx.ready import is_ready_made
 from cfx.simulators.base import Simulator
+from cfx.storage import is_url
 from cfx.tracking.store import folder_of, is_run_id
 
 log = logging.getLogger(__name__)
@@ -94,7 +95,7 @@ def reported_objectives(config: JobConfig, objective: Objective) -> dict[str, Ob
 
 
 def make_protocol(config: JobConfig) -> Protocol:
-    """Returns the protocol, for which ids of MLflow runs have become folders.
+    """Returns the protocol, for which ids of MLflow runs, and URLs, have become folders.
 
     Raises:
         ConfigError: a setting is wrong.
@@ -106,7 +107,7 @@ def make_protocol(config: JobConfig) -> Protocol:
         protocol = cast(type[Protocol], registry.get("protocol", name))
         for setting in protocol.jobs:
             given = str(node.get(setting))
-            if is_run_id(given) or is_ready_made(given):
+            if is_run_id(given) or is_ready_made(given) or is_url(given):
                 node[setting] = folder_of(given, config.tracking.uri)
     return cast(Protocol, registry.create("protocol", node))
 

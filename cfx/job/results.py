@@ -64,8 +64,8 @@ def load(folder_or_run: str | Path) -> JobResult:
     """Reads a finished job back.
 
     Args:
-        folder_or_run: a job's output folder, the id of its MLflow run, or a ready-made policy
-            (`cfx://NAME`), whose table of pairs is empty.
+        folder_or_run: a job's output folder or the URL of its copy (`output.url`), the id of its
+            MLflow run, or a ready-made policy (`cfx://NAME`), whose table of pairs is empty.
 
     Raises:
         DataError: there is no finished job, or no such policy.

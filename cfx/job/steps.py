@@ -32,6 +32,7 @@ from cfx.job.parts import (
 )
 from cfx.job.results import JobResult
 from cfx.job.run import load_pairs
+from cfx.job.upload import Upload
 from cfx.learners.curves import best_losses
 from cfx.memory import require_memory
 from cfx.pairs import PairBatch, PairSet
@@ -77,6 +78,10 @@ def take_steps(
     parts = Parts.of(config, protocol)
     output = Output.make(folder)
     output.begin(config)
+    upload = None
+    if config.output.url is not None:
+        upload = Upload(config.output.url, folder)
+        upload.begin()
     with Tracker.open(config, folder) as tracker:
         if config.data != data:  # the protocol has determined other data
             loaded = load_pairs(parts.dataset)
@@ -99,6 +104,10 @@ def take_steps(
             if config.figures.enabled:
                 view = calibration_view(context, protocol_result.evaluation)
         result = _keep(config, parts, output, pairs, style, protocol_result, view, tracker)
+        if upload is not None:
+            upload.finish()
+            tracker.set_tags({"cfx.output_url": upload.url})
+            log.info("The job's folder was copied to %s", upload.url)
     report(
         result,
         protocol_result.evaluation,
@@ -106,6 +115,7 @@ def take_steps(
         tracker,
         has_constant_baseline=parts.model.has_constant_baseline,
         adapts=parts.policy.adapts,
+        copied_to=None if upload is None else upload.url,
     )
     return result
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from cfx.errors import DataError
@@ -12,6 +12,7 @@ from cfx.report.files import optional, read_json, without_password
 from cfx.report.job import Job, Origin, Runs, Unfinished
 from cfx.report.names import named
 from cfx.report.read import read_job
+from cfx.storage import is_url, local_folder
 
 _PASSED_OVER = {".hydra", "mlartifacts", "figures", "policy", "cache"}
 """Folders below an output folder that hold no jobs of their own."""
@@ -24,8 +25,8 @@ def read_runs(runs: Sequence[str]) -> Runs:
     """Reads jobs.
 
     Args:
-        runs: each an output folder of a job, a folder with jobs below it, or the id of an MLflow
-            run, also of a sweep's parent.
+        runs: each an output folder of a job, a folder with jobs below it, the URL of either
+            (`output.url`), or the id of an MLflow run, also of a sweep's parent.
 
     Raises:
         DataError: a folder holds no finished job, or a job's file is damaged.
@@ -34,8 +35,7 @@ def read_runs(runs: Sequence[str]) -> Runs:
     jobs: dict[str, Job] = {}
     unfinished: dict[str, Unfinished] = {}
     for run in runs:
-        path = Path(run).expanduser()
-        for found in _of_folder(path) if path.exists() else _of_mlflow(run):
+        for found in _read(run):
             if isinstance(found, Job):
                 jobs.setdefault(found.place, found)
             else:
@@ -43,13 +43,32 @@ def read_runs(runs: Sequence[str]) -> Runs:
     return Runs(named(tuple(jobs.values())), tuple(unfinished.values()))
 
 
-def _of_folder(folder: Path) -> list[Job | Unfinished]:
+def _read(run: str) -> list[Job | Unfinished]:
+    """Returns the jobs that one word on the command line stands for."""
+    if is_url(run):
+        copy = local_folder(run)
+        return _of_folder(
+            copy, lambda job: f"{run.rstrip('/')}/{job.relative_to(copy)}".removesuffix("/.")
+        )
+    path = Path(run).expanduser()
+    if path.exists():
+        return _of_folder(path, lambda job: str(job.absolute()))
+    return _of_mlflow(run)
+
+
+def _of_folder(folder: Path, place: Callable[[Path], str]) -> list[Job | Unfinished]:
+    """Returns the jobs below a folder.
+
+    Args:
+        folder: as it lies on this machine.
+        place: takes the folder of a job, and returns what people know it by.
+    """
     if not folder.is_dir():
         raise DataError(
             f"{folder} is a file; give a job's output folder, a sweep's folder, or the id of an"
             " MLflow run"
         )
-    found = [_one(place) for place in _job_folders(folder)]
+    found = [_one(job, place(job)) for job in _job_folders(folder)]
     if not any(isinstance(one, Job) for one in found):
         raise DataError(
             f"{folder} holds no finished job (a finished one has a metrics.json){_reasons(found)}"
@@ -86,8 +105,7 @@ def _job_folders(folder: Path) -> Iterator[Path]:
             below[:] = sorted(set(below) - _PASSED_OVER, key=natural_order)
 
 
-def _one(folder: Path) -> Job | Unfinished:
-    place = str(folder.absolute())
+def _one(folder: Path, place: str) -> Job | Unfinished:
     if (folder / "metrics.json").is_file():
         return read_job(folder, Origin(place))
     status = optional(folder / "outcome.json", read_json) or {}
