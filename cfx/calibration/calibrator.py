@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -44,6 +44,10 @@ from cfx.simulation.base import Stepper
 _GROUP = 1024
 """Problems solved together: enough to fill the batch, few enough that an interruption loses
 little."""
+
+_PART = 64
+"""Whole trajectories that are solved in one shard of a cluster: each is the work of a hundred
+windows."""
 
 
 @dataclass(frozen=True)
@@ -187,13 +191,13 @@ class Calibrator:
 
         compiled = self._has_kernel(batch)
 
-        def shard(chosen: Tensor) -> DriverShard:
+        def shard(chosen: Tensor, group: Tensor) -> DriverShard:
             chosen = chosen.to(device)
-            return DriverShard(
-                self.solver, self._code, compiled, batch[chosen].trimmed(), last[chosen]
-            )
+            solver = self._solver_for(len(group) * int(last[group].max()))
+            return DriverShard(solver, self._code, compiled, batch[chosen].trimmed(), last[chosen])
 
-        results = self._cached("Driver-specific parameters", keys, [1] * len(pairs), shard)
+        title = "Driver-specific parameters"
+        results = self._cached(title, keys, [1] * len(pairs), shard, part=_PART)
         return _stacked(results, device)
 
     def population(self, pairs: PairSet, batch: PairBatch, last: Tensor, members: Tensor) -> Tensor:
@@ -219,7 +223,7 @@ class Calibrator:
 
         compiled = self._has_kernel(batch)
 
-        def shard(chosen: Tensor) -> PooledShard:
+        def shard(chosen: Tensor, _group: Tensor) -> PooledShard:
             groups = members[chosen].to(device)
             used = groups.any(0).nonzero()[:, 0]
             trajectories = batch[used].trimmed()
@@ -227,6 +231,7 @@ class Calibrator:
                 self.solver, self._code, compiled, trajectories, last[used], groups[:, used]
             )
 
+        # Not cut into parts: groups share candidates, and what is simulated for one serves all.
         results = self._cached("Pooled parameters", keys, [1] * len(members), shard)
         return _stacked(results, device)
 
@@ -253,7 +258,7 @@ class Calibrator:
 
         compiled = self._has_kernel(batch)
 
-        def shard(chosen: Tensor) -> WindowShard:
+        def shard(chosen: Tensor, _group: Tensor) -> WindowShard:
             own, _ = windows.select(chosen)
             chosen = chosen.to(device)
             return WindowShard(
@@ -334,7 +339,8 @@ class Calibrator:
         what: str,
         keys: list[str],
         problems: list[int],
-        shard: Callable[[Tensor], CalibrationShard],
+        shard: Callable[[Tensor, Tensor], CalibrationShard],
+        part: int = _GROUP,
         **scope: Any,
     ) -> list[Arrays]:
         """Returns one entry per key; solves what neither the cache nor another process provides.
@@ -343,19 +349,24 @@ class Calibrator:
             what: what is calibrated, for the progress display.
             keys: of the entries.
             problems: how many each entry stands for.
-            shard: takes the numbers of entries and returns what solves these entries.
+            shard: takes the numbers of entries, and those of the group that they are cut from, and
+                returns what solves these entries.
+            part: problems in each shard at most, where groups are cut.
             scope: settings that all keys share, besides those of the calibrator.
         """
-        work = _Work(self.cache, keys, problems, self.optimizer.evaluations())
+        together = _GROUP
+        enough: float = _GROUP
+        if self.optimizer.in_parts or (self.optimizer.in_threads and self.engine.distributes):
+            together = min(part, _GROUP)
+        if self.engine.distributes:
+            enough = math.inf
+        work = _Work(self.cache, keys, problems, self.optimizer.evaluations(), together)
         wanted = work.shares(self._key(what, "", **scope))
         optimizer = type(self.optimizer).__name__
         objective = type(self.objective).__name__
         if self.objective.unit:
             objective = f"{objective} in {self.objective.unit}"
         title = f"{what} ({optimizer}, {objective}, {work.missing_problems} problems)"
-        enough: float = _GROUP
-        if self.engine.distributes:
-            enough = math.inf
         with self.progress(title, work.missing_problems * work.evaluations) as task:
             while wanted:
                 with self.cache.claim(work.sizes(wanted), enough) as claimed:
@@ -365,16 +376,32 @@ class Calibrator:
 
     def _solve(
         self,
-        groups: list[list[int]],
-        shard: Callable[[Tensor], CalibrationShard],
+        groups: list[_Group],
+        shard: Callable[[Tensor, Tensor], CalibrationShard],
         work: _Work,
         task: Task,
     ) -> None:
         """Has the engine solve groups of entries; each result is kept as soon as it is there."""
-        shards = (shard(torch.tensor(group)) for group in groups)
+        parts = [part for group in groups for part in group.parts]
+        shards = (
+            shard(torch.tensor(part), torch.tensor(group.entries))
+            for group in groups
+            for part in group.parts
+        )
         with closing(self.engine.map(solve_shard, shards, task.advance)) as results:
             for number, entries in results:
-                work.keep(groups[number], entries)
+                work.keep(parts[number], entries)
+
+    def _solver_for(self, steps: int) -> Solver:
+        """Returns the solver of a group of problems, for any part of it.
+
+        Whether work is compiled depends on how much there is, and its last bits on that.
+
+        Args:
+            steps: of all problems of the group, for one candidate.
+        """
+        simulator = self.simulator.for_work(steps * self.optimizer.evaluations())
+        return replace(self.solver, simulator=simulator)
 
     @cached_property
     def solver(self) -> Solver:
@@ -395,6 +422,13 @@ class Calibrator:
         return content_key({"what": what, "pair": pair, **self._scope, **details})
 
 
+class _Group(NamedTuple):
+    """Entries that belong together, and the parts that are solved one by one."""
+
+    entries: list[int]
+    parts: list[list[int]]
+
+
 class _Work:
     """The entries of one calibration: what the cache holds, and what is still to be solved.
 
@@ -404,11 +438,12 @@ class _Work:
     """
 
     def __init__(
-        self, cache: Cache, keys: list[str], problems: list[int], evaluations: int
+        self, cache: Cache, keys: list[str], problems: list[int], evaluations: int, together: int
     ) -> None:
         self._cache = cache
         self._keys = keys
         self._problems = problems
+        self._together = together
         self._entries = [cache.get(key) for key in keys]
         self.evaluations = evaluations
         self.missing_problems = self._size(self._missing(range(len(keys))))
@@ -429,13 +464,13 @@ class _Work:
             sizes[name] = self._size(indices)
         return sizes
 
-    def groups(self, shares: dict[str, list[int]], task: Task) -> list[list[int]]:
+    def groups(self, shares: dict[str, list[int]], task: Task) -> list[_Group]:
         """Returns what is left of claimed shares: entries that are solved together.
 
         Another process may have solved some before the claim. Shares are put together as an engine
         claims them that solves one group after the other, so that every engine has the same groups.
         """
-        groups: list[list[int]] = []
+        groups = []
         for names in first_fit(self.sizes(shares), _GROUP):
             indices: list[int] = []
             for name in names:
@@ -445,7 +480,9 @@ class _Work:
                 self._entries[index] = self._cache.get(self._keys[index])
             left = self._missing(indices)
             task.advance(self.evaluations * (self._size(indices) - self._size(left)))
-            groups.extend(_groups(left, self._problems))
+            for group in _runs(left, self._problems, _GROUP):
+                parts = list(_runs(group, self._problems, self._together))
+                groups.append(_Group(group, parts))
         return groups
 
     def keep(self, group: list[int], entries: list[Arrays]) -> None:
@@ -468,12 +505,12 @@ class _Work:
         return [index for index in indices if self._entries[index] is None]
 
 
-def _groups(indices: list[int], problems: list[int]) -> Iterator[list[int]]:
-    """Yields runs of indices with at most `_GROUP` problems, or one index if it alone has more."""
+def _runs(indices: list[int], problems: list[int], together: int) -> Iterator[list[int]]:
+    """Yields runs of indices with so many problems at most, or one index if it alone has more."""
     group: list[int] = []
     size = 0
     for index in indices:
-        if group and size + problems[index] > _GROUP:
+        if group and size + problems[index] > together:
             yield group
             group, size = [], 0
         group.append(index)

@@ -104,7 +104,12 @@ class Optimizer(Component):
 
     kind = "optimizer"
     in_threads: ClassVar[bool] = False
-    """`solve` may be called for several chunks at once, in threads of one process."""
+    """`solve` may be called for several chunks at once, in threads of one process: how problems are
+    cut into chunks changes no bit, and a cluster cuts them further."""
+    in_parts: ClassVar[bool] = False
+    """Groups of whole trajectories are cut into the same parts on every engine, so that the workers
+    of a cluster share them: for an optimizer whose last bits depend on how problems are cut. One
+    with neither solves a group as a whole."""
 
     @abstractmethod
     def solve(

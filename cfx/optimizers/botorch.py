@@ -128,6 +128,7 @@ class BotorchOptimizer(Optimizer):
 
     schema: ClassVar[type[Settings]] = BotorchSettings
     settings: BotorchSettings
+    in_parts = True
 
     def evaluations(self) -> int:
         return self.space_filling() + self.settings.iterations

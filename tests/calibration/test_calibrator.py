@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+import copy
+from collections.abc import Generator, Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,8 +13,10 @@ from torch import Tensor
 
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
+from cfx.calibration.shards import CalibrationShard
 from cfx.calibration.windows import Windows, WindowSettings
 from cfx.datasets.synthetic import SyntheticDataset
+from cfx.engine.base import Engine, Report
 from cfx.errors import OutputError
 from cfx.models.base import DrivingModel
 from cfx.models.krauss import Krauss
@@ -21,8 +26,9 @@ from cfx.objectives.huber import SpeedHuber
 from cfx.objectives.mixed import Mixed
 from cfx.objectives.rmse import GapRmse, SpeedRmse
 from cfx.objectives.theil import TheilU
-from cfx.optimizers.base import CandidateLosses
+from cfx.optimizers.base import CandidateLosses, Optimizer
 from cfx.optimizers.botorch import BotorchOptimizer
+from cfx.optimizers.gradient import GradientSearch
 from cfx.optimizers.random import RandomSearch
 from cfx.pairs import PairBatch, PairSet
 from cfx.progress import Task
@@ -284,3 +290,50 @@ def test_the_number_of_cores_changes_no_bit(samples: int, request: pytest.Fixtur
     alone = tool.fixed(pairs, batch, batch.lengths - 1)
     threads.limit_cores(None)
     assert torch.equal(tool.fixed(pairs, batch, batch.lengths - 1), alone)
+
+
+class Elsewhere(Engine):
+    """Works as a cluster would whose workers are processes of their own."""
+
+    distributes = True
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.shards: list[CalibrationShard] = []
+
+    def map(
+        self, work: Any, shards: Iterable[Any], report: Report, *, shares_cores: bool = True
+    ) -> Generator[tuple[int, Any], None, None]:
+        for number, one in enumerate(shards):
+            self.shards.append(one)
+            yield number, work(copy.deepcopy(one), report)
+
+
+@pytest.mark.parametrize(
+    "optimizer",
+    [
+        RandomSearch(samples=512),
+        GradientSearch(),
+        BotorchOptimizer(screening=32, initial=6, iterations=6),
+    ],
+    ids=["random", "gradient", "botorch"],
+)
+def test_a_cluster_shares_drivers_among_its_workers_and_changes_no_bit(
+    optimizer: Optimizer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Small parts would not be worth compiling for; all of them together are."""
+    monkeypatch.setattr("cfx.calibration.calibrator._PART", 2)
+    drivers = torch.stack([torch.linspace(1.0, 2.5, 7), torch.linspace(0.0, 0.6, 7)], dim=1)
+    pairs = wavy_pairs(Krauss(), drivers.double(), frames=150)
+    batch, elsewhere = PairBatch.of(pairs), Elsewhere()
+    last = torch.tensor([149, 120, 149, 90, 149, 149, 60])
+    members = torch.tensor([[True] * 7, [True, False, True, True, True, True, False]])
+    here = calibrator(optimizer)
+    there = calibrator(optimizer, engine=elsewhere)
+    expected = here.fixed(pairs, batch, last)
+    assert torch.equal(there.fixed(pairs, batch, last), expected)
+    assert [len(shard.batch) for shard in elsewhere.shards] == [2, 2, 2, 1]
+    elsewhere.shards.clear()
+    expected = here.population(pairs, batch, last, members)
+    assert torch.equal(there.population(pairs, batch, last, members), expected)
+    assert len(elsewhere.shards) == 1, "what is simulated for one group serves all"
