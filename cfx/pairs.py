@@ -237,8 +237,11 @@ class PairBatch:
         length = max(len(pair) for pair in pair_set)
         signals = {}
         for name in SIGNALS:
-            rows = [_extend(pair, name, length) for pair in pair_set]
-            signals[name] = torch.as_tensor(np.stack(rows)).to(device=device, dtype=dtype)
+            # Filled row by row: a list of rows would hold the signal twice.
+            values = np.empty((len(pair_set), length))
+            for row, pair in zip(values, pair_set, strict=True):
+                row[:] = _extend(pair, name, length)
+            signals[name] = torch.as_tensor(values).to(device=device, dtype=dtype)
         leader_lengths = [pair.leader_length for pair in pair_set]
         lengths = torch.tensor([len(pair) for pair in pair_set])
         return cls(
