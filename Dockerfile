@@ -8,6 +8,8 @@ ARG PYTHON=3.12
 FROM python:${PYTHON}-slim-bookworm AS build
 
 # The compiler makes kernels for the processor that the container runs on, so the image that runs has it too.
+# Its version is Debian's of the day, with its security fixes.
+# hadolint ignore=DL3008
 RUN apt-get update && apt-get install --yes --no-install-recommends g++ && rm -rf /var/lib/apt/lists/*
 ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
 WORKDIR /src
@@ -24,11 +26,13 @@ ARG EXTRAS=dask,joblib,postgresql,s3
 RUN /opt/cfx/bin/pip install --no-cache-dir --constraint constraints.txt ".[$EXTRAS]" ./plugins/cfx-dask
 
 FROM python:${PYTHON}-slim-bookworm
+# hadolint ignore=DL3008
 RUN apt-get update && apt-get install --yes --no-install-recommends g++ && rm -rf /var/lib/apt/lists/* \
   && useradd --create-home --uid 1000 cfx && install --directory --owner cfx /work
 COPY --from=build /opt/cfx /opt/cfx
 ENV PATH=/opt/cfx/bin:$PATH OMP_NUM_THREADS=1 MLFLOW_DISABLE_TELEMETRY=true
-USER cfx
+# By number: Kubernetes cannot know that a name is not root.
+USER 1000
 WORKDIR /work
 # Without words after the image's name: the job of `make run`. `cfx ...`, `dask worker ...` and anything else run as they are.
 CMD ["cfx"]
