@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -69,6 +69,8 @@ def simulate_in_shards(
         engine: where shards are simulated; few pairs are simulated here.
         simulator, agent, batch, first, network, base, history: as for `simulate_closed_loop`.
     """
+    # Whom it has learned from is a long list, and drives nothing.
+    agent = replace(agent, learned_from={})
     whole = ClosedLoopShard(simulator, agent, batch, first, network, base, history)
     if len(batch) <= PAIRS_AT_ONCE:
         return simulate_shard(whole, _nothing)
