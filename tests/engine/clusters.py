@@ -34,9 +34,12 @@ class Cluster:
         where = ["--host", "127.0.0.1", "--port", str(self.port), "--no-dashboard"]
         return _start("distributed.cli.dask_scheduler", *where)
 
-    def start_worker(self, *options: str, **environment: str) -> subprocess.Popen[bytes]:
+    def start_worker(
+        self, *options: str, root: Path = ROOT, **environment: str
+    ) -> subprocess.Popen[bytes]:
+        """Starts a worker that imports cfx from `root`."""
         where = [self.address, "--host", "127.0.0.1", "--nthreads", "1", "--no-dashboard"]
-        worker = _start("distributed.cli.dask_worker", *where, *options, **environment)
+        worker = _start("distributed.cli.dask_worker", *where, *options, root=root, **environment)
         self.workers.append(worker)
         return worker
 
@@ -65,10 +68,13 @@ class Cluster:
             _end(process)
 
 
-def _start(module: str, *arguments: str, **environment: str) -> subprocess.Popen[bytes]:
+def _start(
+    module: str, *arguments: str, root: Path = ROOT, **environment: str
+) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
         [sys.executable, "-m", module, *arguments],
-        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", **environment},
+        cwd=root,
+        env={**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1", **environment},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,  # so that its children can be ended with it

@@ -34,7 +34,7 @@ def cluster(tmp_path: Path) -> Iterator[Cluster]:
     shutil.copytree(ROOT / "tests", tmp_path / "tests")
     with (tmp_path / "cfx" / "models" / "krauss.py").open("a") as file:
         file.write("# of another version\n")
-    made.start_worker(PYTHONPATH=str(tmp_path))
+    made.start_worker(root=tmp_path)
     yield made
     made.stop()
 
