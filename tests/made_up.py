@@ -9,9 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from cfx.evaluation.distributions import DISTRIBUTION_COLUMNS
 from cfx.evaluation.forecasts import FORECAST_COLUMNS, FORECAST_METHODS, Forecasts
 from cfx.evaluation.result import Evaluation, Improvement, PairTrajectory, Platoon
 from cfx.evaluation.tables import VALUE_COLUMNS
+from cfx.evaluation.traffic.result import ROAD_COLUMNS, Traffic
 from cfx.metrics.base import MetricInfo
 from cfx.parameters import Parameter, ParameterSpace
 from cfx.style.result import CLUSTERS, StyleResult
@@ -193,6 +195,58 @@ def make_forecasts(drivers: int = 6, methods: tuple[str, ...] = FORECAST_METHODS
                     rows.append((*row, error, 2 * error, abs(error)))
     table = pd.DataFrame(rows, columns=list(FORECAST_COLUMNS))
     return Forecasts(table, (0.5, 2.0, 10.0), "given", seed=0)
+
+
+def make_distributions(forecasts: Forecasts, seed: int = 0) -> pd.DataFrame:
+    """Scores of the same origins: the policy's paths are a third better than its centre."""
+    rng = np.random.default_rng(seed)
+    parts = []
+    for method, share in (("population_ar", 1.2), ("fixed_ar", 1.1), ("policy", 0.67)):
+        rows = forecasts.table[forecasts.table["method"] == "policy"]
+        scores = dict.fromkeys(DISTRIBUTION_COLUMNS[4:], share * rows["ade"])
+        scores["crps_speed"] = share * rows["speed_error"].abs()
+        scores["coverage"] = (rng.random(len(rows)) < 0.85).astype(float)
+        scores["pit"] = rng.beta(0.8, 0.8, len(rows))
+        part = rows[["pair_id", "driver", "horizon_s"]].assign(method=method, **scores)
+        parts.append(part[list(DISTRIBUTION_COLUMNS)])
+    centre = parts[0].assign(method="fixed", coverage=np.nan, pit=np.nan)
+    return pd.concat([*parts, centre], ignore_index=True)
+
+
+def make_traffic(methods: tuple[str, ...] = ("population", "fixed_ar", "policy")) -> Traffic:
+    """Traffic of made-up vehicles: each method's flows and variations are of another size."""
+    rng = np.random.default_rng(0)
+    roads, growth, strips, paths = [], [], [], []
+    for k, method in enumerate(("real", *methods)):
+        size = 1.0 - 0.1 * k
+        density = rng.uniform(20.0, 110.0, 400)
+        flow = size * 25.0 * density * (1.0 - density / 150.0)
+        columns = {"density": density, "flow": flow, "speed_std": size * 0.9}
+        strips.append(pd.DataFrame({"method": method, **columns}))
+        if method == "real":
+            continue
+        for density_of_ring in (30.0, 60.0, 90.0):
+            ring_flow = size * 25.0 * density_of_ring * (1.0 - density_of_ring / 150.0)
+            row = dict.fromkeys(ROAD_COLUMNS, 1.0) | {"flow": ring_flow, "wave_speed": -15.0 * size}
+            level = {"level": density_of_ring, "density": density_of_ring}
+            roads.append(row | level | {"method": method, "road": "ring", "collisions": 0})
+        free = dict.fromkeys(ROAD_COLUMNS, np.nan) | {"discharge": 1500.0 * size, "collisions": k}
+        roads.append(free | {"method": method, "road": "open", "level": 1800.0})
+        vehicle = np.arange(9)
+        along = {"leader_speed": 8.0, "vehicle": vehicle, "speed_std": size * np.sqrt(vehicle)}
+        growth.append(pd.DataFrame({"method": method, **along}))
+        time = np.tile(np.arange(50.0), 4)
+        place = np.mod(10.0 * time + 100.0 * np.repeat(np.arange(4.0), 50), 400.0)
+        points = {"vehicle": np.repeat(np.arange(4), 50), "time_s": time, "place": place}
+        paths.append(pd.DataFrame({"method": method, **points, "speed": 10.0 * size}))
+    return Traffic(
+        pd.DataFrame(roads, columns=list(ROAD_COLUMNS)),
+        pd.concat(growth, ignore_index=True),
+        pd.concat(strips, ignore_index=True),
+        pd.concat(paths, ignore_index=True),
+        -14.0,
+        5,
+    )
 
 
 GAINS = {

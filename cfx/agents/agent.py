@@ -68,6 +68,30 @@ class AgentState(NamedTuple):
     score: Tensor
     beyond: Tensor
 
+    def of(self, drivers: Tensor) -> AgentState:
+        """Returns the state of some of the drivers, each as often as it is named.
+
+        Args:
+            drivers: their indices, `(E,)`.
+        """
+        network = self.network[drivers]
+        place = driver_places(network)
+        shape = (self.state.shape[0], int(place.max()) + 1, *self.state.shape[2:])
+        state = self.state.new_zeros(shape)
+        state[network, place] = self.state[network, self.place[drivers]]
+        base = None
+        if self.base is not None:
+            base = self.base[drivers]
+        return AgentState(
+            network,
+            place,
+            state,
+            base,
+            self.conditioning[drivers],
+            self.score[drivers],
+            self.beyond[drivers],
+        )
+
 
 @dataclass(frozen=True)
 class Agent:

@@ -84,7 +84,7 @@ def simulate_closed_loop(
     """
     simulator = agent.stepper(simulator)
     if state is None:
-        state = _burnt_in(agent, batch, first, network, base, history, simulator.dt)
+        state = burnt_in(agent, batch, first, network, base, history, simulator.dt)
     track = _Track(batch, first, agent.windows.length, steps)
     position, speed, acceleration = track.now()
     follower = simulator.begin(Start(position, speed, acceleration))
@@ -112,7 +112,7 @@ def simulate_closed_loop(
     return ClosedLoop(speed, gap, parameters, counted, at_limit, outside, beyond)
 
 
-def _burnt_in(
+def burnt_in(
     agent: Agent,
     batch: PairBatch,
     first: Tensor,
@@ -121,7 +121,12 @@ def _burnt_in(
     history: float | None,
     dt: float,
 ) -> AgentState:
-    """Returns the agent's state at the last measured frame."""
+    """Returns an agent's state after what it has observed of P pairs up to a frame.
+
+    Args:
+        agent, batch, first, network, base, history: as for `simulate_closed_loop`.
+        dt: time step, s.
+    """
     since = None
     if history is not None:
         since = (first - round(history / dt)).clamp(min=0)

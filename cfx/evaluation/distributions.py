@@ -218,6 +218,34 @@ def distribution_metrics(table: pd.DataFrame) -> dict[str, float]:
     return found
 
 
+def sampled_methods(table: pd.DataFrame) -> tuple[str, ...]:
+    """Returns the methods of which several paths were sampled, the policy last.
+
+    Args:
+        table: as `score_distributions` returns it.
+    """
+    several = table[table["coverage"].notna()]["method"].astype(str).unique().tolist()
+    return tuple(sorted(several, key=lambda method: method == "policy"))
+
+
+def centre_errors(forecasts: pd.DataFrame) -> pd.DataFrame:
+    """Returns the absolute error of speed of the policy where nothing is drawn.
+
+    It is what the CRPS of a distribution is that has no width.
+
+    Args:
+        forecasts: as `Forecasts.table`.
+
+    Returns:
+        A row per horizon: horizon_s, crps_speed (m/s; mean over drivers of each driver's mean over
+        origins).
+    """
+    rows = forecasts[forecasts["method"] == "policy"]
+    rows = rows.assign(crps_speed=rows["speed_error"].abs())
+    of_driver = rows.groupby(["horizon_s", "driver"], sort=True)["crps_speed"].mean()
+    return of_driver.groupby("horizon_s").mean().reset_index()
+
+
 def _scores(sampled: Sampled, recorded: Recorded, step: int, dt: float) -> dict[str, Array]:
     """Returns the scores at one step, `(Q,)` each."""
     speed, truth = sampled.speed[:, :, step], recorded.speed[:, step]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from cfx.evaluation.forecasts import Forecasts
 from cfx.evaluation.tables import summaries, wide_table
+from cfx.evaluation.traffic.result import Traffic
 from cfx.metrics.base import MetricInfo
 from cfx.metrics.installed import LeftOut
 
@@ -168,6 +169,7 @@ class Evaluation:
         `history/BASE/AMOUNT/rmse_improvement`: see `history`; AMOUNT is `80pct` for "80 %" and
             `10s` for "10 s".
         `forecast/...`: see `Forecasts`.
+        `traffic/...`: see `Traffic`.
 
     Attributes:
         about: a row per pair and method: pair_id, recording, leader_id, follower_id, driver,
@@ -196,6 +198,7 @@ class Evaluation:
             it has learned from, in words by scope; empty if it did not.
         forecasts: from many moments of each trajectory; None if there were none.
         meanings: what the tuned parameters are, in words; empty if that is not known.
+        traffic: of many vehicles that these methods drive; None if none was simulated.
     """
 
     about: pd.DataFrame
@@ -214,6 +217,7 @@ class Evaluation:
     outside: Mapping[str, str] = field(default_factory=dict)
     forecasts: Forecasts | None = None
     meanings: tuple[str, ...] = ()
+    traffic: Traffic | None = None
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -260,6 +264,8 @@ class Evaluation:
                 values[f"history/{base}/{name}/rmse_improvement"] = float(gains.mean())
         if self.forecasts is not None:
             values |= self.forecasts.metrics()
+        if self.traffic is not None:
+            values |= self.traffic.metrics()
         return values
 
     def trajectories_table(self) -> pd.DataFrame:

@@ -10,10 +10,17 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from cfx.evaluation.distributions import (
+    LEVEL,
+    centre_errors,
+    sampled_methods,
+    summarize_distributions,
+)
 from cfx.evaluation.forecasts import Forecasts
 from cfx.evaluation.result import Evaluation, Improvement
+from cfx.evaluation.traffic.result import Traffic
 from cfx.job.results import JobResult
-from cfx.metrics.base import TRANSIENT_S, MetricInfo, key_of
+from cfx.metrics.base import RECORDED, TRANSIENT_S, MetricInfo, key_of
 from cfx.plots.words import few_drivers
 
 if TYPE_CHECKING:
@@ -62,6 +69,10 @@ def report(
         console.print(text, soft_wrap=True)
     if evaluation.forecasts is not None:
         console.print(forecasts_table(evaluation.forecasts))
+        if evaluation.forecasts.distributions is not None:
+            console.print(distributions_table(evaluation.forecasts))
+    if evaluation.traffic is not None:
+        console.print(traffic_table(evaluation.traffic))
     _print_safety(evaluation, result.metrics, console)
     for scope, words in evaluation.outside.items():
         text = f"Policy, {_SCOPES[scope]}: {words}; there it fades towards its base parameters."
@@ -122,6 +133,67 @@ def forecasts_table(forecasts: Forecasts) -> Table:
         for horizon in forecasts.horizons:
             value = by_method.get((method, horizon))
             cells.append("" if value is None else f"{value:.3f}")
+        table.add_row(method, *cells)
+    return table
+
+
+def distributions_table(forecasts: Forecasts) -> Table:
+    """Returns the CRPS of speed of each sampled method at each horizon, and its coverage below.
+
+    The policy's centre, a single path, has its absolute error instead, and no coverage.
+    """
+    assert forecasts.distributions is not None
+    share = f"{100 * LEVEL:.0f} %"
+    title = f"Sampled forecasts: CRPS of speed (m/s), coverage of the central {share}, after"
+    table = Table(title=title, title_justify="left")
+    table.add_column("method")
+    for horizon in forecasts.horizons:
+        table.add_column(f"{horizon:g} s", justify="right")
+    summary = summarize_distributions(forecasts.distributions).set_index(["method", "horizon_s"])
+    for method in sampled_methods(forecasts.distributions):
+        cells = []
+        for horizon in forecasts.horizons:
+            crps = summary["crps_speed"].get((method, horizon))
+            coverage = summary["coverage"].get((method, horizon))
+            if crps is None or coverage is None:
+                cells.append("")
+            else:
+                cells.append(f"{crps:.3f}\n{100 * coverage:.0f} %")
+        table.add_row(method, *cells)
+    centre = centre_errors(forecasts.table).set_index("horizon_s")["crps_speed"]
+    cells = []
+    for horizon in forecasts.horizons:
+        value = centre.get(horizon)
+        cells.append("" if value is None else f"{value:.3f}")
+    table.add_row("policy's centre", *cells)
+    return table
+
+
+_TRAFFIC = (
+    ("capacity", "capacity", ".0f"),
+    ("error", "flow_error", ".0f"),
+    ("std", "speed_std", ".2f"),
+    ("waves", "wave_speed", ".1f"),
+    ("last", "growth_last", ".2f"),
+    ("half", "growth_half", ".2f"),
+    ("hits", "collisions", ".0f"),
+)
+"""Columns of the table of traffic: heading, metric, format."""
+
+
+def traffic_table(traffic: Traffic) -> Table:
+    """Returns what traffic looks like for each method, and recorded; it fits 80 columns."""
+    title = "Traffic: rings in vehicles/h, m/s and km/h; platoons in m/s; collisions"
+    table = Table(title=title, title_justify="left")
+    table.add_column("method")
+    for heading, _, _ in _TRAFFIC:
+        table.add_column(heading, justify="right")
+    metrics = traffic.metrics()
+    for method in (*traffic.methods, RECORDED):
+        cells = []
+        for _, metric, form in _TRAFFIC:
+            value = metrics.get(f"traffic/{metric}/{method}", math.nan)
+            cells.append(f"{value:{form}}" if math.isfinite(value) else "")
         table.add_row(method, *cells)
     return table
 

@@ -205,7 +205,7 @@ def write_further_tables(
         "slices.parquet": None if view is None else view.slices,
         "fits.parquet": None if view is None else view.fits,
         "distributions.parquet": distributions,
-    }
+    } | _traffic_tables(evaluation)
     paths = []
     for name, table in tables.items():
         path = output.folder / name
@@ -215,6 +215,16 @@ def write_further_tables(
             output.file(name, functools.partial(table.to_parquet, index=False))
             paths.append(path)
     return paths
+
+
+def _traffic_tables(evaluation: Evaluation) -> dict[str, pd.DataFrame | None]:
+    """Returns the tables of simulated traffic by file; None where none was simulated."""
+    traffic = evaluation.traffic
+    tables = {}
+    for name in ("roads", "growth", "strips", "paths"):
+        file = "traffic.parquet" if name == "roads" else f"traffic_{name}.parquet"
+        tables[file] = None if traffic is None else getattr(traffic, name)
+    return tables
 
 
 def write_figures(

@@ -19,6 +19,9 @@ COLOURS = {
     "constant_acceleration": "#666666",
     "population_residual": "#dba6d0",
     "fixed_residual": "#7fb8dc",
+    "population_ar": "#661155",
+    "fixed_ar": "#003f66",
+    "policy_sampled": "#b8860b",
 }
 OTHER_COLOUR = "#777777"
 """A method of a protocol that cfx does not know."""

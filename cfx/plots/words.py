@@ -20,6 +20,9 @@ LABELS = {
     "constant_acceleration": "constant acceleration",
     "population_residual": "pooled, with residual",
     "fixed_residual": "driver-specific, with residual",
+    "population_ar": "pooled, with noise",
+    "fixed_ar": "driver-specific, with noise",
+    "policy_sampled": "policy, sampled",
 }
 """Methods and recorded vehicles as legends name them."""
 
@@ -31,6 +34,9 @@ SHORT = {
     "constant_acceleration": "constant acceleration",
     "population_residual": "pooled + residual",
     "fixed_residual": "driver-specific + residual",
+    "population_ar": "pooled + noise",
+    "fixed_ar": "driver-specific + noise",
+    "policy_sampled": "policy, sampled",
 }
 """Methods as tables name them, where the key of the metrics says too little."""
 
@@ -50,6 +56,11 @@ EXPLAINED = {
     " origin, which decays in two seconds",
     "fixed_residual": "driver-specific calibration, and what it misses of the acceleration at the"
     " origin, which decays in two seconds",
+    "population_ar": "pooled calibration with auto-regressive noise on the acceleration, as"
+    " measured on recorded drivers",
+    "fixed_ar": "driver-specific calibration with auto-regressive noise on the acceleration, as"
+    " measured on the driver",
+    "policy_sampled": "the policy with all that it leaves to chance, drawn with the job's seed",
 }
 """Methods in words that end a sentence."""
 

@@ -13,7 +13,6 @@ from pydantic import AfterValidator, Field
 from torch import Tensor
 
 from cfx.agents.agent import Agent
-from cfx.calibration.residuals import measure_residuals
 from cfx.component import Settings
 from cfx.errors import ConfigError, DataError
 from cfx.evaluation.distributions import Recorded, score_distributions
@@ -27,12 +26,11 @@ from cfx.evaluation.forecast_paths import (
 )
 from cfx.evaluation.forecasts import Forecasts, forecast_errors
 from cfx.evaluation.result import Evaluation
-from cfx.models.residual import TIME
 from cfx.policies.fixed import FixedPolicy
 from cfx.protocols.across_drivers import AcrossDrivers, AcrossDriversSettings
 from cfx.protocols.base import ProtocolContext, ProtocolResult
 from cfx.protocols.held_out import HeldOut
-from cfx.simulation.base import Stepper
+from cfx.protocols.noise import can_drive, residual_noise
 
 log = logging.getLogger(__name__)
 
@@ -204,7 +202,7 @@ class Forecast(AcrossDrivers):
             residual["population_residual"] = (test.population, test.network)
         for name, (parameters, network) in residual.items():
             agent = context.constant(FixedPolicy(residual=True), parameters)
-            if _can_drive(context.simulator, agent):
+            if can_drive(context.simulator, agent):
                 agents[name] = (agent, network)
         for name, (agent, network) in agents.items():
             found = self._from_origins(test, agent, origins, steps, network, (None,))
@@ -216,9 +214,9 @@ class Forecast(AcrossDrivers):
         context, each = test.context, torch.arange(len(test.batch), device=origins.pair.device)
         agents = {}
         for name, parameters in _constants(test).items():
-            noise = _noise(test, parameters, own=name == "fixed")
+            noise = residual_noise(test, parameters, own=name == "fixed")
             agent = context.constant_with_noise(parameters, *noise)
-            if _can_drive(context.simulator, agent):
+            if can_drive(context.simulator, agent):
                 agents[f"{name}_ar"] = (agent, each)
         if test.policy.is_stochastic:
             agents["policy"] = (test.policy, test.network)
@@ -267,38 +265,6 @@ def _constants(test: HeldOut) -> dict[str, Tensor]:
     if test.population is not None:
         found["population"] = test.population[test.network]
     return found
-
-
-def _noise(test: HeldOut, parameters: Tensor, *, own: bool) -> tuple[Tensor, Tensor]:
-    """Returns the AR(1) process of each driver's residual: time, s, and scale, m/s2, `(P,)` each.
-
-    Args:
-        test: the drivers, of whom what was measured before the first origin is read.
-        parameters: `(P, n)`.
-        own: measured on each driver; otherwise the mean over those of the other folds.
-    """
-    model, windows = test.context.simulator.model, test.context.windows
-    lag = windows.stride * test.batch.dt
-    found = measure_residuals(model, test.batch, parameters, test.first, lag)
-    usual = found.time.nanmean().nan_to_num(TIME.default)
-    time = torch.where(found.time.isnan(), usual, found.time)
-    if own:
-        return time, found.scale
-    others = (test.network[:, None] != test.network[None, :]).to(time)
-    if not bool(others.any()):
-        others = torch.ones_like(others)
-    share = others / others.sum(1, keepdim=True)
-    return share @ time, (share @ found.scale.square()).sqrt()
-
-
-def _can_drive(simulator: Stepper, agent: Agent) -> bool:
-    """Says whether a simulator takes the steps of the model that an agent drives."""
-    try:
-        agent.stepper(simulator)
-    except ConfigError as error:
-        log.info("Left out of the forecasts: %s", error)
-        return False
-    return True
 
 
 def _with_forecasts(evaluation: Evaluation, forecasts: Forecasts) -> Evaluation:

@@ -28,6 +28,7 @@ TEXT_COLUMNS = frozenset(
         "pair_id",
         "recording",
         "leader_id",
+        "road",
         "follower_id",
         "driver",
         "method",

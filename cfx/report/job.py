@@ -43,6 +43,9 @@ class Job:
         values: every metric of every pair, method and part of the trajectories (columns pair_id,
             driver, method, scope, metric, value); None if the job left none.
         forecasts: as `Forecasts.table`; None if there were none.
+        distributions: scores of sampled forecasts; None if none were sampled.
+        traffic, traffic_growth, traffic_strips: as `roads`, `growth` and `strips` of `Traffic`;
+            None if none was simulated.
         overrides: what was typed; None if that is not known.
         experiment: the preset that was chosen, "" for none; None if that is not known.
         started: when it began; None if that is not known.
@@ -67,6 +70,10 @@ class Job:
     labels: pd.DataFrame | None = None
     values: pd.DataFrame | None = None
     forecasts: pd.DataFrame | None = None
+    distributions: pd.DataFrame | None = None
+    traffic: pd.DataFrame | None = None
+    traffic_growth: pd.DataFrame | None = None
+    traffic_strips: pd.DataFrame | None = None
     overrides: tuple[str, ...] | None = None
     experiment: str | None = None
     started: datetime | None = None

@@ -14,7 +14,9 @@ from typing import Any
 import pandas as pd
 
 from cfx import renamed
+from cfx.evaluation.distributions import DISTRIBUTION_COLUMNS
 from cfx.evaluation.forecasts import FORECAST_COLUMNS
+from cfx.evaluation.traffic.result import GROWTH_COLUMNS, ROAD_COLUMNS, STRIP_COLUMNS
 from cfx.job_folder import examine
 from cfx.report.files import (
     optional,
@@ -60,6 +62,10 @@ _COLUMNS = {
     "labels.parquet": ("pair_id", "time_s", "loss", "sensitivity"),
     "pair_metrics.parquet": ("pair_id", "method", "scope", "metric", "value"),
     "forecasts.parquet": FORECAST_COLUMNS,
+    "distributions.parquet": DISTRIBUTION_COLUMNS,
+    "traffic.parquet": ROAD_COLUMNS,
+    "traffic_growth.parquet": GROWTH_COLUMNS,
+    "traffic_strips.parquet": STRIP_COLUMNS,
 }
 """Columns that the files of a job have at the least."""
 
@@ -99,6 +105,10 @@ def read_job(folder: Path, origin: Origin) -> Job:
         labels=tables["labels.parquet"],
         values=tables["pair_metrics.parquet"],
         forecasts=tables["forecasts.parquet"],
+        distributions=tables["distributions.parquet"],
+        traffic=tables["traffic.parquet"],
+        traffic_growth=tables["traffic_growth.parquet"],
+        traffic_strips=tables["traffic_strips.parquet"],
         overrides=_overrides(hydra),
         experiment=_experiment(config, hydra),
         started=started,

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from cfx.evaluation.forecasts import errors_by_history
 from cfx.evaluation.result import Evaluation
 from cfx.plots.choice.calibration import correlations, parameter_spreads
+from cfx.plots.choice.distributions import distribution_view
 from cfx.plots.choice.errors import error_panels
 from cfx.plots.choice.forecasts import history_panels, horizon_panels
 from cfx.plots.choice.history import amounts_of, history_curves
@@ -23,10 +24,12 @@ from cfx.plots.choice.learning import learning_curves
 from cfx.plots.choice.pairs import rank_pairs
 from cfx.plots.choice.platoon import platoon_panels, speed_range
 from cfx.plots.choice.style import style_histogram
+from cfx.plots.choice.traffic import path_panels, traffic_panels
 from cfx.plots.choice.trajectories import PairPanels, pair_panels, parameter_axes
 from cfx.plots.look import colour_of
 from cfx.plots.matplotlib import figures
 from cfx.plots.matplotlib.calibration import draw_calibration
+from cfx.plots.matplotlib.distributions import draw_distributions
 from cfx.plots.matplotlib.errors import draw_errors
 from cfx.plots.matplotlib.forecasts import draw_forecasts
 from cfx.plots.matplotlib.history import draw_history
@@ -34,8 +37,10 @@ from cfx.plots.matplotlib.improvements import draw_improvements
 from cfx.plots.matplotlib.learning import draw_learning
 from cfx.plots.matplotlib.platoon import draw_platoons
 from cfx.plots.matplotlib.style import draw_style
+from cfx.plots.matplotlib.traffic import draw_paths, draw_traffic
 from cfx.plots.matplotlib.trajectories import draw_pairs, draw_parameters
 from cfx.plots.plotly.calibration import calibration_plot
+from cfx.plots.plotly.distributions import distributions_plot
 from cfx.plots.plotly.errors import errors_plot
 from cfx.plots.plotly.forecasts import forecasts_plot
 from cfx.plots.plotly.history import history_plot
@@ -43,10 +48,20 @@ from cfx.plots.plotly.improvements import improvements_view
 from cfx.plots.plotly.learning import learning_plot
 from cfx.plots.plotly.platoon import platoon_plot
 from cfx.plots.plotly.style import style_plot
+from cfx.plots.plotly.traffic import traffic_plot
 from cfx.plots.plotly.trajectories import pair_plot
+from cfx.plots.words import label
 from cfx.report.runs import read_runs
 from cfx.report.sections.trajectories import chosen_pairs
-from tests.made_up import GAINS, make_forecasts, make_history, make_platoon, make_results
+from tests.made_up import (
+    GAINS,
+    make_distributions,
+    make_forecasts,
+    make_history,
+    make_platoon,
+    make_results,
+    make_traffic,
+)
 from tests.report.folders import write_job
 
 Trace = dict[str, Any]
@@ -255,6 +270,56 @@ def test_forecasts_have_the_same_lines() -> None:
         is_logarithmic = figure.axes[k].get_yscale() == "log"
         assert is_logarithmic == panel.logarithmic
         assert (view["layout"][f"yaxis{k + 1 if k else ''}"].get("type") == "log") == is_logarithmic
+
+
+def test_distributions_have_the_same_lines_and_histograms() -> None:
+    forecasts = make_forecasts()
+    shown = distribution_view(make_distributions(forecasts), forecasts.table)
+    assert shown.methods == ("population_ar", "fixed_ar", "policy_sampled", "policy")
+    assert shown.horizon == 2.0
+    figure = draw_distributions(shown)
+    view = view_of(distributions_plot(shown))
+    for k, panel in enumerate((shown.crps, shown.coverage)):
+        lines = drawn_lines(figure.axes[k])
+        traces = on_axes(view, str(k + 1) if k else "")
+        assert len(traces) == len(panel.lines)
+        for line, trace in zip(panel.lines, traces, strict=True):
+            np.testing.assert_allclose(lines[colour_of(line.method)].get_ydata(), line.values)
+            np.testing.assert_allclose(numbers(trace["y"]), line.values, rtol=1e-6)
+    traces = on_axes(view, "3")
+    patches = figure.axes[2].patches
+    for histogram, patch, trace in zip(shown.pit, patches, traces, strict=True):
+        assert histogram.density.mean() == pytest.approx(1.0)
+        np.testing.assert_allclose(patch.get_data().values, histogram.density)
+        np.testing.assert_allclose(numbers(trace["y"])[:-1], histogram.density, rtol=1e-6)
+
+
+def test_traffic_has_the_same_lines_and_points() -> None:
+    traffic = make_traffic()
+    tables = (traffic.roads, traffic.growth, traffic.strips, traffic.real_wave_speed)
+    panels = traffic_panels(*tables, traffic.methods)
+    figure = draw_traffic(panels, traffic.methods)
+    view = view_of(traffic_plot(panels))
+    assert len(panels) == 4
+    for k, panel in enumerate(panels):
+        number = str(k + 1) if k else ""
+        lines = drawn_lines(figure.axes[k])
+        traces = on_axes(view, number)
+        assert len(panel.lines) == len(traces)
+        for line, trace in zip(panel.lines, traces, strict=True):
+            np.testing.assert_allclose(numbers(trace["y"]), line.values, rtol=1e-6)
+            if len(line.time) > 2:
+                drawn = lines[colour_of(line.method)]
+                np.testing.assert_allclose(drawn.get_ydata(), line.values)
+    (cloud,) = (trace for trace in view["data"] if trace["mode"] == "markers")
+    points = figure.axes[0].collections[0].get_offsets()
+    np.testing.assert_allclose(numbers(cloud["x"]), np.asarray(points)[:, 0], atol=0.06)
+    without = traffic_panels(traffic.roads, traffic.growth.iloc[:0], *tables[2:], traffic.methods)
+    assert len(without) == 3
+    paths = draw_paths(path_panels(traffic.paths, traffic.methods))
+    assert [axes.get_title(loc="left") for axes in paths.axes[:3]] == [
+        label(method) for method in traffic.methods
+    ]
 
 
 def test_longer_histories_stand_to_the_right() -> None:

@@ -7,6 +7,7 @@ import pytest
 from cfx.protocols.across_drivers import AcrossDrivers
 from cfx.protocols.base import Protocol
 from cfx.protocols.forecast import Forecast
+from cfx.protocols.traffic import TrafficProtocol
 from cfx.protocols.within_driver import WithinDriver
 from cfx.testing import ProtocolContract
 
@@ -14,6 +15,17 @@ from cfx.testing import ProtocolContract
 WITHIN = {networks: WithinDriver(networks=networks) for networks in ("pair", "all")}
 ACROSS = AcrossDrivers(folds=3)
 FORECAST = Forecast(folds=3, horizons=(0.5, 1.0), histories=())
+TRAFFIC = TrafficProtocol(
+    folds=3,
+    histories=(),
+    densities=(30.0,),
+    vehicles=5,
+    demands=(900.0,),
+    leader_speeds=(8.0,),
+    platoon=3,
+    duration=10.0,
+    settle=5.0,
+)
 
 
 class TestWithinDriver(ProtocolContract):
@@ -33,3 +45,10 @@ class TestForecast(ProtocolContract):
     @pytest.fixture
     def protocol(self) -> Protocol:
         return FORECAST
+
+
+@pytest.mark.slow  # as TestForecast
+class TestTraffic(ProtocolContract):
+    @pytest.fixture
+    def protocol(self) -> Protocol:
+        return TRAFFIC

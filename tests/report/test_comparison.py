@@ -9,16 +9,19 @@ from pathlib import Path
 
 import pytest
 
+from cfx.plots.words import MINUS
 from cfx.report.job import Job
 from cfx.report.page import render
 from cfx.report.runs import read_runs
 from cfx.report.sections.comparison import absolute, closeness, safety
+from cfx.report.sections.distributions import crps_sheet
 from cfx.report.sections.forecasts import errors
 from cfx.report.sections.safety import safety_of_methods
+from cfx.report.sections.traffic import traffic_sheet
 from cfx.report.summary import summary
 from cfx.report.tables import Sheet
 from tests.browser import Browser
-from tests.made_up import make_forecasts
+from tests.made_up import make_distributions, make_forecasts, make_traffic
 from tests.report.folders import ACROSS, write_job
 from tests.report.test_page import page_of
 
@@ -197,6 +200,55 @@ def test_forecasts_have_plots_and_tables(tmp_path: Path) -> None:
     low, high = found[f"{key}/ci95_low"], found[f"{key}/ci95_high"]
     assert cell.text == f"{found[key]:.3f}"
     assert cell.second == f"{low:.3f} to {high:.3f}"
+
+
+def test_sampled_forecasts_have_a_plot_and_a_table(tmp_path: Path) -> None:
+    write_job(tmp_path / "job", pairs=4)
+    forecasts = make_forecasts(drivers=4)
+    scores = make_distributions(forecasts)
+    forecasts.table.to_parquet(tmp_path / "job" / "forecasts.parquet", index=False)
+    scores.to_parquet(tmp_path / "job" / "distributions.parquet", index=False)
+    page = page_of(tmp_path)
+    assert "distributions" in page.having("id")
+    sheet = crps_sheet(scores, forecasts.table)
+    names = [row[0].text for row in sheet.rows]
+    assert names == ["pooled + noise", "driver-specific + noise", "policy, sampled", "policy"]
+    sampled, centre = sheet.rows[-2], sheet.rows[-1]
+    policy = forecasts.table[
+        (forecasts.table["method"] == "policy") & (forecasts.table["horizon_s"] == 2.0)
+    ]
+    error = policy["speed_error"].abs().groupby(policy["driver"]).mean().mean()
+    assert centre[2].text == f"{error:.3f}"
+    assert sampled[2].text == f"{0.67 * error:.3f}"
+    assert sampled[2].second.endswith(" %")
+    assert centre[2].second == ""
+    captions = [content["label"] for content in page.contents.values() if "label" in content]
+    assert not captions or any("PIT" in caption for caption in captions)
+
+
+def test_traffic_has_a_plot_and_a_table(tmp_path: Path) -> None:
+    metrics = write_job(tmp_path / "job", pairs=4)
+    traffic = make_traffic()
+    for name in ("roads", "growth", "strips"):
+        file = "traffic.parquet" if name == "roads" else f"traffic_{name}.parquet"
+        getattr(traffic, name).to_parquet(tmp_path / "job" / file, index=False)
+    found = {**metrics, **traffic.metrics()}
+    (tmp_path / "job" / "metrics.json").write_text(
+        json.dumps({key: value if math.isfinite(value) else None for key, value in found.items()})
+    )
+    page = page_of(tmp_path)
+    assert "traffic" in page.having("id")
+    (job,) = read_runs([str(tmp_path)]).jobs
+    sheet = traffic_sheet(job, traffic.roads)
+    assert [row[0].text for row in sheet.rows] == [
+        "pooled",
+        "driver-specific + noise",
+        "policy",
+        "real",
+    ]
+    pooled, *_, real = sheet.rows
+    assert pooled[1].text == f"{found['traffic/capacity/population']:.0f}"
+    assert real[4].text == f"{MINUS}14.0"
 
 
 def test_the_comparison_fits_a_laptop_and_sorts(

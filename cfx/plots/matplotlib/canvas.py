@@ -33,6 +33,9 @@ DASHES: dict[str, Dash] = {
     "constant_acceleration": (0, (5.0, 1.8)),
     "population_residual": (0, (6.0, 1.5, 1.2, 1.5)),
     "fixed_residual": (0, (5.0, 1.8)),
+    "population_ar": (0, (1.2, 1.4)),
+    "fixed_ar": (0, (1.2, 1.4)),
+    "policy_sampled": (0, (1.2, 1.4)),
 }
 _WIDTHS = {"real": 1.8, "leader": 1.0, "policy": 1.8}
 _ORDER = ("leader", "default", "population", "fixed", "shrunk", "real", "policy")

@@ -11,8 +11,10 @@ from matplotlib.figure import Figure
 from cfx.errors import ConfigError, nearest
 from cfx.evaluation.forecasts import Forecasts, errors_by_history
 from cfx.evaluation.result import Evaluation, PairTrajectory, Platoon
+from cfx.evaluation.traffic.result import Traffic
 from cfx.metrics.base import TRANSIENT_S
 from cfx.plots.choice.calibration import correlations, parameter_spreads
+from cfx.plots.choice.distributions import distribution_view
 from cfx.plots.choice.errors import error_panels
 from cfx.plots.choice.forecasts import (
     HISTORY_TITLE,
@@ -26,6 +28,7 @@ from cfx.plots.choice.learning import learning_curves
 from cfx.plots.choice.pairs import RankedPair, rank_pairs
 from cfx.plots.choice.platoon import platoon_panels
 from cfx.plots.choice.style import style_histogram
+from cfx.plots.choice.traffic import path_panels, traffic_panels
 from cfx.plots.choice.trajectories import (
     HIDDEN,
     PairPanels,
@@ -35,6 +38,7 @@ from cfx.plots.choice.trajectories import (
     parameter_axes,
 )
 from cfx.plots.matplotlib.calibration import draw_calibration
+from cfx.plots.matplotlib.distributions import draw_distributions
 from cfx.plots.matplotlib.errors import draw_errors
 from cfx.plots.matplotlib.forecasts import draw_forecasts
 from cfx.plots.matplotlib.history import draw_history
@@ -42,6 +46,7 @@ from cfx.plots.matplotlib.improvements import draw_improvements
 from cfx.plots.matplotlib.learning import draw_learning
 from cfx.plots.matplotlib.platoon import draw_platoons
 from cfx.plots.matplotlib.style import draw_style
+from cfx.plots.matplotlib.traffic import draw_paths, draw_traffic
 from cfx.plots.matplotlib.trajectories import draw_pairs, draw_parameters, draw_speeds
 from cfx.plots.words import percent, short
 from cfx.style.result import StyleResult
@@ -182,6 +187,30 @@ def forecasts_by_history(result: Forecasts) -> Figure:
             " trajectories"
         )
     return draw_forecasts(panels, result.methods, HISTORY_TITLE)
+
+
+def distributions(result: Forecasts) -> Figure:
+    """CRPS and coverage of sampled forecasts against the horizon, and their PIT.
+
+    Raises:
+        ConfigError: none were sampled.
+    """
+    if result.distributions is None:
+        raise ConfigError("no forecasts were sampled: set protocol.samples=50")
+    return draw_distributions(distribution_view(result.distributions, result.table))
+
+
+def traffic(result: Traffic) -> Figure:
+    """Flow, variation and waves against density, growth along platoons; beside the recording."""
+    panels = traffic_panels(
+        result.roads, result.growth, result.strips, result.real_wave_speed, result.methods
+    )
+    return draw_traffic(panels, result.methods)
+
+
+def traffic_paths(result: Traffic) -> Figure:
+    """The vehicles of one ring over time, a panel per method."""
+    return draw_paths(path_panels(result.paths, result.methods))
 
 
 def _chosen(

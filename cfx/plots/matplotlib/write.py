@@ -41,8 +41,10 @@ def write_figures(
 
     Args:
         folder: made if it is not there.
-        evaluation: of the job; without a platoon, a history or forecasts there is no `platoon.png`,
-            `history.png`, `forecasts.png` or `forecasts_by_history.png`.
+        evaluation: of the job; without a platoon, a history, forecasts or traffic there is no
+            `platoon.png`, `history.png`, `forecasts.png` and `forecasts_by_history.png`, or
+            `traffic.png` and `traffic_paths.png`; without sampled forecasts no
+            `distributions.png`.
         style: of its drivers.
         curves: columns `network`, `epoch`, `train_loss`, `validation_loss`; if it is empty there is
             no `learning_curve.png`.
@@ -76,6 +78,11 @@ def write_figures(
             draw["forecasts_by_history"] = partial(
                 figures.forecasts_by_history, evaluation.forecasts
             )
+        if evaluation.forecasts.distributions is not None:
+            draw["distributions"] = partial(figures.distributions, evaluation.forecasts)
+    if evaluation.traffic is not None:
+        draw["traffic"] = partial(figures.traffic, evaluation.traffic)
+        draw["traffic_paths"] = partial(figures.traffic_paths, evaluation.traffic)
     return _written(draw, folder, formats)
 
 

@@ -21,6 +21,9 @@ DASHES: Mapping[str, str] = {
     "constant_acceleration": "dash",
     "population_residual": "dashdot",
     "fixed_residual": "dash",
+    "population_ar": "dot",
+    "fixed_ar": "dot",
+    "policy_sampled": "dot",
 }
 WIDTHS: Mapping[str, float] = {"real": 2.2, "leader": 1.2, "policy": 2.2}
 

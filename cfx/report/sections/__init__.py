@@ -8,6 +8,7 @@ from cfx.report.sections import (
     clusters,
     comparison,
     configurations,
+    distributions,
     drivers,
     errors,
     forecasts,
@@ -20,6 +21,7 @@ from cfx.report.sections import (
     safety,
     seeds,
     style,
+    traffic,
     trajectories,
 )
 
@@ -31,6 +33,8 @@ SECTIONS: tuple[Section, ...] = (
     safety.SECTION,
     metrics.SECTION,
     forecasts.SECTION,
+    distributions.SECTION,
+    traffic.SECTION,
     history.SECTION,
     paper.SECTION,
     drivers.SECTION,

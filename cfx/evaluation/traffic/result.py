@@ -1,0 +1,235 @@
+"""What simulated traffic delivers: tables and metrics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pandas as pd
+
+from cfx.metrics.base import RECORDED
+
+TRAFFIC_METHODS = (
+    "population",
+    "population_ar",
+    "fixed",
+    "fixed_ar",
+    "policy",
+    "policy_sampled",
+)
+"""What drives in traffic, in the order in which it is shown.
+
+`population`: pooled parameters, the same for every vehicle.
+`fixed`: driver-specific parameters; each vehicle has those of a recorded driver.
+`population_ar`, `fixed_ar`: the same with AR(1) noise on the acceleration, as measured.
+`policy`: the policy, nothing drawn; each vehicle is a recorded driver that it has observed.
+`policy_sampled`: the same, with all that a stochastic policy leaves to chance.
+"""
+
+ROAD_COLUMNS = (
+    "method",
+    "road",
+    "level",
+    "repetition",
+    "density",
+    "flow",
+    "speed",
+    "speed_std",
+    "wave_speed",
+    "ring_wave_speed",
+    "coherence",
+    "discharge",
+    "min_gap",
+    "collisions",
+    "outside",
+)
+"""Columns of the table of roads, which a job writes as `traffic.parquet`. level: vehicles/km of a
+ring, vehicles/h that enter an open road, m/s of a platoon's leader. density (vehicles/km), flow
+(vehicles/h), speed (m/s): Edie's, of a whole ring, or of the stretch upstream of the bottleneck.
+speed_std: of all vehicles' speeds over time, m/s. wave_speed (km/h): from vehicle
+to vehicle; ring_wave_speed (km/h) and coherence: of the ring as a whole. discharge: flow downstream
+of the bottleneck, vehicles/h. min_gap: m. collisions: vehicles whose gap was negative. outside:
+share of windows outside what the policy has learned from."""
+
+GROWTH_COLUMNS = ("method", "leader_speed", "vehicle", "speed_std")
+"""Columns of `traffic_growth.parquet`: the standard deviation of each vehicle's speed over time,
+m/s, the root of its mean square over the repetitions; vehicle 0 is the platoon's leader."""
+
+STRIP_COLUMNS = ("method", "density", "flow", "speed_std")
+"""Columns of `traffic_strips.parquet`: see `cfx.evaluation.traffic.edie`; `real` are recorded."""
+
+PATH_COLUMNS = ("method", "vehicle", "time_s", "place", "speed")
+"""Columns of `traffic_paths.parquet`: the vehicles of one ring; place in m, from 0 to its
+circumference."""
+
+BIN_PER_KM = 10.0
+"""Width of the bins of density in which flows are compared, vehicles/km."""
+
+_LEAST_STRIPS = 10
+"""Strips that a bin must have to count."""
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """Traffic of sampled drivers, beside the recording.
+
+    Metrics (`metrics`), under their names in metrics.json and MLflow, METHOD as in
+    `TRAFFIC_METHODS`:
+        `traffic/capacity/METHOD`: the largest mean flow of a ring over all densities, vehicles/h.
+        `traffic/flow_error/METHOD`: RMS difference to the recording of the mean flow in bins of
+            local density, vehicles/h, over the bins that both have.
+        `traffic/speed_std/METHOD`, `/real`: standard deviation of a vehicle's speed in 10 s, mean
+            over the bins of density that all have, m/s.
+        `traffic/wave_speed/METHOD`, `/real`: from vehicle to vehicle, km/h, median over the rings
+            that have waves, or over all recorded pairs (`PairWaves.speed`); NaN without waves.
+        `traffic/growth_last/METHOD`: standard deviation of the speed of a platoon's last vehicle,
+            m/s, mean over the leaders' speeds.
+        `traffic/growth_half/METHOD`: the same of the vehicle half-way, over that of the last: 0.5
+            where it grows linearly, more where the growth is concave, less where it is convex; NaN
+            where the last one's is below 0.05 m/s.
+        `traffic/discharge/METHOD`: the flow out of the bottleneck at the largest demand,
+            vehicles/h.
+        `traffic/collisions/METHOD`: vehicles on all roads whose gap was negative.
+        `traffic/outside/METHOD`: share of windows outside what the policy has learned from.
+
+    Attributes:
+        roads: a row per method and road; columns `ROAD_COLUMNS`.
+        growth: a row per method, leader's speed and vehicle; columns `GROWTH_COLUMNS`.
+        strips: flow and density of pairs; columns `STRIP_COLUMNS`.
+        paths: the vehicles of one ring per method; columns `PATH_COLUMNS`.
+        real_wave_speed: of the recording, km/h (`PairWaves.speed`).
+        real_waves: pairs of the recording that have one.
+    """
+
+    roads: pd.DataFrame
+    growth: pd.DataFrame
+    strips: pd.DataFrame
+    paths: pd.DataFrame
+    real_wave_speed: float
+    real_waves: int
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """What drove, in the order of `TRAFFIC_METHODS`."""
+        return traffic_methods(self.roads)
+
+    @cached_property
+    def bins(self) -> pd.DataFrame:
+        """Mean flow and variation in bins of density; see `binned`."""
+        return binned(self.strips)
+
+    def metrics(self) -> dict[str, float]:
+        """Returns the metrics under their MLflow names."""
+        found: dict[str, float] = {}
+        errors = flow_errors(self.bins)
+        variations = common_variation(self.bins)
+        for method in self.methods:
+            rows = self.roads[self.roads["method"] == method]
+            values = _of_roads(rows) | _of_growth(self.growth[self.growth["method"] == method])
+            values["flow_error"] = errors.get(method, math.nan)
+            values["speed_std"] = variations.get(method, math.nan)
+            for name, value in values.items():
+                found[f"traffic/{name}/{method}"] = value
+        found[f"traffic/wave_speed/{RECORDED}"] = self.real_wave_speed
+        found[f"traffic/speed_std/{RECORDED}"] = variations.get(RECORDED, math.nan)
+        return found
+
+
+def traffic_methods(roads: pd.DataFrame) -> tuple[str, ...]:
+    """Returns the methods of a table of roads in the order in which they are shown."""
+    present = roads["method"].astype(str).unique().tolist()
+    known = [method for method in TRAFFIC_METHODS if method in present]
+    return (*known, *(method for method in present if method not in known))
+
+
+def binned(strips: pd.DataFrame) -> pd.DataFrame:
+    """Returns means in bins of local density, of bins with ten strips or more.
+
+    The mean flow is Edie's of all strips of a bin together: their ways over their areas.
+
+    Args:
+        strips: columns `STRIP_COLUMNS`.
+
+    Returns:
+        A row per method and bin: method, density (the middle), flow, speed_std, strips.
+    """
+    middle = (np.floor(strips["density"] / BIN_PER_KM) + 0.5) * BIN_PER_KM
+    # A strip's area is its duration over its density, and all have the same duration.
+    area = 1.0 / strips["density"]
+    table = strips.assign(middle=middle, area=area, way=area * strips["flow"])
+    grouped = table.groupby(["method", "middle"], sort=True, observed=True)
+    sums = grouped[["area", "way"]].sum()
+    found = pd.DataFrame(
+        {
+            "flow": sums["way"] / sums["area"],
+            "speed_std": grouped["speed_std"].mean(),
+            "strips": grouped.size(),
+        }
+    )
+    found = found.reset_index().rename(columns={"middle": "density"})
+    return found[found["strips"] >= _LEAST_STRIPS].reset_index(drop=True)
+
+
+def flow_errors(bins: pd.DataFrame) -> dict[str, float]:
+    """Returns by method the RMS difference of flows to the recording, over the bins of both."""
+    wide = bins.pivot_table(index="density", columns="method", values="flow")
+    found: dict[str, float] = {}
+    if RECORDED not in wide:
+        return found
+    for method in wide:
+        off = (wide[method] - wide[RECORDED]).dropna()
+        if method != RECORDED and len(off):
+            found[str(method)] = float(np.sqrt((off**2).mean()))
+    return found
+
+
+def common_variation(bins: pd.DataFrame) -> dict[str, float]:
+    """Returns by method the mean standard deviation of speeds over the bins that all have."""
+    wide = bins.pivot_table(index="density", columns="method", values="speed_std").dropna()
+    if not len(wide):
+        return {}
+    return {str(method): float(value) for method, value in wide.mean().items()}
+
+
+def mean_growth(growth: pd.DataFrame) -> pd.Series:
+    """Returns the standard deviation by vehicle, mean over the leaders' speeds, of one method."""
+    return growth.groupby("vehicle")["speed_std"].mean().sort_index()
+
+
+def discharge_at_most(roads: pd.DataFrame) -> float:
+    """Returns the flow out of the bottleneck at the largest demand of one method; NaN for none."""
+    open_roads = roads[roads["road"] == "open"]
+    if not len(open_roads):
+        return math.nan
+    return float(open_roads.sort_values("level")["discharge"].iloc[-1])
+
+
+def ring_means(roads: pd.DataFrame, columns: Sequence[str]) -> pd.DataFrame:
+    """Returns the rings of one method, mean over repetitions, by density."""
+    rings = roads[roads["road"] == "ring"]
+    return rings.groupby("level")[list(columns)].mean().sort_index().reset_index()
+
+
+def _of_roads(roads: pd.DataFrame) -> dict[str, float]:
+    rings = roads[roads["road"] == "ring"]
+    return {
+        "capacity": float(ring_means(roads, ["flow"])["flow"].max()),
+        "wave_speed": float(rings["wave_speed"].median()),
+        "discharge": discharge_at_most(roads),
+        "collisions": float(roads["collisions"].sum()),
+        "outside": float(roads["outside"].mean()),
+    }
+
+
+def _of_growth(growth: pd.DataFrame) -> dict[str, float]:
+    by_vehicle = mean_growth(growth).to_numpy()
+    if not len(by_vehicle):
+        return {"growth_last": math.nan, "growth_half": math.nan}
+    last = float(by_vehicle[-1])
+    half = math.nan
+    if last >= 0.05:
+        half = float(by_vehicle[(len(by_vehicle) - 1) // 2]) / last
+    return {"growth_last": last, "growth_half": half}

@@ -1,0 +1,148 @@
+"""Traffic of sampled drivers: flow, variation and waves against density, growth along platoons."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from cfx.evaluation.traffic.result import binned, mean_growth, ring_means
+from cfx.metrics.base import RECORDED
+from cfx.plots.choice.common import Array
+from cfx.plots.choice.trajectories import Line
+
+DENSITY_TITLE = "density (vehicles/km)"
+FLOW_TITLE = "flow (vehicles/h)"
+VEHICLE_TITLE = "vehicle of the platoon"
+
+PEOPLE_KMH = (-20.0, -15.0)
+"""km/h: how fast stop-and-go waves of people travel (Treiber and Kesting, 2013, chapter 18)."""
+
+_MOST_POINTS = 1500
+
+
+@dataclass(frozen=True)
+class TrafficPanel:
+    """One panel.
+
+    Attributes:
+        title: of the vertical axis.
+        against: title of the horizontal one.
+        lines: by method, and `real` where the recording says something; what `Line` calls time is
+            what the values stand against.
+        cloud: recorded points below the lines, x and y; empty if there are none.
+        band: values that people show elsewhere; None if there are none.
+    """
+
+    title: str
+    against: str
+    lines: tuple[Line, ...]
+    cloud: tuple[Array, Array] = (np.empty(0), np.empty(0))
+    band: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class PathPanel:
+    """The vehicles of one ring over time.
+
+    Attributes:
+        method: who drives them.
+        time, place, speed: of all points, s, m and m/s.
+    """
+
+    method: str
+    time: Array
+    place: Array
+    speed: Array
+
+
+def traffic_panels(
+    roads: pd.DataFrame,
+    growth: pd.DataFrame,
+    strips: pd.DataFrame,
+    real_wave_speed: float,
+    methods: Sequence[str],
+) -> tuple[TrafficPanel, ...]:
+    """Chooses flow, variation, waves and growth, in this order; without platoons no growth.
+
+    Args:
+        roads, growth, strips: as in `Traffic`.
+        real_wave_speed: of the recording, km/h; NaN if it is not known.
+        methods: those to show.
+    """
+    recorded = strips[strips["method"] == RECORDED]
+    every = max(1, -(-len(recorded) // _MOST_POINTS))
+    shown = recorded.iloc[::every]
+    cloud = (shown["density"].to_numpy(dtype=float), shown["flow"].to_numpy(dtype=float))
+    bins = binned(strips)
+    panels = [
+        TrafficPanel(FLOW_TITLE, DENSITY_TITLE, _flows(roads, bins, methods), cloud),
+        TrafficPanel(
+            "std of speed within 10 s (m/s)",
+            DENSITY_TITLE,
+            _of_bins(bins, (*methods, RECORDED), "speed_std"),
+        ),
+        TrafficPanel(
+            "speed of waves (km/h)",
+            DENSITY_TITLE,
+            _waves(roads, real_wave_speed, methods),
+            band=PEOPLE_KMH,
+        ),
+    ]
+    if len(growth):
+        lines = []
+        for method in methods:
+            found = mean_growth(growth[growth["method"] == method])
+            place = found.index.to_numpy(dtype=float)
+            lines.append(Line(method, place, found.to_numpy(dtype=float)))
+        panels.append(TrafficPanel("std of speed (m/s)", VEHICLE_TITLE, tuple(lines)))
+    return tuple(panels)
+
+
+def path_panels(paths: pd.DataFrame, methods: Sequence[str]) -> tuple[PathPanel, ...]:
+    """Chooses the paths of one ring for each method.
+
+    Args:
+        paths: as `Traffic.paths`.
+        methods: those to show.
+    """
+    panels = []
+    for method in methods:
+        rows = paths[paths["method"] == method]
+        columns = [rows[name].to_numpy(dtype=float) for name in ("time_s", "place", "speed")]
+        panels.append(PathPanel(method, *columns))
+    return tuple(panels)
+
+
+def _flows(roads: pd.DataFrame, bins: pd.DataFrame, methods: Sequence[str]) -> tuple[Line, ...]:
+    lines = []
+    for method in methods:
+        found = ring_means(roads[roads["method"] == method], ["flow"])
+        lines.append(_line(method, found["level"], found["flow"]))
+    return (*lines, *_of_bins(bins, (RECORDED,), "flow"))
+
+
+def _of_bins(bins: pd.DataFrame, methods: Sequence[str], column: str) -> tuple[Line, ...]:
+    lines = []
+    for method in methods:
+        rows = bins[bins["method"] == method].sort_values("density")
+        lines.append(_line(method, rows["density"], rows[column]))
+    return tuple(lines)
+
+
+def _waves(roads: pd.DataFrame, real: float, methods: Sequence[str]) -> tuple[Line, ...]:
+    lines = []
+    for method in methods:
+        found = ring_means(roads[roads["method"] == method], ["wave_speed"])
+        lines.append(_line(method, found["level"], found["wave_speed"]))
+    if np.isfinite(real):
+        rings = roads[roads["road"] == "ring"]
+        ends = np.array([rings["level"].min(), rings["level"].max()], dtype=float)
+        lines.append(Line(RECORDED, ends, np.array([real, real])))
+    return tuple(lines)
+
+
+def _line(method: str, against: pd.Series, values: pd.Series) -> Line:
+    return Line(method, against.to_numpy(dtype=float), values.to_numpy(dtype=float))

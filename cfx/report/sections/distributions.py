@@ -1,0 +1,96 @@
+"""Sampled forecasts: proper scores, coverage, PIT."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pandas as pd
+
+from cfx.evaluation.distributions import (
+    LEVEL,
+    centre_errors,
+    sampled_methods,
+    summarize_distributions,
+)
+from cfx.plots.choice.distributions import distribution_view, sampled_name
+from cfx.plots.plotly.distributions import distributions_plot
+from cfx.report.blocks import Block, Figure, Group, Heading, Section, Table, Text
+from cfx.report.job import Job, Runs
+from cfx.report.tables import Cell, Column, Sheet, formatted, method_cell, methods_explained, number
+
+_SHARE = f"{100 * LEVEL:.0f} %"
+
+_INTRODUCTION = (
+    "From every moment of the test trajectories several paths were sampled. The CRPS of speed is"
+    " smallest, in the mean, for the distribution that reality is drawn from; that of a single path"
+    " is its absolute error, so the policy's centre, where nothing is drawn, can stand beside it."
+    f" Coverage: the share of moments whose real speed lies in the central {_SHARE} of the sampled"
+    " ones. The last panel has the share of sampled speeds below the real one: flat if the spread"
+    " is right, high at both ends if the paths are too much alike. Means over drivers."
+)
+
+
+def blocks(runs: Runs) -> list[Block]:
+    """Returns plots and a table for each job with sampled forecasts."""
+    cards: list[Block] = []
+    methods: dict[str, None] = {}
+    for job in runs.jobs:
+        if job.distributions is not None and job.forecasts is not None:
+            cards.append(Group(tuple(_job_blocks(job, job.distributions, job.forecasts)), "card"))
+            methods |= dict.fromkeys(_shown(job.distributions))
+    if not cards:
+        return []
+    return [Text(_INTRODUCTION), Text(f"Methods: {methods_explained(methods)}"), *cards]
+
+
+def _job_blocks(job: Job, table: pd.DataFrame, forecasts: pd.DataFrame) -> list[Block]:
+    return [
+        Heading(job.name),
+        Figure(distributions_plot(distribution_view(table, forecasts))),
+        Table(crps_sheet(table, forecasts)),
+    ]
+
+
+def crps_sheet(table: pd.DataFrame, forecasts: pd.DataFrame) -> Sheet:
+    """Returns a row per sampled method and one for the policy's centre, a column per horizon.
+
+    Args:
+        table: scores, as a job has written them.
+        forecasts: of the same job.
+    """
+    summary = summarize_distributions(table).set_index(["method", "horizon_s"])
+    horizons = sorted(float(horizon) for horizon in table["horizon_s"].unique())
+    columns = [Column("Method", number=False)]
+    for horizon in horizons:
+        meaning = f"CRPS of speed {horizon:g} s after the origin, m/s; below it the coverage."
+        columns.append(Column(f"CRPS, {horizon:g} s (m/s)", meaning))
+    rows: list[tuple[Cell, ...]] = []
+    for method, name in zip(sampled_methods(table), _shown(table), strict=False):
+        cells = [method_cell(name)]
+        for horizon in horizons:
+            crps = summary["crps_speed"].get((method, horizon), math.nan)
+            coverage = summary["coverage"].get((method, horizon), math.nan)
+            cells.append(replace(_number(float(crps)), second=formatted(float(coverage), ".0%")))
+        rows.append(tuple(cells))
+    centre = centre_errors(forecasts).set_index("horizon_s")["crps_speed"]
+    cells = [method_cell("policy")]
+    for horizon in horizons:
+        cells.append(_number(float(centre.get(horizon, math.nan))))
+    rows.append(tuple(cells))
+    return Sheet(tuple(columns), tuple(rows))
+
+
+def _shown(table: pd.DataFrame) -> tuple[str, ...]:
+    """Returns what the methods are called beside the policy's centre, which stands last."""
+    names = []
+    for method in sampled_methods(table):
+        names.append(sampled_name(method))
+    return (*names, "policy")
+
+
+def _number(value: float) -> Cell:
+    return number(value, formatted(value, ".3f"))
+
+
+SECTION = Section("distributions", "Sampled forecasts", "Distributions", blocks)
