@@ -91,6 +91,11 @@ class TrafficSettings(AcrossDriversSettings):
         description="m/s: constant speeds of the leaders of platoons; empty: there are none",
     )
     platoon: int = Field(25, ge=2, le=2000, description="vehicles of each platoon with its leader")
+    noise: tuple[float, float] | None = Field(
+        None,
+        description="time constant, s, and standard deviation, m/s2, of the noise on the"
+        " acceleration of constant parameters; null: as measured on each driver",
+    )
     duration: float = Field(600.0, gt=0, description="s: how long all roads are simulated")
     settle: float = Field(
         300.0, ge=0, description="s from the start that do not count, in which traffic settles"
@@ -104,6 +109,8 @@ class TrafficSettings(AcrossDriversSettings):
                 " longer duration"
             )
         begin, end = self.bottleneck
+        if self.noise is not None and not (self.noise[0] > 0 and self.noise[1] >= 0):
+            raise ValueError("noise is a time constant in s above 0 and a deviation of 0 or more")
         if not 0 < begin < end:
             raise ValueError(f"bottleneck=[{begin:g}, {end:g}] has to begin after 0 and end later")
         return self
@@ -129,7 +136,7 @@ class TrafficProtocol(AcrossDrivers):
     - `population`: pooled parameters of all drivers, the same for every vehicle;
     - `fixed`: the driver-specific parameters of the vehicle's driver;
     - `population_ar`, `fixed_ar`: the same with AR(1) noise on the acceleration, measured on all
-      drivers, or on the driver;
+      drivers, or on the driver, or as `noise` says;
     - `policy`: the policy, driven at its centre where it is stochastic;
     - `policy_sampled`: the same, drawn with the job's seed, of a stochastic policy.
 
@@ -236,7 +243,7 @@ class TrafficProtocol(AcrossDrivers):
 
     def _kinds(self, test: HeldOut) -> dict[str, _Kind]:
         """Returns who drives, by method."""
-        context = test.context
+        s, context = self.settings, test.context
         kinds: dict[str, _Kind] = {}
         if context.simulator.model.has_constant_baseline:
             constants = {"fixed": test.fixed}
@@ -244,7 +251,7 @@ class TrafficProtocol(AcrossDrivers):
             if pooled is not None:
                 constants = {"population": pooled, **constants}
             for name, parameters in constants.items():
-                kinds |= _constant_kinds(test, name, parameters)
+                kinds |= _constant_kinds(test, name, parameters, s.noise)
         if context.policy.adapts or not kinds:
             state = _observed(test, test.policy, test.network)
             kinds["policy"] = _Kind(test.policy, state, draws=False)
@@ -275,14 +282,20 @@ def _pooled(test: HeldOut) -> Tensor | None:
     return test.population[number].expand(len(test.pairs), -1)
 
 
-def _constant_kinds(test: HeldOut, name: str, parameters: Tensor) -> Mapping[str, _Kind]:
+def _constant_kinds(
+    test: HeldOut, name: str, parameters: Tensor, noise: tuple[float, float] | None
+) -> Mapping[str, _Kind]:
     """Returns constant parameters of each test driver, `(P, n)`, without and with noise."""
     context = test.context
     each = torch.arange(len(test.pairs), device=parameters.device)
     agent = context.constant(FixedPolicy(), parameters)
     kinds = {name: _Kind(agent, agent.begin(each), draws=False)}
-    noise = residual_noise(test, parameters, own=name == "fixed")
-    noisy = context.constant_with_noise(parameters, *noise)
+    if noise is None:
+        time, scale = residual_noise(test, parameters, own=name == "fixed")
+    else:
+        ones = torch.ones_like(parameters[:, 0])
+        time, scale = noise[0] * ones, noise[1] * ones
+    noisy = context.constant_with_noise(parameters, time, scale)
     if can_drive(MemoryStepper(context.simulator.model, noisy.dt), noisy):
         kinds[f"{name}_ar"] = _Kind(noisy, noisy.begin(each), draws=True)
     return kinds

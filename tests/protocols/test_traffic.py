@@ -123,7 +123,7 @@ def test_a_stochastic_policy_drives_at_its_centre_and_sampled(
 )
 def test_estimators_drive_too(policy: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
-    short = ["protocol.duration=12", "protocol.settle=1", "model=idm"]
+    short = ["protocol.duration=12", "protocol.settle=1", "model=idm", "protocol.noise=[2,0.2]"]
     result = cfx.run([*TRAFFIC, *policy.split(), *short])
     assert np.isfinite(result.metrics["traffic/capacity/policy"])
 
@@ -135,6 +135,7 @@ def test_estimators_drive_too(policy: str, monkeypatch: pytest.MonkeyPatch, tmp_
         (["protocol.demands=[20000]"], r"20000 vehicles/h do not fit"),
         (["protocol.densities=[]"], "densities"),
         (["protocol.densities=[-1]"], "levels are greater than 0"),
+        (["protocol.noise=[0,1]"], "noise is a time constant in s above 0"),
         (["protocol.settle=50"], r"settle=50 s leaves nothing of duration=40 s"),
         (["protocol.bottleneck=[300,200]"], r"bottleneck=\[300, 200\] has to begin after 0"),
         (

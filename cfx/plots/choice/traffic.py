@@ -20,7 +20,13 @@ VEHICLE_TITLE = "vehicle of the platoon"
 PEOPLE_KMH = (-20.0, -15.0)
 """km/h: how fast stop-and-go waves of people travel (Treiber and Kesting, 2013, chapter 18)."""
 
+WAVE_LIMITS = (-40.0, 10.0)
+"""km/h: between these waves are shown; on nearly empty rings nothing worth the name travels."""
+
 _MOST_POINTS = 1500
+
+_NOISE = "_ar"
+"""What methods end with that are constant parameters with noise."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +40,7 @@ class TrafficPanel:
             what the values stand against.
         cloud: recorded points below the lines, x and y; empty if there are none.
         band: values that people show elsewhere; None if there are none.
+        limits: of the vertical axis; None: from 0 to the largest value. Some lines may leave it.
     """
 
     title: str
@@ -41,6 +48,7 @@ class TrafficPanel:
     lines: tuple[Line, ...]
     cloud: tuple[Array, Array] = (np.empty(0), np.empty(0))
     band: tuple[float, float] | None = None
+    limits: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -77,6 +85,9 @@ def traffic_panels(
     shown = recorded.iloc[::every]
     cloud = (shown["density"].to_numpy(dtype=float), shown["flow"].to_numpy(dtype=float))
     bins = binned(strips)
+    last = bins.loc[bins["method"] == RECORDED, "density"].max()
+    if np.isfinite(last):
+        bins = bins[bins["density"] <= last]
     panels = [
         TrafficPanel(FLOW_TITLE, DENSITY_TITLE, _flows(roads, bins, methods), cloud),
         TrafficPanel(
@@ -89,6 +100,7 @@ def traffic_panels(
             DENSITY_TITLE,
             _waves(roads, real_wave_speed, methods),
             band=PEOPLE_KMH,
+            limits=WAVE_LIMITS,
         ),
     ]
     if len(growth):
@@ -97,7 +109,10 @@ def traffic_panels(
             found = mean_growth(growth[growth["method"] == method])
             place = found.index.to_numpy(dtype=float)
             lines.append(Line(method, place, found.to_numpy(dtype=float)))
-        panels.append(TrafficPanel("std of speed (m/s)", VEHICLE_TITLE, tuple(lines)))
+        limits = _growth_limits(lines)
+        panels.append(
+            TrafficPanel("std of speed (m/s)", VEHICLE_TITLE, tuple(lines), limits=limits)
+        )
     return tuple(panels)
 
 
@@ -142,6 +157,18 @@ def _waves(roads: pd.DataFrame, real: float, methods: Sequence[str]) -> tuple[Li
         ends = np.array([rings["level"].min(), rings["level"].max()], dtype=float)
         lines.append(Line(RECORDED, ends, np.array([real, real])))
     return tuple(lines)
+
+
+def _growth_limits(lines: Sequence[Line]) -> tuple[float, float] | None:
+    """Returns the axis that the policy's growth can be seen on, if it has any.
+
+    Constant parameters with noise may vary ten times as much.
+    """
+    top = 0.0
+    for line in lines:
+        if not line.method.endswith(_NOISE):
+            top = max(top, float(np.nanmax(line.values, initial=0.0)))
+    return (0.0, 1.3 * top) if top > 0.2 else None
 
 
 def _line(method: str, against: pd.Series, values: pd.Series) -> Line:

@@ -115,6 +115,13 @@ def draw_lines(axes: Axes, lines: Sequence[Line]) -> None:
     axes.margins(x=0.01)
 
 
+def mark_points(axes: Axes) -> None:
+    """Puts a point where each value of the lines stands."""
+    for line in axes.lines:
+        line.set_marker("o")
+        line.set_markersize(3.5)
+
+
 def method_handles(methods: Iterable[str]) -> list[Line2D]:
     """Returns legend entries."""
     handles = []

@@ -10,7 +10,14 @@ from cfx.evaluation.distributions import LEVEL
 from cfx.plots.choice.distributions import PIT_TITLE, DistributionView
 from cfx.plots.choice.forecasts import HORIZON_TITLE, ForecastPanel
 from cfx.plots.look import EDGE, colour_of
-from cfx.plots.matplotlib.canvas import DASHES, canvas, draw_lines, method_legend, styled
+from cfx.plots.matplotlib.canvas import (
+    DASHES,
+    canvas,
+    draw_lines,
+    mark_points,
+    method_legend,
+    styled,
+)
 
 
 @styled
@@ -42,8 +49,6 @@ def draw_distributions(view: DistributionView) -> Figure:
 
 def _against_horizon(axes: Axes, panel: ForecastPanel) -> None:
     draw_lines(axes, panel.lines)
-    for line in axes.lines:
-        line.set_marker("o")
-        line.set_markersize(3.5)
+    mark_points(axes)
     axes.set_xlabel(HORIZON_TITLE)
     axes.set_ylabel(panel.title)

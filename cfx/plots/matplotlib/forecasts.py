@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import ScalarFormatter
 
 from cfx.plots.choice.forecasts import ForecastPanel
-from cfx.plots.matplotlib.canvas import canvas, draw_lines, method_legend, styled
+from cfx.plots.matplotlib.canvas import canvas, draw_lines, mark_points, method_legend, styled
 
 
 @styled
@@ -24,9 +24,7 @@ def draw_forecasts(panels: Sequence[ForecastPanel], methods: Sequence[str], agai
     grid = figure.subplots(1, len(panels), squeeze=False)[0]
     for axes, panel in zip(grid, panels, strict=True):
         draw_lines(axes, panel.lines)
-        for line in axes.lines:
-            line.set_marker("o")
-            line.set_markersize(3.5)
+        mark_points(axes)
         axes.set_xlabel(against)
         axes.set_ylabel(panel.title)
         if panel.logarithmic:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from cfx.metrics.base import RECORDED
 from cfx.plots.choice.traffic import PathPanel, TrafficPanel
 from cfx.plots.look import BAND, EDGE
-from cfx.plots.matplotlib.canvas import canvas, draw_lines, method_legend, styled
+from cfx.plots.matplotlib.canvas import canvas, draw_lines, mark_points, method_legend, styled
 from cfx.plots.words import label
 
 _COLUMNS = 2
@@ -33,12 +33,12 @@ def draw_traffic(panels: Sequence[TrafficPanel], methods: Sequence[str]) -> Figu
             axes.axhspan(*panel.band, color=BAND, zorder=0.5)
         draw_lines(axes, panel.lines)
         if len(panel.lines) and len(panel.lines[0].time) < 15:
-            for line in axes.lines:
-                line.set_marker("o")
-                line.set_markersize(3.0)
+            mark_points(axes)
         axes.set_xlabel(panel.against)
         axes.set_ylabel(panel.title)
-        if panel.band is None:
+        if panel.limits is not None:
+            axes.set_ylim(*panel.limits)
+        else:
             axes.set_ylim(bottom=0)
     for axes in grid[len(panels) :]:
         axes.remove()

@@ -28,8 +28,9 @@ def traffic_plot(panels: Sequence[TrafficPanel]) -> Plot:
         across = _domain(k % _COLUMNS, _COLUMNS)
         down = _domain(rows - 1 - k // _COLUMNS, rows)
         scale: dict[str, Any] = {"rangemode": "tozero"}
+        if panel.limits is not None:
+            scale = {"range": list(panel.limits)}
         if panel.band is not None:
-            scale = {}
             layout["shapes"].append(_band(panel.band, number))
         layout[f"xaxis{number}"] = axis(panel.against, domain=across, anchor=f"y{number}")
         layout[f"yaxis{number}"] = axis(panel.title, domain=down, anchor=f"x{number}", **scale)
