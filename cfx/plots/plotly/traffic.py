@@ -13,8 +13,8 @@ from cfx.plots.plotly.figure import Plot, Trace, axes_number, axis, view
 from cfx.plots.plotly.trajectories import line_trace
 
 _COLUMNS = 2
-_APART = 0.1
-"""Share of the width, and of the height, between two panels."""
+_APART, _BELOW = 0.1, 0.16
+"""Shares of the width and of the height between two panels."""
 
 
 def traffic_plot(panels: Sequence[TrafficPanel]) -> Plot:
@@ -25,8 +25,8 @@ def traffic_plot(panels: Sequence[TrafficPanel]) -> Plot:
     named: set[str] = set()
     for k, panel in enumerate(panels):
         number = axes_number(k)
-        across = _domain(k % _COLUMNS, _COLUMNS)
-        down = _domain(rows - 1 - k // _COLUMNS, rows)
+        across = _domain(k % _COLUMNS, _COLUMNS, _APART)
+        down = _domain(rows - 1 - k // _COLUMNS, rows, _BELOW)
         scale: dict[str, Any] = {"rangemode": "tozero"}
         if panel.limits is not None:
             scale = {"range": list(panel.limits)}
@@ -42,9 +42,9 @@ def traffic_plot(panels: Sequence[TrafficPanel]) -> Plot:
     return Plot({"": view(data, layout)}, 330 * rows, "Traffic of sampled drivers")
 
 
-def _domain(place: int, places: int) -> list[float]:
-    width = (1.0 - _APART * (places - 1)) / places
-    begin = place * (width + _APART)
+def _domain(place: int, places: int, apart: float) -> list[float]:
+    width = (1.0 - apart * (places - 1)) / places
+    begin = place * (width + apart)
     return [begin, min(1.0, begin + width)]
 
 
