@@ -20,8 +20,14 @@ def driver_places(network: Tensor) -> Tensor:
     Returns:
         `(D,)` int64.
     """
-    same = network[:, None] == network[None, :]
-    return torch.tril(same, diagonal=-1).sum(1)
+    if len(network) == 0:
+        return torch.zeros_like(network)
+    order = torch.argsort(network, stable=True)
+    counts = torch.bincount(network)
+    first = counts.cumsum(0) - counts
+    place = torch.empty_like(order)
+    place[order] = torch.arange(len(network), device=network.device) - first[network[order]]
+    return place
 
 
 def group_by(names: Sequence[str]) -> tuple[Tensor, tuple[str, ...]]:

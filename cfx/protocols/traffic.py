@@ -28,6 +28,7 @@ from cfx.evaluation.traffic.roads import (
     ring_roads,
     simulate_roads,
 )
+from cfx.memory import require_memory
 from cfx.policies.features import measured_history
 from cfx.policies.fixed import FixedPolicy
 from cfx.protocols.across_drivers import AcrossDrivers, AcrossDriversSettings
@@ -40,6 +41,9 @@ log = logging.getLogger(__name__)
 
 _DRAWN = 7_919
 """Keeps the random numbers of roads and drivers apart from those of other parts of a job."""
+
+_COPIES = 8
+"""Signals of all vehicles at all frames that are in memory at once, about."""
 
 
 def _rising(levels: tuple[float, ...]) -> tuple[float, ...]:
@@ -184,7 +188,7 @@ class TrafficProtocol(AcrossDrivers):
                 f" {model.needs_simulator} only, and cfx simulates the roads itself; choose a model"
                 " that cfx has, such as krauss or idm"
             )
-        self._check(length)
+        self._check(length, context.windows.stride * context.simulator.dt)
         generator = torch.Generator().manual_seed(context.seed * _DRAWN + 1)
         parts = [
             ring_roads(s.densities, s.vehicles, s.repetitions, length, s.perturbation, generator)
@@ -196,13 +200,24 @@ class TrafficProtocol(AcrossDrivers):
             parts.append(platoons(s.leader_speeds, s.platoon, s.repetitions, length))
         return joined(parts).to(context.batch.lengths.device)
 
-    def _check(self, length: float) -> None:
-        """Checks whether vehicles of this length, m, fit on the roads.
+    def _check(self, length: float, interval: float) -> None:
+        """Checks whether vehicles of this length, m, fit on the roads and into the memory.
+
+        Args:
+            length: m.
+            interval: s between the frames that are kept.
 
         Raises:
             ConfigError: they do not.
         """
         s = self.settings
+        of_rings = len(s.densities) * s.repetitions * s.vehicles
+        of_platoons = len(s.leader_speeds) * s.repetitions * s.platoon
+        vehicles = of_rings + of_platoons + sum(s.demands) * s.duration / 3600.0
+        require_memory(
+            _COPIES * 8.0 * vehicles * s.duration / interval,
+            f"protocol.duration={s.duration:g} of {vehicles:.0f} vehicles",
+        )
         most = 1000.0 / (length + 0.5)
         if s.densities[-1] > most:
             raise ConfigError(

@@ -135,6 +135,7 @@ def test_estimators_drive_too(policy: str, monkeypatch: pytest.MonkeyPatch, tmp_
         (["protocol.demands=[20000]"], r"20000 vehicles/h do not fit"),
         (["protocol.densities=[]"], "densities"),
         (["protocol.densities=[-1]"], "levels are greater than 0"),
+        (["protocol.duration=1e12"], r"protocol.duration=1e\+12 of .* needs about"),
         (["protocol.noise=[0,1]"], "noise is a time constant in s above 0"),
         (["protocol.settle=50"], r"settle=50 s leaves nothing of duration=40 s"),
         (["protocol.bottleneck=[300,200]"], r"bottleneck=\[300, 200\] has to begin after 0"),
