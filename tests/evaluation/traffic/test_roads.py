@@ -159,7 +159,7 @@ def test_recurrent_policies_drive_each_vehicle_as_the_driver_that_it_is() -> Non
     agent = adaptive(model, GruPolicy(hidden_size=4), networks=3, features=30)
     with torch.no_grad():
         for weights in agent.network.parameters():
-            weights += torch.randn(weights.shape, generator=drawn())
+            weights.add_(torch.randn(weights.shape, generator=drawn()))
     lanes = rings(40.0, vehicles=8)
     start = agent.begin(torch.tensor([0, 1, 2]))
     drivers = torch.tensor([2, 0, 1, 1, 2, 0, 0, 2])
