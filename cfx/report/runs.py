@@ -33,14 +33,20 @@ def read_runs(runs: Sequence[str]) -> Runs:
         TrackingError: there is no such run.
     """
     jobs: dict[str, Job] = {}
+    given: dict[str, int] = {}
     unfinished: dict[str, Unfinished] = {}
-    for run in runs:
+    for number, run in enumerate(runs):
         for found in _read(run):
             if isinstance(found, Job):
                 jobs.setdefault(found.place, found)
+                given.setdefault(found.place, number)
             else:
                 unfinished.setdefault(found.place, found)
-    return Runs(named(tuple(jobs.values())), tuple(unfinished.values()))
+    # Folders of a sweep are named by content: only the jobs' names have an order that people see.
+    ordered = sorted(
+        named(tuple(jobs.values())), key=lambda job: (given[job.place], natural_order(job.name))
+    )
+    return Runs(tuple(ordered), tuple(unfinished.values()))
 
 
 def _read(run: str) -> list[Job | Unfinished]:
