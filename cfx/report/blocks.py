@@ -130,6 +130,19 @@ class Section:
     blocks: Callable[[Runs], Sequence[Block]]
 
 
+MOST = 6
+"""Jobs that are drawn at once, or named in a sentence; of more, the others are folded away."""
+
+
+def cards(groups: Sequence[Group]) -> list[Block]:
+    """Returns the cards of some jobs, beside each other, and the others' in a fold."""
+    found: list[Block] = [Grid(tuple(groups[:MOST]))]
+    others = groups[MOST:]
+    if others:
+        found.append(Fold(f"{len(others)} more jobs", (Grid(tuple(others)),)))
+    return found
+
+
 def job_fold(name: str, blocks: Sequence[Block], *, first: bool) -> Fold:
     """Returns the fold of one job; the first is open."""
     return Fold(name, tuple(blocks), unfolded=first, style="job")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from cfx.plots.choice.history import amounts_of, history_curves
 from cfx.plots.plotly.figure import Plot
 from cfx.plots.plotly.history import history_plot
-from cfx.report.blocks import Block, Figure, Grid, Group, Heading, Section, Table, Text
+from cfx.report.blocks import Block, Figure, Group, Heading, Section, Table, Text, cards
 from cfx.report.job import Job, Runs
 from cfx.report.tables import Cell, Column, Sheet, interval, number, share, text
 
@@ -23,10 +23,10 @@ def blocks(runs: Runs) -> list[Block]:
     jobs = [job for job in runs.jobs if job.history is not None]
     if not jobs:
         return []
-    cards = []
+    groups = []
     for job in jobs:
-        cards.append(Group((Heading(job.name), Figure(history(job))), "card"))
-    return [Text(_INTRODUCTION), Grid(tuple(cards)), Table(histories(jobs))]
+        groups.append(Group((Heading(job.name), Figure(history(job))), "card"))
+    return [Text(_INTRODUCTION), *cards(groups), Table(histories(jobs))]
 
 
 def history(job: Job) -> Plot:

@@ -6,14 +6,14 @@ from cfx.plots.choice.learning import learning_curves
 from cfx.plots.plotly.learning import learning_plot
 from cfx.plots.words import plural
 from cfx.report.blocks import (
+    MOST,
     Block,
     Figure,
-    Fold,
-    Grid,
     Group,
     Heading,
     Section,
     Text,
+    cards,
     missing_file,
 )
 from cfx.report.job import Runs
@@ -23,13 +23,10 @@ _INTRODUCTION = (
     " several, the band between the quartiles. A network that stopped early keeps its last loss."
 )
 
-_OPEN = 6
-"""Jobs whose curves are shown at once, and jobs that are named in a sentence."""
-
 
 def blocks(runs: Runs) -> list[Block]:
     """Returns a plot for each job that learned something."""
-    cards, without = [], []
+    groups, without = [], []
     for job in runs.jobs:
         if job.curves is None:
             continue
@@ -38,11 +35,9 @@ def blocks(runs: Runs) -> list[Block]:
             continue
         chosen = learning_curves(job.curves)
         heading = Heading(job.name, f"({plural(chosen.networks, 'network')})")
-        cards.append(Group((heading, Figure(learning_plot(chosen))), "card"))
-    found: list[Block] = [Text(_INTRODUCTION), Grid(tuple(cards[:_OPEN]))]
-    if len(cards) > _OPEN:
-        found.append(Fold(f"{len(cards) - _OPEN} more jobs", (Grid(tuple(cards[_OPEN:])),)))
-    if len(without) > _OPEN:
+        groups.append(Group((heading, Figure(learning_plot(chosen))), "card"))
+    found: list[Block] = [Text(_INTRODUCTION), *cards(groups)]
+    if len(without) > MOST:
         found.append(Text(f"Nothing was learned in {len(without)} jobs.", "fine"))
     elif without:
         found.append(Text(f"Nothing was learned in {', '.join(without)}.", "fine"))
