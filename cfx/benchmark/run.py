@@ -14,7 +14,7 @@ from cfx import registry
 from cfx.benchmark.frozen import DATA, DATA_NAME, FROZEN_KEYS, METHODS, OVERRIDES
 from cfx.benchmark.row import PAIRS, ROW, Row, errors_of, protocol_name, values_of
 from cfx.datasets.base import Dataset
-from cfx.errors import ConfigError, DataError, nearest
+from cfx.errors import ConfigError, DataError, Terminated, nearest
 from cfx.files import atomic_write
 
 _CHANGE_NOTHING = (
@@ -155,6 +155,7 @@ def _run_job(command: Sequence[str], job: Path) -> None:
     Raises:
         ConfigError: the folder holds another job.
         DataError: it failed; its own words stand above.
+        KeyboardInterrupt, Terminated: it was broken off; the same command goes on.
     """
     record = job / "benchmark_command.json"
     if (job / "metrics.json").is_file() and (job / _SECONDS).is_file():
@@ -162,12 +163,16 @@ def _run_job(command: Sequence[str], job: Path) -> None:
             print(f"{job}: was finished before")
             return
         raise ConfigError(f"{job}: holds another job; give --output another folder, or --name")
-    from cfx.application import start
+    from cfx.application import INTERRUPTED, TERMINATED, start
 
     job.mkdir(parents=True, exist_ok=True)
     record.write_text(json.dumps(list(command)), encoding="utf-8")
     began = time.monotonic()
     code = start([*command, f"hydra.run.dir={job.absolute()}"])
+    if code == INTERRUPTED:
+        raise KeyboardInterrupt
+    if code == TERMINATED:
+        raise Terminated
     if code:
         raise DataError("cfx benchmark: the job failed; its words stand above")
     (job / _SECONDS).write_text(f"{time.monotonic() - began:.1f}", encoding="utf-8")

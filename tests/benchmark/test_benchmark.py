@@ -9,14 +9,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cfx import cli
+from cfx import application, cli
 from cfx.benchmark.compare import compared, lines_of, read_errors
 from cfx.benchmark.frozen import DATA, METHODS, TESTED, protocol_hash
 from cfx.benchmark.row import Row, errors_of, markdown, protocol_name, values_of
-from cfx.benchmark.run import overrides_of, row_name
+from cfx.benchmark.run import overrides_of, row_name, run
 from cfx.datasets.synthetic import SyntheticDataset
 from cfx.datasets.tidy import TidyDataset, write_tidy
-from cfx.errors import DataError
+from cfx.errors import DataError, Terminated
 
 
 def test_the_protocol_is_the_published_one() -> None:
@@ -185,3 +185,16 @@ def test_a_row_of_other_pairs_is_made_and_marked(
     assert "was finished before" in said
     assert "krauss (other pairs: p.parquet" in said
     assert "| krauss | rmse_speed | +0.0% |" in said
+
+
+@pytest.mark.parametrize(("code", "error"), [(130, KeyboardInterrupt), (143, Terminated)])
+def test_a_job_that_was_broken_off_has_not_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, error: type[BaseException]
+) -> None:
+    """The exit code is that of the signal, and the same command goes on."""
+    path = tmp_path / "p.parquet"
+    write_tidy(SyntheticDataset(pairs=2, frames=320, min_frames=2).load(), path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(application, "start", lambda _: code)
+    with pytest.raises(error):
+        run(["model=idm"], path, None, name="mine", other_data=True)
