@@ -382,13 +382,16 @@ class Calibrator:
         task: Task,
     ) -> None:
         """Has the engine solve groups of entries; each result is kept as soon as it is there."""
-        parts = [part for group in groups for part in group.parts]
-        shards = (
-            shard(torch.tensor(part), torch.tensor(group.entries))
-            for group in groups
-            for part in group.parts
-        )
-        with closing(self.engine.map(solve_shard, shards, task.advance)) as results:
+        parts = []
+        for group in groups:
+            parts += group.parts
+
+        def shards() -> Iterator[CalibrationShard]:
+            for group in groups:
+                for part in group.parts:
+                    yield shard(torch.tensor(part), torch.tensor(group.entries))
+
+        with closing(self.engine.map(solve_shard, shards(), task.advance)) as results:
             for number, entries in results:
                 work.keep(parts[number], entries)
 
