@@ -19,7 +19,7 @@ from cfx.plots.choice.trajectories import Line
 
 CRPS_TITLE = "CRPS of speed (m/s)"
 COVERAGE_TITLE = f"share within the central {100 * LEVEL:.0f} %"
-PIT_TITLE = "share of sampled speeds below the real one"
+PIT_TITLE = "share of samples below reality"
 
 PIT_BINS = 10
 
