@@ -15,8 +15,8 @@ from cfx.evaluation.distributions import (
 )
 from cfx.plots.choice.distributions import distribution_view, sampled_name
 from cfx.plots.plotly.distributions import distributions_plot
-from cfx.report.blocks import Block, Figure, Group, Heading, Section, Table, Text
-from cfx.report.job import Job, Runs
+from cfx.report.blocks import Block, Figure, Section, Table, Text, job_fold
+from cfx.report.job import Runs
 from cfx.report.tables import Cell, Column, Sheet, formatted, method_cell, methods_explained, number
 
 _SHARE = f"{100 * LEVEL:.0f} %"
@@ -33,20 +33,20 @@ _INTRODUCTION = (
 
 def blocks(runs: Runs) -> list[Block]:
     """Returns plots and a table for each job with sampled forecasts."""
-    cards: list[Block] = []
+    found: list[Block] = []
     methods: dict[str, None] = {}
     for job in runs.jobs:
         if job.distributions is not None and job.forecasts is not None:
-            cards.append(Group(tuple(_job_blocks(job, job.distributions, job.forecasts)), "card"))
+            shown = _job_blocks(job.distributions, job.forecasts)
+            found.append(job_fold(job.name, shown, first=not found))
             methods |= dict.fromkeys(_shown(job.distributions))
-    if not cards:
+    if not found:
         return []
-    return [Text(_INTRODUCTION), Text(f"Methods: {methods_explained(methods)}"), *cards]
+    return [Text(_INTRODUCTION), Text(f"Methods: {methods_explained(methods)}"), *found]
 
 
-def _job_blocks(job: Job, table: pd.DataFrame, forecasts: pd.DataFrame) -> list[Block]:
+def _job_blocks(table: pd.DataFrame, forecasts: pd.DataFrame) -> list[Block]:
     return [
-        Heading(job.name),
         Figure(distributions_plot(distribution_view(table, forecasts))),
         Table(crps_sheet(table, forecasts)),
     ]

@@ -11,7 +11,7 @@ from cfx.metrics.base import RECORDED, key_of
 from cfx.plots.choice.traffic import traffic_panels
 from cfx.plots.plotly.traffic import traffic_plot
 from cfx.plots.words import MINUS
-from cfx.report.blocks import Block, Figure, Group, Heading, Section, Table, Text
+from cfx.report.blocks import Block, Figure, Section, Table, Text, job_fold
 from cfx.report.job import Job, Runs
 from cfx.report.tables import Cell, Column, Sheet, formatted, method_cell, methods_explained, number
 
@@ -71,19 +71,19 @@ _COLUMNS = (
 
 def blocks(runs: Runs) -> list[Block]:
     """Returns plots and a table for each job with traffic."""
-    cards: list[Block] = []
+    found: list[Block] = []
     methods: dict[str, None] = {}
     for job in runs.jobs:
         if job.traffic is not None:
-            cards.append(Group(tuple(_job_blocks(job, job.traffic)), "card"))
+            found.append(job_fold(job.name, _job_blocks(job, job.traffic), first=not found))
             methods |= dict.fromkeys(traffic_methods(job.traffic))
-    if not cards:
+    if not found:
         return []
-    return [Text(_INTRODUCTION), Text(f"Methods: {methods_explained(methods)}"), *cards]
+    return [Text(_INTRODUCTION), Text(f"Methods: {methods_explained(methods)}"), *found]
 
 
 def _job_blocks(job: Job, roads: pd.DataFrame) -> list[Block]:
-    shown: list[Block] = [Heading(job.name)]
+    shown: list[Block] = []
     if job.traffic_growth is not None and job.traffic_strips is not None:
         panels = traffic_panels(
             roads,
