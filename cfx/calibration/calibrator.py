@@ -49,6 +49,10 @@ _PART = 64
 """Whole trajectories that are solved in one shard of a cluster: each is the work of a hundred
 windows."""
 
+_BLOCK = 32
+"""Windows of an entry of the cache: the first windows of a pair have the same labels, however many
+of them a job asks for."""
+
 
 @dataclass(frozen=True)
 class Labels:
@@ -245,36 +249,46 @@ class Calibrator:
             fixed: `(P, n)`, SI units: the first guess in each window, before the model's defaults.
         """
         device = batch.lengths.device
-        counts = torch.bincount(windows.pair, minlength=len(pairs)).tolist()
+        counts = torch.bincount(windows.pair, minlength=len(pairs))
         tolerance = self.tie_tolerance(windows.settings)
         description = {**windows.settings.model_dump(), "tie_tolerance": tolerance}
-        keys = []
-        for pair, count, row in zip(pairs, counts, fixed.tolist(), strict=True):
-            keys.append(
-                self._key("labels", pair.fingerprint, windows=count, fixed=row, **description)
-            )
+        keys, owner, begin, sizes = [], [], [], []
+        rows = zip(pairs, counts.tolist(), fixed.tolist(), strict=True)
+        for number, (pair, count, row) in enumerate(rows):
+            for first in range(0, count, _BLOCK):
+                size = min(_BLOCK, count - first)
+                which = {"first": first, "windows": size, "fixed": row}
+                keys.append(self._key("labels", pair.fingerprint, **which, **description))
+                owner.append(number)
+                begin.append(first)
+                sizes.append(size)
         defaults = self.space.defaults(device=device).expand_as(fixed)
         guesses = self.space.to_unit(torch.stack([fixed, defaults], dim=1))
+        of_block = (torch.tensor(owner), torch.tensor(begin), torch.tensor(sizes))
 
         compiled = self._has_kernel(batch)
 
         def shard(chosen: Tensor, _group: Tensor) -> WindowShard:
-            own, _ = windows.select(chosen)
-            chosen = chosen.to(device)
+            pair, first, count = (values[chosen] for values in of_block)
+            block = torch.arange(len(chosen)).repeat_interleave(count)
+            number = torch.arange(len(block)) - (count.cumsum(0) - count)[block]
+            used, place = torch.unique(pair, return_inverse=True)
+            used = used.to(device)
             return WindowShard(
                 self.solver,
                 self._code,
                 compiled,
-                batch[chosen].trimmed(),
-                pair=own.pair.to(device),
-                first=own.first.to(device),
+                batch[used].trimmed(),
+                pair=place[block].to(device),
+                first=((first[block] + number) * windows.settings.stride).to(device),
+                counts=tuple(count.tolist()),
                 length=windows.settings.length,
-                guesses=guesses[chosen],
+                guesses=guesses[used],
                 tolerance=tolerance,
             )
 
         title = "Per-window calibrated parameters (labels)"
-        results = self._cached(title, keys, counts, shard, **description)
+        results = self._cached(title, keys, sizes, shard, **description)
         joined = {}
         for name in results[0]:
             parts = np.concatenate([entry[name] for entry in results])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -153,16 +154,27 @@ class SegmentLosses:
     @torch.no_grad()
     def __call__(self, candidates: Tensor) -> Tensor:
         """Returns losses `(P, q)`, in the objective's unit, of candidates `(P, q, n)`."""
-        sums = self._accumulated(candidates)
+        # Candidates that all problems share, an expanded view, are converted once.
+        if candidates.stride(0) == 0:
+            candidates = candidates[:1]
+        return self.with_parameters(self._parameters(candidates))
+
+    @torch.no_grad()
+    def with_parameters(self, p: Mapping[str, Tensor]) -> Tensor:
+        """Returns losses `(P, q)`, in the objective's unit.
+
+        Args:
+            p: one tensor per parameter, in SI units, `()` or broadcasting to `(P, q)`.
+        """
+        sums = self.simulator.accumulate(self._segments(), p, self._terms, self._terms_key)
         if sums is not None:
             count = self.counted.sum(0).clamp(min=1)[:, None]
             return self.objective.finish(sums, count)
-        frames = self.simulate(candidates, gap="gap" in self.objective.signals)
+        frames = self._simulated(p, gap="gap" in self.objective.signals)
         return self.objective(frames, self.counted[..., None])
 
-    def _accumulated(self, candidates: Tensor) -> tuple[Tensor, ...] | None:
-        """Returns the objective's sums `(P, q)`; None where trajectories are needed."""
-        segments = Segments(
+    def _segments(self) -> Segments:
+        return Segments(
             leader_position=self.leader_position,
             leader_speed=self.leader_speed,
             leader_acceleration=self.leader_acceleration,
@@ -175,11 +187,6 @@ class SegmentLosses:
             speed=self.start_speed,
             acceleration=self.start_acceleration,
         )
-        # Candidates that all problems share, an expanded view, are converted once.
-        if candidates.stride(0) == 0:
-            candidates = candidates[:1]
-        p = self._parameters(candidates)
-        return self.simulator.accumulate(segments, p, self._terms, self._terms_key)
 
     def _terms(
         self, speed: Tensor, gap: Tensor, measured_speed: Tensor, measured_gap: Tensor
@@ -198,10 +205,15 @@ class SegmentLosses:
             candidates: `(P, q, n)` in unit space.
             gap: compute the simulated gap; without, it is NaN.
         """
-        follower = self.simulator.begin(self._start(candidates.shape[:2]))
-        _, position, speed = self.simulator.advance(
-            follower, self._leader(), self._parameters(candidates)
+        return self._simulated(self._parameters(candidates), gap=gap)
+
+    def _simulated(self, p: Mapping[str, Tensor], *, gap: bool) -> FrameValues:
+        """As `simulate`, of parameters by name."""
+        shape = torch.broadcast_shapes(  # type: ignore[no-untyped-call]  # torch leaves it untyped
+            (self.problems, 1), *[value.shape for value in p.values()]
         )
+        follower = self.simulator.begin(self._start(shape))
+        _, position, speed = self.simulator.advance(follower, self._leader(), p)
         simulated_gap = speed.new_tensor(torch.nan)
         if gap:
             simulated_gap = self.leader_rear[..., None] - position

@@ -8,6 +8,7 @@ Shapes: P pairs of a shard, T frames of the longest, W windows, K groups, n tune
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -222,6 +223,7 @@ class WindowShard(CalibrationShard):
 
     Attributes:
         pair, first: `(W,)`, the pair of each window and the frame that it starts from.
+        counts: windows of each entry of the cache.
         length: steps of a window.
         guesses: `(P, g, n)` in unit space, first guesses in each window of a pair.
         tolerance: losses this close are equal, in the objective's unit.
@@ -229,6 +231,7 @@ class WindowShard(CalibrationShard):
 
     pair: Tensor
     first: Tensor
+    counts: tuple[int, ...]
     length: int
     guesses: Tensor
     tolerance: float
@@ -238,8 +241,8 @@ class WindowShard(CalibrationShard):
         losses = self.segments(self.pair, self.first, steps)
         found = self.solver.minimize(losses, self.guesses[self.pair], report, self.tolerance)
         entries = []
-        for number in range(len(self.batch)):
-            own = (self.pair == number).cpu().numpy()
+        for last, count in zip(itertools.accumulate(self.counts), self.counts, strict=True):
+            own = slice(last - count, last)
             entries.append({name: values[own] for name, values in found.items()})
         return entries
 

@@ -64,8 +64,8 @@ class Split:
             windows.append(settings.count(len(pair)))
         return cls(torch.tensor(frames), torch.tensor(windows))
 
-    def __getitem__(self, index: Tensor) -> Split:
-        """Selects pairs by their numbers, `(D,)`."""
+    def __getitem__(self, index: Tensor | slice) -> Split:
+        """Selects pairs by their numbers, `(D,)`, or a slice of them."""
         return Split(self.frame[index], self.windows[index])
 
 

@@ -189,6 +189,7 @@ def test_an_interrupted_calibration_goes_on_where_it_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("cfx.calibration.calibrator._GROUP", 40)
+    monkeypatch.setattr("cfx.calibration.calibrator._BLOCK", 40)
     pairs = wavy_pairs(Krauss(), TRUE)
     whole = everything(calibrator(Counting()), pairs)
     interrupted = Counting(stop_after=3 + 80)
@@ -201,11 +202,31 @@ def test_an_interrupted_calibration_goes_on_where_it_stopped(
         assert torch.equal(one, two)
 
 
+def test_labels_of_more_windows_of_the_same_drivers_begin_with_those_that_are_known(
+    tmp_path: Path,
+) -> None:
+    pairs = wavy_pairs(Krauss(), TRUE)
+    batch = PairBatch.of(pairs)
+    fixed = Krauss().space.defaults().expand(3, -1)
+    few = Windows.of(torch.tensor([34, 33, 32]), SETTINGS)
+    many = Windows.of(torch.tensor([40, 40, 40]), SETTINGS)
+    known = calibrator(Counting(), tmp_path).labels(pairs, batch, few, fixed)
+    optimizer = Counting()
+    found = calibrator(optimizer, tmp_path).labels(pairs, batch, many, fixed)
+    # The first 32 windows of each are there; the eight that follow are calibrated.
+    assert optimizer.solved == 3 * 8
+    whole = calibrator(Counting()).labels(pairs, batch, many, fixed)
+    assert torch.equal(found.parameters, whole.parameters)
+    assert torch.equal(found.loss, whole.loss)
+    first = [0, 31, 34, 65, 67, 98]
+    assert torch.equal(known.loss[first], found.loss[[0, 31, 40, 71, 80, 111]])
+
+
 def test_a_damaged_entry_is_computed_again(tmp_path: Path) -> None:
     pairs = wavy_pairs(Krauss(), TRUE)
     everything(calibrator(Counting(), tmp_path), pairs)
     entries = sorted(tmp_path.rglob("*.entry"))
-    assert len(entries) == 6
+    assert len(entries) == 9  # a driver's parameters, and two blocks of labels
     entries[0].write_bytes(entries[0].read_bytes()[:50])
     entries[1].write_bytes(b"")
     np.savez(entries[2], parameters=np.array([object()], dtype=object), allow_pickle=True)
