@@ -273,30 +273,31 @@ def _about(
     """Returns `Evaluation.about`."""
     by_driver = style.table.set_index("driver")
     methods = [method for method in test if method != RECORDED]
-    parameters = {method: _mean_parameters(test[method]) for method in methods}
-    frames = next(iter(test.values())).counted.sum(1).tolist()
-    folds = [0] * len(pairs)
+    drivers = [pair.driver for pair in pairs]
+    clusters = by_driver["cluster"].loc[drivers].map(dict(enumerate(CLUSTERS)))
+    folds = np.zeros(len(pairs), dtype=np.int64)
     if fold is not None:
-        folds = fold.tolist()
-    rows = []
-    for i, pair in enumerate(pairs):
-        for method in methods:
-            row = {
-                "pair_id": pair.pair_id,
-                "recording": pair.recording,
-                "leader_id": pair.leader_id,
-                "follower_id": pair.follower_id,
-                "driver": pair.driver,
-                "cluster": CLUSTERS[by_driver["cluster"][pair.driver]],
-                "style_score": float(by_driver["score"][pair.driver]),
-                "fold": folds[i],
-                "method": method,
-                "frames": frames[i],
-            }
-            for k, name in enumerate(names):
-                row[f"parameter_{name}"] = float(parameters[method][i, k])
-            rows.append(row)
-    return pd.DataFrame(rows)
+        folds = fold.numpy()
+    of_pair = {
+        "pair_id": [pair.pair_id for pair in pairs],
+        "recording": [pair.recording for pair in pairs],
+        "leader_id": [pair.leader_id for pair in pairs],
+        "follower_id": [pair.follower_id for pair in pairs],
+        "driver": drivers,
+        "cluster": clusters.to_numpy(),
+        "style_score": by_driver["score"].loc[drivers].to_numpy(dtype=np.float64),
+        "fold": folds,
+    }
+    # A pair after the other, the methods in turn.
+    table = pd.DataFrame(of_pair).iloc[np.repeat(np.arange(len(pairs)), len(methods))]
+    table = table.reset_index(drop=True)
+    table["method"] = np.tile(np.asarray(methods, dtype=object), len(pairs))
+    frames = next(iter(test.values())).counted.sum(1).cpu().numpy()
+    table["frames"] = np.repeat(frames, len(methods))
+    parameters = np.stack([_mean_parameters(test[method]) for method in methods], 1)
+    for k, name in enumerate(names):
+        table[f"parameter_{name}"] = parameters[:, :, k].reshape(-1)
+    return table
 
 
 def _mean_parameters(trajectories: Trajectories) -> Array:

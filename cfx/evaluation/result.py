@@ -275,22 +275,23 @@ class Evaluation:
             gap_METHOD and, for each tuned parameter, NAME_METHOD. A pair's first row is the last
             measured state before the simulation takes over.
         """
-        tables = [self._trajectory_table(trajectory) for trajectory in self.trajectories]
-        return pd.concat(tables, ignore_index=True)
-
-    def _trajectory_table(self, trajectory: PairTrajectory) -> pd.DataFrame:
+        pieces = self.trajectories
         columns: dict[str, object] = {
-            "pair_id": trajectory.pair_id,
-            "time_s": trajectory.time,
-            "leader_speed": trajectory.leader_speed,
-            "real_speed": trajectory.real_speed,
-            "real_gap": trajectory.real_gap,
+            "pair_id": np.repeat(
+                np.array([one.pair_id for one in pieces], dtype=object),
+                [len(one.time) for one in pieces],
+            ),
+            "time_s": np.concatenate([one.time for one in pieces]),
+            "leader_speed": np.concatenate([one.leader_speed for one in pieces]),
+            "real_speed": np.concatenate([one.real_speed for one in pieces]),
+            "real_gap": np.concatenate([one.real_gap for one in pieces]),
         }
         for method in self.methods:
-            columns[f"speed_{method}"] = trajectory.speed[method]
-            columns[f"gap_{method}"] = trajectory.gap[method]
+            columns[f"speed_{method}"] = np.concatenate([one.speed[method] for one in pieces])
+            columns[f"gap_{method}"] = np.concatenate([one.gap[method] for one in pieces])
+            chosen = np.concatenate([one.parameters[method] for one in pieces])
             for k, name in enumerate(self.names):
-                columns[f"{name}_{method}"] = trajectory.parameters[method][:, k]
+                columns[f"{name}_{method}"] = chosen[:, k]
         return pd.DataFrame(columns)
 
 

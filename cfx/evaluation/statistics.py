@@ -15,6 +15,9 @@ _TRIMMED = 0.1
 
 _RESAMPLES = 9_999
 
+_AT_ONCE = 1_000_000
+"""Drivers in all resamples that are computed at once."""
+
 Floats = NDArray[np.float64]
 
 
@@ -115,6 +118,8 @@ def _interval(gain: Floats, who: NDArray[np.intp], seed: int) -> tuple[float, fl
         (np.bincount(who, gain), number),
         mean,
         n_resamples=_RESAMPLES,
+        # Alike for any number, but for the memory: they are drawn one after the other.
+        batch=max(1, _AT_ONCE // len(number)),
         paired=True,
         method="percentile",
         rng=np.random.default_rng(seed),
