@@ -18,6 +18,7 @@ from typing import Any, ClassVar, Protocol
 import lightning.pytorch as pl
 import pandas as pd
 import torch
+from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.pytorch.callbacks import ModelCheckpoint
 from torch import Tensor
 
@@ -230,24 +231,26 @@ def fit(
         callbacks.append(EveryEpoch(checkpoint))
     with torch.random.fork_rng(devices=devices):
         torch.manual_seed(seed)
-        trainer = pl.Trainer(
-            max_epochs=epochs,
-            accelerator="gpu" if is_gpu else "cpu",
-            devices=1,
-            logger=False,
-            callbacks=callbacks,
-            enable_checkpointing=checkpoint is not None,
-            enable_model_summary=False,
-            enable_progress_bar=False,
-            num_sanity_val_steps=0,
-            # Nothing random happens between batches, and they must come in order.
-            use_distributed_sampler=False,
-        )
         with warnings.catch_warnings(), one_thread():
             warnings.filterwarnings("ignore", module=r"lightning\.")
             # torch's compiler looks at everything that it is given.
             of_compiler = r"The \.grad attribute of a Tensor that is not a leaf"
             warnings.filterwarnings("ignore", message=of_compiler)
+            trainer = pl.Trainer(
+                max_epochs=epochs,
+                accelerator="gpu" if is_gpu else "cpu",
+                devices=1,
+                logger=False,
+                callbacks=callbacks,
+                # Jobs in a queue of Slurm are no parts of one training on many machines.
+                plugins=[LightningEnvironment()],
+                enable_checkpointing=checkpoint is not None,
+                enable_model_summary=False,
+                enable_progress_bar=False,
+                num_sanity_val_steps=0,
+                # Nothing random happens between batches, and they must come in order.
+                use_distributed_sampler=False,
+            )
             _run(trainer, module, data, checkpoint)
     module.restore_best()
     module.network.to(device).eval()
