@@ -9,7 +9,7 @@ from cfx.simulation.threads import cores
 
 
 class LocalEngine(Engine):
-    """Works in this process; work that uses one core runs in a process for each core.
+    """Works in this process; work that uses one core runs in a process for each core, this one too.
 
     `cores` says how many cores there are for it.
     """

@@ -6,14 +6,15 @@ no `if __name__ == "__main__"`. They share no lock with this process, as forked 
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import threading
 import time
 import warnings
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from typing import Any
+from typing import Any, Generic
 
 import loky
 from loky.backend import get_context
@@ -21,7 +22,7 @@ from loky.process_executor import BrokenProcessPool
 
 from cfx.engine.base import Report, ResultT, ShardT, Work
 from cfx.errors import EngineError
-from cfx.simulation.threads import limit_cores
+from cfx.simulation.threads import limit_cores, one_core, one_thread
 
 _LOOK = 0.5
 """Seconds between looks at the workers' progress."""
@@ -38,39 +39,23 @@ def in_processes(
 ) -> Generator[tuple[int, ResultT], None, None]:
     """Works on as many shards at once as there are processes; as `Engine.map`.
 
-    The workers end when the caller stops listening, is interrupted or dies.
+    This process is one of them: it has imported already what a worker has to import first. Each
+    time that its work reports progress, it looks after the others. They end when the caller stops
+    listening, is interrupted or dies.
 
     Args:
         work: uses one core.
         shards: made one after the other, as processes become free.
         report: called with the workers' progress, as it is made.
-        processes: how many at most.
+        processes: how many at most, two or more.
 
     Raises:
         EngineError: a worker was killed.
     """
-    # A worker that has grown is replaced by a new one, of which loky warns.
-    warnings.filterwarnings("ignore", message="A worker stopped while some jobs were given")
-    context = get_context("loky")
-    units = context.SimpleQueue()
-    pool = loky.ProcessPoolExecutor(
-        processes,
-        context=context,
-        initializer=_begin,
-        initargs=(units, os.getpid()),
-        # Threads that spin would slow down the other processes.
-        env={"OMP_NUM_THREADS": "1"},
-    )
-    running: dict[Future[ResultT], int] = {}
+    workers = _Workers(work, report, processes - 1)
     is_done = False
     try:
-        for number, shard in enumerate(shards):
-            running[pool.submit(_do, work, shard)] = number
-            if len(running) >= processes:
-                yield from _finished(running, units, report)
-        while running:
-            yield from _finished(running, units, report)
-        _drain(units, report)
+        yield from _work_along(work, enumerate(shards), workers)
         is_done = True
     except BrokenProcessPool as error:
         raise EngineError(
@@ -78,27 +63,104 @@ def in_processes(
             " time, and what was finished is kept"
         ) from error
     finally:
-        # A worker that ends by itself also ends what libraries have started in it.
-        pool.shutdown(wait=True, kill_workers=not is_done)
+        workers.end(kill=not is_done)
 
 
-def _finished(
-    running: dict[Future[ResultT], int], units: Any, report: Report
+def _work_along(
+    work: Work[ShardT, ResultT],
+    source: Iterator[tuple[int, ShardT]],
+    workers: _Workers[ShardT, ResultT],
 ) -> Generator[tuple[int, ResultT], None, None]:
-    """Yields what is done, at least one; it leaves `running`."""
-    done: set[Future[ResultT]] = set()
-    while not done:
-        done, _ = wait(running, timeout=_LOOK, return_when=FIRST_COMPLETED)
-        _drain(units, report)
-    for future in done:
-        number = running.pop(future)
-        yield number, future.result()
+    """Yields results of the workers and of this process."""
+
+    def look_after(units: int) -> None:
+        workers.report(units)
+        workers.check()
+        workers.hand_out(source)
+
+    workers.hand_out(source)
+    for number, shard in source:
+        with one_thread(), one_core():
+            result = work(shard, look_after)
+        yield number, result
+        yield from workers.finished()
+        workers.hand_out(source)
+    while workers.are_busy:
+        workers.wait()
+        yield from workers.finished()
+        workers.hand_out(source)
+    workers.report(0)
 
 
-def _drain(units: Any, report: Report) -> None:
-    """Reports what workers have done since."""
-    while not units.empty():
-        report(units.get())
+class _Workers(Generic[ShardT, ResultT]):
+    """Other processes, each at one shard.
+
+    Args:
+        work: what they do.
+        report: called with their progress.
+        count: how many at most.
+    """
+
+    def __init__(self, work: Work[ShardT, ResultT], report: Report, count: int) -> None:
+        # A worker that has grown is replaced by a new one, of which loky warns.
+        warnings.filterwarnings("ignore", message="A worker stopped while some jobs were given")
+        context = get_context("loky")
+        self._units = context.SimpleQueue()
+        self._pool = loky.ProcessPoolExecutor(
+            count,
+            context=context,
+            initializer=_begin,
+            initargs=(self._units, os.getpid()),
+            # Threads that spin would slow down the other processes.
+            env={"OMP_NUM_THREADS": "1"},
+        )
+        self._work = work
+        self._report = report
+        self._count = count
+        self._running: dict[Future[ResultT], int] = {}
+        # They import what they need while the first shard is made here.
+        for _ in range(count):
+            self._pool.submit(_import, work)
+
+    @property
+    def are_busy(self) -> bool:
+        """Whether some of their results are still to come, or to be fetched."""
+        return bool(self._running)
+
+    def hand_out(self, source: Iterator[tuple[int, ShardT]]) -> None:
+        """Gives a shard to each worker that is free."""
+        busy = sum(not future.done() for future in self._running)
+        for number, shard in itertools.islice(source, self._count - busy):
+            self._running[self._pool.submit(_do, self._work, shard)] = number
+
+    def report(self, units: int) -> None:
+        """Reports what was done here, and what workers have done since."""
+        self._report(units)
+        while not self._units.empty():
+            self._report(self._units.get())
+
+    def check(self) -> None:
+        """Raises what one of them has raised, though its result is not fetched yet."""
+        for future in self._running:
+            if future.done():
+                future.result()
+
+    def wait(self) -> None:
+        """Waits until one of them has a result."""
+        done: set[Future[ResultT]] = set()
+        while not done:
+            done, _ = wait(self._running, timeout=_LOOK, return_when=FIRST_COMPLETED)
+            self.report(0)
+
+    def finished(self) -> Iterator[tuple[int, ResultT]]:
+        """Yields what is there."""
+        for future in [one for one in self._running if one.done()]:
+            number = self._running.pop(future)
+            yield number, future.result()
+
+    def end(self, *, kill: bool) -> None:
+        """Ends them; one that ends by itself also ends what libraries have started in it."""
+        self._pool.shutdown(wait=True, kill_workers=kill)
 
 
 def _begin(units: Any, job: int) -> None:
@@ -115,6 +177,10 @@ def _end_with(job: int) -> None:
     while os.getppid() == job:
         time.sleep(_ORPHAN)
     os._exit(1)
+
+
+def _import(_work: Work[ShardT, ResultT]) -> None:
+    """Imports the module of some work, which is found as the work arrives."""
 
 
 def _do(work: Work[ShardT, ResultT], shard: ShardT) -> ResultT:

@@ -35,6 +35,17 @@ def own_cores(count: int) -> None:
     _OWN[:] = [count]
 
 
+@contextmanager
+def one_core() -> Iterator[None]:
+    """Shares no work in the block: other processes use the other cores."""
+    before = list(_LIMIT)
+    _LIMIT[:] = [1]
+    try:
+        yield
+    finally:
+        _LIMIT[:] = before
+
+
 def cores() -> int:
     """Returns how many cores this process shares work among."""
     if hasattr(os, "sched_getaffinity"):

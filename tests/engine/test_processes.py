@@ -63,3 +63,44 @@ def test_workers_end_with_the_job(how: signal.Signals, tmp_path: Path) -> None:
     while any(map(_is_running, workers)) and time.monotonic() < deadline:
         time.sleep(0.1)
     assert not any(map(_is_running, workers))
+
+
+_SHARED = """
+import os, time
+from cfx.engine.processes import in_processes
+
+def work(shard, report):
+    for _ in range(40):
+        time.sleep(0.1)
+        report(1)
+    if shard == "broken":
+        raise ValueError("broken")
+    return os.getpid()
+
+units = []
+found = dict(in_processes(work, ["a", "b", "c"], units.append, 2))
+assert sorted(found) == [0, 1, 2]
+assert os.getpid() in found.values(), "this process works too"
+assert len(set(found.values())) == 2
+assert sum(units) == 120
+try:
+    # The worker takes the first shard.
+    list(in_processes(work, ["broken", *"abcdefghij"], units.append, 2))
+except ValueError as error:
+    print(error)
+"""
+
+
+@pytest.mark.slow
+def test_this_process_works_beside_the_workers_and_hears_of_their_errors(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(_SHARED)
+    root = Path(__file__).parents[2]
+    ran = subprocess.run(
+        [sys.executable, str(script)],
+        env={"PYTHONPATH": str(root), "PATH": "/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ran.stdout == "broken\n", ran.stderr

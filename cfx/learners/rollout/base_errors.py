@@ -3,30 +3,27 @@
 The improvement over constant parameters is what an evaluation reports, and some trajectories are
 much harder to follow than others.
 
-Shapes: P pairs, N networks (each member of an ensemble counts), B drivers of the network that has
-most, D trajectories of each network, W windows of the longest pair, n tuned parameters, K simulated
-frames.
+Shapes: U recorded pairs, N networks (each member of an ensemble counts), B drivers of the network
+that has most, D trajectories of each network, W windows of the longest pair, n parameters that
+bases have, R pairs with a base each, C most bases of one pair.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from cfx.calibration.losses import SegmentLosses
 from cfx.learners.base import TrainingData
 from cfx.learners.rollout.batch import RolloutBatch
 from cfx.learners.rollout.dataset import RolloutDataset
-from cfx.models.base import Leader
-from cfx.objectives.base import FrameValues
 from cfx.objectives.rmse import GapRmse
-from cfx.pairs import PairBatch
-from cfx.simulation.trajectory import Start
 
-_TABLE = 4_000_000
-"""Vehicle steps of one part of a table of errors, which bounds its memory to some hundred MB."""
+_AT_ONCE = 1_000_000
+"""Frames of all segments that are simulated at once, which bounds the memory to some 100 MB."""
 
 _LEAST_GAP = 1.0
 """m: added to the gap's error of the base, as the objective's floor is to the objective's:
@@ -53,50 +50,74 @@ class Divisors(NamedTuple):
 class BaseErrors:
     """The objective and the gap's RMSE of constant parameters, side by side in the last dimension.
 
+    Networks share pairs, and often bases too: each pair is simulated once with each of its bases.
+
     Attributes:
-        with_history: of each driver's base over the horizon from each window on, `(N, B, W, 2)`.
-        cold_start: the same of the pooled base.
-        full_trajectory: of the pooled base over the whole training part, `(N, B, 2)`.
+        over_windows: over the horizon from each window on, `(R, W, 2)`.
+        over_pair: over the whole training part, `(R, 2)`; of pooled bases alone.
+        own: the row of each place's driver with their base, `(N, B)`.
+        pooled: with the base of drivers without one of their own.
         floor: added to the objective.
         has_unit: whether the objective grows with the trajectories' scale.
     """
 
-    with_history: Tensor
-    cold_start: Tensor
-    full_trajectory: Tensor
+    over_windows: Tensor
+    over_pair: Tensor
+    own: Tensor
+    pooled: Tensor
     floor: float
     has_unit: bool
 
     @classmethod
     def of(cls, training_data: TrainingData, dataset: RolloutDataset, horizon: int) -> BaseErrors:
-        """Simulates the bases; `horizon` in windows."""
-        stride, drivers = training_data.windows.stride, dataset.pair.shape[1]
-        frames = torch.arange(dataset.tokens.shape[1], device=dataset.pair.device) * stride
-        near = _ConstantParameters(training_data, dataset.batch, horizon * stride)
-        far = _ConstantParameters(training_data, dataset.batch, int(dataset.last.max()))
-        # The members of an ensemble have the same bases.
-        first = slice(None, None, dataset.ensemble_size)
-        pair, own = dataset.pair[first].flatten(), dataset.base[first].flatten(0, 1)
-        pooled = dataset.pooled[first].repeat_interleave(drivers, 0)
-        with_history = _placed(near.errors(pair, own, frames), dataset)
-        cold_start = with_history
-        if training_data.base is not None:
-            cold_start = _placed(near.errors(pair, pooled, frames), dataset)
-        full_trajectory = _placed(far.errors(pair, pooled, frames[:1]), dataset)[:, :, 0]
+        """Simulates the bases, in the precision of the training data; `horizon` in windows."""
+        networks, drivers = dataset.pair.shape
+        own = dataset.base
+        pooled = dataset.pooled[:, None].expand(-1, drivers, -1)
+        if training_data.base is None:
+            pooled = own
+        pair = torch.cat([dataset.pair, dataset.pair], 1)[..., None].to(own.dtype)
+        wanted = torch.cat([pair, torch.cat([own, pooled], 1)], -1)
+        rows, row = torch.unique(wanted.flatten(0, 1), dim=0, return_inverse=True)
+        row = row.view(networks, 2 * drivers)
+        bases = _Bases.of(rows[:, 0].long(), rows[:, 1:], len(dataset.batch))
+        simulation = _ConstantParameters(training_data, dataset, bases)
+        stride = training_data.windows.stride
+        frames = torch.arange(dataset.tokens.shape[1], device=own.device) * stride
+        over_windows = simulation.errors(frames, horizon * stride)
+        over_pair = simulation.errors(frames[:1], int(dataset.last.max()))[:, 0]
         objective = training_data.objective
-        has_unit = bool(objective.unit)
-        return cls(with_history, cold_start, full_trajectory, objective.floor, has_unit)
+        return cls(
+            over_windows,
+            over_pair,
+            row[:, :drivers],
+            row[:, drivers:],
+            objective.floor,
+            bool(objective.unit),
+        )
+
+    def only(self, networks: slice) -> BaseErrors:
+        """Returns the errors of some networks."""
+        used = torch.cat([self.own[networks], self.pooled[networks]], 1)
+        rows, row = torch.unique(used, return_inverse=True)
+        drivers = self.own.shape[1]
+        return replace(
+            self,
+            over_windows=self.over_windows[rows],
+            over_pair=self.over_pair[rows],
+            own=row[:, :drivers],
+            pooled=row[:, drivers:],
+        )
 
     def over_horizon(self, batch: RolloutBatch) -> Divisors:
         """Returns the divisors over the horizon from where each trajectory begins."""
-        places = (batch.row, batch.place, batch.start)
-        cold_start = batch.cold_start[..., None]
-        errors = torch.where(cold_start, self.cold_start[places], self.with_history[places])
-        return self._divisors(errors, batch)
+        own, pooled = self.own[batch.row, batch.place], self.pooled[batch.row, batch.place]
+        row = torch.where(batch.cold_start, pooled, own)
+        return self._divisors(self.over_windows[row, batch.start], batch)
 
     def over_full_trajectory(self, batch: RolloutBatch) -> Divisors:
         """Returns the divisors over each trajectory from the first frame to the last."""
-        return self._divisors(self.full_trajectory[batch.row, batch.place], batch)
+        return self._divisors(self.over_pair[self.pooled[batch.row, batch.place]], batch)
 
     def _divisors(self, errors: Tensor, batch: RolloutBatch) -> Divisors:
         """Takes the errors `(N, D, 2)` of unscaled trajectories."""
@@ -108,79 +129,87 @@ class BaseErrors:
         return Divisors((objective + self.floor).clamp(min=_LEAST_DIVISOR), gap + _LEAST_GAP)
 
 
-def _placed(errors: Tensor, dataset: RolloutDataset) -> Tensor:
-    """Arranges errors of the ensembles' drivers in order as `(N, B, windows, 2)`."""
-    networks, drivers = dataset.pair.shape
-    of_ensembles = errors.view(networks // dataset.ensemble_size, drivers, -1, 2)
-    return of_ensembles.repeat_interleave(dataset.ensemble_size, 0)
+class _Bases(NamedTuple):
+    """The bases of each pair, as candidates of one simulation.
+
+    Attributes:
+        unit: in unit space, `(U, C, n)`; a pair with fewer bases has one of them several times.
+        pair, place: where each of the R bases stands, `(R,)`.
+    """
+
+    unit: Tensor
+    pair: Tensor
+    place: Tensor
+
+    @classmethod
+    def of(cls, pair: Tensor, unit: Tensor, pairs: int) -> _Bases:
+        """Arranges bases.
+
+        Args:
+            pair: which pair each base is of, in order, `(R,)`.
+            unit: in unit space, `(R, n)`.
+            pairs: U.
+        """
+        count = torch.bincount(pair, minlength=pairs)
+        first = count.cumsum(0) - count
+        place = torch.arange(len(pair), device=pair.device) - first[pair]
+        of_pair = torch.arange(int(count.max()), device=pair.device)
+        chosen = first[:, None] + torch.minimum(of_pair, count[:, None] - 1)
+        return cls(unit[chosen], pair, place)
 
 
 class _ConstantParameters:
-    """Simulates constant parameters from many frames on, `steps` frames each."""
+    """Simulates all bases of all pairs from some frames on."""
 
-    def __init__(self, training_data: TrainingData, batch: PairBatch, steps: int) -> None:
+    def __init__(self, training_data: TrainingData, dataset: RolloutDataset, bases: _Bases) -> None:
         self.simulator = training_data.simulator
         self.objective = training_data.objective
-        self.gap_rmse = GapRmse()
-        self.batch = batch
-        self.steps = steps
-        self.last = training_data.split.frame.to(batch.lengths.device)
+        self.batch = training_data.batch[dataset.recorded]
+        frame = training_data.split.frame.to(dataset.recorded.device)
+        self.last = frame[dataset.recorded]
+        self.bases = bases
 
     @torch.no_grad()
-    def errors(self, pair: Tensor, unit: Tensor, windows: Tensor) -> Tensor:
-        """Returns the objective and the gap's RMSE over `steps` frames, `(R, windows, 2)`.
+    def errors(self, frames: Tensor, steps: int) -> Tensor:
+        """Returns the objective and the gap's RMSE, `(R, F, 2)`, in single precision.
 
         Args:
-            pair: which pair each of R rows is of, `(R,)`.
-            unit: parameters in unit space, `(R, n)`.
-            windows: frames at which trajectories begin, `(windows,)`.
+            frames: at which trajectories begin, `(F,)`.
+            steps: how many each lasts at most.
         """
-        size = max(1, _TABLE // (len(windows) * self.steps))
+        size = max(1, _AT_ONCE // (len(frames) * steps))
         parts = []
-        for first in range(0, len(pair), size):
-            rows = slice(first, first + size)
-            parts.append(self._part(pair[rows], unit[rows], windows))
-        return torch.cat(parts)
+        for first in range(0, len(self.last), size):
+            parts.append(self._part(slice(first, first + size), frames, steps).float())
+        return torch.cat(parts)[self.bases.pair, :, self.bases.place]
 
-    def _part(self, pair: Tensor, unit: Tensor, windows: Tensor) -> Tensor:
-        batch, end = self.batch, self.batch.mask.shape[1] - 1
-        shape = (len(pair), len(windows))
-        rows, first = pair[:, None].expand(shape), windows.clamp(max=end).expand(shape)
-        frames = (windows + torch.arange(self.steps + 1, device=pair.device)[:, None])[:, None]
-        index = frames.clamp(max=end).expand(-1, *shape)
-        start = Start(
-            batch.follower_position[rows, first],
-            batch.follower_speed[rows, first],
-            batch.follower_acceleration[rows, first],
+    def _part(self, which: slice, frames: Tensor, steps: int) -> Tensor:
+        """Returns the errors of some pairs, `(pairs, F, C, 2)`."""
+        last, unit = self.last[which], self.bases.unit[which]
+        pairs, windows, bases = len(last), len(frames), unit.shape[1]
+        pair = torch.arange(pairs, device=last.device).repeat_interleave(windows)
+        first = frames.repeat(pairs)
+        losses = SegmentLosses.of_segments(
+            self.simulator,
+            self.objective,
+            self.batch[which],
+            pair,
+            first.clamp(max=self.batch.mask.shape[1] - 1),
+            (last[pair] - first).clamp(0, steps),
         )
-        length, leader_position = batch.leader_length[rows], batch.leader_position[rows, index]
-        leader = Leader(
-            leader_position[:-1],
-            batch.leader_speed[rows, index[:-1]],
-            batch.leader_acceleration[rows, index[:-1]],
-            length,
-        )
-        parameters = self._by_name(unit)
-        _, position, speed = self.simulator.advance(self.simulator.begin(start), leader, parameters)
-        values = FrameValues(
-            speed=speed,
-            gap=leader_position[1:] - length - position,
-            measured_speed=batch.follower_speed[rows, index[1:]],
-            measured_gap=batch.gap[rows, index[1:]],
-            dt=self.simulator.dt,
-        )
-        counted = (frames[1:] <= self.last[pair][:, None]).to(speed.dtype)
-        objective = self.objective(values, counted)
-        return torch.stack([objective, self.gap_rmse(values, counted)], -1)
+        # Whether a kernel pays is asked for all parts together.
+        work = len(self.last) * windows * steps * bases
+        losses = replace(losses, simulator=self.simulator.for_work(work))
+        p = self._by_name(unit.to(losses.counted.dtype), windows)
+        objective = losses.with_parameters(p)
+        gap = replace(losses, objective=GapRmse()).with_parameters(p)
+        return torch.stack([objective, gap], -1).view(pairs, windows, bases, 2)
 
-    def _by_name(self, unit: Tensor) -> dict[str, Tensor]:
-        """Returns the model's parameters by name, those that differ between rows as `(R, 1)`.
+    def _by_name(self, unit: Tensor, windows: int) -> dict[str, Tensor]:
+        """Returns the model's parameters by name, those that differ as `(pairs windows, C)`.
 
         What heads answer beyond them stands behind them, and is left out.
         """
         space = self.simulator.model.adaptation_space
-        unit = unit[..., : len(space)]
-        named = {}
-        for name, value in space.unpack(space.from_unit(unit)).items():
-            named[name] = value[:, None] if value.dim() else value
-        return named
+        values = space.from_unit(unit[..., : len(space)]).repeat_interleave(windows, 0)
+        return {name: value.contiguous() for name, value in space.unpack(values).items()}

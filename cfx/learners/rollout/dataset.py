@@ -1,8 +1,9 @@
 """What closed-loop training learns from: drivers placed on networks, with their bases and inputs.
 
-Shapes: P pairs of the training data, N networks (each member of an ensemble counts), E ensembles, B
-drivers of the network that has most, D trajectories of each network, W windows of the longest pair,
-f features of a token, n tuned parameters, k driver features, c = n + k features of conditioning.
+Shapes: P pairs of the training data, U recorded pairs among them, N networks (each member of an
+ensemble counts), E ensembles, B drivers of the network that has most, D trajectories of each
+network, W windows of the longest pair, f features of a token, n tuned parameters, k driver
+features, c = n + k features of conditioning.
 """
 
 from __future__ import annotations
@@ -54,18 +55,22 @@ class Conditioning(NamedTuple):
 class RolloutDataset:
     """The training data, placed as N networks by B drivers, in single precision.
 
+    Networks learn from the same recordings, which the training data holds once for each network.
+    Here each is held once.
+
     Attributes:
-        batch: the P pairs.
-        pair: which of them stands at each place, `(N, B)`.
+        batch: the U pairs.
+        recorded: which of the P pairs each is, `(U,)`.
+        pair: which of the U pairs stands at each place, `(N, B)`.
         trains, validates: what a place is used for, bool `(N, B)`.
         until: last frame that training may use, `(N, B)`.
         last: last frame of the training part, `(N, B)`.
         base: each driver's base in unit space, `(N, B, n)`.
         pooled: the base of drivers without one of their own, in unit space, `(N, n)`.
-        tokens: measured, `(P, W, f)`.
-        driver_features: from each driver's whole training part, `(P, k)`; NaN where too little was
+        tokens: measured, `(U, W, f)`.
+        driver_features: from each driver's whole training part, `(U, k)`; NaN where too little was
             measured.
-        time_gap: each driver's usual one, `(P,)`, s.
+        time_gap: each driver's usual one, `(U,)`, s.
         scaler: normalises tokens and conditioning, f + c features; alike for all members of an
             ensemble.
         ensemble_size: networks of an ensemble, which stand behind one another.
@@ -74,6 +79,7 @@ class RolloutDataset:
     """
 
     batch: PairBatch
+    recorded: Tensor
     pair: Tensor
     trains: Tensor
     validates: Tensor
@@ -112,11 +118,12 @@ class RolloutDataset:
         """
         if head is None:
             head = OffsetHead.for_model(training_data.simulator.model)
-        batch = _single_precision(training_data.batch)
+        recorded, row = _recorded_once(training_data)
+        batch = _single_precision(training_data.batch[recorded])
         device = batch.lengths.device
         space, fixed = head.space, head.completed(training_data.fixed)
         grid = Grid(training_data.network.to(device), len(training_data.names))
-        pairs = torch.arange(len(batch), device=device)
+        pairs = torch.arange(len(row), device=device)
         pair = grid.scatter(pairs).repeat_interleave(ensemble_size, 0)
         present = grid.scatter(torch.ones_like(pairs)).bool().repeat_interleave(ensemble_size, 0)
         pooled = grid.mean(space.to_unit(fixed)).float()
@@ -129,26 +136,30 @@ class RolloutDataset:
             base = space.to_unit(fixed).float()
         else:
             base = space.to_unit(head.completed(training_data.base)).float()
-        seen = _measured_tokens(training_data, policy, batch)
-        driver_features = _driver_features(training_data, policy, batch)
+        frame = training_data.split.frame.to(device)[recorded]
+        seen = _measured_tokens(training_data, policy, batch, frame)
+        driver_features = _driver_features(training_data, policy, batch, frame)
+        of_driver = row[pair]
         # Whatever a member of the ensemble trains on counts, so that all members share one scaler.
         trained_by_any = trains.view(-1, ensemble_size, trains.shape[1]).any(1)
         first = slice(None, None, ensemble_size)
         windows = torch.arange(seen.shape[1], device=device) * training_data.windows.stride
         counted = trained_by_any[..., None] & (windows <= until[first, :, None])
-        scaler = _scaler(seen, base, driver_features, pair[first], counted)
+        placed = base[pair]
+        scaler = _scaler(seen, placed[first], driver_features, of_driver[first], counted)
         return cls(
             batch=batch,
-            pair=pair,
+            recorded=recorded,
+            pair=of_driver,
             trains=trains,
             validates=present & (few | kept) & (share > 0),
             until=until,
             last=last,
-            base=base[pair],
+            base=placed,
             pooled=pooled.repeat_interleave(ensemble_size, 0),
             tokens=seen,
             driver_features=driver_features,
-            time_gap=usual_time_gap(batch, training_data.split.frame.to(device)),
+            time_gap=usual_time_gap(batch, frame),
             scaler=Scaler(
                 scaler.mean.repeat_interleave(ensemble_size, 0),
                 scaler.scale.repeat_interleave(ensemble_size, 0),
@@ -156,15 +167,16 @@ class RolloutDataset:
             ensemble_size=ensemble_size,
         )
 
-    def only(self, networks: slice) -> tuple[RolloutDataset, Tensor]:
-        """Returns some of all networks, and which pairs they learn from.
+    def only(self, networks: slice) -> RolloutDataset:
+        """Returns some of all networks.
 
         What is sampled for a network does not depend on which others stand beside it.
         """
         rows, pair = torch.unique(self.pair[networks], return_inverse=True)
-        part = replace(
+        return replace(
             self,
             batch=self.batch[rows],
+            recorded=self.recorded[rows],
             pair=pair,
             trains=self.trains[networks],
             validates=self.validates[networks],
@@ -179,7 +191,6 @@ class RolloutDataset:
             networks=networks,
             total=len(self.pair),
         )
-        return part, rows
 
     def lots(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
         """Returns uniform random numbers from 0 to 1 for these networks, `(N, *shape)`.
@@ -273,6 +284,31 @@ class RolloutDataset:
         return Conditioning(pair, base, features)
 
 
+def _recorded_once(training_data: TrainingData) -> tuple[Tensor, Tensor]:
+    """Finds pairs that stand for all that are equal to them.
+
+    Equal are pairs with the same signals and the same training part, as of one driver that several
+    networks learn from.
+
+    Returns:
+        Which of the P pairs these are, `(U,)`, and which one of these stands for each, `(P,)`.
+    """
+    batch = training_data.batch
+    frame = training_data.split.frame.to(batch.lengths.device)
+    marks = [frame.double(), batch.lengths.double(), batch.leader_length.double()]
+    for name in SIGNALS:
+        marks.append(getattr(batch, name).sum(1).double())
+    _, group = torch.unique(torch.stack(marks, 1), dim=0, return_inverse=True)
+    number = torch.arange(len(group), device=group.device)
+    first = torch.full_like(number, len(group)).scatter_reduce(0, group, number, "amin")
+    recorded, row = torch.unique(first[group], return_inverse=True)
+    for name in SIGNALS:
+        signal = getattr(batch, name)
+        if not torch.equal(signal[recorded][row], signal):  # equal sums of others by chance
+            return number, number
+    return recorded, row
+
+
 def usual_time_gap(batch: PairBatch, last: Tensor) -> Tensor:
     """Returns each driver's median time gap while they move, `(P,)`, s.
 
@@ -336,19 +372,22 @@ def _single_precision(batch: PairBatch) -> PairBatch:
     return replace(batch, **changed)
 
 
-def _measured_tokens(training_data: TrainingData, policy: Policy, batch: PairBatch) -> Tensor:
-    """Returns the tokens of all windows of the training parts, `(P, W, f)`."""
+def _measured_tokens(
+    training_data: TrainingData, policy: Policy, batch: PairBatch, last: Tensor
+) -> Tensor:
+    """Returns the tokens of all windows of the training parts, `(U, W, f)`."""
     device = batch.lengths.device
-    end = int(training_data.split.frame.max()) + 1
+    end = int(last.max()) + 1
     windows = torch.arange(0, end, training_data.windows.stride, device=device)
     pairs = torch.arange(len(batch), device=device)[:, None]
     history = measured_history(batch, pairs, windows, training_data.windows.length)
     return tokens(history, policy.inputs, policy.summary)
 
 
-def _driver_features(training_data: TrainingData, policy: Policy, batch: PairBatch) -> Tensor:
-    """Returns the driver features that networks read, `(P, k)`."""
-    until = training_data.split.frame.to(batch.lengths.device)
+def _driver_features(
+    training_data: TrainingData, policy: Policy, batch: PairBatch, until: Tensor
+) -> Tensor:
+    """Returns the driver features that networks read, `(U, k)`."""
     if not policy.driver_features:
         return until.new_empty((len(batch), 0), dtype=torch.float32)
     since = torch.zeros_like(until)
@@ -359,21 +398,25 @@ def _driver_features(training_data: TrainingData, policy: Policy, batch: PairBat
 def _scaler(
     seen: Tensor, base: Tensor, driver_features: Tensor, pair: Tensor, counted: Tensor
 ) -> Scaler:
-    """Measures the scaler of each ensemble.
+    """Measures the scaler of each ensemble, one after the other: their windows are many.
 
     Args:
-        seen: tokens, `(P, W, f)`.
-        base: in unit space, `(P, n)`.
-        driver_features: `(P, k)`, NaN where unknown.
+        seen: tokens, `(U, W, f)`.
+        base: of each place in unit space, `(E, B, n)`.
+        driver_features: `(U, k)`, NaN where unknown.
         pair: which pair stands at each place, `(E, B)`.
         counted: windows that are trained on, bool `(E, B, W)`.
     """
     windows = seen.shape[1]
-    squashed = coordinates(base)[:, None].expand(-1, windows, -1)
-    of_base = Scaler.of(torch.cat([seen, squashed], -1)[pair], counted)
-    known = driver_features.isnan().logical_not().all(-1)[pair]
-    values = driver_features.nan_to_num()[pair, None].expand(-1, -1, windows, -1)
-    of_driver = Scaler.of(values, counted & known[..., None])
-    mean = torch.cat([of_base.mean, of_driver.mean], -1)
-    scale = torch.cat([of_base.scale, of_driver.scale], -1)
-    return Scaler(mean, scale)
+    known = driver_features.isnan().logical_not().all(-1)
+    means, scales = [], []
+    for number, own in enumerate(pair):
+        squashed = coordinates(base[number])[:, None].expand(-1, windows, -1)
+        windows_counted = counted[number]
+        of_base = Scaler.of(torch.cat([seen[own], squashed], -1)[None], windows_counted[None])
+        values = driver_features[own].nan_to_num()[:, None].expand(-1, windows, -1)
+        is_known = windows_counted & known[own][:, None]
+        of_driver = Scaler.of(values[None], is_known[None])
+        means.append(torch.cat([of_base.mean, of_driver.mean], -1))
+        scales.append(torch.cat([of_base.scale, of_driver.scale], -1))
+    return Scaler(torch.cat(means), torch.cat(scales))

@@ -12,7 +12,7 @@ Shapes: N networks (each member of an ensemble counts), n tuned parameters.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -30,13 +30,16 @@ from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResu
 from cfx.learners.batched import warn_of_nothing_learned
 from cfx.learners.rollout.augmentation import Augmentation
 from cfx.learners.rollout.checkpoint import checkpoint_path
-from cfx.learners.rollout.dataset import RolloutDataset
+from cfx.learners.rollout.dataset import RolloutDataset, usual_time_gap
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.learners.rollout.shard import (
     TrainedShard,
     TrainingShard,
     cut,
     epochs,
+    expert_checkpoint,
+    networks_of_shards,
+    shard_checkpoints,
     train,
     untrained,
 )
@@ -109,22 +112,27 @@ class RolloutLearner(Learner):
             curves = pd.DataFrame(columns=CURVE_COLUMNS)
             return self._result(network.eval(), dataset, training_data, curves)
         checkpoint = self.checkpoint(policy, training_data)
-        shards = list(cut(s, policy, training_data, dataset, network, checkpoint))
-        curves, dispersion = self._train(shards, training_data.engine, network, dataset)
-        for shard in shards:
-            for file in shard.files:
+        networks = networks_of_shards(s, dataset)
+        shards = cut(s, policy, training_data, dataset, network, networks, checkpoint)
+        curves, dispersion = self._train(
+            shards, len(networks), training_data.engine, network, dataset
+        )
+        for file in shard_checkpoints(checkpoint, networks):
+            if file is not None:
                 file.unlink(missing_ok=True)
+                expert_checkpoint(file).unlink(missing_ok=True)
         found = self._result(network.eval(), dataset, training_data, curves)
         return replace(found, dispersion=dispersion)
 
     def _train(
         self,
-        shards: Sequence[TrainingShard],
+        shards: Iterable[TrainingShard],
+        count: int,
         engine: Engine,
         network: PolicyNetwork,
         dataset: RolloutDataset,
     ) -> tuple[pd.DataFrame, Tensor | None]:
-        """Trains all networks in place.
+        """Trains all networks in place, in `count` shards.
 
         Returns:
             The learning curves, and the dispersion of each ensemble's noise; None for a head
@@ -132,12 +140,11 @@ class RolloutLearner(Learner):
         """
         at_most = epochs(self.settings)
         title = f"Training ({len(dataset.pair)} networks, at most {at_most} epochs)"
-        alone = len(shards) == 1
-        with Task(title, at_most * len(shards)) as task:
+        with Task(title, at_most * count) as task:
             trained: dict[int, TrainedShard] = dict(
-                engine.map(train, shards, task.advance, shares_cores=alone)
+                engine.map(train, shards, task.advance, shares_cores=count == 1)
             )
-        in_order = [trained[number] for number in range(len(shards))]
+        in_order = [trained[number] for number in range(count)]
         weights = {}
         for name in network.state_dict():
             weights[name] = torch.cat([found.weights[name] for found in in_order])
@@ -170,7 +177,9 @@ class RolloutLearner(Learner):
         augment = None
         if has_cold_starts:
             generator = torch.Generator().manual_seed(training_data.seed)
-            augment = Augmentation(self.settings, dataset.time_gap, generator)
+            last = training_data.split.frame.to(training_data.batch.lengths.device)
+            time_gap = usual_time_gap(training_data.batch, last)
+            augment = Augmentation(self.settings, time_gap, generator)
         return replace(found, valid_range=learned_range(training_data, augment))
 
     def checkpoint(self, policy: Policy, training_data: TrainingData) -> Path | None:

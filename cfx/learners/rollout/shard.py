@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -54,8 +54,9 @@ class TrainingShard:
     Attributes:
         settings: of the learner.
         policy: the component that built the networks.
-        training_data: of these networks alone.
-        dataset: the same, placed; it knows which of all networks these are.
+        training_data: names and seed of these networks, and what simulates them; without pairs.
+        dataset: their pairs, placed; it knows which of all networks these are.
+        errors: of their bases.
         weights: of the untrained networks.
         expert_weights: of their untrained experts; None: without distillation.
         checkpoint: the file from which interrupted training goes on; None: no such file.
@@ -65,16 +66,10 @@ class TrainingShard:
     policy: Policy
     training_data: TrainingData
     dataset: RolloutDataset
+    errors: BaseErrors
     weights: dict[str, Tensor]
     expert_weights: dict[str, Tensor] | None
     checkpoint: Path | None
-
-    @property
-    def files(self) -> tuple[Path, ...]:
-        """What training leaves behind so that it can go on."""
-        if self.checkpoint is None:
-            return ()
-        return self.checkpoint, self.checkpoint.with_suffix(".expert.ckpt")
 
 
 @dataclass(frozen=True)
@@ -106,9 +101,32 @@ def networks_of_shards(settings: RolloutSettings, dataset: RolloutDataset) -> li
     ensembles = networks // dataset.ensemble_size
     count = 1
     if windows >= _WORTH_A_PROCESS and dataset.pair.device.type == "cpu":
-        count = min(ensembles, max(2, math.ceil(trajectories / _TRAJECTORIES)))
+        count = _even(ensembles, max(2, math.ceil(trajectories / _TRAJECTORIES)))
     size = math.ceil(ensembles / count) * dataset.ensemble_size
     return [slice(first, min(first + size, networks)) for first in range(0, networks, size)]
+
+
+def _even(ensembles: int, count: int) -> int:
+    """Returns how many shards at least `count` keep two cores busy to the end."""
+
+    def longest(shards: int) -> int:
+        size = math.ceil(ensembles / shards)
+        return size * math.ceil(math.ceil(ensembles / size) / 2)
+
+    counts = range(min(count, ensembles), min(2 * count, ensembles) + 1)
+    return min(counts, key=longest)
+
+
+def shard_checkpoints(checkpoint: Path | None, shards: Sequence[slice]) -> list[Path | None]:
+    """Returns the file of each shard, beside that of the whole training; None: no such file."""
+    if checkpoint is None or len(shards) == 1:
+        return [checkpoint] * len(shards)
+    return [checkpoint.with_suffix(f".{one.start}-{one.stop}.ckpt") for one in shards]
+
+
+def expert_checkpoint(checkpoint: Path) -> Path:
+    """Returns the file of a shard's experts."""
+    return checkpoint.with_suffix(".expert.ckpt")
 
 
 def cut(
@@ -117,9 +135,12 @@ def cut(
     training_data: TrainingData,
     dataset: RolloutDataset,
     network: PolicyNetwork,
+    shards: Sequence[slice],
     checkpoint: Path | None,
 ) -> Iterator[TrainingShard]:
     """Yields the shards of a training; a training that is not cut is one shard.
+
+    What all shards need is computed once, before the first.
 
     Args:
         settings: of the learner.
@@ -127,28 +148,28 @@ def cut(
         training_data: of all networks.
         dataset: of all networks.
         network: all networks, untrained.
-        checkpoint: of the whole training; each shard has a file of its own beside it.
+        shards: which networks train together (`networks_of_shards`).
+        checkpoint: of the whole training.
     """
-    slices = networks_of_shards(settings, dataset)
+    errors = BaseErrors.of(training_data, dataset, settings.horizon)
     experts = None
     if settings.distillation_epochs:
         expert_data, expert_dataset = _for_experts(training_data, dataset)
         generator = torch.Generator().manual_seed(training_data.seed)
         head = OffsetHead.for_model(expert_data.simulator.model)
         experts = untrained(policy, expert_dataset, head, generator)
-    for networks in slices:
-        part, rows = dataset.only(networks)
-        own = checkpoint
-        if checkpoint is not None and len(slices) > 1:
-            own = checkpoint.with_suffix(f".{networks.start}-{networks.stop}.ckpt")
+    files = shard_checkpoints(checkpoint, shards)
+    for networks, file in zip(shards, files, strict=True):
+        is_whole = len(shards) == 1
         yield TrainingShard(
             settings=settings,
             policy=policy,
-            training_data=_of_rows(training_data, part, rows, networks),
-            dataset=part,
+            training_data=_of_networks(training_data, dataset.ensemble_size, networks),
+            dataset=dataset if is_whole else dataset.only(networks),
+            errors=errors if is_whole else errors.only(networks),
             weights=_weights(network, networks),
             expert_weights=None if experts is None else _weights(experts, networks),
-            checkpoint=own,
+            checkpoint=file,
         )
 
 
@@ -160,23 +181,19 @@ def _weights(network: PolicyNetwork, networks: slice) -> dict[str, Tensor]:
     return weights
 
 
-def _of_rows(
-    training_data: TrainingData, part: RolloutDataset, rows: Tensor, networks: slice
-) -> TrainingData:
-    """Returns the training data of some networks, whose pairs are `rows`."""
-    size = part.ensemble_size
-    first, last = networks.start // size, networks.stop // size
-    at = rows.to(training_data.fixed.device)
+def _of_networks(training_data: TrainingData, ensemble_size: int, networks: slice) -> TrainingData:
+    """Returns what is said of some networks; their pairs are left to the dataset."""
+    names = slice(networks.start // ensemble_size, networks.stop // ensemble_size)
     base = training_data.base
     return replace(
         training_data,
-        batch=part.batch,
-        split=training_data.split[rows.to(training_data.split.frame.device)],
-        fixed=training_data.fixed[at],
-        base=None if base is None else base[at],
+        batch=training_data.batch[:0],
+        split=training_data.split[:0],
+        fixed=training_data.fixed[:0],
+        base=None if base is None else base[:0],
         labels=None,
-        network=training_data.network[rows.to(training_data.network.device)] - first,
-        names=training_data.names[first:last],
+        network=training_data.network[:0],
+        names=training_data.names[names],
         drivers=None,
         workspace=None,
         engine=LocalEngine(),
@@ -205,24 +222,22 @@ def train(shard: TrainingShard, report: Report) -> TrainedShard:
     head = HEADS[s.head].for_model(training_data.simulator.model)
     network = untrained(shard.policy, dataset, head)
     network.load_state_dict(shard.weights)
-    errors = BaseErrors.of(training_data, dataset, s.horizon)
-    checkpoint, expert_checkpoint = None, None
-    if shard.files and _has_place(shard.files[0]):
-        checkpoint, expert_checkpoint = shard.files
+    if shard.checkpoint is not None and not _has_place(shard.checkpoint):
+        shard = replace(shard, checkpoint=None)
     expert = None
     if s.distillation_epochs:
-        expert = _expert(shard, errors, expert_checkpoint, progress.one_more)
+        expert = _expert(shard, progress.one_more)
     module = RolloutModule(
         network,
         dataset,
         shard.policy,
         training_data,
         s,
-        errors,
+        shard.errors,
         expert,
         on_epoch=progress.one_more,
     )
-    _fit(module, checkpoint)
+    _fit(module, shard.checkpoint)
     progress.end()
     dispersion = module.fit_dispersion()
     return TrainedShard(module.network.state_dict(), module.curves(), dispersion)
@@ -297,12 +312,7 @@ def _expert_settings(settings: RolloutSettings) -> RolloutSettings:
     return settings.model_copy(update=changes)
 
 
-def _expert(
-    shard: TrainingShard,
-    errors: BaseErrors,
-    checkpoint: Path | None,
-    on_epoch: Callable[[], None],
-) -> Expert:
+def _expert(shard: TrainingShard, on_epoch: Callable[[], None]) -> Expert:
     """Returns experts trained on the same trajectories; from the checkpoint if it is there."""
     assert shard.expert_weights is not None
     expert_data, expert_dataset = _for_experts(shard.training_data, shard.dataset)
@@ -315,9 +325,12 @@ def _expert(
         shard.policy,
         expert_data,
         _expert_settings(shard.settings),
-        errors,
+        shard.errors,
         on_epoch=on_epoch,
     )
+    checkpoint = None
+    if shard.checkpoint is not None:
+        checkpoint = expert_checkpoint(shard.checkpoint)
     _fit(module, checkpoint)
     module.network.requires_grad_(False)
     return Expert(module.training_window, expert_dataset)

@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 import torch
 
+from cfx.learners.rollout import base_errors
 from cfx.learners.rollout.base_errors import BaseErrors
+from cfx.learners.rollout.batch import RolloutBatch
+from cfx.learners.rollout.dataset import RolloutDataset
+from cfx.models.krauss import Krauss
 from cfx.objectives.rmse import GapRmse
 from cfx.objectives.theil import TheilU
+from cfx.simulation.rollout import MemoryStepper
 from tests.learners.made import TRUE, batch_of, gru, loop, placed, training_data, untrained
 
 
@@ -16,14 +22,15 @@ def test_errors_of_the_base_are_those_of_constant_parameters() -> None:
     data = training_data(networks=1, base=TRUE)
     errors = BaseErrors.of(data, placed(data, gru(), 0.0), 12)
     # The true parameters drive as the drivers did.
-    assert float(errors.with_history[..., :30, 0].max()) < 1e-3
+    with_history = errors.over_windows[errors.own]
+    assert float(with_history[..., :30, 0].max()) < 1e-3
     result = untrained(replace(data, base=None), gru())
     found = loop(result, data, gru())
     squares = (found.speed - data.batch.follower_speed).square()[:, 1:]
     near = {"rtol": 1e-3, "atol": 1e-3}
-    full = errors.full_trajectory[0, :, 0].double()
+    full = errors.over_pair[errors.pooled][0, :, 0].double()
     torch.testing.assert_close(full, squares.mean(1).sqrt(), **near)
-    horizon = errors.cold_start[0, :, 0, 0].double()
+    horizon = errors.over_windows[errors.pooled][0, :, 0, 0].double()
     torch.testing.assert_close(horizon, squares[:, :60].mean(1).sqrt(), **near)
 
 
@@ -32,8 +39,8 @@ def test_errors_are_those_of_the_jobs_objective() -> None:
     dataset = placed(data, gru(), 0.0)
     speed = BaseErrors.of(data, dataset, 12)
     gap = BaseErrors.of(replace(data, objective=GapRmse()), dataset, 12)
-    assert torch.equal(gap.cold_start[..., 0], speed.cold_start[..., 1])
-    assert torch.equal(gap.cold_start[..., 1], speed.cold_start[..., 1])
+    assert torch.equal(gap.over_windows[..., 0], speed.over_windows[..., 1])
+    assert torch.equal(gap.over_windows[..., 1], speed.over_windows[..., 1])
     assert (speed.floor, gap.floor) == (0.2, 1.0)
 
 
@@ -49,3 +56,63 @@ def test_divisors_grow_with_the_scale_of_a_trajectory_where_the_objective_has_a_
     torch.testing.assert_close(two.gap - 1.0, 2.0 * (one.gap - 1.0))
     theil = BaseErrors.of(replace(data, objective=TheilU()), dataset, 12)
     assert torch.equal(theil.over_horizon(batch).objective, theil.over_horizon(scaled).objective)
+
+
+def test_networks_that_share_pairs_and_bases_share_their_errors() -> None:
+    data = training_data(networks=3, base=TRUE.repeat(3, 1))
+    dataset = placed(data, gru(), 0.0)
+    assert len(dataset.batch) == 6
+    errors = BaseErrors.of(data, dataset, 12)
+    assert len(errors.over_windows) == 12
+    assert torch.equal(errors.own[0], errors.own[2])
+    one = data.split.frame[:6].clone()
+    one[0] = 120  # one network's training part of a pair ends earlier
+    split = replace(data.split, frame=torch.cat([one, data.split.frame[6:]]))
+    assert len(placed(replace(data, split=split), gru(), 0.0).batch) == 7
+
+
+def test_errors_of_some_networks_are_those_of_all() -> None:
+    fixed = torch.tensor([[4.0, 0.8], [3.0, 0.5], [2.0, 0.2]]).double().repeat_interleave(6, 0)
+    data = training_data(networks=3, base=TRUE.repeat(3, 1), fixed=fixed)
+    dataset = placed(data, gru(), 0.0)
+    whole = BaseErrors.of(data, dataset, 12)
+    part, networks = whole.only(slice(1, 3)), dataset.only(slice(1, 3))
+    assert len(part.over_windows) == 18
+    batch = _everywhere(networks)
+    for one, two in zip(
+        part.over_horizon(batch), whole.over_horizon(_everywhere(dataset)), strict=True
+    ):
+        assert torch.equal(one, two[1:])
+    for one, two in zip(
+        part.over_full_trajectory(batch),
+        whole.over_full_trajectory(_everywhere(dataset)),
+        strict=True,
+    ):
+        assert torch.equal(one, two[1:])
+
+
+def test_a_kernel_finds_the_errors_that_pytorch_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = training_data(networks=2, base=TRUE.repeat(2, 1))
+    dataset = placed(data, gru(), 0.0)
+    eager = BaseErrors.of(
+        replace(data, simulator=MemoryStepper(Krauss(), 0.1, compile="never")), dataset, 12
+    )
+    kernel = BaseErrors.of(
+        replace(data, simulator=MemoryStepper(Krauss(), 0.1, compile="always")), dataset, 12
+    )
+    torch.testing.assert_close(kernel.over_windows, eager.over_windows)
+    torch.testing.assert_close(kernel.over_pair, eager.over_pair)
+    # However many pairs are simulated at once.
+    monkeypatch.setattr(base_errors, "_AT_ONCE", 1)
+    apart = BaseErrors.of(data, dataset, 12)
+    torch.testing.assert_close(apart.over_windows, eager.over_windows)
+
+
+def _everywhere(dataset: RolloutDataset) -> RolloutBatch:
+    """Returns a cold start and another trajectory of each driver."""
+    networks, drivers = dataset.pair.shape
+    place = torch.arange(drivers).repeat(2).expand(networks, -1)
+    start = torch.arange(2 * drivers).expand(networks, -1)
+    cold_start = (torch.arange(2 * drivers) < drivers).expand(networks, -1)
+    last, weight = dataset.last.repeat(1, 2), torch.ones_like(place).float()
+    return RolloutBatch(place, start, cold_start, last, weight)

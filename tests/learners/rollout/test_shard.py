@@ -152,6 +152,12 @@ def test_small_trainings_are_not_cut() -> None:
     ]
 
 
+def test_shards_keep_two_cores_busy_to_the_end() -> None:
+    assert [shard._even(6, count) for count in (2, 3, 4)] == [2, 6, 6]
+    assert [shard._even(11, count) for count in (2, 4, 6)] == [2, 4, 6]
+    assert [shard._even(count, 4) for count in (1, 3, 4)] == [1, 3, 4]
+
+
 _SCRIPT = """
 import torch
 from cfx.learners.rollout import RolloutLearner, shard
