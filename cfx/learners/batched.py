@@ -3,7 +3,7 @@
 The sum of N losses trains every network by its own loss. Gradients are clipped, the best epoch is
 chosen and training stops for each network on its own.
 
-Shapes: P pairs, N networks, B drivers of the network that has most, n tuned parameters.
+Shapes: N networks.
 """
 
 from __future__ import annotations
@@ -22,37 +22,12 @@ from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.pytorch.callbacks import ModelCheckpoint
 from torch import Tensor
 
-from cfx.agents.placement import driver_places
 from cfx.files import atomic_write
 from cfx.learners.base import CURVE_COLUMNS
-from cfx.learners.curves import networks_without_loss
 from cfx.policies.base import PolicyNetwork
 from cfx.simulation.threads import one_thread
 
 log = logging.getLogger(__name__)
-
-
-class Grid:
-    """Places P pairs as N networks by B drivers."""
-
-    def __init__(self, network: Tensor, networks: int) -> None:
-        """Takes which network learns from each pair, `(P,)`."""
-        self.network = network
-        self.place = driver_places(network)
-        self.shape = (networks, int(self.place.max()) + 1)
-
-    def scatter(self, values: Tensor) -> Tensor:
-        """Arranges `(P, ...)` as `(N, B, ...)`, zero where a network has fewer drivers."""
-        grid = values.new_zeros((*self.shape, *values.shape[1:]))
-        grid[self.network, self.place] = values
-        return grid
-
-    def mean(self, values: Tensor) -> Tensor:
-        """Returns the mean of `(P, n)` over each network's pairs, `(N, n)`."""
-        networks = self.shape[0]
-        total = values.new_zeros((networks, values.shape[1]))
-        total = total.index_add_(0, self.network, values)
-        return total / torch.bincount(self.network, minlength=networks)[:, None]
 
 
 class Training(Protocol):
@@ -254,18 +229,6 @@ def fit(
             _run(trainer, module, data, checkpoint)
     module.restore_best()
     module.network.to(device).eval()
-
-
-def warn_of_nothing_learned(curves: pd.DataFrame) -> None:
-    """Warns of networks whose loss was never a number."""
-    lost = networks_without_loss(curves)
-    if lost:
-        log.warning(
-            "%d of %d networks have learned nothing: their training loss is not a number in any"
-            " epoch (curves.parquet); their parameters are those that training began with",
-            len(lost),
-            curves["network"].nunique(),
-        )
 
 
 class EveryEpoch(ModelCheckpoint):

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 import pandas as pd
+
+log = logging.getLogger(__name__)
 
 
 def over_networks(curves: pd.DataFrame, column: str) -> pd.DataFrame:
@@ -42,3 +46,15 @@ def networks_without_loss(curves: pd.DataFrame) -> list[str]:
     losses = curves["train_loss"].astype(float).replace([np.inf, -np.inf], np.nan)
     measured = losses.groupby(curves["network"]).count()
     return [str(name) for name in measured.index[measured == 0]]
+
+
+def warn_of_nothing_learned(curves: pd.DataFrame) -> None:
+    """Warns of networks whose loss was never a number."""
+    lost = networks_without_loss(curves)
+    if lost:
+        log.warning(
+            "%d of %d networks have learned nothing: their training loss is not a number in any"
+            " epoch (curves.parquet); their parameters are those that training began with",
+            len(lost),
+            curves["network"].nunique(),
+        )

@@ -19,8 +19,9 @@ import torch
 from cfx.agents.heads.offset import NONE
 from cfx.calibration.windows import Split, WindowSettings
 from cfx.learners.base import TrainingData
-from cfx.learners.rollout import RolloutModule, RolloutSettings
+from cfx.learners.rollout import RolloutSettings
 from cfx.learners.rollout.dataset import RolloutDataset
+from cfx.learners.rollout.module import RolloutModule
 from cfx.models.base import DrivingModel
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99

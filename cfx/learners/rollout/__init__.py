@@ -1,15 +1,14 @@
 """Learning through the simulation: the learner `rollout`.
 
-From the settings down: `learner` puts a training together, `module` takes gradient steps,
-`sampling` chooses trajectories of the `dataset`, `loop` simulates them window by window (`step`),
-`loss` and `base_errors` judge them, `gradients` says which way back gradients take, and
-`distillation` lets experts help.
+From the settings down: `learner` puts a training together, `shard` cuts it, `train` trains a part
+of it, and `module` takes gradient steps, for which `sampling` chooses trajectories of the
+`dataset`. `loop` simulates them window by window (`step`), `loss` and `base_errors` judge them,
+`gradients` says which way back gradients take, and `distillation` lets experts help.
 """
 
 from __future__ import annotations
 
 from cfx.learners.rollout.learner import RolloutLearner
-from cfx.learners.rollout.module import RolloutModule
 from cfx.learners.rollout.settings import RolloutSettings
 
-__all__ = ["RolloutLearner", "RolloutModule", "RolloutSettings"]
+__all__ = ["RolloutLearner", "RolloutSettings"]

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from cfx.component import content_key, folder_hash
-from cfx.learners import batched
+from cfx.learners import base
 from cfx.learners.base import TrainingData
 from cfx.policies.base import Policy
 
@@ -30,7 +30,7 @@ def checkpoint_path(
         "model": training_data.simulator.model.identity(),
         "objective": training_data.objective.identity(),
         "windows": training_data.windows.model_dump(),
-        "code": folder_hash(batched.__file__),
+        "code": folder_hash(base.__file__),
         "trajectories": _digest(training_data),
         "names": training_data.names,
         "drivers": training_data.drivers,

@@ -18,7 +18,7 @@ from cfx.agents.heads.base import ParameterHead
 from cfx.agents.heads.offset import OffsetHead, coordinates
 from cfx.agents.scaler import Scaler
 from cfx.learners.base import TrainingData
-from cfx.learners.batched import Grid
+from cfx.learners.grid import Grid
 from cfx.learners.rollout.batch import RolloutBatch
 from cfx.pairs import SIGNALS, PairBatch
 from cfx.policies.base import Policy

@@ -27,7 +27,7 @@ from cfx.agents.scaler import Scaler
 from cfx.component import Settings
 from cfx.engine.base import Engine
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
-from cfx.learners.batched import warn_of_nothing_learned
+from cfx.learners.curves import warn_of_nothing_learned
 from cfx.learners.rollout.augmentation import Augmentation
 from cfx.learners.rollout.checkpoint import checkpoint_path
 from cfx.learners.rollout.dataset import RolloutDataset, usual_time_gap
@@ -40,7 +40,6 @@ from cfx.learners.rollout.shard import (
     expert_checkpoint,
     networks_of_shards,
     shard_checkpoints,
-    train,
     untrained,
 )
 from cfx.learners.situations import learned_range
@@ -139,6 +138,9 @@ class RolloutLearner(Learner):
             without noise.
         """
         at_most = epochs(self.settings)
+        # Where nothing is trained, its imports would only take time and memory.
+        from cfx.learners.rollout.train import train
+
         title = f"Training ({len(dataset.pair)} networks, at most {at_most} epochs)"
         with Task(title, at_most * count) as task:
             trained: dict[int, TrainedShard] = dict(

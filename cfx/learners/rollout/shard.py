@@ -1,4 +1,4 @@
-"""Training of some of the networks: in this process, in another one, or on another machine.
+"""Some of the networks and what they learn from: trained here, in another process or elsewhere.
 
 Networks are independent: each learns from its own loss. So a training is cut into shards of some
 networks each, and what a network learns does not depend on where its shard is trained.
@@ -8,11 +8,8 @@ Shapes: N networks (each member of an ensemble counts), D trajectories of each.
 
 from __future__ import annotations
 
-import logging
 import math
-import os
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,23 +17,16 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from cfx.agents.heads import HEADS
 from cfx.agents.heads.base import ParameterHead
 from cfx.agents.heads.offset import OffsetHead
-from cfx.engine.base import Report
 from cfx.engine.local import LocalEngine
 from cfx.learners.base import TrainingData
-from cfx.learners.batched import fit
 from cfx.learners.rollout.base_errors import BaseErrors
 from cfx.learners.rollout.dataset import RolloutDataset
-from cfx.learners.rollout.distillation import Expert
-from cfx.learners.rollout.module import RolloutModule, StepNumbers
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.models.direct import Direct
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.simulation.rollout import MemoryStepper
-
-log = logging.getLogger(__name__)
 
 _TRAJECTORIES = 3_000
 """Of a shard's gradient step at most. A window costs as much per trajectory with 1,500 of them as
@@ -154,7 +144,7 @@ def cut(
     errors = BaseErrors.of(training_data, dataset, settings.horizon)
     experts = None
     if settings.distillation_epochs:
-        expert_data, expert_dataset = _for_experts(training_data, dataset)
+        expert_data, expert_dataset = for_experts(training_data, dataset)
         generator = torch.Generator().manual_seed(training_data.seed)
         head = OffsetHead.for_model(expert_data.simulator.model)
         experts = untrained(policy, expert_dataset, head, generator)
@@ -203,55 +193,8 @@ def _of_networks(training_data: TrainingData, ensemble_size: int, networks: slic
 def epochs(settings: RolloutSettings) -> int:
     """Returns how many epochs a shard trains at most, those of experts among them."""
     if settings.distillation_epochs:
-        return settings.epochs + _expert_settings(settings).epochs
+        return settings.epochs + expert_settings(settings).epochs
     return settings.epochs
-
-
-def train(shard: TrainingShard, report: Report) -> TrainedShard:
-    """Trains the networks of a shard.
-
-    Training goes on from the shard's checkpoint, and leaves it behind. Where there is no place for
-    it, as on a worker without the job's disk, an interrupted training begins again.
-
-    Args:
-        shard: which networks, and what they learn from.
-        report: called with how many epochs are done.
-    """
-    progress = _Epochs(report, epochs(shard.settings))
-    dataset, training_data, s = shard.dataset, shard.training_data, shard.settings
-    head = HEADS[s.head].for_model(training_data.simulator.model)
-    network = untrained(shard.policy, dataset, head)
-    network.load_state_dict(shard.weights)
-    if shard.checkpoint is not None and not _has_place(shard.checkpoint):
-        shard = replace(shard, checkpoint=None)
-    expert = None
-    if s.distillation_epochs:
-        expert = _expert(shard, progress.one_more)
-    module = RolloutModule(
-        network,
-        dataset,
-        shard.policy,
-        training_data,
-        s,
-        shard.errors,
-        expert,
-        on_epoch=progress.one_more,
-    )
-    _fit(module, shard.checkpoint)
-    progress.end()
-    dispersion = module.fit_dispersion()
-    return TrainedShard(module.network.state_dict(), module.curves(), dispersion)
-
-
-def _has_place(checkpoint: Path) -> bool:
-    """Says whether the folder of a checkpoint can be written to; makes it."""
-    folder = checkpoint.parent
-    with suppress(OSError):
-        folder.mkdir(parents=True, exist_ok=True)
-    if os.access(folder, os.W_OK):
-        return True
-    log.warning("%s cannot be written to: if this training is interrupted, it begins again", folder)
-    return False
 
 
 def untrained(
@@ -276,34 +219,8 @@ def untrained(
     return policy.build(features, default, start, generator).to(dataset.pair.device)
 
 
-class _Epochs:
-    """Reports epochs, in the end all that were planned."""
-
-    def __init__(self, report: Report, planned: int) -> None:
-        self.report = report
-        self.left = planned
-
-    def one_more(self) -> None:
-        self.left -= 1
-        self.report(1)
-
-    def end(self) -> None:
-        self.report(self.left)
-
-
-def _fit(module: RolloutModule, checkpoint: Path | None) -> None:
-    s = module.settings
-    fit(
-        module,
-        StepNumbers(s.steps),
-        epochs=s.epochs,
-        seed=module.sampler.seed,
-        device=module.dataset.pair.device,
-        checkpoint=checkpoint,
-    )
-
-
-def _expert_settings(settings: RolloutSettings) -> RolloutSettings:
+def expert_settings(settings: RolloutSettings) -> RolloutSettings:
+    """Returns how the experts of networks are trained."""
     changes = {
         "head": OffsetHead.name,
         "distillation_epochs": 0,
@@ -312,31 +229,7 @@ def _expert_settings(settings: RolloutSettings) -> RolloutSettings:
     return settings.model_copy(update=changes)
 
 
-def _expert(shard: TrainingShard, on_epoch: Callable[[], None]) -> Expert:
-    """Returns experts trained on the same trajectories; from the checkpoint if it is there."""
-    assert shard.expert_weights is not None
-    expert_data, expert_dataset = _for_experts(shard.training_data, shard.dataset)
-    head = OffsetHead.for_model(expert_data.simulator.model)
-    network = untrained(shard.policy, expert_dataset, head)
-    network.load_state_dict(shard.expert_weights)
-    module = RolloutModule(
-        network,
-        expert_dataset,
-        shard.policy,
-        expert_data,
-        _expert_settings(shard.settings),
-        shard.errors,
-        on_epoch=on_epoch,
-    )
-    checkpoint = None
-    if shard.checkpoint is not None:
-        checkpoint = expert_checkpoint(shard.checkpoint)
-    _fit(module, checkpoint)
-    module.network.requires_grad_(False)
-    return Expert(module.training_window, expert_dataset)
-
-
-def _for_experts(
+def for_experts(
     training_data: TrainingData, dataset: RolloutDataset
 ) -> tuple[TrainingData, RolloutDataset]:
     """Returns what experts learn from: the same trajectories, to be driven by `Direct`."""

@@ -12,7 +12,8 @@ import torch
 
 from cfx.errors import ConfigError
 from cfx.learners.base import TrainingResult
-from cfx.learners.rollout import RolloutLearner, RolloutModule
+from cfx.learners.rollout import RolloutLearner
+from cfx.learners.rollout.module import RolloutModule
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.objectives.base import Objective

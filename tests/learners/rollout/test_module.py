@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from cfx.agents.heads.offset import coordinates
-from cfx.learners.rollout import RolloutLearner, RolloutModule, RolloutSettings
+from cfx.learners.rollout import RolloutLearner, RolloutSettings
 from cfx.learners.rollout.batch import RolloutBatch
 from cfx.learners.rollout.gradients import NoGradients
 from cfx.learners.rollout.loop import burn_in, simulate
-from cfx.learners.rollout.module import DISPERSIONS
+from cfx.learners.rollout.module import DISPERSIONS, RolloutModule
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.policies.driver_features import measure

@@ -16,6 +16,7 @@ import torch
 from cfx.engine.base import Engine, Report
 from cfx.learners.base import TrainingData, TrainingResult
 from cfx.learners.rollout import RolloutLearner, shard
+from cfx.learners.rollout import train as training
 from cfx.learners.rollout.dataset import RolloutDataset
 from cfx.learners.rollout.shard import networks_of_shards
 from cfx.simulation import threads
@@ -108,8 +109,8 @@ def test_an_interrupted_shard_goes_on_and_finished_ones_are_not_done_again(
 
             return train(one, stop)
 
-    train = shard.train
-    monkeypatch.setattr("cfx.learners.rollout.learner.train", Broken())
+    train = training.train
+    monkeypatch.setattr("cfx.learners.rollout.train.train", Broken())
     learner = RolloutLearner(**SHORT)
     monkeypatch.setattr(shard, "_WORTH_A_PROCESS", 0)
     monkeypatch.setattr(threads, "_LIMIT", [1])
@@ -161,6 +162,7 @@ def test_shards_keep_two_cores_busy_to_the_end() -> None:
 _SCRIPT = """
 import torch
 from cfx.learners.rollout import RolloutLearner, shard
+from cfx.learners.rollout import train as training
 from cfx.simulation.threads import limit_cores
 from tests.learners.made import TRUE, gru, training_data
 from tests.learners.rollout.test_shard import SHORT
