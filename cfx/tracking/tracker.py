@@ -335,6 +335,7 @@ class MlflowTracker(Tracker):
         self._log_artifacts(sorted(folder.iterdir()), "policy")
         with (
             translate_errors("log the policy as a model"),
+            _requirements_as_they_are(),
             tempfile.TemporaryDirectory() as temporary,
         ):
             import mlflow
@@ -424,6 +425,27 @@ def _run_name(config: JobConfig, names: Mapping[str, str]) -> str:
     if config.tracking.sweep is not None:
         parts.append(f"seed{config.seed}")
     return "-".join([*parts, names["optimizer"], names["data"]])
+
+
+@contextmanager
+def _requirements_as_they_are() -> Iterator[None]:
+    """Keeps MLflow from comparing a model's requirements with what is installed.
+
+    They name the versions that are installed. MLflow reads the file lists of all distributions for
+    that, half a second, to print a warning.
+    """
+    from mlflow.utils import environment
+
+    name = "warn_dependency_requirement_mismatches"
+    before = getattr(environment, name, None)
+    if before is None:
+        yield
+        return
+    setattr(environment, name, lambda _requirements: None)
+    try:
+        yield
+    finally:
+        setattr(environment, name, before)
 
 
 def _dataset_name(name: str, source: str) -> str:
