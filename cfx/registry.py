@@ -421,21 +421,37 @@ def _warn_of_deprecated(found: Entry, cls: type[Component], settings: BaseModel)
             log.warning("%s of %s is deprecated: %s", path, found, field.deprecation_message)
 
 
-def _search_path() -> tuple[tuple[str, float], ...]:
+def _search_path() -> tuple[tuple[str, ...], ...]:
     """Returns what changes when a distribution is installed.
 
     With it as a key of a cache, a new plugin is seen without a restart.
     """
-    changed = []
+    found = []
     for folder in sys.path:
         if folder and Path(folder).exists():
-            changed.append((folder, Path(folder).stat().st_mtime))
-    return tuple(changed)
+            found.append(_metadata_in(folder, Path(folder).stat().st_mtime))
+    return tuple(found)
+
+
+@functools.lru_cache(maxsize=64)
+def _metadata_in(folder: str, changed: float) -> tuple[str, ...]:
+    """Returns a folder and the metadata of distributions that lie in it, with their times.
+
+    Other files come and go where a job is started: they announce nothing.
+    """
+    found = [folder]
+    try:
+        for path in sorted(Path(folder).iterdir()):
+            if path.suffix in {".dist-info", ".egg-info", ".egg-link", ".egg"}:
+                found.append(f"{path.name} {path.stat().st_mtime}")
+    except OSError:  # such as an archive, which says nothing of its parts
+        found.append(str(changed))
+    return tuple(found)
 
 
 @functools.lru_cache(maxsize=1)
 def _announced(
-    search_path: tuple[tuple[str, float], ...],  # noqa: ARG001 - the cache's key
+    search_path: tuple[tuple[str, ...], ...],  # noqa: ARG001 - the cache's key
 ) -> dict[str, tuple[Entry, ...]]:
     """Returns the entries of every kind, sorted."""
     found: dict[str, list[Entry]] = {name: [] for name in KINDS}

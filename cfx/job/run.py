@@ -38,6 +38,8 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
         "Model %s, policy %s, learner %s, protocol %s, data %s: starting",
         *[node.get("name") for node in _chosen(config)],
     )
+    # An engine that is not installed is told at once too; it connects to nothing yet.
+    registry.create("engine", config.engine)
     pairs = load_pairs(cast("Dataset", registry.create("dataset", config.data)))
     from cfx.job.steps import take_steps
 

@@ -1,7 +1,7 @@
 """How work is shared among threads, and how many of them PyTorch uses.
 
 Threads of ours sleep while they have nothing to do. PyTorch's own spin, which slows down whatever
-else wants the core.
+else wants the core. PyTorch is imported where it is needed: engines are made before it.
 """
 
 from __future__ import annotations
@@ -13,8 +13,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
-
-import torch
 
 log = logging.getLogger(__name__)
 
@@ -57,6 +55,8 @@ def cores() -> int:
 
 def set_threads(count: int) -> None:
     """Sets how many threads PyTorch uses: no more than this process has cores, with a warning."""
+    import torch
+
     available = cores()
     if count > available:
         log.warning(
@@ -104,6 +104,8 @@ def one_thread() -> Iterator[None]:
     second thread for each costs more than it brings, and thirty times more where another program
     wants the same core.
     """
+    import torch
+
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
