@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
+import sys
+
 import psutil  # type: ignore[import-untyped]  # it ships no types
 
 from cfx.errors import ConfigError
@@ -30,6 +33,19 @@ def require_memory(needed: float, what: str) -> None:
 def total_memory() -> float:
     """Returns this machine's memory, bytes."""
     return float(psutil.virtual_memory().total)
+
+
+def give_back() -> None:
+    """Gives the system back what is free in this process, such as what reading a file has needed.
+
+    Arrow keeps it otherwise, and so does glibc.
+    """
+    arrow = sys.modules.get("pyarrow")
+    if arrow is not None:
+        arrow.default_memory_pool().release_unused()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+    if trim is not None:
+        trim(0)
 
 
 def is_out_of_memory(error: BaseException) -> bool:

@@ -14,7 +14,7 @@ from cfx.objectives.base import FrameValues, Objective
 from cfx.pairs import PairBatch
 from cfx.simulation.base import Stepper
 from cfx.simulation.kernel.keys import ComponentKey
-from cfx.simulation.trajectory import Segments, Start
+from cfx.simulation.trajectory import Segments, Start, common_shape
 
 _NOT_BATCHED = ("simulator", "objective")
 """Fields of `SegmentLosses` that all its segments share."""
@@ -209,9 +209,7 @@ class SegmentLosses:
 
     def _simulated(self, p: Mapping[str, Tensor], *, gap: bool) -> FrameValues:
         """As `simulate`, of parameters by name."""
-        shape = torch.broadcast_shapes(  # type: ignore[no-untyped-call]  # torch leaves it untyped
-            (self.problems, 1), *[value.shape for value in p.values()]
-        )
+        shape = common_shape([(self.problems, 1), *[value.shape for value in p.values()]])
         follower = self.simulator.begin(self._start(shape))
         _, position, speed = self.simulator.advance(follower, self._leader(), p)
         simulated_gap = speed.new_tensor(torch.nan)

@@ -19,6 +19,7 @@ from cfx.datasets.resample import resampled
 from cfx.datasets.tracks import summed
 from cfx.errors import DataError, PluginError, nearest
 from cfx.files import absolute
+from cfx.memory import give_back
 from cfx.pairs import SIGNALS, Dropped, Pair, PairSet
 from cfx.storage import is_url, local_copies
 
@@ -200,6 +201,7 @@ class Dataset(Component):
             PluginError: `read` gives anything but pairs of finite numbers.
         """
         pairs = self.read()
+        give_back()
         self._check(pairs)
         if not len(pairs):
             raise DataError(f"{pairs.source}: no leader-follower pair found{_why(pairs.dropped)}")

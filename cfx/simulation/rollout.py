@@ -32,7 +32,7 @@ from cfx.simulation.kernel.keys import ComponentKey
 from cfx.simulation.step import advance_vehicle
 from cfx.simulation.threads import one_thread
 from cfx.simulation.tiles import Tile, tile_size, tiles
-from cfx.simulation.trajectory import Segments, Start, Terms, Trajectory
+from cfx.simulation.trajectory import Segments, Start, Terms, Trajectory, common_shape
 
 Compile = Literal["auto", "always", "never"]
 _Parameters = dict[str, Tensor]
@@ -350,8 +350,7 @@ def _batch(
     for _, _, p in windows:
         for value in p.values():
             shapes.append(value.shape)
-    batch: torch.Size = torch.broadcast_shapes(*shapes)  # type: ignore[no-untyped-call]
-    return batch
+    return common_shape(shapes)
 
 
 def _time_first(signal: Tensor) -> Tensor:

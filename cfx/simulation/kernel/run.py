@@ -21,7 +21,7 @@ from cfx.simulation.kernel.graph import Unsupported, record
 from cfx.simulation.kernel.keys import ComponentKey, KernelKey
 from cfx.simulation.kernel.source import BLOCK, SIGNALS, write
 from cfx.simulation.threads import share
-from cfx.simulation.trajectory import Segments, Terms
+from cfx.simulation.trajectory import Segments, Terms, common_shape
 
 log = logging.getLogger(__name__)
 
@@ -72,9 +72,7 @@ def accumulate(
     if kernel is None:
         return None
     pages.keep()
-    shape = torch.broadcast_shapes(  # type: ignore[no-untyped-call]  # torch leaves it untyped
-        (len(segments.speed), 1), *[value.shape for value in p.values()]
-    )
+    shape = common_shape([(len(segments.speed), 1), *[value.shape for value in p.values()]])
     sums = segments.speed.new_empty((kernel.terms, *shape))
     _run(kernel, segments, list(p.values()), sums)
     return tuple(sums)
