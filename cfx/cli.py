@@ -13,6 +13,7 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
+from cfx.collector import importing, is_program
 from cfx.errors import CfxError, Terminated
 from cfx.signals import ignore_signals, terminable
 
@@ -51,7 +52,8 @@ def _hydra(arguments: Sequence[str]) -> int:
     """Runs the Hydra application, or completes what a shell asks for."""
 
     def start() -> int:
-        from cfx import application
+        with importing():
+            from cfx import application
 
         return application.start(arguments)
 
@@ -68,6 +70,7 @@ def program() -> NoReturn:
     Raises:
         SystemExit: always, with the exit code.
     """
+    is_program()
     try:
         code = main()
     except KeyboardInterrupt:

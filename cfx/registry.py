@@ -31,6 +31,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from cfx import renamed
+from cfx.collector import importing
 from cfx.component import API_VERSION, Component, Settings, validate
 from cfx.errors import CfxError, ConfigError, PluginError, nearest
 from cfx.extras import advice
@@ -501,7 +502,9 @@ def _entries(distribution: importlib.metadata.Distribution) -> Iterator[Entry]:
 def _import(found: Entry) -> Any:
     module, _, attribute = found.target.partition(":")
     try:
-        return functools.reduce(getattr, attribute.split("."), importlib.import_module(module))
+        with importing():
+            imported = importlib.import_module(module)
+        return functools.reduce(getattr, attribute.split("."), imported)
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # a plugin may raise anything, even SystemExit

@@ -27,6 +27,7 @@ FLOORS = (
         "locks",
         "ready",
         "signals",
+        "collector",
         "memory",
         "job_folder",
         "extras",

@@ -13,6 +13,7 @@ from typing import Any
 import pandas as pd
 import yaml
 
+from cfx.collector import importing
 from cfx.config import JobConfig
 from cfx.datasets.tidy import write_tidy
 from cfx.errors import OutputError
@@ -253,7 +254,8 @@ def write_figures(
     """
     paths: list[Path] = []
     if config.figures.enabled:
-        from cfx.plots.matplotlib import write
+        with importing():
+            from cfx.plots.matplotlib import write
 
         folder = output.folder / "figures"
         formats = config.figures.formats

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from cfx import registry
+from cfx.collector import importing
 from cfx.config import JobConfig
 
 if TYPE_CHECKING:
@@ -41,7 +42,8 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
     # An engine that is not installed is told at once too; it connects to nothing yet.
     registry.create("engine", config.engine)
     pairs = load_pairs(cast("Dataset", registry.create("dataset", config.data)))
-    from cfx.job.steps import take_steps
+    with importing():
+        from cfx.job.steps import take_steps
 
     return take_steps(config, folder, pairs, console)
 

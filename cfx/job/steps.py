@@ -16,6 +16,7 @@ from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.prior import prior_weight
 from cfx.calibration.settings import WindowSettings
+from cfx.collector import importing
 from cfx.config import JobConfig
 from cfx.errors import PluginError
 from cfx.job import output as files
@@ -65,7 +66,8 @@ def take_steps(
     Raises:
         CfxError: the user's mistake, in one sentence; nothing half-written is left.
     """
-    from cfx.tracking.tracker import Tracker
+    with importing():
+        from cfx.tracking.tracker import Tracker
 
     console = console or Console()
     data = config.data

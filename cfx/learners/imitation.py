@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from cfx.agents.heads import HEADS
 from cfx.agents.heads.base import ParameterHead
 from cfx.agents.scaler import Scaler
+from cfx.collector import importing
 from cfx.component import Settings
 from cfx.errors import DataError
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
@@ -127,8 +128,9 @@ class ImitationLearner(Learner):
             " (learner=rollout) policies follow real drivers more closely"
         )
         # Lightning takes seconds to import, and 100 MB: only where something is trained.
-        from cfx.learners.batched import fit
-        from cfx.learners.imitation_module import ImitationModule, SegmentData
+        with importing():
+            from cfx.learners.batched import fit
+            from cfx.learners.imitation_module import ImitationModule, SegmentData
 
         task = Task(f"Training ({len(names)} networks, at most {s.epochs} epochs)", s.epochs)
         module = ImitationModule(network, dataset, head, s, names, on_epoch=task.advance)

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from filelock import BaseFileLock, Timeout
 
+from cfx.collector import importing
 from cfx.errors import TrackingError
 from cfx.locks import lock_for
 from cfx.ready import folder_of_ready_made, is_ready_made
@@ -146,7 +147,8 @@ def open_store(uri: str, experiment: str, default: Path | None = None) -> Store:
     if file is not None:
         name = file.name
     lock = lock_for(home / f"{name}.lock", timeout=4 * LOCK_SECONDS)
-    with _held(lock):
+    # It imports MLflow, SQLAlchemy and Alembic.
+    with _held(lock), importing():
         if file is not None:
             if _is_new(file):
                 _create(file, home)
