@@ -6,6 +6,7 @@ import logging
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -89,6 +90,11 @@ class ProtocolContext:
     def engine(self) -> Engine:
         """Where calibration, training and evaluation run."""
         return self.calibrator.engine
+
+    @cached_property
+    def _recorded(self) -> dict[str, tuple[float, ...]]:
+        """`Agent.recorded` of all agents here."""
+        return recorded_quantiles(self.batch)
 
     def labels(self, counts: Tensor, fixed: Tensor) -> Labels | None:
         """Calibrates parameters per window (labels), if the learner needs any.
@@ -216,7 +222,7 @@ class ProtocolContext:
             learned_from=learned_from,
             valid_range=training_result.valid_range,
             dispersion=training_result.dispersion,
-            recorded=recorded_quantiles(self.batch),
+            recorded=self._recorded,
         )
 
     def _head(self, policy: Policy, training_result: TrainingResult) -> ParameterHead:

@@ -31,7 +31,7 @@ from cfx.optimizers.random import RandomSearch
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.trajectory import Start
 
-WINDOWS, STEPS, DT, LOOPED = 128, 5, 0.1, 6
+WINDOWS, STEPS, DT, LOOPED = 128, 5, 0.1, 4
 
 
 def windows(model: DrivingModel) -> SegmentLosses:
