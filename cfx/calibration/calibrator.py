@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.cache import Arrays, Cache, first_fit
-from cfx.calibration.losses import SegmentLosses
+from cfx.calibration.losses import BYTES_AT_ONCE, SegmentLosses
 from cfx.calibration.shards import (
     CalibrationShard,
     DriverShard,
@@ -320,7 +320,8 @@ class Calibrator:
             row, pair = members.to(device).nonzero().unbind(1)
         unit = self.space.to_unit(parameters.to(device))[row][:, None]
         segments = self._segments(batch, pair, last.to(device)[pair])
-        size = max(1, self.memory // max(1, segments.bytes_per_candidate))
+        bound = min(self.memory, BYTES_AT_ONCE)
+        size = max(1, bound // max(1, segments.bytes_per_trajectory))
         means = dict.fromkeys(self.reported, 0.0)
         for part in torch.split(torch.arange(len(pair), device=device), size):
             chosen = segments.take(part)

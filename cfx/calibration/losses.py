@@ -119,10 +119,15 @@ class SegmentLosses:
         if self.accumulates:
             values = 3 * parameters + 8
         elif "gap" in self.objective.signals:
-            values = 6 * self.steps + 32
+            return self.bytes_per_trajectory
         else:
             values = 4 * self.steps + 32
         return values * self.measured_speed.element_size()
+
+    @property
+    def bytes_per_trajectory(self) -> int:
+        """Memory that one simulated trajectory needs where it is kept."""
+        return (6 * self.steps + 32) * self.measured_speed.element_size()
 
     @property
     def accumulates(self) -> bool:
@@ -247,9 +252,9 @@ class SegmentLosses:
         )
 
 
-_BYTES_AT_ONCE = 1 << 27
-"""Most bytes that pooled losses simulate at once. 1 GB took three times as long as 256 MB, all of
-it in fetching pages."""
+BYTES_AT_ONCE = 1 << 27
+"""Most bytes that pooled and reported losses simulate at once. 1 GB took three times as long as
+256 MB, all of it in fetching pages."""
 
 
 @dataclass(frozen=True)
@@ -302,24 +307,34 @@ class PooledLosses:
         problem, segment = self.members.nonzero().unbind(1)
         if bool((candidates == candidates[:1]).all()):
             used = self.members.any(0)
-            simulated, place = used.nonzero()[:, 0], used.cumsum(0) - 1
+            simulated, place = used.nonzero()[:, 0], (used.cumsum(0) - 1)[segment]
             shared = candidates[:1].expand(len(simulated), -1, -1)
-            losses = self._simulated(simulated, shared)[place[segment]]
-        else:
-            losses = self._simulated(segment, candidates[problem])
-        total = losses.new_zeros(candidates.shape[:2]).index_add_(0, problem, losses)
-        return total / self.members.sum(1, keepdim=True)
+            return self._means(simulated, shared, problem, place)
+        place = torch.arange(len(segment), device=segment.device)
+        return self._means(segment, candidates[problem], problem, place)
 
-    def _simulated(self, segment: Tensor, candidates: Tensor) -> Tensor:
-        """Returns losses `(S, q)` of segments `(S,)` with candidates `(S, q, n)`."""
-        segments, count = self.segments.take(segment), candidates.shape[1]
+    def _means(self, segment: Tensor, candidates: Tensor, problem: Tensor, place: Tensor) -> Tensor:
+        """Simulates segments, a block of candidates after the other; returns means `(K, q)`.
+
+        Args:
+            segment: which are simulated, `(S,)`.
+            candidates: of each, `(S, q, n)`.
+            problem, place: the problem that each loss counts for, and the number of its segment
+                among those that are simulated, `(M,)`.
+        """
+        segments, count = self.segments, candidates.shape[1]
+        every = torch.arange(segments.problems, device=segment.device)
+        if not torch.equal(segment, every):
+            segments = segments.take(segment)
         # The blocks are small, but there are many: together they may be worth compiling for, which
         # none of them is alone.
         simulator = segments.simulator.for_work(segments.steps * len(segment) * count)
         segments = replace(segments, simulator=simulator)
-        bound = min(self.memory, _BYTES_AT_ONCE)
+        bound = min(self.memory, BYTES_AT_ONCE)
         block = max(1, bound // (segments.bytes_per_candidate * len(segment)))
-        losses = []
+        means = []
         for part in torch.split(candidates, block, dim=1):
-            losses.append(segments(part))
-        return torch.cat(losses, dim=1)
+            losses = segments(part)
+            total = losses.new_zeros((self.problems, losses.shape[1]))
+            means.append(total.index_add_(0, problem, losses[place]))
+        return torch.cat(means, dim=1) / self.members.sum(1, keepdim=True)

@@ -39,7 +39,7 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
         "Model %s, policy %s, learner %s, protocol %s, data %s: starting",
         *[node.get("name") for node in _chosen(config)],
     )
-    # An engine that is not installed is told at once too; it connects to nothing yet.
+    # An engine that is not installed is named at once too; it connects to nothing yet.
     registry.create("engine", config.engine)
     pairs = load_pairs(cast("Dataset", registry.create("dataset", config.data)))
     with importing():
