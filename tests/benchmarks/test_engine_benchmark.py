@@ -5,6 +5,7 @@ Run alone: `make bench`, or with pytest's `-k engine`. Other work on the machine
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 
@@ -77,9 +78,14 @@ def test_efficiency_of_two_workers(benchmark, engine: Engine, monkeypatch) -> No
         return time.perf_counter() - began
 
     monkeypatch.setattr(threads, "_LIMIT", [1])
-    seconds(engine)
-    alone = seconds(LocalEngine())
-    together = benchmark.pedantic(seconds, args=(engine,), rounds=2)
+    seconds(engine)  # kernels are compiled, or read from the disk
+    seconds(LocalEngine())
+    # In turns, and the fastest of each: other work on the machine only slows down.
+    alone, together = math.inf, math.inf
+    for _ in range(3):
+        alone = min(alone, seconds(LocalEngine()))
+        together = min(together, seconds(engine))
+    benchmark.pedantic(seconds, args=(engine,), rounds=1)
     benchmark.extra_info["s alone"] = alone
     benchmark.extra_info["efficiency"] = alone / (2 * together)
     print(f"alone {alone:.1f} s, together {together:.1f} s, {alone / (2 * together):.3f} of ideal")
