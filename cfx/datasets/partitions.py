@@ -7,7 +7,8 @@ reading one recording, or looking at all of them, needs the memory of the larges
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import os
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -25,10 +26,7 @@ def partitions(path: Path) -> list[Path]:
     """
     if not path.is_dir():
         return [path]
-    found = []
-    for file in sorted(path.rglob("*.parquet")):
-        if file.is_file() and not file.name.startswith((".", "_")):
-            found.append(file)
+    found = sorted(_files(path))
     if not found:
         raise DataError(
             f"{path}: is a folder without parquet files; set data.path to a file, or to a folder"
@@ -39,7 +37,23 @@ def partitions(path: Path) -> list[Path]:
 
 def are_partitions(path: Path) -> bool:
     """Says whether a folder holds parquet files, in folders named by recordings or beside them."""
-    return path.is_dir() and next(path.rglob("*.parquet"), None) is not None
+    return path.is_dir() and next(_files(path), None) is not None
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """Yields the parquet files below a folder; folders that are links count, each once."""
+    seen = set()
+    for place, below, names in os.walk(folder, followlinks=True):
+        home = os.path.realpath(place)
+        if home in seen:
+            below.clear()
+            continue
+        seen.add(home)
+        below.sort()
+        for name in names:
+            file = Path(place, name)
+            if name.endswith(".parquet") and not name.startswith((".", "_")) and file.is_file():
+                yield file
 
 
 def recording_of(file: Path) -> str | None:

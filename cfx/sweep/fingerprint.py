@@ -18,6 +18,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from cfx.component import content_key
+from cfx.datasets.partitions import partitions
 from cfx.errors import CfxError
 from cfx.storage import is_url, state
 
@@ -93,6 +94,8 @@ def command_of(config: DictConfig) -> tuple[tuple[str, ...], str, int | None]:
 def _state_of_data(node: Any) -> list[list[Any]] | None:
     """Returns size and time of change (ns) of each data file; None if the dataset names none.
 
+    A folder stands for the parquet files in it.
+
     Of files behind a URL it is what their store says that they are.
     """
     if not isinstance(node, Mapping) or not node.get("path"):
@@ -108,9 +111,11 @@ def _state_of_data(node: Any) -> list[list[Any]] | None:
         path = Path(str(pattern)).expanduser()
         files = [str(path)] if path.exists() else sorted(glob.glob(str(path)))  # noqa: PTH207 - the pattern may be absolute, Path.glob takes none
         for file in files:
-            with contextlib.suppress(OSError):  # the dataset complains about a file that is gone
-                found = Path(file).stat()
-                states.append([found.st_size, found.st_mtime_ns])
+            # The dataset complains about a file that is gone, and about a folder without any.
+            with contextlib.suppress(OSError, CfxError):
+                for part in partitions(Path(file)):
+                    found = part.stat()
+                    states.append([found.st_size, found.st_mtime_ns])
     return states
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from cfx.datasets.describe import describe
 from cfx.datasets.tidy import TidyDataset, read_tidy, write_tidy
 from cfx.errors import DataError
 from cfx.pairs import PairSet
+from cfx.sweep.fingerprint import fingerprint
 from tests.drives import straight_pairs
 
 
@@ -50,6 +52,25 @@ def test_a_folder_holds_what_one_file_does(folder: Path) -> None:
     found = TidyDataset(path=folder).read()
     assert {pair.pair_id: pair.fingerprint for pair in found} == whole
     assert {pair.recording for pair in found} == {"i80", "us 101", "a/b"}
+
+
+def test_folders_that_are_links_count_each_once(folder: Path, tmp_path: Path) -> None:
+    elsewhere = tmp_path / "links"
+    elsewhere.mkdir()
+    for recording in folder.iterdir():
+        (elsewhere / recording.name).symlink_to(recording)
+    (elsewhere / "again").symlink_to(elsewhere)
+    found = TidyDataset(path=elsewhere).read()
+    assert {pair.pair_id for pair in found} == {pair.pair_id for pair in recordings()}
+
+
+def test_a_job_of_a_sweep_is_done_again_when_a_file_of_the_folder_has_changed(folder: Path) -> None:
+    values = {"data": {"name": "tidy", "path": str(folder)}, "model": {"name": "krauss"}}
+    before = fingerprint(values)
+    assert fingerprint(values) == before
+    file = next(folder.rglob("*.parquet"))
+    os.utime(file, ns=(1, 1))
+    assert fingerprint(values) != before
 
 
 def test_other_recordings_are_not_read(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
