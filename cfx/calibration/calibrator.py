@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.cache import Arrays, Cache, first_fit
-from cfx.calibration.losses import BYTES_AT_ONCE, SegmentLosses
+from cfx.calibration.losses import SegmentLosses
 from cfx.calibration.shards import (
     CalibrationShard,
     DriverShard,
@@ -48,6 +48,9 @@ little."""
 _PART = 64
 """Whole trajectories that are solved in one shard of a cluster: each is the work of a hundred
 windows."""
+
+_FRAMES_AT_ONCE = 200_000
+"""Frames of trajectories that are simulated at once to report their losses: some 30 MB."""
 
 _BLOCK = 32
 """Windows of an entry of the cache: the first windows of a pair have the same labels, however many
@@ -319,15 +322,15 @@ class Calibrator:
         if members is not None:
             row, pair = members.to(device).nonzero().unbind(1)
         unit = self.space.to_unit(parameters.to(device))[row][:, None]
-        segments = self._segments(batch, pair, last.to(device)[pair])
-        bound = min(self.memory, BYTES_AT_ONCE)
-        size = max(1, bound // max(1, segments.bytes_per_trajectory))
+        last = last.to(device)
+        size = max(1, _FRAMES_AT_ONCE // int(last.max()))
         means = dict.fromkeys(self.reported, 0.0)
         for part in torch.split(torch.arange(len(pair), device=device), size):
-            chosen = segments.take(part)
-            frames = chosen.simulate(unit[part], gap=True)
+            own = pair[part]
+            segments = self._segments(batch, own, last[own])
+            frames = segments.simulate(unit[part], gap=True)
             for name, objective in self.reported.items():
-                loss = objective(frames, chosen.counted[..., None])
+                loss = objective(frames, segments.counted[..., None])
                 means[name] += float(loss.sum()) / len(pair)
         return means
 

@@ -119,15 +119,10 @@ class SegmentLosses:
         if self.accumulates:
             values = 3 * parameters + 8
         elif "gap" in self.objective.signals:
-            return self.bytes_per_trajectory
+            values = 6 * self.steps + 32
         else:
             values = 4 * self.steps + 32
         return values * self.measured_speed.element_size()
-
-    @property
-    def bytes_per_trajectory(self) -> int:
-        """Memory that one simulated trajectory needs where it is kept."""
-        return (6 * self.steps + 32) * self.measured_speed.element_size()
 
     @property
     def accumulates(self) -> bool:
@@ -252,9 +247,9 @@ class SegmentLosses:
         )
 
 
-BYTES_AT_ONCE = 1 << 27
-"""Most bytes that pooled and reported losses simulate at once. 1 GB took three times as long as
-256 MB, all of it in fetching pages."""
+_BYTES_AT_ONCE = 1 << 27
+"""Most bytes that pooled losses simulate at once. 1 GB took three times as long as 256 MB, all of
+it in fetching pages."""
 
 
 @dataclass(frozen=True)
@@ -330,7 +325,7 @@ class PooledLosses:
         # none of them is alone.
         simulator = segments.simulator.for_work(segments.steps * len(segment) * count)
         segments = replace(segments, simulator=simulator)
-        bound = min(self.memory, BYTES_AT_ONCE)
+        bound = min(self.memory, _BYTES_AT_ONCE)
         block = max(1, bound // (segments.bytes_per_candidate * len(segment)))
         means = []
         for part in torch.split(candidates, block, dim=1):
