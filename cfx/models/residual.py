@@ -1,12 +1,13 @@
 """A driving model with a residual: the model explains most of the acceleration, not all of it.
 
     a(t) = a_model(t) + r(t)        r(t0) = a_measured(t0) - a_model(t0)
-    r(t + dt) = c + (r(t) - c) exp(-dt / tau)
+    r(t + dt) = c + (r(t) - c) exp(-dt / tau) + g dt
 
 The residual r begins as what the model misses of the acceleration at the first step. So a
 simulation starts with the acceleration that the vehicle has. From there r goes to the target c, in
-m/s2, with the time constant tau. Both are parameters like the model's own: constants make a
-baseline, and a policy may choose them anew for each window. With c drawn at random the residual is
+m/s2, with the time constant tau, and grows by g, in m/s3, beside that: people's accelerations go on
+changing as they did. All three are parameters like the model's own: constants make a baseline, and
+a policy may choose them anew for each window. With c drawn at random the residual is
 the auto-regressive noise of C. Zhang and L. Sun (2024), *Bayesian calibration of the intelligent
 driver model*, IEEE T-ITS 25(8), whose errors of acceleration are AR(1).
 
@@ -50,8 +51,17 @@ TARGET = Parameter(
     "where the residual acceleration goes",
     "0: the model alone",
 )
+SLOPE = Parameter(
+    "residual_slope",
+    "m/s3",
+    -3.0,
+    3.0,
+    0.0,
+    "by how much the residual acceleration grows beside that",
+    "0: it does not",
+)
 
-RESIDUAL = (TIME, TARGET)
+RESIDUAL = (TIME, TARGET, SLOPE)
 """The parameters of a residual, in order."""
 
 _NEAR_M = 0.5
@@ -68,7 +78,7 @@ _HARD = 2.0
 class WithResidual(DrivingModel):
     """Any driving model, and a residual acceleration beside it.
 
-    Parameters are the model's, then `residual_time` and `residual_target`. Memory `(*batch, m + 2)`
+    Parameters are the model's, then those of `RESIDUAL`. Memory `(*batch, m + 2)`
     is the model's, the residual (m/s2), and whether it has begun (0 or 1).
 
     A positive residual could keep a vehicle from braking. So it counts for nothing where the gap is
@@ -127,7 +137,7 @@ class WithResidual(DrivingModel):
     ) -> Tensor:
         residual = self._residual(follower, self._alone(follower, leader, p, dt))
         kept = torch.exp(-dt / p[TIME.name])
-        after = p[TARGET.name] + (residual - p[TARGET.name]) * kept
+        after = p[TARGET.name] + (residual - p[TARGET.name]) * kept + p[SLOPE.name] * dt
         inner = self.inner.next_memory(self._inner(follower), leader, p, dt, speed)
         begun = torch.ones_like(after)
         return torch.cat([inner, after[..., None], begun[..., None]], -1)

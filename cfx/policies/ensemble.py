@@ -37,13 +37,21 @@ class Ensemble(PolicyNetwork):
     def initial_state(self, networks: int, drivers: int) -> Tensor:
         return self._together(self.members.initial_state(networks * self.size, drivers))
 
+    def observe(self, tokens: Tensor, state: Tensor) -> Tensor:
+        apart = self._apart(state)
+        return self._together(self.members.observe(tokens.repeat_interleave(self.size, 0), apart))
+
     def forward(self, tokens: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        apart = self._apart(state)
+        answers, after = self.members(tokens.repeat_interleave(self.size, 0), apart)
+        logits = torch.logit(answers, eps=_EDGE).view(len(state), self.size, *answers.shape[1:])
+        return logits.quantile(0.5, dim=1).sigmoid(), self._together(after)
+
+    def _apart(self, state: Tensor) -> Tensor:
+        """Arranges states `(N, B, M s)` as those of each network, `(N M, B, s)`."""
         networks, drivers, width = state.shape
         apart = state.view(networks, drivers, self.size, width // self.size)
-        apart = apart.transpose(1, 2).flatten(0, 1)
-        answers, after = self.members(tokens.repeat_interleave(self.size, 0), apart)
-        logits = torch.logit(answers, eps=_EDGE).view(networks, self.size, *answers.shape[1:])
-        return logits.quantile(0.5, dim=1).sigmoid(), self._together(after)
+        return apart.transpose(1, 2).flatten(0, 1)
 
     def _together(self, states: Tensor) -> Tensor:
         """Arranges the networks' states `(N M, B, s)` as `(N, B, M s)`."""

@@ -37,6 +37,16 @@ class RecurrentSettings(PolicySettings):
         description="what an untrained network answers: the fixed parameters, or about the middle"
         " of the bounds (paper)",
     )
+    skip: bool = Field(
+        False,
+        description="whether outputs also depend on the inputs directly, linearly, beside the"
+        " recurrent layers: for policies that go on from the driver's acceleration",
+    )
+    acting_bias: bool = Field(
+        False,
+        description="whether networks know if they act, or only observe what was measured: what"
+        " they see while they act is their own doing",
+    )
 
 
 def _uniform(shape: tuple[int, ...], width: int, generator: torch.Generator) -> nn.Parameter:
@@ -98,27 +108,46 @@ class RecurrentNetwork(PolicyNetwork):
         else:
             self.w_out = weights
             self.b_out = nn.Parameter(torch.zeros((networks, 1, parameters)))
+        self.b_acting: nn.Parameter | None = None
+        if settings.acting_bias:
+            self.b_acting = nn.Parameter(torch.zeros((networks, 1, 1, self.gates * self.hidden)))
+        self.w_skip: nn.Parameter | None = None
+        if settings.skip:
+            self.w_skip = nn.Parameter(torch.zeros((networks, features, parameters)))
 
     def initial_state(self, networks: int, drivers: int) -> Tensor:
         return self.w_out.new_zeros(
             (networks, drivers, self.hidden * self.states * len(self.layers))
         )
 
+    def observe(self, tokens: Tensor, state: Tensor) -> Tensor:
+        return self._recurred(tokens, state, acts=False)[1]
+
     def forward(self, tokens: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        x, after = self._recurred(tokens, state, acts=True)
+        logits = torch.baddbmm(self.b_out, self.dropout(x).flatten(1, 2), self.w_out)
+        if self.w_skip is not None:
+            logits = logits + torch.bmm(tokens.flatten(1, 2), self.w_skip)
+        return logits.view(*x.shape[:3], -1).sigmoid(), after
+
+    def _recurred(self, tokens: Tensor, state: Tensor, *, acts: bool) -> tuple[Tensor, Tensor]:
+        """Returns the outputs of the last layer, `(N, B, W, hidden)`, and the state afterwards."""
         x = tokens
         last = []
-        for layer, before in zip(self.layers, state.chunk(len(self.layers), dim=-1), strict=True):
+        states = state.chunk(len(self.layers), dim=-1)
+        for number, (layer, before) in enumerate(zip(self.layers, states, strict=True)):
             assert isinstance(layer, RecurrentLayer)
             carried = before
             projected = layer.project(x)
+            if number == 0 and acts and self.b_acting is not None:
+                projected = projected + self.b_acting
             outputs = []
             for k in range(tokens.shape[2]):
                 carried = self.cell(projected[:, :, k], layer, carried)
                 outputs.append(carried[..., : self.hidden])
             x = torch.stack(outputs, dim=2)
             last.append(carried)
-        logits = torch.baddbmm(self.b_out, self.dropout(x).flatten(1, 2), self.w_out)
-        return logits.view(*x.shape[:3], -1).sigmoid(), torch.cat(last, dim=-1)
+        return x, torch.cat(last, dim=-1)
 
     def cell(self, projected: Tensor, layer: RecurrentLayer, carried: Tensor) -> Tensor:
         """Returns what a layer carries after a window, `(N, B, states * hidden)`, output first."""

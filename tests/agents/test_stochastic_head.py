@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from cfx.agents import checkpoint
-from cfx.agents.heads.stochastic import StochasticHead
+from cfx.agents.heads.stochastic import SCALE, StochasticHead
 from cfx.models.krauss import Krauss
 from cfx.models.residual import TARGET, TIME
 from cfx.policies.features import History
@@ -22,7 +22,8 @@ WINDOW_S = 0.5
 def parameters(time: float, target: float, scale: float, count: int) -> torch.Tensor:
     head = StochasticHead.for_model(Krauss())
     values = head.space.defaults().expand(count, -1).clone()
-    values[:, -3:] = torch.tensor([time, target, scale], dtype=torch.float64)
+    for parameter, value in ((TIME, time), (TARGET, target), (SCALE, scale)):
+        values[:, head.space.names.index(parameter.name)] = value
     return values
 
 

@@ -85,6 +85,7 @@ def simulate(
     burn_in_windows: int | None = None,
     expert: Expert | None = None,
     noise: Tensor | None = None,
+    paths: int = 1,
 ) -> Iterator[Segment]:
     """Simulates trajectories in closed loop.
 
@@ -96,13 +97,17 @@ def simulate(
         path: the way that gradients take back.
         burn_in_windows: windows of history that are observed at most; None: all.
         expert: says how it would have driven each window; None: nothing is asked.
-        noise: what a stochastic head draws from, `(H, N, D, k)`; None: nothing is drawn.
+        noise: what a stochastic head draws from, `(H, N, paths D, k)`; None: nothing is drawn.
+        paths: of each trajectory, all of them behind the ones before. What was measured is observed
+            once for all.
 
     Yields:
         What was simulated between two cuts of the gradients.
     """
+    state = burn_in(step, dataset, batch, dataset.condition(batch), burn_in_windows)
+    state = state.repeat(1, paths, 1)
+    batch = batch.repeated(paths)
     conditioning = dataset.condition(batch)
-    state = burn_in(step, dataset, batch, conditioning, burn_in_windows)
     inputs = RolloutInputs.of(dataset.batch, conditioning.pair, batch, step, windows)
     now = inputs.initial(state)
     expert_state: ExpertState | None = None

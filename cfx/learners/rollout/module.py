@@ -24,6 +24,7 @@ from cfx.learners.rollout.batch import RolloutBatch
 from cfx.learners.rollout.dataset import RolloutDataset
 from cfx.learners.rollout.distillation import Expert
 from cfx.learners.rollout.gradients import GradientPath, NoGradients, ThroughMemory, ThroughTime
+from cfx.learners.rollout.inputs import Measured
 from cfx.learners.rollout.loop import simulate
 from cfx.learners.rollout.loss import FrameWeights, TrajectoryLoss
 from cfx.learners.rollout.sampling import TrajectorySampler
@@ -40,8 +41,20 @@ eager work."""
 _LEAST_TEMPERATURE = 0.02
 """Below this a smoothed switch has no gradient that single precision resolves."""
 
-DISPERSIONS = (1.0, 1.2, 1.4, 1.7, 2.0, 2.5, 3.0)
-"""Factors on the noise of a stochastic head that are tried on validation drivers."""
+DISPERSIONS = (0.5, 4.0)
+"""Least and greatest factor on the noise of a stochastic head."""
+
+_HALVINGS = 6
+"""Of the logarithm between `DISPERSIONS`, which leave 3 % of a factor."""
+
+_COVERING = 19
+"""Sampled paths whose range holds 90 % of what happens, if it is one of them as far as anybody can
+tell: it is the least or the greatest of twenty in two cases of twenty."""
+
+_TOGETHER = 4_000
+"""Of these paths as many trajectories are simulated at once, which bounds the memory."""
+
+_COVERED = (_COVERING - 1) / (_COVERING + 1)
 
 _WARM_UP = 20
 """Gradient steps over which the learning rate rises."""
@@ -198,16 +211,17 @@ class RolloutModule(BatchedModule):
         noise = None
         if self.exact_step.core.head.noise_width > 0 and expert is None:
             paths = self.settings.paths
-            noise = self._noise(batch, windows)
+            noise = self._noise(batch, windows, paths)
         segments = simulate(
             step,
             self.dataset,
-            batch.repeated(paths),
+            batch,
             windows,
             path,
             burn_in_windows=most,
             expert=expert,
             noise=noise,
+            paths=paths,
         )
         for segment in segments:
             if paths == 1:
@@ -215,16 +229,16 @@ class RolloutModule(BatchedModule):
             else:
                 yield self.loss.of_paths(segment, divisors, paths)
 
-    def _noise(self, batch: RolloutBatch, windows: int) -> Tensor:
+    def _noise(self, batch: RolloutBatch, windows: int, paths: int) -> Tensor:
         """Returns what sampled paths draw from, `(windows, N, paths D, k)`.
 
         In training it follows from the gradient step; in validation it is always the same.
         """
-        s, dataset = self.settings, self.dataset
+        dataset = self.dataset
         count, width = batch.place.shape[1], self.exact_step.core.head.noise_width
         most = max(count, self.sampler.trajectories)
         generator = torch.Generator().manual_seed(self.sampler.step_seed(self._noise_of))
-        drawn = dataset.normal((windows, s.paths, most, width), generator)[:, :, :, :count]
+        drawn = dataset.normal((windows, paths, most, width), generator)[:, :, :, :count]
         drawn = drawn * self.dispersion.view(-1, 1, 1, 1, 1)
         return drawn.flatten(2, 3).transpose(0, 1).contiguous()
 
@@ -232,18 +246,51 @@ class RolloutModule(BatchedModule):
     def fit_dispersion(self) -> Tensor | None:
         """Returns a factor on each network's noise, `(N,)`; None for a head without noise.
 
-        It is the one of `DISPERSIONS` with the smallest CRPS of validation drivers: networks are
-        surer of drivers that they learned from than of others. 1 where none was kept.
+        With it the range of sampled paths holds as many of the speeds of validation drivers as it
+        should: networks are surer of drivers that they learned from than of others. 1 where none
+        was kept.
         """
         if self.exact_step.core.head.noise_width == 0:
             return None
-        losses = []
-        for factor in DISPERSIONS:
-            self.dispersion.fill_(factor)
-            losses.append(self._loss_with_history())
+        batch = self.sampler.validation_with_history()
+        if not bool((batch.weight > 0).any()):
+            return self.dispersion.clone()
+        least, greatest = (torch.full_like(self.dispersion, math.log(end)) for end in DISPERSIONS)
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (least + greatest)
+            self.dispersion.copy_(middle.exp())
+            too_wide = self._coverage(batch) > _COVERED
+            greatest = torch.where(too_wide, middle, greatest)
+            least = torch.where(too_wide, least, middle)
         self.dispersion.fill_(1.0)
-        found = torch.stack(losses).nan_to_num(nan=0.0)
-        return torch.tensor(DISPERSIONS, device=found.device)[found.argmin(0)]
+        known = (batch.weight > 0).any(1)
+        return torch.where(known, (0.5 * (least + greatest)).exp(), 1.0)
+
+    def _coverage(self, batch: RolloutBatch) -> Tensor:
+        """Returns the share of speeds within the range of sampled paths, `(N,)`.
+
+        The first window does not count, in which hardly anything is left to chance.
+        """
+        windows, step = self.settings.horizon, self.exact_step
+        networks, count = batch.place.shape
+        together = max(1, _TOGETHER // (networks * count))
+        lows, highs = [], []
+        for first in range(0, _COVERING, together):
+            self._noise_of = first
+            paths = min(together, _COVERING - first)
+            noise = self._noise(batch, windows, paths)
+            path = NoGradients()
+            found = simulate(step, self.dataset, batch, windows, path, noise=noise, paths=paths)
+            segment = next(found)
+            speed = segment.speed.view(networks, paths, count, -1)
+            lows.append(speed.amin(1))
+            highs.append(speed.amax(1))
+        low, high = torch.stack(lows).amin(0), torch.stack(highs).amax(0)
+        measured = Measured(*(values[:, :count] for values in segment.measured))
+        within = (low <= measured.speed) & (measured.speed <= high)
+        weight = measured.counted * batch.weight[..., None]
+        later = slice(step.stride, None)
+        return (within * weight)[..., later].sum((1, 2)) / weight[..., later].sum((1, 2))
 
     @torch.no_grad()
     def _frame_weights(self) -> FrameWeights:

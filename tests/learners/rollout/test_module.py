@@ -113,25 +113,31 @@ def test_weights_let_each_time_after_the_start_count_alike() -> None:
     assert torch.equal(beyond.speed[0, 0, 5:], weights.speed[0, 0, -1].expand(15))
 
 
-def test_the_noise_is_as_wide_as_validation_drivers_want_it() -> None:
-    """Of the factors the one with the smallest CRPS; the noise that is drawn grows with it."""
-    policy, data = gru(), training_data(networks=2)
-    settings = RolloutSettings(**(QUICK | {"head": "stochastic"}))
+def test_the_noise_is_as_wide_as_validation_drivers_want_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nine tenths of their speeds are within the range of 19 paths, where a factor does that."""
+    policy, data = gru(), training_data(networks=3)
+    settings = RolloutSettings(**(QUICK | {"head": "stochastic", "horizon": 4}))
     dataset = placed(data, policy, settings.validation, head="stochastic")
     result = untrained(data, policy, head="stochastic")
     module = RolloutModule(result.network, dataset, policy, data, settings)
+    batch = module.sampler.validation_with_history()
+    with torch.no_grad():
+        assert bool(module._coverage(batch).le(1.0).all())
+        truth = batch._replace(weight=torch.zeros_like(batch.weight))
+        assert bool(module._coverage(truth).isnan().all())
+    wanted = torch.tensor([0.7, 1.9, 100.0])
+
+    def coverage(batch: RolloutBatch) -> torch.Tensor:
+        return 0.9 + 0.1 * (module.dispersion / wanted).log()
+
+    monkeypatch.setattr(module, "_coverage", coverage)
     found = module.fit_dispersion()
     assert found is not None
-    losses = []
-    with torch.no_grad():
-        for factor in DISPERSIONS:
-            module.dispersion.fill_(factor)
-            losses.append(module._loss_with_history())
-    best = torch.stack(losses).argmin(0)
-    assert found.tolist() == [pytest.approx(DISPERSIONS[index]) for index in best.tolist()]
-    assert len({round(float(loss.sum()), 6) for loss in losses}) == len(DISPERSIONS)
-    assert result.dispersion is not None
-    assert result.dispersion.shape == (2,)
+    expected = torch.tensor([0.7, 1.9, DISPERSIONS[1]])
+    torch.testing.assert_close(found, expected, rtol=0.05, atol=0)
+    assert module.dispersion.tolist() == [1.0, 1.0, 1.0]
 
 
 def exact_losses(module: RolloutModule, batch: RolloutBatch, windows: int, full: bool) -> Any:
