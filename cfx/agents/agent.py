@@ -277,7 +277,7 @@ class Agent:
             )
         state = self._judged(history, state)
         unit = self._faded(answer.double(), state).to(dtype)
-        chosen = self.space.from_unit(unit)
+        chosen = self.head.measured(self.space.from_unit(unit), history, self.dt)
         if generator is not None and self.head.noise_width > 0:
             shape = (len(chosen), self.head.noise_width)
             noise = torch.randn(shape, generator=generator, dtype=torch.float64).to(chosen)

@@ -1,13 +1,16 @@
 """A driving model with a residual: the model explains most of the acceleration, not all of it.
 
     a(t) = a_model(t) + r(t)        r(t0) = a_measured(t0) - a_model(t0)
-    r(t + dt) = c + (r(t) - c) exp(-dt / tau) + g dt
+    r(t + dt) = c + (r(t) - c) exp(-dt / tau) + j(t + dt) dt        j(t0) = jerk_measured(t0)
+    j(t + dt) = j(t) exp(-dt / tau_j)
 
 The residual r begins as what the model misses of the acceleration at the first step. So a
 simulation starts with the acceleration that the vehicle has. From there r goes to the target c, in
-m/s2, with the time constant tau, and grows by g, in m/s3, beside that: people's accelerations go on
-changing as they did. All three are parameters like the model's own: constants make a baseline, and
-a policy may choose them anew for each window. With c drawn at random the residual is
+m/s2, with the time constant tau. Beside that it goes on growing with the jerk that the vehicle has
+at the start, which is forgotten with the time constant tau_j: people's accelerations change
+smoothly. Target and time constants are parameters like the model's own: constants make a baseline,
+and a policy may choose them anew for each window. The jerk is a parameter too, which is read in the
+first step only; 0 where nobody knows it. With c drawn at random the residual is
 the auto-regressive noise of C. Zhang and L. Sun (2024), *Bayesian calibration of the intelligent
 driver model*, IEEE T-ITS 25(8), whose errors of acceleration are AR(1).
 
@@ -51,17 +54,26 @@ TARGET = Parameter(
     "where the residual acceleration goes",
     "0: the model alone",
 )
-SLOPE = Parameter(
-    "residual_slope",
+JERK = Parameter(
+    "residual_jerk",
     "m/s3",
-    -3.0,
-    3.0,
+    -5.0,
+    5.0,
     0.0,
-    "by how much the residual acceleration grows beside that",
-    "0: it does not",
+    "the jerk with which the residual acceleration grows at the start",
+    "0: it is not known",
+)
+JERK_TIME = Parameter(
+    "residual_jerk_time",
+    "s",
+    0.01,
+    2.0,
+    0.8,
+    "time constant with which that jerk is forgotten",
+    "on reconstructed I-80 it forecasts the next two seconds best",
 )
 
-RESIDUAL = (TIME, TARGET, SLOPE)
+RESIDUAL = (TIME, TARGET, JERK, JERK_TIME)
 """The parameters of a residual, in order."""
 
 _NEAR_M = 0.5
@@ -78,8 +90,8 @@ _HARD = 2.0
 class WithResidual(DrivingModel):
     """Any driving model, and a residual acceleration beside it.
 
-    Parameters are the model's, then those of `RESIDUAL`. Memory `(*batch, m + 2)`
-    is the model's, the residual (m/s2), and whether it has begun (0 or 1).
+    Parameters are the model's, then those of `RESIDUAL`. Memory `(*batch, m + 3)`
+    is the model's, the residual (m/s2), its jerk (m/s3), and whether it has begun (0 or 1).
 
     A positive residual could keep a vehicle from braking. So it counts for nothing where the gap is
     below 1 m and does not grow; and where a deceleration of more than 2 m/s2 is needed to reach the
@@ -106,7 +118,7 @@ class WithResidual(DrivingModel):
         self.inner = model
         self.settings = model.settings
         self.space = with_residual(model.space)
-        self.memory_size = model.memory_size + 2
+        self.memory_size = model.memory_size + 3
         self.temperature = model.temperature
 
     @property
@@ -137,13 +149,14 @@ class WithResidual(DrivingModel):
     ) -> Tensor:
         residual = self._residual(follower, self._alone(follower, leader, p, dt))
         kept = torch.exp(-dt / p[TIME.name])
-        after = p[TARGET.name] + (residual - p[TARGET.name]) * kept + p[SLOPE.name] * dt
+        jerk = self._jerk(follower, p) * torch.exp(-dt / p[JERK_TIME.name])
+        after = p[TARGET.name] + (residual - p[TARGET.name]) * kept + jerk * dt
         inner = self.inner.next_memory(self._inner(follower), leader, p, dt, speed)
         begun = torch.ones_like(after)
-        return torch.cat([inner, after[..., None], begun[..., None]], -1)
+        return torch.cat([inner, torch.stack([after, jerk.expand_as(after), begun], -1)], -1)
 
     def initial_memory(self, speed: Tensor) -> Tensor:
-        own = torch.zeros((*speed.shape, 2), dtype=speed.dtype, device=speed.device)
+        own = torch.zeros((*speed.shape, 3), dtype=speed.dtype, device=speed.device)
         return torch.cat([self.inner.initial_memory(speed), own], -1)
 
     def _inner(self, follower: Follower) -> Follower:
@@ -159,8 +172,13 @@ class WithResidual(DrivingModel):
 
     def _residual(self, follower: Follower, alone: Tensor) -> Tensor:
         """Returns the residual now, `(*batch,)`, m/s2: as remembered, or measured at the start."""
-        remembered, begun = follower.memory[..., -2], follower.memory[..., -1]
+        remembered, begun = follower.memory[..., -3], follower.memory[..., -1]
         return torch.where(begun > 0.5, remembered, follower.acceleration - alone)
+
+    def _jerk(self, follower: Follower, p: Mapping[str, Tensor]) -> Tensor:
+        """As `_residual`, of its jerk, m/s3."""
+        remembered, begun = follower.memory[..., -2], follower.memory[..., -1]
+        return torch.where(begun > 0.5, remembered, p[JERK.name])
 
 
 def with_residual(space: ParameterSpace) -> ParameterSpace:

@@ -37,11 +37,6 @@ class RecurrentSettings(PolicySettings):
         description="what an untrained network answers: the fixed parameters, or about the middle"
         " of the bounds (paper)",
     )
-    skip: bool = Field(
-        False,
-        description="whether outputs also depend on the inputs directly, linearly, beside the"
-        " recurrent layers: for policies that go on from the driver's acceleration",
-    )
     acting_bias: bool = Field(
         False,
         description="whether networks know if they act, or only observe what was measured: what"
@@ -111,9 +106,6 @@ class RecurrentNetwork(PolicyNetwork):
         self.b_acting: nn.Parameter | None = None
         if settings.acting_bias:
             self.b_acting = nn.Parameter(torch.zeros((networks, 1, 1, self.gates * self.hidden)))
-        self.w_skip: nn.Parameter | None = None
-        if settings.skip:
-            self.w_skip = nn.Parameter(torch.zeros((networks, features, parameters)))
 
     def initial_state(self, networks: int, drivers: int) -> Tensor:
         return self.w_out.new_zeros(
@@ -126,8 +118,6 @@ class RecurrentNetwork(PolicyNetwork):
     def forward(self, tokens: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         x, after = self._recurred(tokens, state, acts=True)
         logits = torch.baddbmm(self.b_out, self.dropout(x).flatten(1, 2), self.w_out)
-        if self.w_skip is not None:
-            logits = logits + torch.bmm(tokens.flatten(1, 2), self.w_skip)
         return logits.view(*x.shape[:3], -1).sigmoid(), after
 
     def _recurred(self, tokens: Tensor, state: Tensor, *, acts: bool) -> tuple[Tensor, Tensor]:

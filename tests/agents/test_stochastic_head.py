@@ -12,7 +12,7 @@ import torch
 from cfx.agents import checkpoint
 from cfx.agents.heads.stochastic import SCALE, StochasticHead
 from cfx.models.krauss import Krauss
-from cfx.models.residual import TARGET, TIME
+from cfx.models.residual import JERK, TARGET, TIME
 from cfx.policies.features import History
 from tests.sumo.policies import adaptive
 
@@ -44,6 +44,22 @@ def test_the_residual_is_an_ar_process_of_the_scale_that_the_network_says() -> N
     assert float(residual.std()) == pytest.approx(scale, rel=0.05)
     together = torch.corrcoef(torch.stack([before, residual]))
     assert float(together[0, 1]) == pytest.approx(kept, abs=0.03)
+
+
+def test_the_jerk_is_measured_between_the_last_two_frames_and_bounded() -> None:
+    head = StochasticHead.for_model(Krauss())
+    chosen = parameters(2.0, 0.0, 0.3, 3)
+    blank = torch.zeros((3, 5)).double()
+    acceleration = blank.clone()
+    acceleration[:, -1] = torch.tensor([0.1, -0.05, 2.0])
+    history = History(blank, blank, blank, acceleration, blank)
+    found = head.measured(chosen, history, 0.1)
+    column = head.space.names.index(JERK.name)
+    assert found[:, column].tolist() == pytest.approx([1.0, -0.5, JERK.high])
+    others = torch.arange(chosen.shape[-1]) != column
+    assert torch.equal(found[:, others], chosen[:, others])
+    one = History(*(signal[:, :1] for signal in history))
+    assert torch.equal(head.measured(chosen, one, 0.1), chosen)
 
 
 def test_nothing_but_the_target_is_drawn() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 
 import pytest
@@ -75,17 +76,26 @@ def test_it_starts_with_the_measured_acceleration_and_decays_exponentially() -> 
     """Against the closed form, for many values at once: the speed is a sum of exponentials."""
     draw = torch.rand((5, 200), generator=torch.Generator().manual_seed(0)).double()
     alone, measured, target = 4.0 * draw[0] - 2.0, 4.0 * draw[1] - 2.0, 2.0 * draw[2] - 1.0
-    tau, slope = 0.3 + 10.0 * draw[3], 2.0 * draw[4] - 1.0
+    tau, jerk, forget = 0.3 + 10.0 * draw[3], 2.0 * draw[4] - 1.0, 0.37
     model = WithResidual(Steady(limits=None))
     begin = Start(torch.zeros_like(alone), torch.full_like(alone, 50.0), measured)
-    p = {"a": alone, "residual_time": tau, "residual_target": target, "residual_slope": slope}
+    p = {"a": alone, "residual_time": tau, "residual_target": target}
+    p |= {"residual_jerk": jerk, "residual_jerk_time": torch.full_like(jerk, forget)}
     simulator = MemoryStepper(model, DT)
     _, _, speed = simulator.advance(simulator.begin(begin), far_leader(60, 1), p)
     kept, steps = torch.exp(-DT / tau), torch.arange(1, 61)[:, None]
-    # What grows and decays is in balance there.
-    target = target + slope * DT / (1.0 - kept)
     decaying = (measured - alone - target) * (1.0 - kept**steps) / (1.0 - kept)
     expected = 50.0 + DT * ((alone + target) * steps + decaying)
+    # The jerk adds its own part: two decays after each other.
+    lost = math.exp(-DT / forget)
+    grown = torch.zeros_like(alone)
+    part = torch.zeros_like(alone)
+    parts = []
+    for step in range(60):
+        parts.append(grown)
+        part = part * kept + jerk * lost ** (step + 1) * DT
+        grown = grown + DT * part
+    expected = expected + torch.stack(parts)
     torch.testing.assert_close(speed, expected, rtol=0, atol=1e-9)
     torch.testing.assert_close((speed[0] - 50.0) / DT, measured, rtol=0, atol=1e-9)
 
@@ -99,7 +109,7 @@ def test_the_first_step_is_the_drivers_and_the_rest_becomes_the_models(
     leader = leader._replace(position=leader.position - 970.0)
     first = start(14.0, -0.4)
     parameters = model.space.defaults().tolist()
-    with_residual = speeds(model, first, leader, *parameters, 0.2, 0.0, 0.0)
+    with_residual = speeds(model, first, leader, *parameters, 0.2, 0.0, 0.0, 0.5)
     assert (float(with_residual[0]) - 14.0) / DT == pytest.approx(-0.4, abs=1e-9)
     if not isinstance(model, W99):  # who never stops oscillating
         simulator, p = MemoryStepper(model, DT), model.space.unpack(model.space.defaults())
@@ -113,7 +123,7 @@ def test_no_residual_keeps_a_vehicle_from_braking_for_its_leader() -> None:
     still = torch.zeros((steps, 1)).double()
     leader = Leader(still + 65.0, still, still, torch.tensor(5.0).double())
     model = IDM()
-    parameters = (*model.space.defaults().tolist(), 20.0, 3.0, 0.0)
+    parameters = (*model.space.defaults().tolist(), 20.0, 3.0, 0.0, 0.5)
     wrapped = WithResidual(model)
     p = wrapped.space.unpack(torch.tensor([parameters]).double())
     simulator = MemoryStepper(wrapped, DT)

@@ -1,6 +1,7 @@
 """The contract of a parameter head: it turns what networks answer into parameters.
 
-Shapes: `*batch` any leading dimensions, N networks, n tuned parameters, c features of conditioning.
+Shapes: `*batch` any leading dimensions, N networks, n tuned parameters, c features of conditioning,
+L frames of a token.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from cfx.models.base import DrivingModel
 from cfx.parameters import ParameterSpace
+from cfx.policies.features import History
 
 
 class ParameterHead(ABC):
@@ -52,6 +54,19 @@ class ParameterHead(ABC):
     def model_space(self) -> ParameterSpace:
         """The driving model's parameters, which stand first in `space`."""
         return self.space
+
+    def measured(self, parameters: Tensor, history: History, dt: float) -> Tensor:
+        """Fills in what is measured of a driver and no network answers.
+
+        Args:
+            parameters: `(*batch, n)`, SI units.
+            history: the last L frames, `(*batch, L)` each.
+            dt: time step, s.
+
+        Returns:
+            `(*batch, n)`, SI units.
+        """
+        return parameters
 
     def sampled(self, parameters: Tensor, noise: Tensor, window_s: float) -> Tensor:
         """Draws the parameters of a window.

@@ -3,7 +3,7 @@
 It is for policies that are not trained. Their networks answer the driving model's parameters; the
 residual of `cfx.models.residual` decays with its default time constant.
 
-Shapes: `*batch` any leading dimensions, m tuned parameters of the driving model, n = m + 2.
+Shapes: `*batch` any leading dimensions, m tuned parameters of the driving model, n = m + 4.
 """
 
 from __future__ import annotations

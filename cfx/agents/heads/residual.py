@@ -1,11 +1,13 @@
 """The residual head: offsets from base parameters, and a residual acceleration that decays.
 
 The network chooses, beside the model's parameters, how fast the residual of
-`cfx.models.residual` is forgotten and where it goes. So the policy starts with exactly the
-acceleration that the driver has, and its decay depends on the state that the network reads. An
-untrained network is the base with a residual that decays in two seconds.
+`cfx.models.residual` and its jerk are forgotten, and where the residual goes. So the policy starts
+with exactly the acceleration that the driver has and with their jerk, and what becomes of both
+depends on the state that the network reads. An untrained network is the base with a residual that
+decays in two seconds. The jerk is measured between the last two frames; what networks answer in its
+place is not read.
 
-Shapes: `*batch` any leading dimensions, m tuned parameters of the driving model, n = m + 2.
+Shapes: `*batch` any leading dimensions, m tuned parameters of the driving model, n = m + 4.
 """
 
 from __future__ import annotations
@@ -18,8 +20,9 @@ from torch import Tensor
 
 from cfx.agents.heads.offset import OffsetHead
 from cfx.models.base import DrivingModel
-from cfx.models.residual import RESIDUAL, WithResidual
+from cfx.models.residual import JERK, RESIDUAL, WithResidual
 from cfx.parameters import ParameterSpace
+from cfx.policies.features import History
 
 
 class ResidualHead(OffsetHead):
@@ -37,6 +40,15 @@ class ResidualHead(OffsetHead):
 
     def driven_model(self, model: DrivingModel) -> DrivingModel:
         return WithResidual(model)
+
+    def measured(self, parameters: Tensor, history: History, dt: float) -> Tensor:
+        acceleration = history.follower_acceleration
+        if acceleration.shape[-1] < 2:
+            return parameters
+        jerk = (acceleration[..., -1] - acceleration[..., -2]) / dt
+        at = self.space.names.index(JERK.name)
+        bounded = jerk.clamp(JERK.low, JERK.high)[..., None].to(parameters)
+        return torch.cat([parameters[..., :at], bounded, parameters[..., at + 1 :]], -1)
 
     def completed(self, parameters: Tensor) -> Tensor:
         known = parameters.shape[-1]

@@ -92,7 +92,7 @@ class WindowStep:
         """
         history = self._history(now, leader, leader_length)
         unit, state = self.core.act(history, base, conditioning, now.state)
-        chosen = self.low + unit * self.range
+        chosen = self.core.head.measured(self.low + unit * self.range, history, self.dt)
         if noise is not None:
             chosen = self.core.head.sampled(chosen, noise, self.stride * self.dt)
         p = self.space.unpack(chosen)
