@@ -58,7 +58,8 @@ def test_the_jerk_is_measured_between_the_last_two_frames_and_bounded() -> None:
     assert found[:, column].tolist() == pytest.approx([1.0, -0.5, JERK.high])
     others = torch.arange(chosen.shape[-1]) != column
     assert torch.equal(found[:, others], chosen[:, others])
-    one = History(*(signal[:, :1] for signal in history))
+    first = blank[:, :1]
+    one = History(first, first, first, first, first)
     assert torch.equal(head.measured(chosen, one, 0.1), chosen)
 
 

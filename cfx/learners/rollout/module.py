@@ -255,7 +255,8 @@ class RolloutModule(BatchedModule):
         batch = self.sampler.validation_with_history()
         if not bool((batch.weight > 0).any()):
             return self.dispersion.clone()
-        least, greatest = (torch.full_like(self.dispersion, math.log(end)) for end in DISPERSIONS)
+        least = torch.full_like(self.dispersion, math.log(DISPERSIONS[0]))
+        greatest = torch.full_like(self.dispersion, math.log(DISPERSIONS[1]))
         for _ in range(_HALVINGS):
             middle = 0.5 * (least + greatest)
             self.dispersion.copy_(middle.exp())
@@ -286,7 +287,11 @@ class RolloutModule(BatchedModule):
             lows.append(speed.amin(1))
             highs.append(speed.amax(1))
         low, high = torch.stack(lows).amin(0), torch.stack(highs).amax(0)
-        measured = Measured(*(values[:, :count] for values in segment.measured))
+        once = slice(None, count)
+        everything = segment.measured
+        measured = Measured(
+            everything.speed[:, once], everything.gap[:, once], everything.counted[:, once]
+        )
         within = (low <= measured.speed) & (measured.speed <= high)
         weight = measured.counted * batch.weight[..., None]
         later = slice(step.stride, None)
