@@ -44,8 +44,11 @@ _LEAST_TEMPERATURE = 0.02
 DISPERSIONS = (0.5, 4.0)
 """Least and greatest factor on the noise of a stochastic head."""
 
-_HALVINGS = 6
-"""Of the logarithm between `DISPERSIONS`, which leave 3 % of a factor."""
+_HALVINGS = 5
+"""Of the logarithm between `DISPERSIONS`, which leave 6 % of a factor."""
+
+_STARTS = (0.3, 0.7)
+"""Shares of a validation trajectory from which these paths are sampled."""
 
 _COVERING = 19
 """Sampled paths whose range holds 90 % of what happens, if it is one of them as far as anybody can
@@ -252,7 +255,7 @@ class RolloutModule(BatchedModule):
         """
         if self.exact_step.core.head.noise_width == 0:
             return None
-        batch = self.sampler.validation_with_history()
+        batch = self.sampler.validation_with_history(_STARTS)
         if not bool((batch.weight > 0).any()):
             return self.dispersion.clone()
         least = torch.full_like(self.dispersion, math.log(DISPERSIONS[0]))

@@ -97,13 +97,19 @@ class TrajectorySampler:
         time_gap = dataset.time_gap[dataset.pair.gather(1, place)]
         return shift, shift * time_gap
 
-    def validation_with_history(self) -> RolloutBatch:
-        """Returns validation trajectories over the horizon, with observed history."""
+    def validation_with_history(
+        self, shares: tuple[float, ...] = _VALIDATION_STARTS
+    ) -> RolloutBatch:
+        """Returns validation trajectories over the horizon, with observed history.
+
+        Args:
+            shares: of each trajectory, at which the policy takes over.
+        """
         dataset, place = self.dataset, self.validation_places
         last, until = dataset.last.gather(1, place), dataset.until.gather(1, place)
         begin = torch.where(until < last, until, 0)
         starts = []
-        for share in _VALIDATION_STARTS:
+        for share in shares:
             starts.append(((begin + share * (last - begin)) / self.stride).long())
         copies = len(starts)
         places = place.repeat(1, copies)
