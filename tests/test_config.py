@@ -7,12 +7,16 @@ from typing import Any
 
 import pytest
 import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hypothesis import given
+from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from pydantic import Field, ValidationError
 
 from cfx import DrivingModel, Parameter, ParameterSpace, Settings, hydra_source, nodes, registry
 from cfx.config import JobConfig
 from cfx.errors import ConfigError, PluginError
+from cfx.hydra_source import path_override
 
 CONF = nodes.conf_dir()
 
@@ -307,3 +311,11 @@ def test_more_threads_than_cores_are_not_used(caplog: pytest.LogCaptureFixture) 
         assert f"there are {cores()} cores here" in caplog.text
     finally:
         torch.set_num_threads(before)
+
+
+@given(st.text("ab1='\\\", (){}[]:#~@+-%\u00fc./;", min_size=1, max_size=12))
+def test_hydra_reads_any_path_back(name: str) -> None:
+    """Names of rows hold equals signs, folders of people spaces and quotes."""
+    path = Path("/place") / name
+    override = OverridesParser.create().parse_override(path_override("data.path", path))
+    assert override.value() == str(path)

@@ -16,6 +16,7 @@ from cfx.benchmark.row import PAIRS, ROW, Row, errors_of, protocol_name, values_
 from cfx.datasets.base import Dataset
 from cfx.errors import ConfigError, DataError, Terminated, nearest
 from cfx.files import atomic_write
+from cfx.hydra_source import path_override
 
 _CHANGE_NOTHING = (
     "tracking",
@@ -65,7 +66,7 @@ def run(
     if fingerprint != DATA:
         about = f"{data.name}, {fingerprint[:12]}"
     job = folder or Path("outputs/benchmark") / _as_file_name(name)
-    command = [*overrides, *OVERRIDES, f"data.path={data}"]
+    command = [*overrides, *OVERRIDES, path_override("data.path", data)]
     protocol = protocol_name(fingerprint)
     print(f"Benchmark {protocol}, row '{name}'; the job's folder: {job}", flush=True)
     _run_job(command, job)
@@ -168,7 +169,7 @@ def _run_job(command: Sequence[str], job: Path) -> None:
     job.mkdir(parents=True, exist_ok=True)
     record.write_text(json.dumps(list(command)), encoding="utf-8")
     began = time.monotonic()
-    code = start([*command, f"hydra.run.dir={job.absolute()}"])
+    code = start([*command, path_override("hydra.run.dir", job.absolute())])
     if code == INTERRUPTED:
         raise KeyboardInterrupt
     if code == TERMINATED:

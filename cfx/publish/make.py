@@ -18,6 +18,7 @@ from cfx.agents.agent import Agent
 from cfx.agents.valid_range import FADED, SIGNALS
 from cfx.errors import ConfigError, DataError, nearest
 from cfx.files import atomic_write, write_json
+from cfx.hydra_source import path_override
 from cfx.publish.recipes import DATA_OVERRIDES, RECIPES
 from cfx.ready import FOLDER
 
@@ -85,7 +86,8 @@ def command_of(name: str) -> str:
 
 def _train(name: str, data: Path, job: Path) -> None:
     command = [sys.executable, "-m", "cfx", *RECIPES[name].overrides, *DATA_OVERRIDES]
-    command += [f"data.path={data.absolute()}", f"hydra.run.dir={job.absolute()}"]
+    command.append(path_override("data.path", data.absolute()))
+    command.append(path_override("hydra.run.dir", job.absolute()))
     # Our own command, no shell.
     done = subprocess.run(command, check=False)  # noqa: S603
     if done.returncode:
