@@ -381,16 +381,22 @@ class Agent:
                 f"the policy has {len(self.names)} networks, one for each of its own pairs, and"
                 " none for others; train one with protocol.networks=all or protocol=across_drivers"
             )
-        number = self.names.index(ALL)
-        row = slice(number, number + 1)
+        return self.only(torch.tensor([self.names.index(ALL)]))
+
+    def only(self, numbers: Tensor) -> Agent:
+        """Returns the agent with some of its networks, `(M,)` int64, which are numbered anew."""
+
+        def rows(values: Tensor | None) -> Tensor | None:
+            return None if values is None else values[numbers.to(values.device)]
+
         return replace(
             self,
-            core=self.core.only(number),
-            names=(ALL,),
-            base=None if self.base is None else self.base[row],
-            population=None if self.population is None else self.population[row],
-            valid_range=None if self.valid_range is None else self.valid_range.only(number),
-            dispersion=None if self.dispersion is None else self.dispersion[row],
+            core=self.core.only(numbers),
+            names=tuple(self.names[number] for number in numbers.tolist()),
+            base=rows(self.base),
+            population=rows(self.population),
+            valid_range=None if self.valid_range is None else self.valid_range.only(numbers),
+            dispersion=rows(self.dispersion),
         )
 
     def to(self, device: torch.device) -> Agent:

@@ -55,12 +55,12 @@ class AgentCore:
             self.policy, self.network.to(device), self.scaler.to(device), self.head.to(device)
         )
 
-    def only(self, number: int) -> AgentCore:
-        """Returns the core of one of the N networks."""
-        at = torch.tensor([number], device=self.scaler.mean.device)
+    def only(self, numbers: Tensor) -> AgentCore:
+        """Returns the core of some of the N networks, `(M,)` int64."""
+        at = numbers.to(self.scaler.mean.device)
         scaler = Scaler(self.scaler.mean[at], self.scaler.scale[at])
         size = self.ensemble_size
-        members = at * size + torch.arange(size, device=at.device)
+        members = (at[:, None] * size + torch.arange(size, device=at.device)).flatten()
         weights = {}
         for name, value in self.network.state_dict().items():
             weights[name] = value[members]

@@ -97,9 +97,9 @@ class ValidRange:
         value = situation.to(self.mean)
         return torch.cat([value < self.low[network], value > self.high[network]], -1)
 
-    def only(self, number: int) -> ValidRange:
-        """Returns the range of one of the N networks."""
-        return ValidRange(*(value[number : number + 1] for value in self._tensors()))
+    def only(self, numbers: Tensor) -> ValidRange:
+        """Returns the ranges of some of the N networks, `(M,)` int64."""
+        return ValidRange(*(value[numbers.to(value.device)] for value in self._tensors()))
 
     def to(self, device: torch.device) -> ValidRange:
         """Returns the same on a device."""

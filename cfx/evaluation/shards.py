@@ -85,17 +85,21 @@ def _nothing(_pairs: int) -> None:
 
 
 def _cut(whole: ClosedLoopShard) -> Iterator[ClosedLoopShard]:
-    for begin in range(0, len(whole.batch), PAIRS_AT_ONCE):
-        part = slice(begin, begin + PAIRS_AT_ONCE)
-        base = None
+    """Yields shards that hold copies of their own rows: pickled, a slice is all that it is of."""
+    every = torch.arange(len(whole.batch), device=whole.first.device)
+    for part in torch.split(every, PAIRS_AT_ONCE):
+        agent, network, base = whole.agent, whole.network[part], None
+        if len(agent.names) > len(part):
+            used, network = torch.unique(network, return_inverse=True)
+            agent = agent.only(used)
         if whole.base is not None:
             base = whole.base[part]
         yield ClosedLoopShard(
             whole.simulator,
-            whole.agent,
+            agent,
             whole.batch[part].trimmed(),
             whole.first[part],
-            whole.network[part],
+            network,
             base,
             whole.history,
         )

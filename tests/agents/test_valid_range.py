@@ -95,7 +95,9 @@ def test_each_network_has_its_own_range() -> None:
     where = learned()[:5]
     zeros, ones = torch.zeros(5, dtype=torch.int64), torch.ones(5, dtype=torch.int64)
     assert bool((both.score(where, zeros) < both.score(where, ones)).all())
-    torch.testing.assert_close(both.only(1).score(where, zeros), both.score(where, ones))
+    torch.testing.assert_close(
+        both.only(torch.tensor([1])).score(where, zeros), both.score(where, ones)
+    )
 
 
 def test_words_say_how_much_and_why() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -48,6 +49,33 @@ def test_shards_give_what_the_whole_gives(monkeypatch: pytest.MonkeyPatch) -> No
         assert one.shape == other.shape
         torch.testing.assert_close(counted(one, whole.counted), counted(other, whole.counted))
     torch.testing.assert_close(parts.beyond, whole.beyond)
+
+
+class Remembering(LocalEngine):
+    """Remembers its shards."""
+
+    def map(self, work: Any, given: Any, report: Any, **options: Any) -> Any:
+        self.shards = list(given)
+        return super().map(work, self.shards, report, **options)
+
+
+def test_a_shard_holds_nothing_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is pickled for a worker, whose memory is small."""
+    monkeypatch.setattr(shards, "PAIRS_AT_ONCE", 2)
+    model, pairs = Krauss(), pairs_of_several_lengths()
+    batch, engine = PairBatch.of(pairs), Remembering()
+    agent = adaptive(model, GruPolicy(hidden_size=4), len(pairs), 30)
+    agent = replace(agent, learned_from={"content": "driver"})
+    first, network = torch.full((5,), 10), torch.arange(5)
+    simulate_in_shards(engine, MemoryStepper(model, 0.1), agent, batch, first, network)
+    assert [len(one.batch) for one in engine.shards] == [2, 2, 1]
+    row = batch.leader_speed[0].nbytes
+    for one in engine.shards:
+        rows = len(one.batch)
+        assert one.batch.leader_speed.untyped_storage().nbytes() == rows * row
+        assert one.first.untyped_storage().nbytes() == rows * one.first.itemsize
+        assert len(one.agent.names) == len(one.agent.scaler.mean) == rows
+        assert not one.agent.learned_from
 
 
 def counted(values: Tensor, frames: Tensor) -> Tensor:
