@@ -10,7 +10,7 @@ import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from cfx.plots.choice.trajectories import Line
 from cfx.plots.look import EDGE, INK, PALE, colour_of
@@ -120,6 +120,18 @@ def mark_points(axes: Axes) -> None:
     for line in axes.lines:
         line.set_marker("o")
         line.set_markersize(3.5)
+
+
+def logarithmic(axes: Axes) -> None:
+    """Makes the vertical axis logarithmic, with plain numbers at 1, 2 and 5."""
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(FuncFormatter(_plain_tick))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+def _plain_tick(value: float, _position: int) -> str:
+    return f"{value:g}"
 
 
 def method_handles(methods: Iterable[str]) -> list[Line2D]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import ScalarFormatter
 
 from cfx.evaluation.distributions import LEVEL
 from cfx.plots.choice.distributions import PIT_TITLE, DistributionView
@@ -14,6 +13,7 @@ from cfx.plots.matplotlib.canvas import (
     DASHES,
     canvas,
     draw_lines,
+    logarithmic,
     mark_points,
     method_legend,
     styled,
@@ -26,8 +26,7 @@ def draw_distributions(view: DistributionView) -> Figure:
     figure = canvas(4.2)
     crps, coverage, pit = figure.subplots(1, 3)
     _against_horizon(crps, view.crps)
-    crps.set_yscale("log")
-    crps.yaxis.set_major_formatter(ScalarFormatter())
+    logarithmic(crps)
     _against_horizon(coverage, view.coverage)
     coverage.axhline(LEVEL, color=EDGE, linewidth=1.0, zorder=1)
     coverage.set_ylim(0.0, 1.0)

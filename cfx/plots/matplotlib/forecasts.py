@@ -5,10 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from matplotlib.figure import Figure
-from matplotlib.ticker import ScalarFormatter
 
 from cfx.plots.choice.forecasts import ForecastPanel
-from cfx.plots.matplotlib.canvas import canvas, draw_lines, mark_points, method_legend, styled
+from cfx.plots.matplotlib.canvas import (
+    canvas,
+    draw_lines,
+    logarithmic,
+    mark_points,
+    method_legend,
+    styled,
+)
 
 
 @styled
@@ -28,8 +34,7 @@ def draw_forecasts(panels: Sequence[ForecastPanel], methods: Sequence[str], agai
         axes.set_xlabel(against)
         axes.set_ylabel(panel.title)
         if panel.logarithmic:
-            axes.set_yscale("log")
-            axes.yaxis.set_major_formatter(ScalarFormatter())
+            logarithmic(axes)
         else:
             axes.set_ylim(bottom=0)
     method_legend(figure, methods)
