@@ -307,6 +307,12 @@ def _constant_kinds(
     kinds = {name: _Kind(agent, agent.begin(each), draws=False)}
     if noise is None:
         time, scale = residual_noise(test, parameters, own=name == "fixed")
+        log.info(
+            "Noise of %s_ar as measured: %.2f m/s2 that lasts %.1f s",
+            name,
+            float(scale.square().mean().sqrt()),
+            float(time.mean()),
+        )
     else:
         ones = torch.ones_like(parameters[:, 0])
         time, scale = noise[0] * ones, noise[1] * ones
