@@ -1,0 +1,98 @@
+"""Memory and CPU time of one calibration of I-80's drivers, from 4,096 candidates each, on one core.
+
+`python -m tests.benchmarks.calibration_memory fixed --model krauss --copies 4`: `fixed`,
+`population` (the pooled sets of six networks) or `labels`; `--copies` makes more drivers of the 229
+that `../shared/data` has.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
+import torch
+
+from cfx import registry
+from cfx.calibration.cache import Cache
+from cfx.calibration.calibrator import Calibrator
+from cfx.calibration.windows import Split, Windows, WindowSettings
+from cfx.datasets.tidy import TidyDataset
+from cfx.models.base import DrivingModel
+from cfx.optimizers.random import RandomSearch
+from cfx.pairs import PairBatch, PairSet
+from cfx.progress import Task
+from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.threads import limit_cores
+
+_FILE = Path(__file__).parents[3] / "shared" / "data" / "i80_reconstructed_pairs.parquet"
+_NETWORKS = 6
+
+
+def memory() -> float:
+    """Returns what this process holds, MB."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 2**20
+
+
+def drivers(copies: int) -> PairSet:
+    """Returns I-80's pairs, each as often as that."""
+    pairs = TidyDataset(path=str(_FILE), min_frames=300).load()
+    several = []
+    for copy in range(copies):
+        for pair in pairs:
+            several.append(replace(pair, pair_id=f"{pair.pair_id} {copy}"))
+    return PairSet(tuple(several), pairs.source)
+
+
+def calibrate(what: str, model: DrivingModel, pairs: PairSet, batch: PairBatch) -> None:
+    """Runs one calibration, without a cache."""
+    tool = Calibrator(
+        MemoryStepper(model, batch.dt),
+        RandomSearch(),
+        seed=0,
+        cache=Cache(None),
+        memory=1 << 30,
+        progress=Task,
+    )
+    settings = WindowSettings()
+    split = Split.of(pairs, settings, 0.8)
+    if what == "fixed":
+        tool.fixed(pairs, batch, split.frame)
+    elif what == "population":
+        number = torch.arange(_NETWORKS)[:, None]
+        tool.population(pairs, batch, split.frame, torch.arange(len(pairs)) % _NETWORKS != number)
+    else:
+        fixed = model.space.defaults().expand(len(pairs), -1)
+        tool.labels(pairs, batch, Windows.of(split.windows, settings), fixed)
+
+
+def main() -> None:
+    """Measures and prints."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", choices=["fixed", "population", "labels"])
+    parser.add_argument("--model", default="krauss")
+    parser.add_argument("--copies", type=int, default=1)
+    options = parser.parse_args()
+    limit_cores(1)
+    torch.set_num_threads(1)
+    imports = memory()
+    pairs = drivers(options.copies)
+    batch = PairBatch.of(pairs)
+    recordings = memory()
+    model = cast("DrivingModel", registry.create("model", {"name": options.model}))
+    before = resource.getrusage(resource.RUSAGE_SELF)
+    calibrate(options.what, model, pairs, batch)
+    after = resource.getrusage(resource.RUSAGE_SELF)
+    print(
+        f"{options.what}, {options.model}, {len(pairs)} pairs:"
+        f" {after.ru_utime - before.ru_utime:.2f} s,"
+        f" {after.ru_stime - before.ru_stime:.2f} s of the system; MB: {imports:.0f} imports,"
+        f" {recordings - imports:.0f} recordings, {after.ru_maxrss / 1024:.0f} at most"
+    )
+
+
+if __name__ == "__main__":
+    main()
