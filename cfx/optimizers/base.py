@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -265,6 +266,10 @@ def _reduce(
 
 def _low_median_high(losses: Tensor, finite: Tensor) -> Tensor:
     """Returns the lowest, median and highest finite loss of each row, `(P, 3)`; NaN if none is."""
+    if bool(finite.all()) and losses.device.type == "cpu" and losses.shape[1]:
+        # NumPy sorts with vector instructions, in less time than PyTorch finds the median.
+        ordered = np.sort(losses.detach().numpy(), axis=1)
+        return torch.as_tensor(ordered[:, [0, (losses.shape[1] - 1) // 2, -1]])
     if bool(finite.all()):
         low, high = losses.aminmax(dim=1)
         return torch.stack([low, losses.median(dim=1).values, high], dim=1)
