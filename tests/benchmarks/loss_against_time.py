@@ -50,6 +50,9 @@ _BUDGETS: dict[str, tuple[dict[str, Any], ...]] = {
 }
 """Settings of each optimizer, in the order of their cost."""
 
+_STEEPEST = 6.0
+"""Times the cost of one budget that the next one costs at most."""
+
 
 def problems(model: DrivingModel, pairs: int) -> Iterator[tuple[str, SegmentLosses]]:
     """Yields the losses of full training parts and of their windows."""
@@ -106,7 +109,7 @@ def curve(name: str, losses: SegmentLosses, guesses: Tensor) -> list[tuple[float
 def _expected(found: list[tuple[float, float]]) -> float:
     """Returns how long the next run will take, judged by the last two."""
     (before, _), (last, _) = found[-2:]
-    return last * max(1.0, last / max(before, 1e-3))
+    return last * min(_STEEPEST, max(1.0, last / max(before, 1e-3)))
 
 
 def reached(found: list[tuple[float, float]], seconds: float) -> float:
