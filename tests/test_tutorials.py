@@ -55,6 +55,7 @@ def test_cells_are_text_and_code() -> None:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("name", RUNNER.NAMES)
 def test_a_tutorial_runs_small(name: str, tmp_path: Path) -> None:
