@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cfx.evaluation.distributions import LEVEL
 from cfx.plots.choice.distributions import PIT_TITLE, DistributionView
-from cfx.plots.choice.forecasts import HORIZON_TITLE, ForecastPanel
+from cfx.plots.choice.forecasts import HORIZON_TITLE
 from cfx.plots.look import EDGE, colour_of
-from cfx.plots.matplotlib.canvas import (
-    DASHES,
-    canvas,
-    draw_lines,
-    logarithmic,
-    mark_points,
-    method_legend,
-    styled,
-)
+from cfx.plots.matplotlib.canvas import DASHES, canvas, logarithmic, method_legend, styled
+from cfx.plots.matplotlib.forecasts import draw_panel
 
 
 @styled
@@ -25,9 +17,9 @@ def draw_distributions(view: DistributionView) -> Figure:
     """Draws CRPS and coverage against the horizon, and the PIT of one horizon."""
     figure = canvas(4.2)
     crps, coverage, pit = figure.subplots(1, 3)
-    _against_horizon(crps, view.crps)
+    draw_panel(crps, view.crps, HORIZON_TITLE)
     logarithmic(crps)
-    _against_horizon(coverage, view.coverage)
+    draw_panel(coverage, view.coverage, HORIZON_TITLE)
     coverage.axhline(LEVEL, color=EDGE, linewidth=1.0, zorder=1)
     coverage.set_ylim(0.0, 1.0)
     for histogram in view.pit:
@@ -44,10 +36,3 @@ def draw_distributions(view: DistributionView) -> Figure:
     pit.set_ylim(bottom=0)
     method_legend(figure, view.methods)
     return figure
-
-
-def _against_horizon(axes: Axes, panel: ForecastPanel) -> None:
-    draw_lines(axes, panel.lines)
-    mark_points(axes)
-    axes.set_xlabel(HORIZON_TITLE)
-    axes.set_ylabel(panel.title)
