@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import math
 import os
@@ -231,13 +232,15 @@ def _links(store: str, port: int) -> list[str]:
 def _sweep_lines(client: MlflowClient, parent: Any, address: str) -> list[str]:
     experiment, name = str(parent.info.experiment_id), parent.data.tags["cfx.sweep_parent"]
     chosen = f"tags.`cfx.sweep` = '{name}'"
-    found = client.search_runs(
+    jobs = client.search_runs(
         [experiment], chosen, order_by=[f"{IMPROVEMENT} DESC"], max_results=1000
     )
+    groups = _over_seeds(jobs)
+    found = list(itertools.chain.from_iterable(groups))
     table = _shared_view(client, experiment, chosen)
     title = f"sweep {name}, {_began(parent)}: {len(found)} jobs"
-    if found:
-        title += _improvement(found[0], "best ")
+    if groups:
+        title += _best(groups[0])
     lines = [
         title,
         f"  table:   {address}{table}",
@@ -250,6 +253,42 @@ def _sweep_lines(client: MlflowClient, parent: Any, address: str) -> list[str]:
             line += f" (the best {COMPARED})"
         lines.append(line)
     return lines
+
+
+def _over_seeds(runs: Sequence[Any]) -> list[list[Any]]:
+    """Returns the runs, those that differ in the seed alone together, the best mean first.
+
+    A single seed that was lucky so comes before no setting that is better on average.
+    """
+    groups: dict[tuple[tuple[str, str], ...], list[Any]] = {}
+    for run in runs:
+        settings = {key: value for key, value in run.data.params.items() if key != "seed"}
+        groups.setdefault(tuple(sorted(settings.items())), []).append(run)
+    return sorted(groups.values(), key=_mean_improvement, reverse=True)
+
+
+def _improvements(runs: Sequence[Any]) -> list[float]:
+    """Returns the improvements of those runs that have one."""
+    values = []
+    for run in runs:
+        value = run.data.metrics.get("rmse_improvement/mean", math.nan)
+        if math.isfinite(value):
+            values.append(value)
+    return values
+
+
+def _mean_improvement(runs: Sequence[Any]) -> float:
+    """Returns the runs' mean improvement, minus infinity if none has one."""
+    values = _improvements(runs)
+    return sum(values) / len(values) if values else -math.inf
+
+
+def _best(runs: Sequence[Any]) -> str:
+    """Returns the improvement of the best setting, over its seeds if there are several."""
+    values = _improvements(runs)
+    if len(values) < 2:
+        return _improvement(runs[0], "best ")
+    return f", best improvement {_mean_improvement(runs):.1%} (mean of {len(values)} seeds)"
 
 
 def _experiment_lines(client: MlflowClient, names: dict[str, str], address: str) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import socket
 import subprocess
@@ -11,12 +12,14 @@ import urllib.request
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from cfx import cli
 from cfx.tracking.store import quiet
 from cfx.tracking.tracker import MlflowTracker
+from cfx.ui import _best, _over_seeds
 from tests.browser import Browser
 
 IMPROVEMENTS = {"krauss": 0.1234, "w99": 0.2345, "w74": -0.0567}
@@ -80,6 +83,23 @@ def fill(store: str) -> str:
     run.store.client.set_tag(run.run_id, "cfx.process", f"{dead.stdout.strip()}@1000000000")
     run.store.client.update_run(run.run_id, status="RUNNING")
     return run.run_id
+
+
+def a_run(model: str, seed: int, improvement: float) -> SimpleNamespace:
+    """Returns a job's run as MLflow gives it."""
+    metrics = {"rmse_improvement/mean": improvement}
+    data = SimpleNamespace(params={"model.name": model, "seed": str(seed)}, metrics=metrics)
+    return SimpleNamespace(data=data, info=SimpleNamespace(status="FINISHED"))
+
+
+def test_a_lucky_seed_is_not_the_best_of_a_sweep() -> None:
+    lucky = [a_run("w99", 0, 0.30), a_run("w99", 1, 0.01), a_run("w99", 2, math.nan)]
+    steady = [a_run("idm", 0, 0.20), a_run("idm", 1, 0.18)]
+    groups = _over_seeds([*lucky, *steady])
+    assert groups == [steady, lucky]
+    assert _best(groups[0]) == ", best improvement 19.0% (mean of 2 seeds)"
+    assert _best([lucky[0]]) == ", best improvement 30.0%"
+    assert _best([lucky[2]]) == ", FINISHED"
 
 
 def free_port() -> int:
