@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cfx import scratch
 from cfx.errors import DataError
 
 if TYPE_CHECKING:
@@ -32,6 +33,9 @@ SIGNALS = (
     "follower_speed",
     "follower_acceleration",
 )
+
+_TOGETHER = 1024
+"""Pairs that one part of the work reads before their signals are let go of."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +154,37 @@ class PairSet(Sequence[Pair]):
         return self.pairs[index]
 
     def __iter__(self) -> Iterator[Pair]:
-        return iter(self.pairs)
+        for start in range(0, len(self.pairs), _TOGETHER):
+            yield from self.pairs[start : start + _TOGETHER]
+            scratch.release()
+
+    @property
+    def size(self) -> int:
+        """Bytes of all signals."""
+        return len(SIGNALS) * 8 * sum(len(pair) for pair in self.pairs)
+
+    def in_file(self) -> PairSet:
+        """Returns the same pairs, whose signals and true parameters lie in a file.
+
+        Raises:
+            OutputError: the disk is full.
+        """
+        rows = [len(SIGNALS) + len(pair.truth) for pair in self.pairs]
+        sizes = [count * len(pair) for count, pair in zip(rows, self.pairs, strict=True)]
+        values = scratch.in_file((sum(sizes),))
+        ends = np.cumsum(sizes)
+        stored = []
+        for pair, count, size, end in zip(self, rows, sizes, ends.tolist(), strict=True):
+            own = values[end - size : end].reshape(count, len(pair))
+            arrays = {name: getattr(pair, name) for name in SIGNALS}
+            kept = {}
+            for row, (name, array) in zip(own, (arrays | dict(pair.truth)).items(), strict=True):
+                row[:] = array
+                kept[name] = row
+            signals: dict[str, Any] = {name: kept[name] for name in SIGNALS}
+            truth = {name: kept[name] for name in pair.truth}
+            stored.append(replace(pair, **signals, truth=truth))
+        return replace(self, pairs=tuple(stored))
 
     def select(self, keep: Sequence[bool], reason: str) -> PairSet:
         """Keeps the pairs marked True and counts the others under `reason`."""
@@ -190,7 +224,7 @@ class PairSet(Sequence[Pair]):
 
 @dataclass(frozen=True)
 class PairBatch:
-    """Pairs as padded tensors.
+    """Pairs as padded tensors; those of many pairs lie in files (`cfx.scratch`).
 
     Beyond its end a pair is continued at its last speed with zero acceleration, so that a rollout
     stays finite there; `mask` says what is real. Positions are relative to the follower's first
@@ -234,21 +268,24 @@ class PairBatch:
             raise DataError("no pairs to stack")
         pair_set = pairs if isinstance(pairs, PairSet) else PairSet(tuple(pairs), "pairs")
         dt, dtype = pair_set.dt, dtype or torch.float64
-        length = max(len(pair) for pair in pair_set)
+        length = max(len(pair) for pair in pair_set.pairs)
+        shape = (len(pair_set), length)
         signals = {}
         for name in SIGNALS:
             # Filled row by row: a list of rows would hold the signal twice.
-            values = np.empty((len(pair_set), length))
+            values = scratch.empty(shape, together=len(SIGNALS))
             for row, pair in zip(values, pair_set, strict=True):
                 row[:] = _extend(pair, name, length)
             signals[name] = torch.as_tensor(values).to(device=device, dtype=dtype)
-        leader_lengths = [pair.leader_length for pair in pair_set]
-        lengths = torch.tensor([len(pair) for pair in pair_set])
+        leader_lengths = [pair.leader_length for pair in pair_set.pairs]
+        lengths = torch.tensor([len(pair) for pair in pair_set.pairs])
+        mask = torch.as_tensor(scratch.empty(shape, bool))
+        torch.lt(torch.arange(length), lengths[:, None], out=mask)
         return cls(
             **signals,
             leader_length=torch.tensor(leader_lengths, dtype=dtype, device=device),
             lengths=lengths.to(device),
-            mask=(torch.arange(length) < lengths[:, None]).to(device),
+            mask=mask.to(device),
             dt=dt,
         )
 
@@ -274,6 +311,7 @@ class PairBatch:
         for one in fields(self):
             if one.name != "dt":
                 chosen[one.name] = getattr(self, one.name)[index]
+        scratch.release()
         return replace(self, **chosen)
 
 

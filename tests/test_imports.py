@@ -29,6 +29,7 @@ FLOORS = (
         "signals",
         "collector",
         "memory",
+        "scratch",
         "job_folder",
         "extras",
     ),

@@ -49,6 +49,9 @@ _EXTREMES = (0.001, 0.999)
 _RECORDED = (0.05, 0.5, 0.95)
 """Quantiles of recordings that are kept, to be set beside live traffic."""
 
+_MOST_PAIRS = 4096
+"""Pairs whose recordings are looked at for these quantiles."""
+
 _WALKING_MPS = 1.5
 """Speed below which a time gap means nothing."""
 
@@ -144,7 +147,13 @@ def weight_of_answer(score: Tensor) -> Tensor:
 
 
 def recorded_quantiles(batch: PairBatch) -> dict[str, tuple[float, ...]]:
-    """Returns quantiles of what recorded drivers do: see `Agent.recorded`."""
+    """Returns quantiles of what recorded drivers do: see `Agent.recorded`.
+
+    Of very many pairs only some are looked at, which are spread evenly over all.
+    """
+    if len(batch) > _MOST_PAIRS:
+        chosen = torch.linspace(0, len(batch) - 1, _MOST_PAIRS).round().long()
+        batch = batch[chosen.to(batch.lengths.device)]
     speed = batch.follower_speed[batch.mask]
     moves = speed > _WALKING_MPS
     signals = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, NamedTuple
@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field
 from pydantic_core import PydanticCustomError
 
-from cfx import registry
+from cfx import registry, scratch
 from cfx.component import Component, Settings
 from cfx.datasets.files import FileStart
 from cfx.datasets.resample import resampled
@@ -256,15 +256,21 @@ def scaled(pairs: PairSet, factor: float) -> PairSet:
     return replace(pairs, pairs=tuple(changed), source=source)
 
 
-def joined(parts: Sequence[PairSet]) -> PairSet:
+def joined(files: Iterable[PairSet]) -> PairSet:
     """Returns the pairs of several files as one set, in their order.
 
-    What was left out for the same reason is counted together.
+    What was left out for the same reason is counted together. Where there are many pairs, their
+    signals are moved into temporary files (`cfx.scratch`), so that memory holds those of one file.
+
+    Args:
+        files: read one after the other.
 
     Raises:
         DataError: a pair stands in two of the files, by its id or by its content, however it is
             called: a driver who counts twice would be learned from and tested.
+        OutputError: the disk of temporary files is full.
     """
+    parts = list(_compact(files))
     if len(parts) == 1:
         return parts[0]
     _require_different(parts)
@@ -277,6 +283,18 @@ def joined(parts: Sequence[PairSet]) -> PairSet:
         ends += part.ends
     sources = listed([part.source for part in parts], 3)
     return PairSet(tuple(pairs), f"{len(parts)} files ({sources})", summed(dropped), summed(ends))
+
+
+def _compact(files: Iterable[PairSet]) -> Iterator[PairSet]:
+    """Yields the pairs of each file; the signals of all but the first few lie in files."""
+    size = 0
+    for part in files:
+        size += part.size
+        if size < scratch.LARGE:
+            yield part
+        else:
+            yield part.in_file()
+            give_back()
 
 
 def _require_different(parts: Sequence[PairSet]) -> None:

@@ -22,7 +22,9 @@ A length of 0 says that the leader's position is that of its rear bumper. See
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, ClassVar
@@ -33,6 +35,7 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet as pq
 
+from cfx import scratch
 from cfx.component import Settings
 from cfx.datasets.base import Dataset, FileDatasetSettings, joined, listed
 from cfx.datasets.files import PARQUET, FileStart, Floats, Ints
@@ -84,7 +87,7 @@ class TidyDataset(Dataset):
         for path in self.settings.files():
             files += partitions(path)
         files = of_recording(files, self.settings.recording)
-        return joined([read_tidy(file) for file in files])
+        return joined(read_tidy(file) for file in files)
 
 
 def read_tidy(path: Path) -> PairSet:
@@ -190,6 +193,12 @@ def _simplest(step: float) -> float:
     return step
 
 
+_ATTRIBUTES = {TRUE_MODEL: "truth_model"} | {name: name for name in DRIVER_TYPES}
+"""Optional columns of labels, and the attributes of pairs that they hold."""
+
+_PAIRS_AT_ONCE = 1024
+"""Pairs that are in one table while they are written."""
+
 # --- writing --------------------------------------------------------------------------------------
 
 
@@ -208,10 +217,9 @@ def write_tidy(pairs: PairSet, path: Path | str) -> None:
     path = Path(path).expanduser()
     if not path.name.lower().endswith((".parquet", ".csv", ".csv.gz")):
         raise OutputError(f"{path}: a tidy file is named .parquet, .csv or .csv.gz")
-    table = _as_table(pairs)
     try:
         with atomic_write(path) as temporary:
-            _write(table, temporary, path.name.lower())
+            _write(_tables(pairs), temporary, path.name.lower())
     except OSError as error:
         raise OutputError(
             f"{path}: cannot be written ({error.strerror or error});"
@@ -221,23 +229,49 @@ def write_tidy(pairs: PairSet, path: Path | str) -> None:
 
 def frame_of(pairs: PairSet) -> pd.DataFrame:
     """Returns pairs as a table in the tidy layout."""
-    frame: pd.DataFrame = _as_table(pairs).to_pandas()
+    frame: pd.DataFrame = pa.concat_tables(_tables(pairs)).to_pandas()
     return frame
 
 
-def _write(table: Any, temporary: Path, name: str) -> None:
-    if name.endswith(".parquet"):
-        pq.write_table(table, temporary, compression="zstd")
-        return
-    compression = None
-    if name.endswith(".gz"):
-        compression = "gzip"
-    with pa.output_stream(str(temporary), compression=compression) as stream:
-        pa.csv.write_csv(table, stream)
+def _write(tables: Iterator[Any], temporary: Path, name: str) -> None:
+    """Writes tables with the same columns, one behind the other."""
+    first = next(tables)
+    with ExitStack() as opened:
+        if name.endswith(".parquet"):
+            writer = pq.ParquetWriter(temporary, first.schema, compression="zstd")
+        else:
+            compression = None
+            if name.endswith(".gz"):
+                compression = "gzip"
+            stream = opened.enter_context(pa.output_stream(str(temporary), compression=compression))
+            writer = pa.csv.CSVWriter(stream, first.schema)
+        opened.enter_context(writer)
+        for table in itertools.chain([first], tables):
+            writer.write_table(table)
 
 
-def _as_table(pairs: PairSet) -> Any:
-    """Returns pairs as an Arrow table in the tidy layout."""
+def _tables(pairs: PairSet) -> Iterator[Any]:
+    """Yields pairs as Arrow tables in the tidy layout, some pairs after the other; one at least."""
+    optional = []
+    if any(pair.lane is not None for pair in pairs.pairs):
+        optional.append(LANE)
+    for name, attribute in _ATTRIBUTES.items():
+        if any(getattr(pair, attribute) for pair in pairs.pairs):
+            optional.append(name)
+    truths = _truth_names(pairs)
+    for start in range(0, max(1, len(pairs)), _PAIRS_AT_ONCE):
+        yield _as_table(pairs[start : start + _PAIRS_AT_ONCE], optional, truths)
+        scratch.release()
+
+
+def _as_table(pairs: Sequence[Pair], optional: Sequence[str], truths: Sequence[str]) -> Any:
+    """Returns pairs as an Arrow table in the tidy layout.
+
+    Args:
+        pairs: the rows.
+        optional: columns of labels that only some files have.
+        truths: true parameters.
+    """
     sizes = [len(pair) for pair in pairs]
     pair_of_row = pa.array(np.repeat(np.arange(len(sizes)), sizes))
 
@@ -257,16 +291,14 @@ def _as_table(pairs: PairSet) -> Any:
     for signal, column in SIGNAL_COLUMNS.items():
         columns[column] = _over_time([getattr(pair, signal) for pair in pairs])
     columns["leader_length_m"] = per_pair([pair.leader_length for pair in pairs], pa.float64())
-    if any(pair.lane is not None for pair in pairs):
+    if LANE in optional:
         columns[LANE] = per_pair([pair.lane for pair in pairs], pa.int64())
-    for name in (TRUE_MODEL, *DRIVER_TYPES):
-        attribute = name.replace(TRUE_MODEL, "truth_model")
-        values = [getattr(pair, attribute) for pair in pairs]
-        if any(values):
-            columns[name] = per_pair(values, pa.string())
-    for name in _truth_names(pairs):
-        truths = [pair.truth.get(name, np.full(len(pair), np.nan)) for pair in pairs]
-        columns[TRUE + name] = _over_time(truths)
+    for name, attribute in _ATTRIBUTES.items():
+        if name in optional:
+            columns[name] = per_pair([getattr(pair, attribute) for pair in pairs], pa.string())
+    for name in truths:
+        values = [pair.truth.get(name, np.full(len(pair), np.nan)) for pair in pairs]
+        columns[TRUE + name] = _over_time(values)
     return pa.table(columns)
 
 
@@ -278,7 +310,7 @@ def _over_time(arrays: Sequence[Floats]) -> Any:
 def _truth_names(pairs: PairSet) -> list[str]:
     """Returns the true parameters that any pair has, in the order in which they come."""
     names: list[str] = []
-    for pair in pairs:
+    for pair in pairs.pairs:
         for name in pair.truth:
             if name not in names:
                 names.append(name)

@@ -5,8 +5,7 @@ Shapes: P pairs, K + 1 frames, n tuned parameters.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -18,9 +17,17 @@ from cfx import registry
 from cfx.agents.agent import Agent
 from cfx.evaluation.closed_loop import ClosedLoop
 from cfx.evaluation.outside import outside_in_words
-from cfx.evaluation.result import METHODS, Array, Evaluation, Improvement, PairTrajectory, Platoon
+from cfx.evaluation.result import METHODS, Array, Evaluation, Improvement, Platoon
 from cfx.evaluation.statistics import improvement_statistics
 from cfx.evaluation.tables import long_table, values_of
+from cfx.evaluation.trajectories import (
+    SimulatedPairs,
+    array,
+    beside_recording,
+    parts_of,
+    rows_of,
+    trajectories_of,
+)
 from cfx.metrics.base import RECORDED, TRANSIENT_S, MetricInfo, Trajectories
 from cfx.metrics.errors import RmseGap, RmseSpeed
 from cfx.metrics.installed import LeftOut, MeasuredMetric, MetricSet, leave_out
@@ -73,24 +80,29 @@ def evaluate(
     if adaptation_space is not None:
         policy_space = adaptation_space
     spaces = dict.fromkeys(METHODS, space) | {"policy": policy_space}
-    test = trajectories_of(batch, first, loops, spaces)
-    scopes = {"test": test, "steady": _after_transient(test)}
-    if full_trajectory:
-        start = torch.zeros_like(first)
-        scopes["full_trajectory"] = trajectories_of(batch, start, full_trajectory, spaces)
-    measured, infos, left_out = _measure(metrics or MetricSet.own(), scopes)
+    measures = _Measures(metrics or MetricSet.own())
+    for rows in parts_of(len(pairs)):
+        some = batch[rows]
+        test = trajectories_of(some, first[rows], _rows(loops, rows), spaces)
+        scopes = {"test": test, "steady": _after_transient(test)}
+        if full_trajectory:
+            start = torch.zeros_like(first[rows])
+            whole = _rows(full_trajectory, rows)
+            scopes["full_trajectory"] = trajectories_of(some, start, whole, spaces)
+        measures.add(scopes)
+    measured, infos, left_out = measures.found()
     drivers = [pair.driver for pair in pairs]
     values = long_table([pair.pair_id for pair in pairs], drivers, measured)
     improvements = {}
     for scope in ("test", "steady", "full_trajectory"):
         improvements[scope] = _improvements(values, scope, drivers, seed)
     return Evaluation(
-        about=_about(pairs, style, fold, test, space.names),
+        about=_about(pairs, style, fold, measures, space.names),
         values=values,
         measured=infos,
         improvements=improvements["test"],
         steady_improvements=improvements["steady"],
-        trajectories=_pair_trajectories(pairs, batch, first, loops),
+        trajectories=SimulatedPairs(pairs, batch, first, loops),
         names=space.names,
         units=tuple(parameter.unit for parameter in space.tuned),
         meanings=tuple(parameter.meaning for parameter in space.tuned),
@@ -125,60 +137,18 @@ def closed_loop_errors(batch: PairBatch, first: Tensor, loop: ClosedLoop) -> tup
     Args:
         first: `(P,)`, the frame of the recording at which each closed loop begins.
     """
-    trajectories = _trajectories(batch, first, loop, ParameterSpace(()))
-    return _array(RmseSpeed().compute(trajectories)), _array(RmseGap().compute(trajectories))
+    speed, gap = [], []
+    for rows in parts_of(len(batch)):
+        space = ParameterSpace(())
+        some = beside_recording(batch[rows], first[rows], rows_of(loop, rows), space)
+        speed.append(array(RmseSpeed().compute(some)))
+        gap.append(array(RmseGap().compute(some)))
+    return np.concatenate(speed), np.concatenate(gap)
 
 
-def trajectories_of(
-    batch: PairBatch,
-    first: Tensor,
-    loops: Mapping[str, ClosedLoop],
-    spaces: Mapping[str, ParameterSpace],
-) -> dict[str, Trajectories]:
-    """Returns closed loops, and the recorded drivers (`real`), beside the recording.
-
-    Args:
-        first: `(P,)`, the frame of the recording at which each closed loop begins.
-        spaces: for each method the bounds within which its parameters were chosen.
-    """
-    found = {}
-    for method, loop in loops.items():
-        found[method] = _trajectories(batch, first, loop, spaces[method])
-    of_any = next(iter(found.values()))
-    found[RECORDED] = replace(
-        of_any,
-        speed=of_any.measured_speed,
-        gap=of_any.measured_gap,
-        parameters=torch.full_like(of_any.parameters, torch.nan),
-        at_limits=None,
-        outside=None,
-    )
-    return found
-
-
-def _trajectories(
-    batch: PairBatch, first: Tensor, loop: ClosedLoop, space: ParameterSpace
-) -> Trajectories:
-    index = _frames(batch, first, loop.counted.shape[1])
-    return Trajectories(
-        speed=loop.speed,
-        gap=loop.gap,
-        measured_speed=batch.follower_speed.gather(1, index),
-        measured_gap=batch.gap.gather(1, index),
-        leader_speed=batch.leader_speed.gather(1, index),
-        parameters=loop.parameters,
-        counted=loop.counted,
-        dt=batch.dt,
-        space=space,
-        at_limits=loop.at_limits,
-        outside=loop.outside,
-    )
-
-
-def _frames(batch: PairBatch, first: Tensor, count: int) -> Tensor:
-    """Returns the frames of the recording from frames `first` `(P,)` on, `(P, count)`."""
-    frames = first[:, None] + torch.arange(count, device=first.device)
-    return frames.clamp(max=batch.mask.shape[1] - 1)
+def _rows(loops: Mapping[str, ClosedLoop], rows: slice) -> dict[str, ClosedLoop]:
+    """Returns of each method the closed loops of some of the pairs."""
+    return {method: rows_of(loop, rows) for method, loop in loops.items()}
 
 
 def _after_transient(trajectories: Mapping[str, Trajectories]) -> dict[str, Trajectories]:
@@ -190,28 +160,57 @@ def _after_transient(trajectories: Mapping[str, Trajectories]) -> dict[str, Traj
     return found
 
 
-def _measure(
-    metrics: MetricSet, scopes: Mapping[str, Mapping[str, Trajectories]]
-) -> tuple[Measured, tuple[MetricInfo, ...], tuple[LeftOut, ...]]:
-    """Computes every metric for every scope and method.
+class _Measures:
+    """What is measured of pairs, some after the other.
 
     A plugin's metric that fails is left out with a warning.
+
+    Attributes:
+        frames: of the test part, how many count of each pair, `(P,)`; one array per part.
+        parameters: by method the mean of each parameter over them, `(P, n)`; the same.
     """
-    measured: Measured = {}
-    infos = []
-    left_out = list(metrics.left_out)
-    for one in metrics.metrics:
-        try:
-            measured |= _values(one, scopes)
-        except (
-            Exception
-        ) as error:  # a plugin may raise anything, and must not cost the job its results
-            if one.distribution == registry.OWN:
-                raise
-            left_out.append(leave_out(one.name, one.distribution, registry.in_words(error)))
-            continue
-        infos.append(_info(one, scopes))
-    return measured, tuple(infos), tuple(left_out)
+
+    def __init__(self, metrics: MetricSet) -> None:
+        self.frames: list[NDArray[np.int64]] = []
+        self.parameters: dict[str, list[Array]] = {}
+        self._metrics = list(metrics.metrics)
+        self._left_out = list(metrics.left_out)
+        self._values: dict[str, dict[tuple[str, str, str], list[Array]]] = {}
+        self._scopes: Collection[str] = ()
+
+    def add(self, scopes: Mapping[str, Mapping[str, Trajectories]]) -> None:
+        """Computes every metric for every scope and method of further pairs."""
+        self._scopes = scopes.keys()
+        for one in list(self._metrics):
+            try:
+                values = _values(one, scopes)
+            except (
+                Exception
+            ) as error:  # a plugin may raise anything, and must not cost the job its results
+                if one.distribution == registry.OWN:
+                    raise
+                self._left_out.append(
+                    leave_out(one.name, one.distribution, registry.in_words(error))
+                )
+                self._metrics.remove(one)
+                continue
+            of_metric = self._values.setdefault(one.name, {})
+            for key, found in values.items():
+                of_metric.setdefault(key, []).append(found)
+        test = scopes["test"]
+        self.frames.append(next(iter(test.values())).counted.sum(1).cpu().numpy())
+        for method, trajectories in test.items():
+            if method != RECORDED:
+                self.parameters.setdefault(method, []).append(_mean_parameters(trajectories))
+
+    def found(self) -> tuple[Measured, tuple[MetricInfo, ...], tuple[LeftOut, ...]]:
+        """Returns what was measured of all pairs, of which metrics, and what was left out."""
+        measured: Measured = {}
+        for one in self._metrics:
+            for key, parts in self._values[one.name].items():
+                measured[key] = np.concatenate(parts)
+        infos = tuple(_info(one, self._scopes) for one in self._metrics)
+        return measured, infos, tuple(self._left_out)
 
 
 @torch.no_grad()
@@ -226,11 +225,11 @@ def _values(one: MeasuredMetric, scopes: Mapping[str, Mapping[str, Trajectories]
                 raise ValueError(f"compute gives the shape {tuple(values.shape)}, not (pairs,)")
             # Where no frame counts nothing is defined, a count of zero neither.
             some = trajectories.counted.any(1)
-            found[one.name, scope, method] = _array(torch.where(some, values, torch.nan))
+            found[one.name, scope, method] = array(torch.where(some, values, torch.nan))
     return found
 
 
-def _info(one: MeasuredMetric, scopes: Mapping[str, Mapping[str, Trajectories]]) -> MetricInfo:
+def _info(one: MeasuredMetric, scopes: Collection[str]) -> MetricInfo:
     metric = one.metric
     return MetricInfo(
         name=one.name,
@@ -267,12 +266,12 @@ def _about(
     pairs: PairSet,
     style: StyleResult,
     fold: Tensor | None,
-    test: Mapping[str, Trajectories],
+    measures: _Measures,
     names: Sequence[str],
 ) -> pd.DataFrame:
     """Returns `Evaluation.about`."""
     by_driver = style.table.set_index("driver")
-    methods = [method for method in test if method != RECORDED]
+    methods = list(measures.parameters)
     drivers = [pair.driver for pair in pairs]
     clusters = by_driver["cluster"].loc[drivers].map(dict(enumerate(CLUSTERS)))
     folds = np.zeros(len(pairs), dtype=np.int64)
@@ -292,9 +291,9 @@ def _about(
     table = pd.DataFrame(of_pair).iloc[np.repeat(np.arange(len(pairs)), len(methods))]
     table = table.reset_index(drop=True)
     table["method"] = np.tile(np.asarray(methods, dtype=object), len(pairs))
-    frames = next(iter(test.values())).counted.sum(1).cpu().numpy()
-    table["frames"] = np.repeat(frames, len(methods))
-    parameters = np.stack([_mean_parameters(test[method]) for method in methods], 1)
+    table["frames"] = np.repeat(np.concatenate(measures.frames), len(methods))
+    of_method = [np.concatenate(parts) for parts in measures.parameters.values()]
+    parameters = np.stack(of_method, 1)
     for k, name in enumerate(names):
         table[f"parameter_{name}"] = parameters[:, :, k].reshape(-1)
     return table
@@ -303,45 +302,4 @@ def _about(
 def _mean_parameters(trajectories: Trajectories) -> Array:
     """Returns the mean of each parameter over the frames that count, `(P, n)`."""
     weight = trajectories.counted[..., None]
-    return _array(torch.where(weight, trajectories.parameters, 0.0).sum(1) / weight.sum(1))
-
-
-def _pair_trajectories(
-    pairs: PairSet, batch: PairBatch, first: Tensor, loops: Mapping[str, ClosedLoop]
-) -> tuple[PairTrajectory, ...]:
-    index = _frames(batch, first, next(iter(loops.values())).counted.shape[1])
-    ends = (batch.lengths - first).tolist()
-    leader_speed = _array(batch.leader_speed.gather(1, index))
-    real_speed = _array(batch.follower_speed.gather(1, index))
-    real_gap = _array(batch.gap.gather(1, index))
-    speed, gap, parameters = {}, {}, {}
-    for method, loop in loops.items():
-        speed[method] = _array(loop.speed)
-        gap[method] = _array(loop.gap)
-        parameters[method] = _array(loop.parameters)
-    found = []
-    for i, pair in enumerate(pairs):
-        end = ends[i]
-        frame = int(first[i]) + np.arange(len(real_speed[i, :end]), dtype=np.float64)
-        trajectory = PairTrajectory(
-            pair_id=pair.pair_id,
-            driver=pair.driver,
-            time=frame * pair.dt,
-            leader_speed=leader_speed[i, :end],
-            real_speed=real_speed[i, :end],
-            real_gap=real_gap[i, :end],
-            speed=_rows(speed, i, end),
-            gap=_rows(gap, i, end),
-            parameters=_rows(parameters, i, end),
-        )
-        found.append(trajectory)
-    return tuple(found)
-
-
-def _rows(by_method: Mapping[str, Array], i: int, end: int) -> dict[str, Array]:
-    """Returns of each method the frames of pair i that were recorded."""
-    return {method: values[i, :end] for method, values in by_method.items()}
-
-
-def _array(values: Tensor) -> Array:
-    return np.asarray(values.double().cpu().numpy())
+    return array(torch.where(weight, trajectories.parameters, 0.0).sum(1) / weight.sum(1))

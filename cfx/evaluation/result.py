@@ -5,7 +5,7 @@ Shapes: K + 1 frames, n tuned parameters.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -14,12 +14,18 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from cfx.evaluation.forecasts import Forecasts
-from cfx.evaluation.tables import summaries, wide_table
+from cfx.evaluation.tables import in_text, summaries, wide_table
 from cfx.evaluation.traffic.result import Traffic
 from cfx.metrics.base import MetricInfo
 from cfx.metrics.installed import LeftOut
 
 Array = NDArray[np.float64]
+
+_PAIRS_AT_ONCE = 1024
+"""Pairs whose closed loops are in one table while they are written."""
+
+_ROWS_AT_ONCE = 1 << 20
+"""Rows of the long table that are text at once, while it is written."""
 
 METHODS = ("default", "population", "fixed", "shrunk", "policy")
 """What an evaluation may compare, in the order in which it is shown.
@@ -178,7 +184,8 @@ class Evaluation:
         values: a row per pair, method, scope and metric; see `cfx.evaluation.tables`.
         measured: the metrics, in the order in which they are shown.
         improvements: statistics of the policy's improvement over each baseline.
-        trajectories: the closed loops themselves, in the order of the pairs.
+        trajectories: the closed loops themselves, in the order of the pairs; those of a job are
+            made when they are asked for.
         names: the tuned parameters' names.
         units: their units.
         bounds: `(2, n)`, those within which the policy chooses.
@@ -205,7 +212,7 @@ class Evaluation:
     values: pd.DataFrame
     measured: tuple[MetricInfo, ...]
     improvements: Mapping[str, Improvement]
-    trajectories: tuple[PairTrajectory, ...]
+    trajectories: Sequence[PairTrajectory]
     names: tuple[str, ...]
     units: tuple[str, ...]
     bounds: Array
@@ -268,6 +275,11 @@ class Evaluation:
             values |= self.traffic.metrics()
         return values
 
+    def values_tables(self) -> Iterator[pd.DataFrame]:
+        """Yields `values` as it is written, some rows after the other."""
+        for start in range(0, max(1, len(self.values)), _ROWS_AT_ONCE):
+            yield in_text(self.values.iloc[start : start + _ROWS_AT_ONCE])
+
     def trajectories_table(self) -> pd.DataFrame:
         """Returns the closed loops in long form, SI units.
 
@@ -275,7 +287,15 @@ class Evaluation:
             gap_METHOD and, for each tuned parameter, NAME_METHOD. A pair's first row is the last
             measured state before the simulation takes over.
         """
-        pieces = self.trajectories
+        return pd.concat(self.trajectories_tables(), ignore_index=True)
+
+    def trajectories_tables(self) -> Iterator[pd.DataFrame]:
+        """Yields the same table, some pairs after the other."""
+        for start in range(0, len(self.trajectories), _PAIRS_AT_ONCE):
+            yield self._trajectories_of(self.trajectories[start : start + _PAIRS_AT_ONCE])
+
+    def _trajectories_of(self, pieces: Sequence[PairTrajectory]) -> pd.DataFrame:
+        """Returns the rows of some pairs of `trajectories_table`."""
         columns: dict[str, object] = {
             "pair_id": np.repeat(
                 np.array([one.pair_id for one in pieces], dtype=object),

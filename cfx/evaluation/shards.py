@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from cfx import scratch
 from cfx.agents.agent import Agent
 from cfx.engine.base import Engine, Report
 from cfx.evaluation.closed_loop import ClosedLoop, simulate_closed_loop
@@ -74,10 +75,11 @@ def simulate_in_shards(
     whole = ClosedLoopShard(simulator, agent, batch, first, network, base, history)
     if len(batch) <= PAIRS_AT_ONCE:
         return simulate_shard(whole, _nothing)
-    found: dict[int, ClosedLoop] = {}
+    joined = _Joined(len(batch), 1 + int((batch.lengths - 1 - first).max()))
     with closing(engine.map(simulate_shard, _cut(whole), _nothing)) as results:
-        found.update(results)
-    return _joined([found[number] for number in range(len(found))])
+        for number, part in results:
+            joined.put(number, part)
+    return joined.whole()
 
 
 def _nothing(_pairs: int) -> None:
@@ -105,31 +107,49 @@ def _cut(whole: ClosedLoopShard) -> Iterator[ClosedLoopShard]:
         )
 
 
-def _joined(parts: list[ClosedLoop]) -> ClosedLoop:
-    """Returns the closed loops of all shards, `(P, K + 1)`.
+class _Joined:
+    """Closed loops of P pairs, put together from shards in any order.
 
-    Frames that a shard has not, because all its pairs end before, repeat its last one and do not
-    count, as frames after the end of a pair.
+    Those of many pairs lie in files (`cfx.scratch`). Frames that a shard has not, because all its
+    pairs end before, repeat its last one and do not count, as frames after the end of a pair.
+
+    Args:
+        pairs: P.
+        columns: K + 1.
     """
-    width = max(part.speed.shape[1] for part in parts)
-    columns: dict[str, Tensor | None] = {}
-    for name in ("speed", "gap", "parameters", "counted", "at_limits", "outside"):
-        values = [getattr(part, name) for part in parts]
-        columns[name] = None
-        if all(value is not None for value in values):
-            columns[name] = torch.cat([_widened(value, width) for value in values])
-    beyond = None
-    if all(part.beyond is not None for part in parts):
-        beyond = torch.stack([part.beyond for part in parts if part.beyond is not None]).sum(0)
-    return ClosedLoop(**columns, beyond=beyond)  # type: ignore[arg-type]  # speed is never None
 
+    def __init__(self, pairs: int, columns: int) -> None:
+        self._shape = (pairs, columns)
+        self._tensors: dict[str, Tensor] = {}
+        self._beyond: dict[int, Tensor] = {}
 
-def _widened(values: Tensor, width: int) -> Tensor:
-    """Returns `(P, width, ...)`: the last column repeated, false where it says yes or no."""
-    missing = width - values.shape[1]
-    if missing == 0:
-        return values
-    tail = values[:, -1:].expand(-1, missing, *values.shape[2:])
-    if values.dtype == torch.bool:
-        tail = torch.zeros_like(tail)
-    return torch.cat([values, tail], dim=1)
+    def put(self, number: int, part: ClosedLoop) -> None:
+        """Takes the closed loops of a shard."""
+        rows = slice(number * PAIRS_AT_ONCE, number * PAIRS_AT_ONCE + len(part.speed))
+        for name in ("speed", "gap", "parameters", "counted", "at_limits", "outside"):
+            values = getattr(part, name)
+            if values is None:
+                continue
+            if name not in self._tensors:
+                self._tensors[name] = self._empty(values)
+            target, width = self._tensors[name][rows], values.shape[1]
+            target[:, :width] = values
+            target[:, width:] = False if values.dtype == torch.bool else values[:, -1:]
+        if part.beyond is not None:
+            self._beyond[number] = part.beyond
+        scratch.release()
+
+    def _empty(self, values: Tensor) -> Tensor:
+        """Returns room for values `(pairs, columns, ...)` of all shards, on their device."""
+        shape = (*self._shape, *values.shape[2:])
+        if values.device.type != "cpu":
+            return values.new_empty(shape)
+        return torch.as_tensor(scratch.empty(shape, values.new_empty(0).numpy().dtype))
+
+    def whole(self) -> ClosedLoop:
+        """Returns the closed loops of all shards, `(P, K + 1)`."""
+        beyond = None
+        if self._beyond:
+            # In the order of the shards: the sum of floating point numbers depends on it.
+            beyond = torch.stack([self._beyond[number] for number in sorted(self._beyond)]).sum(0)
+        return ClosedLoop(**self._tensors, beyond=beyond)

@@ -8,6 +8,7 @@ something of a recording.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -18,8 +19,6 @@ from cfx.metrics.base import RECORDED, SCOPES, MetricInfo, column_of, key_of
 VALUE_COLUMNS = ("pair_id", "driver", "method", "scope", "metric", "value")
 """Columns of the long table, which a job writes as `pair_metrics.parquet`."""
 
-_ID = ["pair_id", "method"]
-
 Floats = NDArray[np.float64]
 
 
@@ -28,7 +27,7 @@ def long_table(
     drivers: Sequence[str],
     measured: Mapping[tuple[str, str, str], Floats],
 ) -> pd.DataFrame:
-    """Returns the long table.
+    """Returns the long table; its names are categories, which need little memory.
 
     Args:
         pair_ids, drivers: of P pairs.
@@ -37,26 +36,46 @@ def long_table(
     groups: dict[tuple[str, str], dict[str, Floats]] = {}
     for (metric, scope, method), values in measured.items():
         groups.setdefault((metric, scope), {})[method] = values
-    parts = []
+    metrics, scopes, methods = (list(dict.fromkeys(part)) for part in zip(*measured, strict=True))
+    names = {"pair_id": list(pair_ids), "method": methods, "scope": scopes, "metric": metrics}
+    codes: dict[str, list[NDArray[Any]]] = {name: [] for name in names}
+    value = []
     for (metric, scope), by_method in groups.items():
         # Pair by pair, the methods in turn: in its last bit pandas' mean over groups depends on the
         # order.
-        methods = list(by_method)
-        columns = {
-            "pair_id": np.repeat(np.asarray(pair_ids, dtype=object), len(methods)),
-            "driver": np.repeat(np.asarray(drivers, dtype=object), len(methods)),
-            "method": methods * len(pair_ids),
-            "scope": scope,
-            "metric": metric,
-            "value": np.stack(list(by_method.values()), axis=1).reshape(-1),
-        }
-        parts.append(pd.DataFrame(columns))
-    return pd.concat(parts, ignore_index=True)
+        of_method = np.array([methods.index(one) for one in by_method], np.int8)
+        rows = len(pair_ids) * len(of_method)
+        codes["pair_id"].append(np.arange(len(pair_ids), dtype=np.int32).repeat(len(of_method)))
+        codes["method"].append(np.tile(of_method, len(pair_ids)))
+        codes["scope"].append(np.full(rows, scopes.index(scope), np.int8))
+        codes["metric"].append(np.full(rows, metrics.index(metric), np.int16))
+        value.append(np.stack(list(by_method.values()), axis=1).reshape(-1))
+    columns: dict[str, Any] = {}
+    for name, found in codes.items():
+        columns[name] = _categories(np.concatenate(found), names[name])
+    of_pair, known = pd.factorize(np.asarray(drivers, dtype=object))
+    columns["driver"] = _categories(of_pair[columns["pair_id"].codes], list(known))
+    columns["value"] = np.concatenate(value)
+    return pd.DataFrame({name: columns[name] for name in VALUE_COLUMNS})
+
+
+def _categories(codes: NDArray[Any], names: list[str]) -> Any:
+    """Returns a column of names, each a number in memory."""
+    return pd.Categorical.from_codes(codes, pd.Index(names))
+
+
+def in_text(rows: pd.DataFrame) -> pd.DataFrame:
+    """Returns rows of the long table with their names as text, as they stand in the file."""
+    texts = {}
+    for name in VALUE_COLUMNS[:-1]:
+        if isinstance(rows[name].dtype, pd.CategoricalDtype):
+            texts[name] = rows[name].astype(rows[name].cat.categories.dtype)
+    return rows.assign(**texts)
 
 
 def values_of(values: pd.DataFrame, metric: str, scope: str) -> pd.DataFrame:
     """Returns one metric in one scope: a row per pair, in their order, and a column per method."""
-    rows = values[(values["metric"] == metric) & (values["scope"] == scope)]
+    rows = in_text(values[(values["metric"] == metric) & (values["scope"] == scope)])
     # `pivot_table` would drop a method whose values are all undefined.
     wide = rows.pivot(index="pair_id", columns="method", values="value")  # noqa: PD010
     return wide.reindex(rows["pair_id"].drop_duplicates())
@@ -72,7 +91,7 @@ def wide_table(
     """
     parameters = [name for name in about if str(name).startswith("parameter_")]
     columns: dict[str, pd.Series] = {}
-    places = pd.MultiIndex.from_frame(about[_ID])
+    places = _Places(about)
     for scope in SCOPES:
         for metric in metrics:
             if scope in metric.scopes:
@@ -99,7 +118,7 @@ def summaries(
     """
     found = {}
     for metric in metrics:
-        rows = values[(values["metric"] == metric.name) & (values["scope"] == scope)]
+        rows = in_text(values[(values["metric"] == metric.name) & (values["scope"] == scope)])
         if scope not in metric.scopes or rows.empty:
             continue
         is_recorded = rows["method"] == RECORDED
@@ -124,10 +143,36 @@ def summarize(values: pd.Series, summary: str) -> float:
     return float(values.agg(summary))
 
 
-def _column(values: pd.DataFrame, metric: str, scope: str, places: pd.MultiIndex) -> pd.Series:
+class _Places:
+    """The rows of a table by pair and method.
+
+    Args:
+        about: columns pair_id and method.
+    """
+
+    def __init__(self, about: pd.DataFrame) -> None:
+        self._pairs = pd.Index(about["pair_id"].unique())
+        self._methods = pd.Index(about["method"].unique())
+        self._numbers = self._number(about)
+
+    def of(self, rows: pd.DataFrame) -> pd.Series:
+        """Returns the values that rows of the long table have at these places; else NaN."""
+        found = np.full(len(self._pairs) * len(self._methods), np.nan)
+        number = self._number(rows)
+        found[number[number >= 0]] = rows["value"].to_numpy()[number >= 0]
+        return pd.Series(found[self._numbers])
+
+    def _number(self, rows: pd.DataFrame) -> NDArray[np.int64]:
+        """Returns the number of each row's pair and method; negative where there are none such."""
+        pair = self._pairs.get_indexer(pd.Index(rows["pair_id"]))
+        method = self._methods.get_indexer(pd.Index(rows["method"]))
+        number = pair.astype(np.int64) * len(self._methods) + method
+        return np.where((pair < 0) | (method < 0), -1, number)
+
+
+def _column(values: pd.DataFrame, metric: str, scope: str, places: _Places) -> pd.Series:
     """Returns a metric at each place (pair and method)."""
-    rows = values[(values["metric"] == metric) & (values["scope"] == scope)]
-    return rows.set_index(_ID)["value"].reindex(places).reset_index(drop=True)
+    return places.of(values[(values["metric"] == metric) & (values["scope"] == scope)])
 
 
 def _whole_numbers(column: pd.Series) -> pd.Series:
@@ -140,7 +185,7 @@ def _whole_numbers(column: pd.Series) -> pd.Series:
 def _improvements(about: pd.DataFrame, values: pd.DataFrame) -> dict[str, pd.Series]:
     """Returns each method's improvement of the RMSE of speed over each baseline, by column."""
     speed = values_of(values, "rmse_speed", "test")
-    own = _column(values, "rmse_speed", "test", pd.MultiIndex.from_frame(about[_ID]))
+    own = _column(values, "rmse_speed", "test", _Places(about))
     columns = {}
     for baseline in about["method"].drop_duplicates():
         if baseline == "policy":

@@ -5,12 +5,15 @@ from __future__ import annotations
 import functools
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import yaml
 
 from cfx.collector import importing
@@ -170,11 +173,11 @@ def write_tables(
         OutputError: a file cannot be written.
     """
     evaluation = protocol_result.evaluation
-    trajectories, curves = evaluation.trajectories_table, typed_curves(protocol_result.curves)
+    curves = typed_curves(protocol_result.curves)
     output.file("pairs.csv", lambda path: evaluation.table.to_csv(path, index=False))
-    values = evaluation.values
-    output.file("pair_metrics.parquet", lambda path: values.to_parquet(path, index=False))
-    output.file("trajectories.parquet", lambda path: trajectories().to_parquet(path, index=False))
+    values, trajectories = evaluation.values_tables, evaluation.trajectories_tables
+    output.file("pair_metrics.parquet", lambda path: write_parquet(values(), path))
+    output.file("trajectories.parquet", lambda path: write_parquet(trajectories(), path))
     output.file("curves.parquet", lambda path: curves.to_parquet(path, index=False))
     output.file("style.csv", lambda path: style.table.to_csv(path, index=False))
     if protocol_result.labels is not None:
@@ -183,6 +186,23 @@ def write_tables(
     if any(pair.truth for pair in pairs):
         output.file("data.parquet", lambda path: write_tidy(pairs, path))
     return write_further_tables(output, evaluation, view)
+
+
+def write_parquet(parts: Iterable[pd.DataFrame], path: Path) -> None:
+    """Writes a table, of which there may be more than fits into memory.
+
+    Args:
+        parts: its rows, some after the other; one part at least.
+        path: of the file.
+    """
+    with ExitStack() as opened:
+        writer: pq.ParquetWriter | None = None
+        for part in parts:
+            schema = None if writer is None else writer.schema
+            table = pa.Table.from_pandas(part, schema, preserve_index=False)
+            if writer is None:
+                writer = opened.enter_context(pq.ParquetWriter(path, table.schema))
+            writer.write_table(table)
 
 
 def write_further_tables(

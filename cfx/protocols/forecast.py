@@ -26,6 +26,7 @@ from cfx.evaluation.forecast_paths import (
 )
 from cfx.evaluation.forecasts import Forecasts, forecast_errors
 from cfx.evaluation.result import Evaluation
+from cfx.evaluation.tables import in_text
 from cfx.policies.fixed import FixedPolicy
 from cfx.protocols.across_drivers import AcrossDrivers, AcrossDriversSettings
 from cfx.protocols.base import ProtocolContext, ProtocolResult
@@ -269,7 +270,7 @@ def _constants(test: HeldOut) -> dict[str, Tensor]:
 
 def _with_forecasts(evaluation: Evaluation, forecasts: Forecasts) -> Evaluation:
     """Returns the evaluation with forecasts, also in its long table."""
-    values = pd.concat([evaluation.values, forecasts.values()], ignore_index=True)
+    values = pd.concat([in_text(evaluation.values), forecasts.values()], ignore_index=True)
     return replace(evaluation, values=values, forecasts=forecasts)
 
 

@@ -14,18 +14,24 @@ leading minus sign, with which they would all be negative, is left out.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from cfx import scratch
 from cfx.errors import DataError
-from cfx.pairs import PairSet
+from cfx.pairs import Pair, PairSet
 from cfx.style.result import CLUSTERS, StyleResult
 from cfx.style.settings import StyleSettings
 
 Floats = NDArray[np.float64]
+
+
+_PAIRS_AT_ONCE = 4096
+"""Pairs whose frames are looked at together."""
 
 
 class Indicator(NamedTuple):
@@ -109,6 +115,28 @@ def indicators(pairs: PairSet) -> pd.DataFrame:
     or more; for a driver who is never that fast, it is the mean space headway over 0.5 m/s.
     Variances are those of the population (divided by the number of frames).
     """
+    parts = [_indicators(some) for some in _by_driver(pairs)]
+    return pd.concat(parts, ignore_index=True)
+
+
+def _by_driver(pairs: PairSet) -> Iterator[list[Pair]]:
+    """Yields the pairs of some drivers, then of some others: frames of all need much memory."""
+    of_driver: dict[str, list[int]] = {}
+    for index, pair in enumerate(pairs.pairs):
+        of_driver.setdefault(pair.driver, []).append(index)
+    some: list[Pair] = []
+    for indices in of_driver.values():
+        some += [pairs[index] for index in indices]
+        if len(some) >= _PAIRS_AT_ONCE:
+            yield some
+            some = []
+            scratch.release()
+    if some:
+        yield some
+
+
+def _indicators(pairs: Sequence[Pair]) -> pd.DataFrame:
+    """Returns the indicators of drivers all of whose pairs are given."""
     sizes = [len(pair) for pair in pairs]
     code, drivers = pd.factorize(np.array([pair.driver for pair in pairs], dtype=object))
     code = np.repeat(code, sizes)
