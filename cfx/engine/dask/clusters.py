@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import inspect
 import logging
+import multiprocessing
+import sys
+import uuid
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from cfx.engine.dask.settings import DaskSettings
@@ -73,15 +78,31 @@ def start(settings: DaskSettings) -> Any:
         make = _in_queue
     elif settings.cluster == "kubernetes":
         make = _pods
+    elif getattr(multiprocessing.current_process(), "_inheriting", False):
+        # The job that started this worker says what is to be done.
+        raise SystemExit("a worker was started by a script, and must not run it again")
     try:
         return make(settings)
     except Exception as error:  # these packages raise whatever their programs end in
         first = next(iter(str(error).splitlines()), "")
+        advice = f"engine.options={settings.options} goes to it as it is"
+        if make is _local and _script():
+            advice = (
+                f"workers import {_script()}: put what it runs below `if __name__ =="
+                ' "__main__":`, or it runs again in each of them'
+            )
         raise EngineError(
             f"engine.cluster={settings.cluster or 'local'} cannot be started"
-            f" ({type(error).__name__}: {first}); engine.options={settings.options} goes to it as"
-            " it is"
+            f" ({type(error).__name__}: {first}); {advice}"
         ) from error
+
+
+def _script() -> str:
+    """Returns the name of the Python script that runs; "" for a module and in a notebook."""
+    main = sys.modules["__main__"]
+    if getattr(main, "__spec__", None) is not None:
+        return ""
+    return Path(getattr(main, "__file__", None) or "").name
 
 
 def _local(settings: DaskSettings) -> Any:
@@ -113,6 +134,8 @@ def _in_queue(settings: DaskSettings) -> Any:
         "scheduler_options": {"dashboard": False, "dashboard_address": "127.0.0.1:0"},
         "silence_logs": logging.CRITICAL,
         "security": _security(settings),
+        # Where the workers' keys lie while the job runs: nodes see the job's own folder.
+        "shared_temp_directory": str(Path.cwd()),
     }
     cluster = _class(package)(**{**arguments, **settings.options})
     # Unlike `scale`, this replaces jobs that the queue has ended.
@@ -122,15 +145,29 @@ def _in_queue(settings: DaskSettings) -> Any:
 
 
 def _pods(settings: DaskSettings) -> Any:
-    package = _PACKAGES["kubernetes"]
-    limits = {"cpu": "1", "memory": settings.memory}
+    from dask.utils import parse_bytes
+
+    operator = importlib.import_module(_PACKAGES["kubernetes"].module)
+    limits = {"cpu": "1", "memory": str(parse_bytes(settings.memory))}
     arguments = {
-        "name": "cfx",
+        "name": f"cfx-{uuid.uuid4().hex[:10]}",
         "n_workers": workers_of(settings),
         "resources": {"limits": limits, "requests": limits},
+        "worker_command": ["dask", "worker", "--nthreads", "1"],
         "quiet": True,
+        **settings.options,
     }
-    return _class(package)(**{**arguments, **settings.options})
+    if "custom_cluster_spec" not in arguments:
+        spec = {}
+        for name in inspect.signature(operator.make_cluster_spec).parameters:
+            if name in arguments:
+                spec[name] = arguments.pop(name)
+        pods = operator.make_cluster_spec(**spec)
+        # As pods are made elsewhere it is `dask-scheduler`, which Dask has no more.
+        container = pods["spec"]["scheduler"]["spec"]["containers"][0]
+        container["args"] = ["dask", "scheduler", *container["args"][1:]]
+        arguments["custom_cluster_spec"] = pods
+    return operator.KubeCluster(**arguments)
 
 
 def _class(package: _Package) -> Any:
