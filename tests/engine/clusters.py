@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -48,20 +49,29 @@ class Cluster:
         listed = Path(f"/proc/{worker.pid}/task/{worker.pid}/children").read_text()
         return [int(number) for number in listed.split()]
 
-    def kill_workers(self, rounds: int, when: Callable[[], object]) -> None:
-        """Kills all workers with signal 9, again and again; nannies start them again.
+    @contextmanager
+    def kills(self, rounds: int, when: Callable[[], object]) -> Iterator[None]:
+        """Kills all workers with signal 9, again and again, beside the block.
+
+        Nannies start them again. The block must not end before the last round.
 
         Args:
             rounds: how often.
             when: says that it is time for the next round; the work must have made some progress
                 since the last one, or it would never end.
         """
-        for _ in range(rounds):
-            until(when, seconds=120.0)
-            for worker in self.workers:
-                for child in self.children(worker):
-                    with suppress(ProcessLookupError):
-                        os.kill(child, signal.SIGKILL)
+
+        def kill() -> None:
+            for _ in range(rounds):
+                until(when, seconds=120.0)
+                for worker in self.workers:
+                    for child in self.children(worker):
+                        with suppress(ProcessLookupError):
+                            os.kill(child, signal.SIGKILL)
+
+        with meanwhile(kill) as killing:
+            yield
+            assert not killing.is_alive(), "the work ended before the workers were killed"
 
     def stop(self) -> None:
         for process in [*self.workers, self.scheduler]:
@@ -89,15 +99,26 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 @contextmanager
-def running_cluster(workers: int, *options: str) -> Iterator[str]:
-    """Yields the address of a cluster that is stopped after the block."""
+def running_cluster(workers: int, *options: str) -> Iterator[Cluster]:
+    """Yields a cluster that is stopped after the block."""
     cluster = Cluster()
     try:
         for _ in range(workers):
             cluster.start_worker(*options)
-        yield cluster.address
+        yield cluster
     finally:
         cluster.stop()
+
+
+@contextmanager
+def meanwhile(what: Callable[[], None]) -> Iterator[threading.Thread]:
+    """Does something beside the block, and waits for its end after it."""
+    thread = threading.Thread(target=what)
+    thread.start()
+    try:
+        yield thread
+    finally:
+        thread.join()
 
 
 def until(what: object, seconds: float = 60.0) -> None:

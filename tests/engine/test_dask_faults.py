@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -27,7 +25,7 @@ from cfx.pairs import PairBatch
 from cfx.progress import Task
 from cfx.simulation.rollout import MemoryStepper
 from tests.drives import wavy_pairs
-from tests.engine.clusters import Cluster, until
+from tests.engine.clusters import Cluster, meanwhile, running_cluster, until
 
 SAMPLES = 12288
 PAIRS, WINDOWS = 60, 240
@@ -72,22 +70,8 @@ def expected() -> Tensor:
 
 @pytest.fixture
 def cluster() -> Iterator[Cluster]:
-    made = Cluster()
-    made.start_worker()
-    made.start_worker()
-    yield made
-    made.stop()
-
-
-@contextmanager
-def meanwhile(what: Callable[[], None]) -> Iterator[threading.Thread]:
-    """Does something beside the block, and waits for its end after it."""
-    thread = threading.Thread(target=what)
-    thread.start()
-    try:
-        yield thread
-    finally:
-        thread.join()
+    with running_cluster(workers=2) as made:
+        yield made
 
 
 @pytest.mark.slow
@@ -102,15 +86,10 @@ def test_workers_that_are_killed_ten_times_change_nothing(
         before, seen[0] = seen[0], len(list(tmp_path.rglob("*.entry")))
         return seen[0] > before
 
-    def kill_ten() -> None:
-        cluster.kill_workers(5, some_are_finished)
-
     engine = DaskEngine(address=cluster.address)
-    with meanwhile(kill_ten) as killing:
+    with cluster.kills(5, some_are_finished):
         found = calibrated(engine, tmp_path)
-        was_over = not killing.is_alive()
     engine.close()
-    assert was_over, "the calibration ended before ten workers were killed"
     assert torch.equal(found, expected)
 
 

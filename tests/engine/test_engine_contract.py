@@ -40,8 +40,8 @@ def test_it_is_chosen_by_name() -> None:
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[str]:
     """One cluster for all statements: starting it takes seconds."""
-    with running_cluster(workers=1) as address:
-        yield address
+    with running_cluster(workers=1) as made:
+        yield made.address
 
 
 class TestDask(EngineContract):
