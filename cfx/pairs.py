@@ -310,9 +310,28 @@ class PairBatch:
         chosen: dict[str, Any] = {}
         for one in fields(self):
             if one.name != "dt":
-                chosen[one.name] = getattr(self, one.name)[index]
+                chosen[one.name] = _selected(getattr(self, one.name), index)
         scratch.release()
         return replace(self, **chosen)
+
+
+def _selected(values: Tensor, index: Any) -> Tensor:
+    """Returns rows of values `(P, ...)`; many rows lie in a file, as those that they are copies of.
+
+    Args:
+        values: of all pairs.
+        index: a slice, an index tensor, or a boolean mask `(P,)`.
+    """
+    import torch
+
+    is_copy = isinstance(index, torch.Tensor) and index.dtype == torch.int64 and values.ndim == 2
+    if not is_copy or values.device.type != "cpu":
+        return values[index]
+    size = len(index) * values.shape[1] * values.itemsize
+    if len(SIGNALS) * size < scratch.LARGE:
+        return values[index]
+    rows = scratch.in_file((len(index), values.shape[1]), values[:0].numpy().dtype)
+    return torch.index_select(values, 0, index, out=torch.as_tensor(rows))
 
 
 def _extend(pair: Pair, name: str, length: int) -> Array:

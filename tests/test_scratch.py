@@ -109,7 +109,10 @@ def test_a_batch_in_files_is_the_same_batch(
     for name in ("leader_position", "follower_speed", "mask", "lengths"):
         assert torch.equal(getattr(found, name), getattr(expected, name))
     some = torch.tensor([4, 1])
-    assert torch.equal(found[some].gap, expected[some].gap)
+    before = maps()
+    chosen = found[some]
+    assert maps() > before
+    assert torch.equal(chosen.gap, expected[some].gap)
 
 
 @pytest.mark.parametrize("suffix", [".parquet", ".csv", ".csv.gz"])

@@ -18,6 +18,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from cfx import scratch
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.losses import SegmentLosses
 from cfx.objectives.base import Objective
@@ -26,6 +27,9 @@ from cfx.pairs import PairBatch
 
 PLACES = 21
 """G: places between a parameter's bounds, both included."""
+
+_PAIRS_AT_ONCE = 1024
+"""Pairs whose segments are cut together."""
 
 
 def slices(
@@ -96,14 +100,15 @@ def losses_of(
     calibrator: Calibrator, objective: Objective, batch: PairBatch, last: Tensor, candidates: Tensor
 ) -> Tensor:
     """Returns losses `(P, q)` of candidates `(P, q, n)` in unit space, pair by pair in chunks."""
-    pair = torch.arange(len(batch), device=candidates.device)
-    first = torch.zeros_like(pair)
-    segments = SegmentLosses.of_segments(
-        calibrator.simulator, objective, batch, pair, first, last.to(pair.device)
-    )
-    per_pair = segments.bytes_per_candidate * candidates.shape[1]
-    size = max(1, calibrator.memory // max(1, per_pair))
     parts = []
-    for part in torch.split(pair, size):
-        parts.append(segments.take(part)(candidates[part]))
+    for own in torch.split(torch.arange(len(batch), device=candidates.device), _PAIRS_AT_ONCE):
+        first, end = torch.zeros_like(own), last.to(own.device)[own]
+        segments = SegmentLosses.of_segments(
+            calibrator.simulator, objective, batch, own, first, end
+        )
+        per_pair = segments.bytes_per_candidate * candidates.shape[1]
+        size = max(1, calibrator.memory // max(1, per_pair))
+        for some in torch.split(torch.arange(len(own), device=own.device), size):
+            parts.append(segments.take(some)(candidates[own[some]]))
+        scratch.release()
     return torch.cat(parts)

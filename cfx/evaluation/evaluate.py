@@ -21,11 +21,11 @@ from cfx.evaluation.result import METHODS, Array, Evaluation, Improvement, Plato
 from cfx.evaluation.statistics import improvement_statistics
 from cfx.evaluation.tables import long_table, values_of
 from cfx.evaluation.trajectories import (
-    SimulatedPairs,
     array,
     beside_recording,
     parts_of,
     rows_of,
+    simulated_pairs,
     trajectories_of,
 )
 from cfx.metrics.base import RECORDED, TRANSIENT_S, MetricInfo, Trajectories
@@ -102,7 +102,7 @@ def evaluate(
         measured=infos,
         improvements=improvements["test"],
         steady_improvements=improvements["steady"],
-        trajectories=SimulatedPairs(pairs, batch, first, loops),
+        trajectories=simulated_pairs(pairs, batch, first, loops),
         names=space.names,
         units=tuple(parameter.unit for parameter in space.tuned),
         meanings=tuple(parameter.meaning for parameter in space.tuned),

@@ -118,11 +118,11 @@ def summaries(
     """
     found = {}
     for metric in metrics:
-        rows = in_text(values[(values["metric"] == metric.name) & (values["scope"] == scope)])
+        rows = values[(values["metric"] == metric.name) & (values["scope"] == scope)]
         if scope not in metric.scopes or rows.empty:
             continue
         is_recorded = rows["method"] == RECORDED
-        by_method = rows[~is_recorded].groupby("method")["value"]
+        by_method = rows[~is_recorded].groupby("method", observed=True)["value"]
         if metric.summary == "sum":
             summary = by_method.sum(min_count=1)
         else:

@@ -95,6 +95,20 @@ def _frames(batch: PairBatch, first: Tensor, count: int) -> Tensor:
     return frames.clamp(max=batch.mask.shape[1] - 1)
 
 
+def simulated_pairs(
+    pairs: PairSet, batch: PairBatch, first: Tensor, loops: Mapping[str, ClosedLoop]
+) -> Sequence[PairTrajectory]:
+    """Returns the test part of each pair; of many pairs, each is made when it is asked for.
+
+    Args:
+        pairs, batch, first, loops: as for `SimulatedPairs`.
+    """
+    found = SimulatedPairs(pairs, batch, first, loops)
+    if len(pairs) > PAIRS_AT_ONCE:
+        return found
+    return tuple(found)
+
+
 @dataclass(frozen=True)
 class SimulatedPairs(Sequence[PairTrajectory]):
     """The test part of each pair as it was recorded and simulated; each is made when asked for.
