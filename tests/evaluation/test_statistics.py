@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
+from cfx.evaluation import statistics
 from cfx.evaluation.statistics import improvement_statistics, mean_interval
 
 
@@ -91,3 +92,19 @@ def test_a_mean_has_an_interval_over_drivers() -> None:
     assert low < mean < high
     assert math.isnan(mean_interval(values, ["a"] * 5, seed=0)[1])
     assert all(math.isnan(value) for value in mean_interval([math.nan], ["a"], seed=0))
+
+
+def test_of_very_many_drivers_the_interval_is_the_limit_of_the_bootstrap(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Some drivers have several pairs, which are alike."""
+    rng = np.random.default_rng(3)
+    who = np.sort(rng.integers(0, 400, 1000))
+    gain = rng.normal(0.1, 0.2, 1000) + rng.normal(0, 0.3, 400)[who]
+    drivers = [str(driver) for driver in who]
+    _, low, high = mean_interval(gain.tolist(), drivers, seed=0)
+    monkeypatch.setattr(statistics, "_MOST_RESAMPLED", 100)
+    mean, lower, higher = mean_interval(gain.tolist(), drivers, seed=0)
+    assert mean == pytest.approx(gain.mean())
+    assert higher - lower == pytest.approx(high - low, rel=0.05)
+    assert lower == pytest.approx(low, abs=0.05 * (high - low))
