@@ -16,7 +16,7 @@ _TRIMMED = 0.1
 _RESAMPLES = 9_999
 
 _MOST_RESAMPLED = 10_000
-"""Drivers from which on the interval is the bootstrap's limit: resampling them all takes minutes."""
+"""Drivers from which on the interval is the bootstrap's limit: resampling them takes minutes."""
 
 _NORMAL_975 = 1.959964
 """97.5 % quantile of the normal distribution."""
