@@ -37,6 +37,9 @@ LOCK_SECONDS = 15.0
 Jobs of a sweep hold it for milliseconds.
 """
 
+_TURNS = 20
+"""How many times as long a job waits for its turn among hundreds that start at once."""
+
 _PATIENCE_S = 60
 """How long a later write waits: the work is done by then, and worth the wait."""
 
@@ -146,8 +149,10 @@ def open_store(uri: str, experiment: str, default: Path | None = None) -> Store:
     name = "mlflow"
     if file is not None:
         name = file.name
-    lock = lock_for(home / f"{name}.lock", timeout=4 * LOCK_SECONDS)
-    # It imports MLflow, SQLAlchemy and Alembic.
+    # Not while the lock is held: on a busy machine it takes each of many jobs a minute.
+    with importing(), quiet():
+        _import_databases()
+    lock = lock_for(home / f"{name}.lock", timeout=_TURNS * LOCK_SECONDS)
     with _held(lock), importing():
         if file is not None:
             if _is_new(file):
@@ -306,6 +311,13 @@ def folder_of(folder_or_run: str | Path, uri: str | None = None) -> Path:
     if folder.is_dir():
         return folder
     return download_run(str(folder_or_run), uri)
+
+
+def _import_databases() -> None:
+    """Imports what MLflow imports for its first answer: SQLAlchemy, Alembic and its own stores."""
+    _import_mlflow()
+    import mlflow.store.db.utils
+    import mlflow.store.tracking.sqlalchemy_store  # noqa: F401 - imported for later
 
 
 def _import_mlflow() -> Any:
