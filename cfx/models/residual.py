@@ -1,21 +1,29 @@
-"""A driving model with a residual: the model explains most of the acceleration, not all of it.
+"""A driving model that takes over from the acceleration that a vehicle has.
 
-    a(t) = a_model(t) + r(t)        r(t0) = a_measured(t0) - a_model(t0)
-    r(t + dt) = c + (r(t) - c) exp(-dt / tau) + j(t + dt) dt        j(t0) = jerk_measured(t0)
-    j(t + dt) = j(t) exp(-dt / tau_j)
+    a(t) = w(t) h(t) + (1 - w(t)) a_model(t) + r(t)         w(t) = exp(-((t - t0) / tau_w)^2)
+    h(t + dt) = h(t) + j(t + dt) dt                         h(t0) = a_measured(t0)
+    j(t + dt) = j(t) exp(-dt / tau_j)                       j(t0) = jerk_measured(t0)
+    r(t + dt) = c + (r(t) - c) exp(-dt / tau)               r(t0) = 0
 
-The residual r begins as what the model misses of the acceleration at the first step. So a
-simulation starts with the acceleration that the vehicle has. From there r goes to the target c, in
-m/s2, with the time constant tau. Beside that it goes on growing with the jerk that the vehicle has
-at the start, which is forgotten with the time constant tau_j: people's accelerations change
-smoothly. Target and time constants are parameters like the model's own: constants make a baseline,
+A simulation starts with the acceleration that the vehicle has, and holds it: h goes on changing
+with the jerk that the vehicle has at the start, which is forgotten with the time constant tau_j, as
+people's accelerations change smoothly. The model counts for nothing at first (w = 1), and takes
+over with the time constant tau_w. Beside it stands a residual r, in m/s2, which goes from 0 to the
+target c with the time constant tau.
+
+The usual form adds what the model misses at the start to all that it wants later, `a_model(t) +
+r(t)` with `r(t0) = a_measured(t0) - a_model(t0)`. It has the vehicle's acceleration in the first
+step alone: afterwards the model's own changes come on top. A stiff model, such as Krauss's, takes
+the speed that it wants within a step; what it misses at the start says nothing of the next step.
+
+Target and time constants are parameters like the model's own: constants make a baseline,
 and a policy may choose them anew for each window. The jerk is a parameter too, which is read in the
 first step only; 0 where nobody knows it. With c drawn at random the residual is
 the auto-regressive noise of C. Zhang and L. Sun (2024), *Bayesian calibration of the intelligent
 driver model*, IEEE T-ITS 25(8), whose errors of acceleration are AR(1).
 
-Where a vehicle has to brake hard so as not to hit its leader, the residual does not keep it from
-that: see `WithResidual`.
+Where a vehicle has to brake hard so as not to hit its leader, nothing of this keeps it from that:
+see `WithResidual`.
 
 Shapes: `*batch` are any leading dimensions; m is the width of the inner model's memory.
 """
@@ -60,7 +68,7 @@ JERK = Parameter(
     -5.0,
     5.0,
     0.0,
-    "the jerk with which the residual acceleration grows at the start",
+    "the jerk with which the acceleration goes on at the start",
     "0: it is not known",
 )
 JERK_TIME = Parameter(
@@ -73,8 +81,22 @@ JERK_TIME = Parameter(
     "on reconstructed I-80 it forecasts the next two seconds best",
 )
 
-RESIDUAL = (TIME, TARGET, JERK, JERK_TIME)
+HANDOVER = Parameter(
+    "residual_handover",
+    "s",
+    0.2,
+    20.0,
+    2.0,
+    "time constant with which the model takes over from the acceleration at the start",
+    "on reconstructed I-80 it forecasts the next two seconds best",
+)
+
+RESIDUAL = (TIME, TARGET, JERK, JERK_TIME, HANDOVER)
 """The parameters of a residual, in order."""
+
+_WIDTH = 4
+_HELD, _JERK, _RESIDUAL, _PASSED = range(-_WIDTH, 0)
+"""Columns of the memory, behind the inner model's."""
 
 _NEAR_M = 0.5
 """m: room to brake in counts as this at least."""
@@ -88,15 +110,17 @@ _HARD = 2.0
 
 
 class WithResidual(DrivingModel):
-    """Any driving model, and a residual acceleration beside it.
+    """Any driving model, which takes over from the acceleration at the start, and a residual.
 
-    Parameters are the model's, then those of `RESIDUAL`. Memory `(*batch, m + 3)`
-    is the model's, the residual (m/s2), its jerk (m/s3), and whether it has begun (0 or 1).
+    Parameters are the model's, then those of `RESIDUAL`. Memory `(*batch, m + 4)` is the model's,
+    the acceleration that is held (m/s2), its jerk (m/s3), the residual (m/s2), and the time since
+    the start (s).
 
-    A positive residual could keep a vehicle from braking. So it counts for nothing where the gap is
-    below 1 m and does not grow; and where a deceleration of more than 2 m/s2 is needed to reach the
-    leader's speed within the gap, b = (v - v_l)^2 / (2 s), the vehicle brakes at least as hard as
-    that, or as hard as the model wants if that is less.
+    Neither the acceleration at the start nor a residual keeps a vehicle from braking. Where the gap
+    is below 1 m and does not grow, the vehicle accelerates no more than the model wants; and where
+    a deceleration of more than 2 m/s2 is needed to reach the leader's speed within the gap,
+    b = (v - v_l)^2 / (2 s), it brakes at least as hard as that, or as hard as the model wants if
+    that is less.
 
     Args:
         model: the inner model.
@@ -118,7 +142,7 @@ class WithResidual(DrivingModel):
         self.inner = model
         self.settings = model.settings
         self.space = with_residual(model.space)
-        self.memory_size = model.memory_size + 3
+        self.memory_size = model.memory_size + _WIDTH
         self.temperature = model.temperature
 
     @property
@@ -140,45 +164,40 @@ class WithResidual(DrivingModel):
     def next_speed(
         self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
     ) -> Tensor:
-        alone = self._alone(follower, leader, p, dt)
-        residual = self._residual(follower, alone)
-        return (follower.speed + dt * _braked(alone, residual, follower, leader)).clamp(min=0.0)
+        wanted = self.inner.next_speed(self._inner(follower), leader, p, dt)
+        alone = (wanted - follower.speed) / dt
+        share = torch.exp(-(follower.memory[..., _PASSED] / p[HANDOVER.name]).square())
+        held = self._remembered(follower, _HELD, follower.acceleration)
+        both = share * held + (1.0 - share) * alone + follower.memory[..., _RESIDUAL]
+        braked = _braked(both, alone, follower, leader)
+        return (follower.speed + dt * braked).clamp(min=0.0)
 
     def next_memory(
         self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float, speed: Tensor
     ) -> Tensor:
-        residual = self._residual(follower, self._alone(follower, leader, p, dt))
-        kept = torch.exp(-dt / p[TIME.name])
-        jerk = self._jerk(follower, p) * torch.exp(-dt / p[JERK_TIME.name])
-        after = p[TARGET.name] + (residual - p[TARGET.name]) * kept + jerk * dt
+        jerk = self._remembered(follower, _JERK, p[JERK.name]) * torch.exp(-dt / p[JERK_TIME.name])
+        held = self._remembered(follower, _HELD, follower.acceleration) + jerk * dt
+        target = p[TARGET.name]
+        residual = target + (follower.memory[..., _RESIDUAL] - target) * torch.exp(
+            -dt / p[TIME.name]
+        )
+        passed = follower.memory[..., _PASSED] + dt
         inner = self.inner.next_memory(self._inner(follower), leader, p, dt, speed)
-        begun = torch.ones_like(after)
-        return torch.cat([inner, torch.stack([after, jerk.expand_as(after), begun], -1)], -1)
+        own = torch.stack([held, jerk, residual, passed], -1)
+        return torch.cat([inner, own], -1)
 
     def initial_memory(self, speed: Tensor) -> Tensor:
-        own = torch.zeros((*speed.shape, 3), dtype=speed.dtype, device=speed.device)
+        own = torch.zeros((*speed.shape, _WIDTH), dtype=speed.dtype, device=speed.device)
         return torch.cat([self.inner.initial_memory(speed), own], -1)
 
     def _inner(self, follower: Follower) -> Follower:
         """Returns the follower as the inner model knows it."""
         return follower._replace(memory=follower.memory[..., : self.inner.memory_size])
 
-    def _alone(
-        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
-    ) -> Tensor:
-        """Returns the acceleration that the inner model wants, `(*batch,)`, m/s2."""
-        wanted = self.inner.next_speed(self._inner(follower), leader, p, dt)
-        return (wanted - follower.speed) / dt
-
-    def _residual(self, follower: Follower, alone: Tensor) -> Tensor:
-        """Returns the residual now, `(*batch,)`, m/s2: as remembered, or measured at the start."""
-        remembered, begun = follower.memory[..., -3], follower.memory[..., -1]
-        return torch.where(begun > 0.5, remembered, follower.acceleration - alone)
-
-    def _jerk(self, follower: Follower, p: Mapping[str, Tensor]) -> Tensor:
-        """As `_residual`, of its jerk, m/s3."""
-        remembered, begun = follower.memory[..., -2], follower.memory[..., -1]
-        return torch.where(begun > 0.5, remembered, p[JERK.name])
+    def _remembered(self, follower: Follower, column: int, at_start: Tensor) -> Tensor:
+        """Returns what a column of the memory holds, `(*batch,)`, or this in the first step."""
+        has_begun = follower.memory[..., _PASSED] > 0
+        return torch.where(has_begun, follower.memory[..., column], at_start)
 
 
 def with_residual(space: ParameterSpace) -> ParameterSpace:
@@ -186,9 +205,14 @@ def with_residual(space: ParameterSpace) -> ParameterSpace:
     return replace(space, parameters=(*space, *RESIDUAL))
 
 
-def _braked(alone: Tensor, residual: Tensor, follower: Follower, leader: Leader) -> Tensor:
-    """Returns the acceleration `(*batch,)`, m/s2, with all braking that is needed."""
-    both = alone + residual
+def _braked(both: Tensor, alone: Tensor, follower: Follower, leader: Leader) -> Tensor:
+    """Returns the acceleration `(*batch,)`, m/s2, with all braking that is needed.
+
+    Args:
+        both: of the model and the residual.
+        alone: that the model wants.
+        follower, leader: where they are.
+    """
     no_more = torch.minimum(both, alone)
     gap = bumper_gap(follower, leader)
     difference = follower.speed - leader.speed

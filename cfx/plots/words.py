@@ -52,10 +52,10 @@ EXPLAINED = {
     "policy": "parameters that the policy chooses anew in each window",
     "constant_speed": "the driver goes on at the speed that they have",
     "constant_acceleration": "the driver goes on at the acceleration that they have",
-    "population_residual": "pooled calibration, and what it misses of the acceleration at the"
-    " origin, which decays in two seconds",
-    "fixed_residual": "driver-specific calibration, and what it misses of the acceleration at the"
-    " origin, which decays in two seconds",
+    "population_residual": "pooled calibration, which takes over from the acceleration at the"
+    " origin within seconds",
+    "fixed_residual": "driver-specific calibration, which takes over from the acceleration at the"
+    " origin within seconds",
     "population_ar": "pooled calibration with auto-regressive noise on the acceleration, as"
     " measured on recorded drivers",
     "fixed_ar": "driver-specific calibration with auto-regressive noise on the acceleration, as"

@@ -86,8 +86,8 @@ class ResidualSettings(Settings):
 
     residual: bool = Field(
         False,
-        description="start with the acceleration that the driver has: what the parameters miss of"
-        " it is added, and decays in two seconds",
+        description="start with the acceleration and the jerk that the driver has, from which the"
+        " model takes over within seconds",
     )
 
 

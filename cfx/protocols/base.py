@@ -30,7 +30,7 @@ from cfx.errors import PluginError
 from cfx.evaluation.result import Evaluation
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingResult
 from cfx.metrics.installed import MetricSet
-from cfx.models.residual import JERK_TIME, TIME
+from cfx.models.residual import TIME
 from cfx.objectives.base import Objective
 from cfx.pairs import PairBatch, PairSet
 from cfx.parameters import ParameterSpace
@@ -160,8 +160,7 @@ class ProtocolContext:
         """
         head = StochasticHead.for_model(self.simulator.model, parameters.device)
         complete = head.completed(parameters).clone()
-        forgotten = torch.full_like(time, JERK_TIME.low)
-        for parameter, values in ((TIME, time), (SCALE, scale), (JERK_TIME, forgotten)):
+        for parameter, values in ((TIME, time), (SCALE, scale)):
             column = head.space.names.index(parameter.name)
             complete[:, column] = values.clamp(parameter.low, parameter.high)
         policy = FixedPolicy()

@@ -84,8 +84,9 @@ class Forecast(AcrossDrivers):
     - `population`: pooled parameters, calibrated on the drivers of the other folds;
     - `fixed`: driver-specific parameters, calibrated on the driver's trajectory up to their first
       origin: what every origin may read, and nothing after it;
-    - `population_residual`, `fixed_residual`: the same with a residual: what they miss of the
-      acceleration at the origin is added to theirs, and decays in two seconds;
+    - `population_residual`, `fixed_residual`: the same with a residual: they start with the
+      acceleration and the jerk at the origin, from which the model takes over within seconds
+      (`cfx.models.residual`);
     - `policy`: observes all history up to each origin (`history` bounds it) and drives on from
       there, seeing the simulated follower.
 

@@ -13,7 +13,7 @@ from cfx.errors import ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
-from cfx.models.residual import WithResidual
+from cfx.models.residual import RESIDUAL, WithResidual
 from cfx.models.sumo_vtype import SumoVType
 from cfx.models.w99 import W99
 from cfx.parameters import Parameter, ParameterSpace
@@ -72,32 +72,43 @@ def test_the_contract_of_models_holds(check: Callable[[DrivingModel], None]) -> 
     check(WithResidual(Krauss()))
 
 
-def test_it_starts_with_the_measured_acceleration_and_decays_exponentially() -> None:
-    """Against the closed form, for many values at once: the speed is a sum of exponentials."""
-    draw = torch.rand((5, 200), generator=torch.Generator().manual_seed(0)).double()
+def test_it_starts_with_the_measured_acceleration_and_hands_over_to_the_model() -> None:
+    """Against the closed form, for many values at once: the speed is a sum of accelerations."""
+    draw = torch.rand((6, 200), generator=torch.Generator().manual_seed(0)).double()
     alone, measured, target = 4.0 * draw[0] - 2.0, 4.0 * draw[1] - 2.0, 2.0 * draw[2] - 1.0
     tau, jerk, forget = 0.3 + 10.0 * draw[3], 2.0 * draw[4] - 1.0, 0.37
+    handover = 0.3 + 5.0 * draw[5]
     model = WithResidual(Steady(limits=None))
     begin = Start(torch.zeros_like(alone), torch.full_like(alone, 50.0), measured)
     p = {"a": alone, "residual_time": tau, "residual_target": target}
     p |= {"residual_jerk": jerk, "residual_jerk_time": torch.full_like(jerk, forget)}
+    p |= {"residual_handover": handover}
     simulator = MemoryStepper(model, DT)
     _, _, speed = simulator.advance(simulator.begin(begin), far_leader(60, 1), p)
-    kept, steps = torch.exp(-DT / tau), torch.arange(1, 61)[:, None]
-    decaying = (measured - alone - target) * (1.0 - kept**steps) / (1.0 - kept)
-    expected = 50.0 + DT * ((alone + target) * steps + decaying)
-    # The jerk adds its own part: two decays after each other.
+    kept, steps = torch.exp(-DT / tau), torch.arange(60).double()[:, None]
     lost = math.exp(-DT / forget)
-    grown = torch.zeros_like(alone)
-    part = torch.zeros_like(alone)
-    parts = []
-    for step in range(60):
-        parts.append(grown)
-        part = part * kept + jerk * lost ** (step + 1) * DT
-        grown = grown + DT * part
-    expected = expected + torch.stack(parts)
-    torch.testing.assert_close(speed, expected, rtol=0, atol=1e-9)
+    held = measured + jerk * DT * lost * (1.0 - lost**steps) / (1.0 - lost)
+    residual = target * (1.0 - kept**steps)
+    share = torch.exp(-((DT * steps / handover) ** 2))
+    acceleration = share * held + (1.0 - share) * alone + residual
+    torch.testing.assert_close(speed, 50.0 + DT * acceleration.cumsum(0), rtol=0, atol=1e-9)
     torch.testing.assert_close((speed[0] - 50.0) / DT, measured, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("model", [Krauss(), IDM(), W99()], ids=["krauss", "idm", "w99"])
+def test_the_acceleration_hardly_changes_from_step_to_step(model: DrivingModel) -> None:
+    """Also of a model that takes the speed that it wants at once, and wants quite another."""
+    leader = far_leader(20, 1)
+    leader = leader._replace(position=leader.position - 985.0)
+    parameters = (*model.space.defaults().tolist(), *(each.default for each in RESIDUAL))
+    speed = speeds(model, start(14.0, -0.4), leader, *parameters)
+    simulator, p = MemoryStepper(model, DT), model.space.unpack(model.space.defaults())
+    alone = simulator.advance(simulator.begin(start(14.0, -0.4)), leader, p)[2][:, 0]
+    wanted = abs(float(alone[0] - 14.0) / DT + 0.4)
+    assert wanted > 0.3, "the model wants another acceleration"
+    acceleration = torch.cat([torch.tensor([14.0]).double(), speed]).diff() / DT
+    assert float(acceleration[0]) == pytest.approx(-0.4, abs=1e-9)
+    assert float(acceleration[:4].diff().abs().max()) < 0.1 * wanted
 
 
 @pytest.mark.parametrize("model", [Krauss(), IDM(), W99()], ids=["krauss", "idm", "w99"])
@@ -109,7 +120,7 @@ def test_the_first_step_is_the_drivers_and_the_rest_becomes_the_models(
     leader = leader._replace(position=leader.position - 970.0)
     first = start(14.0, -0.4)
     parameters = model.space.defaults().tolist()
-    with_residual = speeds(model, first, leader, *parameters, 0.2, 0.0, 0.0, 0.5)
+    with_residual = speeds(model, first, leader, *parameters, 0.2, 0.0, 0.0, 0.5, 0.2)
     assert (float(with_residual[0]) - 14.0) / DT == pytest.approx(-0.4, abs=1e-9)
     if not isinstance(model, W99):  # who never stops oscillating
         simulator, p = MemoryStepper(model, DT), model.space.unpack(model.space.defaults())
@@ -123,7 +134,7 @@ def test_no_residual_keeps_a_vehicle_from_braking_for_its_leader() -> None:
     still = torch.zeros((steps, 1)).double()
     leader = Leader(still + 65.0, still, still, torch.tensor(5.0).double())
     model = IDM()
-    parameters = (*model.space.defaults().tolist(), 20.0, 3.0, 0.0, 0.5)
+    parameters = (*model.space.defaults().tolist(), 20.0, 3.0, 0.0, 0.5, 20.0)
     wrapped = WithResidual(model)
     p = wrapped.space.unpack(torch.tensor([parameters]).double())
     simulator = MemoryStepper(wrapped, DT)

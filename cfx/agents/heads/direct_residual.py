@@ -1,9 +1,9 @@
-"""The direct head with a residual: parameters, and what they miss of the acceleration at the start.
+"""The direct head with a residual: parameters, which take over from the acceleration at the start.
 
-It is for policies that are not trained. Their networks answer the driving model's parameters; the
-residual of `cfx.models.residual` decays with its default time constant.
+It is for policies that are not trained. Their networks answer the driving model's parameters; those
+of the residual (`cfx.models.residual`) are the defaults, but for the jerk, which is measured.
 
-Shapes: `*batch` any leading dimensions, m tuned parameters of the driving model, n = m + 4.
+Shapes: `*batch` any leading dimensions, m tuned parameters of the driving model, n = m + 5.
 """
 
 from __future__ import annotations
@@ -15,9 +15,11 @@ import torch
 from torch import Tensor
 
 from cfx.agents.heads.direct import DirectHead
+from cfx.agents.heads.residual import with_measured_jerk
 from cfx.models.base import DrivingModel
 from cfx.models.residual import RESIDUAL, WithResidual, with_residual
 from cfx.parameters import ParameterSpace
+from cfx.policies.features import History
 
 
 class DirectResidualHead(DirectHead):
@@ -42,6 +44,9 @@ class DirectResidualHead(DirectHead):
 
     def unit_parameters(self, answer: Tensor, base: Tensor | None) -> Tensor:
         return self._with_defaults(answer, self.space.to_unit(self.space.defaults()))
+
+    def measured(self, parameters: Tensor, history: History, dt: float) -> Tensor:
+        return with_measured_jerk(self.space, parameters, history, dt)
 
     def completed(self, parameters: Tensor) -> Tensor:
         return self._with_defaults(parameters, self.space.defaults())

@@ -1,13 +1,13 @@
-"""The residual head: offsets from base parameters, and a residual acceleration that decays.
+"""The residual head: offsets from base parameters, and a residual acceleration.
 
-The network chooses, beside the model's parameters, how fast the residual of
-`cfx.models.residual` and its jerk are forgotten, and where the residual goes. So the policy starts
-with exactly the acceleration that the driver has and with their jerk, and what becomes of both
-depends on the state that the network reads. An untrained network is the base with a residual that
-decays in two seconds. The jerk is measured between the last two frames; what networks answer in its
-place is not read.
+The network chooses, beside the model's parameters, how fast the model takes over from the
+acceleration at the start (`cfx.models.residual`), how fast its jerk is forgotten, and where the
+residual goes. So the policy starts with exactly the acceleration that the driver has and
+with their jerk, and what becomes of both depends on the state that the network reads. An untrained
+network is the base, which takes over within seconds. The jerk is measured between the last two
+frames; what networks answer in its place is not read.
 
-Shapes: `*batch` any leading dimensions, m tuned parameters of the driving model, n = m + 4.
+Shapes: `*batch` any leading dimensions, m tuned parameters of the driving model, n = m + 5.
 """
 
 from __future__ import annotations
@@ -42,13 +42,7 @@ class ResidualHead(OffsetHead):
         return WithResidual(model)
 
     def measured(self, parameters: Tensor, history: History, dt: float) -> Tensor:
-        acceleration = history.follower_acceleration
-        if acceleration.shape[-1] < 2:
-            return parameters
-        jerk = (acceleration[..., -1] - acceleration[..., -2]) / dt
-        at = self.space.names.index(JERK.name)
-        bounded = jerk.clamp(JERK.low, JERK.high)[..., None].to(parameters)
-        return torch.cat([parameters[..., :at], bounded, parameters[..., at + 1 :]], -1)
+        return with_measured_jerk(self.space, parameters, history, dt)
 
     def completed(self, parameters: Tensor) -> Tensor:
         known = parameters.shape[-1]
@@ -57,3 +51,26 @@ class ResidualHead(OffsetHead):
         defaults = self.space.defaults(dtype=parameters.dtype, device=parameters.device)
         more = defaults[known:].expand(*parameters.shape[:-1], -1)
         return torch.cat([parameters, more], -1)
+
+
+def with_measured_jerk(
+    space: ParameterSpace, parameters: Tensor, history: History, dt: float
+) -> Tensor:
+    """Returns parameters with the jerk that the driver has, between their last two frames.
+
+    Args:
+        space: the parameters, with those of a residual among them.
+        parameters: `(*batch, n)`, SI units.
+        history: the last L frames, `(*batch, L)` each; of one frame nothing is measured.
+        dt: time step, s.
+
+    Returns:
+        `(*batch, n)`, SI units.
+    """
+    acceleration = history.follower_acceleration
+    if acceleration.shape[-1] < 2:
+        return parameters
+    jerk = (acceleration[..., -1] - acceleration[..., -2]) / dt
+    at = space.names.index(JERK.name)
+    bounded = jerk.clamp(JERK.low, JERK.high)[..., None].to(parameters)
+    return torch.cat([parameters[..., :at], bounded, parameters[..., at + 1 :]], -1)

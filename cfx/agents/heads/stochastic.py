@@ -16,7 +16,7 @@ that the acceleration has no jumps; a network, not a posterior, says how much of
 
 Without a generator nothing is drawn, and the path of the centre is driven.
 
-Shapes: `*batch` any leading dimensions, m tuned parameters of the driving model, n = m + 5.
+Shapes: `*batch` any leading dimensions, m tuned parameters of the driving model, n = m + 6.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ class RolloutLearner(Learner):
 
     Networks answer offsets (`cfx.agents.heads.offset`): untrained, each driver is driven by their
     base parameters, so training starts from a fixed model. With `head=residual` they also choose
-    how the acceleration that the model misses at first decays (`cfx.agents.heads.residual`).
+    how the model takes over from the acceleration at the start (`cfx.agents.heads.residual`).
 
     Before a trajectory the policy observes the driver's measured history; cold starts, as of unseen
     drivers, have none. The drivers of all networks (at most `drivers` of each) are simulated at

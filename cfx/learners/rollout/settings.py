@@ -20,7 +20,7 @@ class HeadSettings(Settings):
     head: Literal["offset", "residual", "stochastic"] = Field(
         "offset",
         description="offset: offsets from each driver's base parameters; residual: also how the"
-        " acceleration that the model misses at the start decays, so that the policy starts with"
+        " model takes over from the acceleration at the start, so that the policy starts with"
         " exactly the acceleration that the driver has; stochastic: also how much it varies,"
         " trained by the CRPS of sampled paths",
     )
