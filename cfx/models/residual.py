@@ -1,15 +1,17 @@
 """A driving model that takes over from the acceleration that a vehicle has.
 
-    a(t) = w(t) h(t) + (1 - w(t)) a_model(t) + r(t)         w(t) = exp(-((t - t0) / tau_w)^2)
+    a(t) = (1 - m(t)) h(t) + m(t) a_model(t) + sqrt(m(t)) r(t)
+    m(t) = 1 - exp(-((t - t0) / tau_m)^2)
     h(t + dt) = h(t) + j(t + dt) dt                         h(t0) = a_measured(t0)
     j(t + dt) = j(t) exp(-dt / tau_j)                       j(t0) = jerk_measured(t0)
     r(t + dt) = c + (r(t) - c) exp(-dt / tau)               r(t0) = 0
 
 A simulation starts with the acceleration that the vehicle has, and holds it: h goes on changing
 with the jerk that the vehicle has at the start, which is forgotten with the time constant tau_j, as
-people's accelerations change smoothly. The model counts for nothing at first (w = 1), and takes
-over with the time constant tau_w. Beside it stands a residual r, in m/s2, which goes from 0 to the
-target c with the time constant tau.
+people's accelerations change smoothly. The model's share m is 0 at first, and goes to 1 with the
+time constant tau_m. Beside it stands a residual r, in m/s2, which goes from 0 to the target c with
+the time constant tau. What a vehicle does next is known as long as it goes on as it does; so the
+residual's variance counts as the model does.
 
 The usual form adds what the model misses at the start to all that it wants later, `a_model(t) +
 r(t)` with `r(t0) = a_measured(t0) - a_model(t0)`. It has the vehicle's acceleration in the first
@@ -41,6 +43,7 @@ from torch import Tensor
 from cfx.component import content_key, folder_hash
 from cfx.errors import ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
+from cfx.models.guarded import root
 from cfx.models.regimes import Temperature
 from cfx.parameters import Parameter, ParameterSpace
 
@@ -130,7 +133,7 @@ class WithResidual(DrivingModel):
     """
 
     parameters = ParameterSpace(RESIDUAL)
-    reference = "a residual that relaxes exponentially, beside any model"
+    reference = "any model, which takes over from the acceleration at the start"
 
     def __init__(self, model: DrivingModel) -> None:
         if model.needs_simulator:
@@ -166,9 +169,10 @@ class WithResidual(DrivingModel):
     ) -> Tensor:
         wanted = self.inner.next_speed(self._inner(follower), leader, p, dt)
         alone = (wanted - follower.speed) / dt
-        share = torch.exp(-(follower.memory[..., _PASSED] / p[HANDOVER.name]).square())
+        share = -torch.expm1(-(follower.memory[..., _PASSED] / p[HANDOVER.name]).square())
         held = self._remembered(follower, _HELD, follower.acceleration)
-        both = share * held + (1.0 - share) * alone + follower.memory[..., _RESIDUAL]
+        both = (1.0 - share) * held + share * alone
+        both = both + root(share) * follower.memory[..., _RESIDUAL]
         braked = _braked(both, alone, follower, leader)
         return (follower.speed + dt * braked).clamp(min=0.0)
 
@@ -178,9 +182,8 @@ class WithResidual(DrivingModel):
         jerk = self._remembered(follower, _JERK, p[JERK.name]) * torch.exp(-dt / p[JERK_TIME.name])
         held = self._remembered(follower, _HELD, follower.acceleration) + jerk * dt
         target = p[TARGET.name]
-        residual = target + (follower.memory[..., _RESIDUAL] - target) * torch.exp(
-            -dt / p[TIME.name]
-        )
+        kept = torch.exp(-dt / p[TIME.name])
+        residual = target + (follower.memory[..., _RESIDUAL] - target) * kept
         passed = follower.memory[..., _PASSED] + dt
         inner = self.inner.next_memory(self._inner(follower), leader, p, dt, speed)
         own = torch.stack([held, jerk, residual, passed], -1)

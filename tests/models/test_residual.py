@@ -89,8 +89,8 @@ def test_it_starts_with_the_measured_acceleration_and_hands_over_to_the_model() 
     lost = math.exp(-DT / forget)
     held = measured + jerk * DT * lost * (1.0 - lost**steps) / (1.0 - lost)
     residual = target * (1.0 - kept**steps)
-    share = torch.exp(-((DT * steps / handover) ** 2))
-    acceleration = share * held + (1.0 - share) * alone + residual
+    share = 1.0 - torch.exp(-((DT * steps / handover) ** 2))
+    acceleration = (1.0 - share) * held + share * alone + share.sqrt() * residual
     torch.testing.assert_close(speed, 50.0 + DT * acceleration.cumsum(0), rtol=0, atol=1e-9)
     torch.testing.assert_close((speed[0] - 50.0) / DT, measured, rtol=0, atol=1e-9)
 
