@@ -251,6 +251,10 @@ _BYTES_AT_ONCE = 1 << 27
 """Most bytes that pooled losses simulate at once. 1 GB took three times as long as 256 MB, all of
 it in fetching pages."""
 
+_SUMMED_AT_ONCE = 1 << 25
+"""The same where a kernel sums up losses without trajectories: what it writes is freed and written
+again, and stays in the process's own memory (`cfx.simulation.pages`)."""
+
 
 @dataclass(frozen=True)
 class PooledLosses:
@@ -326,6 +330,8 @@ class PooledLosses:
         simulator = segments.simulator.for_work(segments.steps * len(segment) * count)
         segments = replace(segments, simulator=simulator)
         bound = min(self.memory, _BYTES_AT_ONCE)
+        if segments.accumulates:
+            bound = min(self.memory, _SUMMED_AT_ONCE)
         block = max(1, bound // (segments.bytes_per_candidate * len(segment)))
         means = []
         for part in torch.split(candidates, block, dim=1):

@@ -12,12 +12,15 @@ from typing import Any
 import numba
 import numpy as np
 
+FASTEST, HARDEST = 2.6, 9.0
+"""Largest acceleration and hardest braking of any vehicle, m/s2: those of cfx's models."""
+
 _jit = numba.njit(cache=False, fastmath=False, error_model="numpy")
 
 
 @_jit
 def _krauss(v: float, gap: float, v_l: float, a_l: float, a: float, dt: float, p: Any) -> float:
-    accel, b, v_max, t_r, t_i, min_gap, _, b_l = p
+    t_r, t_i, accel, b, v_max, min_gap, _, b_l = p
     g = gap - min_gap
     lag = t_r + 0.5 * t_i
     radicand = b * b * lag * lag + b * (v_l * t_i + v_l * v_l / b_l + 2.0 * g)
@@ -112,7 +115,8 @@ def loop_of(step: Any) -> Any:
                 x, v, a, total = start_x[i], start_v[i], start_a[i], 0.0
                 for t in range(steps[i]):
                     gap = leader_x[i, t] - length[i] - x
-                    after = step(v, gap, leader_v[i, t], leader_a[i, t], a, dt, candidates[c])
+                    wanted = step(v, gap, leader_v[i, t], leader_a[i, t], a, dt, candidates[c])
+                    after = min(max(wanted, v - HARDEST * dt, 0.0), v + FASTEST * dt)
                     a = (after - v) / dt
                     v = after
                     x += v * dt

@@ -31,6 +31,9 @@ DT, STEPS, SAMPLES, MEMORY = 0.1, 600, 4096, 1 << 30
 WORK = {"fixed": (60, STEPS), "population": (60, STEPS), "labels": (7200, 5)}
 """Segments of each calibration and the steps of each: as many vehicle steps in all three."""
 
+_SAME = {"rtol": 1e-9, "atol": 1e-9}
+"""Both compute the same losses, in float64."""
+
 
 def model_of(name: str) -> DrivingModel:
     model = registry.create("model", {"name": name})
@@ -63,10 +66,19 @@ def segments(model: DrivingModel, problems: int, steps: int) -> SegmentLosses:
     )
 
 
+def points_of(model: DrivingModel) -> Tensor:
+    """Returns the candidates that random search tries besides the default set, `(q, n)`."""
+    return sobol(SAMPLES - 1, len(model.space.names), seed=0, like=torch.zeros(1).double())
+
+
 def by_hand(losses: SegmentLosses, name: str) -> Callable[[], Tensor]:
     """Returns the numba loop over the same segments and the same candidates, compiled."""
     model = losses.simulator.model
-    points = sobol(SAMPLES - 1, len(model.space.names), seed=0, like=torch.zeros(1).double())
+    limits = model.limits
+    assert limits is not None
+    assert limits.acceleration == numba_loops.FASTEST
+    assert limits.emergency_deceleration == numba_loops.HARDEST
+    points = points_of(model)
     columns = []
     for value in model.space.unpack(model.space.from_unit(points)).values():
         columns.append(value.expand(len(points)).numpy())
@@ -124,6 +136,9 @@ def test_calibration(benchmark: Any, name: str, kind: str, monkeypatch: pytest.M
     benchmark.extra_info["of_numba"] = min(times) / benchmark.stats.stats.min
     benchmark.extra_info["million_vehicle_steps_per_s"] = rate
     benchmark.extra_info["system_share"] = spent[1] / (spent[0] + spent[1])
+    torch.testing.assert_close(
+        own.for_work(SAMPLES)(points_of(model).expand(own.problems, -1, -1)), wanted, **_SAME
+    )
     if kind == "population":
         wanted = wanted.mean(0, keepdim=True)
     # The default set, which only the calibration tries, may be better than all of them. Losses that
