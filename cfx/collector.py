@@ -18,6 +18,11 @@ def is_program() -> None:
     _PROGRAM[:] = [True]
 
 
+def runs_program() -> bool:
+    """Says whether this process runs cfx alone."""
+    return bool(_PROGRAM)
+
+
 @contextmanager
 def importing() -> Iterator[None]:
     """Collects nothing in the block, and looks at nothing again that lives at its end.

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 import pyarrow as pa
@@ -28,6 +28,9 @@ from cfx.pairs import PairSet
 from cfx.protocols.base import ProtocolResult
 from cfx.style.result import StyleResult
 from cfx.tracking.provenance import commit, version
+
+if TYPE_CHECKING:
+    from cfx.engine.processes import Standby
 
 TRACKED = (
     "config.yaml",
@@ -257,6 +260,7 @@ def write_figures(
     view: CalibrationView | None,
     *,
     adapts: bool,
+    second: Standby | None = None,
 ) -> list[Path]:
     """Writes the figures, if the configuration wants any; returns their paths.
 
@@ -268,6 +272,7 @@ def write_figures(
         protocol_result: what is drawn.
         view: slices and fits of the calibration; None without.
         adapts: as `Policy.adapts`.
+        second: a process that draws some of them.
 
     Raises:
         OutputError: a file cannot be written.
@@ -277,30 +282,20 @@ def write_figures(
         with importing():
             from cfx.plots.matplotlib import write
 
-        folder = output.folder / "figures"
-        formats = config.figures.formats
         evaluation = protocol_result.evaluation
-        labels = None
-        if protocol_result.labels is not None:
-            labels = protocol_result.labels.to_frame(pairs, evaluation.names)
+        draw = {**write.figures_of_job(evaluation, style, protocol_result.curves, adapts=adapts)}
+        if view is not None:
+            labels = None
+            if protocol_result.labels is not None:
+                labels = protocol_result.labels.to_frame(pairs, evaluation.names)
+            draw |= write.figures_of_calibration(evaluation, view.slices, view.fits, labels)
+        share: write.Share = write.in_turn
+        if second is not None:
+            share = second.share
 
         def write_all() -> None:
-            paths.extend(
-                write.write_figures(
-                    folder,
-                    evaluation,
-                    style,
-                    protocol_result.curves,
-                    adapts=adapts,
-                    formats=formats,
-                )
-            )
-            if view is not None:
-                paths.extend(
-                    write.write_calibration(
-                        folder, evaluation, view.slices, view.fits, labels, formats=formats
-                    )
-                )
+            folder, formats = output.folder / "figures", config.figures.formats
+            paths.extend(write.write_figures(folder, draw, formats=formats, share=share))
 
         output.run(write_all)
     return paths

@@ -44,6 +44,7 @@ from cfx.style.entropy import measure_style, select_cluster
 from cfx.style.result import StyleResult
 
 if TYPE_CHECKING:
+    from cfx.engine.processes import Standby
     from cfx.tracking.tracker import Tracker
 
 log = logging.getLogger(__name__)
@@ -53,7 +54,11 @@ _WINDOW_S = 0.5
 
 
 def take_steps(
-    config: JobConfig, folder: Path, loaded: PairSet, console: Console | None = None
+    config: JobConfig,
+    folder: Path,
+    loaded: PairSet,
+    console: Console | None = None,
+    second: Standby | None = None,
 ) -> JobResult:
     """Runs one job and writes its results into `folder`.
 
@@ -62,6 +67,7 @@ def take_steps(
         folder: the job's output folder; made if it is not there.
         loaded: the pairs of the configuration's dataset.
         console: where the table goes; stdout unless given.
+        second: a process that draws some of the figures.
 
     Raises:
         CfxError: the user's mistake, in one sentence; nothing half-written is left.
@@ -105,7 +111,7 @@ def take_steps(
             view = None
             if config.figures.enabled:
                 view = calibration_view(context, protocol_result.evaluation)
-        result = _keep(config, parts, output, pairs, style, protocol_result, view, tracker)
+        result = _keep(config, parts, output, pairs, style, protocol_result, view, tracker, second)
         if upload is not None:
             upload.finish()
             tracker.set_tags({"cfx.output_url": upload.url})
@@ -213,6 +219,7 @@ def _keep(
     protocol_result: ProtocolResult,
     view: CalibrationView | None,
     tracker: Tracker,
+    second: Standby | None,
 ) -> JobResult:
     """Writes everything into the folder, then into MLflow."""
     evaluation = protocol_result.evaluation
@@ -228,7 +235,14 @@ def _keep(
     further = files.write_tables(output, pairs, style, protocol_result, view)
     output.run(lambda: checkpoint.save(protocol_result.policy, policy_folder))
     figures = files.write_figures(
-        output, config, pairs, style, protocol_result, view, adapts=parts.policy.adapts
+        output,
+        config,
+        pairs,
+        style,
+        protocol_result,
+        view,
+        adapts=parts.policy.adapts,
+        second=second,
     )
     demo = files.write_demo(output, config, pairs, protocol_result)
     files.write_provenance(

@@ -13,6 +13,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
+from cfx.engine.processes import Standby
 from cfx.errors import ConfigError, OutputError
 from cfx.evaluation.result import Evaluation
 from cfx.learners.curves import over_networks
@@ -22,7 +23,7 @@ from cfx.plots.choice.history import amounts_of
 from cfx.plots.choice.platoon import braking_time, worst_platoon
 from cfx.plots.look import COLOURS
 from cfx.plots.matplotlib import figures
-from cfx.plots.matplotlib.write import write_figures
+from cfx.plots.matplotlib.write import Figures, figures_of_job, write_figures
 from cfx.plots.words import percent, pretty_unit, short, unit_label
 from tests.made_up import GAINS, MadeUp, make_history, make_platoon, make_results
 
@@ -34,6 +35,11 @@ TEN = ParameterSpace.of(
 def texts(figure: Figure) -> str:
     """Everything written in a figure."""
     return "\n".join(artist.get_text() for artist in figure.findobj(mpl.text.Text))
+
+
+def drawn(results: MadeUp) -> Figures:
+    """Returns the figures of made-up results."""
+    return figures_of_job(results.evaluation, results.style, results.curves)
 
 
 def with_improvement(results: MadeUp, gains: dict[int, float]) -> Evaluation:
@@ -70,7 +76,7 @@ def with_improvement(results: MadeUp, gains: dict[int, float]) -> Evaluation:
 )
 def test_every_size_of_job_is_drawn(tmp_path: Path, options: dict[str, Any], files: int) -> None:
     results = make_results(**options)
-    paths = write_figures(tmp_path / "figures", results.evaluation, results.style, results.curves)
+    paths = write_figures(tmp_path / "figures", drawn(results))
     assert len(paths) == files == len(list((tmp_path / "figures").iterdir()))
     for path in paths:
         height, width = imread(path).shape[:2]
@@ -198,7 +204,8 @@ def test_names_are_text_and_never_formulas(tmp_path: Path) -> None:
         values=results.evaluation.values.assign(pair_id=name),
         trajectories=(dataclasses.replace(results.evaluation.trajectories[0], pair_id=name),),
     )
-    assert len(write_figures(tmp_path, evaluation, results.style, results.curves)) == 8
+    draw = figures_of_job(evaluation, results.style, results.curves)
+    assert len(write_figures(tmp_path, draw)) == 8
 
 
 def test_cuts_and_cluster_sizes_stand_in_the_style_figure() -> None:
@@ -243,7 +250,7 @@ def test_a_loss_that_no_logarithm_takes_is_drawn(loss: float) -> None:
 def test_figures_leave_the_readers_matplotlib_alone(tmp_path: Path) -> None:
     before = dict(mpl.rcParams)
     results = make_results(pairs=2, frames=10)
-    write_figures(tmp_path, results.evaluation, results.style, results.curves)
+    write_figures(tmp_path, drawn(results))
     assert dict(mpl.rcParams) == before
 
 
@@ -253,9 +260,7 @@ def test_a_path_that_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(
         OutputError, match=r"improvement_per_driver\.png: this figure cannot be written"
     ):
-        write_figures(
-            tmp_path / "file" / "figures", results.evaluation, results.style, results.curves
-        )
+        write_figures(tmp_path / "file" / "figures", drawn(results))
 
 
 def test_labels() -> None:
@@ -316,27 +321,38 @@ def test_platoon_and_history_are_written_where_a_protocol_delivered_them(tmp_pat
     further = dataclasses.replace(
         results.evaluation, platoon=make_platoon({"policy": 2}), history=history
     )
-    names = {path.name for path in write_figures(tmp_path, further, results.style, results.curves)}
+    draw = figures_of_job(further, results.style, results.curves)
+    names = {path.name for path in write_figures(tmp_path, draw)}
     assert {"platoon.png", "history.png"} <= names
     assert len(names) == 10
 
 
-def test_a_policy_that_does_not_adapt_has_no_figure_of_improvements(tmp_path: Path) -> None:
+def test_a_policy_that_does_not_adapt_has_no_figure_of_improvements() -> None:
     made = make_results(pairs=3, frames=20)
-    drawn = write_figures(tmp_path, made.evaluation, made.style, made.curves, adapts=False)
-    names = {path.name for path in drawn}
-    assert "improvement_per_driver.png" not in names
-    assert "calibration.png" in names
+    draw = figures_of_job(made.evaluation, made.style, made.curves, adapts=False)
+    assert "improvement_per_driver" not in draw
+    assert "calibration" in draw
 
 
 def test_figures_for_a_paper_are_vector_graphics_without_dates(tmp_path: Path) -> None:
     results = make_results(pairs=2, frames=10)
-    arguments = (results.evaluation, results.style, results.curves)
-    paths = write_figures(tmp_path / "a", *arguments, formats=("pdf", "svg"))
-    again = write_figures(tmp_path / "b", *arguments, formats=("pdf", "svg"))
+    draw = drawn(results)
+    paths = write_figures(tmp_path / "a", draw, formats=("pdf", "svg"))
+    again = write_figures(tmp_path / "b", draw, formats=("pdf", "svg"))
     assert {path.suffix for path in paths} == {".pdf", ".svg"}
     by_name = {path.name: path.read_bytes() for path in paths}
     assert {path.name: path.read_bytes() for path in again} == by_name
     assert by_name["speeds.pdf"].startswith(b"%PDF-")
     assert b"<svg" in by_name["speeds.svg"]
     assert b"TrueType" in by_name["speeds.pdf"] or b"CIDFontType2" in by_name["speeds.pdf"]
+
+
+def test_two_processes_draw_the_same_figures_as_one(tmp_path: Path) -> None:
+    draw = drawn(make_results(pairs=2, frames=10))
+    alone = write_figures(tmp_path / "alone", draw)
+    with Standby("cfx.plots.matplotlib.write") as second:
+        second.wait()
+        shared = write_figures(tmp_path / "shared", draw, share=second.share)
+    assert [path.name for path in shared] == [path.name for path in alone]
+    for one, other in zip(alone, shared, strict=True):
+        assert one.read_bytes() == other.read_bytes()

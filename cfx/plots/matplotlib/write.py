@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple, Protocol, TypeVar
 
 import pandas as pd
 from matplotlib.figure import Figure
@@ -20,6 +21,9 @@ from cfx.plots.matplotlib.canvas import DPI, look
 from cfx.plots.matplotlib.identifiability import draw_fits, draw_labels, draw_slices
 from cfx.style.result import StyleResult
 
+_Item = TypeVar("_Item")
+_Done = TypeVar("_Done")
+
 _METADATA: dict[str, dict[str, None]] = {
     "png": {"Software": None},
     "pdf": {"Creator": None, "Producer": None, "CreationDate": None},
@@ -28,31 +32,30 @@ _METADATA: dict[str, dict[str, None]] = {
 """What Matplotlib writes of itself and of today into each format, left out."""
 
 
-def write_figures(
-    folder: Path,
-    evaluation: Evaluation,
-    style: StyleResult,
-    curves: pd.DataFrame,
-    *,
-    adapts: bool = True,
-    formats: Sequence[str] = ("png",),
-) -> list[Path]:
-    """Draws and writes all figures of a job; returns their paths.
+Figures = Mapping[str, Callable[[], Figure]]
+"""What draws each figure, by the name of its files."""
+
+
+class Share(Protocol):
+    """Does independent work, in whichever process; returns the results in the items' order."""
+
+    def __call__(self, work: Callable[[_Item], _Done], items: Sequence[_Item], /) -> list[_Done]:
+        """As described above."""
+
+
+def figures_of_job(
+    evaluation: Evaluation, style: StyleResult, curves: pd.DataFrame, *, adapts: bool = True
+) -> Figures:
+    """Returns what draws the figures of a job.
 
     Args:
-        folder: made if it is not there.
         evaluation: of the job; without a platoon, a history, forecasts or traffic there is no
-            `platoon.png`, `history.png`, `forecasts.png` and `forecasts_by_history.png`, or
-            `traffic.png` and `traffic_paths.png`; without sampled forecasts no
-            `distributions.png`.
+            `platoon`, `history`, `forecasts` and `forecasts_by_history`, or `traffic` and
+            `traffic_paths`; without sampled forecasts no `distributions`.
         style: of its drivers.
         curves: columns `network`, `epoch`, `train_loss`, `validation_loss`; if it is empty there is
-            no `learning_curve.png`.
-        adapts: as `Policy.adapts`; if it does not, there is no `improvement_per_driver.png`.
-        formats: files of each figure: `png`, `pdf`, `svg`.
-
-    Raises:
-        OutputError: a file cannot be written.
+            no `learning_curve`.
+        adapts: as `Policy.adapts`; if it does not, there is no `improvement_per_driver`.
     """
     draw: dict[str, Callable[[], Figure]] = {}
     if adapts:
@@ -83,42 +86,19 @@ def write_figures(
     if evaluation.traffic is not None:
         draw["traffic"] = partial(figures.traffic, evaluation.traffic)
         draw["traffic_paths"] = partial(figures.traffic_paths, evaluation.traffic)
-    return _written(draw, folder, formats)
+    return draw
 
 
-def _written(
-    draw: Mapping[str, Callable[[], Figure]], folder: Path, formats: Sequence[str]
-) -> list[Path]:
-    """Draws and writes figures one after the other, so that only one is in memory."""
-    paths = []
-    for name, make in draw.items():
-        figure = make()
-        for form in formats:
-            paths.append(write_figure(figure, folder / f"{name}.{form}"))
-    return paths
-
-
-def write_calibration(
-    folder: Path,
-    evaluation: Evaluation,
-    slices: pd.DataFrame,
-    fits: pd.DataFrame,
-    labels: pd.DataFrame | None,
-    *,
-    formats: Sequence[str] = ("png",),
-) -> list[Path]:
-    """Draws and writes what calibration found beyond its parameters; returns their paths.
+def figures_of_calibration(
+    evaluation: Evaluation, slices: pd.DataFrame, fits: pd.DataFrame, labels: pd.DataFrame | None
+) -> Figures:
+    """Returns what draws what calibration found beyond its parameters.
 
     Args:
-        folder: made if it is not there.
         evaluation: of the job.
         slices: see `cfx.calibration.identifiability.slices`.
         fits: errors of constant parameters on both parts.
         labels: as `Labels.to_frame` returns them; None if there are none.
-        formats: as for `write_figures`.
-
-    Raises:
-        OutputError: a file cannot be written.
     """
     axes = parameter_axes(evaluation)
     draw: dict[str, Callable[[], Figure]] = {}
@@ -132,7 +112,50 @@ def write_calibration(
         drivers = labels_of(labels, evaluation.table, axes)
         if drivers:
             draw["labels_over_time"] = partial(draw_labels, drivers[len(drivers) // 2], axes)
-    return _written(draw, folder, formats)
+    return draw
+
+
+def in_turn(work: Callable[[_Item], _Done], items: Sequence[_Item]) -> list[_Done]:
+    """Does work in this process, one item after the other."""
+    return [work(item) for item in items]
+
+
+class _Files(NamedTuple):
+    """A figure that is to be drawn, and the files that it is written to."""
+
+    draw: Callable[[], Figure]
+    paths: tuple[Path, ...]
+
+
+def write_figures(
+    folder: Path, draw: Figures, *, formats: Sequence[str] = ("png",), share: Share = in_turn
+) -> list[Path]:
+    """Draws and writes figures; returns their paths.
+
+    Args:
+        folder: made if it is not there.
+        draw: which figures.
+        formats: files of each figure: `png`, `pdf`, `svg`.
+        share: does the work.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    files = []
+    for name, make in draw.items():
+        files.append(_Files(make, tuple(folder / f"{name}.{form}" for form in formats)))
+    paths: list[Path] = []
+    for written in share(_write, files):
+        paths += written
+    return paths
+
+
+def _write(files: _Files) -> tuple[Path, ...]:
+    """Draws one figure and writes it: where figures take turns, only one is in memory."""
+    figure = files.draw()
+    for path in files.paths:
+        write_figure(figure, path)
+    return files.paths
 
 
 def write_figure(figure: Figure, path: Path) -> Path:
