@@ -16,9 +16,12 @@ from cfx.component import Settings
 from cfx.optimizers.base import CandidateLosses, Optimizer, Tried
 from cfx.optimizers.random import AT_ONCE, check_room, evaluate_in_blocks, sobol
 
-_DIFFERENCE = 1e-4
-"""Half the distance in unit space over which a slope is measured. Losses are exact to about 1e-14,
-so rounding adds 1e-10 to a slope; piecewise smooth losses want a short distance."""
+_DIFFERENCE = 1e-6
+"""The distance in unit space over which a slope is measured. Losses are exact to about 1e-14, so
+rounding adds 1e-8 to a slope; piecewise smooth losses want a short distance."""
+
+_SAMPLES_OF_SEARCH = 512
+"""Samples for each local search, those of the screening included."""
 
 _LENGTHS = (3.0, 1.0, 0.5, 0.2, 0.05, 0.01)
 """Multiples of a step that are tried at once."""
@@ -34,13 +37,15 @@ class GradientSettings(Settings):
         4096, ge=1, description="evaluations of each problem, slopes and guesses included"
     )
     screening: float = Field(
-        0.5, gt=0.0, le=1.0, description="share of the samples that chooses where searches start"
+        0.75, gt=0.0, le=1.0, description="share of the samples that chooses where searches start"
     )
-    starts: int = Field(4, ge=1, description="local searches of each problem")
+    starts: int | None = Field(
+        None, ge=1, description="local searches of each problem; null: one for each 512 samples"
+    )
 
     @model_validator(mode="after")
     def _enough(self) -> GradientSettings:
-        if self.first < self.starts:
+        if self.starts is not None and self.first < self.starts:
             raise ValueError(
                 f"optimizer.starts={self.starts}: only {self.first} samples choose among;"
                 " set fewer starts or more samples"
@@ -52,14 +57,24 @@ class GradientSettings(Settings):
         """Samples that are evaluated first."""
         return max(1, int(self.samples * self.screening))
 
+    @property
+    def searches(self) -> int:
+        """Local searches of each problem."""
+        if self.starts is None:
+            return max(1, min(self.samples // _SAMPLES_OF_SEARCH, self.first))
+        return self.starts
+
 
 class GradientSearch(Optimizer):
     """Evaluates guesses and Sobol points, and goes downhill from the best few.
 
-    Each search is BFGS within the bounds. Slopes are central differences, so any model and any
-    simulator will do. Six lengths of each step are tried at once: where simulation is batched this
-    costs no more time than one. A step that finds nothing better starts again along the plain
-    gradient, ten times shorter. All searches of all problems go on together.
+    Each search is BFGS within the bounds. Slopes are differences towards the middle of the bounds,
+    so any model and any simulator will do. Six lengths of each step are tried at once: where
+    simulation is batched this costs no more time than one. A step that finds nothing better starts
+    again along the plain gradient, ten times shorter. All searches of all problems go on together.
+
+    More samples become more searches, not longer ones: a search ends in the next local minimum
+    after some ten steps, and models with regimes, such as Wiedemann's, have many.
 
     What is left of the samples, too little for one more round, becomes further Sobol points.
     """
@@ -78,7 +93,7 @@ class GradientSearch(Optimizer):
         return self.settings.first
 
     def bytes_per_problem(self, n: int) -> int:
-        matrices = self.settings.starts * n * (4 * n + 20)
+        matrices = self.settings.searches * n * (4 * n + 20)
         return 8 * (self.evaluations() * (n + 2) + matrices)
 
     def solve(
@@ -87,13 +102,13 @@ class GradientSearch(Optimizer):
         problems, g, n = guesses.shape
         settings = self.settings
         check_room(settings.first, g, key="samples")
-        each_round = settings.starts * (2 * n + len(_LENGTHS))
+        each_round = settings.searches * (n + len(_LENGTHS))
         rounds, rest = divmod(settings.samples - settings.first, each_round)
         points = sobol(settings.first - g + rest, n, seed=seed, like=guesses)
         shared = points.expand(problems, -1, -1)
         tried, losses = [guesses, shared], [evaluate_in_blocks(objective, guesses)]
         losses.append(evaluate_in_blocks(objective, shared))
-        search = _start(torch.cat(losses, dim=1), guesses, shared, settings.starts)
+        search = _start(torch.cat(losses, dim=1), guesses, shared, settings.searches)
         for _ in range(rounds):
             around = _around(search.point)
             found = objective(around.flatten(1, 2))
@@ -155,19 +170,17 @@ def _identity(point: Tensor) -> Tensor:
 
 
 def _around(point: Tensor) -> Tensor:
-    """Returns a point before and behind each in every coordinate, `(P, S, 2 n, n)`."""
+    """Returns a point beside each in every coordinate, inside the bounds, `(P, S, n, n)`."""
     n = point.shape[-1]
-    shift = _DIFFERENCE * torch.eye(n, dtype=point.dtype, device=point.device)
-    shifts = torch.cat([-shift, shift])
-    return (point[:, :, None] + shifts).clamp(0.0, 1.0)
+    shift = torch.eye(n, dtype=point.dtype, device=point.device)
+    inwards = torch.where(point > 0.5, -_DIFFERENCE, _DIFFERENCE)
+    return point[:, :, None] + shift * inwards[:, :, None]
 
 
 def _with_slope(search: _Search, around: Tensor, losses: Tensor) -> _Search:
     """Measures slopes, and learns the second derivatives from how they changed."""
-    n = search.point.shape[-1]
-    before, behind = losses[:, :, :n], losses[:, :, n:]
-    apart = torch.diagonal(around[:, :, n:] - around[:, :, :n], dim1=-2, dim2=-1)
-    slope = (behind - before) / apart
+    apart = torch.diagonal(around, dim1=-2, dim2=-1) - search.point
+    slope = (losses - search.loss[:, :, None]) / apart
     slope = slope.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
     inverse, fresh = _learned(search, slope)
     return search._replace(slope=slope, inverse=inverse, fresh=fresh)

@@ -82,7 +82,21 @@ def test_a_search_beside_candidates_that_diverge_goes_on() -> None:
 
 def test_too_few_samples_to_choose_starts_is_told() -> None:
     with pytest.raises(ConfigError, match=r"optimizer\.starts=4: only 3 samples choose"):
-        GradientSearch(samples=6)
+        GradientSearch(samples=4, starts=4)
+
+
+def test_more_samples_reach_a_lower_of_many_minima() -> None:
+    def wavy(candidates: Tensor, optima: Tensor) -> Tensor:
+        away = candidates - optima
+        return (away**2 + 0.05 * (1.0 - torch.cos(60.0 * away))).sum(-1)
+
+    optima = torch.rand((10, 3), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    problems, guesses = Problems(wavy, optima), centre(10, 3)
+    few = GradientSearch(samples=512).minimize(problems, guesses, seed=0).loss
+    many = GradientSearch(samples=16384).minimize(problems, guesses, seed=0).loss
+    one = GradientSearch(samples=16384, starts=1).minimize(problems, guesses, seed=0).loss
+    assert float(many.mean()) < 0.1 * float(few.mean())
+    assert float(many.mean()) < 0.5 * float(one.mean())
 
 
 def test_settings_alone_say_so_too() -> None:
