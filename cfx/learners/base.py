@@ -1,6 +1,7 @@
 """The contract of a learner: it trains the networks that a policy builds.
 
-Shapes: P pairs, N networks, W windows of the longest training part, n tuned parameters.
+Shapes: P pairs, one behind the other for all networks; U recorded pairs, of which several networks
+may learn from the same; N networks, W windows of the longest training part, n tuned parameters.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import pandas as pd
+import torch
 from torch import Tensor
 
 from cfx.agents.scaler import Scaler
@@ -37,8 +39,9 @@ class TrainingData:
 
     Attributes:
         simulator: simulates the driving model, with its time step.
-        batch: P pairs, full trajectories; only frames up to `split.frame` may be read.
-        split: where each pair's training part ends.
+        recorded: U pairs, full trajectories; only frames up to `split.frame` may be read.
+        pair: which of them each of the P pairs is, `(P,)` int64.
+        split: where the training part of each of the P pairs ends.
         windows: how trajectories are cut.
         fixed: the parameters that each pair's network starts from, `(P, n)`, SI units: the driver's
             own calibrated set, or the pooled one where networks are for unseen drivers.
@@ -59,7 +62,8 @@ class TrainingData:
     """
 
     simulator: Stepper
-    batch: PairBatch
+    recorded: PairBatch
+    pair: Tensor
     split: Split
     windows: WindowSettings
     fixed: Tensor
@@ -72,6 +76,19 @@ class TrainingData:
     workspace: Path | None = None
     objective: Objective = field(default_factory=SpeedRmse)
     engine: Engine = field(default_factory=LocalEngine)
+
+    @property
+    def batch(self) -> PairBatch:
+        """The P pairs, copied: as many times as many recordings as there are networks.
+
+        A learner that is to learn from thousands of pairs reads `recorded` and `pair`.
+        """
+        return self.recorded[self.pair]
+
+    @property
+    def device(self) -> torch.device:
+        """Where the trajectories lie."""
+        return self.recorded.lengths.device
 
 
 @dataclass(frozen=True)

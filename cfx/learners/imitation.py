@@ -105,7 +105,7 @@ class ImitationLearner(Learner):
             DataError: a pair has too few windows to keep some for validation.
         """
         self.require_no_driver_features(policy)
-        s, device = self.settings, training_data.batch.lengths.device
+        s, device = self.settings, training_data.device
         head = HEADS[s.head].for_model(training_data.simulator.model, device)
         space, names = head.space, training_data.names
         dataset = ImitationDataset.of(policy, training_data, s, head)
@@ -164,8 +164,8 @@ class _Rows(NamedTuple):
 
 def _rows(training_data: TrainingData, head: ParameterHead) -> _Rows:
     """Returns each pair with its base, and with the pooled one where that is another."""
-    device = training_data.batch.lengths.device
-    pair = torch.arange(len(training_data.batch), device=device)
+    device = training_data.device
+    pair = torch.arange(len(training_data.pair), device=device)
     network = training_data.network.to(device)
     pooled, own = training_data.fixed, training_data.base
     unit_pooled = head.space.to_unit(pooled).float()
@@ -227,17 +227,19 @@ class ImitationDataset(nn.Module):
         Raises:
             DataError: a pair has too few windows to keep some for validation.
         """
-        labels, batch = training_data.labels, training_data.batch
+        labels, pairs = training_data.labels, len(training_data.pair)
         if labels is None:
             raise TypeError("imitation needs labels: the parameters calibrated for each window")
-        windows, device = labels.windows, batch.lengths.device
+        windows, device = labels.windows, training_data.device
         pair, first = windows.pair.to(device), windows.first.to(device)
-        history = measured_history(batch, pair, first, training_data.windows.length)
+        recorded = training_data.pair.to(device)[pair]
+        length = training_data.windows.length
+        history = measured_history(training_data.recorded, recorded, first, length)
         seen = tokens(history, policy.inputs, policy.summary).float()
         unit = head.space.to_unit(labels.parameters).float()
-        tokens_of_pairs, mask = windows.to_grid(seen, len(batch))
-        labels_of_pairs, _ = windows.to_grid(unit, len(batch))
-        sensitivity, _ = windows.to_grid(labels.sensitivity.float(), len(batch))
+        tokens_of_pairs, mask = windows.to_grid(seen, pairs)
+        labels_of_pairs, _ = windows.to_grid(unit, pairs)
+        sensitivity, _ = windows.to_grid(labels.sensitivity.float(), pairs)
         train = _training_windows(mask, settings.validation)
         weight = torch.ones_like(sensitivity)
         if settings.weight_by_sensitivity:

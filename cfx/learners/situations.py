@@ -25,12 +25,11 @@ def learned_range(training_data: TrainingData, augment: Augment | None = None) -
         training_data: what the networks learn from.
         augment: what training made of situations besides; None: nothing.
     """
-    batch = training_data.batch
-    device = batch.lengths.device
+    device = training_data.device
     last = training_data.split.frame.to(device)
     windows = torch.arange(0, int(last.max()) + 1, training_data.windows.stride, device=device)
-    pairs = torch.arange(len(batch), device=device)
-    history = measured_history(batch, pairs[:, None], windows, 1)
+    pairs = torch.arange(len(training_data.pair), device=device)
+    history = measured_history(training_data.recorded, training_data.pair[:, None], windows, 1)
     recorded = History(*(signal[..., 0] for signal in history))
     counted = windows <= last[:, None]
     versions = [_situations(recorded)]

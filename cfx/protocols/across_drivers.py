@@ -283,7 +283,8 @@ def _training_data(
         labels = found.labels.select(index)
     return TrainingData(
         simulator=context.simulator,
-        batch=context.batch[rows],
+        recorded=context.batch,
+        pair=rows,
         split=full[index],
         windows=context.windows,
         fixed=start,

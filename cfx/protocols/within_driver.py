@@ -54,7 +54,8 @@ class WithinDriver(Protocol):
         if context.policy.trainable:
             training_data = TrainingData(
                 simulator=context.simulator,
-                batch=batch,
+                recorded=batch,
+                pair=torch.arange(len(batch), device=batch.lengths.device),
                 split=split,
                 windows=context.windows,
                 fixed=fixed,

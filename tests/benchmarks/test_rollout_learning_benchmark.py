@@ -45,10 +45,11 @@ def _training_data(model: DrivingModel, networks: int) -> TrainingData:
     network = torch.arange(networks).repeat_interleave(DRIVERS)
     fixed = model.space.defaults().expand(len(index), -1)
     names, windows = tuple(f"fold {k}" for k in range(networks)), WindowSettings()
-    batch, split = PairBatch.of(pairs)[index], Split.none(pairs, windows)[index]
+    batch, split = PairBatch.of(pairs), Split.none(pairs, windows)[index]
     return TrainingData(
         MemoryStepper(model, 0.1),
         batch,
+        index,
         split,
         windows,
         fixed,

@@ -44,6 +44,7 @@ def _training_data() -> TrainingData:
     return TrainingData(
         MemoryStepper(model, 0.1),
         PairBatch.of(pairs),
+        torch.arange(PAIRS),
         split,
         settings,
         fixed,

@@ -59,7 +59,8 @@ def training_data(
         fixed[:] = torch.tensor([4.0, 0.8])
     data = TrainingData(
         simulator=MemoryStepper(model, 0.1),
-        batch=PairBatch.of(pairs)[index],
+        recorded=PairBatch.of(pairs),
+        pair=index,
         split=Split.none(pairs, WINDOWS)[index],
         windows=WINDOWS,
         fixed=fixed,

@@ -55,7 +55,8 @@ def training_data(
     network, groups = group_by(names)
     return TrainingData(
         simulator=MemoryStepper(model, 0.1),
-        batch=batch,
+        recorded=batch,
+        pair=torch.arange(pairs),
         split=split,
         windows=SETTINGS,
         fixed=model.space.defaults().expand(pairs, 2),
@@ -250,7 +251,7 @@ def test_only_the_training_part_is_read(head: str) -> None:
     hidden = {}
     for name in ("leader_speed", "follower_speed", "follower_position", "leader_position"):
         hidden[name] = torch.where(after, torch.nan, getattr(data.batch, name))
-    other = replace(data, batch=replace(data.batch, **hidden))
+    other = replace(data, recorded=replace(data.recorded, **hidden))
     result = ImitationLearner(head=head, **QUICK).fit(GruPolicy(), other)
     for value in result.network.parameters():
         assert bool(value.isfinite().all())

@@ -164,7 +164,7 @@ class _ConstantParameters:
     def __init__(self, training_data: TrainingData, dataset: RolloutDataset, bases: _Bases) -> None:
         self.simulator = training_data.simulator
         self.objective = training_data.objective
-        self.batch = training_data.batch[dataset.recorded]
+        self.batch = training_data.recorded[training_data.pair[dataset.recorded]]
         frame = training_data.split.frame.to(dataset.recorded.device)
         self.last = frame[dataset.recorded]
         self.bases = bases

@@ -41,12 +41,13 @@ def checkpoint_path(
 
 def _digest(training_data: TrainingData) -> str:
     """Returns the SHA-256 of all tensors that training reads."""
-    batch = training_data.batch
+    batch = training_data.recorded
     tensors = [
         batch.leader_position,
         batch.leader_speed,
         batch.follower_position,
         batch.follower_speed,
+        training_data.pair,
         training_data.split.frame,
         training_data.fixed,
         training_data.network,

@@ -55,8 +55,7 @@ class Conditioning(NamedTuple):
 class RolloutDataset:
     """The training data, placed as N networks by B drivers, in single precision.
 
-    Networks learn from the same recordings, which the training data holds once for each network.
-    Here each is held once.
+    Networks learn from the same recordings: each is held once.
 
     Attributes:
         batch: the U pairs.
@@ -119,7 +118,7 @@ class RolloutDataset:
         if head is None:
             head = OffsetHead.for_model(training_data.simulator.model)
         recorded, row = _recorded_once(training_data)
-        batch = _single_precision(training_data.batch[recorded])
+        batch = _single_precision(training_data.recorded[training_data.pair[recorded]])
         device = batch.lengths.device
         space, fixed = head.space, head.completed(training_data.fixed)
         grid = Grid(training_data.network.to(device), len(training_data.names))
@@ -287,26 +286,27 @@ class RolloutDataset:
 def _recorded_once(training_data: TrainingData) -> tuple[Tensor, Tensor]:
     """Finds pairs that stand for all that are equal to them.
 
-    Equal are pairs with the same signals and the same training part, as of one driver that several
+    Equal are the same recorded pairs with the same training part, as of one driver that several
     networks learn from.
 
     Returns:
         Which of the P pairs these are, `(U,)`, and which one of these stands for each, `(P,)`.
     """
-    batch = training_data.batch
-    frame = training_data.split.frame.to(batch.lengths.device)
-    marks = [frame.double(), batch.lengths.double(), batch.leader_length.double()]
-    for name in SIGNALS:
-        marks.append(getattr(batch, name).sum(1).double())
-    _, group = torch.unique(torch.stack(marks, 1), dim=0, return_inverse=True)
+    frame = training_data.split.frame.to(training_data.device)
+    marks = torch.stack([training_data.pair.to(frame), frame], 1)
+    _, group = torch.unique(marks, dim=0, return_inverse=True)
     number = torch.arange(len(group), device=group.device)
     first = torch.full_like(number, len(group)).scatter_reduce(0, group, number, "amin")
     recorded, row = torch.unique(first[group], return_inverse=True)
-    for name in SIGNALS:
-        signal = getattr(batch, name)
-        if not torch.equal(signal[recorded][row], signal):  # equal sums of others by chance
-            return number, number
     return recorded, row
+
+
+def time_gaps(training_data: TrainingData) -> Tensor:
+    """Returns each driver's usual time gap in the training part, `(P,)`, s."""
+    recorded, row = _recorded_once(training_data)
+    last = training_data.split.frame.to(training_data.device)[recorded]
+    batch = training_data.recorded[training_data.pair[recorded]]
+    return usual_time_gap(batch, last)[row]
 
 
 def usual_time_gap(batch: PairBatch, last: Tensor) -> Tensor:
@@ -345,7 +345,7 @@ def _validation_drivers(
     """Chooses validation drivers for each network; all pairs of a driver stay together."""
     drivers = training_data.drivers
     if drivers is None:
-        drivers = tuple(str(number) for number in range(len(training_data.batch)))
+        drivers = tuple(str(number) for number in range(len(training_data.pair)))
     kept, few = torch.zeros_like(present), torch.zeros(len(pair), dtype=torch.bool)
     for network in range(len(pair)):
         places = present[network].nonzero()[:, 0].tolist()

@@ -31,7 +31,7 @@ from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResu
 from cfx.learners.curves import warn_of_nothing_learned
 from cfx.learners.rollout.augmentation import Augmentation
 from cfx.learners.rollout.checkpoint import checkpoint_path
-from cfx.learners.rollout.dataset import RolloutDataset, usual_time_gap
+from cfx.learners.rollout.dataset import RolloutDataset, time_gaps
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.learners.rollout.shard import (
     TrainedShard,
@@ -181,8 +181,7 @@ class RolloutLearner(Learner):
         augment = None
         if has_cold_starts:
             generator = torch.Generator().manual_seed(training_data.seed)
-            last = training_data.split.frame.to(training_data.batch.lengths.device)
-            time_gap = usual_time_gap(training_data.batch, last)
+            time_gap = time_gaps(training_data)
             augment = Augmentation(self.settings, time_gap, generator)
         return replace(found, valid_range=learned_range(training_data, augment))
 

@@ -177,7 +177,8 @@ def _of_networks(training_data: TrainingData, ensemble_size: int, networks: slic
     base = training_data.base
     return replace(
         training_data,
-        batch=training_data.batch[:0],
+        recorded=training_data.recorded[:0],
+        pair=training_data.pair[:0],
         split=training_data.split[:0],
         fixed=training_data.fixed[:0],
         base=None if base is None else base[:0],

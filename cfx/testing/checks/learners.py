@@ -67,7 +67,8 @@ def training_data(
         labels = _labels(split, truth)
     return TrainingData(
         simulator=MemoryStepper(model, pairs.dt),
-        batch=PairBatch.of(pairs),
+        recorded=PairBatch.of(pairs),
+        pair=torch.arange(PAIRS),
         split=split,
         windows=WINDOWS,
         fixed=model.space.from_unit((model.space.to_unit(truth) + 0.25).clamp(0.05, 0.95)),
@@ -192,13 +193,13 @@ def another_seed_gives_other_networks(learner: Learner) -> None:
 
 def reads_no_frame_after_the_training_part(learner: Learner) -> None:
     data = training_data(needs_labels=learner.needs_labels)
-    frames = torch.arange(data.batch.mask.shape[1])
+    frames = torch.arange(data.recorded.mask.shape[1])
     secret = frames > data.split.frame[:, None]
     changed: dict[str, Any] = {}
     for name in SIGNALS:
-        signal = getattr(data.batch, name)
+        signal = getattr(data.recorded, name)
         changed[name] = torch.where(secret, 3.0 + 0.5 * signal, signal)
-    poisoned = replace(data, batch=replace(data.batch, **changed))
+    poisoned = replace(data, recorded=replace(data.recorded, **changed))
     one, two = _state(_fitted(learner, data)), _state(learner.fit(_POLICY, poisoned))
     assert _equal(one, two), (
         "frames after `split.frame` were changed, and the networks or their scaler changed with"
@@ -212,9 +213,9 @@ def networks_are_independent(learner: Learner) -> None:
     changed: dict[str, Any] = {}
     for name in SIGNALS:
         if not name.endswith("position"):
-            signal = getattr(data.batch, name)
+            signal = getattr(data.recorded, name)
             changed[name] = torch.where(first, 1.0 + 0.8 * signal, signal)
-    other = replace(data, batch=replace(data.batch, **changed))
+    other = replace(data, recorded=replace(data.recorded, **changed))
     labels = data.labels
     if labels is not None:
         of_first = (labels.windows.pair == 0)[:, None]
@@ -239,8 +240,8 @@ def the_training_data_stays_as_it_is(learner: Learner) -> None:
     learner.fit(_POLICY, data)
     message = "must not be changed in place: the protocol still needs it for the evaluation"
     for name in (*SIGNALS, "gap"):
-        one, two = getattr(data.batch, name), getattr(untouched.batch, name)
-        assert torch.equal(one, two), f"batch.{name} of the training data {message}"
+        one, two = getattr(data.recorded, name), getattr(untouched.recorded, name)
+        assert torch.equal(one, two), f"recorded.{name} of the training data {message}"
     for name in ("fixed", "network"):
         one, two = getattr(data, name), getattr(untouched, name)
         assert torch.equal(one, two), f"{name} of the training data {message}"

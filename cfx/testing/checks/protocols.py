@@ -189,14 +189,14 @@ def learners_get_only_what_they_may_use(protocol: Protocol) -> None:
     protocol.run(context(recording(), learner=watched))
     assert watched.training_data_seen, "a trainable policy must be trained by the context's learner"
     for training_data in watched.training_data_seen:
-        pairs = len(training_data.batch)
+        pairs = len(training_data.pair)
         per_pair = (training_data.split.frame, training_data.network, training_data.fixed)
         assert all(len(values) == pairs for values in per_pair), (
             "split, network and fixed of training data have an entry for each of its pairs"
         )
-        assert bool((training_data.split.frame < training_data.batch.lengths).all()), (
-            "`split.frame` is a frame of the pair"
-        )
+        assert bool(
+            (training_data.split.frame < training_data.recorded.lengths[training_data.pair]).all()
+        ), "`split.frame` is a frame of the pair"
         assert set(training_data.network.tolist()) == set(range(len(training_data.names))), (
             "every network of training data has a name and learns from at least one pair"
         )

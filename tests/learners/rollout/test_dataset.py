@@ -54,7 +54,7 @@ def test_a_network_of_few_drivers_keeps_the_end_of_their_trajectories() -> None:
     data = training_data(networks=1)
     few = replace(
         data,
-        batch=data.batch[:2],
+        pair=data.pair[:2],
         split=data.split[torch.arange(2)],
         fixed=data.fixed[:2],
         network=data.network[:2],

@@ -180,9 +180,9 @@ def test_nothing_is_learned_from_validation_drivers() -> None:
     kept = dataset.validates[0]
     assert 0 < int(kept.sum()) < 6
     assert not bool((dataset.trains & dataset.validates).any())
-    speed = data.batch.follower_speed
+    speed = data.recorded.follower_speed
     shifted = torch.where(kept[:, None], speed + 1.0, speed)
-    other = replace(data, batch=replace(data.batch, follower_speed=shifted))
+    other = replace(data, recorded=replace(data.recorded, follower_speed=shifted))
     one = RolloutLearner(**settings).fit(policy, data)
     two = RolloutLearner(**settings).fit(policy, other)
     assert one.curves.train_loss.tolist() == two.curves.train_loss.tolist()
