@@ -45,6 +45,9 @@ TRACKED = (
 """Files of a job's folder that MLflow keeps too, besides its figures and its policy."""
 
 
+_SHARED_PAIRS = 500
+"""Pairs of a job whose figures two processes draw, at most: the other is sent all trajectories."""
+
 METRICS = "metrics.json"
 """The file that is written last: a folder that has it is complete."""
 
@@ -290,7 +293,7 @@ def write_figures(
                 labels = protocol_result.labels.to_frame(pairs, evaluation.names)
             draw |= write.figures_of_calibration(evaluation, view.slices, view.fits, labels)
         share: write.Share = write.in_turn
-        if second is not None:
+        if second is not None and len(pairs) <= _SHARED_PAIRS:
             share = second.share
 
         def write_all() -> None:

@@ -14,6 +14,10 @@ from cfx.agents.valid_range import ValidRange, stacked
 from cfx.learners.base import TrainingData
 from cfx.policies.features import History, measured_history
 
+_PAIRS_AT_MOST = 4096
+"""Pairs of a network whose situations are measured: of more, as many at equal distances. A range
+and its quantiles need no more than the hundred thousands of situations that these have."""
+
 Augment = Callable[[History, Tensor], History]
 """Takes the situations of pairs `(P,)`, `(P, W)` each, and returns others of the same shape."""
 
@@ -28,21 +32,35 @@ def learned_range(training_data: TrainingData, augment: Augment | None = None) -
     device = training_data.device
     last = training_data.split.frame.to(device)
     windows = torch.arange(0, int(last.max()) + 1, training_data.windows.stride, device=device)
-    pairs = torch.arange(len(training_data.pair), device=device)
-    history = measured_history(training_data.recorded, training_data.pair[:, None], windows, 1)
+    networks = training_data.network.to(device)
+    rows = _some_of_each(networks, len(training_data.names))
+    pair = training_data.pair.to(device)[rows]
+    history = measured_history(training_data.recorded, pair[:, None], windows, 1)
     recorded = History(*(signal[..., 0] for signal in history))
-    counted = windows <= last[:, None]
+    counted = windows <= last[rows, None]
     versions = [_situations(recorded)]
     if augment is not None:
-        versions.append(_situations(augment(recorded, pairs)))
+        versions.append(_situations(augment(recorded, rows)))
     found = []
     for number in range(len(training_data.names)):
-        own = training_data.network.to(device) == number
+        own = networks[rows] == number
         of_network = []
         for situations in versions:
             of_network.append(situations[own][counted[own]])
         found.append(torch.cat(of_network))
     return ValidRange.of(found)
+
+
+def _some_of_each(network: Tensor, networks: int) -> Tensor:
+    """Returns rows of each network, all or `_PAIRS_AT_MOST` of them, in order, `(S,)`."""
+    chosen = []
+    for number in range(networks):
+        own = (network == number).nonzero()[:, 0]
+        if len(own) > _PAIRS_AT_MOST:
+            at = torch.arange(_PAIRS_AT_MOST, device=own.device) * len(own) // _PAIRS_AT_MOST
+            own = own[at]
+        chosen.append(own)
+    return torch.cat(chosen).sort().values
 
 
 def _situations(history: History) -> Tensor:

@@ -164,7 +164,8 @@ class _ConstantParameters:
     def __init__(self, training_data: TrainingData, dataset: RolloutDataset, bases: _Bases) -> None:
         self.simulator = training_data.simulator
         self.objective = training_data.objective
-        self.batch = training_data.recorded[training_data.pair[dataset.recorded]]
+        self.batch = training_data.recorded
+        self.pair = training_data.pair[dataset.recorded]
         frame = training_data.split.frame.to(dataset.recorded.device)
         self.last = frame[dataset.recorded]
         self.bases = bases
@@ -192,7 +193,7 @@ class _ConstantParameters:
         losses = SegmentLosses.of_segments(
             self.simulator,
             self.objective,
-            self.batch[which],
+            self.batch[self.pair[which]],
             pair,
             first.clamp(max=self.batch.mask.shape[1] - 1),
             (last[pair] - first).clamp(0, steps),

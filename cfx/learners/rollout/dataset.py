@@ -8,6 +8,7 @@ features, c = n + k features of conditioning.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -28,6 +29,8 @@ from cfx.policies.features import measured_history, tokens
 _FEW_DRIVERS = 5
 """A network with fewer drivers keeps the end of each trajectory for validation, not drivers."""
 
+_PAIRS_AT_ONCE = 4096
+"""Pairs whose frames are read at once, in double precision: some 200 MB of 600 frames each."""
 
 _MOVING_MPS = 3.0
 _STANDSTILL_M = 2.0
@@ -118,7 +121,7 @@ class RolloutDataset:
         if head is None:
             head = OffsetHead.for_model(training_data.simulator.model)
         recorded, row = _recorded_once(training_data)
-        batch = _single_precision(training_data.recorded[training_data.pair[recorded]])
+        batch = _single_precision(training_data.recorded, training_data.pair[recorded])
         device = batch.lengths.device
         space, fixed = head.space, head.completed(training_data.fixed)
         grid = Grid(training_data.network.to(device), len(training_data.names))
@@ -158,7 +161,7 @@ class RolloutDataset:
             pooled=pooled.repeat_interleave(ensemble_size, 0),
             tokens=seen,
             driver_features=driver_features,
-            time_gap=usual_time_gap(batch, frame),
+            time_gap=_usual_time_gaps(batch, frame),
             scaler=Scaler(
                 scaler.mean.repeat_interleave(ensemble_size, 0),
                 scaler.scale.repeat_interleave(ensemble_size, 0),
@@ -305,8 +308,17 @@ def time_gaps(training_data: TrainingData) -> Tensor:
     """Returns each driver's usual time gap in the training part, `(P,)`, s."""
     recorded, row = _recorded_once(training_data)
     last = training_data.split.frame.to(training_data.device)[recorded]
-    batch = training_data.recorded[training_data.pair[recorded]]
-    return usual_time_gap(batch, last)[row]
+    return _usual_time_gaps(training_data.recorded, last, training_data.pair[recorded])[row]
+
+
+def _usual_time_gaps(batch: PairBatch, last: Tensor, pair: Tensor | None = None) -> Tensor:
+    """As `usual_time_gap`, some pairs after the other; of pairs `(U,)`, or all."""
+    if pair is None:
+        pair = torch.arange(len(batch), device=last.device)
+    found = []
+    for part in _parts(len(pair)):
+        found.append(usual_time_gap(batch[pair[part]], last[part]))
+    return torch.cat(found)
 
 
 def usual_time_gap(batch: PairBatch, last: Tensor) -> Tensor:
@@ -364,12 +376,28 @@ def _validation_drivers(
     return _Validation(kept, few)
 
 
-def _single_precision(batch: PairBatch) -> PairBatch:
-    """Returns the batch in single precision, which resolves positions on it to 0.1 mm."""
+def _single_precision(batch: PairBatch, pair: Tensor) -> PairBatch:
+    """Returns pairs `(U,)` in single precision, which resolves positions on them to 0.1 mm."""
     changed = {}
-    for name in (*SIGNALS, "leader_length"):
-        changed[name] = getattr(batch, name).float()
-    return replace(batch, **changed)
+    for name in SIGNALS:
+        signal = getattr(batch, name)
+        values = signal.new_empty((len(pair), signal.shape[1]), dtype=torch.float32)
+        for part in _parts(len(pair)):
+            values[part] = signal[pair[part]].float()
+        changed[name] = values
+    return PairBatch(
+        **changed,
+        leader_length=batch.leader_length[pair].float(),
+        lengths=batch.lengths[pair],
+        mask=batch.mask[pair],
+        dt=batch.dt,
+    )
+
+
+def _parts(pairs: int) -> Iterator[slice]:
+    """Yields which pairs are read at once."""
+    for first in range(0, pairs, _PAIRS_AT_ONCE):
+        yield slice(first, min(first + _PAIRS_AT_ONCE, pairs))
 
 
 def _measured_tokens(
@@ -379,9 +407,12 @@ def _measured_tokens(
     device = batch.lengths.device
     end = int(last.max()) + 1
     windows = torch.arange(0, end, training_data.windows.stride, device=device)
-    pairs = torch.arange(len(batch), device=device)[:, None]
-    history = measured_history(batch, pairs, windows, training_data.windows.length)
-    return tokens(history, policy.inputs, policy.summary)
+    found = []
+    for part in _parts(len(batch)):
+        pairs = torch.arange(part.start, part.stop, device=device)[:, None]
+        history = measured_history(batch, pairs, windows, training_data.windows.length)
+        found.append(tokens(history, policy.inputs, policy.summary))
+    return torch.cat(found)
 
 
 def _driver_features(
