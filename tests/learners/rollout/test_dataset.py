@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 import torch
 
 from cfx.agents.heads.offset import coordinates
+from cfx.learners.rollout import dataset as dataset_module
 from cfx.learners.rollout.base_errors import BaseErrors
-from cfx.learners.rollout.dataset import RolloutDataset
+from cfx.learners.rollout.dataset import RolloutDataset, time_gaps
 from cfx.policies.driver_features import measure
 from tests.learners.made import TRUE, batch_of, gru, placed, training_data
 
@@ -74,3 +76,26 @@ def test_one_driver_is_never_on_both_sides() -> None:
             (kept if is_kept else others).add(name)
         assert kept
         assert not kept & others
+
+
+def test_pairs_that_are_read_some_after_the_other_are_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    data, policy = training_data(networks=2, base=TRUE.repeat(2, 1)), gru()
+    whole, gaps = placed(data, policy), time_gaps(data)
+    monkeypatch.setattr(dataset_module, "_PAIRS_AT_ONCE", 4)
+    parts = placed(data, policy)
+    assert torch.equal(parts.batch.follower_position, whole.batch.follower_position)
+    assert torch.equal(parts.batch.mask, whole.batch.mask)
+    assert torch.equal(parts.tokens, whole.tokens)
+    assert torch.equal(parts.time_gap, whole.time_gap)
+    assert torch.equal(time_gaps(data), gaps)
+    one, other = BaseErrors.of(data, whole, 12), BaseErrors.of(data, parts, 12)
+    assert torch.equal(one.over_windows, other.over_windows)
+
+
+def test_training_data_hold_each_recording_once() -> None:
+    data = training_data(networks=3)
+    assert len(data.recorded) == 6
+    assert len(data.batch) == len(data.pair) == 18
+    assert torch.equal(data.batch.follower_speed[6:12], data.recorded.follower_speed)
