@@ -247,6 +247,45 @@ class SegmentLosses:
         )
 
 
+@dataclass(frozen=True)
+class FullTrajectories:
+    """Pairs from frame 0 to a last one, as segments that are cut out where they are simulated.
+
+    Attributes:
+        simulator: the model and its time step.
+        objective: compares the simulated trajectories with the measured ones.
+        batch: P pairs.
+        last: `(P,)`, the last frame that is compared.
+    """
+
+    simulator: Stepper
+    objective: Objective
+    batch: PairBatch
+    last: Tensor
+
+    @property
+    def problems(self) -> int:
+        """P."""
+        return len(self.last)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the tensors lie."""
+        return self.last.device
+
+    @property
+    def steps(self) -> int:
+        """K, of the longest."""
+        return int(self.last.max())
+
+    def take(self, problems: Tensor) -> SegmentLosses:
+        """Returns pairs of numbers `(S,)` int64; one may stand there more than once."""
+        first, last = torch.zeros_like(problems), self.last[problems]
+        return SegmentLosses.of_segments(
+            self.simulator, self.objective, self.batch, problems, first, last
+        )
+
+
 _BYTES_AT_ONCE = 1 << 27
 """Most bytes that pooled losses simulate at once. 1 GB took three times as long as 256 MB, all of
 it in fetching pages."""
@@ -254,6 +293,13 @@ it in fetching pages."""
 _SUMMED_AT_ONCE = 1 << 25
 """The same where a kernel sums up losses without trajectories: what it writes is freed and written
 again, and stays in the process's own memory (`cfx.simulation.pages`)."""
+
+_SEGMENTS_AT_ONCE = 1024
+"""Segments that are simulated for a block of candidates: memory does not grow with their number,
+and the block stays long."""
+
+_VECTOR = 32
+"""Blocks of candidates are multiples of this, as the kernel simulates so many together."""
 
 
 @dataclass(frozen=True)
@@ -271,7 +317,7 @@ class PooledLosses:
             where all segments of all of them need more.
     """
 
-    segments: SegmentLosses
+    segments: SegmentLosses | FullTrajectories
     members: Tensor
     memory: int
 
@@ -287,8 +333,8 @@ class PooledLosses:
 
     @property
     def bytes_per_candidate(self) -> int:
-        """Memory of one candidate of one problem besides the blocks: the segments' losses."""
-        return 2 * self.members.shape[1] * self.segments.measured_speed.element_size()
+        """Memory of one candidate of one problem besides the blocks: the sum and the mean."""
+        return 2 * torch.float64.itemsize
 
     def for_work(self, candidates: int) -> PooledLosses:
         """Returns the same losses, for a number of candidates of each problem in all calls."""
@@ -303,39 +349,49 @@ class PooledLosses:
     @torch.no_grad()
     def __call__(self, candidates: Tensor) -> Tensor:
         """Returns losses `(K, q)`, in the objective's unit, of candidates `(K, q, n)`."""
-        problem, segment = self.members.nonzero().unbind(1)
-        if bool((candidates == candidates[:1]).all()):
-            used = self.members.any(0)
-            simulated, place = used.nonzero()[:, 0], (used.cumsum(0) - 1)[segment]
-            shared = candidates[:1].expand(len(simulated), -1, -1)
-            return self._means(simulated, shared, problem, place)
-        place = torch.arange(len(segment), device=segment.device)
-        return self._means(segment, candidates[problem], problem, place)
+        shared = bool((candidates == candidates[:1]).all())
+        used = self.members.any(0).nonzero()[:, 0]
+        # The parts are small, but there are many: together they may be worth compiling for, which
+        # none of them is alone.
+        simulated = len(used) if shared else int(self.members.sum())
+        work = self.segments.steps * simulated * candidates.shape[1]
+        simulator = self.segments.simulator.for_work(work)
+        segments = replace(self.segments, simulator=simulator)
+        total = candidates.new_zeros(candidates.shape[:2])
+        for some in torch.split(used, _SEGMENTS_AT_ONCE):
+            problem, place = self.members[:, some].nonzero().unbind(1)
+            if shared:
+                part = segments.take(some)
+                self._add(total, part, candidates[:1].expand(len(some), -1, -1), problem, place)
+            else:
+                part = segments.take(some[place])
+                every = torch.arange(len(place), device=place.device)
+                self._add(total, part, candidates[problem], problem, every)
+        return total / self.members.sum(1, keepdim=True)
 
-    def _means(self, segment: Tensor, candidates: Tensor, problem: Tensor, place: Tensor) -> Tensor:
-        """Simulates segments, a block of candidates after the other; returns means `(K, q)`.
+    def _add(
+        self,
+        total: Tensor,
+        segments: SegmentLosses,
+        candidates: Tensor,
+        problem: Tensor,
+        place: Tensor,
+    ) -> None:
+        """Simulates segments, a block of candidates after the other, and adds up their losses.
 
         Args:
-            segment: which are simulated, `(S,)`.
+            total: where they are added, `(K, q)`.
+            segments: S of them.
             candidates: of each, `(S, q, n)`.
             problem, place: the problem that each loss counts for, and the number of its segment
                 among those that are simulated, `(M,)`.
         """
-        segments, count = self.segments, candidates.shape[1]
-        every = torch.arange(segments.problems, device=segment.device)
-        if not torch.equal(segment, every):
-            segments = segments.take(segment)
-        # The blocks are small, but there are many: together they may be worth compiling for, which
-        # none of them is alone.
-        simulator = segments.simulator.for_work(segments.steps * len(segment) * count)
-        segments = replace(segments, simulator=simulator)
         bound = min(self.memory, _BYTES_AT_ONCE)
         if segments.accumulates:
             bound = min(self.memory, _SUMMED_AT_ONCE)
-        block = max(1, bound // (segments.bytes_per_candidate * len(segment)))
-        means = []
-        for part in torch.split(candidates, block, dim=1):
-            losses = segments(part)
-            total = losses.new_zeros((self.problems, losses.shape[1]))
-            means.append(total.index_add_(0, problem, losses[place]))
-        return torch.cat(means, dim=1) / self.members.sum(1, keepdim=True)
+        block = max(1, bound // (segments.bytes_per_candidate * segments.problems))
+        if block > _VECTOR:
+            block -= block % _VECTOR
+        columns = torch.split(total, block, dim=1)
+        for some, part in zip(columns, torch.split(candidates, block, dim=1), strict=True):
+            some.index_add_(0, problem, segments(part).to(total)[place])

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from cfx import registry
 from cfx.calibration.cache import Arrays
-from cfx.calibration.losses import PooledLosses, SegmentLosses
+from cfx.calibration.losses import FullTrajectories, PooledLosses, SegmentLosses
 from cfx.calibration.prior import LossesWithPrior
 from cfx.component import content_key, folder_hash
 from cfx.engine.base import Report, Unfit
@@ -213,7 +213,9 @@ class PooledShard(CalibrationShard):
     members: Tensor
 
     def solve(self, report: Report) -> list[Arrays]:
-        losses = PooledLosses(self.whole(self.last), self.members, self.solver.memory)
+        simulator, objective = self.solver.simulator, self.solver.objective
+        trajectories = FullTrajectories(simulator, objective, self.batch, self.last)
+        losses = PooledLosses(trajectories, self.members, self.solver.memory)
         return _rows(self.solver.minimize_from_defaults(losses, report))
 
 

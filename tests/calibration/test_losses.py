@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from cfx.calibration.losses import PooledLosses, SegmentLosses
+from cfx.calibration.losses import FullTrajectories, PooledLosses, SegmentLosses
 from cfx.models.base import Leader
 from cfx.models.krauss import Krauss
 from cfx.objectives.base import FrameValues, Objective
@@ -93,6 +93,29 @@ def test_a_pooled_loss_is_the_mean_of_its_segments() -> None:
         torch.testing.assert_close(pooled.select(1, 2)(asked[1:]), expected[1:])
         # One candidate at a time gives the same.
         torch.testing.assert_close(PooledLosses(segments, members, memory=1)(asked), expected)
+
+
+def test_many_trajectories_are_simulated_some_after_the_other(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    batch, index = PairBatch.of(wavy_pairs(Krauss(), TRUE)), torch.arange(3)
+    last = torch.tensor([150, 150, 90])
+    simulator, objective = MemoryStepper(Krauss(), 0.1), SpeedRmse()
+    segments = SegmentLosses.of_segments(
+        simulator, objective, batch, index, torch.zeros_like(index), last
+    )
+    members = torch.tensor([[True, True, False], [True, False, True]])
+    candidates = torch.rand(
+        (2, 7, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    trajectories = FullTrajectories(simulator, objective, batch, last)
+    for asked in (candidates, candidates[:1].expand(2, -1, -1)):
+        expected = PooledLosses(segments, members, memory=1 << 30)(asked)
+        pooled = PooledLosses(trajectories, members, memory=1 << 30)
+        torch.testing.assert_close(pooled(asked), expected)
+        monkeypatch.setattr("cfx.calibration.losses._SEGMENTS_AT_ONCE", 1)
+        torch.testing.assert_close(pooled(asked), expected)
+        monkeypatch.undo()
 
 
 def test_a_segment_that_diverges_spoils_only_its_own_problems() -> None:

@@ -12,9 +12,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from cfx import scratch
 from cfx.agents.heads.base import ParameterHead
 from cfx.agents.heads.offset import OffsetHead, coordinates
 from cfx.agents.scaler import Scaler
@@ -381,9 +383,12 @@ def _single_precision(batch: PairBatch, pair: Tensor) -> PairBatch:
     changed = {}
     for name in SIGNALS:
         signal = getattr(batch, name)
-        values = signal.new_empty((len(pair), signal.shape[1]), dtype=torch.float32)
+        shape = (len(pair), signal.shape[1])
+        values = torch.as_tensor(scratch.empty(shape, np.float32, together=len(SIGNALS)))
+        values = values.to(signal.device)
         for part in _parts(len(pair)):
             values[part] = signal[pair[part]].float()
+            scratch.release()
         changed[name] = values
     return PairBatch(
         **changed,
