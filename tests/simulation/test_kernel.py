@@ -12,13 +12,14 @@ from torch import Tensor
 from cfx import registry
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.krauss import Krauss
+from cfx.models.residual import WithResidual
 from cfx.models.w99 import W99
 from cfx.objectives.base import FrameValues, Objective
 from cfx.objectives.rmse import SpeedRmse
 from cfx.simulation import threads
 from cfx.simulation.base import Stepper
 from cfx.simulation.kernel import compiler
-from cfx.simulation.kernel.graph import literal
+from cfx.simulation.kernel.columns import literal
 from cfx.simulation.kernel.keys import ComponentKey, KernelKey
 from cfx.simulation.kernel.run import accumulate
 from cfx.simulation.rollout import MemoryStepper
@@ -31,12 +32,12 @@ pytestmark = pytest.mark.skipif(compiler.find_compiler() is None, reason="there 
 
 
 def with_equations() -> list[str]:
-    """Returns the names of all models that have equations and no memory of their own."""
+    """Returns the names of all models that have equations."""
     names = []
     for name in registry.names("model"):
         model = registry.get("model", name)
         assert issubclass(model, DrivingModel)
-        if not model.needs_simulator and model().memory_size == 0:
+        if not model.needs_simulator:
             names.append(name)
     return names
 
@@ -125,7 +126,7 @@ def terms_of(objective: Objective) -> Callable[..., tuple[Tensor, ...]]:
 
 
 @pytest.mark.parametrize("name", with_equations())
-def test_every_model_without_memory_has_a_kernel_with_the_losses_of_its_trajectories(
+def test_every_model_has_a_kernel_with_the_losses_of_its_trajectories(
     name: str,
 ) -> None:
     model = registry.create("model", {"name": name})
@@ -233,16 +234,92 @@ class MixesVehicles(Krauss):
         return follower.speed - follower.speed.mean()
 
 
-class Remembers(Krauss):
-    """Has a memory of its own."""
+class RemembersMuch(Krauss):
+    """Has a memory that is too wide for a thread's stack."""
 
-    memory_size = 1
+    memory_size = 100_000
 
 
-@pytest.mark.parametrize("model", [Branches(), MixesVehicles(), Remembers()])
+class TakesOneVehiclesSpeed(Krauss):
+    """Lets all vehicles drive as the first one does."""
+
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
+        return follower.speed[0].expand_as(follower.speed)
+
+
+class LooksUpWhatIsComputed(Krauss):
+    """Chooses a column of values that no memory holds."""
+
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
+        both = torch.stack([follower.speed, follower.speed + 1.0], -1)
+        index = (follower.speed > 3.0).long()[..., None]
+        return both.gather(-1, index)[..., 0]
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        Branches(),
+        MixesVehicles(),
+        RemembersMuch(),
+        TakesOneVehiclesSpeed(),
+        LooksUpWhatIsComputed(),
+    ],
+)
 def test_a_model_that_is_not_elementwise_is_left_to_pytorch(model: DrivingModel) -> None:
     p = candidates_of(model)
     assert accumulate(model, DT, made_up_segments(), p, squares, key="squares") is None
+
+
+class Remembers(Krauss):
+    """Drives with the mean of its speeds: a memory that begins with the first one, and counts."""
+
+    memory_size = 2
+
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
+        mean = follower.memory[..., 0] / follower.memory[..., 1]
+        return 0.5 * (mean + super().next_speed(follower, leader, p, dt))
+
+    def next_memory(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float, speed: Tensor
+    ) -> Tensor:
+        return follower.memory + torch.stack([speed, torch.ones_like(speed)], -1)
+
+    def initial_memory(self, speed: Tensor) -> Tensor:
+        return torch.stack([speed, torch.ones_like(speed)], -1)
+
+
+class RemembersFrames(Krauss):
+    """Drives at the speed of five frames ago; the memory's frames move on in each step."""
+
+    memory_size = 5
+
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
+        return 0.5 * (follower.memory[..., -1] + super().next_speed(follower, leader, p, dt))
+
+    def next_memory(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float, speed: Tensor
+    ) -> Tensor:
+        return torch.cat([speed[..., None], follower.memory[..., :-1]], -1)
+
+
+@pytest.mark.parametrize("model", [Remembers(), RemembersFrames(), WithResidual(Krauss())])
+def test_a_memory_begins_with_the_start_and_goes_on_from_step_to_step(model: DrivingModel) -> None:
+    objective = registry.create("objective", {"name": "mixed"})
+    assert isinstance(objective, Objective)
+    segments, p = made_up_segments(), candidates_of(model)
+    found = summed_up(MemoryStepper(model, DT, compile="always"), objective, segments, p)
+    wanted = simulated(MemoryStepper(model, DT, compile="never"), objective, segments, p)
+    assert found is not None
+    torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-9)
 
 
 def test_small_work_is_not_worth_a_kernel() -> None:

@@ -1,11 +1,12 @@
 """The operations of one vehicle step, recorded from the model's own definition.
 
-Shapes: everything recorded is elementwise over vehicles, `(V,)`, or a constant, `()`.
+Shapes: everything recorded is elementwise over vehicles, `(V,)`, or a constant, `()`. Where the
+model has a memory there are columns too, `(V, m)`; `columns` says how they are kept.
 """
 
 from __future__ import annotations
 
-import math
+import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -13,6 +14,18 @@ import torch
 from torch import Tensor, fx
 
 from cfx.models.base import DrivingModel, Follower, Leader
+from cfx.simulation.kernel.columns import (
+    MOVES,
+    VEHICLES,
+    Expressions,
+    Unsupported,
+    array,
+    broadcast,
+    literal,
+    memory_names,
+    operation_of,
+    shape_of,
+)
 from cfx.simulation.step import advance_vehicle
 from cfx.simulation.trajectory import Terms
 
@@ -30,17 +43,13 @@ INPUTS = (
 )
 """What a step reads, before the model's parameters. The last three are of the next frame."""
 
-_VEHICLES = 7
-"""Vehicles in the recording: a number that no other dimension has by chance."""
+_MOST_COLUMNS = 512
+"""The widest memory of a model that has a kernel; two of them lie on a thread's stack."""
 
 
 def parameter_names(count: int) -> tuple[str, ...]:
     """Returns what expressions call the parameters: a model's own names need not be C++'s."""
     return tuple(f"p{k}" for k in range(count))
-
-
-class Unsupported(Exception):  # noqa: N818 - no error: PyTorch simulates such a model
-    """A step does something that has no place in a kernel."""
 
 
 class Statement(NamedTuple):
@@ -57,11 +66,13 @@ class StepProgram(NamedTuple):
     Attributes:
         statements: in order.
         state: expressions of position, speed and acceleration after the step.
+        memory: expressions of the columns of the model's memory after the step.
         terms: expressions of what the frame adds to each sum.
     """
 
     statements: tuple[Statement, ...]
     state: tuple[str, str, str]
+    memory: tuple[str, ...]
     terms: tuple[str, ...]
 
 
@@ -71,27 +82,30 @@ def record(
     """Records one step of a model and what its frame adds to an objective's sums.
 
     Args:
-        model: without a memory of its own.
+        model: the driving model.
         parameters: names of all the model's parameters, in the order of the kernel's inputs.
         dt: time step, s.
         terms: the objective's.
         dtype: of all values.
 
     Raises:
-        Unsupported: the step is not elementwise, branches on values, or uses an operation that has
-            no C++ counterpart here.
+        Unsupported: the step is not elementwise, branches on values, has a very wide memory, or
+            uses an operation that has no C++ counterpart here.
     """
     from torch.fx.experimental.proxy_tensor import make_fx
 
-    if model.memory_size:
-        raise Unsupported("a memory of its own")
-
-    nothing = torch.empty((_VEHICLES, 0), dtype=dtype)
+    width = model.memory_size
+    if width > _MOST_COLUMNS:
+        raise Unsupported(f"a memory of {width} numbers")
+    last = len(INPUTS) + len(parameters)
 
     def step(*values: Tensor) -> tuple[Tensor, ...]:
         known = dict(zip(INPUTS, values, strict=False))
-        p = dict(zip(parameters, values[len(INPUTS) :], strict=True))
-        follower = Follower(known["position"], known["speed"], known["acceleration"], nothing)
+        p = dict(zip(parameters, values[len(INPUTS) : last], strict=True))
+        memory = torch.empty((VEHICLES, 0), dtype=dtype)
+        if width:
+            memory = torch.stack(values[last:], dim=-1)
+        follower = Follower(known["position"], known["speed"], known["acceleration"], memory)
         leader = Leader(
             known["leader_position"],
             known["leader_speed"],
@@ -101,72 +115,99 @@ def record(
         after = advance_vehicle(model, follower, leader, p, dt)
         gap = known["leader_rear"] - after.position
         added = terms(after.speed, gap, known["measured_speed"], known["measured_gap"])
-        return (after.position, after.speed, after.acceleration, *added)
+        return (after.position, after.speed, after.acceleration, after.memory, *added)
 
     examples = []
-    for number in range(len(INPUTS) + len(parameters)):
-        examples.append(torch.full((_VEHICLES,), 1.0 + number, dtype=dtype))
+    for number in range(last + width):
+        examples.append(torch.full((VEHICLES,), 1.0 + number, dtype=dtype))
     try:
         graph = make_fx(step)(*examples).graph
     except Exception as error:
         raise Unsupported(f"recording it failed ({type(error).__name__})") from error
-    return _program(graph, [*INPUTS, *parameter_names(len(parameters))])
+    names = [*INPUTS, *parameter_names(len(parameters)), *memory_names(width)]
+    return _Recording(names).program(graph, width)
 
 
-def _program(graph: fx.Graph, inputs: Sequence[str]) -> StepProgram:
-    expressions: dict[fx.Node, str] = {}
-    statements: list[Statement] = []
-    names = iter(inputs)
-    for node in graph.nodes:
-        if node.op == "placeholder":
-            expressions[node] = next(names)
-        elif node.op == "call_function":
-            value = node.meta.get("val")
-            _check_elementwise(value)
-            expression = _expression(node, expressions)
-            if expression.startswith("("):
-                name = f"s{len(statements)}"
-                statements.append(Statement(name, expression, value.dtype == torch.bool))
-                expressions[node] = name
+class _Recording:
+    """Turns a recorded graph into statements."""
+
+    def __init__(self, inputs: Sequence[str]) -> None:
+        self._inputs = iter(inputs)
+        self._statements: list[Statement] = []
+        self._known: dict[fx.Node, Any] = {}
+
+    def program(self, graph: fx.Graph, width: int) -> StepProgram:
+        """Returns the whole step of a model whose memory has this width."""
+        for node in graph.nodes:
+            if node.op == "placeholder":
+                self._known[node] = array((1,), [next(self._inputs)])
+            elif node.op == "call_function":
+                self._known[node] = self._computed(node)
+            elif node.op == "get_attr":
+                self._known[node] = _constant(graph, node)
+            elif node.op == "output":
+                return self._finished(node, width)
+        raise Unsupported("it returns nothing")
+
+    def _finished(self, node: fx.Node, width: int) -> StepProgram:
+        returned: Any = node.args[0]
+        found = [list(map(str, self._known[value].flat)) for value in returned]
+        position, speed, acceleration, memory, *terms = found
+        if len(memory) != width:
+            raise Unsupported("a memory that changes its width")
+        return StepProgram(
+            statements=tuple(self._statements),
+            state=(position[0], speed[0], acceleration[0]),
+            memory=tuple(memory),
+            terms=tuple(term[0] for term in terms),
+        )
+
+    def _computed(self, node: fx.Node) -> Any:
+        """Returns the expressions that an operation gives; several arrays if it gives several."""
+        value = node.meta.get("val")
+        move = MOVES.get(operation_of(node))
+        if move is not None:
+            found = move(node, self._known)
+            if isinstance(value, Tensor):
+                return self._named(found.reshape(shape_of(value)), value)
+            return found
+        if not isinstance(value, Tensor):
+            raise Unsupported(f"the operation {operation_of(node)}")
+        return self._named(self._elementwise(node, shape_of(value)), value)
+
+    def _elementwise(self, node: fx.Node, shape: tuple[int, ...]) -> Expressions:
+        """Returns what an operation computes of each element of its operands."""
+        operands: list[Expressions] = []
+        for one in node.args:
+            if isinstance(one, fx.Node):
+                operands.append(broadcast(self._known[one], shape))
             else:
-                expressions[node] = expression
-        elif node.op == "get_attr":
-            expressions[node] = _constant(graph, node)
-        elif node.op == "output":
-            found = [expressions[one] for one in node.args[0]]
-            state = (found[0], found[1], found[2])
-            return StepProgram(tuple(statements), state, tuple(found[3:]))
-    raise Unsupported("it returns nothing")
+                operands.append(broadcast(array((), [_number(one)]), shape))
+        computed = []
+        for place in itertools.product(*map(range, shape)):
+            arguments = [str(operand[place]) for operand in operands]
+            computed.append(_expression(node, arguments))
+        return array(shape, computed)
+
+    def _named(self, computed: Expressions, value: Tensor) -> Expressions:
+        """Returns names of what is computed, of which each is one statement."""
+        names = []
+        for expression in map(str, computed.flat):
+            name = expression
+            if expression.startswith("("):
+                name = f"s{len(self._statements)}"
+                self._statements.append(Statement(name, expression, value.dtype == torch.bool))
+            names.append(name)
+        return array(computed.shape, names)
 
 
-def _check_elementwise(value: Any) -> None:
-    if not isinstance(value, Tensor) or tuple(value.shape) not in {
-        (),
-        (_VEHICLES,),
-        (_VEHICLES, 0),
-    }:
-        raise Unsupported("an operation that is not elementwise")
-
-
-def _constant(graph: fx.Graph, node: fx.Node) -> str:
+def _constant(graph: fx.Graph, node: fx.Node) -> Expressions:
     value: Any = graph.owning_module
     for name in str(node.target).split("."):
         value = getattr(value, name)
-    if not isinstance(value, Tensor) or value.numel() != 1:
+    if not isinstance(value, Tensor) or VEHICLES in value.shape or value.numel() > _MOST_COLUMNS:
         raise Unsupported("a constant that is no number")
-    return literal(value.item())
-
-
-def literal(value: float | bool) -> str:
-    """Returns a number as C++ writes it, exactly."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    number = float(value)
-    if math.isnan(number):
-        return "real(NAN)"
-    if math.isinf(number):
-        return "real(INFINITY)" if number > 0 else "real(-INFINITY)"
-    return f"real({number.hex()})"
+    return array(tuple(value.shape), [literal(one) for one in value.flatten().tolist()])
 
 
 _TEMPLATES: dict[str, str] = {
@@ -212,11 +253,17 @@ _TEMPLATES: dict[str, str] = {
     "bitwise_or": "({0} | {1})",
     "bitwise_not": "(!{0})",
     "isnan": "({0} != {0})",
+    "nan_to_num": "(without_nan({0}))",
 }
 """PyTorch's elementwise operations in C++; `smaller` and `greater` treat NaN as it does."""
 
-_UNCHANGED = {"alias", "clone", "detach", "expand", "lift_fresh_copy", "scalar_tensor", "view"}
-"""Operations that return what they are given; a constant's shape does not matter here."""
+_UNCHANGED = {"alias", "clone", "detach", "expand", "lift_fresh_copy", "scalar_tensor"}
+"""Operations that return what they are given, but for its shape."""
+
+_OTHER_MEANINGS = {"rounding_mode", "nan", "posinf", "neginf"}
+"""Arguments with which an operation computes something else."""
+
+_WHOLE = {torch.int64, torch.int32}
 
 _HUBER_ARGUMENTS = 4
 """Input, target, reduction and delta; PyTorch leaves a delta of 1 out."""
@@ -224,25 +271,26 @@ _HUBER_ARGUMENTS = 4
 _FILLED = {"zeros_like": 0.0, "ones_like": 1.0}
 
 
-def _expression(node: fx.Node, known: dict[fx.Node, str]) -> str:
+def _expression(node: fx.Node, arguments: list[str]) -> str:
     """Returns what an operation computes, in parentheses, or the expression that it passes on."""
-    operation = str(node.target).removeprefix("aten.").partition(".")[0]
+    operation = operation_of(node)
     if operation == "_to_copy":
-        return _converted(node, known)
-    arguments = [_argument(one, known) for one in node.args]
+        return _converted(node, arguments[0])
     if operation == "clamp":
-        return _clamped(node, arguments, known)
+        return _clamped(node, arguments)
     if operation == "huber_loss":
         return _huber(node, arguments)
     passed_on = _passed_on(operation, arguments)
     if passed_on:
         return passed_on
-    if operation not in _TEMPLATES or "rounding_mode" in node.kwargs:
+    if operation not in _TEMPLATES or node.kwargs.keys() & _OTHER_MEANINGS:
         raise Unsupported(f"the operation {operation}")
     if node.kwargs.get("alpha", 1) != 1:
         arguments[1] = f"({literal(float(str(node.kwargs['alpha'])))} * {arguments[1]})"
     if operation == "pow" and isinstance(node.args[1], int | float):
         return _power(arguments[0], float(node.args[1]), arguments[1])
+    if operation == "nan_to_num" and len(arguments) > 1:
+        raise Unsupported("other numbers than PyTorch's for NaN")
     return _TEMPLATES[operation].format(*arguments)
 
 
@@ -255,31 +303,37 @@ def _passed_on(operation: str, arguments: list[str]) -> str:
     return arguments[0] if operation in _UNCHANGED else ""
 
 
-def _argument(value: Any, known: dict[fx.Node, str]) -> str:
-    if isinstance(value, fx.Node):
-        return known[value]
+def _number(value: Any) -> str:
+    """Returns a number of the graph as C++ writes it; "" for what is no number."""
     if isinstance(value, bool | int | float):
         return literal(value)
     return ""
 
 
-def _converted(node: fx.Node, known: dict[fx.Node, str]) -> str:
-    """Returns a condition as a number; other conversions have no place here."""
+def _converted(node: fx.Node, given: str) -> str:
+    """Returns a value in another type, of which a kernel has two: numbers and conditions.
+
+    Whole numbers are kept as floating-point numbers; indices of a memory are small.
+    """
     source: Any = node.args[0]
     before, after = source.meta["val"].dtype, node.meta["val"].dtype
-    if before == after:
-        return known[source]
+    if before == after or (before in _WHOLE and after != torch.bool):
+        return given
     if before == torch.bool and after.is_floating_point:
-        return f"({known[source]} ? real(1) : real(0))"
+        return f"({given} ? real(1) : real(0))"
+    if before.is_floating_point and after in _WHOLE:
+        return f"(std::trunc({given}))"
     raise Unsupported(f"a conversion from {before} to {after}")
 
 
-def _clamped(node: fx.Node, arguments: list[str], known: dict[fx.Node, str]) -> str:
+def _clamped(node: fx.Node, arguments: list[str]) -> str:
     low, high = [*arguments[1:], "", ""][:2]
+    if any(isinstance(bound, fx.Node) for bound in node.kwargs.values()):
+        raise Unsupported("bounds that are computed and given by name")
     if "min" in node.kwargs:
-        low = _argument(node.kwargs["min"], known)
+        low = _number(node.kwargs["min"])
     if "max" in node.kwargs:
-        high = _argument(node.kwargs["max"], known)
+        high = _number(node.kwargs["max"])
     expression = arguments[0]
     if low:
         expression = f"(greater({expression}, {low}))"

@@ -17,7 +17,8 @@ from torch import Tensor
 from cfx.models.base import DrivingModel
 from cfx.simulation import pages
 from cfx.simulation.kernel import compiler
-from cfx.simulation.kernel.graph import Unsupported, record
+from cfx.simulation.kernel.columns import Unsupported
+from cfx.simulation.kernel.graph import record
 from cfx.simulation.kernel.keys import ComponentKey, KernelKey
 from cfx.simulation.kernel.source import BLOCK, SIGNALS, write
 from cfx.simulation.threads import share
@@ -74,7 +75,8 @@ def accumulate(
     pages.keep()
     shape = common_shape([(len(segments.speed), 1), *[value.shape for value in p.values()]])
     sums = segments.speed.new_empty((kernel.terms, *shape))
-    _run(kernel, segments, list(p.values()), sums)
+    memory = model.initial_memory(segments.speed).contiguous()
+    _run(kernel, segments, list(p.values()), memory, sums)
     return tuple(sums)
 
 
@@ -140,7 +142,13 @@ def _source(model: DrivingModel, terms: Terms, key: KernelKey) -> str:
     return write(program, [varied for _, varied in key.parameters], key.dtype)
 
 
-def _run(kernel: _Kernel, segments: Segments, parameters: Sequence[Tensor], sums: Tensor) -> None:
+def _run(
+    kernel: _Kernel,
+    segments: Segments,
+    parameters: Sequence[Tensor],
+    memory: Tensor,
+    sums: Tensor,
+) -> None:
     _, problems, candidates = sums.shape
     ends = _ends(segments.counted)
     signals = []
@@ -150,6 +158,7 @@ def _run(kernel: _Kernel, segments: Segments, parameters: Sequence[Tensor], sums
     values = [_parameter(value, problems, candidates) for value in parameters]
     parameter_views = (_View * len(values))(*values)
     counted = _signal(segments.counted)
+    remembered = _View(memory.data_ptr(), memory.stride(0), memory.stride(1))
     units = problems * -(-candidates // BLOCK)
 
     def take(first: int) -> None:
@@ -158,6 +167,7 @@ def _run(kernel: _Kernel, segments: Segments, parameters: Sequence[Tensor], sums
             parameter_views,
             ctypes.byref(counted),
             ctypes.c_void_p(ends.data_ptr()),
+            ctypes.byref(remembered),
             ctypes.c_void_p(sums.data_ptr()),
             ctypes.c_long(problems),
             ctypes.c_long(candidates),

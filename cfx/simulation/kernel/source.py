@@ -7,10 +7,12 @@ instructions: nothing in it depends on another candidate.
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 
 import torch
 
+from cfx.simulation.kernel.columns import memory_names
 from cfx.simulation.kernel.graph import INPUTS, StepProgram, parameter_names
 
 BLOCK = 32
@@ -21,6 +23,8 @@ _TYPES = {torch.float64: "double", torch.float32: "float"}
 _HEAD = """\
 #include <algorithm>
 #include <cmath>
+#include <cstring>
+#include <limits>
 #ifdef VECTOR_MATH
 // glibc computes these for a whole vector register; its headers say so under -ffast-math alone.
 extern "C" {{
@@ -51,10 +55,21 @@ static inline real huber(real error, real delta) {{
   const real size = std::fabs(error);
   return size < delta ? real(0.5) * size * size : delta * (size - real(0.5) * delta);
 }}
+static inline real without_nan(real a) {{
+  const real most = std::numeric_limits<real>::max();
+  const real number = a != a ? real(0) : a;
+  return smaller(greater(number, -most), most);
+}}
+// A column of the memory; a number that is none is the first one.
+static inline int column(real number, int last) {{
+  const real most = real(last), least = number > real(0) ? number : real(0);
+  return int(least < most ? least : most);
+}}
+#define RECALLED(first, last, number) M[(first) + column(number, last)][j]
 struct View {{ const real* data; long problem; long other; }};
 extern "C" void accumulate(
     const View* signals, const View* parameters, const View* counted, const long* ends,
-    real* sums, long problems, long candidates, long first, long last) {{
+    const View* memory, real* sums, long problems, long candidates, long first, long last) {{
   const long blocks = (candidates + BLOCK - 1) / BLOCK;
   for (long unit = first; unit < last; ++unit) {{
     const long i = unit / blocks, begin = (unit % blocks) * BLOCK;
@@ -86,8 +101,9 @@ def write(program: StepProgram, varied: Sequence[bool], dtype: torch.dtype) -> s
         dtype: float64 or float32.
     """
     lines = [_HEAD.format(type=_TYPES[dtype], block=BLOCK)]
-    lines += _begin(varied, len(program.terms))
-    lines += _loop(program, varied)
+    shift = _shift(program.memory)
+    lines += _begin(varied, len(program.terms), len(program.memory), shift)
+    lines += _loop(program, varied, shift)
     for k in range(len(program.terms)):
         target = f"sums[({k} * problems + i) * candidates + begin + j]"
         lines.append(f"    for (long j = 0; j < width; ++j) {target} = S{k}[j];")
@@ -96,9 +112,33 @@ def write(program: StepProgram, varied: Sequence[bool], dtype: torch.dtype) -> s
     return "\n".join(lines) + "\n"
 
 
-def _begin(varied: Sequence[bool], terms: int) -> list[str]:
+def _shift(memory: Sequence[str]) -> int:
+    """Returns by how many columns the memory moves on in a step; 0 if it stays where it is.
+
+    A memory of the last frames takes a frame in at its beginning and moves the others on. To move
+    the memory's beginning instead writes one frame, not all.
+    """
+    names = memory_names(len(memory))
+    most, best = 0, 0
+    for shift in range(len(memory)):
+        moved = sum(map(operator.eq, memory[shift:], names))
+        if moved > most:
+            most, best = moved, shift
+    return best
+
+
+def _room(width: int, shift: int) -> int:
+    """Returns how many columns before a memory are free, before it must be copied to the end."""
+    return width // shift * shift if shift else 0
+
+
+def _begin(varied: Sequence[bool], terms: int, width: int, shift: int) -> list[str]:
     """Returns the declarations and first values of a unit's states, sums and parameters."""
     lines = []
+    if width:
+        room = _room(width, shift)
+        lines.append(f"    real columns[{room + width}][BLOCK];")
+        lines.append(f"    real (*M)[BLOCK] = columns + {room};")
     for k in range(terms):
         lines.append(f"    real S{k}[BLOCK];")
     for k, name in enumerate(parameter_names(len(varied))):
@@ -112,6 +152,9 @@ def _begin(varied: Sequence[bool], terms: int) -> list[str]:
     lines.append("      const long c = begin + std::min(j, width - 1);")
     for array, place in (("X", at + 1), ("V", at + 2), ("A", at + 3)):
         lines.append(f"      {array}[j] = {_at(place)};")
+    for k in range(width):
+        column = f"i * memory->problem + {k} * memory->other"
+        lines.append(f"      M[{k}][j] = memory->data[{column}];")
     for k in range(terms):
         lines.append(f"      S{k}[j] = real(0);")
     for k, name in enumerate(parameter_names(len(varied))):
@@ -122,9 +165,10 @@ def _begin(varied: Sequence[bool], terms: int) -> list[str]:
     return lines
 
 
-def _loop(program: StepProgram, varied: Sequence[bool]) -> list[str]:
+def _loop(program: StepProgram, varied: Sequence[bool], shift: int) -> list[str]:
     """Returns the loop over time, with the loop over candidates inside."""
     lines = ["    for (long t = 0; t < ends[i]; ++t) {"]
+    lines += _turned(len(program.memory), shift)
     for k, name in enumerate(_SIGNALS):
         lines.append(f"      const real {name} = {_at(k, time=True)};")
     lines.append(
@@ -136,6 +180,9 @@ def _loop(program: StepProgram, varied: Sequence[bool]) -> list[str]:
     for k, name in enumerate(parameter_names(len(varied))):
         if varied[k]:
             lines.append(f"        const real {name} = {name}s[j];")
+    names = memory_names(len(program.memory))
+    for k, name in enumerate(names):
+        lines.append(f"        const real {name} = M[{k}][j];")
     for statement in program.statements:
         kind = "bool" if statement.is_condition else "real"
         lines.append(f"        const {kind} {statement.name} = {statement.expression};")
@@ -146,7 +193,25 @@ def _loop(program: StepProgram, varied: Sequence[bool]) -> list[str]:
     lines.append("        X[j] = next_x; V[j] = next_v; A[j] = next_a;")
     for k in range(len(program.terms)):
         lines.append(f"        S{k}[j] += added{k} * weight;")
-    lines += ["      }", "    }"]
+    for k, value in enumerate(program.memory):
+        if k < shift or value != names[k - shift]:
+            lines.append(f"        N[{k}][j] = {value};")
+    lines.append("      }")
+    if program.memory:
+        lines.append("      M = N;")
+    lines.append("    }")
+    return lines
+
+
+def _turned(width: int, shift: int) -> list[str]:
+    """Returns where a step finds the memory and where it leaves it."""
+    lines = []
+    if shift:
+        end = f"columns + {_room(width, shift)}"
+        size = f"sizeof(real) * {width} * BLOCK"
+        lines.append(f"      if (M == columns) {{ std::memmove({end}, M, {size}); M = {end}; }}")
+    if width:
+        lines.append(f"      real (*N)[BLOCK] = M - {shift};")
     return lines
 
 

@@ -1,0 +1,206 @@
+"""Values with columns, such as a model's memory, in the recording of a step.
+
+A tensor is an array of C++ expressions of its shape, in which all the vehicles have size 1: each
+expression is computed for every vehicle. What moves columns about computes nothing, and works on
+such arrays as NumPy does.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from torch import Tensor, fx
+
+VEHICLES = 1009
+"""Vehicles in the recording: a number that no other dimension has by chance."""
+
+Expressions = npt.NDArray[np.object_]
+"""A tensor's values as C++ expressions, each for all vehicles."""
+
+Known = Mapping[fx.Node, Any]
+"""The expressions of what was recorded before; a sequence of arrays where it gives several."""
+
+
+class Unsupported(Exception):  # noqa: N818 - no error: PyTorch simulates such a model
+    """A step does something that has no place in a kernel."""
+
+
+def memory_names(width: int) -> tuple[str, ...]:
+    """Returns what expressions call the columns of the model's memory."""
+    return tuple(f"memory{k}" for k in range(width))
+
+
+def literal(value: float | bool) -> str:
+    """Returns a number as C++ writes it, exactly."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    number = float(value)
+    if math.isnan(number):
+        return "real(NAN)"
+    if math.isinf(number):
+        return "real(INFINITY)" if number > 0 else "real(-INFINITY)"
+    return f"real({number.hex()})"
+
+
+def array(shape: tuple[int, ...], expressions: Sequence[str]) -> Expressions:
+    """Returns expressions in a shape."""
+    found = np.empty(len(expressions), dtype=object)
+    found[:] = expressions
+    return found.reshape(shape)
+
+
+def shape_of(value: Tensor) -> tuple[int, ...]:
+    """Returns a tensor's shape with one vehicle instead of all.
+
+    Raises:
+        Unsupported: it has a number for each vehicle and each other one.
+    """
+    if list(value.shape).count(VEHICLES) > 1:
+        raise Unsupported("an operation that is not elementwise")
+    return tuple(1 if size == VEHICLES else size for size in value.shape)
+
+
+def broadcast(expressions: Expressions, shape: tuple[int, ...]) -> Expressions:
+    """Returns expressions in a shape that they broadcast to.
+
+    Raises:
+        Unsupported: they do not.
+    """
+    try:
+        return np.broadcast_to(expressions, shape)
+    except ValueError:
+        raise Unsupported("an operation that is not elementwise") from None
+
+
+def operation_of(node: fx.Node) -> str:
+    """Returns the name of an operation without its namespace and variant."""
+    if node.target is operator.getitem:
+        return "getitem"
+    return str(node.target).removeprefix("aten.").partition(".")[0]
+
+
+def _given(node: fx.Node, place: int, name: str, default: Any) -> Any:
+    """Returns an argument, given by its place or by its name."""
+    if len(node.args) > place:
+        return node.args[place]
+    return node.kwargs.get(name, default)
+
+
+def _columns(node: fx.Node, source: Any) -> int:
+    """Returns the dimension that an operation works on.
+
+    Raises:
+        Unsupported: it is that of the vehicles, each of whom is simulated without the others.
+    """
+    dimension = int(_given(node, 1, "dim", 0))
+    if source.meta["val"].shape[dimension] == VEHICLES:
+        raise Unsupported("an operation that is not elementwise")
+    return dimension
+
+
+def _stack(node: fx.Node, known: Known) -> Expressions:
+    parts: Any = node.args[0]
+    return np.stack([known[one] for one in parts], int(_given(node, 1, "dim", 0)))
+
+
+def _arange(node: fx.Node, _known: Known) -> Expressions:
+    numbers: Any = node.args
+    if not all(isinstance(one, int) for one in numbers):
+        raise Unsupported("columns that are not counted by whole numbers")
+    found = list(map(literal, range(*numbers)))
+    return array((len(found),), found)
+
+
+def _cat(node: fx.Node, known: Known) -> Expressions:
+    parts: Any = node.args[0]
+    dimension = _columns(node, parts[0])
+    return np.concatenate([known[one] for one in parts], dimension)
+
+
+def _select(node: fx.Node, known: Known) -> Expressions:
+    source: Any = node.args[0]
+    index = int(_given(node, 2, "index", 0))
+    return np.asarray(np.take(known[source], index, axis=_columns(node, source)))
+
+
+def _slice(node: fx.Node, known: Known) -> Expressions:
+    source: Any = node.args[0]
+    if node.meta["val"].shape == source.meta["val"].shape:
+        return np.asarray(known[source])
+    dimension = _columns(node, source)
+    start, end = _given(node, 2, "start", None), _given(node, 3, "end", None)
+    cut: list[slice] = [slice(None)] * known[source].ndim
+    cut[dimension] = slice(start, end, _given(node, 4, "step", 1))
+    return np.asarray(known[source][tuple(cut)])
+
+
+def _unbind(node: fx.Node, known: Known) -> list[Expressions]:
+    source: Any = node.args[0]
+    return list(np.moveaxis(known[source], _columns(node, source), 0))
+
+
+def _getitem(node: fx.Node, known: Known) -> Any:
+    source: Any = node.args[0]
+    return known[source][node.args[1]]
+
+
+def _reshape(node: fx.Node, known: Known) -> Expressions:
+    """Returns the same values in another shape, in which vehicles have kept their place."""
+    source: Any = node.args[0]
+    if _before_vehicles(source.meta["val"]) != _before_vehicles(node.meta["val"]):
+        raise Unsupported("an operation that is not elementwise")
+    return np.asarray(known[source]).reshape(shape_of(node.meta["val"]))
+
+
+def _before_vehicles(value: Tensor) -> int | None:
+    """Returns how many values lie before the vehicles' dimension; None where there is none."""
+    shape = list(value.shape)
+    if VEHICLES not in shape:
+        return None
+    return math.prod(shape[: shape.index(VEHICLES)])
+
+
+def _gather(node: fx.Node, known: Known) -> Expressions:
+    """Returns columns of the model's memory whose numbers are computed.
+
+    A number outside of the memory gives its first or last column; PyTorch would raise an error.
+
+    Raises:
+        Unsupported: other values than the memory, or neighbouring columns of it, are asked for.
+    """
+    source: Any = node.args[0]
+    index: Any = node.args[2]
+    dimension = _columns(node, source)
+    values = known[source]
+    if dimension % values.ndim != values.ndim - 1:
+        raise Unsupported("a look-up along another dimension than the last")
+    names = list(map(str, values.flat))
+    if values.shape[-1] != values.size or not names[0].startswith("memory"):
+        raise Unsupported("a look-up in values that are computed")
+    first = int(names[0].removeprefix("memory"))
+    last = len(names) - 1
+    if names != list(memory_names(first + last + 1)[first:]):
+        raise Unsupported("a look-up in columns that are not neighbours")
+    found = [f"(RECALLED({first}, {last}, {one}))" for one in known[index].flat]
+    return array(known[index].shape, found)
+
+
+MOVES: dict[str, Callable[[fx.Node, Known], Any]] = {
+    "arange": _arange,
+    "cat": _cat,
+    "gather": _gather,
+    "getitem": _getitem,
+    "select": _select,
+    "slice": _slice,
+    "squeeze": _reshape,
+    "stack": _stack,
+    "unbind": _unbind,
+    "unsqueeze": _reshape,
+    "view": _reshape,
+}
+"""Operations that move columns about, and what they give."""
