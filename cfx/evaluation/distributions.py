@@ -168,21 +168,15 @@ def score_distributions(
         A row per origin, method and horizon that the recording lasts to, with the columns
         `DISTRIBUTION_COLUMNS`.
     """
-    ids = np.asarray([pair.pair_id for pair in pairs], dtype=object)
-    drivers = np.asarray([pair.driver for pair in pairs], dtype=object)
-    pair = origins.pair.cpu().numpy()
+    first = origins.columns(pairs)
     parts = []
     for method, path in paths.items():
         sampled = Sampled.of(path)
         for horizon in horizons:
             step = round(horizon / dt)
             exists = recorded.exists[:, step]
-            columns: dict[str, object] = {
-                "pair_id": ids[pair][exists],
-                "driver": drivers[pair][exists],
-                "method": method,
-                "horizon_s": float(horizon),
-            }
+            columns: dict[str, object] = {name: column[exists] for name, column in first.items()}
+            columns |= {"method": method, "horizon_s": float(horizon)}
             here = Sampled(sampled.speed[:, exists], sampled.travelled[:, exists])
             there = recorded.only(exists)
             columns |= _scores(here, there, step, dt)

@@ -15,13 +15,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from cfx.agents.agent import Agent, AgentState
 from cfx.agents.context import DriverContext
 from cfx.evaluation.closed_loop import simulate_closed_loop
-from cfx.pairs import SIGNALS, PairBatch
+from cfx.pairs import SIGNALS, PairBatch, PairSet
 from cfx.policies.features import measured_history
 from cfx.simulation.base import Stepper
 
@@ -65,6 +67,13 @@ class Origins:
         before = torch.cumsum(counts, 0) - counts
         number = torch.arange(len(pair), device=first.device) - before[pair]
         return cls(pair, first[pair] + number * stride)
+
+    def columns(self, pairs: PairSet) -> dict[str, NDArray[np.object_]]:
+        """Returns the columns with which a table of them begins: `pair_id` and `driver`."""
+        index = self.pair.cpu().numpy()
+        ids = np.asarray([pair.pair_id for pair in pairs], dtype=object)
+        drivers = np.asarray([pair.driver for pair in pairs], dtype=object)
+        return {"pair_id": ids[index], "driver": drivers[index]}
 
     def __len__(self) -> int:
         """Q."""

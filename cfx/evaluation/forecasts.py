@@ -182,9 +182,7 @@ def forecast_errors(
     Returns:
         The table of `Forecasts`.
     """
-    ids = np.asarray([pair.pair_id for pair in pairs], dtype=object)
-    drivers = np.asarray([pair.driver for pair in pairs], dtype=object)
-    pair, frame = origins.pair.cpu().numpy(), origins.frame.cpu().numpy()
+    first, frame = origins.columns(pairs), origins.frame.cpu().numpy()
     parts = []
     for method, path in paths.items():
         off = path.travelled - measured.travelled
@@ -193,8 +191,7 @@ def forecast_errors(
             step = round(horizon / dt)
             exists = recorded[:, step].cpu().numpy()
             columns = {
-                "pair_id": ids[pair],
-                "driver": drivers[pair],
+                **first,
                 "method": method,
                 "history_s": frame * dt,
                 "horizon_s": float(horizon),

@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import psutil
 import pytest
+
+from tests.scripts import ENVIRONMENT, command_of, run_script
 
 _SCRIPT = """
 import os, sys, time
@@ -41,12 +42,9 @@ def _is_running(pid: int) -> bool:
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_workers_end_with_the_job(how: signal.Signals, tmp_path: Path) -> None:
-    script = tmp_path / "script.py"
-    script.write_text(_SCRIPT % (tmp_path, tmp_path))
-    root = Path(__file__).parents[2]
     job = subprocess.Popen(
-        [sys.executable, str(script)],
-        env={"PYTHONPATH": str(root), "PATH": "/usr/bin:/bin"},
+        command_of(_SCRIPT % (tmp_path, tmp_path), tmp_path),
+        env=ENVIRONMENT,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,
@@ -93,14 +91,5 @@ except ValueError as error:
 
 @pytest.mark.slow
 def test_this_process_works_beside_the_workers_and_hears_of_their_errors(tmp_path: Path) -> None:
-    script = tmp_path / "script.py"
-    script.write_text(_SHARED)
-    root = Path(__file__).parents[2]
-    ran = subprocess.run(
-        [sys.executable, str(script)],
-        env={"PYTHONPATH": str(root), "PATH": "/usr/bin:/bin"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    ran = run_script(_SHARED, tmp_path)
     assert ran.stdout == "broken\n", ran.stderr

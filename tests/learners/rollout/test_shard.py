@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Generator, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,6 +19,7 @@ from cfx.learners.rollout.dataset import RolloutDataset
 from cfx.learners.rollout.shard import networks_of_shards
 from cfx.simulation import threads
 from tests.learners.made import QUICK, TRUE, gru, training_data
+from tests.scripts import run_script
 
 SHORT = QUICK | {"ensemble_size": 2, "epochs": 3, "steps": 3, "horizon": 6}
 
@@ -181,15 +180,6 @@ print("the same bits")
 
 @pytest.mark.slow
 def test_processes_give_the_same_bits_and_need_no_guard_in_a_script(tmp_path: Path) -> None:
-    script = tmp_path / "script.py"
-    script.write_text(_SCRIPT)
-    root = Path(__file__).parents[3]
-    ran = subprocess.run(
-        [sys.executable, str(script)],
-        env={"PYTHONPATH": str(root), "PATH": "/usr/bin:/bin"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    ran = run_script(_SCRIPT, tmp_path)
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout.strip() == "the same bits"
