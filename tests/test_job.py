@@ -285,7 +285,7 @@ def test_the_raw_sample_is_found(shared_data: Path) -> None:
             "data.min_frames=300",
             "optimizer=random",
             "optimizer.samples=16",
-            "learner.epochs=2",
+            "policy=fixed",
         ]
     )
     assert result.pairs.pair_id.nunique() == 142

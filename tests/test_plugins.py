@@ -166,7 +166,7 @@ def test_check_exits_with_1_only_if_something_is_broken(
 ) -> None:
     assert cli.main(["plugins", "check", "model", "w99"]) == 0
     assert cli.main(["plugins", "check", "policy"]) == 0
-    assert cli.main(["plugins", "check", "learner"]) == 0
+    assert cli.main(["plugins", "check", "objective"]) == 0
     assert capsys.readouterr().err == ""
     assert cli.main(["plugins", "check", "model", "twin"]) == 1
     complaints = capsys.readouterr().err.splitlines()

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -75,6 +75,7 @@ def test_a_single_driver_has_no_interval() -> None:
     assert (result.pairs, result.drivers) == (3, 1)
 
 
+@settings(max_examples=20)  # each draws thousands of bootstrap samples
 @given(st.lists(st.tuples(st.floats(0.01, 10), st.floats(0.01, 10)), min_size=2, max_size=12))
 def test_nothing_is_invented(values: list[tuple[float, float]]) -> None:
     fixed, policy = np.array(values).T

@@ -16,7 +16,6 @@ IMITATION = {
 }
 _TRIAL = dict(RolloutLearner.trial)
 ROLLOUT = {
-    "one": RolloutLearner(**(_TRIAL | {"ensemble_size": 1})),
     "ensemble": RolloutLearner(**(_TRIAL | {"ensemble_size": 2})),
     "distillation": RolloutLearner(**(_TRIAL | {"ensemble_size": 1, "distillation_epochs": 2})),
 }

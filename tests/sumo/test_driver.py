@@ -561,7 +561,7 @@ def style_of(pairs: Sequence[Any]) -> StyleResult:
         ({"name": "krauss"}, 5, 250, 5.3, (), False),
         ({"name": "w99"}, 5, 250, 5.3, (), True),
         ({"name": "krauss"}, 5, 250, 17.3, ("acceleration", "time_gap"), False),
-        ({"name": "w99"}, 8, 1000, None, ("time_headway",), False),
+        ({"name": "w99"}, 8, 500, None, ("time_headway",), False),
     ],
     ids=[
         "offsets from own parameters, after 5 s",

@@ -54,7 +54,7 @@ import sys
 sys.modules["pyarrow"] = None
 import json
 from cfx.sumo.stress import run_stress
-result = run_stress({"car": "cfx://i80-idm"}, seed=3, cut_ins=60)
+result = run_stress({"car": "cfx://i80-idm"}, seed=3, cut_ins=30)
 print(json.dumps(result.to_json()))
 """
     done = subprocess.run(
@@ -70,8 +70,8 @@ print(json.dumps(result.to_json()))
         "a red light",
     ]
     # Each vehicle that cuts in or brakes is the next ahead of the car, at a gap that was asked for.
-    assert events[0]["number"] == 60
-    assert events[1]["number"] == 12
+    assert events[0]["number"] == 30
+    assert events[1]["number"] == 6
     assert 0 < events[0]["headway"][0] < 0.5
     assert 1.0 < events[1]["headway"][0] < events[1]["headway"][2] < 3.0
     assert events[2]["headway"] is None

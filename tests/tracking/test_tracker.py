@@ -302,11 +302,11 @@ def test_many_processes_begin_a_sweep_at_once(tmp_path: Path) -> None:
             stderr=subprocess.STDOUT,
             text=True,
         )
-        for k in range(4)
+        for k in range(3)
     ]
     said = [job.communicate(timeout=200)[0] for job in jobs]
-    assert [job.returncode for job in jobs] == [0] * 4, said
-    assert said == [""] * 4
+    assert [job.returncode for job in jobs] == [0] * 3, said
+    assert said == [""] * 3
     with quiet():
         from mlflow import MlflowClient
 
@@ -314,10 +314,10 @@ def test_many_processes_begin_a_sweep_at_once(tmp_path: Path) -> None:
         runs = client.search_runs([client.get_experiment_by_name("cfx").experiment_id])
     parents = [run for run in runs if "cfx.sweep_parent" in run.data.tags]
     children = [run for run in runs if run.data.tags.get("cfx.sweep") == "a_sweep_of/many"]
-    assert (len(parents), len(children), len(runs)) == (1, 4, 5)
+    assert (len(parents), len(children), len(runs)) == (1, 3, 4)
     assert {run.info.status for run in runs} == {"FINISHED"}
     assert {run.data.tags["mlflow.parentRunId"] for run in children} == {parents[0].info.run_id}
-    assert {run.data.params["seed"] for run in children} == set("0123")
+    assert {run.data.params["seed"] for run in children} == set("012")
 
 
 def test_a_sweep_has_the_status_of_its_jobs(uri: str, client: Any) -> None:
