@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, NamedTuple
@@ -270,7 +270,7 @@ def joined(files: Iterable[PairSet]) -> PairSet:
             called: a driver who counts twice would be learned from and tested.
         OutputError: the disk of temporary files is full.
     """
-    parts = list(_compact(files))
+    parts = _compact(files)
     if len(parts) == 1:
         return parts[0]
     _require_different(parts)
@@ -285,16 +285,19 @@ def joined(files: Iterable[PairSet]) -> PairSet:
     return PairSet(tuple(pairs), f"{len(parts)} files ({sources})", summed(dropped), summed(ends))
 
 
-def _compact(files: Iterable[PairSet]) -> Iterator[PairSet]:
-    """Yields the pairs of each file; the signals of all but the first few lie in files."""
-    size = 0
+def _compact(files: Iterable[PairSet]) -> list[PairSet]:
+    """Returns the pairs of each file; where there are many, their signals lie in files."""
+    parts: list[PairSet] = []
+    size = moved = 0
     for part in files:
+        parts.append(part)
         size += part.size
-        if size < scratch.LARGE:
-            yield part
-        else:
-            yield part.in_file()
+        if size >= scratch.LARGE:
+            for number in range(moved, len(parts)):
+                parts[number] = parts[number].in_file()
+            moved = len(parts)
             give_back()
+    return parts
 
 
 def _require_different(parts: Sequence[PairSet]) -> None:
