@@ -9,7 +9,7 @@ Shapes: P pairs, T frames of the longest pair.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -162,6 +162,25 @@ class PairSet(Sequence[Pair]):
     def size(self) -> int:
         """Bytes of all signals."""
         return len(SIGNALS) * 8 * sum(len(pair) for pair in self.pairs)
+
+    def changed(self, change: Callable[[Pair], Pair | None]) -> PairSet:
+        """Returns changed pairs, without those of which None is left.
+
+        Raises:
+            OutputError: the disk of temporary files is full.
+        """
+        is_large = self.size >= scratch.LARGE
+        changed: list[Pair] = []
+        for start in range(0, len(self.pairs), _TOGETHER):
+            part = []
+            for pair in self.pairs[start : start + _TOGETHER]:
+                made = change(pair)
+                if made is not None:
+                    part.append(made)
+            some = replace(self, pairs=tuple(part))
+            changed += some.in_file() if is_large else some
+            scratch.release()
+        return replace(self, pairs=tuple(changed))
 
     def in_file(self) -> PairSet:
         """Returns the same pairs, whose signals and true parameters lie in a file.

@@ -69,7 +69,7 @@ def release() -> None:
     advice = getattr(mmap, "MADV_DONTNEED", None)  # where there is none, the system decides
     if advice is None:
         return
-    for content in _maps:
+    for content in list(_maps):
         content.madvise(advice)
 
 

@@ -17,7 +17,8 @@ import torch
 import cfx
 from cfx import scratch
 from cfx.datasets import tidy
-from cfx.datasets.base import joined
+from cfx.datasets.base import joined, scaled
+from cfx.datasets.resample import resampled
 from cfx.datasets.synthetic import SyntheticDataset
 from cfx.datasets.tidy import read_tidy, write_tidy
 from cfx.errors import OutputError
@@ -96,6 +97,17 @@ def test_pairs_of_several_files_that_are_too_many_lie_in_files(
     assert [pair.fingerprint for pair in together] == [
         pair.fingerprint for part in parts for pair in part
     ]
+
+
+def test_changed_pairs_lie_in_files_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    pairs = pairs_of_drivers()
+    expected = scaled(pairs, 2.0), resampled(pairs, 0.2)
+    monkeypatch.setattr(scratch, "LARGE", 1)
+    before = maps()
+    found = scaled(pairs, 2.0), resampled(pairs, 0.2)
+    assert maps() == before + 2
+    for one, other in zip(found, expected, strict=True):
+        assert one.fingerprint == other.fingerprint
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])

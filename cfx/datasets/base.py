@@ -246,14 +246,15 @@ def scaled(pairs: PairSet, factor: float) -> PairSet:
     """
     if factor == 1.0:
         return pairs
-    changed = []
-    for pair in pairs:
+
+    def scale(pair: Pair) -> Pair:
         signals = {name: getattr(pair, name) * factor for name in SIGNALS}
         # The leader's rear bumper is scaled, then its length added again.
         signals["leader_position"] = signals["leader_position"] + pair.leader_length * (1 - factor)
-        changed.append(replace(pair, **signals))
+        return replace(pair, **signals)
+
     source = f"{pairs.source}, {factor:g} times as fast"
-    return replace(pairs, pairs=tuple(changed), source=source)
+    return replace(pairs.changed(scale), source=source)
 
 
 def joined(files: Iterable[PairSet]) -> PairSet:

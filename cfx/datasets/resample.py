@@ -24,16 +24,12 @@ def resampled(pairs: PairSet, step: float) -> PairSet:
     Args:
         step: s.
     """
-    kept = []
-    for pair in pairs:
-        at_step = _pair(pair, step)
-        if at_step is not None:
-            kept.append(at_step)
-    dropped = list(pairs.dropped)
-    if len(kept) < len(pairs):
-        reason = f"shorter than two steps of {step:g} s"
-        dropped.append(Dropped(reason, len(pairs) - len(kept)))
-    return replace(pairs, pairs=tuple(kept), dropped=tuple(dropped))
+    kept = pairs.changed(lambda pair: _pair(pair, step))
+    lost = len(pairs) - len(kept)
+    if lost == 0:
+        return kept
+    dropped = Dropped(f"shorter than two steps of {step:g} s", lost)
+    return replace(kept, dropped=(*pairs.dropped, dropped))
 
 
 def _pair(pair: Pair, step: float) -> Pair | None:
