@@ -19,6 +19,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from cfx import scratch
 from cfx.calibration.cache import Arrays, Cache, first_fit
 from cfx.calibration.losses import SegmentLosses
 from cfx.calibration.shards import (
@@ -332,6 +333,7 @@ class Calibrator:
             for name, objective in self.reported.items():
                 loss = objective(frames, segments.counted[..., None])
                 means[name] += float(loss.sum()) / len(pair)
+            scratch.release()
         return means
 
     def _segments(self, batch: PairBatch, pair: Tensor, last: Tensor) -> SegmentLosses:

@@ -135,6 +135,7 @@ class SimulatedPairs(Sequence[PairTrajectory]):
 
     def __getitem__(self, index: Any) -> Any:
         if isinstance(index, slice):
+            scratch.release()
             return tuple(self._pair(number) for number in range(*index.indices(len(self))))
         return self._pair(range(len(self))[index])
 
