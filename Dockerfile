@@ -30,7 +30,8 @@ FROM python:${PYTHON}-slim-bookworm
 RUN apt-get update && apt-get install --yes --no-install-recommends g++ && rm -rf /var/lib/apt/lists/* \
   && useradd --create-home --uid 1000 cfx && install --directory --owner cfx /work
 COPY --from=build /opt/cfx /opt/cfx
-ENV PATH=/opt/cfx/bin:$PATH OMP_NUM_THREADS=1 MLFLOW_DISABLE_TELEMETRY=true
+# A scheduler would keep its last 1,000 messages to each worker, and a shard is one.
+ENV PATH=/opt/cfx/bin:$PATH OMP_NUM_THREADS=1 MLFLOW_DISABLE_TELEMETRY=true DASK_DISTRIBUTED__ADMIN__LOW_LEVEL_LOG_LENGTH=1
 # By number: Kubernetes cannot know that a name is not root.
 USER 1000
 WORKDIR /work

@@ -140,6 +140,9 @@ def test_a_shard_that_kills_every_worker_is_given_up(cluster: Cluster) -> None:
 def test_a_cluster_of_its_own_starts_works_and_ends() -> None:
     engine = DaskEngine(workers=1, memory="1GB")
     found = dict(engine.map(slowly, [(2, 0.0), (3, 0.0)], nothing))
+    # Each message holds a shard: Dask would keep a thousand of them.
+    streams = engine._connection._cluster.scheduler.stream_comms.values()
+    assert {stream.recent_message_log.maxlen for stream in streams} == {1}
     places = listening()
     engine.close()
     assert found == {0: 4, 1: 9}

@@ -20,6 +20,13 @@ _LOOK_S = 0.5
 _SAY_S = 60.0
 """Seconds between two messages that workers are still waited for."""
 
+_SETTINGS = {
+    # For its developers Dask keeps the last 1,000 messages to each worker, and a shard is one.
+    "distributed.admin.low-level-log-length": 1,
+    "distributed.admin.large-graph-warning-threshold": "4GB",
+}
+"""Settings of Dask while the connection lasts."""
+
 _UNREACHABLE = (OSError, TimeoutError, RuntimeError, AttributeError)
 """What Dask raises, at one place or another, when the scheduler is gone."""
 
@@ -92,7 +99,10 @@ class Connection:
         from distributed import Client
 
         if self._client is None:
+            import dask
+
             self._quiet.enter_context(_quiet())
+            self._quiet.enter_context(dask.config.set(_SETTINGS))
         target: Any = self._settings.address
         if target is None:
             if self._cluster is None:

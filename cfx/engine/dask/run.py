@@ -94,23 +94,20 @@ class Run(Generic[ShardT, ResultT]):
     def _submit(self, attempt: _Attempt[ShardT]) -> None:
         if not self._connection.threads:
             self._connection.wait()
-        import dask
-
         others = set(self._connection.threads) - attempt.avoid
         workers = None
         if attempt.avoid and others:
             workers = sorted(others)
         self._submitted += 1
-        with dask.config.set({"distributed.admin.large-graph-warning-threshold": "4GB"}):
-            future = self._connection.client.submit(
-                work_on,
-                self._work,
-                attempt.shard,
-                installed_code(),
-                key=f"{self._name}-{attempt.number}-{self._submitted}",
-                workers=workers,
-                pure=False,
-            )
+        future = self._connection.client.submit(
+            work_on,
+            self._work,
+            attempt.shard,
+            installed_code(),
+            key=f"{self._name}-{attempt.number}-{self._submitted}",
+            workers=workers,
+            pure=False,
+        )
         self._running[future] = attempt
         future.add_done_callback(self._done.put)
 
