@@ -221,13 +221,14 @@ class Standby:
         """Does independent work.
 
         This process begins with the first item, the other one with the last, once it has imported
-        everything. If it is killed, this one does its share too.
+        everything. What it could not do is done here: it was killed, an item cannot be sent, or the
+        work itself fails, which is then raised here.
 
         Returns:
             The results, in the order of the items.
 
         Raises:
-            CfxError: what `work` raises is raised again.
+            CfxError: what `work` raises.
         """
         left = deque(range(len(items)))
         done: dict[int, _DoneT] = {}
@@ -245,8 +246,8 @@ class Standby:
                     done[number] = work(items[number])
             finally:
                 left.clear()
-        if not isinstance(other.exception(), BrokenProcessPool):
-            other.result()
+        if other.exception() is not None:
+            log.debug("the second process stopped: %r", other.exception())
         results = []
         for number, item in enumerate(items):
             if number not in done:

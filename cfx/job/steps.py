@@ -78,6 +78,8 @@ def take_steps(
     console = console or Console()
     data = config.data
     device = choose_device(config.device)
+    if device.type != "cpu":
+        second = None  # trajectories lie where it is not
     limit_cores(config.cores)
     if config.threads is not None:
         set_threads(config.threads)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
 from functools import partial
 from pathlib import Path
@@ -63,6 +64,13 @@ def test_an_error_is_raised_wherever_it_was(wanted: int) -> None:
         second.wait()
         with pytest.raises(DataError, match=f"item {wanted} is wrong"):
             second.share(partial(_fail_at, wanted), _ITEMS)
+
+
+def test_what_cannot_be_sent_is_done_here() -> None:
+    items = [threading.Lock() for _ in range(4)]
+    with Standby("json") as second:
+        second.wait()
+        assert second.share(type, items) == [type(items[0])] * 4
 
 
 def test_the_work_of_a_killed_process_is_done_here() -> None:
