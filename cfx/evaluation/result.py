@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 _PAIRS_AT_ONCE = 1024
 """Pairs whose closed loops are in one table while they are written."""
 
-_ROWS_AT_ONCE = 1 << 20
+_ROWS_AT_ONCE = 1 << 17
 """Rows of the long table that are text at once, while it is written."""
 
 METHODS = ("default", "population", "fixed", "shrunk", "policy")

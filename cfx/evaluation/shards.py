@@ -16,11 +16,16 @@ from cfx import scratch
 from cfx.agents.agent import Agent
 from cfx.engine.base import Engine, Report
 from cfx.evaluation.closed_loop import ClosedLoop, simulate_closed_loop
+from cfx.memory import give_back
 from cfx.pairs import PairBatch
 from cfx.simulation.base import Stepper
 
 PAIRS_AT_ONCE = 1024
 """Pairs that are simulated together: enough for batches, few enough for a worker's memory."""
+
+
+_TENSORS = 12
+"""Tensors as large as these that an evaluation holds at once: several methods, several of each."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +84,7 @@ def simulate_in_shards(
     with closing(engine.map(simulate_shard, _cut(whole), _nothing)) as results:
         for number, part in results:
             joined.put(number, part)
+    give_back()
     return joined.whole()
 
 
@@ -144,7 +150,8 @@ class _Joined:
         shape = (*self._shape, *values.shape[2:])
         if values.device.type != "cpu":
             return values.new_empty(shape)
-        return torch.as_tensor(scratch.empty(shape, values.new_empty(0).numpy().dtype))
+        kind = values.new_empty(0).numpy().dtype
+        return torch.as_tensor(scratch.empty(shape, kind, together=_TENSORS))
 
     def whole(self) -> ClosedLoop:
         """Returns the closed loops of all shards, `(P, K + 1)`."""
