@@ -51,8 +51,8 @@ def long_table(
         codes["metric"].append(np.full(rows, metrics.index(metric), np.int16))
         value.append(np.stack(list(by_method.values()), axis=1).reshape(-1))
     columns: dict[str, Any] = {}
-    for name in names:
-        columns[name] = _categories(np.concatenate(codes.pop(name)), names[name])
+    for name, categories in names.items():
+        columns[name] = _categories(np.concatenate(codes.pop(name)), categories)
     of_pair, known = pd.factorize(np.asarray(drivers, dtype=object))
     columns["driver"] = _categories(of_pair[columns["pair_id"].codes], list(known))
     columns["value"] = np.concatenate(value)
