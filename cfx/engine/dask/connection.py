@@ -24,6 +24,8 @@ _SETTINGS = {
     # For its developers Dask keeps the last 1,000 messages to each worker, and a shard is one.
     "distributed.admin.low-level-log-length": 1,
     "distributed.admin.large-graph-warning-threshold": "4GB",
+    # Nobody looks at what workers are doing every hundredth of a second.
+    "distributed.worker.profile.enabled": False,
 }
 """Settings of Dask while the connection lasts."""
 
