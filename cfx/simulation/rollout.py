@@ -16,7 +16,9 @@ import importlib.util
 import itertools
 import math
 import shutil
+import sysconfig
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import ClassVar, Literal
 
 import torch
@@ -231,11 +233,14 @@ def _compiled_stepper(model: DrivingModel, dt: float, steps: int) -> _Step:
 def can_compile(device: torch.device) -> bool:
     """Says whether `torch.compile` has what it needs here.
 
-    That is a C++ compiler for the CPU and Triton for CUDA.
+    That is a C++ compiler and Python's headers for the CPU, and Triton for CUDA.
     """
     if device.type == "cuda":
         return importlib.util.find_spec("triton") is not None
     if device.type != "cpu":
+        return False
+    # Debian's Python comes without: they are in python3-dev.
+    if not Path(sysconfig.get_path("include"), "Python.h").is_file():
         return False
     return any(shutil.which(name) for name in ("g++", "clang++", "c++"))
 

@@ -352,6 +352,17 @@ def test_gradients_bypass_the_compiler() -> None:
     assert not rollout._COMPILED
 
 
+def test_without_pythons_headers_nothing_is_compiled(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Debian's Python has none unless python3-dev is installed."""
+    monkeypatch.setattr(rollout.shutil, "which", lambda name: f"/usr/bin/{name}")
+    monkeypatch.setattr(rollout.sysconfig, "get_path", lambda name: str(tmp_path))
+    assert not can_compile(torch.device("cpu"))
+    (tmp_path / "Python.h").touch()
+    assert can_compile(torch.device("cpu"))
+
+
 def test_without_a_compiler_it_runs_eagerly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rollout.shutil, "which", lambda name: None)
     assert not can_compile(torch.device("cpu"))
