@@ -40,6 +40,15 @@ class Segment(NamedTuple):
     expert_speed: Tensor | None
     first: int = 0
 
+    def only(self, trajectories: slice) -> Segment:
+        """Returns the segment of some trajectories."""
+        measured = Measured(*(values[:, trajectories] for values in self.measured))
+        expert_speed = self.expert_speed
+        if expert_speed is not None:
+            expert_speed = expert_speed[:, trajectories]
+        speed, gap = self.speed[:, trajectories], self.gap[:, trajectories]
+        return Segment(speed, gap, measured, expert_speed, self.first)
+
 
 def burn_in(
     step: WindowStep,

@@ -199,6 +199,10 @@ class RolloutModule(BatchedModule):
     ) -> Iterator[Tensor]:
         """Simulates trajectories; yields the loss of each, `(N, D)`, of each segment.
 
+        With a head that draws, the loss of the centre's path is added to that of sampled ones. In
+        the first half of the epochs of training it is the only one: with noise from the start,
+        Krauss's model is not trained.
+
         Args:
             step: simulates one window.
             batch: the trajectories.
@@ -210,11 +214,13 @@ class RolloutModule(BatchedModule):
         most = None
         if not isinstance(path, NoGradients):
             most = self.burn_in_windows
-        paths = 1
+        sampled = 0
         noise = None
-        if self.exact_step.core.head.noise_width > 0 and expert is None:
-            paths = self.settings.paths
-            noise = self._noise(batch, windows, paths)
+        if self.draws and expert is None:
+            sampled = self.settings.paths
+            noise = self._noise(batch, windows, sampled)
+            of_centre = torch.zeros_like(noise[:, :, : noise.shape[2] // sampled])
+            noise = torch.cat([of_centre, noise], 2)
         segments = simulate(
             step,
             self.dataset,
@@ -224,13 +230,22 @@ class RolloutModule(BatchedModule):
             burn_in_windows=most,
             expert=expert,
             noise=noise,
-            paths=paths,
+            paths=1 + sampled,
         )
+        centre = slice(None, batch.place.shape[1])
         for segment in segments:
-            if paths == 1:
-                yield self.loss(segment, divisors)
-            else:
-                yield self.loss.of_paths(segment, divisors, paths)
+            loss = self.loss(segment.only(centre), divisors)
+            if sampled > 0:
+                others = segment.only(slice(centre.stop, None))
+                loss = loss + self.loss.of_paths(others, divisors, sampled)
+            yield loss
+
+    @property
+    def draws(self) -> bool:
+        """Whether paths are sampled in this epoch."""
+        if self.exact_step.core.head.noise_width == 0:
+            return False
+        return not torch.is_grad_enabled() or self.current_epoch >= self.settings.epochs // 2
 
     def _noise(self, batch: RolloutBatch, windows: int, paths: int) -> Tensor:
         """Returns what sampled paths draw from, `(windows, N, paths D, k)`.

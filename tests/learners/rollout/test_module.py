@@ -140,6 +140,25 @@ def test_the_noise_is_as_wide_as_validation_drivers_want_it(
     assert module.dispersion.tolist() == [1.0, 1.0, 1.0]
 
 
+def test_the_path_without_noise_counts_beside_sampled_ones() -> None:
+    policy, data = gru(), training_data(networks=2)
+    settings = RolloutSettings(**(QUICK | {"head": "stochastic", "horizon": 4, "paths": 3}))
+    dataset = placed(data, policy, settings.validation, head="stochastic")
+    network = untrained(data, policy, head="stochastic").network
+    module = RolloutModule(network, dataset, policy, data, settings)
+    batch = module.sampler.training(0)
+    divisors = module.errors.over_horizon(batch)
+    about = (module.exact_step, dataset, batch, 4, NoGradients())
+    with torch.no_grad():
+        centre = module.loss(next(simulate(*about)), divisors)
+        noise = module._noise(batch, 4, 3)
+        sampled = next(simulate(*about, noise=noise, paths=3))
+        crps = module.loss.of_paths(sampled, divisors, 3)
+        found = exact_losses(module, batch, 4, full=False)
+    assert float(crps.min()) > 0
+    torch.testing.assert_close(found, centre + crps)
+
+
 def exact_losses(module: RolloutModule, batch: RolloutBatch, windows: int, full: bool) -> Any:
     """Returns the loss of each trajectory with the exact model, `(N, D)`."""
     divisors = module.errors.over_horizon(batch)
