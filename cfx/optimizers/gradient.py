@@ -196,8 +196,9 @@ def _learned(search: _Search, slope: Tensor) -> tuple[Tensor, Tensor]:
     scale = (curvature / (y * y).sum((-2, -1)).clamp(min=1e-300)).where(search.fresh, 1.0)
     h = search.inverse * scale.where(usable, 1.0)[..., None, None]
     hy = h @ y
-    factor = 1.0 + rho * (y.mT @ hy)
-    updated = h + rho * (factor * (s @ s.mT) - hy @ s.mT - s @ hy.mT)
+    # Both halves of the update, of which one is the other's transpose.
+    half = s @ (rho * (0.5 * (1.0 + rho * (y.mT @ hy)) * s - hy)).mT
+    updated = h + half + half.mT
     inverse = updated.where(usable[..., None, None], search.inverse)
     return inverse, search.fresh & ~usable
 

@@ -33,8 +33,8 @@ _FILE = Path(__file__).parents[3] / "shared" / "data" / "i80_reconstructed_pairs
 _SPLIT = 0.8
 _TIMES_S = (0.1, 0.3, 1.0, 3.0, 10.0)
 _BUDGETS: dict[str, tuple[dict[str, Any], ...]] = {
-    "random": tuple({"samples": 4**k} for k in range(3, 11)),
-    "gradient": tuple({"samples": 4**k} for k in range(3, 10)),
+    "random": tuple({"samples": 2**k} for k in range(6, 21)),
+    "gradient": tuple({"samples": 2**k} for k in range(6, 20)),
     "botorch": (
         {"screening": 256, "iterations": 0},
         {"iterations": 0},
