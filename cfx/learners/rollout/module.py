@@ -216,7 +216,7 @@ class RolloutModule(BatchedModule):
             most = self.burn_in_windows
         sampled = 0
         noise = None
-        if self.draws and expert is None:
+        if self.samples_paths and expert is None:
             sampled = self.settings.paths
             noise = self._noise(batch, windows, sampled)
             of_centre = torch.zeros_like(noise[:, :, : noise.shape[2] // sampled])
@@ -241,8 +241,8 @@ class RolloutModule(BatchedModule):
             yield loss
 
     @property
-    def draws(self) -> bool:
-        """Whether paths are sampled in this epoch."""
+    def samples_paths(self) -> bool:
+        """Whether paths are sampled: in validation always, in training from half the epochs on."""
         if self.exact_step.core.head.noise_width == 0:
             return False
         return not torch.is_grad_enabled() or self.current_epoch >= self.settings.epochs // 2

@@ -157,6 +157,10 @@ def test_the_path_without_noise_counts_beside_sampled_ones() -> None:
         found = exact_losses(module, batch, 4, full=False)
     assert float(crps.min()) > 0
     torch.testing.assert_close(found, centre + crps)
+    assert settings.epochs > 1
+    path = module.through_time
+    early = next(module.trajectory_losses(module.exact_step, batch, 4, divisors, path))
+    torch.testing.assert_close(early.detach(), centre, msg="it is learned first")
 
 
 def exact_losses(module: RolloutModule, batch: RolloutBatch, windows: int, full: bool) -> Any:
