@@ -37,7 +37,7 @@ class GradientSettings(Settings):
         4096, ge=1, description="evaluations of each problem, slopes and guesses included"
     )
     screening: float = Field(
-        0.75, gt=0.0, le=1.0, description="share of the samples that chooses where searches start"
+        0.5, gt=0.0, le=1.0, description="share of the samples that chooses where searches start"
     )
     starts: int | None = Field(
         None, ge=1, description="local searches of each problem; null: one for each 512 samples"
@@ -73,8 +73,8 @@ class GradientSearch(Optimizer):
     simulation is batched this costs no more time than one. A step that finds nothing better starts
     again along the plain gradient, ten times shorter. All searches of all problems go on together.
 
-    More samples become more searches, not longer ones: a search ends in the next local minimum
-    after some ten steps, and models with regimes, such as Wiedemann's, have many.
+    More samples become more searches, not longer ones: half of 512 samples are enough for one to
+    end in its local minimum, and models with regimes, such as Wiedemann's, have many of these.
 
     What is left of the samples, too little for one more round, becomes further Sobol points.
     """
