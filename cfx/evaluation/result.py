@@ -6,7 +6,7 @@ Shapes: K + 1 frames, n tuned parameters.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -242,6 +242,14 @@ class Evaluation:
     def methods(self) -> tuple[str, ...]:
         """The methods that were compared, in the order of `METHODS`."""
         return _in_order(self.about["method"])
+
+    def constant_methods(self) -> Evaluation:
+        """Returns the same results without the policy.
+
+        A policy that does not adapt is one of the constant sets once more.
+        """
+        others = self.about[self.about["method"] != "policy"].reset_index(drop=True)
+        return replace(self, about=others)
 
     @property
     def improvement(self) -> Improvement:

@@ -51,9 +51,10 @@ def report(
         adapts: as `Policy.adapts`.
         copied_to: URL of the folder's copy; None without.
     """
-    console.print(methods_table(evaluation, result.metrics))
+    shown = evaluation if adapts else evaluation.constant_methods()
+    console.print(methods_table(shown, result.metrics))
     if evaluation.full_trajectory_improvements:
-        console.print(methods_table(evaluation, result.metrics, "full_trajectory"))
+        console.print(methods_table(shown, result.metrics, "full_trajectory"))
     if not adapts:
         text = (
             "The policy keeps its parameters constant: this is a calibration, without adaptation."

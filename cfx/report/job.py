@@ -113,8 +113,15 @@ class Job:
 
     @property
     def meaningful_methods(self) -> tuple[str, ...]:
-        """The methods whose numbers say something: without a constant baseline only the policy."""
-        return self.methods if self.has_constant_baseline else ("policy",)
+        """The methods whose numbers say something of their own.
+
+        Without a constant baseline that is only the policy; a calibration's policy is one of its
+        constant sets once more.
+        """
+        if not self.has_constant_baseline:
+            return ("policy",)
+        constant = tuple(method for method in self.methods if method != "policy")
+        return self.methods if self.adapts or not constant else constant
 
     @property
     def adapts(self) -> bool:
@@ -137,8 +144,9 @@ class Job:
         return self._summaries.get((name, method, scope), math.nan)
 
     def has_metric(self, name: str, method: str, scope: str = TEST) -> bool:
-        """Says whether a metric was measured, for a method whose numbers say something."""
-        return method in self.meaningful_methods and (key_of(name, method, scope) in self.metrics)
+        """Says whether a metric was measured, for the policy or for one of `meaningful_methods`."""
+        known = (*self.meaningful_methods, "policy")
+        return method in known and key_of(name, method, scope) in self.metrics
 
     @cached_property
     def known_metrics(self) -> tuple[MetricInfo, ...]:

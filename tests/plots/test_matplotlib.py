@@ -332,6 +332,14 @@ def test_a_policy_that_does_not_adapt_has_no_figure_of_improvements() -> None:
     draw = figures_of_job(made.evaluation, made.style, made.curves, adapts=False)
     assert "improvement_per_driver" not in draw
     assert "calibration" in draw
+    # Its policy is one of the constant sets: it is no line of its own, and improves nothing.
+    written = texts(draw["drives"]())
+    assert "policy" not in written
+    assert "%" not in written
+    assert "improvement" not in written
+    assert "policy" not in texts(draw["speeds"]())
+    errors = made.evaluation.table.query("method == 'fixed'").set_index("pair_id")["rmse_speed"]
+    assert f"best pair, {errors.idxmin()}" in written.lower()
 
 
 def test_figures_for_a_paper_are_vector_graphics_without_dates(tmp_path: Path) -> None:

@@ -14,8 +14,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from cfx.report.blocks import Figure, Fold, Table
 from cfx.report.page import render
 from cfx.report.runs import read_runs
+from cfx.report.sections import clusters as clusters_section
 from cfx.report.sections import paper
 from cfx.report.sections.calibration import sheet, spreads_of
 from cfx.report.sections.clusters import cluster_series
@@ -388,6 +390,14 @@ def test_a_calibration_is_none_of_the_policies_that_adapt(tmp_path: Path) -> Non
     assert "with constant parameters?" in summary(alone)[0]
     page = page_of(tmp_path / "still")
     assert "Improvement of every pair" not in page.words
+    assert "policy" not in alone[0].meaningful_methods, "a constant set is shown once"
+    (moves,) = [job for job in runs.jobs if job.adapts]
+    figure, fold = clusters_section.blocks(runs)[1:3]
+    assert isinstance(figure, Figure)
+    assert isinstance(fold, Fold)
+    (table,) = fold.blocks
+    assert isinstance(table, Table)
+    assert {row[0].text for row in table.sheet.rows} == {moves.name}
     assert "over driver-specific calibration" not in page.words.split("Trajectories")[-1]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -72,7 +73,8 @@ def pairs(
 
     Args:
         evaluation: of a job.
-        pair_id: the pairs to show; None for `count` pairs from the best to the worst improvement.
+        pair_id: the pairs to show; None for `count` pairs from the best to the worst improvement,
+            without a policy from the smallest to the largest error.
         count: how many.
 
     Raises:
@@ -85,7 +87,7 @@ def pairs(
         if np.isfinite(ranked.improvement):
             name += f":  {percent(ranked.improvement)}"
             explained = f"percentages: {improvement_title('fixed')}"
-        elif "fixed" in evaluation.methods:
+        elif {"fixed", "policy"} <= set(evaluation.methods):
             name += ":  improvement undefined"
         rmse = errors_text("speed", "m/s", _errors(evaluation, trajectory.pair_id, "rmse_speed"))
         rmse_gap = errors_text("gap", "m", _errors(evaluation, trajectory.pair_id, "rmse_gap"))
@@ -217,14 +219,21 @@ def _chosen(
     evaluation: Evaluation, pair_id: str | Sequence[str] | None, count: int
 ) -> list[tuple[RankedPair, PairTrajectory]]:
     by_id = {trajectory.pair_id: trajectory for trajectory in evaluation.trajectories}
-    rows = evaluation.table[evaluation.table["method"] == "policy"]
+    is_calibration = "policy" not in evaluation.methods
+    judged = _constant(evaluation) if is_calibration else "policy"
+    rows = evaluation.table[evaluation.table["method"] == judged]
     rows = rows[rows["pair_id"].isin(list(by_id))]
     gains = pd.Series(np.nan, index=rows["pair_id"].astype(str))
     # Without driver-specific calibration there is nothing to be better than.
-    if "improvement" in rows:
+    if "improvement" in rows and not is_calibration:
         gains[:] = rows["improvement"].to_numpy(dtype=float)
     if pair_id is None:
-        ranked = rank_pairs(list(gains.index), gains.to_numpy(dtype=float), count)
+        values = gains.to_numpy(dtype=float)
+        if is_calibration:
+            values = -rows["rmse_speed"].to_numpy(dtype=float)
+        ranked = rank_pairs(list(gains.index), values, count)
+        if is_calibration:
+            ranked = tuple(RankedPair(pair.pair_id, pair.rank, math.nan) for pair in ranked)
         return [(pair, by_id[pair.pair_id]) for pair in ranked]
     wanted = [pair_id] if isinstance(pair_id, str) else list(pair_id)
     chosen = []
@@ -234,6 +243,12 @@ def _chosen(
             raise ConfigError(f"pair '{name}' is not in this evaluation.{hint}")
         chosen.append((RankedPair(name, "", float(gains[name])), by_id[name]))
     return chosen
+
+
+def _constant(evaluation: Evaluation) -> str:
+    """Returns the calibrated constant set that is shown: the drivers' own, if there are any."""
+    shown = [method for method in evaluation.methods if method not in HIDDEN]
+    return shown[-1]
 
 
 def _errors(evaluation: Evaluation, pair_id: str, column: str) -> dict[str, float]:

@@ -55,16 +55,20 @@ def figures_of_job(
         style: of its drivers.
         curves: columns `network`, `epoch`, `train_loss`, `validation_loss`; if it is empty there is
             no `learning_curve`.
-        adapts: as `Policy.adapts`; if it does not, there is no `improvement_per_driver`.
+        adapts: as `Policy.adapts`; if it does not, there is no `improvement_per_driver`, and the
+            policy is no method of its own.
     """
     draw: dict[str, Callable[[], Figure]] = {}
+    shown = evaluation
     if adapts:
         draw["improvement_per_driver"] = partial(figures.improvements, evaluation)
+    else:
+        shown = evaluation.constant_methods()
     draw |= {
-        "drives": partial(figures.pairs, evaluation),
-        "speeds": partial(figures.speeds, evaluation),
-        "error_over_time": partial(figures.errors, evaluation),
-        "chosen_parameters": partial(figures.parameters, evaluation),
+        "drives": partial(figures.pairs, shown),
+        "speeds": partial(figures.speeds, shown),
+        "error_over_time": partial(figures.errors, shown),
+        "chosen_parameters": partial(figures.parameters, shown),
         "style_distribution": partial(figures.style, style),
     }
     if "fixed" in evaluation.methods and evaluation.names:

@@ -28,10 +28,11 @@ _INTRODUCTION = (
 
 def blocks(runs: Runs) -> list[Block]:
     """Returns the plot and a table per baseline, if any job has a baseline."""
-    if not with_baseline(runs.jobs):
+    jobs = with_baseline(runs.jobs)
+    if not jobs:
         return []
-    baselines = any_baselines(runs.jobs)
-    series = cluster_series(runs.jobs)
+    baselines = any_baselines(jobs)
+    series = cluster_series(jobs)
     found: list[Block] = [Text(_INTRODUCTION), Figure(per_cluster(series, baselines))]
     for k, baseline in enumerate(baselines):
         first = k == 0

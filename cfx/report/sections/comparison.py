@@ -298,27 +298,21 @@ def absolute(jobs: Sequence[Job]) -> Plot:
 
 
 def _shown_error(job: Job, metric: str, method: str, scope: str) -> float:
-    return job.metric(metric, method, scope) if _is_shown(job, method) else math.nan
-
-
-def _is_shown(job: Job, method: str) -> bool:
-    """Says whether a method is shown: a calibration's policy is one of its constant sets."""
-    if method == "policy" and not job.adapts:
-        return False
-    return method in job.meaningful_methods
+    return job.metric(metric, method, scope) if method in job.meaningful_methods else math.nan
 
 
 def _measured_methods(jobs: Sequence[Job], scope: str) -> list[str]:
     found = []
     for method in METHODS:
-        showing = [job for job in jobs if _is_shown(job, method)]
+        showing = [job for job in jobs if method in job.meaningful_methods]
         if any_has_metric(showing, "rmse_speed", method, scope):
             found.append(method)
     return found
 
 
 def _error(job: Job, scope: str, method: str) -> Cell:
-    if not (_is_shown(job, method) and job.has_metric("rmse_speed", method, scope)):
+    shown = method in job.meaningful_methods
+    if not (shown and job.has_metric("rmse_speed", method, scope)):
         return number(math.nan, "")
     speed, gap = job.metric("rmse_speed", method, scope), job.metric("rmse_gap", method, scope)
     second = f"{gap:.2f}" if math.isfinite(gap) else ""

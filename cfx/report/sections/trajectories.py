@@ -67,7 +67,7 @@ def pair_of(job: Job, pair_id: str) -> Plot:
     """Speed, gap and each tuned parameter of one pair of a job."""
     for trajectory in job.pair_trajectories:
         if trajectory.pair_id == pair_id:
-            return pair_plot(pair_panels(trajectory, job.methods, job.parameters))
+            return pair_plot(pair_panels(trajectory, job.meaningful_methods, job.parameters))
     raise KeyError(pair_id)
 
 
@@ -82,7 +82,7 @@ def _title(job: Job, pair: RankedPair) -> str:
 def _errors(job: Job, pair: RankedPair) -> str:
     row = job.by_pair.set_index("pair_id").loc[pair.pair_id]
     errors = []
-    for method in job.methods:
+    for method in job.meaningful_methods:
         errors.append(f"{short_label(method)} {row[f'rmse_speed/{method}']:.3f}")
     return f"RMSE of speed (m/s): {', '.join(errors)}"
 
