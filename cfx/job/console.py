@@ -74,7 +74,7 @@ def report(
             console.print(distributions_table(evaluation.forecasts))
     if evaluation.traffic is not None:
         console.print(traffic_table(evaluation.traffic))
-    _print_safety(evaluation, result.metrics, console)
+    _print_safety(shown, result.metrics, console)
     for scope, words in evaluation.outside.items():
         text = f"Policy, {_SCOPES[scope]}: {words}; there it fades towards its base parameters."
         console.print(text, soft_wrap=True, highlight=False)
