@@ -139,7 +139,9 @@ def test_tidy_files_are_written_in_parts(
     assert [pair.truth_model for pair in found] == [pair.truth_model for pair in pairs]
 
 
-@pytest.mark.parametrize("protocol", ["within_driver", "across_drivers"])
+@pytest.mark.parametrize(
+    "protocol", ["within_driver", pytest.param("across_drivers", marks=pytest.mark.slow)]
+)
 def test_a_job_in_files_and_in_parts_has_the_same_results(
     protocol: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
