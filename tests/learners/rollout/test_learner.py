@@ -101,10 +101,10 @@ def test_driver_features_help_to_drive_more_like_each_driver() -> None:
     for driver_features in ((), ("time_headway", "time_gap")):
         policy = gru(driver_features=driver_features)
         data = training_data(networks=1, frames=400)
-        short = {"epochs": 20, "cold_start_fraction": 0.0, "burn_in_s": 0.5, "horizon": 20}
+        short = {"epochs": 8, "cold_start_fraction": 0.0, "burn_in_s": 0.5, "horizon": 20}
         result = RolloutLearner(**(QUICK | short)).fit(policy, data)
         errors.append(error(loop(result, data, policy, first=300), data, first=300))
-    assert errors[1] < 0.9 * errors[0]
+    assert errors[1] < 0.6 * errors[0]
 
 
 def test_training_goes_on_where_it_was_interrupted(
