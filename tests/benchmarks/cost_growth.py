@@ -107,7 +107,8 @@ def draw(costs: dict[str, list[Cost]], path: Path) -> None:
         panel.set(xscale="log", yscale="log", xlabel=f"pairs of {_FRAMES} frames")
         panel.spines[["top", "right"]].set_visible(False)
         panel.grid(alpha=0.3)
-    panels[0].legend(frameon=False)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
     figure.savefig(path, dpi=110)
 
 
