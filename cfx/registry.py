@@ -482,19 +482,22 @@ def _entries(distribution: importlib.metadata.Distribution) -> Iterator[Entry]:
     kinds = {kind.entry_points: kind.name for kind in KINDS.values()}
     points = list(distribution.entry_points)
     api = tuple(sorted(point.name for point in points if point.group == API_GROUP))
-    for point in points:
-        if point.group not in kinds:
-            continue
-        name, version = distribution.metadata["Name"], distribution.version
-        if not isinstance(name, str) or not isinstance(version, str):
-            raise ValueError("the metadata name no distribution, or no version")
+    ours = [point for point in points if point.group in kinds]
+    if not ours:
+        return
+    metadata = distribution.metadata  # read anew each time that it is asked for
+    name, version = metadata["Name"], metadata["Version"]
+    if not isinstance(name, str) or not isinstance(version, str):
+        raise ValueError("the metadata name no distribution, or no version")
+    location = str(distribution.locate_file(""))
+    for point in ours:
         yield Entry(
             kind=kinds[point.group],
             name=point.name,
             target=point.value,
             distribution=name,
             version=version,
-            location=str(distribution.locate_file("")),
+            location=location,
             api=api,
         )
 

@@ -18,7 +18,6 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from cfx.component import content_key
-from cfx.datasets.partitions import partitions
 from cfx.errors import CfxError
 from cfx.storage import is_url, state
 
@@ -94,12 +93,12 @@ def command_of(config: DictConfig) -> tuple[tuple[str, ...], str, int | None]:
 def _state_of_data(node: Any) -> list[list[Any]] | None:
     """Returns size and time of change (ns) of each data file; None if the dataset names none.
 
-    A folder stands for the parquet files in it.
-
-    Of files behind a URL it is what their store says that they are.
+    A folder stands for the parquet files in it. Of files behind a URL it is what their store says that they are.
     """
     if not isinstance(node, Mapping) or not node.get("path"):
         return None
+    from cfx.datasets.partitions import partitions  # imports pandas, a quarter of a second
+
     named = node["path"]
     patterns = named if isinstance(named, list | tuple) else [named]
     states: list[list[Any]] = []
