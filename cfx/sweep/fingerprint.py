@@ -93,7 +93,8 @@ def command_of(config: DictConfig) -> tuple[tuple[str, ...], str, int | None]:
 def _state_of_data(node: Any) -> list[list[Any]] | None:
     """Returns size and time of change (ns) of each data file; None if the dataset names none.
 
-    A folder stands for the parquet files in it. Of files behind a URL it is what their store says that they are.
+    A folder stands for the parquet files in it. Of files behind a URL it is what their store says
+    that they are.
     """
     if not isinstance(node, Mapping) or not node.get("path"):
         return None
