@@ -61,9 +61,11 @@ DATA ?= ../shared/data/i80_reconstructed_pairs.parquet
 policies: $(VENV)/.ready-test
 	$(BIN)/python -m cfx policies make --data $(DATA)
 
+# Pages lie beside the site's as Markdown too: llms.txt names them.
 # Zensical's --strict stops on links without a target; docstrings that do not fit their signatures are only printed, so they are looked for.
 docs: $(VENV)/.ready-docs
 	$(BIN)/zensical build --clean --strict >site.log 2>&1 || { cat site.log; exit 1; }
+	cd docs && find . -name "*.md" | tar cf - -T - | tar xf - -C ../site
 	@cat site.log; ! grep -qE "^(griffe|mkdocstrings):" site.log && rm site.log
 
 tutorials: $(VENV)/.ready-test
