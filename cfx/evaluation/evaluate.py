@@ -82,14 +82,8 @@ def evaluate(
     spaces = dict.fromkeys(METHODS, space) | {"policy": policy_space}
     measures = _Measures(metrics or MetricSet.own())
     for rows in parts_of(len(pairs)):
-        some = batch[rows]
-        test = trajectories_of(some, first[rows], _rows(loops, rows), spaces)
-        scopes = {"test": test, "steady": _after_transient(test)}
-        if full_trajectory:
-            start = torch.zeros_like(first[rows])
-            whole = _rows(full_trajectory, rows)
-            scopes["full_trajectory"] = trajectories_of(some, start, whole, spaces)
-        measures.add(scopes)
+        whole = _rows(full_trajectory or {}, rows)
+        measures.add(_scopes(batch[rows], first[rows], _rows(loops, rows), whole, spaces))
     measured, infos, left_out = measures.found()
     drivers = [pair.driver for pair in pairs]
     values = long_table([pair.pair_id for pair in pairs], drivers, measured)
@@ -149,6 +143,22 @@ def closed_loop_errors(batch: PairBatch, first: Tensor, loop: ClosedLoop) -> tup
 def _rows(loops: Mapping[str, ClosedLoop], rows: slice) -> dict[str, ClosedLoop]:
     """Returns of each method the closed loops of some of the pairs."""
     return {method: rows_of(loop, rows) for method, loop in loops.items()}
+
+
+def _scopes(
+    batch: PairBatch,
+    first: Tensor,
+    test: Mapping[str, ClosedLoop],
+    full_trajectory: Mapping[str, ClosedLoop],
+    spaces: Mapping[str, ParameterSpace],
+) -> dict[str, dict[str, Trajectories]]:
+    """Returns what is measured in each scope, beside the recording."""
+    of_test = trajectories_of(batch, first, test, spaces)
+    scopes = {"test": of_test, "steady": _after_transient(of_test)}
+    if full_trajectory:
+        start = torch.zeros_like(first)
+        scopes["full_trajectory"] = trajectories_of(batch, start, full_trajectory, spaces)
+    return scopes
 
 
 def _after_transient(trajectories: Mapping[str, Trajectories]) -> dict[str, Trajectories]:

@@ -16,6 +16,7 @@ from torch import Tensor
 from cfx import scratch
 from cfx.evaluation.closed_loop import ClosedLoop
 from cfx.evaluation.result import Array, PairTrajectory
+from cfx.memory import give_back
 from cfx.metrics.base import RECORDED, Trajectories
 from cfx.pairs import PairBatch, PairSet
 from cfx.parameters import ParameterSpace
@@ -25,10 +26,16 @@ PAIRS_AT_ONCE = 1024
 
 
 def parts_of(pairs: int) -> Iterator[slice]:
-    """Yields the rows of some pairs, then of the next."""
+    """Yields the rows of some pairs, then of the next.
+
+    Between two of them memory goes back to the system: what is kept of each part, small arrays,
+    lies between large ones that are free by then.
+    """
     for start in range(0, pairs, PAIRS_AT_ONCE):
         yield slice(start, min(start + PAIRS_AT_ONCE, pairs))
         scratch.release()
+        if pairs > PAIRS_AT_ONCE:
+            give_back()
 
 
 def trajectories_of(
