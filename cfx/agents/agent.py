@@ -8,7 +8,8 @@ Life cycle for D drivers: `begin` once; `observe` (or `burn_in` over measured hi
 times; then `act` once per window.
 
 Shapes: N networks, D drivers in any order, B drivers of the network that has most, L frames of a
-token, n tuned parameters, c features of conditioning, s width of the networks' state.
+token, n tuned parameters, c features of conditioning, s width of the networks' state, q numbers
+that a stochastic head keeps.
 """
 
 from __future__ import annotations
@@ -58,6 +59,7 @@ class AgentState(NamedTuple):
         score: how far outside what was learned each was in the last window, `(D,)`; up to 1 is
             inside. 0 where nothing is known of that.
         beyond: which signals alone were unusual, too low and then too high, bool `(D, 2 f)`.
+        latent: what a stochastic head keeps of its random numbers, `(D, q)`; 0 before any.
     """
 
     network: Tensor
@@ -67,6 +69,7 @@ class AgentState(NamedTuple):
     conditioning: Tensor
     score: Tensor
     beyond: Tensor
+    latent: Tensor
 
     def of(self, drivers: Tensor) -> AgentState:
         """Returns the state of some of the drivers, each as often as it is named.
@@ -90,6 +93,7 @@ class AgentState(NamedTuple):
             self.conditioning[drivers],
             self.score[drivers],
             self.beyond[drivers],
+            self.latent[drivers],
         )
 
 
@@ -234,7 +238,8 @@ class Agent:
         beyond = torch.zeros(
             (len(network), 2 * len(SIGNALS)), dtype=torch.bool, device=network.device
         )
-        return AgentState(network, place, state, base, conditioning, score, beyond)
+        latent = score.new_zeros((len(network), self.head.latent_width))
+        return AgentState(network, place, state, base, conditioning, score, beyond, latent)
 
     def observe(self, history: History, state: AgentState, present: Tensor) -> AgentState:
         """Lets networks see one window of D drivers without acting.
@@ -278,12 +283,8 @@ class Agent:
         state = self._judged(history, state)
         unit = self._faded(answer.double(), state).to(dtype)
         chosen = self.head.measured(self.space.from_unit(unit), history, self.dt)
-        if generator is not None and self.head.noise_width > 0:
-            shape = (len(chosen), self.head.noise_width)
-            noise = torch.randn(shape, generator=generator, dtype=torch.float64).to(chosen)
-            if self.dispersion is not None:
-                noise = noise * self.dispersion[state.network, None].to(noise)
-            chosen = self.head.sampled(chosen, noise, self.windows.stride * self.dt)
+        if generator is not None and self.is_stochastic:
+            chosen, state = self._drawn(chosen, state, generator)
         return chosen, state._replace(state=after)
 
     def burn_in(
@@ -409,6 +410,18 @@ class Agent:
             valid_range=None if self.valid_range is None else self.valid_range.to(device),
             dispersion=None if self.dispersion is None else self.dispersion.to(device),
         )
+
+    def _drawn(
+        self, chosen: Tensor, state: AgentState, generator: torch.Generator
+    ) -> tuple[Tensor, AgentState]:
+        """Draws the parameters `(D, n)` of a window, SI units, around those that were chosen."""
+        shape = (len(chosen), self.head.noise_width)
+        noise = torch.randn(shape, generator=generator, dtype=torch.float64).to(chosen)
+        if self.dispersion is not None:
+            noise = noise * self.dispersion[state.network, None].to(noise)
+        window_s = self.windows.stride * self.dt
+        drawn, latent = self.head.sampled(chosen, noise, state.latent.to(chosen), window_s)
+        return drawn, state._replace(latent=latent.to(state.latent))
 
     def _judged(self, history: History, state: AgentState) -> AgentState:
         """Notes how far outside what was learned the drivers are."""

@@ -276,4 +276,4 @@ def _head(
             f"{folder}/policy.json: this version of cfx has no head '{name}'; it has"
             f" {', '.join(HEADS)}"
         )
-    return HEADS[name].for_model(model)
+    return HEADS[name].for_model(model).as_saved(description.parameters)

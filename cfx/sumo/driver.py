@@ -561,6 +561,7 @@ class Driver:
                 store.driver_features[slot] = features
         begun = self._begun(slots)
         store.state[slots] = begun.state[begun.network, begun.place]
+        store.latent[slots] = begun.latent
 
     def _begun(self, slots: Tensor) -> AgentState:
         """Returns the state of vehicles before their first window."""
@@ -589,6 +590,7 @@ class Driver:
         chosen, after = self.policy.act(*self._known(slots), self._generator)
         store.parameters[slots] = chosen
         store.score[slots], store.beyond[slots] = after.score, after.beyond
+        store.latent[slots] = after.latent
         store.state[slots] = after.state[after.network, after.place]
 
     def _observe(self, slots: Tensor) -> None:
@@ -605,7 +607,8 @@ class Driver:
         begun = self._begun(slots)
         state = begun.state.clone()
         state[begun.network, begun.place] = store.state[slots]
-        return History(*store.history[slots].unbind(1)), begun._replace(state=state)
+        now = begun._replace(state=state, latent=store.latent[slots])
+        return History(*store.history[slots].unbind(1)), now
 
     def _speeds(
         self, connection: Connection, names: list[str], slots: Tensor, seen: Seen

@@ -1,7 +1,7 @@
 """What a live driver knows of vehicles, as one table of tensors.
 
 Shapes: C vehicles, L frames of a token, n tuned parameters, m width of the model's memory, s width
-of the networks' state, k driver features.
+of the networks' state, k driver features, q numbers that a stochastic head keeps.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ class VehicleTable:
         parameters: `(C, n)`, SI units.
         memory: `(C, m)`, of the model.
         state: `(C, s)`, of the networks, in their precision.
+        latent: `(C, q)`, what a stochastic head keeps of its random numbers.
         network: `(C,)` int64, which of the agent's networks drives.
         base: `(C, n)`, SI units, the base parameters; NaN where the agent needs none.
         driver_features: `(C, k)`; NaN for unseen drivers.
@@ -39,6 +40,7 @@ class VehicleTable:
     parameters: Tensor
     memory: Tensor
     state: Tensor
+    latent: Tensor
     network: Tensor
     base: Tensor
     driver_features: Tensor
@@ -60,6 +62,7 @@ class VehicleTable:
             parameters=_unknown(count, parameters),
             memory=torch.zeros((count, model.memory_size), dtype=torch.float64),
             state=state.new_zeros((count, state.shape[-1])),
+            latent=begun.latent.new_zeros((count, begun.latent.shape[-1])),
             network=torch.zeros(count, dtype=torch.int64),
             base=_unknown(count, parameters),
             driver_features=_unknown(count, features),

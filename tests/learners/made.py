@@ -94,11 +94,15 @@ def loop(
     policy: Policy,
     first: int = 0,
     base: torch.Tensor | None = None,
+    seed: int | None = None,
 ) -> ClosedLoop:
-    """Returns the closed loop of evaluation from a frame on."""
+    """Returns the closed loop of evaluation from a frame on; with a seed, sampled."""
     frames = torch.full_like(data.network, first)
     agent = ready(result, data, policy)
-    return simulate_closed_loop(data.simulator, agent, data.batch, frames, data.network, base=base)
+    generator = None if seed is None else torch.Generator().manual_seed(seed)
+    return simulate_closed_loop(
+        data.simulator, agent, data.batch, frames, data.network, base=base, generator=generator
+    )
 
 
 def error(found: ClosedLoop, data: TrainingData, first: int = 0) -> float:

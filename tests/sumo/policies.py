@@ -32,25 +32,27 @@ def adaptive(
     offsets: bool = False,
     residual: bool = False,
     stochastic: bool = False,
+    head: ParameterHead | None = None,
     driver_features: tuple[str, ...] = (),
 ) -> Agent:
     """Returns a GRU for each name; what it chooses depends on all it sees.
 
     With `offsets` it answers offsets, from the middle between the bounds for who brings no base;
     with `residual` also how the residual acceleration decays, and with
-    `stochastic` how much it varies.
+    `stochastic` how much it varies. `head` stands in for all of these.
     """
     model = registry.create("model", dict(node))
     assert isinstance(model, DrivingModel)
     policy = GruPolicy(inputs=INPUTS, driver_features=driver_features, start="middle")
     networks = len(names)
-    head: ParameterHead = DirectHead(model.space)
-    if stochastic:
+    if head is None and stochastic:
         head = StochasticHead.for_model(model)
-    elif residual:
+    elif head is None and residual:
         head = ResidualHead.for_model(model)
-    elif offsets:
+    elif head is None and offsets:
         head = OffsetHead(model.space)
+    elif head is None:
+        head = DirectHead(model.space)
     features = length * len(INPUTS) + head.width + len(driver_features)
     unit = head.space.to_unit(head.space.defaults())
     network = (

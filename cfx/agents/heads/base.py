@@ -7,6 +7,7 @@ L frames of a token.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import ClassVar, Self
 
 import torch
@@ -26,13 +27,15 @@ class ParameterHead(ABC):
     Attributes:
         name: in saved policies.
         needs_base: whether parameters depend on each driver's base parameters.
-        noise_width: how many random numbers a window of a driver takes; 0: nothing is drawn.
+        noise_width: how many random numbers a window of a driver takes, k; 0: nothing is drawn.
+        latent_width: how many of a driver's random numbers are kept from window to window, q.
         space: the parameters that it answers, with their bounds.
     """
 
     name: ClassVar[str]
     needs_base: ClassVar[bool] = False
-    noise_width: ClassVar[int] = 0
+    noise_width: int = 0
+    latent_width: int = 0
 
     def __init__(self, space: ParameterSpace, device: torch.device | str | None = None) -> None:
         self.space = space
@@ -41,6 +44,14 @@ class ParameterHead(ABC):
     @abstractmethod
     def for_model(cls, model: DrivingModel, device: torch.device | str | None = None) -> Self:
         """Returns the head for a driving model's parameters: it chooses the parameter space."""
+
+    def as_saved(self, names: Sequence[str]) -> Self:
+        """Returns the head of a saved policy, which may be of an earlier version.
+
+        Args:
+            names: the parameters that it answers; empty if it does not say.
+        """
+        return self
 
     def to(self, device: torch.device | str) -> Self:
         """Returns the same head for tensors of a device."""
@@ -68,18 +79,21 @@ class ParameterHead(ABC):
         """
         return parameters
 
-    def sampled(self, parameters: Tensor, noise: Tensor, window_s: float) -> Tensor:
+    def sampled(
+        self, parameters: Tensor, noise: Tensor, latent: Tensor, window_s: float
+    ) -> tuple[Tensor, Tensor]:
         """Draws the parameters of a window.
 
         Args:
             parameters: what the head says of their distribution, `(*batch, n)`, SI units.
-            noise: standard normal, `(*batch, noise_width)`.
+            noise: standard normal, `(*batch, k)`.
+            latent: what was kept of the last window, `(*batch, q)`; 0 before the first.
             window_s: how long they hold, s.
 
         Returns:
-            `(*batch, n)`, SI units.
+            Parameters `(*batch, n)`, SI units, and what is kept of this window, `(*batch, q)`.
         """
-        return parameters
+        return parameters, latent
 
     def completed(self, parameters: Tensor) -> Tensor:
         """Returns the driving model's parameters with defaults for all else that the head answers.

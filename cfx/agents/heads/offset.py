@@ -132,7 +132,19 @@ def moved(base: Tensor, answer: Tensor, adaptable: Tensor | None = None) -> Tens
     """
     if adaptable is not None:
         answer = torch.where(adaptable, answer, NONE)
-    logit = torch.logit(base.clamp(_EDGE, 1.0 - _EDGE))
     offset = _GAIN * torch.logit(answer, eps=_SMALLEST)
-    step = torch.sigmoid(logit + offset) - torch.sigmoid(logit)
-    return (base + step).clamp(0.0, 1.0)
+    return (base + step_of(base, offset)).clamp(0.0, 1.0)
+
+
+def step_of(base: Tensor, offset: Tensor) -> Tensor:
+    """Returns how far an offset on logits moves a base; exactly 0 where the offset is 0.
+
+    Args:
+        base: `(*batch, n)` in unit space; within 0.5 % of a bound it counts as that far from it.
+        offset: on logits, `(*batch, n)`.
+
+    Returns:
+        `(*batch, n)` in unit space.
+    """
+    logit = coordinates(base)
+    return torch.sigmoid(logit + offset) - torch.sigmoid(logit)

@@ -89,7 +89,8 @@ class Expert:
         memory = state.memory
         if memory is None:
             memory = self.step.model.initial_memory(speed[..., -1])
-        start = LoopState(position, speed, student.acceleration.detach(), memory, state.state)
+        acceleration, latent = student.acceleration.detach(), student.latent.detach()
+        start = LoopState(position, speed, acceleration, memory, state.state, latent)
         conditioning = state.conditioning
         after, speeds, _ = self.step.drive_window(
             start, leader, state.leader_length, conditioning.base, conditioning.features

@@ -76,6 +76,7 @@ class ThroughTime(GradientPath):
             self._bounded(state.acceleration),
             self._bounded(state.memory),
             self._bounded(state.state),
+            self._bounded(state.latent),
         )
 
     def after_segment(self, state: LoopState) -> LoopState:
@@ -85,6 +86,7 @@ class ThroughTime(GradientPath):
             _cut(state.acceleration),
             _cut(state.memory),
             _cut(state.state),
+            _cut(state.latent),
         )
 
     def _bounded(self, value: Tensor) -> Tensor:
@@ -103,6 +105,7 @@ class ThroughMemory(ThroughTime):
             _cut(bounded.acceleration),
             _cut(bounded.memory),
             bounded.state,
+            _cut(bounded.latent),
         )
 
 

@@ -1,7 +1,7 @@
 """What was measured around the trajectories of a gradient step, gathered window by window.
 
 Shapes: P pairs, N networks, D trajectories of each, H windows of a trajectory, L frames of a token,
-S steps of a window, m width of the model's memory.
+S steps of a window, m width of the model's memory, q numbers that a stochastic head keeps.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ class RolloutInputs:
         follower: position, speed, acceleration of the last L frames before the policy takes over,
             `(3, N, D, L)`, SI units.
         memory: of the model at that moment, `(N, D, m)`.
+        latent: of the head at that moment, `(N, D, q)`: nothing is drawn yet.
         measured: at the `H S` frames that are simulated.
     """
 
@@ -51,6 +52,7 @@ class RolloutInputs:
     leader_length: Tensor
     follower: Tensor
     memory: Tensor
+    latent: Tensor
     measured: Measured
 
     @classmethod
@@ -108,7 +110,9 @@ class RolloutInputs:
             speed, gap = speed + shift, gap + wider
         counted = (simulated <= batch.last[..., None]).to(follower.dtype)
         memory = step.model.initial_memory(follower[1, ..., -1])
-        return cls(leader, leader_length, follower, memory, Measured(speed, gap, counted))
+        latent = memory.new_zeros((*pair.shape, step.core.head.latent_width))
+        measured = Measured(speed, gap, counted)
+        return cls(leader, leader_length, follower, memory, latent, measured)
 
     def initial(self, state: Tensor) -> LoopState:
         """Returns where the trajectories begin; `state` is the policy's, `(N, D, s)`.
@@ -117,7 +121,7 @@ class RolloutInputs:
         ones: otherwise the window step would be compiled once more for it.
         """
         position, speed, acceleration = self.follower.unbind(0)
-        begin = LoopState(position, speed, acceleration, self.memory, state)
+        begin = LoopState(position, speed, acceleration, self.memory, state, self.latent)
         if not torch.is_grad_enabled():
             return begin
         return LoopState(
@@ -126,6 +130,7 @@ class RolloutInputs:
             _with_gradient(begin.acceleration),
             _with_gradient(begin.memory),
             _with_gradient(begin.state),
+            _with_gradient(begin.latent),
         )
 
     def measured_at(self, frames: slice) -> Measured:

@@ -1,7 +1,7 @@
 """What the closed loop of training carries from window to window, and what it reads of the leader.
 
 Shapes: N networks, D trajectories of each, L frames of a token, S steps of a window, s width of the
-policy's state, m of the model's memory.
+policy's state, m of the model's memory, q numbers that a stochastic head keeps.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ class LoopState(NamedTuple):
         acceleration: `(N, D, L)`, m/s2.
         memory: of the model, `(N, D, m)`.
         state: of the policy, `(N, D, s)`.
+        latent: what a stochastic head keeps of its random numbers, `(N, D, q)`.
     """
 
     position: Tensor
@@ -27,6 +28,7 @@ class LoopState(NamedTuple):
     acceleration: Tensor
     memory: Tensor
     state: Tensor
+    latent: Tensor
 
 
 class LeaderWindow(NamedTuple):

@@ -93,8 +93,9 @@ class WindowStep:
         history = self._history(now, leader, leader_length)
         unit, state = self.core.act(history, base, conditioning, now.state)
         chosen = self.core.head.measured(self.low + unit * self.range, history, self.dt)
+        latent = now.latent
         if noise is not None:
-            chosen = self.core.head.sampled(chosen, noise, self.stride * self.dt)
+            chosen, latent = self.core.head.sampled(chosen, noise, latent, self.stride * self.dt)
         p = self.space.unpack(chosen)
         last = self.length - 1
         follower = Follower(
@@ -120,6 +121,7 @@ class WindowStep:
             self._shift(now.acceleration, acceleration),
             follower.memory,
             state,
+            latent,
         )
         gap = leader.position[..., self.length :] - leader_length[..., None] - position
         return after, speed, gap

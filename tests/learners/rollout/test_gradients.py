@@ -12,7 +12,7 @@ from cfx.learners.rollout.state import LoopState
 def a_state() -> LoopState:
     generator = torch.Generator().manual_seed(0)
     values = []
-    for _ in range(5):
+    for _ in range(len(LoopState._fields)):
         values.append(torch.randn((2, 3, 4), generator=generator).requires_grad_())
     return LoopState(*values)
 

@@ -13,6 +13,7 @@ from cfx.learners.rollout.batch import RolloutBatch
 from cfx.learners.rollout.gradients import NoGradients
 from cfx.learners.rollout.loop import burn_in, simulate
 from cfx.learners.rollout.module import DISPERSIONS, RolloutModule
+from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.policies.driver_features import measure
@@ -57,6 +58,34 @@ def test_training_simulates_what_evaluation_simulates(
     near = {"rtol": 0, "atol": 2e-3}
     torch.testing.assert_close(segment.speed[0].double(), found.speed[:, 1:56], **near)
     torch.testing.assert_close(segment.gap[0].double(), found.gap[:, 1:56], **near)
+
+
+@pytest.mark.parametrize("model", [Krauss(), IDM()], ids=["krauss", "idm"])
+def test_training_samples_what_evaluation_samples(model: Any) -> None:
+    """The same random numbers give the same speeds and gaps in both closed loops."""
+    policy, data = gru(), training_data(model=model, networks=1)
+    result = untrained(data, policy, head="stochastic")
+    settings = RolloutSettings(**(QUICK | {"head": "stochastic"}))
+    dataset = placed(data, policy, settings.validation, head="stochastic")
+    dataset.scaler = result.scaler
+    module = RolloutModule(result.network, dataset, policy, data, settings)
+    batch = batch_of(dataset, torch.full((1, 6), 40))
+    generator = torch.Generator().manual_seed(5)
+    width = module.exact_step.core.head.noise_width
+    assert width == 1 + len(model.space)
+    drawn = []
+    for _ in range(11):
+        drawn.append(torch.randn((6, width), generator=generator, dtype=torch.float64).float())
+    noise = torch.stack(drawn)[:, None]
+    about = (module.exact_step, dataset, batch, 11, NoGradients())
+    with torch.no_grad():
+        centre = next(simulate(*about))
+        segment = next(simulate(*about, noise=noise))
+    found = loop(result, data, policy, first=200, seed=5)
+    near = {"rtol": 0, "atol": 2e-3}
+    torch.testing.assert_close(segment.speed[0].double(), found.speed[:, 1:56], **near)
+    torch.testing.assert_close(segment.gap[0].double(), found.gap[:, 1:56], **near)
+    assert float((segment.speed - centre.speed).abs().max()) > 0.1
 
 
 def test_a_bounded_burn_in_forgets_what_was_before() -> None:
