@@ -122,6 +122,11 @@ class BatchedModule(pl.LightningModule):
             self.trainer.should_stop = True
         self.on_epoch()
 
+    def forget_best(self) -> None:
+        """Lets no epoch before this one be the best: from here on losses mean something else."""
+        self.best_loss = torch.full_like(self.best_loss, torch.inf)
+        self.stale = torch.zeros_like(self.stale)
+
     def restore_best(self) -> None:
         """Puts each network's best weights back."""
         with torch.no_grad():

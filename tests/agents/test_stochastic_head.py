@@ -20,7 +20,7 @@ from cfx.agents.valid_range import ValidRange
 from cfx.models.base import DrivingModel
 from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
-from cfx.models.residual import JERK, TARGET, TIME
+from cfx.models.residual import HANDOVER, JERK, TARGET, TIME
 from cfx.models.w99 import W99
 from cfx.parameters import Parameter
 from cfx.policies.features import History
@@ -29,6 +29,7 @@ from tests.sumo.policies import adaptive
 WINDOW_S = 0.5
 HEAD = StochasticHead.for_model(Krauss())
 KRAUSS = {"name": "krauss"}
+DRAWN = [HEAD.space.names.index(name) for name in ("t_r", "t_i", HANDOVER.name)]
 
 
 def column(name: str) -> int:
@@ -53,8 +54,8 @@ def drawn_noise(count: int, generator: torch.Generator) -> Tensor:
 
 
 def logits(values: Tensor) -> Tensor:
-    """Returns the driving model's parameters in the squashed space, `(D, m)`."""
-    return torch.logit(HEAD.space.to_unit(values)[:, : HEAD.latent_width])
+    """Returns the parameters that are drawn in the squashed space, `(D, q)`."""
+    return torch.logit(HEAD.space.to_unit(values)[:, DRAWN])
 
 
 def steady(count: int, length: int = 5) -> History:
@@ -125,8 +126,8 @@ def test_parameters_are_an_ar_process_on_logits(
 ) -> None:
     """Standard deviation from the first window on, and the correlation between windows."""
     chosen = parameters(8_000, (PARAMETER_TIME, time))
-    chosen[:, :2] = HEAD.space.from_unit(torch.full_like(chosen, unit))[:, :2]
-    chosen[:, -2:] = scale
+    chosen[:, DRAWN] = HEAD.space.from_unit(torch.full_like(chosen, unit))[:, DRAWN]
+    chosen[:, -len(DRAWN) :] = scale
     generator, latent = torch.Generator().manual_seed(seed), unseen(8_000)
     moves = []
     for _ in range(3):
@@ -134,8 +135,8 @@ def test_parameters_are_an_ar_process_on_logits(
         drawn, latent = HEAD.sampled(chosen, noise, latent, WINDOW_S)
         moves.append(logits(drawn) - logits(chosen))
     for move in moves:
-        assert move.mean(0).tolist() == pytest.approx([0.0, 0.0], abs=0.06 * scale)
-        assert move.std(0).tolist() == pytest.approx([scale, scale], rel=0.05)
+        assert move.mean(0).tolist() == pytest.approx([0.0] * 3, abs=0.06 * scale)
+        assert move.std(0).tolist() == pytest.approx([scale] * 3, rel=0.05)
     for windows in (1, 2):
         together = torch.corrcoef(torch.stack([moves[0][:, 0], moves[windows][:, 0]]))
         kept = math.exp(-windows * WINDOW_S / time)
@@ -153,7 +154,7 @@ def test_the_noise_keeps_its_variance_whatever_time_constants_follow_one_another
         chosen[:, column(PARAMETER_TIME.name)] = PARAMETER_TIME.low + times
         noise = drawn_noise(20_000, generator)
         _, latent = HEAD.sampled(chosen, noise, latent, WINDOW_S)
-    assert latent.std(0).tolist() == pytest.approx([1.0, 1.0], abs=0.02)
+    assert latent.std(0).tolist() == pytest.approx([1.0] * 3, abs=0.02)
 
 
 @pytest.mark.parametrize("model", [Krauss(), IDM(), W99()], ids=["krauss", "idm", "w99"])
@@ -165,7 +166,7 @@ def test_no_draw_leaves_the_bounds(model: DrivingModel, unit: float) -> None:
     noise = 4.0 * torch.randn((500, head.noise_width), generator=generator).double()
     latent = torch.zeros((500, head.latent_width)).double()
     drawn, _ = head.sampled(chosen, noise, latent, WINDOW_S)
-    own = slice(None, len(head.model_space))
+    own = [*range(len(head.model_space)), head.space.names.index(HANDOVER.name)]
     low, high = head.space.bounds()[:, own]
     assert bool(((low <= drawn[:, own]) & (drawn[:, own] <= high)).all())
     assert torch.equal(drawn[:, own], chosen[:, own]) == (unit == 0.0), "the scale is 0 there"
@@ -180,7 +181,8 @@ def test_frozen_parameters_are_not_drawn() -> None:
     assert bool((drawn[:, 0] > chosen[:, 0]).all())
     answer = torch.full((1, len(head.space)), 0.9).double()
     base = head.space.to_unit(head.space.defaults())[None]
-    assert float(head.unit_parameters(answer, base)[0, -1]) == 0.0, "no answer changes that"
+    scale = head.space.names.index("t_i_scale")
+    assert float(head.unit_parameters(answer, base)[0, scale]) == 0.0, "no answer changes that"
 
 
 def test_nothing_is_drawn_without_noise() -> None:
@@ -197,11 +199,11 @@ def test_gradients_reach_scales_and_the_time_constant() -> None:
     for _ in range(2):
         noise = drawn_noise(50, generator)
         drawn, latent = HEAD.sampled(chosen, noise, latent, WINDOW_S)
-    drawn[:, :2].square().sum().backward()
+    drawn[:, DRAWN].square().sum().backward()
     assert chosen.grad is not None
     assert bool(chosen.grad.isfinite().all())
     reached = chosen.grad.abs().sum(0) > 0
-    for name in ("t_r", "t_i", "t_r_scale", "t_i_scale", PARAMETER_TIME.name):
+    for name in ("t_r", "t_r_scale", "t_i_scale", "residual_handover_scale", PARAMETER_TIME.name):
         assert bool(reached[column(name)])
 
 
@@ -227,7 +229,7 @@ def test_an_agent_draws_only_from_a_generator_and_the_same_from_the_same_seed() 
         assert len(sampled[:, column(name)].unique()) == 3, "each driver has noise of their own"
     time = column(TIME.name)
     assert torch.equal(sampled[:, time], centre[:, time])
-    assert len(after.latent.unique()) == 6
+    assert len(after.latent.unique()) == 9
 
 
 def test_a_sampled_driver_stays_themselves_for_seconds() -> None:

@@ -24,16 +24,17 @@ vary:
     logit(u_i') = logit(u_i) + s_i y_i
     y_i <- k_p y_i + sqrt(1 - k_p^2) z_i,    z_i ~ N(0, 1),    k_p = exp(-W / tau_p)
 
-with u_i what the network says of the parameter in unit space. The first y_i is z_i itself, so that
-each y_i is standard normal in every window, whatever the network says. A sampled driver so is one
-draw of a continuous mixture over parameters, who changes slowly. No draw leaves the bounds; frozen
-parameters have the scale 0.
+with u_i what the network says of the parameter in unit space. Drawn are the parameters of the
+driving model and `residual_handover`, the time constant with which the model takes over. The first
+y_i is z_i itself, so that each y_i is standard normal in every window, whatever the network says. A
+sampled driver so is one draw of a continuous mixture over parameters, who changes slowly. No draw
+leaves the bounds; frozen parameters have the scale 0.
 
 Without a generator nothing is drawn, and the path of the centre is driven.
 
-Shapes: `*batch` any leading dimensions, m tuned parameters of the driving model; n = 2 m + 7, k = m
-+ 1 random numbers of a window, of which q = m are kept. With noise on the acceleration alone n = m
-+ 6, k = 1, q = 0.
+Shapes: `*batch` any leading dimensions, m tuned parameters of the driving model; n = 2 m + 8, k = m
++ 2 random numbers of a window, of which q = m + 1 are kept. With noise on the acceleration alone n
+= m + 6, k = 1, q = 0.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ from torch import Tensor
 from cfx.agents.heads.offset import step_of
 from cfx.agents.heads.residual import ResidualHead
 from cfx.models.base import DrivingModel
-from cfx.models.residual import RESIDUAL, TARGET, TIME, WithResidual
+from cfx.models.residual import HANDOVER, RESIDUAL, TARGET, TIME, WithResidual
 from cfx.parameters import Parameter, ParameterSpace
 
 SCALE = Parameter(
@@ -83,17 +84,18 @@ class StochasticHead(ResidualHead):
 
     def __init__(self, space: ParameterSpace, device: torch.device | str | None = None) -> None:
         super().__init__(space, device)
-        self._draws_parameters = PARAMETER_TIME.name in space.names
-        if self._draws_parameters:
-            self.latent_width = len(self.model_space)
+        drawn = [name for name in space.names if _scale_name(name) in space.names]
+        self.latent_width = len(drawn)
         self.noise_width = 1 + self.latent_width
-        bounds = space.bounds(device=device)[:, : self.latent_width]
-        self._low, self._high = bounds.unbind(0)
+        index = [space.names.index(name) for name in drawn]
+        self._drawn = torch.tensor(index, dtype=torch.int64, device=device)
+        self._low, self._high = space.bounds(device=device)[:, self._drawn].unbind(0)
 
     @classmethod
     def for_model(cls, model: DrivingModel, device: torch.device | str | None = None) -> Self:
         space = WithResidual(model).adaptation_space
-        scales = [_scale_of(parameter) for parameter in model.adaptation_space.tuned]
+        scales = [_scale_of(parameter, 0.3) for parameter in model.adaptation_space.tuned]
+        scales.append(_scale_of(HANDOVER, 0.5))
         return cls(replace(space, parameters=(*space, SCALE, PARAMETER_TIME, *scales)), device)
 
     def of_acceleration(self) -> Self:
@@ -124,7 +126,7 @@ class StochasticHead(ResidualHead):
         self, parameters: Tensor, noise: Tensor, latent: Tensor, window_s: float
     ) -> tuple[Tensor, Tensor]:
         drawn = self._with_acceleration(parameters, noise[..., 0], window_s)
-        if not self._draws_parameters:
+        if self.latent_width == 0:
             return drawn, latent
         return self._with_parameters(drawn, noise[..., 1:], latent, window_s)
 
@@ -143,28 +145,33 @@ class StochasticHead(ResidualHead):
     def _with_parameters(
         self, parameters: Tensor, noise: Tensor, latent: Tensor, window_s: float
     ) -> tuple[Tensor, Tensor]:
-        """Draws the driving model's parameters, from noise `(*batch, m)`."""
-        count, time = self.latent_width, self.space.names.index(PARAMETER_TIME.name)
+        """Draws the parameters that have a scale, from noise `(*batch, q)`."""
+        time = self.space.names.index(PARAMETER_TIME.name)
         kept = torch.exp(-window_s / parameters[..., time, None])
         kept = torch.where(latent == 0, 0.0, kept)
         latent = kept * latent + torch.sqrt(1.0 - kept.square()) * noise
-        scale = parameters[..., -count:]
+        scale = parameters[..., -self.latent_width :]
         low, high = self._low.to(parameters), self._high.to(parameters)
-        centre = parameters[..., :count]
+        centre = parameters[..., self._drawn]
         step = step_of((centre - low) / (high - low), scale * latent)
         drawn = (centre + step * (high - low)).clamp(low, high)
-        return torch.cat([drawn, parameters[..., count:]], -1), latent
+        return parameters.index_copy(-1, self._drawn, drawn), latent
 
 
-def _scale_of(parameter: Parameter) -> Parameter:
-    """Returns the scale of a parameter of the driving model; 0 where it is frozen."""
+def _scale_of(parameter: Parameter, default: float) -> Parameter:
+    """Returns the scale of a parameter; 0 where it is frozen."""
     return Parameter(
-        f"{parameter.name}_scale",
+        _scale_name(parameter.name),
         "1",
         0.0,
         2.0,
-        0.0 if parameter.frozen else 0.1,
+        0.0 if parameter.frozen else default,
         f"standard deviation of {parameter.name} in the squashed space",
-        "on logits; 0.1: some 2 % of the range in its middle",
+        "on logits: 0.3 are some 7 % of the range in its middle",
         frozen=parameter.frozen,
     )
+
+
+def _scale_name(name: str) -> str:
+    """Returns what the scale of a parameter is called."""
+    return f"{name}_scale"

@@ -47,8 +47,9 @@ DISPERSIONS = (0.5, 4.0)
 _HALVINGS = 5
 """Of the logarithm between `DISPERSIONS`, which leave 6 % of a factor."""
 
-_STARTS = (0.3, 0.7)
-"""Shares of a validation trajectory from which these paths are sampled."""
+_STARTS = (0.8, 0.9)
+"""Shares of a validation trajectory from which these paths are sampled. Most protocols calibrate
+driver-specific parameters on what is before, so that networks are surer there."""
 
 _COVERING = 19
 """Sampled paths whose range holds 90 % of what happens, if it is one of them as far as anybody can
@@ -155,6 +156,8 @@ class RolloutModule(BatchedModule):
         done = self.current_epoch / max(1, s.epochs - 1)
         temperature = s.temperature + done * (s.temperature_end - s.temperature)
         self.temperature.fill_(max(temperature, _LEAST_TEMPERATURE))
+        if self.is_stochastic and self.current_epoch == self.first_sampled_epoch:
+            self.forget_best()
 
     def training_step(self, number: int, index: int) -> None:
         optimizer, schedule = self.optimizers(), self.lr_schedulers()
@@ -243,9 +246,19 @@ class RolloutModule(BatchedModule):
     @property
     def samples_paths(self) -> bool:
         """Whether paths are sampled: in validation always, in training from half the epochs on."""
-        if self.exact_step.core.head.noise_width == 0:
+        if not self.is_stochastic:
             return False
-        return not torch.is_grad_enabled() or self.current_epoch >= self.settings.epochs // 2
+        return not torch.is_grad_enabled() or self.current_epoch >= self.first_sampled_epoch
+
+    @property
+    def is_stochastic(self) -> bool:
+        """Whether the head draws."""
+        return self.exact_step.core.head.noise_width > 0
+
+    @property
+    def first_sampled_epoch(self) -> int:
+        """The first epoch in which training samples paths, where the head draws."""
+        return self.settings.epochs // 2
 
     def _noise(self, batch: RolloutBatch, windows: int, paths: int) -> Tensor:
         """Returns what sampled paths draw from, `(windows, N, paths D, k)`.
@@ -268,7 +281,7 @@ class RolloutModule(BatchedModule):
         should: networks are surer of drivers that they learned from than of others. 1 where none
         was kept.
         """
-        if self.exact_step.core.head.noise_width == 0:
+        if not self.is_stochastic:
             return None
         batch = self.sampler.validation_with_history(_STARTS)
         if not bool((batch.weight > 0).any()):
@@ -343,8 +356,10 @@ class RolloutModule(BatchedModule):
     def validation_step(self, number: int, index: int) -> None:
         train = torch.stack(self.losses).mean(0)
         self.losses.clear()
-        is_distilling = self.current_epoch < self.settings.distillation_epochs
-        self.judge(train, self.validation_loss().cpu(), hopeful=is_distilling)
+        is_hopeful = self.current_epoch < self.settings.distillation_epochs
+        if self.is_stochastic:
+            is_hopeful |= self.current_epoch < self.first_sampled_epoch
+        self.judge(train, self.validation_loss().cpu(), hopeful=is_hopeful)
 
     def validation_loss(self) -> Tensor:
         """Returns the loss of validation trajectories with the exact model, `(N,)`.

@@ -72,7 +72,7 @@ def test_training_samples_what_evaluation_samples(model: Any) -> None:
     batch = batch_of(dataset, torch.full((1, 6), 40))
     generator = torch.Generator().manual_seed(5)
     width = module.exact_step.core.head.noise_width
-    assert width == 1 + len(model.space)
+    assert width == 2 + len(model.space)
     drawn = []
     for _ in range(11):
         drawn.append(torch.randn((6, width), generator=generator, dtype=torch.float64).float())
