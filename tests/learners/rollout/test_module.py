@@ -192,6 +192,24 @@ def test_the_path_without_noise_counts_beside_sampled_ones() -> None:
     torch.testing.assert_close(early.detach(), centre, msg="it is learned first")
 
 
+@pytest.mark.parametrize(
+    ("head", "epochs", "is_forgotten"),
+    [("stochastic", 1, True), ("stochastic", 4, False), ("residual", 1, False)],
+)
+def test_the_best_weights_are_of_an_epoch_that_samples_paths(
+    head: str, epochs: int, is_forgotten: bool
+) -> None:
+    """The first epoch samples paths if it is the only one; before, losses mean something else."""
+    policy, data = gru(), training_data(networks=2)
+    settings = RolloutSettings(**(QUICK | {"head": head, "epochs": epochs}))
+    dataset = placed(data, policy, settings.validation, head=head)
+    network = untrained(data, policy, head=head).network
+    module = RolloutModule(network, dataset, policy, data, settings)
+    module.best_loss = torch.full_like(module.best_loss, 0.5)
+    module.on_train_epoch_start()
+    assert bool(module.best_loss.isinf().all()) == is_forgotten
+
+
 def exact_losses(module: RolloutModule, batch: RolloutBatch, windows: int, full: bool) -> Any:
     """Returns the loss of each trajectory with the exact model, `(N, D)`."""
     divisors = module.errors.over_horizon(batch)
