@@ -175,6 +175,8 @@ def score_distributions(
         for horizon in horizons:
             step = round(horizon / dt)
             exists = recorded.exists[:, step]
+            if not exists.any():  # no recording lasts as long
+                continue
             columns: dict[str, object] = {name: column[exists] for name, column in first.items()}
             columns |= {"method": method, "horizon_s": float(horizon)}
             here = Sampled(sampled.speed[:, exists], sampled.travelled[:, exists])

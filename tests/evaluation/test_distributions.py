@@ -58,6 +58,27 @@ def table() -> pd.DataFrame:
     return score_distributions(pairs, origins, paths, happened, (1.0, 2.0), DT)
 
 
+def test_a_horizon_that_no_recording_lasts_to_is_left_out() -> None:
+    exists = np.ones((3, STEPS + 1), dtype=bool)
+    exists[:, -1] = False
+    still = np.zeros((3, STEPS + 1))
+    happened = Recorded(
+        speed=still,
+        travelled=still,
+        gap=np.full(3, 20.0),
+        leader_speed=still,
+        leader_travelled=still,
+        exists=exists,
+    )
+    pairs: Any = [SimpleNamespace(pair_id=f"p{i}", driver=f"d{i}") for i in range(3)]
+    index = torch.arange(3)
+    origins = Origins(index, torch.zeros_like(index))
+    paths = {"sampled": Paths(np.zeros((20, 3, STEPS + 1)), np.zeros((20, 3, STEPS + 1)))}
+    horizons = (1.0, STEPS * DT)
+    found = score_distributions(pairs, origins, paths, happened, horizons, DT)
+    assert found["horizon_s"].tolist() == [1.0] * 3
+
+
 def mean_of(table: pd.DataFrame, method: str, column: str, horizon: float = 2.0) -> float:
     rows = table[(table["method"] == method) & (table["horizon_s"] == horizon)]
     return float(rows[column].mean())
