@@ -73,7 +73,8 @@ def test_a_horizon_that_no_recording_lasts_to_is_left_out() -> None:
     pairs: Any = [SimpleNamespace(pair_id=f"p{i}", driver=f"d{i}") for i in range(3)]
     index = torch.arange(3)
     origins = Origins(index, torch.zeros_like(index))
-    paths = {"sampled": Paths(np.zeros((20, 3, STEPS + 1)), np.zeros((20, 3, STEPS + 1)))}
+    none = torch.zeros(20, 3, STEPS + 1)
+    paths = {"sampled": Paths(none, none)}
     horizons = (1.0, STEPS * DT)
     found = score_distributions(pairs, origins, paths, happened, horizons, DT)
     assert found["horizon_s"].tolist() == [1.0] * 3
