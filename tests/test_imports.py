@@ -202,11 +202,8 @@ def test_no_import_comes_back_to_where_it_began() -> None:
     ],
 )
 def test_what_must_answer_at_once_imports_nothing_heavy(code: str) -> None:
-    heavy = tuple(set(HEAVY) - {"pandas", "scipy"})
-    if code == "import cfx.application, cfx.nodes":
-        heavy = HEAVY  # what each job imports before its first line
     script = (
-        f"{code}\nimport sys\nloaded = sys.modules.keys() & set({heavy!r})\n"
+        f"{code}\nimport sys\nloaded = sys.modules.keys() & set({HEAVY!r})\n"
         "sys.exit(str(loaded) if loaded else 0)"
     )
     done = subprocess.run(

@@ -125,7 +125,6 @@ class BatchedModule(pl.LightningModule):
     def forget_best(self) -> None:
         """Lets no epoch before this one be the best: from here on losses mean something else."""
         self.best_loss = torch.full_like(self.best_loss, torch.inf)
-        self.stale = torch.zeros_like(self.stale)
 
     def restore_best(self) -> None:
         """Puts each network's best weights back."""

@@ -158,8 +158,8 @@ class ProtocolContext:
         Raises:
             ConfigError: the model has equations in a simulator only.
         """
-        head = StochasticHead.for_model(self.simulator.model, parameters.device)
-        head = head.of_acceleration()
+        model, device = self.simulator.model, parameters.device
+        head = StochasticHead.for_model(model, device).of_acceleration()
         complete = head.completed(parameters).clone()
         for parameter, values in ((TIME, time), (SCALE, scale)):
             column = head.space.names.index(parameter.name)

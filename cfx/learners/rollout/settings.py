@@ -21,8 +21,9 @@ class HeadSettings(Settings):
         "offset",
         description="offset: offsets from each driver's base parameters; residual: also how the"
         " model takes over from the acceleration at the start, so that the policy starts with"
-        " exactly the acceleration that the driver has; stochastic: also how much it varies,"
-        " trained by the CRPS of sampled paths and the error of the path without noise",
+        " exactly the acceleration that the driver has; stochastic: also how much"
+        " the acceleration and the parameters vary, trained by the CRPS of sampled paths and the"
+        " error of the path without noise",
     )
     paths: int = Field(
         2,
