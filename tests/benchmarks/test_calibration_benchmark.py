@@ -105,8 +105,9 @@ def by_hand(losses: SegmentLosses, name: str) -> Callable[[], Tensor]:
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("name", ["krauss", "idm", "w99"])
 @pytest.mark.parametrize("kind", list(WORK))
-def test_calibration(benchmark: Any, name: str, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(threads, "cores", lambda: 1)
+@threads.one_thread()
+@threads.one_core()
+def test_calibration(benchmark: Any, name: str, kind: str) -> None:
     model = model_of(name)
     own = segments(model, *WORK[kind])
     losses: SegmentLosses | PooledLosses = own

@@ -53,7 +53,9 @@ def test_overhead_of_a_shard(benchmark, engine: Engine) -> None:
 
 
 @pytest.mark.timeout(1200)
-def test_efficiency_of_two_workers(benchmark, engine: Engine, monkeypatch) -> None:
+@threads.one_thread()
+@threads.one_core()
+def test_efficiency_of_two_workers(benchmark, engine: Engine) -> None:
     """Labels of some drivers with W99, in 45 shards: one core here against two workers."""
     model = W99()
     truth = model.space.defaults().expand(DRIVERS, -1).clone()
@@ -76,7 +78,6 @@ def test_efficiency_of_two_workers(benchmark, engine: Engine, monkeypatch) -> No
         calibrator.labels(pairs, batch, windows, truth)
         return time.perf_counter() - began
 
-    monkeypatch.setattr(threads, "_LIMIT", [1])
     seconds(engine)  # kernels are compiled, or read from the disk
     seconds(LocalEngine())
     # In turns, and the fastest of each: other work on the machine only slows down.
