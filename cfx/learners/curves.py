@@ -29,6 +29,23 @@ def over_networks(curves: pd.DataFrame, column: str) -> pd.DataFrame:
     )
 
 
+def first_sampled_epoch(curves: pd.DataFrame) -> float | None:
+    """Returns the epoch from which on the training loss also scores sampled paths.
+
+    Before it the loss is of paths without noise alone, and smaller. None where the loss means the
+    same in all epochs.
+
+    Args:
+        curves: with a column `sampled_paths` where the policy's head draws.
+    """
+    if "sampled_paths" not in curves:
+        return None
+    sampled = curves["sampled_paths"] > 0
+    if not sampled.any() or sampled.all():
+        return None
+    return float(curves["epoch"][sampled].min())
+
+
 def best_losses(curves: pd.DataFrame) -> dict[str, float]:
     """Returns the metric `validation_loss/best`.
 

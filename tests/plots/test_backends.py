@@ -190,6 +190,17 @@ def test_the_same_pairs_are_cut_off_at_the_same_place() -> None:
     assert "1 without a defined improvement" in figure.axes[0].get_xlabel()
 
 
+def test_both_say_from_where_on_sampled_paths_count() -> None:
+    curves = make_results(pairs=9).curves
+    half = curves["epoch"].median()
+    chosen = learning_curves(curves.assign(sampled_paths=2 * (curves["epoch"] >= half)))
+    line = draw_learning(chosen).axes[0].lines[-1]
+    shape = view_of(learning_plot(chosen))["layout"]["shapes"][0]
+    assert line.get_label() == shape["label"]["text"]
+    assert line.get_xdata()[0] == shape["x0"] == shape["x1"] >= half
+    assert "shapes" not in view_of(learning_plot(learning_curves(curves)))["layout"]
+
+
 def test_learning_curves_are_medians_and_quartiles_in_both() -> None:
     chosen = learning_curves(make_results(pairs=9).curves)
     axes = draw_learning(chosen).axes[0]

@@ -20,6 +20,7 @@ from cfx.learners.curves import over_networks
 from cfx.parameters import Parameter, ParameterSpace
 from cfx.plots.choice.errors import errors_over_time
 from cfx.plots.choice.history import amounts_of
+from cfx.plots.choice.learning import SAMPLED
 from cfx.plots.choice.platoon import braking_time, worst_platoon
 from cfx.plots.look import COLOURS
 from cfx.plots.matplotlib import figures
@@ -231,6 +232,14 @@ def test_a_network_that_stopped_early_keeps_its_last_loss() -> None:
     assert over_networks(curves, "train_loss").loc[2].tolist() == [2.0, 5.0]
     assert over_networks(curves, "validation_loss").empty
     assert "2 networks: median and quartiles" in texts(figures.learning(curves))
+
+
+def test_learning_curves_say_where_sampled_paths_begin_to_count() -> None:
+    losses = {"network": "a", "epoch": range(4), "train_loss": [2.0, 1.0, 3.0, 2.0]}
+    curves = pd.DataFrame(losses).assign(validation_loss=np.nan)
+    assert SAMPLED not in texts(figures.learning(curves))
+    curves["sampled_paths"] = [0, 0, 2, 2]
+    assert SAMPLED in texts(figures.learning(curves))
 
 
 @pytest.mark.parametrize("loss", [np.nan, 0.0, -1.0, np.inf])

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import lightning.pytorch as pl
+import pandas as pd
 import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
@@ -242,6 +243,18 @@ class RolloutModule(BatchedModule):
                 others = segment.only(slice(centre.stop, None))
                 loss = loss + self.loss.of_paths(others, divisors, sampled)
             yield loss
+
+    def curves(self) -> pd.DataFrame:
+        """As `BatchedModule.curves`.
+
+        With a head that draws, the column `sampled_paths` says of how many paths of each trajectory
+        the CRPS is in the training loss of an epoch; in the validation loss it always is.
+        """
+        curves = super().curves()
+        if self.is_stochastic:
+            samples = curves["epoch"] >= self.first_sampled_epoch
+            curves["sampled_paths"] = samples * self.settings.paths
+        return curves
 
     @property
     def samples_paths(self) -> bool:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from cfx.learners.curves import over_networks
+from cfx.learners.curves import first_sampled_epoch, over_networks
 from cfx.plots.choice.common import Array
 from cfx.plots.look import TRAIN_COLOUR, VALIDATION_COLOUR
 
@@ -50,6 +50,7 @@ class LearningCurves:
         networks: how many learned.
         logarithmic: whether the loss axis is.
         ticks: of a logarithmic loss axis.
+        sampled_from: epoch from which on the training loss has more terms; None if it never has.
     """
 
     title: str
@@ -57,16 +58,20 @@ class LearningCurves:
     networks: int
     logarithmic: bool
     ticks: tuple[float, ...]
+    sampled_from: float | None = None
 
 
 LOSS_TITLE = "loss (as the learner defines it)"
+SAMPLED = "training counts sampled paths, too (CRPS)"
+"""What the training loss has from `LearningCurves.sampled_from` on."""
 
 
 def learning_curves(curves: pd.DataFrame) -> LearningCurves:
     """Chooses median and quartiles over the networks, and whether the axis is logarithmic.
 
     Args:
-        curves: columns `network`, `epoch`, `train_loss`, `validation_loss`; NaN where not measured.
+        curves: columns `network`, `epoch`, `train_loss`, `validation_loss`; NaN where not measured;
+            `sampled_paths` where a head draws.
     """
     chosen = []
     for column, (label, colour, dashed) in _COLUMNS.items():
@@ -81,7 +86,8 @@ def learning_curves(curves: pd.DataFrame) -> LearningCurves:
     for curve in chosen:
         shown += [curve.low, curve.high]
     ticks = _logarithmic_ticks(np.concatenate(shown))
-    return LearningCurves(title, tuple(chosen), networks, bool(ticks), ticks)
+    sampled_from = first_sampled_epoch(curves)
+    return LearningCurves(title, tuple(chosen), networks, bool(ticks), ticks, sampled_from)
 
 
 def _curve(losses: pd.DataFrame, label: str, colour: str, *, dashed: bool) -> LossCurve:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter
 
-from cfx.plots.choice.learning import LOSS_TITLE, LearningCurves
+from cfx.plots.choice.learning import LOSS_TITLE, SAMPLED, LearningCurves
+from cfx.plots.look import EDGE
 from cfx.plots.matplotlib.canvas import canvas, say, styled
 
 
@@ -29,6 +30,10 @@ def draw_learning(curves: LearningCurves) -> Figure:
             axes.fill_between(
                 curve.epochs, curve.low, curve.high, color=curve.colour, alpha=0.25, linewidth=0
             )
+    if curves.sampled_from is not None:
+        axes.axvline(
+            curves.sampled_from, color=EDGE, linewidth=0.9, linestyle=(0, (4, 2)), label=SAMPLED
+        )
     if curves.logarithmic:
         axes.set_yscale("log")
         axes.yaxis.set_major_locator(FixedLocator(curves.ticks))
@@ -42,7 +47,7 @@ def draw_learning(curves: LearningCurves) -> Figure:
         say(axes, "no loss was measured")
     elif len(curves.curves[0].epochs) == 1:
         axes.set_xticks([int(curves.curves[0].epochs[0])])
-    figure.legend(loc="outside upper center", ncols=2, title=curves.title, title_fontsize=10.5)
+    figure.legend(loc="outside upper center", ncols=3, title=curves.title, title_fontsize=10.5)
     return figure
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from cfx.plots.choice.learning import LOSS_TITLE, LearningCurves, LossCurve
+from cfx.plots.choice.learning import LOSS_TITLE, SAMPLED, LearningCurves, LossCurve
+from cfx.plots.look import EDGE
 from cfx.plots.plotly.figure import Plot, Trace, axis, view
 
 
@@ -16,12 +17,18 @@ def learning_plot(curves: LearningCurves) -> Plot:
             data += _band(curve)
         data.append(_median(curve))
     legend = {"title": {"text": f"{curves.title}  "}, "orientation": "h", "x": 0}
-    layout = {
+    layout: dict[str, Any] = {
         "xaxis": axis("epoch"),
         "yaxis": _loss_axis(curves),
         "hovermode": "x unified",
         "legend": {**legend, "y": 1.0, "yanchor": "bottom"},
     }
+    if curves.sampled_from is not None:
+        shape: dict[str, Any] = {"type": "line", "yref": "y domain"}
+        shape |= {"x0": curves.sampled_from, "x1": curves.sampled_from, "y0": 0, "y1": 1}
+        shape["line"] = {"color": EDGE, "width": 1, "dash": "dash"}
+        shape["label"] = {"text": SAMPLED, "textposition": "end", "textangle": 0, "xanchor": "left"}
+        layout["shapes"] = [shape]
     return Plot({"": view(data, layout)}, 320, f"Learning curves, {curves.title}")
 
 

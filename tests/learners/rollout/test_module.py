@@ -210,6 +210,21 @@ def test_the_best_weights_are_of_an_epoch_that_samples_paths(
     assert bool(module.best_loss.isinf().all()) == is_forgotten
 
 
+@pytest.mark.parametrize(("head", "sampled"), [("stochastic", [0, 0, 2, 2]), ("residual", None)])
+def test_curves_say_in_which_epochs_paths_are_sampled(head: str, sampled: list[int] | None) -> None:
+    policy, data = gru(), training_data(networks=1)
+    settings = RolloutSettings(**(QUICK | {"head": head, "epochs": 4, "paths": 2}))
+    dataset = placed(data, policy, settings.validation, head=head)
+    network = untrained(data, policy, head=head).network
+    module = RolloutModule(network, dataset, policy, data, settings)
+    module.rows += [(torch.ones(1), torch.ones(1))] * 4
+    curves = module.curves()
+    found = None
+    if "sampled_paths" in curves:
+        found = curves["sampled_paths"].tolist()
+    assert found == sampled
+
+
 def exact_losses(module: RolloutModule, batch: RolloutBatch, windows: int, full: bool) -> Any:
     """Returns the loss of each trajectory with the exact model, `(N, D)`."""
     divisors = module.errors.over_horizon(batch)
