@@ -96,12 +96,12 @@ class Trained:
 
     Attributes:
         test: the test pairs and all methods.
-        fold: in which fold each test pair is tested, `(Q,)`.
+        fold: in which fold each test pair is tested, `(Q,)`; None: there are none.
         curves, labels, notes, calibration: as in `ProtocolResult`.
     """
 
     test: HeldOut
-    fold: Tensor
+    fold: Tensor | None
     curves: pd.DataFrame
     labels: Labels | None
     notes: Mapping[str, Any]

@@ -311,14 +311,17 @@ class Protocol(Component):
     same frames from the same measured state.
 
     Attributes:
-        trains: whether it has a `trainable` policy trained; not if it brings one.
         jobs: settings that name the output folders of finished jobs. Where one is the id of an
             MLflow run, the job puts the folder with that run's files in its place.
     """
 
     kind = "protocol"
-    trains: ClassVar[bool] = True
     jobs: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def trains(self) -> bool:
+        """Whether it has a `trainable` policy trained; not if it brings one."""
+        return True
 
     def determines(self) -> Mapping[str, Any]:
         """Returns what this protocol determines of a job's configuration: key -> value.

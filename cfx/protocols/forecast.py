@@ -28,8 +28,8 @@ from cfx.evaluation.forecasts import Forecasts, forecast_errors
 from cfx.evaluation.result import Evaluation
 from cfx.evaluation.tables import in_text
 from cfx.policies.fixed import FixedPolicy
-from cfx.protocols.across_drivers import AcrossDrivers, AcrossDriversSettings
 from cfx.protocols.base import ProtocolContext, ProtocolResult
+from cfx.protocols.finished import FoldsOrFinished, FoldsOrFinishedSettings
 from cfx.protocols.held_out import HeldOut
 from cfx.protocols.noise import can_drive, residual_noise
 
@@ -42,7 +42,7 @@ def _in_order(horizons: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(sorted(set(horizons)))
 
 
-class ForecastSettings(AcrossDriversSettings):
+class ForecastSettings(FoldsOrFinishedSettings):
     """Settings of `forecast`."""
 
     horizons: Annotated[tuple[float, ...], AfterValidator(_in_order)] = Field(
@@ -71,13 +71,14 @@ class ForecastSettings(AcrossDriversSettings):
     )
 
 
-class Forecast(AcrossDrivers):
+class Forecast(FoldsOrFinished):
     """From every moment, knowing the past: where will a driver be in 0.5 to 10 s?
 
-    Folds, calibration and training are those of `across_drivers`, and so is the test part. Beyond
-    it, each test driver is forecast from *origins*, one every `stride` s. At an origin all that was
-    measured up to it may be read, nothing of the follower after it, and of the leader after it what
-    `leader` says. From there all methods are simulated for the longest horizon:
+    Folds, calibration and training are those of `across_drivers`, and so is the test part; with
+    `run` they are those of `transfer`, and nothing is trained. Beyond it, each test driver is
+    forecast from *origins*, one every `stride` s. At an origin all that was measured up to it may
+    be read, nothing of the follower after it, and of the leader after it what `leader` says. From
+    there all methods are simulated for the longest horizon:
 
     - `constant_speed`, `constant_acceleration`: the driver goes on as at the origin;
     - `default`: the model's default parameters;
@@ -93,7 +94,8 @@ class Forecast(AcrossDrivers):
     With `samples` there are also paths that are sampled from each origin (scores of them:
     `cfx.evaluation.distributions`): of a stochastic policy (`learner.head=stochastic`), and
     `population_ar`, `fixed_ar`, constant parameters with AR(1) noise on the acceleration, measured
-    on drivers of the other folds or on the driver's own history.
+    on drivers of the other folds (with `run`, on all test drivers) or on the driver's own history,
+    before the first origin.
 
     Errors of speed and position at each horizon are the RMSE over the origins of a driver, then the
     mean over drivers, with a bootstrap interval over drivers: origins of one driver overlap and are

@@ -26,7 +26,8 @@ def residual_noise(test: HeldOut, parameters: Tensor, *, own: bool) -> tuple[Ten
     Args:
         test: the drivers, of whom what was measured before the first origin is read.
         parameters: `(P, n)`.
-        own: measured on each driver; otherwise the mean over those of the other folds.
+        own: measured on each driver; otherwise the mean over those of the other folds, or over all
+            test drivers where there are no folds.
     """
     model, windows = test.context.simulator.model, test.context.windows
     lag = windows.stride * test.batch.dt

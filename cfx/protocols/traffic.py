@@ -31,8 +31,8 @@ from cfx.evaluation.traffic.roads import (
 from cfx.memory import require_memory
 from cfx.policies.features import measured_history
 from cfx.policies.fixed import FixedPolicy
-from cfx.protocols.across_drivers import AcrossDrivers, AcrossDriversSettings
 from cfx.protocols.base import ProtocolContext, ProtocolResult
+from cfx.protocols.finished import FoldsOrFinished, FoldsOrFinishedSettings
 from cfx.protocols.held_out import HeldOut
 from cfx.protocols.noise import can_drive, residual_noise
 from cfx.simulation.rollout import MemoryStepper
@@ -55,7 +55,7 @@ def _rising(levels: tuple[float, ...]) -> tuple[float, ...]:
 Levels = Annotated[tuple[float, ...], AfterValidator(_rising)]
 
 
-class TrafficSettings(AcrossDriversSettings):
+class TrafficSettings(FoldsOrFinishedSettings):
     """Settings of `traffic`."""
 
     densities: Levels = Field(
@@ -128,14 +128,14 @@ class _Kind(NamedTuple):
     draws: bool
 
 
-class TrafficProtocol(AcrossDrivers):
+class TrafficProtocol(FoldsOrFinished):
     """Does traffic come out right if all vehicles are driven by what was calibrated or learned?
 
-    Folds, calibration, training and the test part are those of `across_drivers`. Beyond it, test
-    drivers are set on roads, all at once (`cfx.evaluation.traffic.roads`): on ring roads of each
-    density, on open roads with a bottleneck at each demand, and in platoons behind leaders that
-    keep their speed. Each vehicle is a test driver, drawn with replacement; every method has the
-    same drivers at the same places:
+    Folds, calibration, training and the test part are those of `across_drivers`; with `run` they
+    are those of `transfer`, and nothing is trained. Beyond it, test drivers are set on roads, all
+    at once (`cfx.evaluation.traffic.roads`): on ring roads of each density, on open roads with a
+    bottleneck at each demand, and in platoons behind leaders that keep their speed. Each vehicle is
+    a test driver, drawn with replacement; every method has the same drivers at the same places:
 
     - `population`: pooled parameters of all drivers, the same for every vehicle;
     - `fixed`: the driver-specific parameters of the vehicle's driver;

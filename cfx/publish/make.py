@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -123,6 +124,7 @@ def _card(name: str, agent: Agent, metrics: dict[str, Any], data: dict[str, Any]
             "last_part_rmse_speed": metrics["rmse_speed/policy"],
             "last_part_improvement_over_own": metrics["rmse_improvement/mean"],
         },
+        "distributions": _distributions(metrics),
         "safety": {
             "collisions": metrics["full_trajectory/collisions/policy"],
             "hard_braking_frames": metrics["full_trajectory/hard_braking/policy"],
@@ -133,6 +135,19 @@ def _card(name: str, agent: Agent, metrics: dict[str, Any], data: dict[str, Any]
         "valid_range": _range(agent),
         "base_parameters": _base(agent),
     }
+
+
+def _distributions(metrics: dict[str, Any]) -> list[dict[str, float]]:
+    """Returns the scores of sampled forecasts, a row per horizon; none where nothing is drawn."""
+    rows = []
+    pattern = re.compile(r"distribution/crps_speed_(?P<seconds>[0-9.]+)s/policy")
+    for name, value in metrics.items():
+        found = pattern.fullmatch(name)
+        coverage = f"distribution/coverage_{found['seconds']}s/policy" if found else ""
+        if found and coverage in metrics:
+            row = {"horizon_s": float(found["seconds"]), "crps_speed": value}
+            rows.append({**row, "coverage": metrics[coverage]})
+    return sorted(rows, key=lambda row: row["horizon_s"])
 
 
 def _limits(agent: Agent) -> dict[str, Any]:
@@ -208,6 +223,7 @@ def card_text(card: dict[str, Any]) -> str:
         f"- **Safety in these tests**: {safety['collisions']:.0f} collisions,"
         f" {safety['hard_braking_frames']:.0f} frames braking harder than 8 m/s2, RMS jerk"
         f" {safety['jerk']:.2f} m/s3 (the recorded drivers: {safety['jerk_of_people']:.2f})",
+        *_distribution_lines(card.get("distributions", ())),
         *_stress_lines(card["stress"]),
         f"- **Limits**: {_pairs(card['limits'])}",
         f"- **Valid range** (99.8 % of what it learned from): {_usual(card['valid_range'])}",
@@ -222,6 +238,20 @@ def card_text(card: dict[str, Any]) -> str:
         "",
     ]
     return "\n".join(lines)
+
+
+def _distribution_lines(rows: Sequence[dict[str, float]]) -> list[str]:
+    if not rows:
+        return []
+    scores = []
+    for row in rows:
+        scores.append(
+            f"{row['crps_speed']:.3f} m/s and {row['coverage']:.0%} at {row['horizon_s']:g} s"
+        )
+    return [
+        "- **Sampled forecasts** (CRPS of speed; coverage of the central 90 %):"
+        f" {', '.join(scores)}. Errors above are those of its centre, where nothing is drawn"
+    ]
 
 
 def _stress_lines(stress: dict[str, Any]) -> list[str]:

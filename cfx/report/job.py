@@ -87,7 +87,7 @@ class Job:
 
         It is "" for the learner of a job that trains nothing, whatever its configuration says.
         """
-        if group == "learner" and self.component("protocol") == "transfer":
+        if group == "learner" and self.setting("protocol.run"):
             return ""
         if group == "objective" and group not in self.config:
             return "speed_rmse"  # a job of a version that had no other

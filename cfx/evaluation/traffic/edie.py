@@ -59,9 +59,12 @@ def strips_of(spacing: Tensor, speed: Tensor, counted: Tensor, dt: float) -> Str
     )
     complete = counted.all(-1) & (spacing > 0.0).all(-1)
     pair = torch.arange(shape[0], device=speed.device)[:, None].expand(-1, whole)[complete]
-    area, way = spacing[complete].sum(-1), speed[complete].sum(-1)
+    spacing, speed = spacing[complete], speed[complete]
+    area, way = spacing.sum(-1), speed.sum(-1)
     density, flow = frames / area * PER_KM, way / area * PER_HOUR
-    return Strips(pair, density, flow, speed[complete].std(-1, correction=0))
+    # Where there is no strip, torch.std warns.
+    spread = (speed - speed.mean(-1, keepdim=True)).square().mean(-1).sqrt()
+    return Strips(pair, density, flow, spread)
 
 
 class Region(NamedTuple):

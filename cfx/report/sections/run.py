@@ -171,14 +171,14 @@ def _protocol(job: Job) -> str:
         said = (
             f"calibrated and learned on the first {train} of each pair, tested on the last {test}"
         )
-    elif name == "across_drivers":
+    elif job.setting("protocol.folds") and not job.setting("protocol.run"):
         folds = f"{job.setting('protocol.folds')} folds"
         apart = _TOGETHER.get(str(job.setting("protocol.together")), "")
         said = (
             "trained on some drivers and tested on unseen drivers: nobody is, as follower, in both;"
             f" {folds}{apart}; {parts}"
         )
-    elif name == "transfer":
+    elif job.setting("protocol.run"):
         said = (
             "nothing is trained: another job's policy is tested, and pooled calibration is that of"
             f" the drivers it learned from; {parts}"
