@@ -170,9 +170,11 @@ def _range(agent: Agent) -> dict[str, Any]:
 
 
 def _base(agent: Agent) -> dict[str, float]:
+    """Returns the driving model's base parameters, without those of a residual."""
     if agent.base is None:
         return {}
-    return dict(zip(agent.space.names, agent.base[0].tolist(), strict=True))
+    names = agent.model_space.names
+    return dict(zip(names, agent.base[0, : len(names)].tolist(), strict=True))
 
 
 def _kilobytes(folder: Path) -> int:

@@ -38,6 +38,18 @@ RECIPES = {
         ),
         "Wiedemann 99 for unseen drivers, Vissim's family.",
     ),
+    "i80-idm-stochastic": Recipe(
+        (
+            "experiment=stochastic",
+            "model=idm",
+            "learner.drivers=32",
+            "learner.cold_start_fraction=1.0",
+            "protocol.base=population",
+            "protocol.history=0.0",
+        ),
+        "Intelligent Driver Model for unseen drivers who vary as people do: each draws their own"
+        " parameters and noise, with a seed.",
+    ),
     "i80-idm-history": Recipe(
         (
             "experiment=with_history",
