@@ -261,7 +261,11 @@ def _drive_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--end", type=float, metavar="SECONDS", help="of simulated time; default: the scenario's"
     )
-    parser.add_argument("--seed", type=int, help="SUMO's; default: the scenario's")
+    parser.add_argument(
+        "--seed",
+        type=int,
+        help="SUMO's, and that of stochastic policies; default: the scenario's, and 0",
+    )
     parser.add_argument(
         "--output",
         metavar="FILE",

@@ -66,8 +66,10 @@ class PolicySettings(Settings):
     inputs: Annotated[tuple[str, ...], BeforeValidator(named_inputs)] = Field(
         SITUATION,
         description="signals that the policy sees, of leader_speed, follower_speed, gap,"
-        " relative_speed, time_headway, leader_acceleration, follower_acceleration and"
-        " inverse_time_to_collision; or speeds, the paper's two, or situation, the default",
+        " relative_speed, time_headway, leader_acceleration, follower_acceleration,"
+        " inverse_time_to_collision, leader_jerk and follower_jerk; or the name of a set, also in a"
+        " list, as in [situation, leader_jerk]: speeds, the paper's two; situation, the default;"
+        " motion, the situation and both jerks",
     )
     summary: Summary = Field(
         "frames",

@@ -136,7 +136,8 @@ SITUATION = (
 """The inputs with which closed-loop training works best."""
 
 MOTION = (*SITUATION, "follower_jerk", "leader_jerk")
-"""The situation and the jerks: for policies that start from the driver's acceleration."""
+"""The situation and the jerks: for policies of smooth models that start from the driver's
+acceleration. The follower's jerk misleads where a model's acceleration jumps, as Krauss's does."""
 
 SPEEDS = ("leader_speed", "follower_speed")
 """The paper's inputs."""
@@ -165,9 +166,16 @@ def of_set(
 ) -> object:
     """Returns the names that a set's name stands for, and whatever else was given as it is.
 
+    In a list a set's name stands for its names.
+
     Raises:
         ValueError: it is a name, but not of a set.
     """
+    if isinstance(value, list | tuple):
+        names: list[object] = []
+        for one in value:
+            names.extend(sets.get(one, (one,)) if isinstance(one, str) else (one,))
+        return tuple(names)
     if not isinstance(value, str):
         return value
     if value not in sets:

@@ -121,6 +121,10 @@ def test_a_set_of_inputs_goes_by_its_name(name: str, message: str) -> None:
     assert GruPolicy(inputs="situation").identity() == listed.identity()
     with pytest.raises(ConfigError, match=message):
         GruPolicy(inputs=name)
+    more = GruPolicy(inputs=("situation", "leader_jerk"))
+    assert more.inputs == (*INPUT_SETS["situation"], "leader_jerk")
+    with pytest.raises(ConfigError, match="stands twice"):
+        GruPolicy(inputs=("situation", "gap"))
 
 
 @pytest.mark.parametrize("component", [GruPolicy, LstmPolicy])

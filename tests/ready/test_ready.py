@@ -70,6 +70,32 @@ def test_each_card_says_what_a_user_must_know(name: str) -> None:
     assert "Valid range" in text
 
 
+def test_stochastic_drivers_vary_with_the_seed_and_are_calibrated() -> None:
+    name = "i80-idm-stochastic"
+    agent = cfx.load(f"cfx://{name}").policy
+    assert agent.is_stochastic
+    frames = torch.full((2, agent.windows.length), 10.0, dtype=torch.float64)
+    history = History(frames, frames * 0, frames, frames * 0, frames * 2)
+
+    def chosen(seed: int | None) -> torch.Tensor:
+        generator = None if seed is None else torch.Generator().manual_seed(seed)
+        state = agent.begin(torch.zeros(2, dtype=torch.int64))
+        return agent.act(history, state, generator)[0]
+
+    assert torch.equal(chosen(1), chosen(1))
+    assert not torch.equal(chosen(1), chosen(2))
+    assert not torch.equal(chosen(1)[0], chosen(1)[1])
+    centre = chosen(None)
+    assert torch.equal(centre[0], centre[1])
+    rows = ready.card_of(name)["distributions"]
+    assert [row["horizon_s"] for row in rows] == [0.5, 1.0, 2.0, 3.0, 5.0, 10.0]
+    for row in rows:
+        assert 0.85 <= row["coverage"] <= 0.95
+    text = (ready.FOLDER / name / "CARD.md").read_text(encoding="utf-8")
+    assert "Sampled forecasts" in text
+    assert "residual_scale" not in text
+
+
 def test_what_was_loaded_is_shown_in_two_lines() -> None:
     lines = repr(cfx.load("cfx://i80-idm")).splitlines()
     assert len(lines) == 2
