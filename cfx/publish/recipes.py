@@ -42,6 +42,7 @@ RECIPES = {
         (
             "experiment=stochastic",
             "model=idm",
+            "policy.inputs=motion",
             "learner.drivers=32",
             "learner.cold_start_fraction=1.0",
             "protocol.base=population",
@@ -52,10 +53,9 @@ RECIPES = {
     ),
     "i80-idm-history": Recipe(
         (
-            "experiment=with_history",
+            "experiment=conditioned",
             "model=idm",
-            "policy.driver_features=all",
-            "protocol.base=population",
+            "policy.inputs=motion",
         ),
         "Intelligent Driver Model for drivers with history: it observes a driver, then drives as"
         " they do.",
