@@ -69,7 +69,7 @@ class PolicySettings(Settings):
         " relative_speed, time_headway, leader_acceleration, follower_acceleration,"
         " inverse_time_to_collision, leader_jerk and follower_jerk; or the name of a set, also in a"
         " list, as in [situation, leader_jerk]: speeds, the paper's two; situation, the default;"
-        " motion, the situation and both jerks",
+        " motion, the situation and both jerks, for smooth models",
     )
     summary: Summary = Field(
         "frames",
