@@ -85,7 +85,8 @@ class FinishedPolicy:
         if policy.base is not None:
             start = policy.base.to(fixed.dtype)
             if policy.context_rule.driver_specific:
-                base = policy.base_of(fixed)
+                # Of the model alone: constant parameters of a driver are a baseline, `shrunk`.
+                base = policy.base_of(fixed)[:, : fixed.shape[1]]
         population = None
         if policy.population is not None:
             population = policy.population.to(fixed.dtype)

@@ -124,6 +124,17 @@ def test_it_starts_from_drivers_own_parameters_where_it_learned_so(
     assert "rmse_speed/shrunk" not in transferred(unseen, tmp_path / "unseen").metrics
 
 
+def test_own_parameters_are_the_models_alone_where_the_policy_has_a_residual(
+    tmp_path: Path,
+) -> None:
+    residual = ["protocol.shrinkage=0.3", "learner.head=residual"]
+    job = trained(tmp_path / "job", *ROLLOUT, *residual)
+    result = transferred(job, tmp_path / "result")
+    metrics = result.metrics
+    assert metrics["rmse_speed/shrunk"] != metrics["rmse_speed/fixed"]
+    assert metrics["rmse_speed/policy"] > 0.0
+
+
 def test_model_policy_and_windows_are_those_it_was_trained_with(
     unseen: Path, tmp_path: Path
 ) -> None:
