@@ -145,7 +145,7 @@ def distributions_table(forecasts: Forecasts) -> Table:
     """
     assert forecasts.distributions is not None
     share = f"{100 * LEVEL:.0f} %"
-    title = f"Sampled forecasts: CRPS of speed (m/s), coverage of the central {share}, after"
+    title = f"Sampled forecasts: CRPS of speed (m/s), coverage of {share}, after"
     table = Table(title=title, title_justify="left")
     table.add_column("method")
     for horizon in forecasts.horizons:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated, Any, ClassVar
 
+import numpy as np
 import pandas as pd
 import torch
 from pydantic import AfterValidator, Field
@@ -164,7 +165,7 @@ class Forecast(FoldsOrFinished):
             )
         steps = round(s.horizons[-1] / dt)
         measured, recorded = measured_paths(batch, origins, steps)
-        log.info("Forecasts from %d origins of %d drivers", len(origins), len(set(test.drivers)))
+        self._say_who_is_forecast(test, origins)
         paths = self._paths(test, origins, steps)
         about = (test.pairs, origins)
         table = forecast_errors(*about, paths, measured, recorded, s.horizons, dt)
@@ -174,6 +175,29 @@ class Forecast(FoldsOrFinished):
             paths |= self._sampled(test, origins, steps)
             distributions = score_distributions(*about, paths, happened, s.horizons, dt)
         return Forecasts(table, s.horizons, s.leader, test.context.seed, distributions)
+
+    def _say_who_is_forecast(self, test: HeldOut, origins: Origins) -> None:
+        """Logs how many drivers there are forecasts of, and horizons that few or none reach."""
+        drivers = np.asarray(test.drivers, dtype=object)
+        left = test.batch.lengths[origins.pair] - 1 - origins.frame
+        known = len(set(drivers))
+        counts = {}
+        for horizon in self.settings.horizons:
+            reached = left >= round(horizon / test.batch.dt)
+            counts[horizon] = len(set(drivers[origins.pair[reached].cpu().numpy()]))
+        log.info(
+            "Forecasts from %d origins of %d drivers",
+            len(origins),
+            counts[self.settings.horizons[0]],
+        )
+        short = [f"{horizon:g} s ({count})" for horizon, count in counts.items() if count < known]
+        if short:
+            log.info(
+                "The recordings of some of the %d drivers end before these horizons (drivers that"
+                " count): %s. A smaller split or protocol.min_history leaves more to forecast",
+                known,
+                ", ".join(short),
+            )
 
     def _from_history(self, test: HeldOut) -> HeldOut:
         """Returns the test with driver-specific parameters of the history before first origins."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 from pathlib import Path
 
 import pandas as pd
@@ -111,6 +112,18 @@ def test_what_cannot_be_is_refused(
     monkeypatch.chdir(str(tmp_path))
     with pytest.raises(CfxError, match=message):
         cfx.run([*FORECAST, "policy=fixed", *changes])
+
+
+def test_horizons_that_few_recordings_reach_are_said(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with caplog.at_level(logging.INFO):
+        result = cfx.run([*FORECAST, "policy=fixed", "protocol.horizons=[0.5,200]"])
+    drivers = result.pairs["driver"].nunique()
+    assert f"origins of {drivers} drivers" in caplog.text
+    assert "(drivers that count): 200 s (0)." in caplog.text
+    assert "forecast/rmse_speed_200s/policy" not in result.metrics
 
 
 def test_sampled_paths_are_scored_as_distributions(
