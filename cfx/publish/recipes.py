@@ -42,7 +42,6 @@ RECIPES = {
         (
             "experiment=stochastic",
             "model=idm",
-            "policy.inputs=motion",
             "learner.drivers=32",
             "learner.cold_start_fraction=1.0",
             "protocol.base=population",
@@ -52,11 +51,7 @@ RECIPES = {
         " parameters and noise, with a seed.",
     ),
     "i80-idm-history": Recipe(
-        (
-            "experiment=conditioned",
-            "model=idm",
-            "policy.inputs=motion",
-        ),
+        ("experiment=conditioned", "model=idm"),
         "Intelligent Driver Model for drivers with history: it observes a driver, then drives as"
         " they do.",
     ),
