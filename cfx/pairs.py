@@ -316,6 +316,18 @@ class PairBatch:
         """Bumper-to-bumper gap `(P, T)`, m."""
         return self.leader_position - self.leader_length[:, None] - self.follower_position
 
+    def to(self, device: torch.device | str) -> PairBatch:
+        """Returns the same pairs on a device."""
+        import torch
+
+        if self.lengths.device == torch.device(device):
+            return self
+        moved: dict[str, Any] = {}
+        for one in fields(self):
+            if one.name != "dt":
+                moved[one.name] = getattr(self, one.name).to(device)
+        return replace(self, **moved)
+
     def trimmed(self) -> PairBatch:
         """Returns the same pairs without the frames that none of them has."""
         frames = int(self.lengths.max())

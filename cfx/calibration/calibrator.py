@@ -191,6 +191,7 @@ class Calibrator:
         Returns:
             `(P, n)`, SI units.
         """
+        asked, batch = batch.lengths.device, self._where_it_is_fast(batch)
         device = batch.lengths.device
         last = last.to(device)
         keys = []
@@ -206,7 +207,7 @@ class Calibrator:
 
         title = "Driver-specific parameters"
         results = self._cached(title, keys, [1] * len(pairs), shard, part=_PART)
-        return _stacked(results, device)
+        return _stacked(results, asked)
 
     def population(self, pairs: PairSet, batch: PairBatch, last: Tensor, members: Tensor) -> Tensor:
         """Finds one parameter set for each of K groups of pairs: the pooled parameters.
@@ -222,6 +223,7 @@ class Calibrator:
         Returns:
             `(K, n)`, SI units.
         """
+        asked, batch = batch.lengths.device, self._where_it_is_fast(batch)
         device = batch.lengths.device
         members, last = members.cpu(), last.to(device)
         keys = []
@@ -241,7 +243,7 @@ class Calibrator:
 
         # Not cut into parts: groups share candidates, and what is simulated for one serves all.
         results = self._cached("Pooled parameters", keys, [1] * len(members), shard)
-        return _stacked(results, device)
+        return _stacked(results, asked)
 
     def labels(self, pairs: PairSet, batch: PairBatch, windows: Windows, fixed: Tensor) -> Labels:
         """Finds the parameters of each window; ties go to the driver-specific parameters.
@@ -252,7 +254,9 @@ class Calibrator:
             windows: W windows of these pairs.
             fixed: `(P, n)`, SI units: the first guess in each window, before the model's defaults.
         """
+        asked, batch = batch.lengths.device, self._where_it_is_fast(batch)
         device = batch.lengths.device
+        fixed = fixed.to(device)
         counts = torch.bincount(windows.pair, minlength=len(pairs))
         tolerance = self.tie_tolerance(windows.settings)
         description = {**windows.settings.model_dump(), "tie_tolerance": tolerance}
@@ -296,7 +300,7 @@ class Calibrator:
         joined = {}
         for name in results[0]:
             parts = np.concatenate([entry[name] for entry in results])
-            joined[name] = torch.as_tensor(parts).to(device)
+            joined[name] = torch.as_tensor(parts).to(asked)
         return Labels(windows=windows, **joined)
 
     @torch.no_grad()
@@ -340,6 +344,20 @@ class Calibrator:
         """Returns the losses of pairs `(S,)` from their frame 0 to a last one `(S,)`."""
         first = torch.zeros_like(pair)
         return SegmentLosses.of_segments(self.simulator, self.objective, batch, pair, first, last)
+
+    def _where_it_is_fast(self, batch: PairBatch) -> PairBatch:
+        """Returns the pairs on the CPU if losses come from a compiled kernel there.
+
+        On a GPU each step of a trajectory is a launch of its own: an H200 took twenty times as long
+        for I-80's drivers as the kernel on one core.
+        """
+        if batch.lengths.device.type == "cpu":
+            return batch
+        one = batch[:1].to("cpu")
+        pair = torch.zeros(1, dtype=torch.int64)
+        if self._segments(one, pair, pair + 1).accumulates:
+            return batch.to("cpu")
+        return batch
 
     def _has_kernel(self, batch: PairBatch) -> bool:
         """Says whether losses come from a compiled kernel here; asked where others solve them."""
