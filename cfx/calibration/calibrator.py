@@ -349,7 +349,7 @@ class Calibrator:
         """Returns the pairs on the CPU if losses come from a compiled kernel there.
 
         On a GPU each step of a trajectory is a launch of its own: an H200 took twenty times as long
-        for I-80's drivers as the kernel on one core.
+        for I-80's drivers as the kernel on 16 cores.
         """
         if batch.lengths.device.type == "cpu":
             return batch
