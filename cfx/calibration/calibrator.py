@@ -353,16 +353,16 @@ class Calibrator:
         """
         if batch.lengths.device.type == "cpu":
             return batch
-        one = batch[:1].to("cpu")
-        pair = torch.zeros(1, dtype=torch.int64)
-        if self._segments(one, pair, pair + 1).accumulates:
+        if self._accumulates(batch[:1].to("cpu")):
             return batch.to("cpu")
         return batch
 
     def _has_kernel(self, batch: PairBatch) -> bool:
         """Says whether losses come from a compiled kernel here; asked where others solve them."""
-        if not self.engine.distributes:
-            return False
+        return self.engine.distributes and self._accumulates(batch)
+
+    def _accumulates(self, batch: PairBatch) -> bool:
+        """Says whether losses come from a compiled kernel where these pairs are."""
         pair = torch.zeros(1, dtype=torch.int64, device=batch.lengths.device)
         return self._segments(batch, pair, pair + 1).accumulates
 
