@@ -71,7 +71,7 @@ def write_export(folder: Path) -> Any:
 
 
 def transfer(folder: Path) -> Any:
-    return Transfer(TransferSettings(run=folder)).policy
+    return Transfer(TransferSettings(run=folder)).finished.agent
 
 
 def drive(folder: Path) -> Any:
