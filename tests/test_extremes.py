@@ -65,8 +65,20 @@ RECORDINGS = {
 }
 
 
-@pytest.mark.parametrize("model", ["krauss", "w99", "idm"])
-@pytest.mark.parametrize("recording", RECORDINGS)
+# An hour takes a model of many parameters twenty seconds: one model shows it, the others are slow tests.
+CASES = [
+    pytest.param(
+        recording,
+        model,
+        marks=[pytest.mark.slow] if recording == "an hour" and model != "idm" else [],
+        id=f"{recording}-{model}",
+    )
+    for recording in RECORDINGS
+    for model in ("krauss", "w99", "idm")
+]
+
+
+@pytest.mark.parametrize(("recording", "model"), CASES)
 def test_the_edges_of_what_is_recorded(
     recording: str, model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
