@@ -322,11 +322,7 @@ class PairBatch:
 
         if self.lengths.device == torch.device(device):
             return self
-        moved: dict[str, Any] = {}
-        for one in fields(self):
-            if one.name != "dt":
-                moved[one.name] = getattr(self, one.name).to(device)
-        return replace(self, **moved)
+        return self._changed(lambda values: values.to(device))
 
     def trimmed(self) -> PairBatch:
         """Returns the same pairs without the frames that none of them has."""
@@ -338,12 +334,17 @@ class PairBatch:
 
     def __getitem__(self, index: Any) -> PairBatch:
         """Selects pairs (a slice, an index tensor or a boolean mask over P); time stays whole."""
-        chosen: dict[str, Any] = {}
+        chosen = self._changed(lambda values: _selected(values, index))
+        scratch.release()
+        return chosen
+
+    def _changed(self, change: Callable[[Tensor], Tensor]) -> PairBatch:
+        """Returns these pairs with each of their tensors changed."""
+        changed: dict[str, Any] = {}
         for one in fields(self):
             if one.name != "dt":
-                chosen[one.name] = _selected(getattr(self, one.name), index)
-        scratch.release()
-        return replace(self, **chosen)
+                changed[one.name] = change(getattr(self, one.name))
+        return replace(self, **changed)
 
 
 def _selected(values: Tensor, index: Any) -> Tensor:
