@@ -233,14 +233,14 @@ def test_the_model_in_the_guide_can_be_simulated() -> None:
 
 
 def test_the_table_of_kinds_names_what_is_there() -> None:
-    import cfx.testing
+    import cfx.contracts
 
     text = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (\w+) \| `cfx\.(\w+)` \| .* \| `(\w+)` \|$", text, flags=re.MULTILINE)
     assert {kind for kind, _, _ in rows} == set(registry.KINDS)
     for kind, base, suite in rows:
         assert getattr(cfx, base).kind == kind
-        assert hasattr(getattr(cfx.testing, suite), kind)
+        assert hasattr(getattr(cfx.contracts, suite), kind)
     assert f"`cfx.API_VERSION` ({cfx.API_VERSION})" in text
     (declared,) = re.findall(
         r'^\[project\.entry-points\."cfx\.api"\]\n(\d+) = ', text, flags=re.MULTILINE

@@ -43,10 +43,10 @@ FLOORS = (
     ("policies",),
     ("agents",),
     ("learners",),
-    ("evaluation", "smoke_checks"),
+    ("evaluation",),
     ("protocols",),
     ("tracking", "plots"),
-    ("config", "nodes", "ui", "testing", "report"),
+    ("config", "nodes", "ui", "contracts", "report"),
     (
         "job",
         "hydra_source",

@@ -21,7 +21,7 @@ PLUGINS = sorted(path.parent for path in (ROOT / "plugins").glob("*/pyproject.to
 PUBLIC_MODULES = {"cfx", "cfx.errors"} | {
     kind.base.partition(":")[0] for kind in registry.KINDS.values()
 }
-"""What a plugin may import from: the top level, errors and base classes; `cfx.testing` as well."""
+"""What a plugin may import from: the top level, errors and base classes; `cfx.contracts` as well."""
 
 BUILD = """
 import os, sys
@@ -139,8 +139,10 @@ def private_uses(path: Path) -> list[str]:
 def is_public(module: str, name: str) -> bool:
     """Says whether a plugin may use `name` of `module`; "" is the module itself."""
     if module == "cfx":
-        return name in {"", "testing", *cfx.__all__}
-    known = module in PUBLIC_MODULES or module == "cfx.testing" or module.startswith("cfx.testing.")
+        return name in {"", "contracts", *cfx.__all__}
+    known = (
+        module in PUBLIC_MODULES or module == "cfx.contracts" or module.startswith("cfx.contracts.")
+    )
     return known and not any(part.startswith("_") for part in (*module.split("."), name))
 
 
@@ -157,7 +159,7 @@ def test_the_check_of_imports_sees_what_is_private(tmp_path: Path) -> None:
     path.write_text(
         "import cfx\nimport cfx.registry\nfrom cfx import nodes, Settings\n"
         "from cfx.models.guarded import root\nfrom cfx.models.base import DrivingModel, _x\n"
-        "from cfx.testing.models import ModelContract\ncfx.job\ncfx.get\n"
+        "from cfx.contracts.models import ModelContract\ncfx.job\ncfx.get\n"
     )
     assert [text.partition(": ")[2] for text in private_uses(path)] == [
         "cfx.registry",

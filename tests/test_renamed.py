@@ -16,11 +16,11 @@ from omegaconf import OmegaConf
 import cfx
 from cfx import application, cli, hydra_source, registry, renamed
 from cfx.config import JobConfig
+from cfx.contracts.optimizers import Problems, bowl
 from cfx.errors import ConfigError
 from cfx.job.output import Output, write_metrics
 from cfx.models.krauss import Krauss
 from cfx.policies.gru import GruPolicy
-from cfx.testing.checks.optimizers import Problems, bowl
 
 Warnings = Callable[[], list[str]]
 

@@ -47,9 +47,7 @@ EXACT: dict[str, str] = {
     ),
     r"\bStudy\b": "ProtocolContext",
     r"\bOutcome\b": "ProtocolResult, JobStatus",
-    r"\b(?:cfx[./])?(?:probes|mistakes)\.py\b|cfx\.(?:probes|mistakes)\b": (
-        "smoke_checks.py, user_errors.py"
-    ),
+    r"\b(?:cfx[./])?(?:probes|mistakes)\.py\b|cfx\.(?:probes|mistakes)\b": ("user_errors.py"),
     r"(?<![\w/.])later/": "steady/",
     r"(?<![\w/.])whole/": "full_trajectory/",
     r"\bfiles\.whole\(|\bimport whole\b|\bwith whole\(": "atomic_write(",

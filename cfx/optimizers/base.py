@@ -99,8 +99,8 @@ class Optimizer(Component):
     into chunks that respect the memory bound, calls `solve` for each, checks what comes back and
     reduces it to a `Solution`. A subclass implements `solve`, `evaluations` and
     `bytes_per_problem`. It keeps no state between calls. The result of a problem must not depend on
-    which other problems stand beside it, beyond rounding. `cfx.testing.OptimizerContract` tests all
-    this.
+    which other problems stand beside it, beyond rounding.
+    `cfx.contracts.OptimizerContract` tests all this.
     """
 
     kind = "optimizer"

@@ -146,7 +146,7 @@ def _shadow(entry: registry.Entry) -> str:
 
 def _broken_contract(entry: registry.Entry, component: object) -> str:
     """Returns the first statement of the contract that does not hold; "" if all hold."""
-    from cfx.testing import contract_for, violations
+    from cfx.contracts import contract_for, violations
 
     found = list(violations(contract_for(entry.kind), component))
     if not found:
@@ -155,7 +155,7 @@ def _broken_contract(entry: registry.Entry, component: object) -> str:
     text = f"{entry} breaks its contract: {' '.join(sentence.split())} ({check})"
     if len(found) > 1:
         text += f"; and {len(found) - 1} more"
-    return f"{text}; its own tests with cfx.testing's suite show all of it"
+    return f"{text}; its own tests with cfx.contracts's suite show all of it"
 
 
 def _not_tried(entry: registry.Entry, required: list[str]) -> str:

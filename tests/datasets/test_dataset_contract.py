@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from cfx.contracts import DatasetContract
 from cfx.datasets.base import Dataset
 from cfx.datasets.ngsim import NgsimDataset
 from cfx.datasets.synthetic import SyntheticDataset
 from cfx.datasets.tidy import TidyDataset, write_tidy
-from cfx.testing.datasets import DatasetContract
 
 
 class TestSynthetic(DatasetContract):

@@ -8,11 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from cfx.contracts import DatasetContract
 from cfx.datasets.describe import describe
 from cfx.datasets.highd import HighdDataset
 from cfx.errors import DataError
 from cfx.pairs import SIGNALS
-from cfx.testing.datasets import DatasetContract
 from tests.datasets.layouts import made_pairs, write_highd
 
 

@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 from scipy.io import savemat
 
+from cfx.contracts import DatasetContract
 from cfx.datasets.base import Dataset
 from cfx.datasets.describe import describe
 from cfx.datasets.followernet import FollowernetDataset
@@ -22,7 +23,6 @@ from cfx.datasets.openacc import OpenaccDataset
 from cfx.datasets.waymo_pairs import WaymoPairsDataset
 from cfx.errors import DataError
 from cfx.pairs import PairSet
-from cfx.testing.datasets import DatasetContract
 from tests.datasets.layouts import events_of, made_pairs, write_lyft, write_openacc, write_waymo
 
 

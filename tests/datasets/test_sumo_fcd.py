@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cfx.contracts import DatasetContract
 from cfx.datasets.describe import describe
 from cfx.datasets.sumo_fcd import SumoFcdDataset
 from cfx.errors import DataError
-from cfx.testing.datasets import DatasetContract
 from tests.datasets.layouts import made_pairs, write_fcd
 
 

@@ -8,11 +8,11 @@ import pytest
 
 import cfx
 from cfx import registry
+from cfx.contracts import EngineContract
 from cfx.engine.base import Engine
 from cfx.engine.dask.engine import DaskEngine
 from cfx.engine.local import LocalEngine
 from cfx.simulation import threads
-from cfx.testing import EngineContract
 from tests.engine.clusters import running_cluster
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from cfx.contracts import LearnerContract
 from cfx.learners.base import Learner
 from cfx.learners.imitation import ImitationLearner
 from cfx.learners.rollout import RolloutLearner
-from cfx.testing import LearnerContract
 
 # Kept for all tests, which then share a training.
 IMITATION = {

@@ -7,8 +7,8 @@ from typing import cast
 import pytest
 
 from cfx import registry
+from cfx.contracts import MetricContract
 from cfx.metrics.base import Metric
-from cfx.testing import MetricContract
 
 
 class TestMetrics(MetricContract):

@@ -4,11 +4,11 @@ import pytest
 import torch
 
 import cfx
+from cfx.contracts import ModelContract
 from cfx.models.base import Leader
 from cfx.models.direct import Direct
 from cfx.simulation.rollout import simulate
 from cfx.simulation.trajectory import Start
-from cfx.testing.models import ModelContract
 
 
 class TestDirect(ModelContract):

@@ -9,9 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from cfx.contracts import ModelContract
+from cfx.contracts.models import Equilibrium
 from cfx.models.base import Follower, Leader
 from cfx.models.krauss import Krauss
-from cfx.testing.models import Equilibrium, ModelContract
 
 
 def number(value: float) -> Tensor:

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from cfx.contracts import models
 from cfx.errors import ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.idm import IDM
@@ -20,7 +21,6 @@ from cfx.parameters import Parameter, ParameterSpace
 from cfx.simulation.kernel.run import model_key
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.trajectory import Start
-from cfx.testing.checks import models
 
 DT = 0.1
 

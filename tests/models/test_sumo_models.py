@@ -5,13 +5,13 @@ import torch
 
 from cfx import registry
 from cfx.component import validate
+from cfx.contracts import ModelContract
 from cfx.errors import ConfigError, ParameterError
 from cfx.models.idm_sumo import IdmSumo
 from cfx.models.krauss import Krauss
 from cfx.models.krauss_sumo import KraussSumo
 from cfx.models.sumo_vtype import SumoVType, SumoVTypeSettings
 from cfx.models.w99 import W99
-from cfx.testing.models import ModelContract
 
 TAU = {"tau": {"low": 0.5, "high": 3.0, "default": 1.0}}
 

@@ -4,11 +4,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from cfx.contracts import ModelContract
 from cfx.models.base import Follower, Leader
 from cfx.models.w74 import W74
 from cfx.simulation.rollout import simulate
 from cfx.simulation.trajectory import Start
-from cfx.testing.models import ModelContract
 
 L, V = 5.0, 10.0
 AX, ABX = L + 2.0, L + 2.0 + 3.5 * V**0.5

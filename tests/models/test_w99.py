@@ -3,9 +3,9 @@ from __future__ import annotations
 import pytest
 import torch
 
+from cfx.contracts import ModelContract
 from cfx.models.base import Follower, Leader
 from cfx.models.w99 import W99
-from cfx.testing.models import ModelContract
 
 
 class TestSumo(ModelContract):

@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cfx import FrameValues, Objective, registry
+from cfx.contracts import ObjectiveContract
 from cfx.errors import ConfigError
 from cfx.objectives.huber import SpeedHuber
 from cfx.objectives.mixed import Mixed
 from cfx.objectives.rmse import GapRmse, SpeedRmse
 from cfx.objectives.theil import TheilU
-from cfx.testing import ObjectiveContract
 
 SHIPPED = {
     "speed_rmse": SpeedRmse(),

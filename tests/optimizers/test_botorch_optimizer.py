@@ -4,11 +4,12 @@ import pytest
 import torch
 from botorch.models import SingleTaskGP
 
+from cfx.contracts import OptimizerContract
+from cfx.contracts.optimizers import Function, Problems, bowl, distance
 from cfx.errors import ConfigError
 from cfx.optimizers import botorch
 from cfx.optimizers.botorch import BotorchOptimizer
 from cfx.optimizers.random import RandomSearch
-from cfx.testing.optimizers import Function, OptimizerContract, Problems, bowl, distance
 
 
 class TestBotorchOptimizer(OptimizerContract):

@@ -6,10 +6,11 @@ from pydantic import ValidationError
 from scipy.optimize import minimize
 from torch import Tensor
 
+from cfx.contracts import OptimizerContract
+from cfx.contracts.optimizers import Problems, bowl, distance
 from cfx.errors import ConfigError
 from cfx.optimizers.gradient import GradientSearch, _stages
 from cfx.optimizers.random import RandomSearch
-from cfx.testing.optimizers import OptimizerContract, Problems, bowl, distance
 
 
 class TestGradientSearch(OptimizerContract):

@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from cfx.contracts.optimizers import Problems, distance
 from cfx.errors import PluginError
 from cfx.optimizers.base import TIE_ABSOLUTE, CandidateLosses, Optimizer
-from cfx.testing.optimizers import Problems, distance
 
 
 class Listed(Optimizer):

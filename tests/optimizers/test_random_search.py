@@ -3,9 +3,10 @@ from __future__ import annotations
 import pytest
 import torch
 
+from cfx.contracts import OptimizerContract
+from cfx.contracts.optimizers import Problems, bowl, distance
 from cfx.errors import ConfigError
 from cfx.optimizers.random import RandomSearch
-from cfx.testing.optimizers import OptimizerContract, Problems, bowl, distance
 
 
 class TestRandomSearch(OptimizerContract):

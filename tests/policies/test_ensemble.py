@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from cfx.agents.heads.offset import NONE
+from cfx.contracts import policies as checks
 from cfx.policies.base import ConstantNetwork, Policy, PolicyNetwork
 from cfx.policies.ensemble import Ensemble
 from cfx.policies.gru import GruPolicy
-from cfx.testing.checks import policies as checks
 
 
 class Three(GruPolicy):

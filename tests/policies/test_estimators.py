@@ -20,6 +20,7 @@ from cfx.agents.scaler import Scaler
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.windows import WindowSettings
+from cfx.contracts import PolicyContract
 from cfx.errors import ConfigError
 from cfx.evaluation.closed_loop import simulate_closed_loop
 from cfx.evaluation.forecast_paths import Origins, simulate_from_origins
@@ -37,7 +38,6 @@ from cfx.policies.recalibrate import RecalibratePolicy
 from cfx.policies.ukf import UkfPolicy, unscented_update
 from cfx.progress import Task
 from cfx.simulation.rollout import MemoryStepper
-from cfx.testing.policies import PolicyContract
 from tests.drives import wavy_pairs
 
 WINDOWS = WindowSettings()

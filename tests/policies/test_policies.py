@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from cfx.contracts import PolicyContract
 from cfx.errors import ConfigError
 from cfx.policies.base import Policy
 from cfx.policies.default import DefaultPolicy
@@ -13,7 +14,6 @@ from cfx.policies.fixed import FixedPolicy
 from cfx.policies.gru import GruPolicy
 from cfx.policies.lstm import LstmPolicy
 from cfx.policies.recurrent import RecurrentNetwork
-from cfx.testing.policies import PolicyContract
 
 
 class TestDefault(PolicyContract):

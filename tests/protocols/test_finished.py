@@ -13,6 +13,7 @@ import yaml
 
 import cfx
 from cfx.agents import checkpoint
+from cfx.contracts import ProtocolContract
 from cfx.errors import CfxError, DataError
 from cfx.evaluation.forecast_paths import Origins, simulate_from_origins
 from cfx.pairs import PairBatch
@@ -20,7 +21,6 @@ from cfx.protocols.base import Protocol
 from cfx.protocols.forecast import Forecast
 from cfx.protocols.traffic import TrafficProtocol
 from cfx.simulation.rollout import MemoryStepper
-from cfx.testing import ProtocolContract
 from tests.protocols.test_transfer import HERE, ROLLOUT, elsewhere, trained
 
 FORECAST = [

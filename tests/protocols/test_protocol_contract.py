@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
+from cfx.contracts import ProtocolContract
 from cfx.protocols.across_drivers import AcrossDrivers
 from cfx.protocols.base import Protocol
 from cfx.protocols.forecast import Forecast
 from cfx.protocols.traffic import TrafficProtocol
 from cfx.protocols.within_driver import WithinDriver
-from cfx.testing import ProtocolContract
 
 # Kept for all tests, which then share a run.
 WITHIN = {networks: WithinDriver(networks=networks) for networks in ("pair", "all")}

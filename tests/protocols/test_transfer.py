@@ -14,6 +14,7 @@ import yaml
 import cfx
 from cfx.agents import checkpoint
 from cfx.agents.placement import ALL
+from cfx.contracts import ProtocolContract
 from cfx.datasets.synthetic import SyntheticDataset
 from cfx.datasets.tidy import write_tidy
 from cfx.errors import CfxError, DataError, TrackingError
@@ -22,7 +23,6 @@ from cfx.pairs import PairBatch, PairSet
 from cfx.protocols.base import Protocol
 from cfx.protocols.transfer import Transfer
 from cfx.simulation.rollout import MemoryStepper
-from cfx.testing import ProtocolContract
 
 QUICK = [
     "debug=quick",

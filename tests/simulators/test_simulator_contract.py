@@ -12,6 +12,7 @@ import torch
 import cfx
 from cfx import registry
 from cfx.config import JobConfig
+from cfx.contracts import SimulatorContract
 from cfx.errors import ConfigError, PluginError
 from cfx.hydra_source import composed, plain
 from cfx.job import run_job
@@ -21,7 +22,6 @@ from cfx.simulation.rollout import MemoryStepper
 from cfx.simulators.base import Simulator
 from cfx.simulators.memory import MemorySimulator
 from cfx.simulators.sumo.simulator import SumoSimulator
-from cfx.testing import SimulatorContract
 
 QUICK = [
     "model=krauss",

@@ -11,7 +11,8 @@ from scipy.optimize import brentq
 from torch import Tensor
 
 from cfx import Leader, Start, simulate
-from cfx.testing.models import Equilibrium, ModelContract
+from cfx.contracts import ModelContract
+from cfx.contracts.models import Equilibrium
 from cfx_classics.gipps import Gipps
 
 from .steps import next_speed, number

@@ -12,8 +12,9 @@ from torch import Tensor
 
 import cfx
 from cfx import DrivingModel, Follower, Leader, Start, simulate
+from cfx.contracts import ModelContract
+from cfx.contracts.models import Equilibrium
 from cfx.errors import ConfigError
-from cfx.testing.models import Equilibrium, ModelContract
 from cfx_classics.gipps import Gipps
 from cfx_classics.gipps_delay import GippsDelay
 

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from cfx import Leader, Start, simulate
-from cfx.testing.models import Equilibrium, ModelContract
+from cfx.contracts import ModelContract
+from cfx.contracts.models import Equilibrium
 from cfx_classics.newell import Newell
 
 from .steps import LENGTH, gain, next_speed, number

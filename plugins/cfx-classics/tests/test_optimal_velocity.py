@@ -13,7 +13,8 @@ from torch import Tensor
 
 import cfx
 from cfx import DrivingModel, Leader, Start, simulate
-from cfx.testing.models import Equilibrium, ModelContract
+from cfx.contracts import ModelContract
+from cfx.contracts.models import Equilibrium
 from cfx_classics.fvdm import FVDM
 from cfx_classics.ovm import OVM
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 import cfx
+from cfx.contracts import OptimizerContract, Problems
 from cfx.errors import ConfigError
-from cfx.testing import OptimizerContract, Problems
 from cfx_cma.evolution import CmaOptimizer
 
 

@@ -18,7 +18,8 @@ from torch import Tensor
 
 import cfx
 from cfx import Follower, Leader, Start, simulate
-from cfx.testing.models import Equilibrium, ModelContract
+from cfx.contracts import ModelContract
+from cfx.contracts.models import Equilibrium
 from cfx_idm.iidm import IIDM
 
 from .rollouts import order

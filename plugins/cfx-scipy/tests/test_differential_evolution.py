@@ -8,8 +8,8 @@ import torch
 from scipy.optimize import differential_evolution
 
 import cfx
+from cfx.contracts import OptimizerContract, Problems
 from cfx.errors import ConfigError
-from cfx.testing import OptimizerContract, Problems
 from cfx_scipy.differential_evolution import DifferentialEvolution
 
 

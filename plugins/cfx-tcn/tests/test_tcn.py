@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 import cfx
-from cfx.testing import PolicyContract
+from cfx.contracts import PolicyContract
 from cfx_tcn.policy import TcnNetwork, TcnPolicy, TcnSettings
 
 

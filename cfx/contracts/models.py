@@ -1,0 +1,428 @@
+"""The contract of a driving model, statement by statement. Letters as in `cfx.models.base`."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from collections.abc import Callable, Mapping
+
+import torch
+from torch import Tensor
+
+from cfx.contracts.contract import NotApplicable, contract_of
+from cfx.models.base import DrivingModel, Follower, Leader
+from cfx.simulation.rollout import simulate
+from cfx.simulation.trajectory import Start
+
+Equilibrium = Callable[[Tensor, Mapping[str, Tensor]], Tensor]
+"""Gap at which nothing changes, m, of the common speed, m/s, and the parameters."""
+
+DT = 0.1
+LENGTH = 5.0
+DRIVES = 64  # random states and parameter sets of the ordinary kind
+
+_Step = tuple[Follower, Leader, dict[str, Tensor]]
+
+
+_EXTREMES = (
+    (-20, -0.1, 0, 0.01, 1, 30, 1e3),  # gap, m
+    (0, 1e-3, 5, 60),  # speed, m/s
+    (0, 1e-3, 15, 60),  # the leader's
+    (-9, 0, 5),  # the leader's acceleration, m/s2
+    (-9, 0, 3),  # acceleration, m/s2
+)
+
+
+def _ordinary(model: DrivingModel) -> _Step:
+    """Returns states as traffic has them and parameters drawn within the bounds, float64."""
+    draw = torch.Generator().manual_seed(0)
+    unit = torch.rand((DRIVES, len(model.space)), generator=draw, dtype=torch.float64)
+    return (*_states(model, draw), model.space.unpack(model.space.from_unit(unit)))
+
+
+def _extreme(model: DrivingModel) -> _Step:
+    """Returns all combinations of extreme states at 200 corners of the bounds, float64."""
+    states = torch.tensor(list(itertools.product(*_EXTREMES)), dtype=torch.float64)
+    gap, v, v_l, a_l, a = states.unbind(dim=1)
+    corner = torch.randint(
+        0, 2, (200, 1, len(model.space.parameters)), generator=torch.Generator().manual_seed(1)
+    ).bool()
+    p = {}
+    for i, parameter in enumerate(model.space):
+        p[parameter.name] = torch.where(corner[..., i], parameter.high, parameter.low).double()
+    shape = (200, len(gap))
+    position = (-gap - LENGTH).expand(shape)
+    follower = _follower(model, position, v.expand(shape), a.expand(shape))
+    return follower, Leader(torch.zeros_like(gap), v_l, a_l, torch.full_like(gap, LENGTH)), p
+
+
+def every_parameter_says_what_it_is(model: DrivingModel) -> None:
+    for parameter in model.space:
+        for field in ("unit", "meaning", "source"):
+            assert getattr(parameter, field), (
+                f"parameter {parameter.name} has no {field}: the documentation, the config's"
+                " comments and the figures show it"
+            )
+    assert model.reference, (
+        "a model says where its equations come from (set `reference`): who reads a result must"
+        " find them"
+    )
+
+
+def constants_can_be_tuned_and_tuned_parameters_fixed(model: DrivingModel) -> None:
+    constants = [parameter.name for parameter in model.space if not parameter.tuned]
+    everything = _with_tuned(model, dict.fromkeys(constants, True))
+    assert set(everything.space.names) == {parameter.name for parameter in model.space}, (
+        "`model.parameters.NAME.tuned=true` must turn a constant into a tuned parameter; build"
+        " `space` in the base class"
+    )
+    for name in constants:
+        value = model.space.unpack(model.space.defaults()[None])[name]
+        assert value.dim() == 0, (
+            f"constant {name} must reach the step as one number for all followers, for it costs"
+            " no memory so"
+        )
+
+
+def keeps_shape_dtype_and_device(model: DrivingModel) -> None:
+    ordinary = _ordinary(model)
+    for dtype in (torch.float64, torch.float32):
+        follower, leader, p = _to(ordinary, dtype)
+        speed = model.next_speed(follower, leader, p, DT)
+        memory = model.next_memory(follower, leader, p, DT, speed)
+        assert speed.shape == (DRIVES,), (
+            f"next_speed must give (*batch,), got {tuple(speed.shape)}: one speed for each follower"
+        )
+        assert speed.dtype == dtype, (
+            f"{dtype} states must give {dtype} speeds, got {speed.dtype}: a step is no place to"
+            " convert"
+        )
+        assert speed.device == follower.speed.device, (
+            "the speed must stay on the device of the states: a step on a GPU must not wait for a"
+            " copy"
+        )
+        assert memory.shape == (DRIVES, model.memory_size), (
+            "next_memory must give (*batch, memory_size), which the next step is given"
+        )
+        assert model.initial_memory(speed).shape == memory.shape, (
+            "initial_memory must give (*batch, memory_size), which the first step is given"
+        )
+
+
+def is_pure(model: DrivingModel) -> None:
+    follower, leader, p = _ordinary(model)
+    before = [tensor.clone() for tensor in (*follower, *leader, *p.values())]
+    first = model.next_speed(follower, leader, p, DT)
+    after = (*follower, *leader, *p.values())
+    assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True)), (
+        "a step must not change its inputs in place: they are recorded trajectories, or states"
+        " that others read"
+    )
+    assert torch.equal(first, model.next_speed(follower, leader, p, DT)), (
+        "the same state must give the same speed: a step draws no random numbers and keeps no state"
+    )
+
+
+def a_batch_equals_the_loop_over_it(model: DrivingModel) -> None:
+    ordinary = _ordinary(model)
+    follower, leader, p = ordinary
+    together = model.next_speed(follower, leader, p, DT)
+    for k in range(DRIVES):
+        alone = model.next_speed(*_pick(ordinary, k), DT)
+        torch.testing.assert_close(
+            alone,
+            together[k],
+            msg=f"follower {k} moves differently alone than in a batch: results would depend on"
+            " chunks",
+        )
+
+
+def leaders_and_parameters_broadcast(model: DrivingModel) -> None:
+    follower, leader, p = _ordinary(model)
+    wide = Follower(*(x[:, None].expand(DRIVES, 3, *x.shape[1:]) for x in follower))
+    narrow = Leader(*(x[:, None] for x in leader))
+    columns = {name: value[:, None] if value.dim() else value for name, value in p.items()}
+    speed = model.next_speed(wide, narrow, columns, DT)
+    assert speed.shape == (DRIVES, 3), (
+        "leaders (P, 1) and parameters (P, 1) must broadcast over followers (P, q): q candidates"
+        " behind one leader"
+    )
+    one = model.next_speed(follower, leader, p, DT)
+    torch.testing.assert_close(
+        speed,
+        one[:, None].expand(DRIVES, 3),
+        msg="broadcasting changes the numbers: a candidate must move the same beside others as"
+        " alone",
+    )
+
+
+def single_precision_agrees_with_double(model: DrivingModel) -> None:
+    ordinary = _ordinary(model)
+    double = model.next_speed(*ordinary, DT)
+    single = model.next_speed(*_to(ordinary, torch.float32), DT).double()
+    # A state may lie on a threshold, where the last bit decides.
+    share = (double - single).abs().lt(1e-3).double().mean().item()
+    assert share >= 0.95, (
+        f"float32 agrees with float64 to 1 mm/s in {share:.0%} of ordinary states only: something"
+        " cancels, and jobs with dtype=float32 would calibrate noise"
+    )
+
+
+def speeds_are_finite_and_not_negative_at_every_extreme(model: DrivingModel) -> None:
+    extreme = _extreme(model)
+    for dtype in (torch.float64, torch.float32):
+        speed = model.next_speed(*_to(extreme, dtype), DT)
+        wrong = ~(speed.isfinite() & (speed >= 0))
+        assert not bool(wrong.any()), (
+            f"{int(wrong.sum())} of {wrong.numel()} extreme states give a negative or infinite"
+            f" speed in {dtype}, such as "
+            f"{_describe(extreme, wrong)}: optimizers visit every corner of the bounds, and"
+            " rollouts go on after collisions"
+        )
+
+
+def a_bad_neighbour_does_no_harm(model: DrivingModel) -> None:
+    follower, leader, p = _ordinary(model)
+    clean = model.next_speed(follower, leader, p, DT)
+    broken = {
+        name: value.index_fill(0, torch.tensor([0]), torch.nan) if value.dim() else value
+        for name, value in p.items()
+    }
+    speed = model.next_speed(follower, leader, broken, DT)
+    assert torch.equal(speed[1:], clean[1:]), (
+        "NaN parameters of one follower must not reach the others: one diverged candidate would"
+        " spoil all"
+    )
+
+
+def gradients_are_right(model: DrivingModel) -> None:
+    if not model.differentiable:
+        raise NotApplicable("the model does not claim to be differentiable")
+    ordinary = _ordinary(model)
+    follower, leader, p = ordinary
+    names = [name for name, value in p.items() if value.dim()]
+
+    def step(*inputs: Tensor) -> Tensor:
+        states, values = inputs[:5], inputs[5:]
+        moved = Follower(states[0], states[1], states[2], follower.memory)
+        ahead = leader._replace(speed=states[3], acceleration=states[4])
+        return model.next_speed(moved, ahead, p | dict(zip(names, values, strict=True)), DT)
+
+    inputs = (
+        follower.position,
+        follower.speed,
+        follower.acceleration,
+        leader.speed,
+        leader.acceleration,
+        *(p[n] for n in names),
+    )
+    inputs = tuple(x.clone().requires_grad_() for x in inputs)
+    assert torch.autograd.gradcheck(step, inputs, eps=1e-7, atol=1e-4, raise_exception=False), (
+        "analytic and numeric gradients differ: the model claims `differentiable`, and learning"
+        " relies on it"
+    )
+
+
+def gradients_are_finite_at_every_extreme(model: DrivingModel) -> None:
+    if not model.differentiable:
+        raise NotApplicable("the model does not claim to be differentiable")
+    extreme = _extreme(model)
+    follower, leader, p = extreme
+    position, speed, acceleration = (x.clone().requires_grad_() for x in follower[:3])
+    values = {
+        name: value.expand(follower.speed.shape).clone().requires_grad_()
+        for name, value in p.items()
+    }
+    inputs = {"position": position, "speed": speed, "acceleration": acceleration, **values}
+    out = model.next_speed(
+        Follower(position, speed, acceleration, follower.memory), leader, values, DT
+    )
+    gradients = torch.autograd.grad(out.sum(), list(inputs.values()), materialize_grads=True)
+    for name, gradient in zip(inputs, gradients, strict=True):
+        wrong = ~gradient.isfinite()
+        assert not bool(wrong.any()), (
+            f"the gradient with respect to {name} is not finite, for instance at"
+            f" {_describe(extreme, wrong)}: replace the "
+            "argument of a root or a division in the branch that is not taken (see"
+            " cfx.models.guarded)"
+        )
+
+
+def has_a_constant_baseline_as_claimed(model: DrivingModel) -> None:
+    if not model.has_constant_baseline:
+        raise NotApplicable("the model does not claim to follow with constant parameters")
+    follower, leader, p = _ordinary(model)
+    near = model.next_speed(follower, leader, p, DT)
+    far = model.next_speed(
+        follower, leader._replace(position=leader.position + 1e3, speed=leader.speed + 20.0), p, DT
+    )
+    reacts = (near - far).abs().gt(1e-6).double().mean().item()
+    assert reacts >= 0.1, (
+        "the model claims `has_constant_baseline`, but takes notice of its leader in"
+        f" {reacts:.0%} of ordinary states: fixed parameters would"
+        " be no baseline (set `has_constant_baseline = False` for a model whose parameters are"
+        " the control itself)"
+    )
+
+
+def no_rollout_leaves_what_is_finite(model: DrivingModel) -> None:
+    draw = torch.Generator().manual_seed(3)
+    corner = torch.randint(0, 2, (256, len(model.space)), generator=draw).double()
+    leader = _stop_and_go(torch.tensor(25.0, dtype=torch.float64), 6.0)
+    zero = torch.zeros(256, dtype=torch.float64)
+    start = Start(zero - LENGTH - 60 * torch.rand(256, generator=draw).double(), zero + 25.0, zero)
+    out = simulate(model, model.space.from_unit(corner), leader, start, DT)
+    assert bool(out.speed.isfinite().all()), (
+        "a rollout at a corner of the bounds ends in infinity or NaN, and optimizers visit every"
+        " corner"
+    )
+    assert out.speed.max() <= 200.0, (
+        "a rollout at a corner of the bounds reaches absurd speeds: bound the acceleration or the"
+        " speed"
+    )
+
+
+def keeps_its_equilibrium(model: DrivingModel, equilibrium: Equilibrium | None = None) -> None:
+    ordinary = _ordinary(model)
+    if equilibrium is None:
+        raise NotApplicable("the model gives no closed form of its equilibrium gap")
+    follower, leader, p = ordinary
+    gap = equilibrium(leader.speed, p)
+    calm = follower._replace(
+        position=leader.position - leader.length - gap, speed=leader.speed.clone()
+    )
+    calm = calm._replace(acceleration=torch.zeros_like(gap))
+    ahead = leader._replace(acceleration=torch.zeros_like(gap))
+    torch.testing.assert_close(
+        model.next_speed(calm, ahead, p, DT),
+        leader.speed,
+        msg="at the equilibrium gap and equal speeds the speed must stay",
+    )
+
+
+def collision_free_as_claimed(model: DrivingModel, leader_deceleration: float = 4.5) -> None:
+    if not model.collision_free:
+        raise NotApplicable("the model does not claim to be free of collisions")
+    speed = torch.linspace(1, 33, 33, dtype=torch.float64)
+    leader = _stop_and_go(speed, leader_deceleration)
+    for headway in (1.8, 3.0, 6.0):
+        start = Start(-LENGTH - 3.0 - headway * speed, speed, torch.zeros_like(speed))
+        out = simulate(model, None, leader, start, DT)
+        hit = out.collided.any(dim=-1)
+        assert not bool(hit.any()), (
+            "the model claims `collision_free`, but with default parameters it hits a leader"
+            " that brakes at "
+            f"{leader_deceleration} m/s2 from {speed[hit][0].item():g} m/s, starting {headway} s"
+            " and 3 m behind"
+        )
+
+
+def can_be_compiled_as_one_graph(model: DrivingModel) -> None:
+    follower, leader, p = _ordinary(model)
+
+    def step(follower: Follower, leader: Leader, p: dict[str, Tensor]) -> Tensor:
+        return model.next_speed(follower, leader, p, DT)
+
+    # torch gives up after eight recompilations of a function, and to it all these are one.
+    whole = torch.compile(  # type: ignore[call-overload]  # torch's overloads leave isolate_recompiles out
+        step, fullgraph=True, backend="aot_eager", isolate_recompiles=True
+    )
+    with torch.no_grad(), warnings.catch_warnings():
+        # PyTorch's advice to take a newer Python than 3.13.0; it says nothing about the model.
+        warnings.filterwarnings("ignore", "Guards may run slower", RuntimeWarning)
+        try:
+            compiled = whole(follower, leader, p)
+        except Exception as error:  # the compiler's errors have no common base
+            raise AssertionError(
+                "long calibrations run the step compiled as one graph, so Python must not look at"
+                " the values of tensors (write"
+                " torch.where instead of if); the compiler says:"
+                f" {str(error).strip().partition(chr(10))[0]}"
+            ) from error
+        eager = model.next_speed(follower, leader, p, DT)
+    torch.testing.assert_close(
+        compiled,
+        eager,
+        msg="compiling the step changes its numbers: calibrations would find others",
+    )
+
+
+def _with_tuned(model: DrivingModel, tuned: Mapping[str, bool]) -> DrivingModel:
+    options = model.settings.model_dump()
+    for name, value in tuned.items():
+        options["parameters"].setdefault(name, {})["tuned"] = value
+    return type(model)(**options)
+
+
+def _follower(
+    model: DrivingModel, position: Tensor, speed: Tensor, acceleration: Tensor
+) -> Follower:
+    return Follower(position, speed, acceleration, model.initial_memory(speed))
+
+
+def _states(model: DrivingModel, draw: torch.Generator) -> tuple[Follower, Leader]:
+    def uniform(low: float, high: float) -> Tensor:
+        return low + (high - low) * torch.rand(DRIVES, generator=draw, dtype=torch.float64)
+
+    gap, leader_speed = uniform(1, 40), uniform(1, 20)
+    leader = Leader(uniform(100, 200), leader_speed, uniform(-1, 0.9), uniform(4, 6))
+    speed = (leader_speed + uniform(-3, 3)).clamp(min=0.1)
+    return _follower(model, leader.position - leader.length - gap, speed, uniform(-1, 1)), leader
+
+
+def _stop_and_go(speed: Tensor, deceleration: float) -> Leader:
+    """Returns a leader that cruises for 3 s, brakes to a standstill, waits 5 s, and starts again.
+
+    Shapes: `speed` `(*batch,)`, the leader's signals `(*batch, time)`.
+    """
+    time = torch.arange(900, dtype=torch.float64) * DT
+    period = time % 45.0
+    top = speed[..., None]
+    braking = (top - deceleration * (period - 3.0)).clamp(min=0.0)
+    v = torch.where(
+        period < 3.0,
+        top,
+        torch.where(
+            period < 20.0, torch.minimum(braking, top), torch.minimum(1.5 * (period - 20.0), top)
+        ),
+    )
+    position = torch.cat(
+        [torch.zeros_like(v[..., :1]), torch.cumsum(v[..., 1:] * DT, dim=-1)], dim=-1
+    )
+    acceleration = torch.diff(v, dim=-1, prepend=v[..., :1]) / DT
+    return Leader(position, v, acceleration, torch.full(speed.shape, LENGTH, dtype=torch.float64))
+
+
+def _to(step: _Step, dtype: torch.dtype) -> _Step:
+    follower, leader, p = step
+    return (
+        Follower(*(x.to(dtype) for x in follower)),
+        Leader(*(x.to(dtype) for x in leader)),
+        {name: value.to(dtype) for name, value in p.items()},
+    )
+
+
+def _pick(step: _Step, k: int) -> _Step:
+    follower, leader, p = step
+    return (
+        Follower(*(x[k] for x in follower)),
+        Leader(*(x[k] for x in leader)),
+        {name: value[k] if value.dim() else value for name, value in p.items()},
+    )
+
+
+def _describe(step: _Step, wrong: Tensor) -> str:
+    """Names the first state and parameters that are wrong."""
+    follower, leader, p = step
+    row, column = (int(i) for i in wrong.nonzero()[0])
+    gap = leader.position[column] - leader.length[column] - follower.position[row, column]
+    values = ", ".join(f"{name}={value[row, 0].item():g}" for name, value in p.items())
+    return (
+        f"gap {gap.item():g} m, v {follower.speed[row, column].item():g}, v_l"
+        f" {leader.speed[column].item():g} m/s, "
+        f"a {follower.acceleration[row, column].item():g}, a_l"
+        f" {leader.acceleration[column].item():g} m/s2, {values}"
+    )
+
+
+CONTRACT = contract_of(__name__, "model", slow=[can_be_compiled_as_one_graph, gradients_are_right])
