@@ -7,10 +7,12 @@ from typing import Any
 
 import yaml
 
+import cfx
+
 
 def citation_file() -> Path:
     """Returns `CITATION.cff`, inside an installed package or beside it in a checkout."""
-    package = Path(__file__).resolve().parent
+    package = Path(cfx.__file__).resolve().parent
     inside = package / "CITATION.cff"
     if inside.is_file():
         return inside

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import cfx
 from cfx.errors import nearest
 
 OWN = "cfx-driving"
@@ -57,7 +58,7 @@ def install_line(wanted: str) -> str:
     In a checkout it is the folder's: `pip install --editable plugins/cfx-classics`.
     """
     name, bracket, extra = wanted.partition("[")
-    checkout = Path(__file__).resolve().parent.parent
+    checkout = Path(cfx.__file__).resolve().parent.parent
     if name != OWN:
         checkout = checkout / "plugins" / name
     source = shlex.quote(wanted)

@@ -20,6 +20,7 @@ import yaml
 from pydantic import BaseModel
 from pydantic_core import to_jsonable_python
 
+import cfx
 from cfx import registry
 from cfx.component import Component
 from cfx.errors import CfxError
@@ -37,7 +38,7 @@ def conf_dir() -> Path:
 
     It lies inside the package when installed, and beside it in a checkout.
     """
-    package = Path(__file__).resolve().parent
+    package = Path(cfx.__file__).resolve().parent
     inside = package / "conf"
     if inside.is_dir():
         return inside

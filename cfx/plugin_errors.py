@@ -6,10 +6,11 @@ import importlib.util
 import traceback
 from pathlib import Path
 
+import cfx
 from cfx import registry
 from cfx.errors import PluginError
 
-_OWN = Path(__file__).resolve().parent
+_OWN = Path(cfx.__file__).resolve().parent
 
 
 def blame(error: BaseException) -> PluginError | None:
