@@ -34,6 +34,7 @@ FLOORS = (
         "scratch",
         "job_folder",
         "extras",
+        "workers",
     ),
     ("registry",),
     ("models",),

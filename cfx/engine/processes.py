@@ -1,8 +1,4 @@
-"""Work in processes of this machine, one shard in each at a time.
-
-The processes are loky's: they run no line of the script that a user started, so that a script needs
-no `if __name__ == "__main__"`. They share no lock with this process, as forked ones would.
-"""
+"""Work in processes of this machine (`cfx.workers`), one shard in each at a time."""
 
 from __future__ import annotations
 
@@ -10,11 +6,7 @@ import importlib
 import itertools
 import logging
 import math
-import os
-import signal
-import threading
 import time
-import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
@@ -27,23 +19,18 @@ from loky.process_executor import BrokenProcessPool
 from cfx.engine.base import Report, ResultT, ShardT, Work
 from cfx.errors import EngineError
 from cfx.simulation.threads import limit_cores, one_core, one_thread
+from cfx.workers import worker_pool
 
 log = logging.getLogger(__name__)
 
 _LOOK = 0.5
 """Seconds between looks at the workers' progress."""
 
-_ORPHAN = 1.0
-"""Seconds between a worker's looks at whether the job is still there."""
-
 _IDLE = 60.0
 """Seconds after which a standby process ends that nobody has needed."""
 
 _ItemT = TypeVar("_ItemT")
 _DoneT = TypeVar("_DoneT")
-
-_ENVIRONMENT = {"OMP_NUM_THREADS": "1"}
-"""Of workers: threads that spin would slow down the other processes."""
 
 _UNITS: list[Any] = []
 """In a worker: the queue that its progress goes to."""
@@ -117,17 +104,8 @@ class _Workers(Generic[ShardT, ResultT]):
     """
 
     def __init__(self, work: Work[ShardT, ResultT], report: Report, count: int) -> None:
-        # A worker that has grown is replaced by a new one, of which loky warns.
-        warnings.filterwarnings("ignore", message="A worker stopped while some jobs were given")
-        context = get_context("loky")
-        self._units = context.SimpleQueue()
-        self._pool = loky.ProcessPoolExecutor(
-            count,
-            context=context,
-            initializer=_begin,
-            initargs=(os.getpid(), self._units),
-            env=_ENVIRONMENT,
-        )
+        self._units = get_context("loky").SimpleQueue()
+        self._pool = worker_pool(count, _begin, self._units)
         self._work = work
         self._report = report
         self._count = count
@@ -192,14 +170,7 @@ class Standby:
         self._ends = time.monotonic() + _IDLE
         self._pool: loky.ProcessPoolExecutor | None = None
         try:
-            self._pool = loky.ProcessPoolExecutor(
-                1,
-                context=get_context("loky"),
-                timeout=_IDLE,
-                initializer=_begin,
-                initargs=(os.getpid(),),
-                env=_ENVIRONMENT,
-            )
+            self._pool = worker_pool(1, _begin, timeout=_IDLE)
             self._imported: Future[None] = self._pool.submit(_import_module, module)
         except (OSError, ImportError) as error:
             log.debug("no second process: %s", error)
@@ -278,25 +249,10 @@ def _import_module(name: str) -> None:
     importlib.import_module(name)
 
 
-def _begin(job: int, units: Any = None) -> None:
-    """Prepares a worker.
-
-    Args:
-        job: the process that it works for.
-        units: the queue that progress goes to.
-    """
+def _begin(units: Any = None) -> None:
+    """Prepares a worker; `units` is the queue that progress goes to."""
     limit_cores(1)
     _UNITS[:] = [units]
-    # The job stops its workers itself.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=(job,), daemon=True).start()
-
-
-def _end_with(job: int) -> None:
-    """Ends this worker once the job is gone, however it ended."""
-    while os.getppid() == job:
-        time.sleep(_ORPHAN)
-    os._exit(1)
 
 
 def _import(_work: Work[ShardT, ResultT]) -> None:

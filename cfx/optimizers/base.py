@@ -10,6 +10,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from threading import Event
 from typing import ClassVar, Protocol
 
 import numpy as np
@@ -195,10 +196,12 @@ class Optimizer(Component):
         if guesses.device.type == "cpu":
             chunk = min(chunk, max(1, _LOSSES_AT_ONCE // self.evaluations()))
         guesses = guesses.double().clamp(0.0, 1.0)
+        ended = Event()
 
         def solve(first: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
             last = min(first + chunk, problems)
-            guarded = _Guarded(objective.select(first, last), progress, n, registry.origin(self))
+            own_losses, origin = objective.select(first, last), registry.origin(self)
+            guarded = _Guarded(own_losses, progress, n, origin, ended)
             own = guesses[first:last]
             tried, losses = self.solve(guarded, own, seed=seed)
             blocks = tried if isinstance(tried, tuple) else (tried,)
@@ -206,10 +209,13 @@ class Optimizer(Component):
             return _reduce(blocks, losses, own, self.space_filling(), tolerance)
 
         starts = range(0, problems, chunk)
-        if self.in_threads and guesses.device.type == "cpu":
-            pieces = share(solve, starts, level="chunks")
-        else:
-            pieces = [solve(first) for first in starts]
+        try:
+            if self.in_threads and guesses.device.type == "cpu":
+                pieces = share(solve, starts, level="chunks")
+            else:
+                pieces = [solve(first) for first in starts]
+        finally:
+            ended.set()  # one thread failed, or a signal came: nobody waits for the others
         best, loss, filling, diverged = (torch.cat(parts) for parts in zip(*pieces, strict=True))
         return Solution(best, loss, filling, diverged)
 
@@ -309,22 +315,30 @@ def _in_unit_space(candidates: Tensor) -> bool:
 class _Guarded:
     """Losses without NaN, which becomes infinity.
 
-    Counts evaluations and refuses candidates outside the bounds.
+    Counts evaluations and refuses candidates outside the bounds, and all once the work has ended.
     """
 
     def __init__(
-        self, objective: CandidateLosses, progress: Progress, n: int, optimizer: str
+        self,
+        objective: CandidateLosses,
+        progress: Progress,
+        n: int,
+        optimizer: str,
+        ended: Event,
     ) -> None:
         self._objective = objective
         self._progress = progress
         self._n = n
         self._optimizer = optimizer
+        self._ended = ended
 
     @property
     def problems(self) -> int:
         return self._objective.problems
 
     def __call__(self, candidates: Tensor) -> Tensor:
+        if self._ended.is_set():
+            raise RuntimeError("nobody waits for these losses any more")
         shape = tuple(candidates.shape)
         if (
             candidates.dtype != torch.float64
@@ -348,5 +362,9 @@ class _Guarded:
 
     def select(self, first: int, last: int) -> CandidateLosses:
         return _Guarded(
-            self._objective.select(first, last), self._progress, self._n, self._optimizer
+            self._objective.select(first, last),
+            self._progress,
+            self._n,
+            self._optimizer,
+            self._ended,
         )

@@ -22,7 +22,7 @@ from cfx.agents.placement import ALL
 from cfx.errors import DataError, SumoError
 from cfx.evaluation.result import Evaluation, PairTrajectory
 from cfx.pairs import Pair, PairBatch, PairSet
-from cfx.simulators.sumo.channel import Message, receive, send
+from cfx.sumo.channel import Message, receive, send
 from cfx.sumo.motorway import ABREAST, Motorway
 from cfx.sumo.replay import FOLLOWERS
 

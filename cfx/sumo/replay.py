@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 
 from cfx.errors import CfxError
-from cfx.simulators.sumo.channel import Array, Message, receive, send
+from cfx.sumo.channel import Array, Message, receive, send
 
 FOLLOWERS = ("real", "policy", "default")
 """What drives behind a copy of the same leader: the recording, the job's policy, the model's

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import psutil
 import pytest
 
 import cfx
@@ -15,6 +21,7 @@ from cfx.errors import CfxError, ConfigError, SumoError
 from cfx.hydra_source import composed, plain
 from cfx.job import run_job
 from cfx.simulators.sumo import installed
+from tests.scripts import ENVIRONMENT
 
 needs_sumo = pytest.mark.skipif(
     importlib.util.find_spec("libsumo") is None,
@@ -66,6 +73,36 @@ def test_any_model_of_sumo_is_calibrated_by_its_name(tmp_path: Path) -> None:
     fixed = result.pairs[result.pairs["method"] == "fixed"]
     assert fixed["rmse_speed"].between(0.0, 5.0).all()
     assert fixed["parameter_tau"].between(0.5, 3.0).all()
+
+
+@needs_sumo
+@pytest.mark.parametrize(("how", "code"), [(signal.SIGTERM, 143), (signal.SIGKILL, -9)])
+def test_a_signal_ends_a_calibration_in_sumo_and_its_processes(
+    how: signal.Signals, code: int, tmp_path: Path
+) -> None:
+    several_chunks = ["data.max_pairs=8", "optimizer.samples=4096", "simulator.memory_mb=16"]
+    sumo = ["model=krauss_sumo", "simulator=sumo", "cache.enabled=false", "hydra.run.dir=job"]
+    job = subprocess.Popen(
+        [sys.executable, "-m", "cfx", *QUICK, *several_chunks, *sumo],
+        cwd=tmp_path,
+        env=ENVIRONMENT | {"TMPDIR": str(tmp_path)},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 120
+    while not list(tmp_path.glob("cfx-sumo-*/*/*.rou.xml")) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    processes = [int(own.name) for own in tmp_path.glob("cfx-sumo-*/*")]
+    assert processes, "SUMO simulates"
+    os.kill(job.pid, how)
+    _, said = job.communicate(timeout=60)
+    assert job.returncode == code
+    assert "memory" not in said
+    while any(map(psutil.pid_exists, processes)) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not any(map(psutil.pid_exists, processes))
+    assert not list(tmp_path.glob("cfx-sumo-*"))
 
 
 @needs_sumo

@@ -10,8 +10,10 @@ import subprocess
 import sys
 import tempfile
 import textwrap
+import threading
 import time
 import tomllib
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +23,8 @@ import pytest
 from cfx.errors import NotInstalledError, SumoError
 from cfx.extras import install_line
 from cfx.simulators.sumo import installed
-from cfx.simulators.sumo.channel import Message
 from cfx.simulators.sumo.session import Session
+from cfx.simulators.sumo.worker import Answer, Request
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -32,7 +34,7 @@ needs_sumo = pytest.mark.skipif(
 )
 
 
-def request(speed: float = 10.0) -> Message:
+def request(speed: float = 10.0) -> Request:
     """One follower behind one leader for two steps."""
     header = {
         "dt": 0.1,
@@ -48,7 +50,7 @@ def request(speed: float = 10.0) -> Message:
         "leader_attributes": np.empty((1, 0)),
         "start": np.array([[0.0], [speed], [0.0]]),
     }
-    return Message(
+    return Request(
         header,
         arrays
         | {
@@ -74,21 +76,77 @@ def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+def processes(folder: Path) -> set[int]:
+    """The SUMO processes that have their folder in a temporary folder."""
+    return {int(own.name) for own in folder.glob("cfx-sumo-*/*")}
+
+
+def speed_after(answer: Answer) -> float:
+    """The speed after the first step; `request` has followers accelerate by 2.6 m/s2."""
+    return float(answer.speed[0, 0])
+
+
 @needs_sumo
 def test_processes_stay_and_end_with_the_session(scratch: Path) -> None:
     with Session(2) as session:
-        assert session.processes == ()
+        assert not list(scratch.iterdir())
         one = session.answer([request()])
-        assert len(session.processes) == 1
+        started = processes(scratch)
         many = session.answer([request(speed) for speed in (10.0, 11.0, 12.0, 13.0)])
-        processes = session.processes
-        assert len(processes) == len(list(scratch.iterdir())) == 2
-        assert [answer.arrays["speed"][0, 0] for answer in many] == pytest.approx(
+        assert started <= processes(scratch)
+        started = processes(scratch)
+        assert len(started) == 2
+        assert [speed_after(answer) for answer in many] == pytest.approx(
             [10.26, 11.26, 12.26, 13.26]
         )
-        assert np.array_equal(one[0].arrays["speed"], many[0].arrays["speed"])
-    assert not any(psutil.pid_exists(process) for process in processes)
+        assert np.array_equal(one[0].speed, many[0].speed)
+    assert not any(psutil.pid_exists(process) for process in started)
     assert not list(scratch.iterdir())
+
+
+@needs_sumo
+@pytest.mark.parametrize("workers", [1, 3])
+def test_every_thread_gets_the_answers_to_its_own_questions(workers: int) -> None:
+    """Threads come at once, before any process runs, and each asks again and again."""
+    ready = threading.Barrier(8)
+    speeds = np.arange(8.0, 16.0)
+
+    def ask(first: float) -> list[float]:
+        ready.wait()
+        found = []
+        for k in range(25):
+            asked = [request(first + 0.01 * k), request(first + 0.01 * k + 0.005)]
+            found += [speed_after(answer) for answer in session.answer(asked)]
+        return found
+
+    with Session(workers) as session, ThreadPoolExecutor(len(speeds)) as pool:
+        found = np.array(list(pool.map(ask, speeds)))
+    expected = speeds[:, None] + 0.005 * np.arange(50) + 0.26
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+
+
+@needs_sumo
+def test_closing_ends_what_other_threads_wait_for(scratch: Path) -> None:
+    with Session(2) as session, ThreadPoolExecutor(3) as pool:
+        waiting = [pool.submit(session.answer, [request()] * 2000) for _ in range(3)]
+        assert wait_until(lambda: len(processes(scratch)) == 2)
+        session.close()
+        for answers in waiting:
+            with pytest.raises(SumoError, match=r"^SUMO was ended in the middle of a simulation$"):
+                answers.result(timeout=60)
+        assert not processes(scratch)
+
+
+@needs_sumo
+def test_a_refused_question_stops_no_other(scratch: Path) -> None:
+    bad = request()
+    bad.header["constants"] = {"tau": "-1"}
+    with Session(1) as session, ThreadPoolExecutor(2) as pool:
+        good = pool.submit(session.answer, [request()] * 20)
+        with pytest.raises(SumoError, match=r"^SUMO refuses the vehicles: "):
+            session.answer([request(), bad, request()])
+        assert len(good.result()) == 20
+        assert len(session.answer([request()])) == 1
 
 
 @needs_sumo
@@ -97,40 +155,43 @@ def test_a_process_that_dies_is_told_in_one_sentence_and_the_session_can_start_a
 ) -> None:
     with Session(1) as session:
         session.answer([request()])
-        os.kill(session.processes[0], signal.SIGKILL)
+        (process,) = processes(scratch)
+        os.kill(process, signal.SIGKILL)
         with pytest.raises(
-            SumoError, match=r"^a SUMO process ended by itself \(signal SIGKILL\); run again"
+            SumoError, match=r"^a SUMO process ended by itself \(SIGKILL\(-9\)\); run again"
         ):
             session.answer([request()])
-        assert session.processes == ()
+        assert not processes(scratch)
         assert len(session.answer([request()])) == 1
     assert not list(scratch.iterdir())
 
 
 @needs_sumo
-def test_nothing_is_left_when_the_job_is_killed() -> None:
+def test_nothing_is_left_when_the_job_is_killed(tmp_path: Path) -> None:
     script = textwrap.dedent("""
         import time
         from tests.simulators.test_sumo_session import request
         from cfx.simulators.sumo.session import Session
         session = Session(1)
         session.answer([request()])
-        print(session.processes[0], session._started[0]._folder.name, flush=True)
+        print("answered", flush=True)
         time.sleep(60)
     """)
     job = subprocess.Popen(
-        [sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, cwd=ROOT
+        [sys.executable, "-c", script],
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        env=os.environ | {"TMPDIR": str(tmp_path)},
     )
     assert job.stdout is not None
-    process, folder = job.stdout.readline().split()
-    assert psutil.pid_exists(int(process))
+    assert job.stdout.readline() == "answered\n"
+    (process,) = processes(tmp_path)
     job.kill()
     job.wait()
     job.stdout.close()
-    assert wait_until(lambda: not psutil.pid_exists(int(process))), (
-        "the SUMO process outlives the job"
-    )
-    assert wait_until(lambda: not Path(folder).exists()), "its folder stays"
+    assert wait_until(lambda: not psutil.pid_exists(process)), "the SUMO process outlives the job"
+    assert wait_until(lambda: not list(tmp_path.glob("cfx-sumo-*"))), "its folder stays"
 
 
 @needs_sumo

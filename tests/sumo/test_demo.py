@@ -12,8 +12,8 @@ import cfx
 from cfx.agents import checkpoint
 from cfx.config import DemoSettings
 from cfx.errors import ConfigError, DataError, SumoError
-from cfx.simulators.sumo.channel import Message
 from cfx.sumo import motorway
+from cfx.sumo.channel import Message
 from cfx.sumo.demo import check_demo
 from cfx.sumo.demo_request import ask
 from cfx.sumo.motorway import SHIPPED, find_netconvert, read_motorway

@@ -2,37 +2,33 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-import queue
-import signal
-import subprocess
-import sys
+import itertools
+import re
+import shutil
 import tempfile
+import threading
 import weakref
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError
 from pathlib import Path
 
-import cfx
-from cfx.errors import SumoError
-from cfx.simulators.sumo.channel import Message, receive, send
-from cfx.simulators.sumo.installed import require_sumo
-from cfx.simulators.sumo.network import ROAD
-from cfx.simulators.sumo.worker import LOG
+from loky.process_executor import BrokenProcessPool, ShutdownExecutorError
 
-_PATIENCE_S = 5.0
-"""How long a process may take to end when it was asked to."""
+from cfx.errors import SumoError
+from cfx.simulators.sumo.installed import require_sumo
+from cfx.simulators.sumo.worker import LOG, Answer, Request, answer, begin
+from cfx.workers import worker_pool
 
 
 class Session:
-    """Answers requests in SUMO; `cfx.simulators.sumo.worker` says what they hold.
+    """Answers requests in SUMO, of any number of threads.
 
-    Processes start with the first request. They end, and their folders go, with `close`, when
-    nobody holds the session any more, and when this process ends, however that happens.
+    The processes belong to an executor, which alone gives them calls and takes their results. They
+    start with the first request. They end, and their folders go, with `close`, when nobody holds
+    the session any more, and when this process ends, however that happens.
 
     Args:
-        workers: processes at most.
+        workers: how many processes.
 
     Raises:
         SumoError: SUMO is not installed, or another version.
@@ -41,9 +37,13 @@ class Session:
     def __init__(self, workers: int) -> None:
         require_sumo()
         self._workers = workers
-        self._idle: queue.LifoQueue[_Worker] = queue.LifoQueue()
-        self._started: list[_Worker] = []
-        weakref.finalize(self, _close, self._started)
+        self._numbers = itertools.count()
+        self._lock = threading.Lock()
+        self._pool: _Pool | None = None
+
+    def __reduce__(self) -> tuple[type[Session], tuple[int]]:
+        """Returns what another process makes a session of its own from."""
+        return Session, (self._workers,)
 
     def __enter__(self) -> Session:
         return self
@@ -51,142 +51,81 @@ class Session:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def answer(self, requests: Iterable[Message]) -> list[Message]:
+    def answer(self, requests: Iterable[Request]) -> list[Answer]:
         """Answers all requests, in their order; which process answers which makes no difference.
 
         Raises:
-            SumoError: SUMO refuses a request, a vehicle is lost, or a process ended; the session is
-                closed then.
+            SumoError: SUMO refuses a request, a vehicle is lost, a process ended, or the session
+                was closed meanwhile.
         """
-        todo = list(requests)
-        for _ in range(min(self._workers, len(todo)) - len(self._started)):
-            worker = _Worker()
-            self._started.append(worker)
-            self._idle.put(worker)
-        if not todo:
+        asked = list(zip(self._numbers, requests, strict=False))
+        if not asked:
             return []
+        with self._lock:
+            if self._pool is None:
+                self._pool = _Pool(self._workers)
+            pool = self._pool
         try:
-            if len(self._started) == 1:
-                return [self._started[0].answer(request) for request in todo]
-            pool = ThreadPoolExecutor(len(self._started))  # a thread waits for each process
-            try:
-                return list(pool.map(self._answer, todo))
-            finally:
-                pool.shutdown(cancel_futures=True)
-        except BaseException:
-            self.close()  # an answer may be on its way that nobody will read
-            raise
-
-    def close(self) -> None:
-        """Ends the processes; the next `answer` starts new ones."""
-        _close(self._started)
-        self._idle = queue.LifoQueue()
-
-    @property
-    def processes(self) -> tuple[int, ...]:
-        """Ids of the processes that run."""
-        return tuple(worker.pid for worker in self._started)
-
-    def _answer(self, request: Message) -> Message:
-        worker = self._idle.get()
-        try:
-            return worker.answer(request)
-        finally:
-            self._idle.put(worker)
-
-
-def _close(workers: list[_Worker]) -> None:
-    while workers:
-        workers.pop().close()
-
-
-class _Worker:
-    """One SUMO process and its folder."""
-
-    def __init__(self) -> None:
-        self._folder = tempfile.TemporaryDirectory(prefix="cfx-sumo-", ignore_cleanup_errors=True)
-        self._process = subprocess.Popen(  # noqa: S603 - this Python, a module of ours, a folder of ours
-            [sys.executable, "-m", "cfx.simulators.sumo.worker", self._folder.name],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env=os.environ | {"PYTHONPATH": _search_path(), "OMP_NUM_THREADS": "1"},
-        )
-
-    @property
-    def pid(self) -> int:
-        return self._process.pid
-
-    def answer(self, request: Message) -> Message:
-        process = self._process
-        if process.stdin is None or process.stdout is None:
-            raise RuntimeError("a process that was started with pipes has them")
-        try:
-            send(process.stdin, request.header, request.arrays)
-            found = receive(process.stdout)
-        except OSError:
-            found = None
-        if found is None:
+            return pool.answer(asked)
+        except BrokenProcessPool as error:
+            with self._lock:  # threads that wait for the same processes say the same
+                pool.end(error)
+                if self._pool is pool:
+                    self._pool = None
             raise SumoError(
-                f"a SUMO process ended by itself ({self._end()}); run again: what was calibrated so"
+                f"a SUMO process ended by itself ({pool.reason}); run again: what was calibrated so"
                 " far is cached"
-            )
-        if "error" in found.header:
-            raise SumoError(_in_words(found.header["error"], self._log()))
-        return found
+            ) from error
+        except (ShutdownExecutorError, CancelledError) as error:
+            raise SumoError("SUMO was ended in the middle of a simulation") from error
 
     def close(self) -> None:
-        process = self._process
-        for pipe in (process.stdin, process.stdout):
-            if pipe is not None:
-                with contextlib.suppress(OSError):
-                    pipe.close()
+        """Ends the processes, also within a request; the next `answer` starts new ones."""
+        with self._lock:
+            pool, self._pool = self._pool, None
+        if pool is not None:
+            pool.end()
+
+
+class _Pool:
+    """An executor and the folder of its processes."""
+
+    reason = ""
+
+    def __init__(self, workers: int) -> None:
+        self._folder = Path(tempfile.mkdtemp(prefix="cfx-sumo-"))
+        self._remove = weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
+        self._executor = worker_pool(workers, begin, self._folder, folder=self._folder)
+
+    def answer(self, asked: list[tuple[int, Request]]) -> list[Answer]:
+        futures = []
         try:
-            process.wait(_PATIENCE_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-        self._folder.cleanup()
+            for number, request in asked:
+                futures.append(self._executor.submit(answer, number, request))
+            answers = [future.result() for future in futures]
+        finally:
+            for future in futures:
+                future.cancel()  # where one failed, nobody waits for the others
+        for (number, _), given in zip(asked, answers, strict=True):
+            if given.number != number:
+                raise RuntimeError(f"SUMO's answer {given.number} was given to request {number}")
+        return answers
 
-    def _end(self) -> str:
-        """Says how the process ended."""
-        try:
-            code = self._process.wait(_PATIENCE_S)
-        except subprocess.TimeoutExpired:
-            return "it no longer answers"
-        how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-        last = ""
-        for line in self._log().splitlines():
-            if line.strip() and not line.startswith("Warning"):
-                last = line.strip()
-        return f"{how}: {last}" if last else how
+    def end(self, error: BaseException | None = None) -> None:
+        """Ends the processes, because of an error perhaps; again, it does nothing."""
+        if error is not None and not self.reason:
+            self.reason = self._reason(error)
+        self._executor.shutdown(wait=True, kill_workers=True)
+        self._remove()
 
-    def _log(self) -> str:
-        with contextlib.suppress(OSError):
-            return Path(self._folder.name, LOG).read_text(encoding="utf-8", errors="replace")
-        return ""
-
-
-def _in_words(error: str, log: str) -> str:
-    """Joins the error that libsumo raised and what SUMO printed beside it.
-
-    Only the two together say what is wrong.
-    """
-    first = error.strip().rstrip(".")
-    if "is not known" in error:
-        return (
-            f"SUMO lost a vehicle ({first}): it left the {ROAD / 1000:.0f} km of its road; look for"
-            " positions far out in the data, and for bounds of parameters that mean nothing"
-        )
-    said = [first]
-    for line in log.splitlines():
-        text = line.removeprefix("Error:").strip().rstrip(".")
-        if line.startswith("Error:") and text not in said[1:]:
-            said.append(text)
-    return f"SUMO refuses the vehicles: {': '.join(said)}"
-
-
-def _search_path() -> str:
-    """Returns PYTHONPATH with the folder of this cfx ahead, wherever it was imported from."""
-    here = str(Path(cfx.__file__).resolve().parent.parent)
-    given = os.environ.get("PYTHONPATH", "")
-    return f"{here}{os.pathsep}{given}" if given else here
+    def _reason(self, error: BaseException) -> str:
+        """Says how a process ended, and what SUMO printed last."""
+        codes = re.search(r"exit codes of the workers are \{(.*)\}", str(error))
+        reasons = [codes[1] if codes else str(error).partition(".")[0]]
+        for log in self._folder.glob(f"*/{LOG}"):
+            text = log.read_text(encoding="utf-8", errors="replace")
+            # What follows is a traceback of Python's.
+            for line in text.partition("Fatal Python error")[0].splitlines()[-1:]:
+                if line.strip() and not line.startswith("Warning"):
+                    reasons.append(line.strip())
+        return ": ".join(reasons)

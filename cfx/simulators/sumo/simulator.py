@@ -16,9 +16,7 @@ from cfx.simulators.sumo.stepper import SumoStepper, require_in_sumo
 class SumoSettings(SimulatorSettings):
     """Settings of `sumo`."""
 
-    workers: int | None = Field(
-        None, ge=1, description="SUMO processes at most; null: one for each core"
-    )
+    workers: int | None = Field(None, ge=1, description="SUMO processes; null: one for each core")
     followers: int = Field(
         50,
         ge=1,

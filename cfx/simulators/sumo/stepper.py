@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -17,10 +16,11 @@ from cfx.errors import ConfigError, SumoError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.vtype import InSumo, VType
 from cfx.simulation.base import Stepper
-from cfx.simulators.sumo.channel import Array, Message
+from cfx.simulation.threads import cores
 from cfx.simulators.sumo.installed import require_sumo
 from cfx.simulators.sumo.schema import check_vtype
 from cfx.simulators.sumo.session import Session
+from cfx.simulators.sumo.worker import Array, Request
 
 _REPLAYED = {"sigma": "0", "maxSpeed": "130"}
 """Attributes of every leader; its movement is prescribed at each step."""
@@ -53,7 +53,7 @@ class SumoStepper(Stepper):
     Args:
         model: one that SUMO has.
         dt: time step, s, in whole milliseconds.
-        workers: SUMO processes at most; None: one for each core.
+        workers: SUMO processes; None: one for each core.
         followers: in one network, each on its own road.
         seed: SUMO's own, for models that draw random numbers.
 
@@ -81,7 +81,7 @@ class SumoStepper(Stepper):
                 "simulator=sumo: SUMO counts in milliseconds, so it cannot take the recording's"
                 f" steps of {dt:g} s"
             )
-        self._session = Session(workers or _cores())
+        self._session = Session(workers or cores())
 
     def identity(self) -> str:
         return content_key(
@@ -140,11 +140,11 @@ class SumoStepper(Stepper):
         positions, speeds = [], []
         for part, answer in zip(parts, answers, strict=True):
             own = rows[:, part]
-            positions.append(torch.from_numpy(answer.arrays["position"]).gather(0, own))
-            speeds.append(torch.from_numpy(answer.arrays["speed"]).gather(0, own))
+            positions.append(torch.from_numpy(answer.position).gather(0, own))
+            speeds.append(torch.from_numpy(answer.speed).gather(0, own))
         return torch.cat(positions, dim=1), torch.cat(speeds, dim=1)
 
-    def _request(self, scene: _Scene, kind: VType, own: slice) -> Message:
+    def _request(self, scene: _Scene, kind: VType, own: slice) -> Request:
         """Returns the request for some followers, each from its entry on.
 
         For those that enter late the last frame is repeated.
@@ -170,7 +170,7 @@ class SumoStepper(Stepper):
             "leader_speed": scene.leader_speed[:, own].gather(0, rows).numpy(),
             "leader_acceleration": scene.leader_acceleration[:, own].gather(0, rows).numpy(),
         }
-        return Message(header, arrays)
+        return Request(header, arrays)
 
 
 class _Remembering(Follower):
@@ -292,10 +292,3 @@ def _flat_values(values: Mapping[str, Tensor | str], batch: torch.Size) -> _Valu
 
 def _flat(value: Tensor, batch: torch.Size) -> Tensor:
     return value.detach().expand(batch).reshape(-1).to("cpu", torch.float64)
-
-
-def _cores() -> int:
-    """Returns how many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

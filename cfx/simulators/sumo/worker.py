@@ -1,37 +1,34 @@
-"""A SUMO process: `python -m cfx.simulators.sumo.worker FOLDER`.
+"""What a SUMO process does: it simulates followers behind leaders, one request after the other.
 
-It simulates followers behind leaders, one request after the other. It is a process of its own,
-because libsumo holds one simulation in a process and does not get on with pyarrow, which jobs load.
-It ends when its standard input does, and so with its job, however that ends. A request loads the
-network of parallel roads anew in the running libsumo (0.1 ms for each road). So an answer depends
-on its request alone, random draws included, and any attribute of a vType may differ between
-requests, which SUMO does not let change while it runs.
+It is a process of its own, because libsumo holds one simulation in a process and does not get on
+with pyarrow, which jobs load. A request loads the network of parallel roads anew in the running
+libsumo (0.1 ms for each road). So an answer depends on its request alone, random draws included,
+and any attribute of a vType may differ between requests, which SUMO does not let change while it
+runs.
 
-Request: header `dt`, `seed`, `car_follow_model`, `constants` and `leader_constants` (vType
-attributes of all), `names` and `leader_names` (those that differ); arrays `attributes` `(n,
-names)`, `leader_attributes`, `start` `(3, n)` (position, speed, acceleration of the followers), and
-`leader_position`, `leader_speed`, `leader_acceleration` `(K, n)`, frames 0 to K - 1.
-
-Answer: arrays `position` and `speed` `(K, n)`, frames 1 to K; or a header with `error`. SI units.
+This module imports neither torch nor SUMO.
 """
 
 from __future__ import annotations
 
 import os
-import shutil
-import signal
-import sys
 from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from cfx.simulators.sumo.channel import Array, Message, receive, send
-from cfx.simulators.sumo.network import FOLLOWER, LANE, LEADER, Placed, network, routes
+from cfx.errors import SumoError
+from cfx.extras import install_line
+from cfx.simulators.sumo.installed import EXTRA
+from cfx.simulators.sumo.network import FOLLOWER, LANE, LEADER, ROAD, Placed, network, routes
+
+Array = NDArray[np.float64]
 
 LOG = "sumo.log"
-"""File in the folder that takes what SUMO prints."""
+"""File in a process's folder that takes what SUMO prints."""
 
 _BEHIND = 100.0  # m from a road's begin to whatever is furthest behind
 
@@ -43,22 +40,61 @@ _OPTIONS = {
 }
 
 
+_ROADS: list[Roads] = []
+"""The simulation of this process."""
+
+
+class Request(NamedTuple):
+    """n followers behind n leaders for K steps. SI units.
+
+    Attributes:
+        header: `dt`, `seed`, `car_follow_model`, `constants` and `leader_constants` (vType
+            attributes of all), `names` and `leader_names` (those that differ).
+        arrays: `attributes` `(n, names)`, `leader_attributes`, `start` `(3, n)` (position, speed,
+            acceleration of the followers), and `leader_position`, `leader_speed`,
+            `leader_acceleration` `(K, n)`, frames 0 to K - 1.
+    """
+
+    header: dict[str, Any]
+    arrays: dict[str, Array]
+
+
+class Answer(NamedTuple):
+    """Positions and speeds of a request's followers.
+
+    Attributes:
+        number: of the request.
+        position, speed: `(K, n)`, frames 1 to K.
+    """
+
+    number: int
+    position: Array
+    speed: Array
+
+
 class Roads:
-    """The simulation of this process.
+    """Parallel roads in the one simulation that a process has.
 
     Args:
         folder: where SUMO's input is written.
     """
 
     def __init__(self, folder: Path) -> None:
-        import libsumo
-
-        self._sumo: Any = libsumo
         self._folder = folder
         self._running = False
 
-    def simulate(self, request: Message) -> dict[str, Array]:
-        """Simulates all followers of a request at once.
+    @cached_property
+    def _sumo(self) -> Any:
+        import libsumo
+
+        return libsumo
+
+    def printed(self) -> str:
+        """Returns what SUMO has printed since the request came."""
+        return (self._folder / LOG).read_text(encoding="utf-8", errors="replace")
+
+    def simulate(self, request: Request) -> tuple[Array, Array]:
+        """Simulates all followers of a request at once; returns positions and speeds `(K, n)`.
 
         Raises:
             libsumo.TraCIException: SUMO refuses the input, or a vehicle is gone.
@@ -68,9 +104,9 @@ class Roads:
         origin = np.minimum(leader.min(axis=0), start[0]) - _BEHIND
         self._load(request, origin)
         position, speed = self._steps(arrays, leader - origin, float(header["dt"]))
-        return {"position": position + origin, "speed": speed}
+        return position + origin, speed
 
-    def _load(self, request: Message, origin: Array) -> None:
+    def _load(self, request: Request, origin: Array) -> None:
         """Puts all vehicles where they start."""
         header, arrays = request
         own = _attributes(header["constants"], header["names"], arrays["attributes"])
@@ -164,37 +200,48 @@ def _attributes(
     return vehicles
 
 
-def main(folder: Path) -> None:
-    """Answers requests from standard input until it ends."""
-    # Ctrl-C is for the job, which then lets go of this process.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # SUMO prints to both standard outputs, and the answers must stay clean.
-    answers = os.fdopen(os.dup(1), "wb")
-    log = os.open(folder / LOG, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o600)
+def begin(folder: Path) -> None:
+    """Prepares this process, which has a folder of its own inside `folder`."""
+    own = folder / str(os.getpid())
+    own.mkdir()
+    # What SUMO prints says why it refuses something.
+    log = os.open(own / LOG, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
     os.dup2(log, 1)
     os.dup2(log, 2)
+    _ROADS[:] = [Roads(own)]
+
+
+def answer(number: int, request: Request) -> Answer:
+    """Simulates all followers of a request.
+
+    Raises:
+        SumoError: SUMO refuses it, lost a vehicle, or cannot be loaded.
+    """
+    os.ftruncate(1, 0)
     try:
-        roads = Roads(folder)
-        while (request := receive(sys.stdin.buffer)) is not None:
-            os.ftruncate(log, 0)
-            try:
-                done = roads.simulate(request)
-            except Exception as error:  # libsumo's errors have no common base
-                send(answers, {"error": _told(error)})
-            else:
-                send(answers, {}, done)
-    except BrokenPipeError:
-        pass  # the job ended in the middle of an answer
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        return Answer(number, *_ROADS[0].simulate(request))
+    except ImportError as error:
+        raise SumoError(f"SUMO cannot be loaded ({error}): {install_line(EXTRA)}") from None
+    except Exception as error:  # libsumo's errors have no common base
+        if not type(error).__module__.startswith("libsumo"):
+            raise
+        raise SumoError(_in_words(str(error), _ROADS[0].printed())) from None
 
 
-def _told(error: Exception) -> str:
-    """Returns an error's text; that of one that is not SUMO's begins with its type."""
-    if type(error).__module__.startswith("libsumo"):
-        return str(error)
-    return f"{type(error).__name__}: {error}"
+def _in_words(error: str, log: str) -> str:
+    """Joins the error that libsumo raised and what SUMO printed beside it.
 
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    Only the two together say what is wrong.
+    """
+    first = error.strip().rstrip(".")
+    if "is not known" in error:
+        return (
+            f"SUMO lost a vehicle ({first}): it left the {ROAD / 1000:.0f} km of its road; look for"
+            " positions far out in the data, and for bounds of parameters that mean nothing"
+        )
+    said = [first]
+    for line in log.splitlines():
+        text = line.removeprefix("Error:").strip().rstrip(".")
+        if line.startswith("Error:") and text not in said[1:]:
+            said.append(text)
+    return f"SUMO refuses the vehicles: {': '.join(said)}"

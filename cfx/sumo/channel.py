@@ -1,4 +1,4 @@
-"""Messages between a job and its SUMO processes.
+"""Messages between a job and the SUMO process of its demonstration.
 
 A message is a JSON header and arrays, as `.npz` bytes with their length ahead. Nothing is pickled.
 This module imports neither torch nor SUMO: both sides read it.
