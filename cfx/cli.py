@@ -282,7 +282,8 @@ def _drive_parser() -> argparse.ArgumentParser:
         "--speed-mode",
         type=int,
         default=31,
-        help="SUMO's bit set; 31 (default): SUMO's own checks bound each speed; 0: none, exact",
+        help="SUMO's bit set; 31 (default): lights, stops and junctions are obeyed, SUMO's safe gap"
+        " is kept; 0: none of it, what the model says to the last bits",
     )
     return parser
 

@@ -24,6 +24,7 @@ from cfx.errors import ConfigError, DataError, OutputError, SumoError, nearest
 from cfx.files import atomic_write
 from cfx.progress import Task
 from cfx.simulators.sumo.installed import require_sumo
+from cfx.sumo.driver import OBEYS_ALL
 from cfx.sumo.fleet import Fleet
 from cfx.sumo.histogram import Histogram
 from cfx.sumo.scenarios import SCENARIOS
@@ -36,6 +37,10 @@ Actor = Callable[[Any], None]
 
 _QUANTILES = (0.05, 0.5, 0.95)
 """Quantiles by which live traffic is compared with the recording."""
+
+
+_LISTED = 10
+"""Collisions that the report lists."""
 
 
 @dataclass
@@ -54,7 +59,9 @@ class Tally:
         speeds: of all steps, m/s.
         accelerations: of all steps, m/s2.
         time_gaps: of the steps that the model drove faster than walking, s.
-        collisions, teleports: vehicles that SUMO reported; a vehicle may do so more than once.
+        collisions: of those that SUMO reported, the ones with contact (`Collision.contact`).
+        below_min_gap: the others: the gap was below minGap, and nobody was touched.
+        teleports: vehicles that SUMO reported; a vehicle may teleport more than once.
     """
 
     vehicles: set[str] = field(default_factory=set)
@@ -69,7 +76,50 @@ class Tally:
     accelerations: Histogram = field(default_factory=lambda: Histogram(-15.0, 8.0, 0.02))
     time_gaps: Histogram = field(default_factory=lambda: Histogram(0.0, 30.0, 0.05))
     collisions: int = 0
+    below_min_gap: int = 0
     teleports: int = 0
+
+
+@dataclass
+class Collision:
+    """What SUMO reports as a collision of two vehicles, however many steps it lasts.
+
+    SUMO reports a gap below the follower's `minGap` as well (`collision.mingap-factor`).
+
+    Attributes:
+        time: s, of the first step.
+        kind: the driven vType of the collider; of the victim, where no policy drives the collider.
+        collider, victim: their ids.
+        lane: of the collider.
+        position: of the collider's front on it, m.
+        gap: the smallest, from bumper to bumper, m; None: not known, as where paths cross.
+    """
+
+    time: float
+    kind: str
+    collider: str
+    victim: str
+    lane: str
+    position: float
+    gap: float | None
+
+    @property
+    def contact(self) -> bool:
+        """Whether they touched; also where the gap is not known."""
+        return self.gap is None or self.gap <= 0.0
+
+    def __str__(self) -> str:
+        """Returns who, where and when on one line."""
+        what = "contact"
+        if not self.contact:
+            what = "below minGap"
+        gap = "gap not known"
+        if self.gap is not None:
+            gap = f"gap {self.gap:.2f} m"
+        return (
+            f"{self.time:.2f} s: {self.collider} behind {self.victim} on {self.lane} at"
+            f" {self.position:.1f} m: {what}, {gap}"
+        )
 
 
 @dataclass(frozen=True)
@@ -89,6 +139,7 @@ class ScenarioRun:
             "" where nothing was.
         recorded: for each vType, quantiles of the recording that its policy learned from, by
             signal (`Agent.recorded`).
+        collisions: that SUMO reported of driven vehicles, in their order.
     """
 
     tallies: Mapping[str, Tally]
@@ -100,6 +151,7 @@ class ScenarioRun:
     limited: Mapping[str, float] = field(default_factory=dict)
     outside: Mapping[str, str] = field(default_factory=dict)
     recorded: Mapping[str, Mapping[str, Sequence[float]]] = field(default_factory=dict)
+    collisions: Sequence[Collision] = ()
 
     @property
     def real_time(self) -> float:
@@ -117,7 +169,7 @@ def run_scenario(
     seed: int | None = None,
     output: Path | None = None,
     look_ahead: float = 200.0,
-    speed_mode: int = 31,
+    speed_mode: int = OBEYS_ALL,
     gui: bool = False,
     options: Sequence[str] = (),
 ) -> ScenarioRun:
@@ -136,7 +188,7 @@ def run_scenario(
         seed: SUMO's, and that of stochastic policies; None for the scenario's, and 0.
         output: a CSV file with a row for each driven vehicle and step.
         look_ahead: as in `Driver`.
-        speed_mode: as in `Driver`; 31 lets SUMO's own checks bound each speed.
+        speed_mode: as in `Driver`.
         gui: show SUMO's window, slowly enough to watch.
         options: more of SUMO's own options.
 
@@ -297,6 +349,8 @@ class _Run:
         self._type_of: dict[str, str] = {}
         self._lanes: dict[str, tuple[str, int]] = {}
         self._braking: set[str] = set()
+        self._collisions: list[Collision] = []
+        self._touching: dict[tuple[str, str], Collision] = {}
         self._decel: dict[str, float] = {}
         self._steps = 0
         self._others = 0
@@ -331,6 +385,7 @@ class _Run:
                 if self._actor is not None:
                     self._actor(self._sumo)
                 self._sumo.simulationStep()
+                self._note_collisions(dt)  # ahead of the drivers, who forget whoever has gone
                 self._fleet.step(self._sumo)
                 self._after_step(dt)
                 task.advance()
@@ -341,6 +396,11 @@ class _Run:
                     f"no vehicle of vType '{name}' was ever on the road in {self._scenario}"
                     f" ({self._steps * dt:g} s); give it a flow, or a later --end"
                 )
+        for collision in self._collisions:
+            if collision.contact:
+                self._tallies[collision.kind].collisions += 1
+            else:
+                self._tallies[collision.kind].below_min_gap += 1
         limited, outside, recorded = {}, {}, {}
         for name, driver in self._fleet.drivers.items():
             limited[name] = driver.counts.limited / max(1, driver.counts.steps)
@@ -356,6 +416,7 @@ class _Run:
             limited,
             outside,
             recorded,
+            self._collisions,
         )
 
     def _last(self, end: float | None) -> float:
@@ -376,7 +437,7 @@ class _Run:
         for name, kind in vehicles.items():
             self._count(name, kind, dt)
         self._count_motions()
-        self._count_events()
+        self._count_teleports()
         if self._rows is not None:
             self._rows.write(self._sumo, self._fleet)
         self._others = max(self._others, self._sumo.vehicle.getIDCount() - len(vehicles))
@@ -421,11 +482,50 @@ class _Run:
             names = [name for name, its in self._fleet.vehicles.items() if its == kind]
             self._tallies[kind].time_gaps.add(driver.time_gaps(names).numpy())
 
-    def _count_events(self) -> None:
-        """Notes which vehicles SUMO reports as collided or teleported."""
-        for name in self._sumo.simulation.getCollidingVehiclesIDList():
-            if name in self._type_of:
-                self._tallies[self._type_of[name]].collisions += 1
+    def _note_collisions(self, dt: float) -> None:
+        """Notes the collisions that SUMO reports after a step; one that goes on is one."""
+        now = self._sumo.simulation.getTime()
+        touching = {}
+        for found in self._sumo.simulation.getCollisions():
+            kind = self._type_of.get(found.collider) or self._type_of.get(found.victim)
+            if kind is None:
+                continue
+            key = found.collider, found.victim
+            known, before = self._touching.get(key), self._gap_before(*key)
+            if known is None:
+                gap = self._gap(found, before, dt)
+                known = Collision(now, kind, *key, found.lane, found.pos, gap)
+                self._collisions.append(known)
+            elif known.gap is not None and before is not None:
+                # SUMO goes on to report the speeds of the first step.
+                known.gap = min(known.gap, before)
+            touching[key] = known
+        self._touching = touching
+
+    def _gap_before(self, collider: str, victim: str) -> float | None:
+        """Returns the gap of a driven vehicle one step ago; None behind another vehicle."""
+        if collider not in self._fleet.vehicles:
+            return None
+        return self._fleet.driver(collider).gap_to(collider, victim)
+
+    def _gap(self, found: Any, before: float | None, dt: float) -> float | None:
+        """Returns the gap as a collision begins, bumper to bumper, m.
+
+        SUMO may have taken the vehicles off the road by now. So it is the gap of the step before,
+        and what their speeds have made of it; for a vehicle that has just changed lanes, or that no
+        policy drives, the places of both on the lane.
+        """
+        if found.type != "collision":
+            return None  # their paths crossed
+        if before is not None:
+            return float(before + (found.victimSpeed - found.colliderSpeed) * dt)
+        vehicle = self._sumo.vehicle
+        if found.victim not in vehicle.getIDList() or vehicle.getLaneID(found.victim) != found.lane:
+            return None
+        back = vehicle.getLanePosition(found.victim) - vehicle.getLength(found.victim)
+        return float(back - found.pos)
+
+    def _count_teleports(self) -> None:
         for name in self._sumo.simulation.getStartingTeleportIDList():
             if name in self._type_of:
                 self._tallies[self._type_of[name]].teleports += 1
@@ -516,6 +616,15 @@ def report(run: ScenarioRun) -> None:
     put(_what_happened(run))
     put(_braking(run))
     put(_beside_the_recording(run))
+    for collision in run.collisions[:_LISTED]:
+        print(collision)
+    if len(run.collisions) > _LISTED:
+        print(f"... and {len(run.collisions) - _LISTED} more collisions")
+    if any(not collision.contact for collision in run.collisions):
+        print(
+            "SUMO takes a gap below minGap for a collision, and teleports the vehicle unless the"
+            " scenario says otherwise; -- --collision.mingap-factor 0 leaves contact alone"
+        )
     for name, words in run.outside.items():
         if words:
             print(f"{name}: {words}; there it fades towards its base parameters")
@@ -533,6 +642,7 @@ def _what_happened(run: ScenarioRun) -> Table:
         "mean speed [m/s]",
         "lane changes",
         "collisions",
+        "below minGap",
         "teleports",
     )
     for name, tally in run.tallies.items():
@@ -543,6 +653,7 @@ def _what_happened(run: ScenarioRun) -> Table:
             f"{tally.metres / (tally.steps * run.dt):.2f}",
             str(tally.lane_changes),
             str(tally.collisions),
+            str(tally.below_min_gap),
             str(tally.teleports),
         )
     return table

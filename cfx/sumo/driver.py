@@ -53,8 +53,11 @@ _MARGIN = 1.5
 _WALKING_MPS = 1.5
 """Speed below which a time gap means nothing."""
 
-_NEAR_M = 0.5
+_NEAR_M = 0.2
 """Room to brake in counts as this at least, m."""
+
+OBEYS_ALL = 31
+"""Speed mode with all of SUMO's checks: lights, stops, yielding, its safe gap."""
 
 
 @dataclass
@@ -83,17 +86,18 @@ class DriveCounts:
 
 
 def needed_deceleration(seen: Seen) -> Tensor:
-    """Returns how hard vehicles must brake at least so that they do not hit their leaders.
+    """Returns how hard vehicles must brake at least to keep their `minGap` behind their leaders.
 
-    The leader goes on as it is, or brakes on to a standstill: the harder of both counts. Within a
-    gap s, with the speeds v and v_l and the leader's deceleration b_l,
+    The leader goes on as it is, or brakes on to a standstill: the harder of both counts. With the
+    room s, which is the gap less `minGap` (for SUMO a shorter gap is a collision, and where its own
+    models end), the speeds v and v_l and the leader's deceleration b_l,
 
         b = (v - v_l)^2 / (2 s)  if v > v_l        b = v^2 / (2 (s + v_l^2 / (2 b_l)))
 
     Returns:
         `(D,)`, m/s2, not negative.
     """
-    room = seen.gap.clamp(min=_NEAR_M)
+    room = (seen.gap - seen.min_gap).clamp(min=_NEAR_M)
     closing = (seen.speed - seen.leader_speed).clamp(min=0.0)
     steady = closing.square() / (2.0 * room)
     braking = (-seen.leader_acceleration).clamp(min=0.0)
@@ -126,13 +130,16 @@ class Driver:
     After a change of leader the vehicle goes on: the policy sees the new leader from then on.
 
     The lane's limit and the vehicle's `maxSpeed` hold as they do around SUMO's own models. With the
-    default `speed_mode` 0 nothing else of SUMO's changes the speed, so junctions, red lights and
-    stops are not obeyed behind a leader: exact, and meant for motorways. `speed_mode=31` lets
-    SUMO's checks bound the speed, its own safe gap among them. Lane changes are SUMO's.
+    default `speed_mode` 31 SUMO's checks bound each speed: red lights, stops, who yields at
+    junctions, and SUMO's own safe gap. With `speed_mode=0` nothing else of SUMO's changes the
+    speed: what the model says is driven to the last bits, so vehicles behind a leader run red
+    lights, pass their stops and do not yield. That is meant for replays of recordings and roads
+    without junctions. Lane changes are SUMO's.
 
     The model's limits of acceleration hold always (`model.limits`). Where SUMO bounds braking too
-    (bit 4 of the speed mode), a vehicle brakes comfortably at most, unless the situation needs
-    more: see `needed_deceleration`. SUMO's `decel` of the vehicle is raised to that meanwhile.
+    (bit 4 of the speed mode), a vehicle brakes comfortably at most, unless keeping its
+    vType's `minGap` needs more: see `needed_deceleration`. SUMO's `decel` of the vehicle is raised
+    to that meanwhile.
 
     A driver holds the state of one simulation; make another for another simulation.
     """
@@ -143,7 +150,7 @@ class Driver:
         *,
         network: str | None = ALL,
         look_ahead: float = 200.0,
-        speed_mode: int = 0,
+        speed_mode: int = OBEYS_ALL,
         model: DrivingModel | None = None,
         source: str = "this policy",
         seed: int | None = 0,
@@ -155,7 +162,8 @@ class Driver:
             network: which of its networks drives vehicles that `assign` does not name; None:
                 `assign` must name each.
             look_ahead: m; a vehicle farther ahead (bumper to bumper) is no leader.
-            speed_mode: SUMO's bit set of `vehicle.setSpeedMode` while a vehicle is driven.
+            speed_mode: SUMO's bit set of `vehicle.setSpeedMode` while a vehicle is driven: 31 obeys
+                lights, stops and junctions and keeps SUMO's safe gap; 0 does none of it.
             model: the driving model; None for the one that the policy was trained for.
             source: where the policy comes from, for messages.
             seed: of what a stochastic policy leaves to chance; None: nothing is drawn.
@@ -195,6 +203,7 @@ class Driver:
         self._decels: dict[str, float] = {}
         self._raised: set[str] = set()
         self.counts = DriveCounts()
+        self._leaders: dict[str, str] = {}
         self._slots: dict[str, int] = {}
         self._free: list[int] = []
         self._store = VehicleTable.empty(policy, self._driven, 0)
@@ -208,7 +217,7 @@ class Driver:
         network: str | None = ALL,
         model: str | None = None,
         look_ahead: float = 200.0,
-        speed_mode: int = 0,
+        speed_mode: int = OBEYS_ALL,
         seed: int | None = 0,
     ) -> Driver:
         """Reads a job's policy.
@@ -219,7 +228,8 @@ class Driver:
                 vehicle, or the id of a pair, to drive like its driver.
             model: refuse a policy of another driving model than this.
             look_ahead: m; a vehicle farther ahead is no leader.
-            speed_mode: SUMO's bit set of `vehicle.setSpeedMode` while a vehicle is driven.
+            speed_mode: SUMO's bit set of `vehicle.setSpeedMode` while a vehicle is driven: 31 obeys
+                lights, stops and junctions and keeps SUMO's safe gap; 0 does none of it.
             seed: of what a stochastic policy leaves to chance; None: nothing is drawn.
 
         Raises:
@@ -250,7 +260,7 @@ class Driver:
         *,
         dt: float = 0.1,
         look_ahead: float = 200.0,
-        speed_mode: int = 0,
+        speed_mode: int = OBEYS_ALL,
     ) -> Driver:
         """Makes a driver with constant parameters: what a policy is compared with.
 
@@ -259,7 +269,8 @@ class Driver:
             parameters: name -> value, SI units; the others at their defaults.
             dt: time step of the simulation, s.
             look_ahead: m; a vehicle farther ahead is no leader.
-            speed_mode: SUMO's bit set of `vehicle.setSpeedMode` while a vehicle is driven.
+            speed_mode: SUMO's bit set of `vehicle.setSpeedMode` while a vehicle is driven: 31 obeys
+                lights, stops and junctions and keeps SUMO's safe gap; 0 does none of it.
 
         Raises:
             ParameterError: the model has no such parameter.
@@ -382,6 +393,13 @@ class Driver:
         speed = history[:, History._fields.index("follower_speed")]
         return (gap / speed)[speed > _WALKING_MPS]
 
+    def gap_to(self, vehicle: str, leader: str) -> float | None:
+        """Returns the gap at the last step, bumper to bumper, m; None behind another or nobody."""
+        slot = self._slots.get(vehicle)
+        if slot is None or self._leaders.get(vehicle) != leader:
+            return None
+        return float(self._store.history[slot, History._fields.index("gap"), -1])
+
     def parameters(self, vehicle: str) -> dict[str, float]:
         """Returns the parameters of a vehicle now, SI units; empty if the policy drives it not."""
         slot = self._slots.get(vehicle)
@@ -411,7 +429,10 @@ class Driver:
         now = connection.simulation.getTime()
         self._check_step(connection)
         self._forget_gone(connection, names, now)
-        following, seen, alone = look(connection, self._not_yet(names, now), self.look_ahead)
+        following, leaders, seen, alone = look(
+            connection, self._not_yet(names, now), self.look_ahead
+        )
+        self._leaders.update(zip(following, leaders, strict=True))
         for name in alone:
             self.release(connection, name)
         if not following:
@@ -447,6 +468,7 @@ class Driver:
         """Drops all that is known of a vehicle; SUMO keeps the last speed that it was given."""
         self._speed_modes.pop(vehicle, None)
         self._decels.pop(vehicle, None)
+        self._leaders.pop(vehicle, None)
         self._raised.discard(vehicle)
         slot = self._slots.pop(vehicle, None)
         if slot is not None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from cfx.agents.placement import ALL
 from cfx.errors import DataError
-from cfx.sumo.driver import Driver
+from cfx.sumo.driver import OBEYS_ALL, Driver
 from cfx.sumo.surroundings import Connection
 
 
@@ -48,7 +48,7 @@ class Fleet:
         *,
         network: str = ALL,
         look_ahead: float = 200.0,
-        speed_mode: int = 0,
+        speed_mode: int = OBEYS_ALL,
         seed: int = 0,
     ) -> Fleet:
         """Reads the policy of a run for each vType; types with the same run share a driver.

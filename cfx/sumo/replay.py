@@ -146,8 +146,11 @@ def _scene(
     """Simulates the pairs of one scene."""
     from cfx.sumo.driver import Driver
 
-    policy = Driver.load(header["policy"], network=None, look_ahead=LOOK_AHEAD, seed=None)
-    default = Driver.constant(policy.model, dt=header["dt"], look_ahead=LOOK_AHEAD)
+    # Speed mode 0: these trajectories are those of the closed loop in memory, to the last bits.
+    policy = Driver.load(
+        header["policy"], network=None, look_ahead=LOOK_AHEAD, speed_mode=0, seed=None
+    )
+    default = Driver.constant(policy.model, dt=header["dt"], look_ahead=LOOK_AHEAD, speed_mode=0)
     drivers = {"policy": policy, "default": default}
     roads = []
     chosen = {}

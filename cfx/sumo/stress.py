@@ -22,6 +22,7 @@ from cfx.files import write_json
 from cfx.progress import Task
 from cfx.simulators.sumo.installed import require_sumo
 from cfx.sumo.drive import started
+from cfx.sumo.driver import OBEYS_ALL
 from cfx.sumo.fleet import Fleet
 from cfx.sumo.scenarios import ASSETS, CAR, STEP_S
 
@@ -99,7 +100,11 @@ class StressResult:
 
 
 def run_stress(
-    runs: Mapping[str, str | Path], *, seed: int = 0, cut_ins: int = 1000, speed_mode: int = 31
+    runs: Mapping[str, str | Path],
+    *,
+    seed: int = 0,
+    cut_ins: int = 1000,
+    speed_mode: int = OBEYS_ALL,
 ) -> StressResult:
     """Drives all events with the policy of the vType `car`.
 

@@ -24,6 +24,7 @@ class Seen(NamedTuple):
         gap: bumper to bumper.
         leader_speed, leader_acceleration, leader_length: of the vehicle ahead.
         allowed: the speed limit that holds for the follower.
+        min_gap: the follower's `minGap`, the gap that SUMO's own models keep at a standstill.
     """
 
     speed: Tensor
@@ -33,11 +34,12 @@ class Seen(NamedTuple):
     leader_acceleration: Tensor
     leader_length: Tensor
     allowed: Tensor
+    min_gap: Tensor
 
 
 def look(
     connection: Connection, names: list[str], look_ahead: float
-) -> tuple[list[str], Seen, list[str]]:
+) -> tuple[list[str], list[str], Seen, list[str]]:
     """Reads vehicles and their leaders.
 
     Args:
@@ -46,23 +48,24 @@ def look(
         look_ahead: m; a vehicle farther ahead is no leader.
 
     Returns:
-        The vehicles that have a leader, what they and their leaders do, and the vehicles without a
+        The vehicles that have a leader, their leaders, what both do, and the vehicles without a
         leader.
 
     Raises:
         SumoError: a vehicle is not in the simulation.
     """
     reader = _Reader(connection)
-    following, alone, rows = [], [], []
+    following, leaders, alone, rows = [], [], [], []
     for name in names:
         leader = leader_of(connection, name, look_ahead)
         if leader is None:
             alone.append(name)
         else:
             following.append(name)
+            leaders.append(leader[0])
             rows.append(reader.row(name, *leader))
     table = torch.tensor(rows, dtype=torch.float64).reshape(-1, len(Seen._fields))
-    return following, Seen(*table.unbind(1)), alone
+    return following, leaders, Seen(*table.unbind(1)), alone
 
 
 def leader_of(connection: Connection, name: str, look_ahead: float) -> tuple[str, float] | None:
@@ -105,7 +108,8 @@ class _Reader:
         leader_speed, leader_acceleration = self._motion(leader)
         length = self._vehicle.getLength(leader)
         allowed = self._vehicle.getAllowedSpeed(name)
-        return speed, acceleration, gap, leader_speed, leader_acceleration, length, allowed
+        min_gap = self._vehicle.getMinGap(name)
+        return speed, acceleration, gap, leader_speed, leader_acceleration, length, allowed, min_gap
 
     def _motion(self, name: str) -> tuple[float, float]:
         if name not in self._motions:

@@ -34,7 +34,8 @@ print(scenario)
 # ## In your own program
 #
 # `Driver.step` chooses parameters for all vehicles in one call and sets their speeds. It
-# remembers each vehicle, and forgets those that have left.
+# remembers each vehicle, and forgets those that have left. Red lights, stops and junctions are
+# obeyed, and SUMO's safe gap is kept; `speed_mode=0` drives what the model says and obeys none.
 
 # %%
 driver = cfx.sumo.Driver.load("cfx://i80-idm")

@@ -16,7 +16,7 @@ from cfx.agents import checkpoint
 from cfx.console import ConsoleHandler
 from cfx.errors import ConfigError
 from cfx.extras import install_line
-from cfx.sumo.drive import ScenarioRun, Tally, parse_drivers, report
+from cfx.sumo.drive import Collision, ScenarioRun, Tally, parse_drivers, report
 from cfx.sumo.motorway import SHIPPED
 from tests.sumo.policies import adaptive
 
@@ -229,14 +229,14 @@ def test_a_vehicle_that_collides_teleports_or_changes_lanes_is_counted_and_ends_
         fleet.step = careless
         driven = run.go(12.0)
         tally = driven.tallies["calm"]
-        counts = [tally.collisions > 0, tally.teleports, tally.lane_changes, driven.steps]
+        counts = [tally.collisions + tally.below_min_gap, tally.teleports, tally.lane_changes, driven.steps]
         print(json.dumps([sorted(tally.vehicles), *counts]))
         """,
         scenario,
     )
     vehicles, collided, teleports, lane_changes, steps = counts
     assert vehicles == ["blind", "mover"]
-    assert collided
+    assert collided == 1, "once, with contact or below minGap"
     assert teleports == 1
     assert lane_changes >= 1
     assert steps == 120
@@ -252,6 +252,7 @@ def test_the_table_says_it_all(capsys: pytest.CaptureFixture[str]) -> None:
         hard_brakings=2,
         hardest_braking=6.25,
         collisions=1,
+        below_min_gap=8,
         teleports=4,
     )
     tally.braking.add([0.0] * 189 + [0.49] * 10 + [4.99])
@@ -267,14 +268,20 @@ def test_the_table_says_it_all(capsys: pytest.CaptureFixture[str]) -> None:
         limited={"calm": 0.25},
         outside={"calm": "3 % of steps outside what the policy has learned (speed above 18 m/s)"},
         recorded={"calm": recorded},
+        collisions=[
+            Collision(3.1, "calm", "a", "b", "road_0", 51.26, -0.2),
+            Collision(4.0, "calm", "b", "x", "road_0", 80.0, 2.391),
+        ],
     )
     report(run)
     out = capsys.readouterr().out
     rows = [line.split() for line in out.splitlines() if "calm" in line]
-    assert rows[0] == ["calm", "2", "75%", "12.00", "3", "1", "4"]
+    assert rows[0] == ["calm", "2", "75%", "12.00", "3", "1", "8", "4"]
     assert rows[1] == ["calm", "0.49", "4.99", "6.25", "2", "25.0%"]
     assert rows[2] == ["calm", "10.05,", "12.05,", "14.05", *["nan,", "nan,", "nan"] * 2]
     assert rows[3][0] == "calm:"
+    assert "3.10 s: a behind b on road_0 at 51.3 m: contact, gap -0.20 m" in out
+    assert "4.00 s: b behind x on road_0 at 80.0 m: below minGap, gap 2.39 m" in out
     assert "calm: 3 % of steps outside what the policy has learned (speed above 18 m/s)" in out
     assert next(line.split() for line in out.splitlines() if "its recording" in line)[2:5] == [
         "1.00,",

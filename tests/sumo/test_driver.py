@@ -189,7 +189,7 @@ def test_a_vehicle_that_leaves_is_forgotten_and_its_place_is_used_again() -> Non
 def test_without_a_leader_sumo_drives_and_a_new_leader_begins_anew() -> None:
     road = platoon(1)
     car = road.cars["v0"]
-    driver = Driver(adaptive({"name": "krauss"}), look_ahead=100)
+    driver = Driver(adaptive({"name": "krauss"}), look_ahead=100, speed_mode=0)
     driver.step(road, "v0")
     assert car.mode == 0
     assert driver.drives("v0")
@@ -379,6 +379,7 @@ def seen(**values: float) -> Seen:
         "leader_acceleration": 0.0,
         "leader_length": 5.0,
         "allowed": 60.0,
+        "min_gap": 0.0,
     }
     columns = {}
     for name, value in (usual | values).items():
@@ -395,13 +396,16 @@ def test_the_needed_deceleration_just_avoids_the_leader() -> None:
     braking = seen(leader_acceleration=-9.0)
     needed = float(needed_deceleration(braking))
     assert 400.0 / (2.0 * needed) == pytest.approx(30.0 + 400.0 / 18.0)
-    assert float(needed_deceleration(seen(gap=-1.0, speed=10.0, leader_speed=0.0))) == 100.0
+    assert float(needed_deceleration(seen(gap=-1.0, speed=10.0, leader_speed=0.0))) == 250.0
+    # minGap stays as the speeds meet.
+    kept = seen(leader_speed=14.0, gap=12.0, min_gap=2.5)
+    assert float(needed_deceleration(kept)) == pytest.approx(36.0 / 19.0)
 
 
 def test_a_live_vehicle_brakes_comfortably_unless_it_must_brake_harder() -> None:
     """The policy's Krauss wants to stop at once in a gap that is gone."""
     node = {"name": "krauss"}
-    for gap, leader_speed, hardest in ((8.0, 10.0, 4.5), (8.0, 2.0, 6.0), (3.0, 0.0, 9.0)):
+    for gap, leader_speed, hardest in ((8.0, 10.0, 4.5), (10.5, 2.0, 6.0), (3.0, 0.0, 9.0)):
         road = Road(lead=Car(speed=leader_speed), v=Car(speed=10.0, gap=gap, leader="lead"))
         driver = Driver(adaptive(node), speed_mode=31)
         driver.step(road, "v")
@@ -438,7 +442,7 @@ def test_a_model_without_limits_does_not_go_live() -> None:
 def test_steps_outside_the_valid_range_and_at_limits_are_counted() -> None:
     rows = torch.randn((500, 5), generator=torch.Generator().manual_seed(0)).double()
     narrow = ValidRange.of([rows * 0.5 + torch.tensor([5.0, 0.0, 0.0, 0.0, 2.5])])
-    driver = Driver(replace(adaptive({"name": "krauss"}), valid_range=narrow))
+    driver = Driver(replace(adaptive({"name": "krauss"}), valid_range=narrow), speed_mode=0)
     road = platoon(4)
     for _ in range(3):
         driver.step(road, ["v0", "v1", "v2", "v3"])
