@@ -20,7 +20,7 @@ from cfx.agents.valid_range import FADED, SIGNALS
 from cfx.errors import ConfigError, DataError, nearest
 from cfx.files import atomic_write, write_json
 from cfx.hydra_source import path_override
-from cfx.publish.recipes import SHARED_OVERRIDES, RECIPES
+from cfx.publish.recipes import RECIPES, SHARED_OVERRIDES
 from cfx.ready import FOLDER
 
 _TRAINING_DATA = (
