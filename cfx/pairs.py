@@ -9,7 +9,7 @@ Shapes: P pairs, T frames of the longest pair.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -33,6 +33,12 @@ SIGNALS = (
     "follower_speed",
     "follower_acceleration",
 )
+
+_LIKENESS_FRAMES = 8
+"""Frames of a pair at which its likeness is taken."""
+
+_ALIKE = 0.1 + 1e-9
+"""m/s and m; the same trajectory saved with one decimal differs by less, two drivers by more."""
 
 _TOGETHER = 1024
 """Pairs that one part of the work reads before their signals are let go of."""
@@ -107,11 +113,50 @@ class Pair:
         """SHA-256 of the trajectories alone, whatever the pair and its recording are called."""
         return self._digest(f"{self.dt!r}|{self.leader_length!r}")
 
+    @cached_property
+    def likeness(self) -> str:
+        """What the trajectories are recognised by, however they are called and in whatever units.
+
+        In plain numbers: frames, time step (ms), then at frames evenly spread over the pair both
+        speeds (m/s) and the gap (m); see `LearnedFrom`.
+        """
+        at = np.linspace(0, len(self) - 1, _LIKENESS_FRAMES).round().astype(np.int64)
+        values = (self.leader_speed[at], self.follower_speed[at], self.gap[at])
+        numbers = [f"{value:.2f}" for value in np.concatenate(values)]
+        return " ".join([str(len(self)), f"{1000 * self.dt:.0f}", *numbers])
+
     def _digest(self, header: str) -> str:
         digest = hashlib.sha256(header.encode())
         for name in SIGNALS:
             digest.update(np.ascontiguousarray(getattr(self, name), dtype=np.float64).tobytes())
         return digest.hexdigest()
+
+
+class LearnedFrom:
+    """Trajectories that were learned from, by what they are recognised by.
+
+    A pair is one of them if it has as many frames of the same step, and if both speeds and the gap
+    agree to 0.1 m/s and 0.1 m wherever they are compared: other units, names and decimals of a file
+    do not hide it. Another cut of it, in time or in another time step, is not recognised.
+
+    Args:
+        likenesses: `Pair.likeness` of each.
+    """
+
+    def __init__(self, likenesses: Iterable[str]) -> None:
+        found: dict[str, list[list[float]]] = {}
+        for one in likenesses:
+            frames, step, *numbers = one.split()
+            found.setdefault(f"{frames} {step}", []).append([float(value) for value in numbers])
+        self._known = {length: np.array(numbers) for length, numbers in found.items()}
+
+    def __contains__(self, pair: Pair) -> bool:
+        frames, step, *numbers = pair.likeness.split()
+        known = self._known.get(f"{frames} {step}")
+        if known is None:
+            return False
+        differences = np.abs(known - np.array([float(value) for value in numbers]))
+        return bool((differences <= _ALIKE).all(1).any())
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,12 @@ def test_every_experiment_says_its_question_command_and_duration(name: str) -> N
     assert hydra_source.plain(hydra_source.composed([f"experiment={name}"]))["preset"] == name
 
 
+@pytest.mark.parametrize("name", [name for name in NAMES if not name.startswith("paper/")])
+def test_baselines_are_calibrated_as_a_calibration_is(name: str) -> None:
+    chosen = hydra_source.plain(hydra_source.composed([f"experiment={name}"]))["optimizer"]
+    assert chosen == hydra_source.plain(hydra_source.composed([]))["optimizer"]
+
+
 @pytest.mark.parametrize("name", ["paper/pair", "paper/pairs", "paper/clusters", "paper/grid"])
 def test_the_papers_experiments_train_as_the_paper_does(name: str) -> None:
     values = hydra_source.plain(

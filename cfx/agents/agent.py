@@ -112,7 +112,7 @@ class Agent:
         context_rule: how a driver's context is made.
         population: pooled parameters calibrated on the drivers that each network learned from,
             `(N, n)`, SI units; None if there are none.
-        learned_from: the pairs that were learned from or calibrated on: `Pair.content` and the
+        learned_from: the pairs that were learned from or calibrated on: `Pair.likeness` and the
             driver's name.
         recorded: quantiles (5, 50, 95 %) of speed (m/s), acceleration (m/s2) and time gap (s) of
             the drivers learned from; empty if they are not known.

@@ -8,6 +8,8 @@ Shapes: P pairs, W windows of all pairs together.
 
 from __future__ import annotations
 
+import logging
+import statistics
 from dataclasses import dataclass
 
 import torch
@@ -15,9 +17,12 @@ from torch import Tensor
 
 from cfx.calibration.settings import WindowSettings
 from cfx.errors import DataError
+from cfx.metrics.base import TRANSIENT_S
 from cfx.pairs import PairSet
 
 __all__ = ["Split", "WindowSettings", "Windows"]
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,38 @@ class Split:
             frames.append(len(pair) - 1)
             windows.append(settings.count(len(pair)))
         return cls(torch.tensor(frames), torch.tensor(windows))
+
+    def check_test_parts(self, pairs: PairSet, settings: WindowSettings, share: float) -> None:
+        """Warns where test parts are so short that their errors say little.
+
+        Args:
+            pairs: those that are tested, as many as this has.
+            settings, share: as in `of`.
+
+        Raises:
+            DataError: most are within one window, so that parameters are chosen once.
+        """
+        tested = [
+            len(pair) - 1 - last for pair, last in zip(pairs, self.frame.tolist(), strict=True)
+        ]
+        middle = statistics.median(tested)
+        lasts = middle * pairs.dt
+        if lasts >= TRANSIENT_S:
+            return
+        said = (
+            f"split={share:g} leaves {sum(tested):,} frames of {len(tested)} pairs to be tested,"
+            f" {lasts:.2g} s of the median pair"
+        )
+        remedy = "lower split, or keep longer pairs (data.min_frames)"
+        if middle <= settings.length:
+            raise DataError(f"{said}, no more than one window, in which nothing adapts; {remedy}")
+        log.warning(
+            "%s, all of it within the transient of the first %g s, in which every simulation is"
+            " near the measured state: errors say little; %s",
+            said,
+            TRANSIENT_S,
+            remedy,
+        )
 
     def __getitem__(self, index: Tensor | slice) -> Split:
         """Selects pairs by their numbers, `(D,)`, or a slice of them."""

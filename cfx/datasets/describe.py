@@ -7,7 +7,7 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from cfx import registry
 from cfx.datasets.base import Contents, Dataset, listed
 from cfx.datasets.files import Floats, beginning
 from cfx.datasets.partitions import partitions
+from cfx.datasets.resample import frames_in_steps
 from cfx.errors import DataError, PluginError
 from cfx.pairs import Dropped, Pair, PairSet
 from cfx.registry import Entry
@@ -74,8 +75,8 @@ def describe(path: Path) -> str:
     if contents.pairs.ends:
         pieces += ["", "Why pairs end:", *_counts(contents.pairs.ends)]
     pieces += ["", *_problems(contents)]
-    shorter = _shorter(contents.pairs, dataset.settings.min_frames)
-    pieces += ["", f"Use it: data={name} data.path={path}{shorter}"]
+    options, kept = _advice(_lengths(contents.pairs), dataset.settings.min_frames)
+    pieces += ["", f"Use it: data={name} data.path={path}{options}", *kept]
     return _text(pieces)
 
 
@@ -87,6 +88,7 @@ def _describe_partitions(folder: Path, cls: type[Dataset]) -> str:
         table.add_column(heading, justify="right")
     totals = [0] * 5
     names: set[str] = set()
+    lengths: list[_Length] = []
     files = partitions(folder)
     for file in files:
         contents = cls(path=file).contents()
@@ -97,9 +99,11 @@ def _describe_partitions(folder: Path, cls: type[Dataset]) -> str:
         counts = [contents.rows, len(pairs), len(drivers), _frames(pairs), long]
         totals = [before + count for before, count in zip(totals, counts, strict=True)]
         names |= recordings
+        lengths += _lengths(pairs)
         cells = [f"{count:,}" for count in counts]
         table.add_row(str(file.relative_to(folder)), listed(sorted(recordings), 2), *cells)
     table.add_row("all", f"{len(names):,}", *[f"{count:,}" for count in totals])
+    options, kept = _advice(lengths, cls.schema.model_fields["min_frames"].default)
     return _text(
         [
             str(folder),
@@ -109,7 +113,9 @@ def _describe_partitions(folder: Path, cls: type[Dataset]) -> str:
             table,
             "",
             "A recording alone: python -m cfx data describe FILE",
-            f"Use it: data=tidy data.path={folder}, or one recording with data.recording=NAME",
+            f"Use it: data=tidy data.path={folder}{options}",
+            *kept,
+            "One recording of it: data.recording=NAME",
         ]
     )
 
@@ -165,19 +171,48 @@ def _frames(pairs: PairSet) -> int:
     return sum(len(pair) for pair in pairs)
 
 
-def _shorter(pairs: PairSet, usual: int) -> str:
-    """Returns ` data.min_frames=N` where no pair is as long as usual; half of the pairs are.
+class _Length(NamedTuple):
+    """How long a pair is."""
+
+    frames: int
+    dt: float
+
+    def in_steps(self, step: float) -> int:
+        """Returns its frames after `data.time_step=STEP`."""
+        return frames_in_steps(self.frames, self.dt, step)
+
+
+def _lengths(pairs: PairSet) -> list[_Length]:
+    return [_Length(len(pair), round(pair.dt, 9)) for pair in pairs]
+
+
+def _advice(pairs: Sequence[_Length], usual: int) -> tuple[str, list[str]]:
+    """Returns the options that a job needs to use at least half of the pairs, and what it keeps.
 
     Args:
-        pairs: of the file.
+        pairs: of all files.
         usual: shortest pair, in frames, that a job keeps unless told otherwise.
     """
-    lengths = sorted(len(pair) for pair in pairs)
-    if not lengths or lengths[-1] >= usual:
-        return ""
+    if not pairs:
+        return "", []
+    options = ""
+    steps = {pair.dt for pair in pairs}
+    step = max(steps)
+    if len(steps) > 1:
+        options = f" data.time_step={step:g}"
+    lengths = sorted(pair.in_steps(step) for pair in pairs)
     median = lengths[(len(lengths) - 1) // 2]
-    least = max(median // _ROUND * _ROUND, min(median, _ROUND))
-    return f" data.min_frames={least}"
+    least = usual
+    if sum(length >= usual for length in lengths) * 2 < len(lengths):
+        least = max(median // _ROUND * _ROUND, min(median, _ROUND))
+        options += f" data.min_frames={least}"
+    kept = sum(length >= least for length in lengths)
+    if kept == len(lengths):
+        return options, [f"It keeps all {kept:,} pairs."]
+    return options, [
+        f"It keeps {kept:,} of {len(lengths):,} pairs and leaves out {len(lengths) - kept:,}"
+        f" shorter than {least} frames; data.min_frames={lengths[0]} keeps all."
+    ]
 
 
 def _overview(layout: str, contents: Contents) -> Table:
@@ -252,8 +287,8 @@ def _joined(pairs: PairSet, name: str) -> Floats:
 
 def _left_out(pairs: PairSet) -> list[str]:
     if not pairs.dropped:
-        return ["Left out: nothing"]
-    return ["Left out:", *_counts(pairs.dropped)]
+        return ["Left out in reading: nothing"]
+    return ["Left out in reading:", *_counts(pairs.dropped)]
 
 
 def _counts(counts: Sequence[Dropped]) -> list[str]:

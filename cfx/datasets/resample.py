@@ -32,6 +32,16 @@ def resampled(pairs: PairSet, step: float) -> PairSet:
     return replace(kept, dropped=(*pairs.dropped, dropped))
 
 
+def frames_in_steps(frames: int, dt: float, step: float) -> int:
+    """Returns how many frames a trajectory has in another step.
+
+    Args:
+        frames: recorded, `dt` seconds apart.
+        dt, step: s.
+    """
+    return int((frames - 1) * dt / step + _ROUNDING) + 1
+
+
 def _pair(pair: Pair, step: float) -> Pair | None:
     """Returns one pair in the new step; None if it has fewer than two frames then."""
     if np.isclose(pair.dt, step, rtol=0, atol=1e-9):
@@ -39,7 +49,7 @@ def _pair(pair: Pair, step: float) -> Pair | None:
     from scipy.interpolate import PchipInterpolator
 
     last = len(pair) - 1
-    frames = int(last * pair.dt / step + _ROUNDING) + 1
+    frames = frames_in_steps(len(pair), pair.dt, step)
     at = np.arange(frames) * (step / pair.dt)  # in recorded frames
     if len(at) < 2:
         return None

@@ -155,6 +155,9 @@ class AcrossDrivers(Protocol):
         notes = describe_folds(pairs, fold, apart=self.settings.together == "recording")
         members = learned_from(fold, self.settings.folds)
         split = Split.of(pairs, context.windows, context.split)
+        tested = fold >= 0
+        of_tested = pairs.select(tested.tolist(), "not tested")
+        split[tested].check_test_parts(of_tested, context.windows, context.split)
         full = Split.none(pairs, context.windows)
         found = self._calibrated(context, split, full, members)
         policy, training_result = self._learn(context, full, members, found)

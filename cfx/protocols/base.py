@@ -211,7 +211,7 @@ class ProtocolContext:
         head = self._head(policy, training_result)
         _check_networks(who, training_result, len(names), head.answers)
         # Constant parameters are calibrated on these pairs, too.
-        learned_from = {pair.content: pair.driver for pair in self.pairs}
+        learned_from = {pair.likeness: pair.driver for pair in self.pairs}
         return Agent(
             core=AgentCore(policy, training_result.network, training_result.scaler, head),
             model_node=self.model_node,

@@ -20,7 +20,7 @@ from cfx.component import Settings
 from cfx.errors import DataError
 from cfx.files import FilePath
 from cfx.learners.base import CURVE_COLUMNS
-from cfx.pairs import PairSet
+from cfx.pairs import LearnedFrom, PairSet
 from cfx.protocols.across_drivers import AcrossDrivers, AcrossDriversSettings, Trained
 from cfx.protocols.base import ProtocolContext
 from cfx.protocols.held_out import HeldOut
@@ -74,10 +74,11 @@ class FinishedPolicy:
             DataError: the policy has learned from some of the pairs, or drives in other steps.
         """
         policy, pairs, batch = self.agent, context.pairs, context.batch
-        self._check(pairs)
+        self.check(pairs)
         device = batch.lengths.device
         policy = policy.to(device)
         split = Split.of(pairs, context.windows, context.split)
+        split.check_test_parts(pairs, context.windows, context.split)
         fixed = context.calibrator.fixed(pairs, batch, split.frame)
         default = context.space.defaults(dtype=fixed.dtype, device=fixed.device)
         start = default[None]
@@ -116,7 +117,7 @@ class FinishedPolicy:
             calibration=context.calibration_metrics("fixed", split.frame, fixed),
         )
 
-    def _check(self, pairs: PairSet) -> None:
+    def check(self, pairs: PairSet) -> None:
         """Checks that the policy can drive these pairs and has learned from none of them.
 
         Raises:
@@ -128,7 +129,8 @@ class FinishedPolicy:
                 f"{where}: this policy drives in steps of {policy.dt:g} s, {pairs.source} has"
                 f" {pairs.dt:g} s; set data.time_step={policy.dt:g}"
             )
-        known = [pair.pair_id for pair in pairs if pair.content in policy.learned_from]
+        learned_from = LearnedFrom(policy.learned_from)
+        known = [pair.pair_id for pair in pairs if pair in learned_from]
         if known:
             raise DataError(
                 f"{where}: this policy has learned from {len(known)} of the {len(pairs)} pairs in"

@@ -48,6 +48,7 @@ class WithinDriver(Protocol):
     def run(self, context: ProtocolContext) -> ProtocolResult:
         pairs, batch = context.pairs, context.batch
         split = Split.of(pairs, context.windows, context.split)
+        split.check_test_parts(pairs, context.windows, context.split)
         fixed = context.calibrator.fixed(pairs, batch, split.frame)
         labels = context.labels(split.windows, fixed)
         network, names = self._networks(context)

@@ -20,7 +20,7 @@ from cfx.agents.valid_range import FADED, SIGNALS
 from cfx.errors import ConfigError, DataError, nearest
 from cfx.files import atomic_write, write_json
 from cfx.hydra_source import path_override
-from cfx.publish.recipes import DATA_OVERRIDES, RECIPES
+from cfx.publish.recipes import RECIPES, SHARED_OVERRIDES
 from cfx.ready import FOLDER
 
 _TRAINING_DATA = (
@@ -81,12 +81,12 @@ def publish(name: str, job: Path) -> None:
 
 def command_of(name: str) -> str:
     """Returns the command that trains a policy."""
-    overrides = " ".join((*RECIPES[name].overrides, *DATA_OVERRIDES))
+    overrides = " ".join((*RECIPES[name].overrides, *SHARED_OVERRIDES))
     return f"python -m cfx {overrides} data.path=i80_reconstructed_pairs.parquet"
 
 
 def _train(name: str, data: Path, job: Path) -> None:
-    command = [sys.executable, "-m", "cfx", *RECIPES[name].overrides, *DATA_OVERRIDES]
+    command = [sys.executable, "-m", "cfx", *RECIPES[name].overrides, *SHARED_OVERRIDES]
     command.append(path_override("data.path", data.absolute()))
     command.append(path_override("hydra.run.dir", job.absolute()))
     # Our own command, no shell.

@@ -17,7 +17,12 @@ class Recipe(NamedTuple):
     summary: str
 
 
-DATA_OVERRIDES = ("data=tidy", "data.min_frames=300", "protocol.min_test_frames=700")
+SHARED_OVERRIDES = (
+    "optimizer=random",  # by which the constants that they start from were found
+    "data=tidy",
+    "data.min_frames=300",
+    "protocol.min_test_frames=700",
+)
 """What all jobs share; `data.path` is added."""
 
 RECIPES = {

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from cfx.calibration.windows import Split, Windows, WindowSettings
 from cfx.component import validate
 from cfx.errors import ConfigError, DataError
+from cfx.pairs import PairSet
 from tests.drives import straight_pairs
 
 
@@ -59,3 +60,30 @@ def test_a_pair_that_is_too_short_says_how_long_it_must_be() -> None:
 def test_windows_that_leave_frames_out_are_refused() -> None:
     with pytest.raises(ConfigError, match="leaves frames out between windows"):
         validate(WindowSettings, {"length": 3, "stride": 5}, where="windows")
+
+
+def split_of(frames: int, share: float) -> tuple[PairSet, Split]:
+    pairs = straight_pairs([frames] * 3)
+    return pairs, Split.of(pairs, WindowSettings(), share)
+
+
+def test_a_test_part_within_the_transient_is_warned_of_with_what_is_tested(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    pairs, split = split_of(700, 0.99)
+    split.check_test_parts(pairs, WindowSettings(), 0.99)
+    (said,) = caplog.messages
+    assert said.startswith("split=0.99 leaves 42 frames of 3 pairs to be tested, 1.4 s of the")
+    assert "lower split, or keep longer pairs" in said
+
+
+def test_a_test_part_in_which_nothing_adapts_is_refused() -> None:
+    pairs, split = split_of(31, 0.99)
+    with pytest.raises(DataError, match=r"split=0\.99 leaves 15 frames of 3 pairs .*; lower split"):
+        split.check_test_parts(pairs, WindowSettings(), 0.99)
+
+
+def test_usual_test_parts_are_not_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    pairs, split = split_of(300, 0.8)
+    split.check_test_parts(pairs, WindowSettings(), 0.8)
+    assert not caplog.messages

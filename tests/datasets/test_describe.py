@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from cfx.datasets.describe import describe
 from cfx.datasets.synthetic import SyntheticDataset
-from cfx.datasets.tidy import write_tidy
+from cfx.datasets.tidy import TidyDataset, write_tidy
 from cfx.errors import DataError
+from cfx.pairs import PairSet
 from tests.conftest import Installer
 from tests.drives import straight_pairs
 
@@ -23,7 +25,7 @@ def test_describes_real_tidy_pairs(shared_data: Path) -> None:
         "i80-0400 (113 pairs), i80-0500 (116 pairs)",
         "229 of 221 drivers",
         "0.1 s",
-        "Left out: nothing",
+        "Left out in reading: nothing",
     ):
         assert words in text
     line = next(line for line in text.splitlines() if "at least 700" in line)
@@ -113,14 +115,54 @@ def test_a_broken_plugin_is_warned_of_and_stops_nothing(
     assert "cfx-bad" in caplog.text
 
 
-def test_the_advice_is_one_that_keeps_pairs(tmp_path: Path) -> None:
-    """A job leaves out pairs of fewer than 700 frames, unless told otherwise."""
-    short = tmp_path / "short.parquet"
-    write_tidy(straight_pairs([430, 260, 380]), short)
-    assert describe(short).endswith(f"Use it: data=tidy data.path={short} data.min_frames=350")
-    shorter = tmp_path / "shorter.parquet"
-    write_tidy(straight_pairs([30, 20]), shorter)
-    assert describe(shorter).endswith("data.min_frames=20")
-    long = tmp_path / "long.parquet"
-    write_tidy(straight_pairs([700, 20]), long)
-    assert describe(long).endswith(f"data.path={long}")
+def advice(path: Path, pairs: PairSet) -> list[str]:
+    """Writes pairs; returns the options behind the path of the line to use, and what stands below.
+
+    A job leaves out pairs of fewer than 700 frames, unless told otherwise.
+    """
+    write_tidy(pairs, path)
+    used, kept = describe(path).splitlines()[-2:]
+    assert used.startswith(f"Use it: data=tidy data.path={path}")
+    return [used.partition(str(path))[2].strip(), kept]
+
+
+@pytest.mark.parametrize(
+    ("lengths", "options", "kept"),
+    [
+        ([430, 260, 380], "data.min_frames=350", (2, 3)),
+        ([30, 20], "data.min_frames=20", (2, 2)),
+        ([700, 20], "", (1, 2)),
+        ([700, 320, 310], "data.min_frames=300", (3, 3)),
+        ([700, 320, 100], "data.min_frames=300", (2, 3)),
+    ],
+)
+def test_the_advice_keeps_at_least_half_of_the_pairs_and_says_what_it_leaves_out(
+    tmp_path: Path, lengths: list[int], options: str, kept: tuple[int, int]
+) -> None:
+    path = tmp_path / "pairs.parquet"
+    said = advice(path, straight_pairs(lengths))
+    assert said[0] == options
+    few, every = kept
+    if few == every:
+        assert said[1] == f"It keeps all {every} pairs."
+    else:
+        least = options.rpartition("=")[2] or "700"
+        assert said[1] == (
+            f"It keeps {few} of {every} pairs and leaves out {every - few} shorter than {least}"
+            f" frames; data.min_frames={min(lengths)} keeps all."
+        )
+    given = {"path": path} | ({"min_frames": int(options.rpartition("=")[2])} if options else {})
+    assert len(TidyDataset(**given).load()) == few
+
+
+def test_the_advice_brings_recordings_to_one_step(tmp_path: Path) -> None:
+    """A job needs one time step; lengths count in it."""
+    slow = straight_pairs([400])
+    fast = [
+        replace(pair, dt=0.05, pair_id=f"f{pair.pair_id}", recording="fast")
+        for pair in SyntheticDataset(pairs=1, frames=801, dt=0.05).load()
+    ]
+    both = PairSet((*slow, *fast), "both")
+    path = tmp_path / "pairs.parquet"
+    assert advice(path, both) == ["data.time_step=0.1 data.min_frames=400", "It keeps all 2 pairs."]
+    assert len(TidyDataset(path=path, time_step=0.1, min_frames=400).load()) == 2

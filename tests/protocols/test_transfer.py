@@ -16,7 +16,7 @@ from cfx.agents import checkpoint
 from cfx.agents.placement import ALL
 from cfx.contracts import ProtocolContract
 from cfx.datasets.synthetic import SyntheticDataset
-from cfx.datasets.tidy import write_tidy
+from cfx.datasets.tidy import TidyDataset, frame_of, write_tidy
 from cfx.errors import CfxError, DataError, TrackingError
 from cfx.evaluation.closed_loop import simulate_closed_loop
 from cfx.pairs import PairBatch, PairSet
@@ -203,6 +203,23 @@ def test_what_it_has_learned_from_is_refused_whatever_it_is_called(
         cfx.run(
             [*tidy, f"data.path={tmp_path / 'renamed.csv'}", f"hydra.run.dir={tmp_path / 'again'}"]
         )
+
+
+def test_other_units_and_fewer_decimals_do_not_hide_what_it_has_learned_from(
+    unseen: Path, tmp_path: Path
+) -> None:
+    """The same pairs through km/h, and saved with two decimals."""
+    seen = SyntheticDataset(pairs=6, frames=200, seed=5).load()
+    table = frame_of(PairSet(tuple(replace(pair, recording="other") for pair in seen), "seen"))
+    speeds = ["leader_speed_mps", "follower_speed_mps"]
+    for name, saved in {
+        "kmh": table.assign(**{column: table[column] * 3.6 / 3.6 for column in speeds}),
+        "rounded": table.round(2),
+    }.items():
+        path = tmp_path / f"{name}.csv"
+        saved.to_csv(path, index=False)
+        with pytest.raises(DataError, match="has learned from 6 of the 6 pairs"):
+            Transfer(run=unseen).finished.check(TidyDataset(path=path, min_frames=2).load())
 
 
 def test_constant_parameters_are_not_tested_on_whom_they_were_calibrated_on(tmp_path: Path) -> None:
