@@ -393,7 +393,12 @@ def _largest_changes(model: DrivingModel) -> dict[str, float]:
     for column in range(count):
         moved[column, ..., column] = torch.linspace(0, 1, places, dtype=torch.float64)[:, None]
     top = torch.linspace(3, 33, _BEHIND, dtype=torch.float64)
-    leader = Leader(*(x[..., :_PERIOD] for x in _stop_and_go(top, 3.0)[:3]), top * 0 + LENGTH)
+    ahead = _stop_and_go(top, 3.0)
+    leader = ahead._replace(
+        position=ahead.position[..., :_PERIOD],
+        speed=ahead.speed[..., :_PERIOD],
+        acceleration=ahead.acceleration[..., :_PERIOD],
+    )
     far = torch.arange(_BEHIND) % 4 == 3
     gap = torch.where(far, 400.0, 3.0 + 3.0 * top * torch.rand(_BEHIND, generator=draw).double())
     speed = top * (0.5 + 0.7 * torch.rand(_BEHIND, generator=draw).double())
