@@ -164,11 +164,16 @@ def _parameter(parameter: Parameter) -> list[str]:
     about = f"{parameter.name}, {parameter.unit}: {parameter.meaning}"
     if parameter.source:
         about += f" ({parameter.source})"
+    tuned: bool | None = parameter.tuned
+    if parameter.used_with is not None and parameter.tuned:
+        setting, value = parameter.used_with
+        about += f"; tuned: null is true with {setting}={value}, else false"
+        tuned = None
     node = {
         "low": parameter.low,
         "high": parameter.high,
         "default": parameter.default,
-        "tuned": parameter.tuned,
+        "tuned": tuned,
     }
     return [*_comment(about), f"{_scalar(parameter.name)}: {_value(node)}"]
 

@@ -43,6 +43,9 @@ class Parameter:
         tuned: whether calibration and policies choose it; a constant otherwise.
         frozen: whether policies of offsets leave it at its base
             (`ModelSettings.adaptation_bounds`).
+        used_with: the model's setting and its value with which the model uses the parameter, such
+            as `("variant", "vissim")`; None: it always does. With another value the parameter is
+            not tuned, and stays at its default.
     """
 
     name: str
@@ -54,6 +57,7 @@ class Parameter:
     source: str = ""
     tuned: bool = True
     frozen: bool = False
+    used_with: tuple[str, object] | None = None
 
     def __post_init__(self) -> None:
         finite = math.isfinite(self.low) and math.isfinite(self.high)
@@ -72,6 +76,13 @@ class Parameter:
                 f" model.parameters.{self.name}.low or .high"
             )
 
+    def is_used(self, settings: Settings) -> bool:
+        """Says whether a model with these settings uses the parameter."""
+        if self.used_with is None:
+            return True
+        name, value = self.used_with
+        return bool(getattr(settings, name) == value)
+
     @property
     def held(self) -> bool:
         """The earlier name of `frozen`."""
@@ -87,7 +98,11 @@ class ParameterOverride(Settings):
     default: float | None = Field(
         None, description="value of the method 'default', and of a parameter that is not tuned"
     )
-    tuned: bool | None = Field(None, description="whether calibration and policies choose it")
+    tuned: bool | None = Field(
+        None,
+        description="whether calibration and policies choose it; null: as the model declares, and"
+        " not where its settings leave the parameter out",
+    )
 
 
 @dataclass(frozen=True)
@@ -141,6 +156,14 @@ class ParameterSpace:
     def names(self) -> tuple[str, ...]:
         """Names of the tuned parameters, in tensor order."""
         return tuple(parameter.name for parameter in self.tuned)
+
+    def for_settings(self, settings: Settings) -> ParameterSpace:
+        """Returns the space of a model with these settings: what it does not use is not tuned."""
+        parameters = []
+        for parameter in self.parameters:
+            tuned = parameter.tuned and parameter.is_used(settings)
+            parameters.append(replace(parameter, tuned=tuned))
+        return replace(self, parameters=tuple(parameters))
 
     def override(self, changes: Mapping[str, ParameterOverride]) -> ParameterSpace:
         """Returns a space with the config's changes.

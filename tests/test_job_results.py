@@ -67,6 +67,16 @@ def test_hard_braking_and_parameters_at_bounds_are_told() -> None:
     assert "Parameters at their bounds: fixed 25%, policy 50%." in text
 
 
+def test_parameters_that_recordings_do_not_determine_are_told() -> None:
+    evaluation = make_results(pairs=4, frames=20).evaluation
+    about, name = evaluation.about, evaluation.names[0]
+    fixed = about["method"] == "fixed"
+    shares = pd.Series([1.0, 1.0, 0.95, 1.0], index=about.index[fixed])
+    flat = dataclasses.replace(evaluation, about=about.assign(**{f"flat_{name}": shares}))
+    assert f"Not determined: {name} for 3 of 4 pairs" in said(flat)
+    assert "Not determined" not in said(evaluation)
+
+
 def test_a_model_that_follows_nobody_is_not_compared_with_its_fixed_parameters() -> None:
     evaluation = make_results(pairs=4, frames=20).evaluation
     assert "Improvement of the policy over other methods" in said(evaluation)

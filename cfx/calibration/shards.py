@@ -31,6 +31,13 @@ from cfx.simulation.base import Stepper
 _SAME_RELATIVE, _SAME_ABSOLUTE = 1e-5, 1e-8
 """How far a loss that is computed again may differ: candidates in another batch round otherwise."""
 
+_WAY = (1.0, 0.9, 0.7, 0.5, 0.3, 0.1, 0.03, 0.01, 0.0)
+"""Parts of the way from where a search ended to the default that are tried at once; with the last
+one it stays."""
+
+_SETTLING_ROUNDS = 6
+"""How often each parameter is tried at most."""
+
 
 @dataclass(frozen=True)
 class Solver:
@@ -85,10 +92,34 @@ class Solver:
         guesses = default[None, None, :].expand(losses.problems, 1, -1)
         if self.prior == 0:
             return self.minimize(losses, guesses, report)
-        found = self.minimize(LossesWithPrior.of(losses, default, self.prior), guesses, report)
-        best = torch.as_tensor(found["parameters"], device=device)
-        unit = self.space.to_unit(best)[:, None]
-        return {**found, "loss": losses(unit)[:, 0].cpu().numpy()}
+        with_prior = LossesWithPrior.of(losses, default, self.prior)
+        found = self.minimize(with_prior, guesses, report)
+        best = self.space.to_unit(torch.as_tensor(found["parameters"], device=device))
+        settled = self._settled(with_prior, best.double())
+        return {
+            **found,
+            "parameters": self.space.from_unit(settled).cpu().numpy(),
+            "loss": losses(settled[:, None])[:, 0].cpu().numpy(),
+        }
+
+    def _settled(self, losses: LossesWithPrior, best: Tensor) -> Tensor:
+        """Moves what a search has found to where prior plus loss is lowest along each parameter.
+
+        A search stops at what it has tried. Where a parameter hardly matters, the prior alone
+        says where it belongs, and its slope is too small for a search among steep ones. So each
+        parameter in turn goes some part of the way to its default, as far as that is better.
+
+        Args:
+            losses: of the P problems, with the prior.
+            best: `(P, n)` in unit space.
+        """
+        at_once = max(1, self.memory // (losses.bytes_per_candidate * len(_WAY)))
+        worked = losses.for_work(self.optimizer.evaluations())
+        parts = []
+        for first in range(0, len(best), at_once):
+            last = min(first + at_once, len(best))
+            parts.append(_towards_default(worked.select(first, last), best[first:last]))
+        return torch.cat(parts)
 
     def minimize(
         self,
@@ -267,6 +298,23 @@ def solve_shard(shard: CalibrationShard, report: Report) -> list[Arrays]:
             " results would differ in their last bits"
         )
     return shard.solve(report)
+
+
+def _towards_default(losses: LossesWithPrior, best: Tensor) -> Tensor:
+    """Returns `(P, n)` in unit space: see `Solver._settled`."""
+    way = torch.tensor(_WAY, dtype=best.dtype, device=best.device)
+    default, problem = losses.default.to(best), torch.arange(len(best), device=best.device)
+    point = best
+    for _ in range(_SETTLING_ROUNDS):
+        before = point
+        for column in range(best.shape[1]):
+            tried = point[:, None].repeat(1, len(way), 1)
+            tried[..., column] += way * (default[column] - point[:, column, None])
+            index = losses(tried).nan_to_num(nan=torch.inf).argmin(dim=1)
+            point = tried[problem, index]
+        if torch.equal(point, before):
+            break
+    return point
 
 
 def _rows(found: Arrays) -> list[Arrays]:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from typing import Literal, get_args, get_origin
 
 import torch
 from torch import Tensor
 
 from cfx.contracts.contract import NotApplicable, contract_of
+from cfx.errors import CfxError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.simulation.rollout import simulate
 from cfx.simulation.trajectory import Start
@@ -20,6 +23,9 @@ Equilibrium = Callable[[Tensor, Mapping[str, Tensor]], Tensor]
 DT = 0.1
 LENGTH = 5.0
 DRIVES = 64  # random states and parameter sets of the ordinary kind
+_BEHIND = 32  # leaders of its kinds behind which parameters are moved
+_PERIOD = 450  # frames in which a leader of `_stop_and_go` stops and starts again
+_FELT = 1e-3  # m/s: a parameter that changes no speed by this much changes none
 
 _Step = tuple[Follower, Leader, dict[str, Tensor]]
 
@@ -81,6 +87,18 @@ def constants_can_be_tuned_and_tuned_parameters_fixed(model: DrivingModel) -> No
         assert value.dim() == 0, (
             f"constant {name} must reach the step as one number for all followers, for it costs"
             " no memory so"
+        )
+
+
+def every_tuned_parameter_changes_a_trajectory(model: DrivingModel) -> None:
+    for variant, said in _variants(model):
+        moved = _largest_changes(variant)
+        dead = [name for name, change in moved.items() if change < _FELT]
+        assert not dead, (
+            f"{', '.join(dead)} changes no trajectory{said}, from bound to bound behind leaders in"
+            " stop-and-go and on a free road: whatever calibration finds for it is arbitrary"
+            " (say with which setting the model uses it, `Parameter(..., used_with=(SETTING,"
+            " VALUE))`, or `tuned=False`)"
         )
 
 
@@ -345,6 +363,50 @@ def can_be_compiled_as_one_graph(model: DrivingModel) -> None:
         eager,
         msg="compiling the step changes its numbers: calibrations would find others",
     )
+
+
+def _variants(model: DrivingModel) -> Iterator[tuple[DrivingModel, str]]:
+    """Yields the model, and with each choice of its settings that it does not have; says which."""
+    yield model, ""
+    for name, field in model.schema.model_fields.items():
+        if get_origin(field.annotation) is not Literal:
+            continue
+        for choice in get_args(field.annotation):
+            if choice == getattr(model.settings, name):
+                continue
+            # What the first one tunes explicitly, the others may not use.
+            given = {**dict(model.settings), name: choice, "parameters": {}}
+            with suppress(CfxError):  # it does not go with the other settings
+                yield type(model)(**given), f" with {name}={choice}"
+
+
+def _largest_changes(model: DrivingModel) -> dict[str, float]:
+    """Returns by how much each tuned parameter changes a speed at most, m/s.
+
+    Each is moved from bound to bound, the others are drawn within the bounds, or at their defaults.
+    """
+    draw = torch.Generator().manual_seed(4)
+    places, count = 3, len(model.space)
+    unit = torch.rand((_BEHIND, count), generator=draw, dtype=torch.float64)
+    unit[::2] = model.space.to_unit(model.space.defaults())
+    moved = unit.repeat(count, places, 1, 1)  # (n, places, drives, n)
+    for column in range(count):
+        moved[column, ..., column] = torch.linspace(0, 1, places, dtype=torch.float64)[:, None]
+    top = torch.linspace(3, 33, _BEHIND, dtype=torch.float64)
+    ahead = _stop_and_go(top, 3.0)
+    leader = ahead._replace(
+        position=ahead.position[..., :_PERIOD],
+        speed=ahead.speed[..., :_PERIOD],
+        acceleration=ahead.acceleration[..., :_PERIOD],
+    )
+    far = torch.arange(_BEHIND) % 4 == 3
+    gap = torch.where(far, 400.0, 3.0 + 3.0 * top * torch.rand(_BEHIND, generator=draw).double())
+    speed = top * (0.5 + 0.7 * torch.rand(_BEHIND, generator=draw).double())
+    start = Start(-LENGTH - gap, speed, torch.zeros_like(speed))
+    with torch.no_grad():
+        out = simulate(model, model.space.from_unit(moved), leader, start, DT).speed
+    change = (out - out[:, :1]).abs().flatten(1).amax(1)
+    return dict(zip(model.space.names, change.tolist(), strict=True))
 
 
 def _with_tuned(model: DrivingModel, tuned: Mapping[str, bool]) -> DrivingModel:

@@ -152,7 +152,7 @@ def _require_all_read(model: DrivingModel, p: _Noted) -> None:
     """Checks that a model in its default settings reads each tuned parameter that it declares."""
     if not _has_default_settings(model):  # a variant of a model may leave some out
         return
-    names = model.parameters.names
+    names = model.parameters.for_settings(model.settings).names
     unread = [name for name in names if name not in p.read]
     if unread:
         raise PluginError(

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from cfx.calibration.flatness import with_flat_shares
 from cfx.evaluation.forecasts import Forecasts
 from cfx.evaluation.tables import in_text, summaries, wide_table
 from cfx.evaluation.traffic.result import Traffic
@@ -180,7 +181,8 @@ class Evaluation:
     Attributes:
         about: a row per pair and method: pair_id, recording, leader_id, follower_id, driver,
             cluster, style_score, fold, method, frames (that count), and a column `parameter_NAME`
-            with the mean of each tuned parameter over them.
+            with the mean of each tuned parameter over them; of `fixed` also `flat_NAME`, on which
+            share of its range the loss is flat (`cfx.calibration.flatness`), where that was asked.
         values: a row per pair, method, scope and metric; see `cfx.evaluation.tables`.
         measured: the metrics, in the order in which they are shown.
         improvements: statistics of the policy's improvement over each baseline.
@@ -242,6 +244,10 @@ class Evaluation:
     def methods(self) -> tuple[str, ...]:
         """The methods that were compared, in the order of `METHODS`."""
         return _in_order(self.about["method"])
+
+    def with_slices(self, slices: pd.DataFrame) -> Evaluation:
+        """Returns the same results with the columns `flat_NAME`: see `with_flat_shares`."""
+        return replace(self, about=with_flat_shares(self.about, slices, self.names))
 
     def constant_methods(self) -> Evaluation:
         """Returns the same results without the policy.

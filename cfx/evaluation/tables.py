@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from cfx.calibration.flatness import COLUMN
 from cfx.metrics.base import RECORDED, SCOPES, MetricInfo, column_of, key_of
 
 VALUE_COLUMNS = ("pair_id", "driver", "method", "scope", "metric", "value")
@@ -89,7 +90,7 @@ def wide_table(
     Columns besides those of `about`: METRIC, `steady_METRIC`, `full_trajectory_METRIC` and, of the
     recorded driver, `real_METRIC`; `improvement` over `fixed` and `improvement_over_BASELINE`.
     """
-    parameters = [name for name in about if str(name).startswith("parameter_")]
+    parameters = [name for name in about if str(name).startswith(("parameter_", COLUMN))]
     columns: dict[str, pd.Series] = {}
     places = _Places(about)
     for scope in SCOPES:

@@ -15,9 +15,6 @@ from cfx.evaluation.result import Evaluation
 from cfx.protocols.base import ProtocolContext
 from cfx.simulation.rollout import MemoryStepper
 
-MOST_PAIRS = 60
-"""Pairs of which slices are taken, spread evenly over all."""
-
 _CONSTANT = ("default", "population", "fixed")
 
 
@@ -56,16 +53,8 @@ def calibration_view(context: ProtocolContext, evaluation: Evaluation) -> Calibr
             parameters = _parameters(evaluation, method, ids, batch.leader_length)
             found = training_errors(context.calibrator, batch, last, parameters)
             fits.append(_fits(evaluation, method, found))
-    few = torch.linspace(0, len(ids) - 1, min(len(ids), MOST_PAIRS)).round().long()
     best = _parameters(evaluation, "fixed", ids, batch.leader_length)
-    few_there = few.to(best.device)
-    table = slices(
-        context.calibrator,
-        batch[few_there],
-        last[few],
-        best[few_there],
-        [ids[index] for index in few.tolist()],
-    )
+    table = slices(context.calibrator, batch, last, best, ids)
     return CalibrationView(table, pd.concat(fits, ignore_index=True))
 
 

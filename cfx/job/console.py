@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from cfx.calibration.flatness import NEAR, flat_for
 from cfx.evaluation.distributions import (
     LEVEL,
     centre_errors,
@@ -75,6 +76,7 @@ def report(
     if evaluation.traffic is not None:
         console.print(traffic_table(evaluation.traffic))
     _print_safety(shown, result.metrics, console)
+    _print_flat(evaluation, console)
     for scope, words in evaluation.outside.items():
         text = f"Policy, {_SCOPES[scope]}: {words}; there it fades towards its base parameters."
         console.print(text, soft_wrap=True, highlight=False)
@@ -288,6 +290,19 @@ def _print_safety(evaluation: Evaluation, metrics: Mapping[str, float], console:
         sentences.append(f"Parameters at their bounds: {at_bounds}.")
     if sentences:
         console.print(" ".join(sentences), soft_wrap=True, highlight=False)
+
+
+def _print_flat(evaluation: Evaluation, console: Console) -> None:
+    """Prints which driver-specific parameters the recordings do not determine, if there are any."""
+    shares = flat_for(evaluation.table, evaluation.names)
+    pairs = int((evaluation.about["method"] == "fixed").sum())
+    found = [f"{name} for {share * pairs:.0f}" for name, share in shares.items() if share > 0]
+    if found:
+        text = (
+            f"Not determined: {', '.join(found)} of {pairs} pairs (within {100 * NEAR:.0f} % of the"
+            " best loss from bound to bound; flat_NAME is 1 in pairs.csv)."
+        )
+        console.print(text, soft_wrap=True, highlight=False)
 
 
 def _methods_above(

@@ -56,6 +56,8 @@ class Parts:
             CfxError: the simulator needs what is not installed, such as SUMO.
         """
         model = cast(DrivingModel, registry.create("model", config.model))
+        if "model" not in protocol.determines():  # else the policy has been trained already
+            model.refuse_unused()
         simulator = cast(Simulator, registry.create("simulator", config.simulator))
         simulator.require(model)
         learner = cast(Learner, registry.create("learner", config.learner))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ from cfx import registry, renamed
 from cfx.agents import checkpoint
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
+from cfx.calibration.flatness import flat_for
 from cfx.calibration.prior import prior_weight
 from cfx.calibration.settings import WindowSettings
 from cfx.collector import importing
@@ -110,9 +112,10 @@ def take_steps(
         context = _context(config, parts, pairs, style, device)
         with closing(context.simulator), closing(parts.engine):
             protocol_result = _run_protocol(parts.protocol, context)
-            view = None
-            if config.figures.enabled:
-                view = calibration_view(context, protocol_result.evaluation)
+            view = calibration_view(context, protocol_result.evaluation)
+        if view is not None:
+            evaluation = protocol_result.evaluation.with_slices(view.slices)
+            protocol_result = replace(protocol_result, evaluation=evaluation)
         result = _keep(config, parts, output, pairs, style, protocol_result, view, tracker, second)
         if upload is not None:
             upload.finish()
@@ -230,6 +233,8 @@ def _keep(
         of_training |= protocol_result.labels.metrics()
     of_training |= best_losses(protocol_result.curves)
     of_training |= protocol_result.calibration
+    for name, share in flat_for(evaluation.table, evaluation.names).items():
+        of_training[f"flat/{name}"] = share
     metrics = renamed.Metrics(evaluation.metrics() | of_training)
 
     output.replace(config)

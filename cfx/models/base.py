@@ -20,6 +20,7 @@ from pydantic import Field
 from torch import Tensor
 
 from cfx.component import Component, Settings
+from cfx.errors import ConfigError
 from cfx.models.earlier import EarlierNames
 from cfx.models.limits import LimitSettings
 from cfx.models.regimes import Temperature
@@ -119,9 +120,30 @@ class DrivingModel(EarlierNames, Component):
 
     def __init__(self, settings: Settings | None = None, **options: object) -> None:
         super().__init__(settings, **options)
-        self.space = self.parameters.override(self.settings.parameters)
+        declared = self.parameters.for_settings(self.settings)
+        self.space = declared.override(self.settings.parameters)
         self._adaptation_bounds = self.settings.adaptation_bounds or {}
         self.space.for_adaptation(self._adaptation_bounds)  # says now what is wrong with them
+
+    def refuse_unused(self) -> None:
+        """Refuses to tune what the model does not use with its settings.
+
+        A job asks for this. A saved policy that answers such a parameter still drives.
+
+        Raises:
+            ConfigError: `model.parameters.NAME.tuned=true` of such a parameter.
+        """
+        for parameter in self.space.tuned:
+            if parameter.is_used(self.settings):
+                continue
+            assert parameter.used_with is not None
+            setting, value = parameter.used_with
+            chosen = getattr(self.settings, setting)
+            raise ConfigError(
+                f"model.parameters.{parameter.name}.tuned=true: the model does not use"
+                f" {parameter.name} with model.{setting}={chosen}, so there is nothing to tune;"
+                f" leave it out, or set model.{setting}={value}"
+            )
 
     def equations_key(self) -> str:
         """Returns what the equations depend on besides the class; parameters are inputs of them."""

@@ -95,6 +95,7 @@ class Krauss(DrivingModel):
             "brake cap, in variant=sumo only",
             "SUMO's emergencyDecel",
             tuned=False,
+            used_with=("variant", "sumo"),
         ),
     )
 

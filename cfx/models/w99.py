@@ -62,8 +62,8 @@ class W99(DrivingModel):
        0.
 
     In case 4 amax = CC8 + CC9 min(v, 22.2). SUMO realises the result with CC8 as the cap on
-    acceleration, so amax is never felt and **CC9 has no effect** (`variant=vissim` reads it as
-    Vissim does: amax goes from CC8 at standstill to CC9 at 80 km/h, and is the cap).
+    acceleration, so amax is never felt, **CC9 has no effect** and is not tuned (`variant=vissim`
+    reads it as Vissim does: amax goes from CC8 at standstill to CC9 at 80 km/h, and is the cap).
 
     Differences from SUMO: this is the deterministic part. SUMO adds u in [0, 1) to amax (cut off by
     the cap) and, while closing in on a leader that accelerates by 1 m/s2 or more, takes CC1 max(0,
@@ -141,6 +141,7 @@ class W99(DrivingModel):
             1.5,
             "acceleration at 80 km/h; no effect in variant=sumo",
             _VISSIM,
+            used_with=("variant", "vissim"),
         ),
         Parameter(
             "b",

@@ -112,6 +112,8 @@ def _parameters(cls: Any) -> Table:
         tuned = "constant"
         if p.tuned:
             tuned = "yes"
+        if p.tuned and p.used_with is not None:
+            tuned = f"with {p.used_with[0]}={p.used_with[1]}"
         mark = ""
         if p.source:
             mark = f"[{sources.index(p.source) + 1}]"

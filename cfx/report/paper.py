@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from cfx.calibration.flatness import NEAR
 from cfx.files import write_output
 from cfx.plots.words import short_label
 from cfx.report.files import without_folders
 from cfx.report.grouped import Row, any_adapts, baselines_of, methods_of, rows_of
 from cfx.report.job import Job, Runs
-from cfx.report.sections.calibration import sheet, spreads_of
+from cfx.report.sections.calibration import sheet, slices_of, spreads_of
 
 FORMS = {"latex": ".tex", "csv": ".csv"}
 """What a table can be written as, and how its file ends."""
@@ -137,7 +138,7 @@ def _parameter_tables(rows: Sequence[Row]) -> Iterator[str]:
         spreads = () if job.adapts else spreads_of(job)
         if not spreads:
             continue
-        found = sheet(spreads)
+        found = sheet(spreads, slices_of(job))
         lines = []
         for line in found.rows:
             lines.append([cell.text for cell in line])
@@ -145,7 +146,9 @@ def _parameter_tables(rows: Sequence[Row]) -> Iterator[str]:
         name = _ESCAPED.sub(r"\\\g<0>", row.name)
         caption = (
             f"Calibrated parameters, {name}: the model's default, the mean of the folds' pooled"
-            " parameters, and median and quantiles of the driver-specific ones."
+            " parameters, and median and quantiles of the driver-specific ones. Flat: the loss is"
+            f" within {100 * NEAR:.0f} \\% of a driver's best, on so much of the range (median over"
+            " pairs), and for so many pairs on all of it."
         )
         label = re.sub(r"\W+", "-", row.name).strip("-")
         yield _latex_table(table, caption, f"tab:cfx-parameters-{label}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor
 
 from cfx import registry
+from cfx.calibration.flatness import COLUMN
 from cfx.errors import ConfigError, DataError
 from cfx.files import write_output
 from cfx.job_folder import examine, parse_yaml
@@ -51,6 +53,7 @@ def export(run: str | Path, output: str | Path | None = None) -> list[str]:
     folder, home = _folder(run)
     node, table = _read(folder)
     kind, notes = vtypes(node, table)
+    notes += _undetermined(table)
     path = Path(output).expanduser() if output else home / NAME
     write_output(path, _xml(table, kind, notes), "the list of vTypes")
     first = quoteattr(str(table["cluster"].iloc[0]))
@@ -148,6 +151,24 @@ def _read(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
     return node, fixed
 
 
+def _undetermined(table: pd.DataFrame) -> list[str]:
+    """Returns a note on the parameters that some recordings do not determine, if there are any."""
+    counts = Counter(name for row in table.index for name in _flat(table, row))
+    if not counts:
+        return []
+    listed = ", ".join(f"{name} of {count}" for name, count in counts.items())
+    return [
+        f"some recordings do not determine {listed} of the {len(table)} drivers, so that these"
+        " values say nothing of them; each such vType names them in its parameter 'flat'"
+    ]
+
+
+def _flat(table: pd.DataFrame, row: Any) -> list[str]:
+    """Returns the parameters whose loss is flat for the driver of a row, by cfx's names."""
+    columns = [str(name) for name in table if str(name).startswith(COLUMN)]
+    return [name.removeprefix(COLUMN) for name in columns if table[name][row] == 1]
+
+
 def _xml(table: pd.DataFrame, kind: VType, notes: list[str]) -> str:
     columns: dict[str, list[str]] = {}
     for name, value in {"sigma": "0", **kind.attributes}.items():
@@ -165,18 +186,27 @@ def _xml(table: pd.DataFrame, kind: VType, notes: list[str]) -> str:
         for place, row in enumerate(rows.index):
             attributes = {name: values[row] for name, values in columns.items()}
             names.append(f"{cluster}_{place}")
-            lines += _vtype(names[-1], kind, attributes, rows["pair_id"][row])
+            about = {"pair": rows["pair_id"][row]}
+            flat = _flat(table, row)
+            if flat:
+                about["flat"] = " ".join(flat)
+            lines += _vtype(names[-1], kind, attributes, about)
         lines.append("    </vTypeDistribution>")
     lines.append(f'    <vTypeDistribution id="{ALL_DRIVERS}" vTypes={quoteattr(" ".join(names))}/>')
     return "\n".join([*lines, "</additional>", ""])
 
 
-def _vtype(name: str, kind: VType, attributes: Mapping[str, str], pair_id: str) -> list[str]:
+def _vtype(
+    name: str, kind: VType, attributes: Mapping[str, str], about: Mapping[str, str]
+) -> list[str]:
+    further = []
+    for key, said in about.items():
+        further.append(f"            <param key={quoteattr(key)} value={quoteattr(said)}/>")
     given = " ".join(f"{key}={quoteattr(value)}" for key, value in attributes.items())
     return [
         f"        <vType id={quoteattr(name)} carFollowModel={quoteattr(kind.car_follow_model)}"
         f' speedDev="0" {given}>',
-        f'            <param key="pair" value={quoteattr(pair_id)}/>',
+        *further,
         "        </vType>",
     ]
 

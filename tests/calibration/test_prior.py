@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
+import pytest
 import torch
+from torch import Tensor
 
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.losses import SegmentLosses
 from cfx.calibration.prior import LossesWithPrior, prior_weight
+from cfx.models.base import Follower, Leader
 from cfx.models.idm import IDM
 from cfx.objectives.rmse import SpeedRmse
+from cfx.optimizers.base import Optimizer
+from cfx.optimizers.botorch import BotorchOptimizer
 from cfx.optimizers.gradient import GradientSearch
+from cfx.optimizers.random import RandomSearch
 from cfx.pairs import PairBatch
+from cfx.parameters import Parameter, ParameterSpace
 from cfx.progress import Task
 from cfx.simulation.rollout import MemoryStepper
 from tests.drives import wavy_pairs
@@ -63,6 +71,50 @@ def test_what_is_determined_is_found_and_what_is_not_stays() -> None:
     assert bool(((time_gap - TRUE[:, 1]).abs() < 0.15).all())
     default = MODEL.space["v0"].default
     assert bool(((values[:, 0] - default).abs() < 8.0).all())
+
+
+class Indifferent(IDM):
+    """IDM with a parameter that nothing depends on, and one that matters below half its range."""
+
+    parameters = ParameterSpace.of(
+        *IDM.parameters,
+        Parameter("mood", "1", 0.0, 4.0, 1.0, "nothing"),
+        Parameter("most", "m/s2", 0.0, 20.0, 12.0, "bound that these drivers do not reach"),
+    )
+
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
+        speed = super().next_speed(follower, leader, p, dt)
+        return torch.minimum(speed, follower.speed + p["most"] * dt)
+
+
+@pytest.mark.parametrize(
+    "optimizer",
+    [
+        RandomSearch(samples=256),
+        GradientSearch(samples=512),
+        BotorchOptimizer(screening=64, initial=10, iterations=3),
+    ],
+    ids=lambda one: type(one).__name__,
+)
+def test_what_does_not_matter_returns_to_its_default(optimizer: Optimizer) -> None:
+    model = Indifferent()
+    calibrator = Calibrator(
+        MemoryStepper(model, 0.1),
+        optimizer,
+        seed=0,
+        cache=Cache(None),
+        memory=1 << 28,
+        progress=Task,
+        prior=prior_weight("weak"),
+    )
+    last = BATCH.lengths - 1
+    own = calibrator.fixed(PAIRS, BATCH, last)
+    pooled = calibrator.population(PAIRS, BATCH, last, torch.ones((1, 2), dtype=torch.bool))
+    unit = model.space.to_unit(torch.cat([own, pooled]))
+    away = (unit - model.space.to_unit(model.space.defaults()))[:, -2:].abs()
+    assert float(away.max()) < 1e-3
 
 
 def test_without_prior_and_with_it_are_different_entries(tmp_path: Path) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from dataclasses import replace
+from typing import Any, ClassVar, Literal
 
 import pytest
 import torch
@@ -11,8 +12,9 @@ from torch import Tensor
 
 from cfx.contracts import models as checks
 from cfx.contracts import violations
+from cfx.component import Settings
 from cfx.models.base import DrivingModel
-from cfx.models.krauss import Krauss
+from cfx.models.krauss import Krauss, KraussSettings
 from cfx.parameters import Parameter, ParameterSpace
 
 Step = Callable[..., Any]
@@ -86,6 +88,37 @@ def krauss_gap(speed: Tensor, p: Any) -> Tensor:
     return speed * p["t_r"] + p["min_gap"]
 
 
+class Overgrown(Krauss):
+    """Declares a parameter that no equation reads, as tuned."""
+
+    parameters = ParameterSpace.of(
+        *Krauss.parameters, Parameter("mood", "1", 0.0, 1.0, 0.5, "how they feel", "made up")
+    )
+
+
+class MoodySettings(KraussSettings):
+    style: Literal["moody", "calm"] = "moody"
+
+
+class Moody(Overgrown):
+    """Reads it with its default settings only."""
+
+    schema: ClassVar[type[Settings]] = MoodySettings
+
+    def next_speed(self, follower: Any, leader: Any, p: Any, dt: float) -> Tensor:
+        speed = super().next_speed(follower, leader, p, dt)
+        return speed * p["mood"] if self.settings.style == "moody" else speed
+
+
+class Declared(Moody):
+    """Says so."""
+
+    parameters = ParameterSpace.of(
+        *Krauss.parameters,
+        replace(Overgrown.parameters["mood"], used_with=("style", "moody")),
+    )
+
+
 EXTREME = checks.speeds_are_finite_and_not_negative_at_every_extreme
 SHAPE = checks.keeps_shape_dtype_and_device
 BROKEN = {
@@ -142,6 +175,11 @@ BROKEN = {
         checks.constants_can_be_tuned_and_tuned_parameters_fixed,
         "must turn a constant",
     ),
+    "overgrown": (
+        Overgrown(),
+        checks.every_tuned_parameter_changes_a_trajectory,
+        "mood changes no trajectory, from bound",
+    ),
     "no source": (Undocumented(), checks.every_parameter_says_what_it_is, "has no source"),
     "no unit": (Dimensionless(), checks.every_parameter_says_what_it_is, "has no unit"),
     "no reference": (Anonymous(), checks.every_parameter_says_what_it_is, "set `reference`"),
@@ -158,6 +196,15 @@ def test_it_fails(broken: str) -> None:
     component, check, sentence = BROKEN[broken]
     with pytest.raises(AssertionError, match=sentence):
         check(component)
+
+
+def test_a_parameter_that_a_variant_does_not_use_is_told_unless_it_is_declared() -> None:
+    check = checks.every_tuned_parameter_changes_a_trajectory
+    with pytest.raises(AssertionError, match="mood changes no trajectory with style=calm"):
+        check(Moody())
+    check(Declared())
+    assert "mood" in Declared().space.names
+    assert "mood" not in Declared(style="calm").space.names
 
 
 def test_another_equilibrium_is_told() -> None:

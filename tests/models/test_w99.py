@@ -1,9 +1,13 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 
 from cfx.contracts import ModelContract
+import cfx
+from cfx.errors import ConfigError
 from cfx.models.base import Follower, Leader
 from cfx.models.w99 import W99
 
@@ -34,6 +38,23 @@ def test_cc9_has_no_effect_in_sumo_and_is_the_acceleration_at_80_kmh_in_vissim()
     assert free_acceleration(W99(variant="vissim"), 22.2) == pytest.approx(1.5)
     assert free_acceleration(W99(variant="vissim"), 0.0) == pytest.approx(2.0)
     assert free_acceleration(W99(variant="vissim"), 11.1) == pytest.approx(1.75)
+
+
+def test_cc9_is_tuned_where_it_is_used_and_else_held_at_its_default() -> None:
+    assert "cc9" in W99(variant="vissim").space.names
+    space = W99(parameters={"cc9": {"default": 2.5}}).space
+    assert space.names == tuple(f"cc{number}" for number in range(9))
+    assert space.unpack(space.defaults())["cc9"].item() == 2.5
+
+
+def test_a_job_refuses_to_tune_what_the_variant_does_not_use(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=r"cc9\.tuned=true: .* set model\.variant=vissim"):
+        cfx.run(["model=w99", "model.parameters.cc9.tuned=true", "policy=fixed", "data=synthetic"])
+    with pytest.raises(ConfigError, match=r"b_max\.tuned=true: .* set model\.variant=sumo"):
+        cfx.run(["model.parameters.b_max.tuned=true", "model=krauss", "data=synthetic"])
 
 
 def test_it_does_not_creep_into_a_standing_leader() -> None:

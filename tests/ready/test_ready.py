@@ -12,7 +12,7 @@ import cfx
 from cfx import cli, ready
 from cfx.agents import checkpoint
 from cfx.errors import DataError
-from cfx.job.parts import make_protocol
+from cfx.job.parts import Parts, complete, make_protocol
 from cfx.policies.features import History
 from cfx.publish.recipes import RECIPES
 
@@ -134,6 +134,26 @@ def test_transfer_takes_one_by_its_name() -> None:
     )
     determined = make_protocol(config).determines()
     assert determined["model"]["name"] == ready.card_of(NAMES[0])["model"]
+
+
+def test_a_policy_that_answers_what_its_model_does_not_use_is_tested_all_the_same() -> None:
+    from cfx.config import JobConfig
+
+    node = {"name": "transfer", "run": "cfx://i80-w99"}
+    config = JobConfig.of(
+        {
+            "data": {"name": "synthetic"},
+            "model": {"name": "w99"},
+            "policy": {"name": "fixed"},
+            "optimizer": {"name": "random"},
+            "learner": {"name": "rollout"},
+            "protocol": node,
+        }
+    )
+    protocol = make_protocol(config)
+    model = Parts.of(complete(config, protocol), protocol).model
+    assert model.space.names == cfx.load("cfx://i80-w99").policy.model_space.names
+    assert "cc9" in model.space.names
 
 
 def test_a_policy_that_is_too_large_or_no_object_is_not_read(

@@ -8,15 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from cfx.calibration.flatness import flat_shares
 from cfx.plots.choice.common import Array
 from cfx.plots.choice.trajectories import ParameterAxis
-
-NEAR = 0.05
-"""A loss that is higher than the best by no more than this share of it counts as nearly as good."""
 
 RATIO_TITLE = "loss, as a multiple of the best"
 HIGHEST = 2.0
 """Multiple of the best loss at which the axis ends."""
+
+MOST_LINES = 60
+"""Pairs whose slices are drawn, spread evenly over all."""
 
 MOST_DRIVERS = 6
 """Drivers whose labels are shown."""
@@ -31,7 +32,9 @@ class SlicePanel:
         places: `(G,)`, 0 at the lower bound to 1 at the upper.
         values: `(G,)`, the parameter there, SI units.
         ratios: `(D, G)`, the loss as a multiple of the pair's best.
-        near: median over pairs of the share of the range in which the loss is nearly the best.
+        near: median over pairs of the share of the range in which the loss is nearly the best
+            (`cfx.calibration.flatness`).
+        flat: share of the pairs for which that is the whole range.
     """
 
     axis: ParameterAxis
@@ -39,6 +42,14 @@ class SlicePanel:
     values: Array
     ratios: Array
     near: float
+    flat: float
+
+    @property
+    def lines(self) -> Array:
+        """The ratios of those pairs that are drawn."""
+        few = min(len(self.ratios), MOST_LINES)
+        chosen = np.linspace(0, len(self.ratios) - 1, few).round().astype(int)
+        return np.asarray(self.ratios[chosen], dtype=np.float64)
 
     @property
     def median(self) -> Array:
@@ -54,6 +65,7 @@ def slice_panels(table: pd.DataFrame, axes: Sequence[ParameterAxis]) -> tuple[Sl
         axes: the tuned parameters.
     """
     panels = []
+    shares = flat_shares(table)
     for axis in axes:
         rows = table[table["parameter"] == axis.name]
         if rows.empty:
@@ -68,9 +80,11 @@ def slice_panels(table: pd.DataFrame, axes: Sequence[ParameterAxis]) -> tuple[Sl
         if not len(ratios):
             continue
         values = rows.drop_duplicates("place").sort_values("place")["value"]
-        near = float(np.median((ratios <= 1 + NEAR).mean(axis=1)))
+        known = shares[axis.name].dropna()
+        near, flat = float(known.median()), float((known == 1).mean())
         places = wide.columns.to_numpy(dtype=np.float64)
-        panels.append(SlicePanel(axis, places, values.to_numpy(dtype=np.float64), ratios, near))
+        of_axis = values.to_numpy(dtype=np.float64)
+        panels.append(SlicePanel(axis, places, of_axis, ratios, near, flat))
     return tuple(panels)
 
 

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
+from cfx.calibration.flatness import NEAR
 from cfx.plots.choice.identifiability import (
     HIGHEST,
-    NEAR,
     RATIO_TITLE,
     DriverLabels,
     Fit,
@@ -32,9 +32,7 @@ def draw_slices(panels: Sequence[SlicePanel]) -> Figure:
     figure = canvas(0.9 + 2.3 * rows)
     grid = figure.subplots(rows, across, squeeze=False, sharey=True)
     for place, panel in zip(grid.flat, panels, strict=False):
-        place.plot(
-            panel.places, panel.ratios.T, color=colour_of("fixed"), alpha=0.15, linewidth=0.8
-        )
+        place.plot(panel.places, panel.lines.T, color=colour_of("fixed"), alpha=0.15, linewidth=0.8)
         place.plot(panel.places, panel.median, color=INK, linewidth=2)
         place.axhline(1 + NEAR, color=EDGE, linestyle="--", linewidth=1)
         share = percent(panel.near).lstrip("+")

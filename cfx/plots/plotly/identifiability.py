@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from cfx.calibration.flatness import NEAR
 from cfx.plots.choice.identifiability import (
     HIGHEST,
-    NEAR,
     RATIO_TITLE,
     DriverLabels,
     Fit,
@@ -38,7 +38,7 @@ def slices_plot(panels: Sequence[SlicePanel]) -> Plot:
 def _slices(panel: SlicePanel) -> list[Trace]:
     data: list[Trace] = []
     look = {"color": colour_of("fixed"), "width": 1}
-    shown = np.minimum(panel.ratios, 10 * HIGHEST)
+    shown = np.minimum(panel.lines, 10 * HIGHEST)
     for ratios in shown:
         data.append(
             {

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from cfx.calibration.flatness import NEAR
 from cfx.plots.choice.calibration import (
     AT_BOUND,
     ParameterSpread,
@@ -15,7 +16,6 @@ from cfx.plots.choice.calibration import (
     parameter_spreads,
 )
 from cfx.plots.choice.identifiability import (
-    NEAR,
     Fit,
     SlicePanel,
     fits_of,
@@ -143,16 +143,23 @@ def sheet(spreads: Sequence[ParameterSpread], panels: Sequence[SlicePanel] = ())
             f"Share of the range on which the loss is within {NEAR:.0%} of its best, the others"
             " held; median over pairs.".replace("%", " %", 1),
         ),
+        Column(
+            "Flat for",
+            "Share of the pairs for which that is the whole range: these recordings do not"
+            " determine the parameter, and its value says nothing of the driver.",
+        ),
     )
-    near = {panel.axis.name: panel.near for panel in panels}
-    return Sheet(columns, tuple(_row(spread, near) for spread in spreads))
+    of_name = {panel.axis.name: panel for panel in panels}
+    return Sheet(columns, tuple(_row(spread, of_name) for spread in spreads))
 
 
-def _row(spread: ParameterSpread, near: Mapping[str, float]) -> tuple[Cell, ...]:
+def _row(spread: ParameterSpread, panels: Mapping[str, SlicePanel]) -> tuple[Cell, ...]:
     axis = spread.axis
     assert axis.low is not None
     assert axis.high is not None
-    share = near.get(axis.name, float("nan"))
+    share = flat = float("nan")
+    if axis.name in panels:
+        share, flat = panels[axis.name].near, panels[axis.name].flat
     low, median, high = np.quantile(spread.values, (0.05, 0.5, 0.95))
     pooled = float(spread.pooled.mean()) if len(spread.pooled) else float("nan")
     return (
@@ -165,6 +172,7 @@ def _row(spread: ParameterSpread, near: Mapping[str, float]) -> tuple[Cell, ...]
         number(spread.at_low, formatted(spread.at_low, ".0%")),
         number(spread.at_high, formatted(spread.at_high, ".0%")),
         number(share, formatted(share, ".0%")),
+        number(flat, formatted(flat, ".0%")),
     )
 
 
