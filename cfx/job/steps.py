@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from rich.console import Console
 
-from cfx import registry, renamed
+from cfx import registry
 from cfx.agents import checkpoint
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
@@ -230,7 +230,7 @@ def _keep(
         of_training |= protocol_result.labels.metrics()
     of_training |= best_losses(protocol_result.curves)
     of_training |= protocol_result.calibration
-    metrics = renamed.Metrics(evaluation.metrics() | of_training)
+    metrics = evaluation.metrics() | of_training
 
     output.replace(config)
     policy_folder = output.folder / "policy"

@@ -20,7 +20,6 @@ from pydantic import Field
 from torch import Tensor
 
 from cfx.component import Component, Settings
-from cfx.models.earlier import EarlierNames
 from cfx.models.limits import LimitSettings
 from cfx.models.regimes import Temperature
 from cfx.parameters import ParameterOverride, ParameterSpace
@@ -77,7 +76,7 @@ class ModelSettings(Settings):
     )
 
 
-class DrivingModel(EarlierNames, Component):
+class DrivingModel(Component):
     """Base of every driving model.
 
     Life cycle: constructed once per job. `next_speed` (and `next_memory`, if the model has a
