@@ -110,8 +110,6 @@ __all__ = [  # noqa: PLE0604 - the public names, from the one table that also sa
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        name = import_module("cfx.renamed").public(name) or name
     if name in _HOMES:
         value = getattr(import_module(_HOMES[name]), name)
     elif name in {"errors", "sumo"}:

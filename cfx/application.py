@@ -28,7 +28,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from cfx import hydra_source, nodes, registry, renamed
+from cfx import hydra_source, nodes, registry
 from cfx.errors import CfxError, ConfigError, Terminated, printable, without_passwords
 from cfx.memory import is_out_of_memory
 from cfx.plugin_errors import blame
@@ -164,7 +164,6 @@ class JobFunction:
 
 def start(arguments: Sequence[str], *, target: str = JOB) -> int:
     """Runs the Hydra application and returns its exit code; prints each message once."""
-    arguments = todays(arguments)
     _refuse_passwords(arguments)
     _refuse_interpolated_folder()
     _refuse_urls_as_folders(arguments)
@@ -284,7 +283,6 @@ def run(overrides: Sequence[str] = (), *, target: str = JOB) -> JobResult:
     """
     if isinstance(overrides, str):
         raise ConfigError(f"give a list of overrides: cfx.run({overrides.split()!r})")
-    overrides = todays(overrides)
     try:
         config = hydra_source.composed(overrides)
         values = hydra_source.plain(config)
@@ -307,20 +305,6 @@ def wants_traceback(arguments: Sequence[str]) -> bool:
         if argument.startswith("hydra.verbose=") and not argument.lower().endswith("=false"):
             return True
     return False
-
-
-def todays(arguments: Sequence[str]) -> list[str]:
-    """Returns arguments under today's names; see `cfx.renamed`."""
-    chosen = {}
-    for argument in arguments:
-        key, _, value = argument.partition("=")
-        chosen[key.lstrip("+")] = value.split(",")
-
-    def is_current(path: str) -> bool:
-        names = chosen.get(path.partition(".")[0], [])
-        return any(registry.has_setting(name, path) for name in names)
-
-    return renamed.overrides(arguments, is_current)
 
 
 def _call(target: str, values: Any, folder: Path) -> Any:

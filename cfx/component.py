@@ -9,11 +9,10 @@ import json
 from abc import ABC
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, get_args
+from typing import Any, ClassVar, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, field_validator
 
-from cfx import renamed
 from cfx.errors import ConfigError, nearest
 
 Schema = TypeVar("Schema", bound=BaseModel)
@@ -94,21 +93,6 @@ class Component(ABC):
             group = "data" if self.kind == "dataset" else self.kind
             settings = validate(self.schema, options, where=group)
         self.settings = settings
-
-    def __init_subclass__(cls, **options: Any) -> None:
-        """Gives attributes that a class sets under an earlier name their name of today."""
-        super().__init_subclass__(**options)
-        for name, value in renamed.declared(cls).items():
-            setattr(cls, name, value)
-
-    if not TYPE_CHECKING:  # else every attribute would be known to mypy
-
-        def __getattr__(self, name: str) -> Any:
-            """Answers to the earlier names of attributes."""
-            new = renamed.attribute(type(self), name)
-            if new is None:
-                raise AttributeError(f"'{type(self).__name__}' has no attribute '{name}'")
-            return getattr(self, new)
 
     def identity(self) -> dict[str, Any]:
         """Returns what results of this component depend on: its class, its settings and its code.

@@ -12,7 +12,6 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator
 
-from cfx import registry, renamed
 from cfx.calibration.settings import CalibrationSettings, WindowSettings
 from cfx.component import Settings, validate
 from cfx.errors import ConfigError, without_passwords
@@ -182,9 +181,4 @@ class JobConfig(Settings):
             raise ConfigError(
                 f"a configuration is a mapping of keys to values, not {type(values).__name__}"
             )
-        current = renamed.config(values)
-        for group in registry.GROUPS:
-            node = current.get(group)
-            if isinstance(node, Mapping):
-                current[group] = registry.current_node(group, node)
-        return validate(cls, current, where="")
+        return validate(cls, values, where="")

@@ -31,7 +31,7 @@ from hydra.plugins.config_source import ConfigLoadError, ConfigResult, ConfigSou
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 
-from cfx import nodes, registry, renamed
+from cfx import nodes, registry
 
 log = logging.getLogger(__name__)
 
@@ -75,8 +75,6 @@ class ComponentSource(ConfigSource):
 
     def is_config(self, config_path: str) -> bool:
         group, name = _split(config_path)
-        if (group, name) in renamed.OPTIONS:
-            return True
         return group in registry.GROUPS and name.removeprefix("_") in registry.names(group)
 
     def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
@@ -90,26 +88,18 @@ class ComponentSource(ConfigSource):
     def load_config(self, config_path: str) -> ConfigResult:
         """Imports the chosen component and writes its node.
 
-        An option that was renamed, which a user's own file may name, refers to today's.
-
         Raises:
             PluginError: the component cannot be loaded, or two distributions claim its name.
         """
         group, name = _split(config_path)
         if not self.is_config(config_path):
             raise ConfigLoadError(f"Config not found: {config_path}")
-        current = renamed.option(group, name)
-        if current is not None:
-            return self._result({"defaults": [current]})
         name = name.removeprefix("_")
         text = nodes.render(registry.get(group, name), name)
-        return self._result(OmegaConf.create(text))
-
-    def _result(self, config: Any) -> ConfigResult:
         return ConfigResult(
             provider=self.provider,
             path="cfx://",
-            config=OmegaConf.create(config),
+            config=OmegaConf.create(text),
             header={"package": None},
         )
 

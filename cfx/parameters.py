@@ -14,7 +14,6 @@ or 1.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -82,12 +81,6 @@ class Parameter:
             return True
         name, value = self.used_with
         return bool(getattr(settings, name) == value)
-
-    @property
-    def held(self) -> bool:
-        """The earlier name of `frozen`."""
-        _warn("Parameter.held", "frozen")
-        return self.frozen
 
 
 class ParameterOverride(Settings):
@@ -231,11 +224,6 @@ class ParameterSpace:
             return None
         return ~torch.tensor(frozen, device=device)
 
-    def free(self, *, device: torch.device | str | None = None) -> Tensor | None:
-        """The earlier name of `adaptable`."""
-        _warn("ParameterSpace.free", "adaptable")
-        return self.adaptable(device=device)
-
     def bounds(
         self, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None
     ) -> Tensor:
@@ -314,11 +302,6 @@ def _check_adaptation(
                 f"model.adaptation_bounds.{name}=[{low}, {high}]: the first must be below the"
                 " second, and both finite"
             )
-
-
-def _warn(old: str, new: str) -> None:
-    text = f"{old} is now called {new}; the old name goes with the next version"
-    warnings.warn(text, DeprecationWarning, stacklevel=3)
 
 
 def _for_adaptation(parameter: Parameter, bounds: tuple[float, float] | None) -> Parameter:

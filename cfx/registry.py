@@ -30,7 +30,6 @@ from typing import Any, get_args
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from cfx import renamed
 from cfx.collector import importing
 from cfx.component import API_VERSION, Component, Settings, validate
 from cfx.errors import CfxError, ConfigError, PluginError, nearest
@@ -263,8 +262,6 @@ def create(kind: str, node: Mapping[str, Any]) -> Component:
         raise ConfigError(
             f"{group}.name: a value is required; choose a {kind}: {', '.join(names(kind))}"
         )
-    node = current_node(group, node)
-    name = str(node["name"])
     cls, found = get(kind, name), entry(kind, name)
     values = {key: value for key, value in node.items() if key != "name"}
     settings = validate(cls.schema, _without_blanks(cls.schema, values), where=group)
@@ -279,27 +276,6 @@ def create(kind: str, node: Mapping[str, Any]) -> Component:
         ) from error
     _smoke_check(found, component, settings)
     return component
-
-
-def current_node(group: str, node: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns a component's config node under today's names; warns of each that was renamed.
-
-    A name of the version before is no old name where the component has a setting of that name.
-    """
-    name = str(node.get("name"))
-    return renamed.node(group, node, lambda path: has_setting(name, path))
-
-
-def has_setting(name: str, path: str) -> bool:
-    """Says whether a component has the setting that a path such as `learner.epochs` leads to."""
-    group, _, key = path.partition(".")
-    if group not in GROUPS:
-        return False
-    try:
-        cls = get(group, name)
-    except CfxError:  # there is none; whoever creates it says so
-        return False
-    return key.partition(".")[0] in cls.schema.model_fields
 
 
 def is_loaded(found: Entry) -> bool:

@@ -13,7 +13,7 @@ import torch
 import yaml
 
 import cfx
-from cfx import registry, renamed
+from cfx import registry
 from cfx.cli import COMMANDS, PARSERS
 from cfx.hydra_source import composed
 from cfx.models.base import DrivingModel
@@ -264,19 +264,6 @@ def test_the_floors_are_those_of_the_test_of_imports() -> None:
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| \d+ \| ([\w, ]+) \|$", text, flags=re.MULTILINE)
     assert [tuple(row.split(", ")) for row in rows] == list(FLOORS)
-
-
-def test_the_changelog_names_everything_that_was_renamed_or_removed() -> None:
-    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
-    pairs = [*renamed.SETTINGS.items(), *renamed.ATTRIBUTES.items()]
-    for (group, old), new in renamed.OPTIONS.items():
-        pairs.append((f"{group}={old}", f"{group}={new}"))
-    for old, new in renamed.PUBLIC.items():
-        pairs.append((f"cfx.{old}", f"cfx.{new}"))
-    for old, new in pairs:
-        assert f"| `{old}` | `{new}` |" in text, old
-    for old in renamed.REMOVED:
-        assert f"| `{old}` | " in text, old
 
 
 def guide() -> list[tuple[str, str]]:

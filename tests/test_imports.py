@@ -17,7 +17,7 @@ import cfx
 PACKAGE = Path(cfx.__file__).parent
 
 FLOORS = (
-    ("errors", "renamed"),
+    ("errors",),
     ("component",),
     (
         "parameters",

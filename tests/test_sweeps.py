@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import hydra
 import pytest
 from filelock import FileLock
 
@@ -244,23 +243,6 @@ def test_a_job_runs_again_if_one_of_several_files_changed(run: Run, path: str) -
     Path("b.csv").write_text("ab")
     assert run(*command) == 0
     assert len(ran()) == 2
-
-
-def test_a_sweep_that_a_file_of_the_version_before_asks_for_has_todays_names(
-    run: Run, capsys: pytest.CaptureFixture[str]
-) -> None:
-    Path("mine/experiment").mkdir(parents=True)
-    Path("mine/experiment/old.yaml").write_text(
-        "# @package _global_\ndefaults:\n  - override /learner: rollout\nhydra:\n  mode: MULTIRUN\n"
-        "  sweeper:\n    params:\n      learner.members: 2,3\n"
-    )
-    if not hydra.__version__.startswith("1.3"):
-        assert run("--config-dir", "mine", "experiment=old") == 2
-        assert "write learner.ensemble_size instead" in capsys.readouterr().err
-        return
-    assert run("--config-dir", "mine", "experiment=old") == 0
-    (folder,) = sweeps()
-    assert [row["learner.ensemble_size"] for row in summary(folder)] == ["2", "3"]
 
 
 def test_a_sweep_that_runs_is_left_alone(run: Run, capsys) -> None:

@@ -55,16 +55,6 @@ EXACT: dict[str, str] = {
 }
 """The same where the case of letters or the characters beside them matter."""
 
-EXEMPT = {ROOT / "cfx" / "renamed.py", ROOT / "tests" / "test_words.py"}
-"""Files that name old names on purpose; CHANGELOG.md is not among the texts."""
-
-ALLOWED = {
-    "cfx/models/earlier.py": {"softness"},
-    "cfx/models/regimes.py": {"softness"},
-    "cfx/sumo/driver.py": {"traits"},
-}
-"""Names that plugins of the version before use, where they still work."""
-
 SUFFIXES = {".py", ".md", ".yaml", ".toml", ".html", ".js", ".j2", ".tmpl", ".txt"}
 
 
@@ -74,7 +64,7 @@ def texts() -> list[Path]:
     for folder in ("cfx", "conf", "docs", "plugins"):
         for path in sorted((ROOT / folder).rglob("*")):
             hidden = "__pycache__" in path.parts or ".min." in path.name
-            if path.suffix in SUFFIXES and not hidden and path not in EXEMPT:
+            if path.suffix in SUFFIXES and not hidden:
                 found.append(path)
     return found
 
@@ -104,8 +94,6 @@ def test_the_old_words_are_gone() -> None:
     for path in texts():
         for number, word, instead in old_words(path.read_text(encoding="utf-8")):
             where = path.relative_to(ROOT).as_posix()
-            if word.lower() in ALLOWED.get(where, ()):
-                continue
             wrong.append(f"{where}:{number}: '{word}': write {instead}")
     assert not wrong, f"{len(wrong)} old words\n" + "\n".join(wrong)
 

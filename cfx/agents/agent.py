@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from cfx import registry, renamed
+from cfx import registry
 from cfx.agents.context import UNSEEN, ContextRule, DriverContext
 from cfx.agents.core import AgentCore
 from cfx.agents.heads.base import ParameterHead
@@ -166,12 +166,6 @@ class Agent:
     def model_space(self) -> ParameterSpace:
         """Those of them that the driving model has."""
         return self.core.head.model_space
-
-    def __getattr__(self, name: str) -> Any:
-        new = renamed.attribute(type(self), name)
-        if new is None:
-            raise AttributeError(f"an agent has no attribute '{name}'")
-        return getattr(self, new)
 
     @property
     def is_stochastic(self) -> bool:

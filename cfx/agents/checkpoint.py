@@ -1,8 +1,7 @@
 """Saved policies: an agent in a folder.
 
 `policy.json` holds everything that is text or a number, `policy.safetensors` the tensors: neither
-can hold code. Formats 1 and 2 kept the tensors in `policy.pt`, a state dict that is read with
-`weights_only=True`; format 1 did not name the head. What they saved loads too.
+can hold code.
 """
 
 from __future__ import annotations
@@ -13,16 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import safetensors.torch
-import torch
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from safetensors import SafetensorError
 from torch import Tensor
 
-from cfx import registry, renamed
+from cfx import registry
 from cfx.agents.agent import Agent
 from cfx.agents.context import ContextRule
 from cfx.agents.core import AgentCore, features_read, network_with_weights
-from cfx.agents.heads import HEADS, head_name
+from cfx.agents.heads import HEADS
 from cfx.agents.heads.base import ParameterHead
 from cfx.agents.scaler import Scaler
 from cfx.agents.valid_range import SIGNALS, ValidRange
@@ -34,12 +32,9 @@ from cfx.models.base import DrivingModel
 from cfx.policies.base import Policy
 
 _FORMAT = 3
-_READABLE = (1, 2, 3)
 
 _DESCRIPTION = "policy.json"
 _TENSORS = "policy.safetensors"
-_TENSORS_BEFORE = "policy.pt"
-"""Where formats 1 and 2 kept the tensors."""
 
 _RANGE = "valid_range."
 """What names of tensors of the valid range begin with."""
@@ -71,26 +66,24 @@ def load(folder: Path | str) -> Agent:
     examine(folder)
     written, weights = _read(folder)
     description = _validated(folder, written)
-    policy_node = renamed.node("policy", description.policy)
-    model_node = renamed.node("model", description.model)
     try:
-        policy = registry.create("policy", policy_node)
-        model = registry.create("model", model_node)
+        policy = registry.create("policy", description.policy)
+        model = registry.create("model", description.model)
     except (ConfigError, ParameterError) as error:
         raise DataError(f"{folder}/{_DESCRIPTION}: {error}") from None
     assert isinstance(policy, Policy)
     assert isinstance(model, DrivingModel)
     policy = policy.for_model(model, description.dt, description.windows)
-    head = _head(folder, description, model, has_base="base" in weights)
+    head = _head(folder, description, model)
     try:
-        return _agent(description, weights, policy, model_node, policy_node, head)
+        return _agent(description, weights, policy, head)
     except (ValueError, KeyError, TypeError, IndexError, AttributeError, RuntimeError) as error:
         reason = next(iter(str(error).splitlines()), type(error).__name__)
         raise DataError(f"{folder}: the weights do not fit the description ({reason})") from error
 
 
 class _Description(BaseModel):
-    """What `policy.json` must hold; formats 1 and 2 lack some of it."""
+    """What `policy.json` must hold."""
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
@@ -99,16 +92,14 @@ class _Description(BaseModel):
     windows: WindowSettings
     dt: float = Field(gt=0, le=100)
     names: tuple[str, ...] = Field(min_length=1)
-    parameters: tuple[str, ...] = ()
-    head: str | None = None
-    ensemble_size: int = Field(
-        1, ge=1, le=64, validation_alias=AliasChoices("ensemble_size", "members")
-    )
-    own: bool = True
-    shrinkage: float = Field(0.0, ge=0, le=1)
-    history: float | None = Field(None, ge=0)
-    learned_from: dict[str, str] = {}
-    recorded: dict[str, tuple[float, ...]] = {}
+    parameters: tuple[str, ...] = Field(min_length=1)
+    head: str
+    ensemble_size: int = Field(ge=1, le=64)
+    own: bool
+    shrinkage: float = Field(ge=0, le=1)
+    history: float | None = Field(ge=0)
+    learned_from: dict[str, str]
+    recorded: dict[str, tuple[float, ...]]
 
 
 def _validated(folder: Path, written: Mapping[str, Any]) -> _Description:
@@ -126,8 +117,6 @@ def _agent(
     description: _Description,
     weights: Mapping[str, Tensor],
     policy: Policy,
-    model_node: Mapping[str, Any],
-    policy_node: Mapping[str, Any],
     head: ParameterHead,
 ) -> Agent:
     """Puts an agent together.
@@ -162,8 +151,8 @@ def _agent(
     network = network_with_weights(policy, trained, description.ensemble_size, scaler, head.answers)
     return Agent(
         core=AgentCore(policy, network, scaler, head),
-        model_node=model_node,
-        policy_node=policy_node,
+        model_node=description.model,
+        policy_node=description.policy,
         windows=description.windows,
         dt=description.dt,
         names=description.names,
@@ -246,34 +235,23 @@ def _read(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         description = parse_json(text)
         if not isinstance(description, dict):
             raise ValueError(f"{_DESCRIPTION} is no JSON object")
-        weights = _read_tensors(folder)
+        weights = safetensors.torch.load((folder / _TENSORS).read_bytes())
     except (OSError, ValueError, RuntimeError, SafetensorError) as error:
         raise DataError(
             f"{folder} holds no policy that can be read ({error}); give a job's folder"
         ) from error
-    if description.get("format") not in _READABLE:
+    if description.get("format") != _FORMAT:
         raise DataError(
-            f"{folder}/policy.json has format {description.get('format')}; this version of cfx"
-            f" reads formats {_READABLE[0]} to {_READABLE[-1]}"
+            f"{folder}/{_DESCRIPTION} has format {description.get('format')}; this version of cfx"
+            f" reads format {_FORMAT}"
         )
     return description, weights
 
 
-def _read_tensors(folder: Path) -> dict[str, Tensor]:
-    if (folder / _TENSORS).is_file():
-        return safetensors.torch.load((folder / _TENSORS).read_bytes())
-    before = folder / _TENSORS_BEFORE
-    weights: dict[str, Tensor] = torch.load(before, weights_only=True, map_location="cpu")
-    return weights
-
-
-def _head(
-    folder: Path, description: _Description, model: DrivingModel, *, has_base: bool
-) -> ParameterHead:
-    name = description.head or head_name(has_base=has_base)
-    if name not in HEADS:
+def _head(folder: Path, description: _Description, model: DrivingModel) -> ParameterHead:
+    if description.head not in HEADS:
         raise DataError(
-            f"{folder}/policy.json: this version of cfx has no head '{name}'; it has"
+            f"{folder}/{_DESCRIPTION}: this version of cfx has no head '{description.head}'; it has"
             f" {', '.join(HEADS)}"
         )
-    return HEADS[name].for_model(model).as_saved(description.parameters)
+    return HEADS[description.head].for_model(model)

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pandas as pd
 
-from cfx import renamed
 from cfx.agents import checkpoint
 from cfx.agents.agent import Agent
 from cfx.errors import DataError
@@ -77,7 +76,8 @@ def load(folder_or_run: str | Path) -> JobResult:
             raise FileNotFoundError("it has no metrics.json")
         pairs = pd.DataFrame()  # no recording, and nothing of one, comes with a ready-made policy
         if not is_ready_made(folder_or_run):
-            pairs = _pairs(folder)
+            names = {"leader_id": str, "follower_id": str}
+            pairs = pd.read_csv(folder / "pairs.csv", dtype=names)
     except (OSError, ValueError, KeyError) as error:
         raise DataError(
             f"{folder} holds no finished job ({error}); give the output folder that a job printed"
@@ -86,8 +86,3 @@ def load(folder_or_run: str | Path) -> JobResult:
     figures = tuple(sorted((folder / "figures").glob("*.*")))
     policy = checkpoint.load(folder / "policy")
     return JobResult(metrics, pairs, policy, figures, folder)
-
-
-def _pairs(folder: Path) -> pd.DataFrame:
-    table = pd.read_csv(folder / "pairs.csv", dtype={"leader_id": str, "follower_id": str})
-    return renamed.results(table)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 from rich.console import Console
 
-from cfx import registry, renamed
+from cfx import registry
 from cfx.agents import checkpoint
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
@@ -235,7 +235,7 @@ def _keep(
     of_training |= protocol_result.calibration
     for name, share in flat_for(evaluation.table, evaluation.names).items():
         of_training[f"flat/{name}"] = share
-    metrics = renamed.Metrics(evaluation.metrics() | of_training)
+    metrics = evaluation.metrics() | of_training
 
     output.replace(config)
     policy_folder = output.folder / "policy"

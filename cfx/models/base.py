@@ -21,7 +21,6 @@ from torch import Tensor
 
 from cfx.component import Component, Settings
 from cfx.errors import ConfigError
-from cfx.models.earlier import EarlierNames
 from cfx.models.limits import LimitSettings
 from cfx.models.regimes import Temperature
 from cfx.parameters import ParameterOverride, ParameterSpace
@@ -78,7 +77,7 @@ class ModelSettings(Settings):
     )
 
 
-class DrivingModel(EarlierNames, Component):
+class DrivingModel(Component):
     """Base of every driving model.
 
     Life cycle: constructed once per job. `next_speed` (and `next_memory`, if the model has a

@@ -10,8 +10,6 @@ Simulation, calibration and evaluation always take the exact choice.
 
 from __future__ import annotations
 
-import warnings
-
 import torch
 from torch import Tensor
 
@@ -20,9 +18,6 @@ Temperature = float | Tensor
 
 A 0-dimensional tensor may change while compiled code runs, and is never exact.
 """
-
-Softness = Temperature
-"""Earlier name of `Temperature`."""
 
 SPACING = 2.0
 """m: how gradually a threshold of distance is crossed at temperature 1."""
@@ -44,7 +39,6 @@ def below(
     *,
     scale: float,
     temperature: Temperature = 0.0,
-    softness: Temperature | None = None,
 ) -> Tensor:
     """Returns `yes` where `value < threshold`, else `no`; a mixture near it at a temperature.
 
@@ -52,9 +46,7 @@ def below(
         value, threshold, yes, no: `(*batch,)`, broadcasting; finite.
         scale: width of the transition at temperature 1, in the unit of `value`.
         temperature: how gradual; 0 is exact.
-        softness: earlier name of `temperature`.
     """
-    temperature = _today(temperature, softness)
     if exact(temperature):
         return torch.where(value < threshold, yes, no)
     return torch.lerp(no, yes, torch.sigmoid((threshold - value) / (scale * temperature)))
@@ -68,20 +60,8 @@ def up_to(
     *,
     scale: float,
     temperature: Temperature = 0.0,
-    softness: Temperature | None = None,
 ) -> Tensor:
     """As `below`, for `value <= threshold`."""
-    temperature = _today(temperature, softness)
     if exact(temperature):
         return torch.where(value <= threshold, yes, no)
     return below(value, threshold, yes, no, scale=scale, temperature=temperature)
-
-
-def _today(temperature: Temperature, softness: Temperature | None) -> Temperature:
-    """Returns the temperature, also where it is given by its earlier name."""
-    if softness is None:
-        return temperature
-    if not torch.compiler.is_compiling():  # a warning would break the compiled graph
-        text = "softness= is now called temperature=; the old name goes with the next version"
-        warnings.warn(text, DeprecationWarning, stacklevel=3)
-    return softness

@@ -12,11 +12,9 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cfx import renamed
 from cfx.errors import DataError
 from cfx.job_folder import parse_json, parse_yaml
 from cfx.memory import in_units, total_memory
-from cfx.style.result import CLUSTERS
 
 T = TypeVar("T")
 
@@ -63,27 +61,23 @@ def read_metrics(path: Path) -> dict[str, float]:
             values[str(name)] = math.nan if value is None else float(value)
     except (TypeError, ValueError) as error:
         raise DataError(f"{path} is damaged: a metric is no number ({error})") from error
-    return renamed.metrics(values)
+    return values
 
 
 def read_pairs(path: Path, columns: Iterable[str]) -> pd.DataFrame:
-    """Reads `pairs.csv`, with clusters by name.
+    """Reads `pairs.csv`.
 
     Raises:
         DataError: the file cannot be read, or lacks a column or the policy.
     """
     table = read_table(path, columns)
-    # Earlier versions wrote the clusters' numbers.
-    table["cluster"] = table["cluster"].astype(str)
-    for number, name in enumerate(CLUSTERS):
-        table["cluster"] = table["cluster"].replace(str(number), name)
     if "policy" not in set(table["method"]):
         raise DataError(f"{path} is damaged: it has no row of the method 'policy'")
     return table
 
 
 def read_table(path: Path, columns: Iterable[str]) -> pd.DataFrame:
-    """Reads a table under today's names; all columns but names hold numbers.
+    """Reads a table; all columns but names hold numbers.
 
     Args:
         path: of a CSV or Parquet file.
@@ -92,7 +86,7 @@ def read_table(path: Path, columns: Iterable[str]) -> pd.DataFrame:
     Raises:
         DataError: the file cannot be read, or holds something else.
     """
-    table = renamed.results(_load(path))
+    table = _load(path)
     for column in columns:
         if column not in table:
             raise DataError(f"{path} is damaged: it has no column '{column}'")

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from cfx import renamed
 from cfx.evaluation.result import METHODS, PairTrajectory
 from cfx.metrics.base import TRANSIENT_S, MetricInfo, key_of
 from cfx.plots.choice.trajectories import ParameterAxis
@@ -126,15 +125,12 @@ class Job:
     @property
     def adapts(self) -> bool:
         """Whether its policy may change the parameters; if not, the job is a calibration."""
-        known = self.data.get("adapts")
-        if isinstance(known, bool):
-            return known
-        return self.component("policy") not in {"fixed", "default"}
+        return self.data.get("adapts") is not False
 
     @property
     def has_constant_baseline(self) -> bool:
         """Whether the model follows its leader with constant parameters: those are baselines."""
-        return renamed.data(self.data).get("has_constant_baseline") is not False
+        return self.data.get("has_constant_baseline") is not False
 
     def metric(self, name: str, method: str, scope: str = TEST) -> float:
         """Returns a metric of a method over a part of the trajectories; NaN if it is not known."""
@@ -151,7 +147,7 @@ class Job:
     @cached_property
     def known_metrics(self) -> tuple[MetricInfo, ...]:
         """What the job measured, in the order in which it is shown."""
-        return known_metrics(renamed.data(self.data), self.metrics)
+        return known_metrics(self.data, self.metrics)
 
     @cached_property
     def _summaries(self) -> dict[tuple[str, str, str], float]:

@@ -13,7 +13,6 @@ from typing import Any
 
 import pandas as pd
 
-from cfx import renamed
 from cfx.evaluation.distributions import DISTRIBUTION_COLUMNS
 from cfx.evaluation.forecasts import FORECAST_COLUMNS
 from cfx.evaluation.traffic.result import GROWTH_COLUMNS, ROAD_COLUMNS, STRIP_COLUMNS
@@ -110,7 +109,7 @@ def read_job(folder: Path, origin: Origin) -> Job:
         traffic_growth=tables["traffic_growth.parquet"],
         traffic_strips=tables["traffic_strips.parquet"],
         overrides=_overrides(hydra),
-        experiment=_experiment(config, hydra),
+        experiment=str(config.get("preset") or ""),
         started=started,
         seconds=seconds,
         version=_version(data, origin),
@@ -128,9 +127,7 @@ def _version(data: Mapping[str, Any], origin: Origin) -> str:
 
 
 def _table(folder: Path, name: str) -> pd.DataFrame | None:
-    """Returns a table of the folder, under the file's earlier name if need be."""
-    path = renamed.file(folder / name)
-    return optional(path, partial(read_table, columns=_COLUMNS[name]))
+    return optional(folder / name, partial(read_table, columns=_COLUMNS[name]))
 
 
 def _overrides(folder: Path) -> tuple[str, ...] | None:
@@ -138,16 +135,6 @@ def _overrides(folder: Path) -> tuple[str, ...] | None:
     if typed is None:
         return None
     return tuple(without_password(str(one)) for one in typed)
-
-
-def _experiment(config: Mapping[str, Any], folder: Path) -> str | None:
-    """Returns the preset that was chosen: what the job wrote down itself, else what Hydra did."""
-    if "preset" in config:
-        return str(config["preset"] or "")
-    values: Any = optional(folder / ".hydra" / "hydra.yaml", read_yaml)
-    for key in ("hydra", "runtime", "choices"):
-        values = values.get(key) if isinstance(values, Mapping) else None
-    return str(values.get("experiment") or "") if isinstance(values, Mapping) else None
 
 
 def _duration(folder: Path, origin: Origin) -> tuple[datetime | None, float | None]:

@@ -21,7 +21,7 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from cfx import registry, renamed
+from cfx import registry
 from cfx.agents import checkpoint
 from cfx.agents.agent import Agent, AgentState
 from cfx.agents.context import DriverContext
@@ -313,7 +313,6 @@ class Driver:
         *,
         base: Mapping[str, float] | None = None,
         driver_features: Mapping[str, float] | None = None,
-        **earlier: Mapping[str, float],
     ) -> None:
         """Says how a vehicle is driven from when it begins.
 
@@ -329,15 +328,12 @@ class Driver:
             driver_features: name -> value, where the policy was trained to read some
                 (`policy.driver_features`; `Agent.driver_features_of` measures them); None: those of
                 an unseen driver. What a vehicle does while it is watched does not change them.
-            earlier: `driver_features` by its earlier name.
 
         Raises:
             DataError: the policy has no such network.
             ParameterError: `base` is not a value for each tuned parameter, or `driver_features` not
                 one for each driver feature of the policy.
         """
-        if earlier:
-            driver_features = renamed.arguments(earlier)["driver_features"]
         if network is not None:
             self._assigned[vehicle] = self._number(network)
         if base is not None:

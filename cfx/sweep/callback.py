@@ -8,16 +8,13 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import JobReturn
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from cfx import renamed
-from cfx.errors import ConfigError
-from cfx.sweep.running import Sweep, writable
+from cfx.sweep.running import Sweep
 
 
 class Refused(BaseException):
@@ -34,7 +31,6 @@ class SweepFolder(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         try:
-            _rename_parameters(config)
             SweepFolder._current = Sweep.open(config)
             SweepFolder._current.lead(config)
         except Exception as error:
@@ -55,27 +51,3 @@ class SweepFolder(Callback):
         sweep = cls._current
         cls._current = None
         return sweep
-
-
-def _rename_parameters(config: DictConfig) -> None:
-    """Gives the parameters of a sweep that a configuration file asks for today's names."""
-    given = OmegaConf.select(config, "hydra.sweeper.params")
-    if not given:
-        return
-    before = {}
-    for key, value in given.items():
-        before[str(key)] = str(value)
-    arguments = [f"{key}={value}" for key, value in before.items()]
-    today = {}
-    for argument in renamed.overrides(arguments):
-        key, _, value = argument.partition("=")
-        today[key] = value
-    if today == before:
-        return
-    if not hydra.__version__.startswith("1.3"):
-        raise ConfigError(
-            f"hydra.sweeper.params: write {', '.join(today)} instead of {', '.join(before)} in the"
-            " file that asks for this sweep: this version of Hydra takes today's names alone"
-        )
-    with writable(config):
-        config.hydra.sweeper.params = today

@@ -93,11 +93,3 @@ def test_one_network_of_many_drives_as_it_did_among_them() -> None:
 def test_networks_for_single_pairs_are_for_no_other_driver() -> None:
     with pytest.raises(DataError, match="2 networks, one for each of its own pairs"):
         adaptive(NODE, ("one", "two")).for_unseen_drivers()
-
-
-def test_earlier_names_of_methods_warn_and_work() -> None:
-    agent = adaptive(NODE)
-    with pytest.warns(DeprecationWarning, match="is now called burn_in"):
-        assert agent.read == agent.burn_in
-    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
-        _ = agent.nothing

@@ -1,4 +1,4 @@
-"""Saved policies: what is loaded chooses as what was saved, also in the earlier format."""
+"""Saved policies: what is loaded chooses as what was saved."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import safetensors.torch
 import torch
 
 from cfx.agents import checkpoint
@@ -17,7 +16,6 @@ from cfx.errors import DataError
 from cfx.models.krauss import Krauss
 from cfx.pairs import PairBatch
 from cfx.policies.features import measured_history
-from cfx.policies.trained import TrainedPolicy
 from tests.drives import wavy_pairs
 from tests.sumo.policies import adaptive
 
@@ -54,38 +52,10 @@ def test_a_loaded_agent_chooses_what_the_saved_one_chose(tmp_path: Path, head: s
     assert description["head"] == head
 
 
-@pytest.mark.parametrize("offsets", [False, True])
-def test_format_1_which_names_no_head_is_read(tmp_path: Path, offsets: bool) -> None:
-    agent = adaptive(NODE, offsets=offsets)
-    checkpoint.save(agent, tmp_path)
-    description = json.loads((tmp_path / "policy.json").read_text())
-    description["format"] = 1
-    description["members"] = description.pop("ensemble_size")
-    description["policy"]["traits"] = description["policy"].pop("driver_features")
-    for name in ("head", "shrinkage", "own", "history", "learned_from"):
-        del description[name]
-    (tmp_path / "policy.json").write_text(json.dumps(description))
-    tensors = safetensors.torch.load_file(tmp_path / "policy.safetensors")
-    torch.save(tensors, tmp_path / "policy.pt")
-    (tmp_path / "policy.safetensors").unlink()
-    loaded = checkpoint.load(tmp_path)
-    assert torch.equal(chosen(loaded), chosen(agent))
-    assert loaded.head.name == agent.head.name
-    assert loaded.context_rule == ContextRule()
-
-
-def test_policies_that_mlflow_logged_before_find_what_they_import(tmp_path: Path) -> None:
-    agent = adaptive(NODE)
-    checkpoint.save(agent, tmp_path)
-    with pytest.warns(DeprecationWarning, match=r"is now cfx\.agents"):
-        loaded = TrainedPolicy.load(str(tmp_path))
-    assert torch.equal(chosen(loaded), chosen(agent))
-
-
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("format", 4, "has format 4; this version of cfx reads formats 1 to 3"),
+        ("format", 2, "has format 2; this version of cfx reads format 3"),
         ("head", "mixture", "this version of cfx has no head 'mixture'; it has direct, offset"),
         ("head", "offset", "the weights read 25 features, the policy's settings give 27"),
     ],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -288,27 +287,3 @@ def test_a_saved_policy_draws_as_it_did(tmp_path: Path) -> None:
     for seed in (None, 0):
         expected, _ = act(agent, agent.begin(network), seed)
         assert torch.equal(act(loaded, loaded.begin(network), seed)[0], expected)
-
-
-def test_a_policy_that_was_saved_before_parameters_were_drawn_drives_as_it_did(
-    tmp_path: Path,
-) -> None:
-    """It has noise on the acceleration alone, and draws one number of a driver and window."""
-    agent = adaptive(KRAUSS, head=HEAD.of_acceleration())
-    checkpoint.save(agent, tmp_path)
-    description = json.loads((tmp_path / "policy.json").read_text())
-    assert description["head"] == "stochastic"
-    assert description["parameters"][-1] == SCALE.name
-    loaded = checkpoint.load(tmp_path)
-    state = loaded.begin(torch.zeros(3, dtype=torch.int64))
-    centre, _ = act(loaded, state, None)
-    assert torch.equal(centre, act(agent, state, None)[0])
-    sampled, after = act(loaded, state, 0)
-    assert after.latent.shape == (3, 0)
-    time, scale = centre[:, column(TIME.name)], centre[:, column(SCALE.name)]
-    kept = torch.exp(-WINDOW_S / time)
-    noise = torch.randn((3, 1), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    target = centre[:, column(TARGET.name)] + scale * ((1 + kept) / (1 - kept)).sqrt() * noise[:, 0]
-    expected = centre.clone()
-    expected[:, column(TARGET.name)] = target
-    torch.testing.assert_close(sampled, expected, rtol=0, atol=1e-12)

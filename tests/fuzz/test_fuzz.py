@@ -21,7 +21,6 @@ from hypothesis import strategies as st
 
 from cfx import registry
 from cfx.agents import checkpoint
-from cfx.application import todays
 from cfx.calibration.cache import Cache
 from cfx.config import JobConfig
 from cfx.datasets.describe import describe
@@ -109,7 +108,7 @@ def test_any_value_at_any_key_of_a_configuration(path: tuple[Any, ...], value: A
 def test_any_override_on_the_command_line(key: str, value: str) -> None:
     override = f"{key}={value}"
     try:
-        composed(todays([override]))
+        composed([override])
     except Exception as error:
         if not is_user_error(error):
             raise

@@ -102,7 +102,7 @@ def test_a_plugins_metric_stands_in_the_summary_of_a_sweep(tmp_path: Path) -> No
         (folder / "metrics.json").write_text(json.dumps(metrics))
         (folder / "data.json").write_text(json.dumps({"metrics": [info, hidden]}))
         statuses[folder] = JobStatus(0, "", "", (f"model={name}",))
-    # A job of the version before says nothing of its metrics.
+    # A job may say nothing of its metrics.
     old = tmp_path / "old"
     old.mkdir()
     (old / "metrics.json").write_text(json.dumps({"rmse_improvement/mean": 0.2}))

@@ -77,11 +77,3 @@ def test_w99_wide_calibrates_the_constants_of_w99() -> None:
     assert isinstance(model, W99)
     assert model.space == W99().space
     assert (model.adaptation_space["cc7"].high, model.adaptation_space["cc8"].low) == (3.0, 0.05)
-
-
-def test_the_earlier_names_work() -> None:
-    space = Krauss(adaptation_bounds={"t_i": None}).adaptation_space
-    with pytest.warns(DeprecationWarning, match=r"free is now called adaptable"):
-        assert space.free().tolist() == [True, False]  # type: ignore[union-attr]
-    with pytest.warns(DeprecationWarning, match=r"held is now called frozen"):
-        assert space["t_i"].held

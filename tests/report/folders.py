@@ -89,6 +89,7 @@ def write_job(
         "dropped": dropped,
         "parameters": units,
         "has_constant_baseline": has_constant_baseline,
+        "adapts": config["policy"]["name"] not in {"fixed", "default"},
         "metrics": [metric.to_json() for metric in evaluation.measured],
     }
     (folder / "data.json").write_text(json.dumps(data), encoding="utf-8")

@@ -7,7 +7,6 @@ import shutil
 from pathlib import Path
 
 import pytest
-import yaml
 
 from cfx.cli import main
 from cfx.errors import DataError
@@ -109,7 +108,7 @@ def test_what_a_job_says_of_itself(tmp_path: Path) -> None:
     assert job.setting("tracking.uri") == "postgresql://someone:***@host/db"
 
 
-def test_a_job_of_an_older_version_lacks_files_and_is_still_read(tmp_path: Path) -> None:
+def test_a_job_that_lacks_files_is_still_read(tmp_path: Path) -> None:
     write_job(tmp_path / "job")
     for name in ("trajectories.parquet", "curves.parquet", "style.csv", "data.json", "cfx.log"):
         (tmp_path / "job" / name).unlink()
@@ -117,17 +116,6 @@ def test_a_job_of_an_older_version_lacks_files_and_is_still_read(tmp_path: Path)
     (job,) = read_runs([str(tmp_path / "job")]).jobs
     assert set(job.missing) == {"trajectories.parquet", "curves.parquet", "style.csv"}
     assert (job.experiment, job.overrides, job.started) == ("", None, None)
-
-
-def test_the_preset_is_found_where_only_hydra_noted_it(tmp_path: Path) -> None:
-    write_job(tmp_path / "job")
-    config = yaml.safe_load((tmp_path / "job" / "config.yaml").read_text(encoding="utf-8"))
-    del config["preset"]
-    (tmp_path / "job" / "config.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
-    text = "hydra:\n  runtime:\n    choices:\n      experiment: paper/pair\n"
-    (tmp_path / "job" / ".hydra" / "hydra.yaml").write_text(text, encoding="utf-8")
-    (job,) = read_runs([str(tmp_path / "job")]).jobs
-    assert job.experiment == "paper/pair"
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -145,52 +144,11 @@ def test_a_broken_simulator_is_found_before_any_work(
         registry.create("simulator", {"name": "bad"})
 
 
-@pytest.mark.parametrize(
-    ("earlier", "today"),
-    [
-        ({"memory_mb": 64}, {"name": "memory", "memory_mb": 64, "compile": "auto"}),
-        ({"compile": "never"}, {"name": "memory", "memory_mb": 1024, "compile": "never"}),
-    ],
-)
-def test_a_configuration_of_the_version_before_is_understood(
-    earlier: dict[str, Any], today: dict[str, Any], caplog: pytest.LogCaptureFixture
-) -> None:
-    values = values_of()
-    values["simulation"] = earlier
-    with caplog.at_level(logging.WARNING):
-        assert JobConfig.of(values).simulator == today
-    (key,) = earlier
-    assert f"simulation.{key} is now called simulator.{key}" in caplog.text
-
-
-def test_what_only_the_memory_simulator_has_is_left_out_for_sumo() -> None:
-    values = values_of("simulator=sumo")
-    values["simulation"] = {"memory_mb": 64, "compile": "auto"}
-    node = JobConfig.of(values).simulator
-    assert node["memory_mb"] == 64
-    assert "compile" not in node
-
-
 def test_what_was_never_a_setting_is_refused_by_its_name() -> None:
     values = values_of()
     values["simulation"] = {"memory_gb": 1}
     with pytest.raises(ConfigError, match="simulation: unknown key"):
         JobConfig.of(values)
-
-
-def test_earlier_overrides_of_simulation_work(tmp_path: Path) -> None:
-    result = cfx.run(
-        [
-            *QUICK,
-            "simulation.memory_mb=64",
-            "simulation.compile=never",
-            f"hydra.run.dir={tmp_path / 'job'}",
-        ]
-    )
-    written = (result.folder / "config.yaml").read_text(encoding="utf-8")
-    assert "memory_mb: 64" in written
-    assert "compile: never" in written
-    assert "simulation:" not in written
 
 
 def test_the_chunks_do_not_change_the_numbers(tmp_path: Path) -> None:

@@ -292,19 +292,6 @@ def test_driver_features_are_given_by_name() -> None:
         Driver(adaptive({"name": "krauss"})).assign("v0", driver_features={"time_gap": 0.5})
 
 
-def test_driver_features_may_be_given_by_their_earlier_name() -> None:
-    driver = Driver(adaptive({"name": "krauss"}, driver_features=("time_gap",)))
-    with pytest.warns(DeprecationWarning, match="traits is now called driver_features"):
-        driver.assign("v0", traits={"time_gap": 0.5})
-    driver.step(platoon(1), "v0")
-    today = Driver(adaptive({"name": "krauss"}, driver_features=("time_gap",)))
-    today.assign("v0", driver_features={"time_gap": 0.5})
-    today.step(platoon(1), "v0")
-    assert driver.parameters("v0") == today.parameters("v0")
-    with pytest.raises(TypeError, match="unexpected keyword argument 'feature'"):
-        driver.assign("v0", feature={})
-
-
 def test_a_drivers_own_parameters_are_shrunk_towards_the_default_as_in_training() -> None:
     plain = adaptive({"name": "krauss"}, offsets=True)
     own, found = torch.tensor([[4.0, 1.0]], dtype=torch.float64), []

@@ -23,7 +23,7 @@ HEADS: dict[str, type[ParameterHead]] = {
 
 
 def head_name(*, has_base: bool) -> str:
-    """Returns the head of policies that name none, as those of earlier versions."""
+    """Returns the head of a learner's result that names none."""
     if has_base:
         return OffsetHead.name
     return DirectHead.name

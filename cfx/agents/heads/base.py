@@ -7,7 +7,6 @@ L frames of a token.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from typing import ClassVar, Self
 
 import torch
@@ -44,14 +43,6 @@ class ParameterHead(ABC):
     @abstractmethod
     def for_model(cls, model: DrivingModel, device: torch.device | str | None = None) -> Self:
         """Returns the head for a driving model's parameters: it chooses the parameter space."""
-
-    def as_saved(self, names: Sequence[str]) -> Self:
-        """Returns the head of a saved policy, which may be of an earlier version.
-
-        Args:
-            names: the parameters that it answers; empty if it does not say.
-        """
-        return self
 
     def to(self, device: torch.device | str) -> Self:
         """Returns the same head for tensors of a device."""

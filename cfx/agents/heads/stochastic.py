@@ -39,7 +39,6 @@ Shapes: `*batch` any leading dimensions, m tuned parameters of the driving model
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import ClassVar, Self
 
@@ -99,19 +98,10 @@ class StochasticHead(ResidualHead):
         return cls(replace(space, parameters=(*space, SCALE, PARAMETER_TIME, *scales)), device)
 
     def of_acceleration(self) -> Self:
-        """Returns the head with noise on the acceleration alone.
-
-        Constant parameters have it, and policies that were saved before parameters were drawn.
-        """
+        """Returns the head of constant parameters: with noise on the acceleration alone."""
         end = self._names().index(SCALE.name) + 1
         space = replace(self.space, parameters=self.space.parameters[:end])
         return type(self)(space, self._low.device)
-
-    def as_saved(self, names: Sequence[str]) -> Self:
-        earlier = self.of_acceleration()
-        if tuple(names) == earlier.space.names:
-            return earlier
-        return self
 
     @property
     def model_space(self) -> ParameterSpace:

@@ -24,7 +24,7 @@ from cfx.plots.words import (
 )
 from cfx.report.blocks import Block, Figure, Fold, Heading, Section, Table, Text
 from cfx.report.job import Job, Runs, any_baselines, any_has_metric, without_baseline
-from cfx.report.metrics import lists_metrics, metric_title
+from cfx.report.metrics import metric_title
 from cfx.report.tables import Cell, Column, Sheet, formatted, job_names, number, tested, text
 
 _RECORDED = "Behind recorded leaders"
@@ -258,8 +258,7 @@ def every_metric(jobs: Sequence[Job]) -> Sheet | None:
     """Returns a row per job with all metrics of the test part; None if no job lists its metrics."""
     known: dict[str, MetricInfo] = {}
     for job in jobs:
-        if lists_metrics(job.data):
-            known |= {one.name: one for one in job.known_metrics if TEST in one.scopes}
+        known |= {one.name: one for one in job.known_metrics if TEST in one.scopes}
     if not known:
         return None
     columns = [Column("Job", number=False)]
