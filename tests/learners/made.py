@@ -17,8 +17,8 @@ from cfx.calibration.windows import Split, WindowSettings
 from cfx.evaluation.closed_loop import ClosedLoop, simulate_closed_loop
 from cfx.learners.base import TrainingData, TrainingResult
 from cfx.learners.rollout import RolloutLearner, RolloutSettings
-from cfx.learners.rollout.batch import RolloutBatch
 from cfx.learners.rollout.dataset import RolloutDataset
+from cfx.learners.rollout.inputs import RolloutBatch
 from cfx.learners.rollout.module import RolloutModule
 from cfx.models.krauss import Krauss
 from cfx.pairs import PairBatch

@@ -2,8 +2,7 @@
 
 From the settings down: `learner` puts a training together, `shard` cuts it, `train` trains a part
 of it, and `module` takes gradient steps, for which `sampling` chooses trajectories of the
-`dataset`. `loop` simulates them window by window (`step`), `loss` and `base_errors` judge them,
-`gradients` says which way back gradients take, and `distillation` lets experts help.
+`dataset`. `loop` simulates their `inputs` window by window (`window`), and `loss` judges them.
 """
 
 from __future__ import annotations

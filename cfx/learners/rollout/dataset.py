@@ -22,7 +22,7 @@ from cfx.agents.heads.offset import OffsetHead, coordinates
 from cfx.agents.scaler import Scaler
 from cfx.learners.base import TrainingData
 from cfx.learners.grid import Grid
-from cfx.learners.rollout.batch import RolloutBatch
+from cfx.learners.rollout.inputs import RolloutBatch
 from cfx.pairs import SIGNALS, PairBatch
 from cfx.policies.base import Policy
 from cfx.policies.driver_features import measure

@@ -29,13 +29,13 @@ from cfx.component import Settings
 from cfx.engine.base import Engine
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.learners.curves import warn_of_nothing_learned
-from cfx.learners.rollout.augmentation import Augmentation
-from cfx.learners.rollout.checkpoint import checkpoint_path
 from cfx.learners.rollout.dataset import RolloutDataset, time_gaps
+from cfx.learners.rollout.sampling import Augmentation
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.learners.rollout.shard import (
     TrainedShard,
     TrainingShard,
+    checkpoint_path,
     cut,
     epochs,
     expert_checkpoint,

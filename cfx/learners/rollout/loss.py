@@ -1,20 +1,224 @@
 """The loss of trajectories: the job's objective, the gap's error beside it, and the jerk.
 
-Shapes: N networks, D trajectories of each, K simulated frames.
+A trajectory's loss is divided by the error of its constant base parameters (`BaseErrors`): the
+improvement over these is what an evaluation reports, and some trajectories are much harder to
+follow than others.
+
+Shapes: U recorded pairs, N networks (each member of an ensemble counts), B drivers of the network
+that has most, D trajectories of each network, K simulated frames, W windows of the longest pair, n
+parameters that bases have, R pairs with a base each, C most bases of one pair.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from cfx.learners.rollout.base_errors import Divisors
+from cfx.calibration.losses import SegmentLosses
+from cfx.learners.base import TrainingData
+from cfx.learners.rollout.dataset import RolloutDataset
+from cfx.learners.rollout.inputs import RolloutBatch
 from cfx.learners.rollout.loop import Segment
 from cfx.learners.rollout.settings import LossSettings
 from cfx.objectives.base import FrameValues, Objective
 from cfx.objectives.rmse import GapRmse, SpeedRmse
+
+_AT_ONCE = 1_000_000
+"""Frames of all segments that are simulated at once, which bounds the memory to some 100 MB."""
+
+_LEAST_GAP = 1.0
+"""m: added to the gap's error of the base, as the objective's floor is to the objective's:
+otherwise
+trajectories that the base follows well would outweigh all others."""
+
+_LEAST_DIVISOR = 1e-6
+"""Divisor at least, for an objective without a floor."""
+
+
+class Divisors(NamedTuple):
+    """What the terms of each trajectory's loss are divided by, `(N, D)` each.
+
+    Attributes:
+        objective: in the objective's unit.
+        gap: m.
+    """
+
+    objective: Tensor
+    gap: Tensor
+
+
+@dataclass(frozen=True)
+class BaseErrors:
+    """The objective and the gap's RMSE of constant parameters, side by side in the last dimension.
+
+    Networks share pairs, and often bases too: each pair is simulated once with each of its bases.
+
+    Attributes:
+        over_windows: over the horizon from each window on, `(R, W, 2)`.
+        over_pair: over the whole training part, `(R, 2)`; of pooled bases alone.
+        own: the row of each place's driver with their base, `(N, B)`.
+        pooled: with the base of drivers without one of their own.
+        floor: added to the objective.
+        has_unit: whether the objective grows with the trajectories' scale.
+    """
+
+    over_windows: Tensor
+    over_pair: Tensor
+    own: Tensor
+    pooled: Tensor
+    floor: float
+    has_unit: bool
+
+    @classmethod
+    def of(cls, training_data: TrainingData, dataset: RolloutDataset, horizon: int) -> BaseErrors:
+        """Simulates the bases, in the precision of the training data; `horizon` in windows."""
+        networks, drivers = dataset.pair.shape
+        own = dataset.base
+        pooled = dataset.pooled[:, None].expand(-1, drivers, -1)
+        if training_data.base is None:
+            pooled = own
+        pair = torch.cat([dataset.pair, dataset.pair], 1)[..., None].to(own.dtype)
+        wanted = torch.cat([pair, torch.cat([own, pooled], 1)], -1)
+        rows, row = torch.unique(wanted.flatten(0, 1), dim=0, return_inverse=True)
+        row = row.view(networks, 2 * drivers)
+        bases = _Bases.of(rows[:, 0].long(), rows[:, 1:], len(dataset.batch))
+        simulation = _ConstantParameters(training_data, dataset, bases)
+        stride = training_data.windows.stride
+        frames = torch.arange(dataset.tokens.shape[1], device=own.device) * stride
+        over_windows = simulation.errors(frames, horizon * stride)
+        over_pair = simulation.errors(frames[:1], int(dataset.last.max()))[:, 0]
+        objective = training_data.objective
+        return cls(
+            over_windows,
+            over_pair,
+            row[:, :drivers],
+            row[:, drivers:],
+            objective.floor,
+            bool(objective.unit),
+        )
+
+    def only(self, networks: slice) -> BaseErrors:
+        """Returns the errors of some networks."""
+        used = torch.cat([self.own[networks], self.pooled[networks]], 1)
+        rows, row = torch.unique(used, return_inverse=True)
+        drivers = self.own.shape[1]
+        return replace(
+            self,
+            over_windows=self.over_windows[rows],
+            over_pair=self.over_pair[rows],
+            own=row[:, :drivers],
+            pooled=row[:, drivers:],
+        )
+
+    def over_horizon(self, batch: RolloutBatch) -> Divisors:
+        """Returns the divisors over the horizon from where each trajectory begins."""
+        own, pooled = self.own[batch.row, batch.place], self.pooled[batch.row, batch.place]
+        row = torch.where(batch.cold_start, pooled, own)
+        return self._divisors(self.over_windows[row, batch.start], batch)
+
+    def over_full_trajectory(self, batch: RolloutBatch) -> Divisors:
+        """Returns the divisors over each trajectory from the first frame to the last."""
+        return self._divisors(self.over_pair[self.pooled[batch.row, batch.place]], batch)
+
+    def _divisors(self, errors: Tensor, batch: RolloutBatch) -> Divisors:
+        """Takes the errors `(N, D, 2)` of unscaled trajectories."""
+        objective, gap = errors[..., 0], errors[..., 1]
+        if batch.scale is not None:
+            gap = gap * batch.scale
+            if self.has_unit:
+                objective = objective * batch.scale
+        return Divisors((objective + self.floor).clamp(min=_LEAST_DIVISOR), gap + _LEAST_GAP)
+
+
+class _Bases(NamedTuple):
+    """The bases of each pair, as candidates of one simulation.
+
+    Attributes:
+        unit: in unit space, `(U, C, n)`; a pair with fewer bases has one of them several times.
+        pair, place: where each of the R bases stands, `(R,)`.
+    """
+
+    unit: Tensor
+    pair: Tensor
+    place: Tensor
+
+    @classmethod
+    def of(cls, pair: Tensor, unit: Tensor, pairs: int) -> _Bases:
+        """Arranges bases.
+
+        Args:
+            pair: which pair each base is of, in order, `(R,)`.
+            unit: in unit space, `(R, n)`.
+            pairs: U.
+        """
+        count = torch.bincount(pair, minlength=pairs)
+        first = count.cumsum(0) - count
+        place = torch.arange(len(pair), device=pair.device) - first[pair]
+        of_pair = torch.arange(int(count.max()), device=pair.device)
+        chosen = first[:, None] + torch.minimum(of_pair, count[:, None] - 1)
+        return cls(unit[chosen], pair, place)
+
+
+class _ConstantParameters:
+    """Simulates all bases of all pairs from some frames on."""
+
+    def __init__(self, training_data: TrainingData, dataset: RolloutDataset, bases: _Bases) -> None:
+        self.simulator = training_data.simulator
+        self.objective = training_data.objective
+        self.batch = training_data.recorded
+        self.pair = training_data.pair[dataset.recorded]
+        frame = training_data.split.frame.to(dataset.recorded.device)
+        self.last = frame[dataset.recorded]
+        self.bases = bases
+
+    @torch.no_grad()
+    def errors(self, frames: Tensor, steps: int) -> Tensor:
+        """Returns the objective and the gap's RMSE, `(R, F, 2)`, in single precision.
+
+        Args:
+            frames: at which trajectories begin, `(F,)`.
+            steps: how many each lasts at most.
+        """
+        size = max(1, _AT_ONCE // (len(frames) * steps))
+        parts = []
+        for first in range(0, len(self.last), size):
+            parts.append(self._part(slice(first, first + size), frames, steps).float())
+        return torch.cat(parts)[self.bases.pair, :, self.bases.place]
+
+    def _part(self, which: slice, frames: Tensor, steps: int) -> Tensor:
+        """Returns the errors of some pairs, `(pairs, F, C, 2)`."""
+        last, unit = self.last[which], self.bases.unit[which]
+        pairs, windows, bases = len(last), len(frames), unit.shape[1]
+        pair = torch.arange(pairs, device=last.device).repeat_interleave(windows)
+        first = frames.repeat(pairs)
+        losses = SegmentLosses.of_segments(
+            self.simulator,
+            self.objective,
+            self.batch[self.pair[which]],
+            pair,
+            first.clamp(max=self.batch.mask.shape[1] - 1),
+            (last[pair] - first).clamp(0, steps),
+        )
+        # Whether a kernel pays is asked for all parts together.
+        work = len(self.last) * windows * steps * bases
+        losses = replace(losses, simulator=self.simulator.for_work(work))
+        p = self._by_name(unit.to(losses.counted.dtype), windows)
+        objective = losses.with_parameters(p)
+        gap = replace(losses, objective=GapRmse()).with_parameters(p)
+        return torch.stack([objective, gap], -1).view(pairs, windows, bases, 2)
+
+    def _by_name(self, unit: Tensor, windows: int) -> dict[str, Tensor]:
+        """Returns the model's parameters by name, those that differ as `(pairs windows, C)`.
+
+        What heads answer beyond them stands behind them, and is left out.
+        """
+        space = self.simulator.model.adaptation_space
+        values = space.from_unit(unit[..., : len(space)]).repeat_interleave(windows, 0)
+        return {name: value.contiguous() for name, value in space.unpack(values).items()}
+
 
 _EPSILON = 1e-4
 """(m/s)2, m2: keeps the slope of a root finite where a trajectory has no error."""

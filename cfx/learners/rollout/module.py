@@ -20,17 +20,19 @@ from cfx.agents.core import AgentCore
 from cfx.agents.heads import HEADS
 from cfx.learners.base import TrainingData
 from cfx.learners.batched import BatchedModule
-from cfx.learners.rollout.base_errors import BaseErrors, Divisors
-from cfx.learners.rollout.batch import RolloutBatch
 from cfx.learners.rollout.dataset import RolloutDataset
-from cfx.learners.rollout.distillation import Expert
-from cfx.learners.rollout.gradients import GradientPath, NoGradients, ThroughMemory, ThroughTime
-from cfx.learners.rollout.inputs import Measured
-from cfx.learners.rollout.loop import simulate
-from cfx.learners.rollout.loss import FrameWeights, TrajectoryLoss
+from cfx.learners.rollout.inputs import Measured, RolloutBatch
+from cfx.learners.rollout.loop import Expert, simulate
+from cfx.learners.rollout.loss import BaseErrors, Divisors, FrameWeights, TrajectoryLoss
 from cfx.learners.rollout.sampling import TrajectorySampler
 from cfx.learners.rollout.settings import RolloutSettings
-from cfx.learners.rollout.step import WindowStep
+from cfx.learners.rollout.window import (
+    GradientPath,
+    NoGradients,
+    ThroughMemory,
+    ThroughTime,
+    WindowStep,
+)
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.simulation.rollout import can_compile
 

@@ -1,17 +1,20 @@
 """Some of the networks and what they learn from: trained here, in another process or elsewhere.
 
 Networks are independent: each learns from its own loss. So a training is cut into shards of some
-networks each, and what a network learns does not depend on where its shard is trained.
+networks each, and what a network learns does not depend on where its shard is trained. Interrupted
+training goes on from a shard's checkpoint file.
 
 Shapes: N networks (each member of an ensemble counts), D trajectories of each.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import torch
@@ -19,14 +22,65 @@ from torch import Tensor
 
 from cfx.agents.heads.base import ParameterHead
 from cfx.agents.heads.offset import OffsetHead
+from cfx.component import content_key, folder_hash
 from cfx.engine.local import LocalEngine
+from cfx.learners import base
 from cfx.learners.base import TrainingData
-from cfx.learners.rollout.base_errors import BaseErrors
 from cfx.learners.rollout.dataset import RolloutDataset
+from cfx.learners.rollout.loss import BaseErrors
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.models.direct import Direct
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.simulation.rollout import MemoryStepper
+
+
+def checkpoint_path(
+    learner: dict[str, Any], policy: Policy, training_data: TrainingData
+) -> Path | None:
+    """Returns the file of this very training, or None without a workspace.
+
+    Args:
+        learner: identity of the learner.
+        policy: what is trained.
+        training_data: what it is trained on.
+    """
+    if training_data.workspace is None:
+        return None
+    description = {
+        "learner": learner,
+        "policy": policy.identity(),
+        "model": training_data.simulator.model.identity(),
+        "objective": training_data.objective.identity(),
+        "windows": training_data.windows.model_dump(),
+        "code": folder_hash(base.__file__),
+        "trajectories": _digest(training_data),
+        "names": training_data.names,
+        "drivers": training_data.drivers,
+        "seed": training_data.seed,
+    }
+    return training_data.workspace / f"{content_key(description)}.ckpt"
+
+
+def _digest(training_data: TrainingData) -> str:
+    """Returns the SHA-256 of all tensors that training reads."""
+    batch = training_data.recorded
+    tensors = [
+        batch.leader_position,
+        batch.leader_speed,
+        batch.follower_position,
+        batch.follower_speed,
+        training_data.pair,
+        training_data.split.frame,
+        training_data.fixed,
+        training_data.network,
+    ]
+    if training_data.base is not None:
+        tensors.append(training_data.base)
+    digest = hashlib.sha256()
+    for tensor in tensors:
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
 
 _TRAJECTORIES = 3_000
 """Of a shard's gradient step at most. A window costs as much per trajectory with 1,500 of them as

@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from cfx.learners.rollout import base_errors
-from cfx.learners.rollout.base_errors import BaseErrors
-from cfx.learners.rollout.batch import RolloutBatch
+from cfx.learners.rollout import loss
 from cfx.learners.rollout.dataset import RolloutDataset
+from cfx.learners.rollout.inputs import RolloutBatch
+from cfx.learners.rollout.loss import BaseErrors
 from cfx.models.krauss import Krauss
 from cfx.objectives.rmse import GapRmse
 from cfx.objectives.theil import TheilU
@@ -103,7 +103,7 @@ def test_a_kernel_finds_the_errors_that_pytorch_does(monkeypatch: pytest.MonkeyP
     torch.testing.assert_close(kernel.over_windows, eager.over_windows)
     torch.testing.assert_close(kernel.over_pair, eager.over_pair)
     # However many pairs are simulated at once.
-    monkeypatch.setattr(base_errors, "_AT_ONCE", 1)
+    monkeypatch.setattr(loss, "_AT_ONCE", 1)
     apart = BaseErrors.of(data, dataset, 12)
     torch.testing.assert_close(apart.over_windows, eager.over_windows)
 

@@ -9,8 +9,8 @@ import torch
 
 from cfx.agents.heads.offset import coordinates
 from cfx.learners.rollout import dataset as dataset_module
-from cfx.learners.rollout.base_errors import BaseErrors
 from cfx.learners.rollout.dataset import RolloutDataset, time_gaps
+from cfx.learners.rollout.loss import BaseErrors
 from cfx.policies.driver_features import measure
 from tests.learners.made import TRUE, batch_of, gru, placed, training_data
 

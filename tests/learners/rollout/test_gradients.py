@@ -5,8 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 
-from cfx.learners.rollout.gradients import GradientPath, NoGradients, ThroughMemory, ThroughTime
-from cfx.learners.rollout.state import LoopState
+from cfx.learners.rollout.window import (
+    GradientPath,
+    LoopState,
+    NoGradients,
+    ThroughMemory,
+    ThroughTime,
+)
 
 
 def a_state() -> LoopState:

@@ -9,10 +9,10 @@ import torch
 
 from cfx.agents.heads.offset import coordinates
 from cfx.learners.rollout import RolloutLearner, RolloutSettings
-from cfx.learners.rollout.batch import RolloutBatch
-from cfx.learners.rollout.gradients import NoGradients
+from cfx.learners.rollout.inputs import RolloutBatch
 from cfx.learners.rollout.loop import burn_in, simulate
 from cfx.learners.rollout.module import DISPERSIONS, RolloutModule
+from cfx.learners.rollout.window import NoGradients
 from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
