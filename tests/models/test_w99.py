@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from cfx.contracts import ModelContract
 import cfx
+from cfx.contracts import ModelContract
 from cfx.errors import ConfigError
 from cfx.models.base import Follower, Leader
 from cfx.models.w99 import W99
