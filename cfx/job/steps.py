@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -110,6 +111,9 @@ def take_steps(
         context = _context(config, parts, pairs, style, device)
         with closing(context.simulator), closing(parts.engine):
             protocol_result = _run_protocol(parts.protocol, context)
+            if not parts.policy.adapts:
+                shown = protocol_result.evaluation.constant_methods()
+                protocol_result = replace(protocol_result, evaluation=shown)
             view = None
             if config.figures.enabled:
                 view = calibration_view(context, protocol_result.evaluation)

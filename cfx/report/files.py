@@ -77,8 +77,8 @@ def read_pairs(path: Path, columns: Iterable[str]) -> pd.DataFrame:
     table["cluster"] = table["cluster"].astype(str)
     for number, name in enumerate(CLUSTERS):
         table["cluster"] = table["cluster"].replace(str(number), name)
-    if "policy" not in set(table["method"]):
-        raise DataError(f"{path} is damaged: it has no row of the method 'policy'")
+    if not {"policy", "fixed"} & set(table["method"]):
+        raise DataError(f"{path} is damaged: it has no row of the method 'policy' or 'fixed'")
     return table
 
 
