@@ -369,7 +369,9 @@ def _signal_behind(error: BaseException) -> BaseException | None:
 
 
 def _metric(metrics: Mapping[str, float]) -> float:
-    return float(metrics.get("rmse_speed/policy", float("nan")))
+    from cfx.evaluation.headline import main_error
+
+    return main_error(metrics)
 
 
 def _report(error: BaseException | None, overrides: Sequence[str], show_traceback: bool) -> int:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from cfx.errors import ConfigError, TrackingError
-from cfx.tracking.headline import PERCENT, RESULT, SPEED_ERROR
+from cfx.evaluation.headline import PERCENT, RESULT, SPEED_ERROR
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient

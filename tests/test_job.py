@@ -429,3 +429,21 @@ def test_a_foreign_database_is_told_before_any_work(
 def test_loading_what_is_no_job_is_told(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="holds no finished job"):
         cfx.load(tmp_path)
+
+
+# ---- one number
+
+
+@pytest.mark.parametrize("protocol", ["within_driver", "across_drivers"])
+def test_a_calibration_has_one_number_and_no_policy_that_repeats_another_method(
+    protocol: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few = ["data.pairs=4", f"protocol={protocol}"]
+    if protocol == "across_drivers":
+        few += ["protocol.folds=2", "protocol.histories=[]"]
+    result = run("policy=fixed", *few)
+    assert "policy" not in set(result.pairs["method"])
+    assert not [name for name in result.metrics if name.endswith("/policy") or "improve" in name]
+    own = f"driver-specific {result.metrics['rmse_speed/fixed']:.3f} m/s"
+    said = [capsys.readouterr().out, repr(result), repr(cfx.load(result.folder))]
+    assert all(f"calibration; {own}" in one for one in said)

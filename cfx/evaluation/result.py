@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cfx.calibration.flatness import with_flat_shares
 from cfx.evaluation.forecasts import Forecasts
-from cfx.evaluation.tables import in_text, summaries, wide_table
+from cfx.evaluation.tables import in_text, summaries, values_of, wide_table
 from cfx.evaluation.traffic.result import Traffic
 from cfx.metrics.base import MetricInfo
 from cfx.metrics.installed import LeftOut
@@ -250,12 +250,27 @@ class Evaluation:
         return replace(self, about=with_flat_shares(self.about, slices, self.names))
 
     def constant_methods(self) -> Evaluation:
-        """Returns the same results without the policy.
+        """Returns the same results without the policy, if it is a constant set once more.
 
-        A policy that does not adapt is one of the constant sets once more.
+        A policy that does not adapt is one, unless something else acts beside its parameters.
         """
-        others = self.about[self.about["method"] != "policy"].reset_index(drop=True)
-        return replace(self, about=others)
+        if "policy" not in self.methods or not self._policy_repeats:
+            return self
+        about = self.about[self.about["method"] != "policy"].reset_index(drop=True)
+        values = self.values[self.values["method"] != "policy"].reset_index(drop=True)
+        platoon = self.platoon
+        if platoon is not None:
+            platoon = Platoon(*(one[one["method"] != "policy"] for one in vars(platoon).values()))
+        return replace(self, about=about, values=values, platoon=platoon)
+
+    @property
+    def _policy_repeats(self) -> bool:
+        """Whether the policy has the errors of another method, for every pair."""
+        speed = values_of(self.values, "rmse_speed", "test")
+        for method in set(self.methods) - {"policy"}:
+            if np.allclose(speed[method], speed["policy"], rtol=1e-6, atol=1e-9, equal_nan=True):
+                return True
+        return False
 
     @property
     def improvement(self) -> Improvement:
@@ -273,7 +288,7 @@ class Evaluation:
         for scope, of_scope in improvements.items():
             if scope == "test" or of_scope:
                 values |= summaries(self.values, self.measured, scope, self.methods)
-            for baseline, improvement in of_scope.items():
+            for baseline, improvement in of_scope.items() if "policy" in self.methods else ():
                 prefix = improvement_key(baseline, scope)
                 for name, value in improvement.metrics().items():
                     values[f"{prefix}/{name}"] = value

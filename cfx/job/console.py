@@ -18,6 +18,7 @@ from cfx.evaluation.distributions import (
     summarize_distributions,
 )
 from cfx.evaluation.forecasts import Forecasts
+from cfx.evaluation.headline import headline
 from cfx.evaluation.result import Evaluation, Improvement
 from cfx.evaluation.traffic.result import Traffic
 from cfx.job.results import JobResult
@@ -52,17 +53,18 @@ def report(
         adapts: as `Policy.adapts`.
         copied_to: URL of the folder's copy; None without.
     """
-    shown = evaluation if adapts else evaluation.constant_methods()
-    console.print(methods_table(shown, result.metrics))
+    console.print(methods_table(evaluation, result.metrics))
     if evaluation.full_trajectory_improvements:
-        console.print(methods_table(shown, result.metrics, "full_trajectory"))
+        console.print(methods_table(evaluation, result.metrics, "full_trajectory"))
     if not adapts:
         text = (
             "The policy keeps its parameters constant: this is a calibration, without adaptation."
         )
         console.print(text, soft_wrap=True)
+        _print_headline(result, console)
     elif has_constant_baseline:
         _print_improvements(evaluation, console)
+        _print_headline(result, console)
     else:
         text = (
             "With constant parameters the model follows no leader: compare the policy's RMSE"
@@ -75,7 +77,7 @@ def report(
             console.print(distributions_table(evaluation.forecasts))
     if evaluation.traffic is not None:
         console.print(traffic_table(evaluation.traffic))
-    _print_safety(shown, result.metrics, console)
+    _print_safety(evaluation, result.metrics, console)
     _print_flat(evaluation, console)
     for scope, words in evaluation.outside.items():
         text = f"Policy, {_SCOPES[scope]}: {words}; there it fades towards its base parameters."
@@ -231,6 +233,13 @@ def _print_improvements(evaluation: Evaluation, console: Console) -> None:
     warning = few_drivers(drivers)
     if warning:
         console.print(warning, soft_wrap=True, highlight=False)
+
+
+def _print_headline(result: JobResult, console: Console) -> None:
+    """Prints the one number by which the job is known elsewhere: in MLflow, a report, Python."""
+    _, words = headline(result.metrics)
+    if words:
+        console.print(f"In short: {words}.", soft_wrap=True, highlight=False)
 
 
 def _comparisons(evaluation: Evaluation) -> dict[str, Improvement]:

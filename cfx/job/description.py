@@ -8,8 +8,8 @@ from pathlib import Path
 
 from cfx.config import JobConfig
 from cfx.errors import without_passwords
+from cfx.evaluation.headline import headline
 from cfx.pairs import PairSet
-from cfx.tracking.headline import headline
 
 _CHOSEN = ("model", "policy", "learner", "optimizer", "objective", "protocol")
 
@@ -31,7 +31,7 @@ def described(
             continue
         chosen.append(f"{group} **{getattr(config, group)['name']}**")
     drivers = len({pair.driver for pair in pairs})
-    _, result = headline(metrics, adapts=adapts)
+    _, result = headline(metrics)
     source = Path(pairs.source).name
     lines = [
         f"{result[:1].upper()}{result[1:]}.",

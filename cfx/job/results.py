@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import pandas as pd
 from cfx.agents import checkpoint
 from cfx.agents.agent import Agent
 from cfx.errors import DataError
+from cfx.evaluation.headline import headline
 from cfx.evaluation.result import Evaluation
 from cfx.job_folder import examine
 from cfx.ready import is_ready_made
@@ -50,12 +50,9 @@ class JobResult:
         said.append(f"policy={self.policy.policy_node['name']}")
         if pairs:
             said.append(f"{pairs} pairs")
-        rmse = self.metrics.get("rmse_speed/policy", math.nan)
-        if math.isfinite(rmse):
-            said.append(f"RMSE of speed {rmse:.3f} m/s")
-        mean = self.metrics.get("rmse_improvement/mean", math.nan)
-        if math.isfinite(mean):
-            said.append(f"{mean:+.1%} over driver-specific parameters")
+        _, words = headline(self.metrics)
+        if words:
+            said.append(words)
         return f"JobResult({', '.join(said)},\n  folder={str(self.folder)!r})"
 
 

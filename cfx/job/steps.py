@@ -112,6 +112,9 @@ def take_steps(
         context = _context(config, parts, pairs, style, device)
         with closing(context.simulator), closing(parts.engine):
             protocol_result = _run_protocol(parts.protocol, context)
+            if not parts.policy.adapts:
+                shown = protocol_result.evaluation.constant_methods()
+                protocol_result = replace(protocol_result, evaluation=shown)
             view = calibration_view(context, protocol_result.evaluation)
         if view is not None:
             evaluation = protocol_result.evaluation.with_slices(view.slices)

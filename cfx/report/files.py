@@ -71,8 +71,8 @@ def read_pairs(path: Path, columns: Iterable[str]) -> pd.DataFrame:
         DataError: the file cannot be read, or lacks a column or the policy.
     """
     table = read_table(path, columns)
-    if "policy" not in set(table["method"]):
-        raise DataError(f"{path} is damaged: it has no row of the method 'policy'")
+    if not {"policy", "fixed"} & set(table["method"]):
+        raise DataError(f"{path} is damaged: it has no row of the method 'policy' or 'fixed'")
     return table
 
 

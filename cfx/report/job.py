@@ -123,6 +123,14 @@ class Job:
         return self.methods if self.adapts or not constant else constant
 
     @property
+    def judged(self) -> str:
+        """The method whose numbers the job is judged by: the policy; of a calibration `fixed`."""
+        for method in ("policy", "fixed", "population"):
+            if method in self.meaningful_methods:
+                return method
+        return "default"
+
+    @property
     def adapts(self) -> bool:
         """Whether its policy may change the parameters; if not, the job is a calibration."""
         return self.data.get("adapts") is not False

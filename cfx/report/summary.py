@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cfx.plots.words import explained, few_drivers, percent, plural, short_label
+from cfx.evaluation.headline import Comparison, contradiction
+from cfx.plots.words import TEST, explained, few_drivers, percent, plural, short_label
 from cfx.report.grouped import Row, rows_over_seeds
 from cfx.report.job import Job, calibrations, with_baseline, without_baseline
 
@@ -142,4 +143,6 @@ def _gain(job: Job, baseline: str) -> str:
     sure = "no interval for a single driver"
     if np.isfinite(low):
         sure = f"95 % interval {percent(low, 1)} to {percent(high, 1)}"
-    return f"{percent(mean, 1)} on average ({sure})"
+    said = f"{percent(mean, 1)} on average ({sure})"
+    opposite = contradiction(job.metrics, Comparison(baseline, TEST))
+    return f"{said}, {opposite}" if opposite else said

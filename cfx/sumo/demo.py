@@ -147,8 +147,10 @@ def _choose(
 ) -> list[PairTrajectory]:
     """Returns some pairs spread evenly from the best to the worst improvement."""
     policy = table[table["method"] == "policy"].set_index("pair_id")
-    improvement = policy["improvement"].astype(float).fillna(-np.inf)
-    ranked = sorted(trajectories, key=lambda trajectory: -improvement[trajectory.pair_id])
+    improvement = policy["improvement"].astype(float).fillna(-np.inf).to_dict()
+    ranked = sorted(
+        trajectories, key=lambda trajectory: -improvement.get(trajectory.pair_id, -np.inf)
+    )
     # A demonstration of one pair shows the best.
     places = evenly_spread(len(ranked), count) if count > 1 else [0]
     return [ranked[place] for place in places]

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cfx.console import blank_table
+from cfx.evaluation.headline import main_comparison, ratio_of_means
 from cfx.files import atomic_write
 from cfx.sweep.status import JobStatus, metrics_of
 
@@ -19,10 +21,8 @@ if TYPE_CHECKING:
 SUMMARY = "summary.csv"
 """Says in a sweep's folder what came of it."""
 
-_BASELINES = ("population", "fixed")
-"""What a policy is compared with: the first that was measured."""
-
 _STATISTICS = ("mean", "ci95_low", "ci95_high")
+_OF_MEANS = "of_means"
 _METHODS = ("default", "fixed", "population", "policy")
 _SHOWN = ("default", "fixed", "policy")
 _AFTER_OVERRIDES = "improvement_over"
@@ -165,16 +165,18 @@ def _metrics_said(folder: Path) -> list[Mapping[str, Any]]:
 
 def _improvement(found: Mapping[str, float]) -> dict[str, Any]:
     """Returns the improvement over the baseline that counts, None where it was not measured."""
-    prefix, over = "rmse_improvement", "fixed"
-    for baseline in _BASELINES:
-        if f"rmse_improvement/{baseline}/mean" in found:
-            prefix, over = f"rmse_improvement/{baseline}", baseline
-            break
-    if f"{prefix}/mean" not in found:
-        over = ""
-    row: dict[str, Any] = {_AFTER_OVERRIDES: over}
+    compared = main_comparison(found)
+    row: dict[str, Any] = {_AFTER_OVERRIDES: ""}
+    row |= dict.fromkeys(f"improvement_{name}" for name in (*_STATISTICS, _OF_MEANS))
+    if compared is None:
+        return row
+    row[_AFTER_OVERRIDES] = compared.baseline
+    if compared.scope != "test":
+        row[_AFTER_OVERRIDES] += ", full"
     for name in _STATISTICS:
-        row[f"improvement_{name}"] = found.get(f"{prefix}/{name}")
+        row[f"improvement_{name}"] = found.get(f"{compared.key}/{name}")
+    ratio = ratio_of_means(found, compared)
+    row[f"improvement_{_OF_MEANS}"] = ratio if math.isfinite(ratio) else None
     return row
 
 
@@ -187,6 +189,9 @@ def _improvement_said(row: Mapping[str, Any], *, named: bool) -> str:
     low, high = row["improvement_ci95_low"], row["improvement_ci95_high"]
     if low is not None and high is not None:
         said += f" ({low:+.1%} to {high:+.1%})"
+    ratio = row[f"improvement_{_OF_MEANS}"]
+    if ratio is not None and mean * ratio < 0:
+        said += f"\nof the mean RMSE {ratio:+.1%}"
     if named:
         said += f" over {row['improvement_over']}"
     return said

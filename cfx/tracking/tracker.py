@@ -21,12 +21,12 @@ import numpy as np
 import pandas as pd
 
 from cfx.errors import CfxError, TrackingError
+from cfx.evaluation.headline import RESULT, headline
 from cfx.evaluation.result import Evaluation
 from cfx.learners.curves import over_networks
 from cfx.pairs import SIGNALS, PairSet
 from cfx.plots.look import JOB_COLOURS
 from cfx.tracking import provenance
-from cfx.tracking.headline import RESULT, headline, without_improvements
 from cfx.tracking.store import Store, open_store, tracking_uri, translate_errors
 
 if TYPE_CHECKING:
@@ -269,10 +269,9 @@ class MlflowTracker(Tracker):
 
     def log_evaluation(self, evaluation: Evaluation, *, adapts: bool = True) -> None:
         metrics = evaluation.metrics()
-        values, result = headline(metrics, adapts=adapts)
+        values, result = headline(metrics)
         tags = {RESULT: result}
         if not adapts:
-            metrics = without_improvements(metrics)
             tags["learner"] = "none"
         self.log_metrics(values | metrics)
         self.set_tags(tags)

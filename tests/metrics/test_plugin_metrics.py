@@ -61,15 +61,15 @@ def test_a_plugins_metric_stands_in_every_result(
     overrides = [one for one in QUICK if not one.startswith("tracking")]
     result = cfx.run([*overrides, f"tracking.uri={store}"])
 
-    assert result.metrics["mean_gap/policy"] > 0
+    assert result.metrics["mean_gap/fixed"] > 0
     assert result.metrics["mean_gap/real"] > 0
     written = json.loads((result.folder / "metrics.json").read_text())
-    assert written["mean_gap/policy"] == result.metrics["mean_gap/policy"]
+    assert written["mean_gap/fixed"] == result.metrics["mean_gap/fixed"]
 
     pairs = pd.read_csv(result.folder / "pairs.csv")
-    of_policy = pairs.loc[pairs["method"] == "policy"]
-    assert of_policy["mean_gap"].mean() == pytest.approx(result.metrics["mean_gap/policy"])
-    assert of_policy["real_mean_gap"].mean() == pytest.approx(result.metrics["mean_gap/real"])
+    of_fixed = pairs.loc[pairs["method"] == "fixed"]
+    assert of_fixed["mean_gap"].mean() == pytest.approx(result.metrics["mean_gap/fixed"])
+    assert of_fixed["real_mean_gap"].mean() == pytest.approx(result.metrics["mean_gap/real"])
     values = pd.read_parquet(result.folder / "pair_metrics.parquet")
     scopes = values.loc[values["metric"] == "mean_gap", "scope"]
     assert set(scopes) == {"test", "steady"}
@@ -82,7 +82,7 @@ def test_a_plugins_metric_stands_in_every_result(
     from mlflow import MlflowClient
 
     run = MlflowClient(store).get_run(result.run_id)
-    assert run.data.metrics["mean_gap/policy"] == pytest.approx(written["mean_gap/policy"])
+    assert run.data.metrics["mean_gap/fixed"] == pytest.approx(written["mean_gap/fixed"])
     assert run.data.tags["cfx.plugin.mean-gap-metrics"] == "1.0"
 
     out = io.StringIO()
@@ -153,11 +153,11 @@ def test_broken_metrics_are_left_out_told_and_counted(
     plugin(install, "mean_gap", GOOD)
     with caplog.at_level(logging.WARNING, logger="cfx"):
         result = cfx.run(list(QUICK))
-    assert "mean_gap/policy" in result.metrics
+    assert "mean_gap/fixed" in result.metrics
     said = json.loads((result.folder / "data.json").read_text())
     assert {one["name"] for one in said["metrics_left_out"]} == set(BROKEN)
     for name in BROKEN:
-        assert f"{name}/policy" not in result.metrics
+        assert f"{name}/fixed" not in result.metrics
         distribution = f"{name.replace('_', '-')}-metrics"
         warned = [record for record in caplog.records if distribution in record.getMessage()]
         assert len(warned) == 1, name

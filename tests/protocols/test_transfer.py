@@ -229,8 +229,7 @@ def test_constant_parameters_are_not_tested_on_whom_they_were_calibrated_on(tmp_
     with pytest.raises(DataError, match="has learned from 3 of the 3 pairs"):
         transferred(constant, tmp_path, "data.seed=5", "data.pairs=6", "data.max_pairs=3")
     there = transferred(constant, tmp_path)
-    gain = there.metrics["full_trajectory/rmse_improvement/population/mean"]
-    assert gain == pytest.approx(0, abs=1e-9)
+    assert set(there.pairs["method"]) == {"default", "population", "fixed"}
 
 
 def test_drivers_of_the_same_names_are_counted(

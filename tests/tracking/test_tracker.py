@@ -27,12 +27,12 @@ from cfx.calibration.windows import WindowSettings
 from cfx.config import JobConfig
 from cfx.datasets.tidy import write_tidy
 from cfx.errors import TrackingError
+from cfx.evaluation.headline import headline
 from cfx.models.krauss import Krauss
 from cfx.plots.look import JOB_COLOURS
 from cfx.policies.features import token_width
 from cfx.policies.gru import GruPolicy
 from cfx.tracking import provenance
-from cfx.tracking.headline import headline
 from cfx.tracking.store import download_run, quiet, translate_errors
 from cfx.tracking.tracker import CURVE_POINTS, MlflowTracker, Tracker, sweep_link
 from tests.drives import wavy_pairs
@@ -122,7 +122,7 @@ def test_a_job_is_kept_under_the_names_of_the_contract(
     assert kept.info.run_name == "krauss-gru-random-synthetic"
     losses = {"train_loss", "validation_loss"}
     metrics = {name: value for name, value in kept.data.metrics.items() if name not in losses}
-    first, words = headline(results.evaluation.metrics(), adapts=True)
+    first, words = headline(results.evaluation.metrics())
     assert metrics == pytest.approx(first | results.evaluation.metrics())
     assert kept.data.tags["result"] == words
     assert losses <= set(kept.data.metrics)
@@ -598,7 +598,7 @@ def test_the_recordings_and_a_description_are_the_runs(
 
 
 def test_a_calibration_logs_no_improvement(uri: str, client: Any) -> None:
-    results = make_results(pairs=2, frames=10)
+    results = make_results(pairs=2, frames=10, methods=("default", "population", "fixed"))
     with begin(uri) as run:
         run.log_evaluation(results.evaluation, adapts=False)
     kept = client.get_run(run.run_id).data

@@ -59,11 +59,9 @@ def figures_of_job(
             policy is no method of its own.
     """
     draw: dict[str, Callable[[], Figure]] = {}
-    shown = evaluation
+    shown = evaluation if adapts else evaluation.constant_methods()
     if adapts:
         draw["improvement_per_driver"] = partial(figures.improvements, evaluation)
-    else:
-        shown = evaluation.constant_methods()
     draw |= {
         "drives": partial(figures.pairs, shown),
         "speeds": partial(figures.speeds, shown),

@@ -234,7 +234,7 @@ def safety(jobs: Sequence[Job]) -> Sheet:
     """Returns a row per job: the policy's measures of safety, and below them a baseline's."""
     kept = []
     for one in _SAFETY:
-        if any_has_metric(jobs, one.metric, "policy", one.scope):
+        if any(job.has_metric(one.metric, job.judged, one.scope) for job in jobs):
             kept.append(one)
     columns = [Column("Job", number=False)]
     for one in kept:
@@ -280,7 +280,7 @@ def absolute(jobs: Sequence[Job]) -> Plot:
     """Errors of each method in m/s and m; a view for each error and part of the trajectories."""
     views: dict[str, dict[str, Any]] = {}
     for metric, scope in _ERRORS:
-        if not any_has_metric(jobs, metric, "policy", scope):
+        if not any(job.has_metric(metric, job.judged, scope) for job in jobs):
             continue
         signal, unit = ("speed", "m/s") if metric == "rmse_speed" else ("gap", "m")
         values = {}
@@ -334,7 +334,7 @@ def _gain(job: Job, baseline: str, scope: str) -> Cell:
 
 def _with_baseline(job: Job, metric: str, scope: str, baseline: str, form: str) -> Cell:
     """Returns the policy's number, and below it the baseline's."""
-    value = job.metric(metric, "policy", scope)
+    value = job.metric(metric, job.judged, scope)
     cell = number(value, formatted(value, form))
     if not job.has_metric(metric, baseline, scope):
         return cell

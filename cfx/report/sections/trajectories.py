@@ -57,7 +57,8 @@ def chosen_pairs(job: Job) -> tuple[RankedPair, ...]:
     """Returns the best, the median and the worst pair; fewer if there are fewer."""
     present = [trajectory.pair_id for trajectory in job.pair_trajectories]
     table = job.by_pair[job.by_pair["pair_id"].isin(present)]
-    gains = table["improvement/fixed" if job.adapts else "rmse_speed/policy"].to_numpy(dtype=float)
+    judged = "improvement/fixed" if job.adapts else f"rmse_speed/{job.judged}"
+    gains = table[judged].to_numpy(dtype=float)
     if not job.adapts:
         gains = -gains
     return rank_pairs(table["pair_id"].astype(str).tolist(), gains)

@@ -1,0 +1,143 @@
+"""A job's headline: one number and what it is, the same wherever a job is named."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from cfx.evaluation.result import improvement_key
+from cfx.metrics.base import key_of
+
+RESULT = "result"
+"""The tag that says it in words."""
+
+PERCENT = "improvement_percent"
+SPEED_ERROR = "rmse_speed_mps"
+"""Metrics that charts show first: they have no group, and MLflow puts such metrics first."""
+
+_CONSTANT = {"fixed": "driver-specific", "population": "pooled", "default": "default"}
+"""Constant parameters, the first of which is a calibration's number."""
+
+
+class Comparison(NamedTuple):
+    """What the policy is compared with: a baseline over a part of the trajectories."""
+
+    baseline: str
+    scope: str
+
+    @property
+    def key(self) -> str:
+        """How the metrics of the improvement begin."""
+        return improvement_key(self.baseline, self.scope)
+
+
+_COMPARISONS = (
+    Comparison("fixed", "test"),
+    Comparison("population", "full_trajectory"),
+    Comparison("population", "test"),
+)
+"""The first that was measured counts."""
+
+
+def main_comparison(metrics: Mapping[str, float]) -> Comparison | None:
+    """Returns the comparison that counts: over driver-specific parameters on the test part.
+
+    Where there are none it is over pooled ones, on full trajectories; None if there is nothing.
+    """
+    for one in _COMPARISONS:
+        if math.isfinite(metrics.get(f"{one.key}/mean", math.nan)):
+            return one
+    return None
+
+
+def ratio_of_means(metrics: Mapping[str, float], compared: Comparison) -> float:
+    """Returns by what share the policy's mean RMSE of speed is lower; NaN if that is not known."""
+    before = metrics.get(key_of("rmse_speed", compared.baseline, compared.scope), math.nan)
+    after = metrics.get(key_of("rmse_speed", "policy", compared.scope), math.nan)
+    return (before - after) / before if before > 0 else math.nan
+
+
+def contradiction(metrics: Mapping[str, float], compared: Comparison) -> str:
+    """Returns what the means say where it is the opposite of the mean improvement of pairs; or "".
+
+    A few drivers with small errors may outweigh all others in a mean of ratios.
+    """
+    mean = metrics.get(f"{compared.key}/mean", math.nan)
+    ratio = ratio_of_means(metrics, compared)
+    if not mean * ratio < 0:
+        return ""
+    return f"mean of the pairs' improvements; of the mean RMSE {100 * ratio:+.1f} %"
+
+
+def main_error(metrics: Mapping[str, float]) -> float:
+    """Returns the RMSE of speed that a job is judged by: the policy's; of a calibration `fixed`."""
+    for method in ("policy", *_CONSTANT):
+        error = metrics.get(key_of("rmse_speed", method), math.nan)
+        if math.isfinite(error):
+            return error
+    return math.nan
+
+
+def headline(metrics: Mapping[str, float]) -> tuple[dict[str, float], str]:
+    """Returns a job's headline.
+
+    A job without a method `policy` is a calibration.
+
+    Args:
+        metrics: the job's, under their names in MLflow.
+
+    Returns:
+        Metrics, rounded; and the result in words.
+    """
+    values: dict[str, float] = {}
+    if key_of("rmse_speed", "policy") not in metrics and main_comparison(metrics) is None:
+        return _of_calibration(metrics)
+    words = []
+    compared = main_comparison(metrics)
+    if compared is not None:
+        words.append(_improvement(metrics, compared, values))
+    error = metrics.get(key_of("rmse_speed", "policy"), math.nan)
+    if math.isfinite(error):
+        values[SPEED_ERROR] = round(error, 3)
+        said = f"RMSE of speed {error:.3f} m/s"
+        before = math.nan
+        if compared is not None:
+            before = metrics.get(key_of("rmse_speed", compared.baseline), math.nan)
+        if compared is not None and math.isfinite(before):
+            said += f" ({_CONSTANT[compared.baseline]} {before:.3f} m/s)"
+        words.append(said)
+    return values, "; ".join(words)
+
+
+def _improvement(
+    metrics: Mapping[str, float], compared: Comparison, values: dict[str, float]
+) -> str:
+    """Returns the improvement in words, and adds its numbers to `values`."""
+    mean = 100 * metrics[f"{compared.key}/mean"]
+    low, high = (100 * metrics.get(f"{compared.key}/ci95_{end}", math.nan) for end in ENDS)
+    values[PERCENT] = round(mean, 1)
+    text = f"{mean:+.1f} %"
+    if math.isfinite(low) and math.isfinite(high):
+        values["improvement_low_percent"] = round(low, 1)
+        values["improvement_high_percent"] = round(high, 1)
+        text += f" ({low:+.1f} to {high:+.1f})"
+    text += f" over {_CONSTANT[compared.baseline]}"
+    if compared.scope != "test":
+        text += " on full trajectories"
+    opposite = contradiction(metrics, compared)
+    return f"{text}, {opposite}" if opposite else text
+
+
+def _of_calibration(metrics: Mapping[str, float]) -> tuple[dict[str, float], str]:
+    values: dict[str, float] = {}
+    words = ["calibration"]
+    for method, name in _CONSTANT.items():
+        error = metrics.get(key_of("rmse_speed", method), math.nan)
+        if math.isfinite(error):
+            values.setdefault(SPEED_ERROR, round(error, 3))
+            words.append(f"{name} {error:.3f} m/s")
+    return values, "; ".join(words)
+
+
+ENDS = ("low", "high")

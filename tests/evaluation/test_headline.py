@@ -1,0 +1,66 @@
+"""The one number by which a job is known."""
+
+from __future__ import annotations
+
+import math
+
+from cfx.evaluation.headline import headline, main_error
+
+METRICS = {
+    "rmse_improvement/mean": 0.21584,
+    "rmse_improvement/ci95_low": 0.1688,
+    "rmse_improvement/ci95_high": 0.2621,
+    "steady/rmse_improvement/mean": 0.13,
+    "rmse_speed/policy": 0.58432,
+    "rmse_speed/fixed": 0.7351,
+    "rmse_speed/population": 0.6861,
+}
+
+
+def test_an_improvement_is_in_percent_with_its_interval() -> None:
+    values, words = headline(METRICS)
+    assert words == (
+        "+21.6 % (+16.9 to +26.2) over driver-specific;"
+        " RMSE of speed 0.584 m/s (driver-specific 0.735 m/s)"
+    )
+    assert values == {
+        "improvement_percent": 21.6,
+        "improvement_low_percent": 16.9,
+        "improvement_high_percent": 26.2,
+        "rmse_speed_mps": 0.584,
+    }
+
+
+def test_a_mean_of_ratios_that_the_means_contradict_is_told_with_theirs() -> None:
+    """A few drivers whose baseline is nearly perfect outweigh all others in a mean of ratios."""
+    metrics = {
+        "rmse_improvement/mean": -0.014,
+        "rmse_speed/policy": 0.624,
+        "rmse_speed/fixed": 0.712,
+    }
+    _, words = headline(metrics)
+    assert words == (
+        "-1.4 % over driver-specific, mean of the pairs' improvements; of the mean RMSE +12.4 %;"
+        " RMSE of speed 0.624 m/s (driver-specific 0.712 m/s)"
+    )
+
+
+def test_without_driver_specific_parameters_it_is_over_pooled_ones() -> None:
+    metrics = {"full_trajectory/rmse_improvement/population/mean": 0.1}
+    words = "+10.0 % over pooled on full trajectories"
+    assert headline(metrics) == ({"improvement_percent": 10.0}, words)
+
+
+def test_a_calibration_is_known_by_the_drivers_own_parameters() -> None:
+    metrics = {"rmse_speed/fixed": 0.7351, "rmse_speed/population": 0.6861}
+    values, words = headline(metrics)
+    assert words == "calibration; driver-specific 0.735 m/s; pooled 0.686 m/s"
+    assert values == {"rmse_speed_mps": 0.735}
+    assert main_error(metrics) == 0.7351
+    assert main_error(METRICS) == 0.58432
+
+
+def test_what_is_not_defined_is_not_said() -> None:
+    metrics = {"rmse_improvement/mean": math.nan, "rmse_speed/policy": math.nan}
+    assert headline(metrics) == ({}, "")
+    assert headline({}) == ({}, "calibration")
