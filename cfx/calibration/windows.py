@@ -17,8 +17,8 @@ from torch import Tensor
 
 from cfx.calibration.settings import WindowSettings
 from cfx.errors import DataError
-from cfx.metrics.base import TRANSIENT_S
 from cfx.pairs import PairSet
+from cfx.simulation.trajectory import TRANSIENT_S
 
 __all__ = ["Split", "WindowSettings", "Windows"]
 

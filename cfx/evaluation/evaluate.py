@@ -28,11 +28,12 @@ from cfx.evaluation.trajectories import (
     simulated_pairs,
     trajectories_of,
 )
-from cfx.metrics.base import RECORDED, TRANSIENT_S, MetricInfo, Trajectories
+from cfx.metrics.base import RECORDED, MetricInfo, Trajectories
 from cfx.metrics.errors import RmseGap, RmseSpeed
 from cfx.metrics.installed import LeftOut, MeasuredMetric, MetricSet, leave_out
 from cfx.pairs import PairBatch, PairSet
 from cfx.parameters import ParameterSpace
+from cfx.simulation.trajectory import TRANSIENT_S
 from cfx.style.result import CLUSTERS, StyleResult
 
 Measured = dict[tuple[str, str, str], NDArray[np.float64]]

@@ -22,8 +22,9 @@ from cfx.evaluation.headline import headline
 from cfx.evaluation.result import Evaluation, Improvement
 from cfx.evaluation.traffic.result import Traffic
 from cfx.job.results import JobResult
-from cfx.metrics.base import RECORDED, TRANSIENT_S, MetricInfo, key_of
+from cfx.metrics.base import RECORDED, MetricInfo, key_of
 from cfx.plots.words import few_drivers
+from cfx.simulation.trajectory import TRANSIENT_S
 
 if TYPE_CHECKING:
     from cfx.tracking.tracker import Tracker

@@ -23,9 +23,9 @@ from cfx.errors import OutputError
 from cfx.evaluation.result import Evaluation
 from cfx.files import atomic_write, remove_leftovers
 from cfx.job.calibration_view import CalibrationView
-from cfx.metrics.base import TRANSIENT_S
 from cfx.pairs import PairSet
 from cfx.protocols.base import ProtocolResult
+from cfx.simulation.trajectory import TRANSIENT_S
 from cfx.style.result import StyleResult
 from cfx.tracking.provenance import commit, version
 

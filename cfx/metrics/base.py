@@ -28,12 +28,6 @@ SCOPES: tuple[Scope, ...] = ("test", "steady", "full_trajectory")
 into.
 """
 
-TRANSIENT_S = 5.0
-"""How long the transient of a test part is, s (`transient_s` in `data.json`).
-
-Within some such time constant parameters lead from the measured state to a steady one of their own.
-"""
-
 RECORDED = "real"
 """The method under which the recorded drivers stand in tables and names of metrics."""
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from cfx.metrics.base import SCOPES, TRANSIENT_S
+from cfx.metrics.base import SCOPES
+from cfx.simulation.trajectory import TRANSIENT_S
 
 MINUS = "\N{MINUS SIGN}"
 NOTHING = "\N{EN DASH}"

@@ -14,10 +14,11 @@ import numpy as np
 import pandas as pd
 
 from cfx.evaluation.result import METHODS, PairTrajectory
-from cfx.metrics.base import TRANSIENT_S, MetricInfo, key_of
+from cfx.metrics.base import MetricInfo, key_of
 from cfx.plots.choice.trajectories import ParameterAxis
 from cfx.plots.words import TEST, scope_label
 from cfx.report.metrics import known_metrics
+from cfx.simulation.trajectory import TRANSIENT_S
 
 
 @dataclass(frozen=True)

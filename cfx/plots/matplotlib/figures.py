@@ -13,7 +13,6 @@ from cfx.errors import ConfigError, nearest
 from cfx.evaluation.forecasts import Forecasts, errors_by_history
 from cfx.evaluation.result import Evaluation, PairTrajectory, Platoon
 from cfx.evaluation.traffic.result import Traffic
-from cfx.metrics.base import TRANSIENT_S
 from cfx.plots.choice.calibration import correlations, parameter_spreads
 from cfx.plots.choice.distributions import distribution_view
 from cfx.plots.choice.errors import error_panels
@@ -50,6 +49,7 @@ from cfx.plots.matplotlib.style import draw_style
 from cfx.plots.matplotlib.traffic import draw_paths, draw_traffic
 from cfx.plots.matplotlib.trajectories import draw_pairs, draw_parameters, draw_speeds
 from cfx.plots.words import percent, short
+from cfx.simulation.trajectory import TRANSIENT_S
 from cfx.style.result import StyleResult
 
 
