@@ -6,19 +6,15 @@ no `if __name__ == "__main__"`. They share no lock with this process, as forked 
 
 from __future__ import annotations
 
-import importlib
 import itertools
-import logging
-import math
 import os
 import signal
 import threading
 import time
 import warnings
-from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from typing import Any, Generic, Self, TypeVar
+from collections.abc import Generator, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from typing import Any, Generic
 
 import loky
 from loky.backend import get_context
@@ -28,19 +24,11 @@ from cfx.engine.base import Report, ResultT, ShardT, Work
 from cfx.errors import EngineError
 from cfx.simulation.threads import limit_cores, one_core, one_thread
 
-log = logging.getLogger(__name__)
-
 _LOOK = 0.5
 """Seconds between looks at the workers' progress."""
 
 _ORPHAN = 1.0
 """Seconds between a worker's looks at whether the job is still there."""
-
-_IDLE = 60.0
-"""Seconds after which a standby process ends that nobody has needed."""
-
-_ItemT = TypeVar("_ItemT")
-_DoneT = TypeVar("_DoneT")
 
 _ENVIRONMENT = {"OMP_NUM_THREADS": "1"}
 """Of workers: threads that spin would slow down the other processes."""
@@ -177,108 +165,7 @@ class _Workers(Generic[ShardT, ResultT]):
         self._pool.shutdown(wait=True, kill_workers=kill)
 
 
-class Standby:
-    """A second process, which imports what some work needs while this one does something else.
-
-    Once the work is there, both do it. The process ends with the block, or after a minute for
-    which nobody has needed it: a long job gains nothing from it, and it holds memory. Where none
-    can be started, as on systems without semaphores, this process does all.
-
-    Args:
-        module: what it imports.
-    """
-
-    def __init__(self, module: str) -> None:
-        self._ends = time.monotonic() + _IDLE
-        self._pool: loky.ProcessPoolExecutor | None = None
-        try:
-            self._pool = loky.ProcessPoolExecutor(
-                1,
-                context=get_context("loky"),
-                timeout=_IDLE,
-                initializer=_begin,
-                initargs=(os.getpid(),),
-                env=_ENVIRONMENT,
-            )
-            self._imported: Future[None] = self._pool.submit(_import_module, module)
-        except (OSError, ImportError) as error:
-            log.debug("no second process: %s", error)
-            self._ends = -math.inf
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, kill_workers=True)
-
-    def wait(self) -> None:
-        """Waits until it has imported everything, or failed."""
-        if self._pool is not None:
-            wait([self._imported])
-
-    def share(self, work: Callable[[_ItemT], _DoneT], items: Sequence[_ItemT]) -> list[_DoneT]:
-        """Does independent work.
-
-        This process begins with the first item, the other one with the last, once it has imported
-        everything. What it could not do is done here: it was killed, an item cannot be sent, or the
-        work itself fails, which is then raised here.
-
-        Returns:
-            The results, in the order of the items.
-
-        Raises:
-            CfxError: what `work` raises.
-        """
-        left = deque(range(len(items)))
-        done: dict[int, _DoneT] = {}
-        pool = self._ready_pool()
-
-        def there() -> None:
-            if pool is not None:
-                for number in _taken(left.pop):
-                    done[number] = pool.submit(work, items[number]).result()
-
-        with ThreadPoolExecutor(1) as thread:
-            other = thread.submit(there)
-            try:
-                for number in _taken(left.popleft):
-                    done[number] = work(items[number])
-            finally:
-                left.clear()
-        if other.exception() is not None:
-            log.debug("the second process stopped: %r", other.exception())
-        results = []
-        for number, item in enumerate(items):
-            if number not in done:
-                done[number] = work(item)
-            results.append(done[number])
-        return results
-
-    def _ready_pool(self) -> loky.ProcessPoolExecutor | None:
-        """Returns what reaches the other process; None where it is not there or not ready."""
-        if time.monotonic() > self._ends or not self._imported.done():
-            return None
-        if self._imported.exception() is not None:
-            return None
-        return self._pool
-
-
-def _taken(take: Callable[[], int]) -> Iterator[int]:
-    """Yields what is left, until two threads together have taken everything."""
-    while True:
-        try:
-            number = take()
-        except IndexError:
-            return
-        yield number
-
-
-def _import_module(name: str) -> None:
-    importlib.import_module(name)
-
-
-def _begin(job: int, units: Any = None) -> None:
+def _begin(job: int, units: Any) -> None:
     """Prepares a worker.
 
     Args:

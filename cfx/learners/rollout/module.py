@@ -23,10 +23,9 @@ from cfx.learners.batched import BatchedModule
 from cfx.learners.rollout.base_errors import BaseErrors, Divisors
 from cfx.learners.rollout.batch import RolloutBatch
 from cfx.learners.rollout.dataset import RolloutDataset
-from cfx.learners.rollout.distillation import Expert
 from cfx.learners.rollout.gradients import GradientPath, NoGradients, ThroughMemory, ThroughTime
 from cfx.learners.rollout.inputs import Measured
-from cfx.learners.rollout.loop import simulate
+from cfx.learners.rollout.loop import Expert, simulate
 from cfx.learners.rollout.loss import FrameWeights, TrajectoryLoss
 from cfx.learners.rollout.sampling import TrajectorySampler
 from cfx.learners.rollout.settings import RolloutSettings

@@ -16,7 +16,7 @@ from cfx.agents.heads import HEADS
 from cfx.agents.heads.offset import OffsetHead
 from cfx.engine.base import Report
 from cfx.learners.batched import fit
-from cfx.learners.rollout.distillation import Expert
+from cfx.learners.rollout.loop import Expert
 from cfx.learners.rollout.module import RolloutModule, StepNumbers
 from cfx.learners.rollout.shard import (
     TrainedShard,

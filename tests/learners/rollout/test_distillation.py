@@ -10,9 +10,8 @@ import torch
 from cfx.agents.core import AgentCore
 from cfx.agents.heads.offset import OffsetHead
 from cfx.learners.base import TrainingData
-from cfx.learners.rollout.distillation import Expert
 from cfx.learners.rollout.inputs import RolloutInputs
-from cfx.learners.rollout.loop import burn_in
+from cfx.learners.rollout.loop import Expert, burn_in
 from cfx.learners.rollout.module import RolloutModule
 from cfx.learners.rollout.step import WindowStep
 from cfx.models.direct import Direct
