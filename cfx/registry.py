@@ -30,7 +30,6 @@ from typing import Any, get_args
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from cfx.collector import importing
 from cfx.component import API_VERSION, Component, Settings, validate
 from cfx.errors import CfxError, ConfigError, PluginError, nearest
 from cfx.extras import advice
@@ -481,8 +480,7 @@ def _entries(distribution: importlib.metadata.Distribution) -> Iterator[Entry]:
 def _import(found: Entry) -> Any:
     module, _, attribute = found.target.partition(":")
     try:
-        with importing():
-            imported = importlib.import_module(module)
+        imported = importlib.import_module(module)
         return functools.reduce(getattr, attribute.split("."), imported)
     except KeyboardInterrupt:
         raise

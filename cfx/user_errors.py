@@ -16,6 +16,19 @@ from cfx import hydra_source
 from cfx.errors import CfxError, nearest
 from cfx.extras import advice
 
+SUB_COMMANDS = (
+    "plugins",
+    "policies",
+    "data",
+    "benchmark",
+    "report",
+    "ui",
+    "drive",
+    "export",
+    "cite",
+)
+"""Names of the plain sub-commands (`cfx.cli.COMMANDS`)."""
+
 
 def is_user_error(error: BaseException) -> bool:
     """Says whether an error raised outside the job itself is the user's to mend."""
@@ -78,9 +91,7 @@ def _unknown_option(path: str, options: Sequence[str]) -> str:
 def _unreadable(error: OverrideParseException) -> str:
     word = error.override
     if "=" not in word:
-        from cfx.cli import COMMANDS
-
-        advice = nearest(word, COMMANDS)
+        advice = nearest(word, SUB_COMMANDS)
         return f"{word}: neither key=value nor a sub-command.{advice} See cfx --help."
     detail = "syntax"
     for line in error.message.splitlines():

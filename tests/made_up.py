@@ -11,7 +11,8 @@ import pandas as pd
 
 from cfx.evaluation.distributions import DISTRIBUTION_COLUMNS
 from cfx.evaluation.forecasts import FORECAST_COLUMNS, FORECAST_METHODS, Forecasts
-from cfx.evaluation.result import Evaluation, Improvement, PairTrajectory, Platoon
+from cfx.evaluation.result import Evaluation, PairTrajectory, Platoon
+from cfx.evaluation.statistics import Improvement
 from cfx.evaluation.tables import VALUE_COLUMNS
 from cfx.evaluation.traffic.result import ROAD_COLUMNS, Traffic
 from cfx.metrics.base import MetricInfo

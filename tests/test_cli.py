@@ -19,6 +19,7 @@ from cfx import application, cli, ui
 from cfx.datasets.tidy import write_tidy
 from cfx.errors import CfxError, ConfigError, DataError
 from cfx.tracking.store import open_store
+from cfx.user_errors import SUB_COMMANDS
 from tests.conftest import ROOT
 from tests.drives import straight_pairs
 
@@ -527,3 +528,7 @@ def test_a_signal_that_comes_early_has_its_exit_code(
     _, err = started.communicate(timeout=60)
     assert started.returncode == code
     assert b"Traceback" not in err
+
+
+def test_the_sub_commands_that_messages_suggest_are_those_there_are() -> None:
+    assert tuple(cli.COMMANDS) == SUB_COMMANDS

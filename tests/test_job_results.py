@@ -11,7 +11,8 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from cfx.evaluation.result import Evaluation, Improvement
+from cfx.evaluation.result import Evaluation
+from cfx.evaluation.statistics import Improvement
 from cfx.job.console import report
 from cfx.job.output import Output, write_further_tables
 from cfx.job.results import JobResult

@@ -8,8 +8,7 @@ import pandas as pd
 
 from cfx.benchmark.row import COUNTS
 from cfx.errors import DataError
-from cfx.evaluation.result import Improvement
-from cfx.evaluation.statistics import improvement_statistics
+from cfx.evaluation.statistics import Improvement, improvement_statistics
 
 _NEEDED = ("row", "pair_id", "driver")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -22,6 +23,8 @@ from cfx.files import absolute
 from cfx.memory import give_back
 from cfx.pairs import SIGNALS, Dropped, Pair, PairSet
 from cfx.storage import is_url, local_copies
+
+log = logging.getLogger(__name__)
 
 
 def _files(value: Any) -> Path | str | tuple[Path | str, ...]:
@@ -427,3 +430,11 @@ def _select_first(pairs: PairSet, settings: DatasetSettings) -> PairSet:
         )
     beyond = Dropped(f"beyond max_pairs ({wanted})", len(pairs) - wanted)
     return replace(pairs, pairs=pairs.pairs[:wanted], dropped=(*pairs.dropped, beyond))
+
+
+def load_pairs(dataset: Dataset) -> PairSet:
+    """Returns all pairs of a dataset, and says what they are."""
+    pairs = dataset.load()
+    drivers = len({pair.driver for pair in pairs})
+    log.info("%d pairs of %d drivers from %s", len(pairs), drivers, pairs.source)
+    return pairs

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
 import itertools
 import logging
-import math
-import time
-from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from typing import Any, Generic, Self, TypeVar
+from collections.abc import Generator, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from typing import Any, Generic, TypeVar
 
-import loky
 from loky.backend import get_context
 from loky.process_executor import BrokenProcessPool
 
@@ -153,100 +148,6 @@ class _Workers(Generic[ShardT, ResultT]):
     def end(self, *, kill: bool) -> None:
         """Ends them; one that ends by itself also ends what libraries have started in it."""
         self._pool.shutdown(wait=True, kill_workers=kill)
-
-
-class Standby:
-    """A second process, which imports what some work needs while this one does something else.
-
-    Once the work is there, both do it. The process ends with the block, or after a minute for
-    which nobody has needed it: a long job gains nothing from it, and it holds memory. Where none
-    can be started, as on systems without semaphores, this process does all.
-
-    Args:
-        module: what it imports.
-    """
-
-    def __init__(self, module: str) -> None:
-        self._ends = time.monotonic() + _IDLE
-        self._pool: loky.ProcessPoolExecutor | None = None
-        try:
-            self._pool = worker_pool(1, _begin, timeout=_IDLE)
-            self._imported: Future[None] = self._pool.submit(_import_module, module)
-        except (OSError, ImportError) as error:
-            log.debug("no second process: %s", error)
-            self._ends = -math.inf
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, kill_workers=True)
-
-    def wait(self) -> None:
-        """Waits until it has imported everything, or failed."""
-        if self._pool is not None:
-            wait([self._imported])
-
-    def share(self, work: Callable[[_ItemT], _DoneT], items: Sequence[_ItemT]) -> list[_DoneT]:
-        """Does independent work.
-
-        This process begins with the first item, the other one with the last, once it has imported
-        everything. What it could not do is done here: it was killed, an item cannot be sent, or the
-        work itself fails, which is then raised here.
-
-        Returns:
-            The results, in the order of the items.
-
-        Raises:
-            CfxError: what `work` raises.
-        """
-        left = deque(range(len(items)))
-        done: dict[int, _DoneT] = {}
-        pool = self._ready_pool()
-
-        def there() -> None:
-            if pool is not None:
-                for number in _taken(left.pop):
-                    done[number] = pool.submit(work, items[number]).result()
-
-        with ThreadPoolExecutor(1) as thread:
-            other = thread.submit(there)
-            try:
-                for number in _taken(left.popleft):
-                    done[number] = work(items[number])
-            finally:
-                left.clear()
-        if other.exception() is not None:
-            log.debug("the second process stopped: %r", other.exception())
-        results = []
-        for number, item in enumerate(items):
-            if number not in done:
-                done[number] = work(item)
-            results.append(done[number])
-        return results
-
-    def _ready_pool(self) -> loky.ProcessPoolExecutor | None:
-        """Returns what reaches the other process; None where it is not there or not ready."""
-        if time.monotonic() > self._ends or not self._imported.done():
-            return None
-        if self._imported.exception() is not None:
-            return None
-        return self._pool
-
-
-def _taken(take: Callable[[], int]) -> Iterator[int]:
-    """Yields what is left, until two threads together have taken everything."""
-    while True:
-        try:
-            number = take()
-        except IndexError:
-            return
-        yield number
-
-
-def _import_module(name: str) -> None:
-    importlib.import_module(name)
 
 
 def _begin(units: Any = None) -> None:

@@ -17,8 +17,8 @@ from cfx import registry
 from cfx.agents.agent import Agent
 from cfx.evaluation.closed_loop import ClosedLoop
 from cfx.evaluation.outside import outside_in_words
-from cfx.evaluation.result import METHODS, Array, Evaluation, Improvement, Platoon
-from cfx.evaluation.statistics import improvement_statistics
+from cfx.evaluation.result import METHODS, Array, Evaluation, Platoon
+from cfx.evaluation.statistics import Improvement, improvement_statistics
 from cfx.evaluation.tables import long_table, values_of
 from cfx.evaluation.trajectories import (
     array,

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from cfx.evaluation.distributions import distribution_metrics
 from cfx.evaluation.forecast_paths import Origins, Paths
+from cfx.evaluation.statistics import mean_interval
 from cfx.pairs import PairSet
 
 FORECAST_METHODS = (
@@ -237,8 +238,6 @@ def summarize_forecasts(table: pd.DataFrame, seed: int, by: str = "horizon_s") -
         `rmse_speed_high`, `rmse_position_low` and `rmse_position_high`, the 95 % bootstrap interval
         over drivers; drivers and origins, how many there are.
     """
-    from cfx.evaluation.statistics import mean_interval  # imports scipy
-
     rows = []
     of_driver = errors_by(table, ["method", by, "driver"])
     for (method, value), found in of_driver.groupby(["method", by], sort=False, observed=True):

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from cfx.calibration.flatness import with_flat_shares
 from cfx.evaluation.forecasts import Forecasts
+from cfx.evaluation.statistics import Improvement
 from cfx.evaluation.tables import in_text, summaries, values_of, wide_table
 from cfx.evaluation.traffic.result import Traffic
 from cfx.metrics.base import MetricInfo
@@ -42,9 +43,6 @@ where it is not `fixed` itself; it separates what adapting adds from what shrink
 `policy`: parameters that a policy chooses for each window.
 """
 
-STATISTICS = ("mean", "trimmed_mean", "median", "ci95_low", "ci95_high", "win_rate", "p_value")
-"""What metrics tell of an `Improvement`."""
-
 
 @dataclass(frozen=True)
 class PairTrajectory:
@@ -68,41 +66,6 @@ class PairTrajectory:
     speed: Mapping[str, Array]
     gap: Mapping[str, Array]
     parameters: Mapping[str, Array]
-
-
-@dataclass(frozen=True)
-class Improvement:
-    """`(RMSE_baseline - RMSE_policy) / RMSE_baseline` of speed over the pairs (0.1 is 10 %).
-
-    Attributes:
-        mean, trimmed_mean, median: over pairs; the trimmed mean drops the top and the bottom 10 %.
-        ci95_low, ci95_high: bootstrap confidence interval of the mean; drivers are resampled with
-            all their pairs.
-        win_rate: share of pairs with a positive improvement.
-        p_value: two-sided Wilcoxon signed-rank test of RMSE_baseline against RMSE_policy, means
-            over each driver's pairs.
-        pairs: number of pairs that count.
-        undefined: number of pairs left out because RMSE_baseline is 0 or a rollout diverged.
-        drivers: number of drivers of the pairs that count.
-    """
-
-    mean: float
-    trimmed_mean: float
-    median: float
-    ci95_low: float
-    ci95_high: float
-    win_rate: float
-    p_value: float
-    pairs: int
-    undefined: int
-    drivers: int
-
-    def metrics(self) -> dict[str, float]:
-        """Returns the statistics by name."""
-        values = {}
-        for name in STATISTICS:
-            values[name] = float(getattr(self, name))
-        return values
 
 
 _PLATOON_SUMMARIES = {

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
-
-from cfx.evaluation.result import Improvement
 
 _TRIMMED = 0.1
 """Share dropped at each end of the improvements for the trimmed mean, as in the paper."""
@@ -26,6 +24,44 @@ _AT_ONCE = 1_000_000
 
 Floats = NDArray[np.float64]
 
+STATISTICS = ("mean", "trimmed_mean", "median", "ci95_low", "ci95_high", "win_rate", "p_value")
+"""What metrics tell of an `Improvement`."""
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """`(RMSE_baseline - RMSE_policy) / RMSE_baseline` of speed over the pairs (0.1 is 10 %).
+
+    Attributes:
+        mean, trimmed_mean, median: over pairs; the trimmed mean drops the top and the bottom 10 %.
+        ci95_low, ci95_high: bootstrap confidence interval of the mean; drivers are resampled with
+            all their pairs.
+        win_rate: share of pairs with a positive improvement.
+        p_value: two-sided Wilcoxon signed-rank test of RMSE_baseline against RMSE_policy, means
+            over each driver's pairs.
+        pairs: number of pairs that count.
+        undefined: number of pairs left out because RMSE_baseline is 0 or a rollout diverged.
+        drivers: number of drivers of the pairs that count.
+    """
+
+    mean: float
+    trimmed_mean: float
+    median: float
+    ci95_low: float
+    ci95_high: float
+    win_rate: float
+    p_value: float
+    pairs: int
+    undefined: int
+    drivers: int
+
+    def metrics(self) -> dict[str, float]:
+        """Returns the statistics by name."""
+        values = {}
+        for name in STATISTICS:
+            values[name] = float(getattr(self, name))
+        return values
+
 
 def improvement_statistics(
     baseline: Floats, policy: Floats, drivers: Sequence[str] | None = None, *, seed: int
@@ -41,6 +77,8 @@ def improvement_statistics(
         drivers: the driver of each pair, `(P,)`; None if each pair has a driver of its own.
         seed: of the bootstrap.
     """
+    from scipy import stats  # slow to import
+
     counts = np.isfinite(baseline) & np.isfinite(policy) & (baseline > 0)
     before, after = baseline[counts], policy[counts]
     if not counts.any():
@@ -115,6 +153,8 @@ def _interval(gain: Floats, who: NDArray[np.intp], seed: int) -> tuple[float, fl
     ratio of sums over drivers (W. G. Cochran 1977, Sampling Techniques, chapter 6), which the
     bootstrap tends to.
     """
+    from scipy import stats  # slow to import
+
     number = np.bincount(who).astype(float)
     if len(number) < 2:
         return float("nan"), float("nan")

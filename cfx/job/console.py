@@ -19,7 +19,8 @@ from cfx.evaluation.distributions import (
 )
 from cfx.evaluation.forecasts import Forecasts
 from cfx.evaluation.headline import headline
-from cfx.evaluation.result import Evaluation, Improvement
+from cfx.evaluation.result import Evaluation
+from cfx.evaluation.statistics import Improvement
 from cfx.evaluation.traffic.result import Traffic
 from cfx.job.results import JobResult
 from cfx.metrics.base import RECORDED, MetricInfo, key_of

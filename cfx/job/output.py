@@ -9,14 +9,13 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import yaml
 
-from cfx.collector import importing
 from cfx.config import JobConfig
 from cfx.datasets.tidy import write_tidy
 from cfx.errors import OutputError
@@ -28,9 +27,6 @@ from cfx.protocols.base import ProtocolResult
 from cfx.simulation.trajectory import TRANSIENT_S
 from cfx.style.result import StyleResult
 from cfx.tracking.provenance import commit, version
-
-if TYPE_CHECKING:
-    from cfx.engine.processes import Standby
 
 TRACKED = (
     "config.yaml",
@@ -44,9 +40,6 @@ TRACKED = (
 )
 """Files of a job's folder that MLflow keeps too, besides its figures and its policy."""
 
-
-_SHARED_PAIRS = 500
-"""Pairs of a job whose figures two processes draw, at most: the other is sent all trajectories."""
 
 METRICS = "metrics.json"
 """The file that is written last: a folder that has it is complete."""
@@ -263,7 +256,6 @@ def write_figures(
     view: CalibrationView | None,
     *,
     adapts: bool,
-    second: Standby | None = None,
 ) -> list[Path]:
     """Writes the figures, if the configuration wants any; returns their paths.
 
@@ -275,15 +267,13 @@ def write_figures(
         protocol_result: what is drawn.
         view: slices and fits of the calibration; None without.
         adapts: as `Policy.adapts`.
-        second: a process that draws some of them.
 
     Raises:
         OutputError: a file cannot be written.
     """
     paths: list[Path] = []
     if config.figures.enabled:
-        with importing():
-            from cfx.plots.matplotlib import write
+        from cfx.plots.matplotlib import write
 
         evaluation = protocol_result.evaluation
         draw = {**write.figures_of_job(evaluation, style, protocol_result.curves, adapts=adapts)}
@@ -292,13 +282,10 @@ def write_figures(
             if protocol_result.labels is not None:
                 labels = protocol_result.labels.to_frame(pairs, evaluation.names)
             draw |= write.figures_of_calibration(evaluation, view.slices, view.fits, labels)
-        share: write.Share = write.in_turn
-        if second is not None and len(pairs) <= _SHARED_PAIRS:
-            share = second.share
 
         def write_all() -> None:
             folder, formats = output.folder / "figures", config.figures.formats
-            paths.extend(write.write_figures(folder, draw, formats=formats, share=share))
+            paths.extend(write.write_figures(folder, draw, formats=formats))
 
         output.run(write_all)
     return paths

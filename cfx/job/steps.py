@@ -18,8 +18,8 @@ from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.flatness import flat_for
 from cfx.calibration.prior import prior_weight
 from cfx.calibration.settings import WindowSettings
-from cfx.collector import importing
 from cfx.config import JobConfig
+from cfx.datasets.base import load_pairs
 from cfx.errors import PluginError
 from cfx.job import output as files
 from cfx.job.calibration_view import CalibrationView, calibration_view
@@ -34,7 +34,6 @@ from cfx.job.parts import (
     reported_objectives,
 )
 from cfx.job.results import JobResult
-from cfx.job.run import load_pairs
 from cfx.job.upload import Upload
 from cfx.learners.curves import best_losses
 from cfx.memory import require_memory
@@ -46,7 +45,6 @@ from cfx.style.entropy import measure_style, select_cluster
 from cfx.style.result import StyleResult
 
 if TYPE_CHECKING:
-    from cfx.engine.processes import Standby
     from cfx.tracking.tracker import Tracker
 
 log = logging.getLogger(__name__)
@@ -60,7 +58,6 @@ def take_steps(
     folder: Path,
     loaded: PairSet,
     console: Console | None = None,
-    second: Standby | None = None,
 ) -> JobResult:
     """Runs one job and writes its results into `folder`.
 
@@ -69,19 +66,15 @@ def take_steps(
         folder: the job's output folder; made if it is not there.
         loaded: the pairs of the configuration's dataset.
         console: where the table goes; stdout unless given.
-        second: a process that draws some of the figures.
 
     Raises:
         CfxError: the user's mistake, in one sentence; nothing half-written is left.
     """
-    with importing():
-        from cfx.tracking.tracker import Tracker
+    from cfx.tracking.tracker import Tracker
 
     console = console or Console()
     data = config.data
     device = choose_device(config.device)
-    if device.type != "cpu":
-        second = None  # trajectories lie where it is not
     limit_cores(config.cores)
     if config.threads is not None:
         set_threads(config.threads)
@@ -119,7 +112,7 @@ def take_steps(
         if view is not None:
             evaluation = protocol_result.evaluation.with_slices(view.slices)
             protocol_result = replace(protocol_result, evaluation=evaluation)
-        result = _keep(config, parts, output, pairs, style, protocol_result, view, tracker, second)
+        result = _keep(config, parts, output, pairs, style, protocol_result, view, tracker)
         if upload is not None:
             upload.finish()
             tracker.set_tags({"cfx.output_url": upload.url})
@@ -227,7 +220,6 @@ def _keep(
     protocol_result: ProtocolResult,
     view: CalibrationView | None,
     tracker: Tracker,
-    second: Standby | None,
 ) -> JobResult:
     """Writes everything into the folder, then into MLflow."""
     evaluation = protocol_result.evaluation
@@ -252,7 +244,6 @@ def _keep(
         protocol_result,
         view,
         adapts=parts.policy.adapts,
-        second=second,
     )
     demo = files.write_demo(output, config, pairs, protocol_result)
     files.write_provenance(

@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader
 
 from cfx.agents.heads.base import ParameterHead
 from cfx.learners.batched import BatchedModule
-from cfx.learners.imitation import ImitationDataset, ImitationSettings
+from cfx.learners.imitation_data import ImitationDataset, ImitationSettings
 from cfx.policies.base import PolicyNetwork
 from cfx.simulation.compiling import torch_compiled
 from cfx.simulation.rollout import can_compile

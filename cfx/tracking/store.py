@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Any
 
 from filelock import BaseFileLock, Timeout
 
-from cfx.collector import importing
 from cfx.errors import TrackingError
 from cfx.locks import lock_for
 from cfx.ready import folder_of_ready_made, is_ready_made
@@ -150,10 +149,10 @@ def open_store(uri: str, experiment: str, default: Path | None = None) -> Store:
     if file is not None:
         name = file.name
     # Not while the lock is held: on a busy machine it takes each of many jobs a minute.
-    with importing(), quiet():
+    with quiet():
         _import_databases()
     lock = lock_for(home / f"{name}.lock", timeout=_TURNS * LOCK_SECONDS)
-    with _held(lock), importing():
+    with _held(lock):
         if file is not None:
             if _is_new(file):
                 _create(file, home)

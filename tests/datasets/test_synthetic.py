@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from scipy.signal import lfilter
 
 from cfx.datasets.synthetic import (
     SyntheticDataset,
-    autoregression,
     leader_speed,
     smooth_noise,
 )
@@ -115,12 +113,6 @@ def test_leaders_keep_to_bounded_acceleration_and_jerk() -> None:
     assert acceleration.min() >= -2.5 - 1e-9
     assert np.abs(np.diff(acceleration)).max() <= 1.5 * 0.1 + 1e-9
     assert (speed < 5).any(axis=1).mean() > 0.95, "nearly every leader meets a wave in five minutes"
-
-
-def test_the_autoregression_has_the_bits_of_scipys_filter() -> None:
-    noise = np.random.default_rng(0).standard_normal((3, 2, 400))
-    expected = lfilter([1.0], [1.0, -1.9, 0.91], noise, axis=-1)
-    assert np.array_equal(autoregression(noise, 1.9, -0.91), expected)
 
 
 def test_smooth_noise_is_standard_and_smooth() -> None:

@@ -13,7 +13,6 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from cfx.engine.processes import Standby
 from cfx.errors import ConfigError, OutputError
 from cfx.evaluation.result import Evaluation
 from cfx.learners.curves import over_networks
@@ -362,14 +361,3 @@ def test_figures_for_a_paper_are_vector_graphics_without_dates(tmp_path: Path) -
     assert by_name["speeds.pdf"].startswith(b"%PDF-")
     assert b"<svg" in by_name["speeds.svg"]
     assert b"TrueType" in by_name["speeds.pdf"] or b"CIDFontType2" in by_name["speeds.pdf"]
-
-
-def test_two_processes_draw_the_same_figures_as_one(tmp_path: Path) -> None:
-    draw = drawn(make_results(pairs=2, frames=10))
-    alone = write_figures(tmp_path / "alone", draw)
-    with Standby("cfx.plots.matplotlib.write") as second:
-        second.wait()
-        shared = write_figures(tmp_path / "shared", draw, share=second.share)
-    assert [path.name for path in shared] == [path.name for path in alone]
-    for one, other in zip(alone, shared, strict=True):
-        assert one.read_bytes() == other.read_bytes()

@@ -12,8 +12,8 @@ from typing import Any
 import pandas as pd
 import yaml
 
-from cfx.evaluation.result import Evaluation, Improvement
-from cfx.evaluation.statistics import improvement_statistics
+from cfx.evaluation.result import Evaluation
+from cfx.evaluation.statistics import Improvement, improvement_statistics
 from cfx.evaluation.tables import values_of
 from cfx.parameters import ParameterSpace
 from cfx.style.result import CLUSTERS

@@ -24,7 +24,6 @@ from torch import Tensor
 from cfx.agents.heads import HEADS
 from cfx.agents.heads.base import ParameterHead
 from cfx.agents.scaler import Scaler
-from cfx.collector import importing
 from cfx.component import Settings
 from cfx.engine.base import Engine
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
@@ -140,8 +139,7 @@ class RolloutLearner(Learner):
         """
         at_most = epochs(self.settings)
         # Where nothing is trained, its imports would only take time and memory.
-        with importing():
-            from cfx.learners.rollout.train import train
+        from cfx.learners.rollout.train import train
 
         title = f"Training ({len(dataset.pair)} networks, at most {at_most} epochs)"
         with Task(title, at_most * count) as task:

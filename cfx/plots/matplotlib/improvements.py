@@ -23,7 +23,7 @@ from cfx.plots.words import (
 )
 
 if TYPE_CHECKING:
-    from cfx.evaluation.result import Improvement
+    from cfx.evaluation.statistics import Improvement
 
 _NAMED = 40
 """Up to so many bars carry their pair's name."""

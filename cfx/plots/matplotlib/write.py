@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, Protocol, TypeVar
 
 import pandas as pd
 from matplotlib.figure import Figure
@@ -21,9 +20,6 @@ from cfx.plots.matplotlib.canvas import DPI, look
 from cfx.plots.matplotlib.identifiability import draw_fits, draw_labels, draw_slices
 from cfx.style.result import StyleResult
 
-_Item = TypeVar("_Item")
-_Done = TypeVar("_Done")
-
 _METADATA: dict[str, dict[str, None]] = {
     "png": {"Software": None},
     "pdf": {"Creator": None, "Producer": None, "CreationDate": None},
@@ -34,13 +30,6 @@ _METADATA: dict[str, dict[str, None]] = {
 
 Figures = Mapping[str, Callable[[], Figure]]
 """What draws each figure, by the name of its files."""
-
-
-class Share(Protocol):
-    """Does independent work, in whichever process; returns the results in the items' order."""
-
-    def __call__(self, work: Callable[[_Item], _Done], items: Sequence[_Item], /) -> list[_Done]:
-        """As described above."""
 
 
 def figures_of_job(
@@ -117,47 +106,23 @@ def figures_of_calibration(
     return draw
 
 
-def in_turn(work: Callable[[_Item], _Done], items: Sequence[_Item]) -> list[_Done]:
-    """Does work in this process, one item after the other."""
-    return [work(item) for item in items]
-
-
-class _Files(NamedTuple):
-    """A figure that is to be drawn, and the files that it is written to."""
-
-    draw: Callable[[], Figure]
-    paths: tuple[Path, ...]
-
-
-def write_figures(
-    folder: Path, draw: Figures, *, formats: Sequence[str] = ("png",), share: Share = in_turn
-) -> list[Path]:
-    """Draws and writes figures; returns their paths.
+def write_figures(folder: Path, draw: Figures, *, formats: Sequence[str] = ("png",)) -> list[Path]:
+    """Draws and writes figures, one after the other; returns their paths.
 
     Args:
         folder: made if it is not there.
         draw: which figures.
         formats: files of each figure: `png`, `pdf`, `svg`.
-        share: does the work.
 
     Raises:
         OutputError: a file cannot be written.
     """
-    files = []
+    paths = []
     for name, make in draw.items():
-        files.append(_Files(make, tuple(folder / f"{name}.{form}" for form in formats)))
-    paths: list[Path] = []
-    for written in share(_write, files):
-        paths += written
+        figure = make()
+        for form in formats:
+            paths.append(write_figure(figure, folder / f"{name}.{form}"))
     return paths
-
-
-def _write(files: _Files) -> tuple[Path, ...]:
-    """Draws one figure and writes it: where figures take turns, only one is in memory."""
-    figure = files.draw()
-    for path in files.paths:
-        write_figure(figure, path)
-    return files.paths
 
 
 def write_figure(figure: Figure, path: Path) -> Path:

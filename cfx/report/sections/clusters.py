@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
-from cfx.evaluation.result import Improvement
+from cfx.evaluation.statistics import Improvement
 from cfx.plots.choice.jobs import ClusterGroup, cluster_boxes
 from cfx.plots.plotly.figure import Plot
 from cfx.plots.plotly.jobs import clusters_view
