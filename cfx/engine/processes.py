@@ -6,7 +6,7 @@ import itertools
 import logging
 from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic
 
 from loky.backend import get_context
 from loky.process_executor import BrokenProcessPool
@@ -21,11 +21,6 @@ log = logging.getLogger(__name__)
 _LOOK = 0.5
 """Seconds between looks at the workers' progress."""
 
-_IDLE = 60.0
-"""Seconds after which a standby process ends that nobody has needed."""
-
-_ItemT = TypeVar("_ItemT")
-_DoneT = TypeVar("_DoneT")
 
 _UNITS: list[Any] = []
 """In a worker: the queue that its progress goes to."""
@@ -150,7 +145,7 @@ class _Workers(Generic[ShardT, ResultT]):
         self._pool.shutdown(wait=True, kill_workers=kill)
 
 
-def _begin(units: Any = None) -> None:
+def _begin(units: Any) -> None:
     """Prepares a worker; `units` is the queue that progress goes to."""
     limit_cores(1)
     _UNITS[:] = [units]
