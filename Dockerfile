@@ -22,8 +22,9 @@ COPY pyproject.toml README.md LICENSE CITATION.cff ./
 COPY cfx ./cfx
 COPY conf ./conf
 COPY plugins/cfx-dask ./plugins/cfx-dask
+COPY plugins/cfx-recordings ./plugins/cfx-recordings
 ARG EXTRAS=dask,joblib,postgresql,s3
-RUN /opt/cfx/bin/pip install --no-cache-dir --constraint constraints.txt ".[$EXTRAS]" ./plugins/cfx-dask
+RUN /opt/cfx/bin/pip install --no-cache-dir --constraint constraints.txt ".[$EXTRAS]" ./plugins/cfx-dask ./plugins/cfx-recordings
 
 FROM python:${PYTHON}-slim-bookworm
 # hadolint ignore=DL3008

@@ -91,8 +91,9 @@ conf: $(VENV)/.ready
 	$(BIN)/python -m cfx.nodes
 
 # The stamps are made again when what they were made from changes, so a second `make run` installs nothing.
-$(VENV)/.ready: pyproject.toml constraints.txt $(VENV)/.torch
-	$(PIP) install --quiet --constraint constraints.txt --editable .
+# Readers of published recordings are a plugin that everybody gets.
+$(VENV)/.ready: pyproject.toml plugins/cfx-recordings/pyproject.toml constraints.txt $(VENV)/.torch
+	$(PIP) install --quiet --constraint constraints.txt --editable . --editable plugins/cfx-recordings
 	touch $@
 
 # The plugins in this repository are distributions of their own; what they need is in the test extra.

@@ -15,6 +15,12 @@ from cfx.errors import nearest
 OWN = "cfx-driving"
 
 EXTRAS: dict[tuple[str, str], str] = {
+    ("data", "followernet"): "cfx-recordings",
+    ("data", "follownet"): "cfx-recordings",
+    ("data", "highd"): "cfx-recordings",
+    ("data", "lyft_pairs"): "cfx-recordings",
+    ("data", "openacc"): "cfx-recordings",
+    ("data", "waymo_pairs"): "cfx-recordings",
     ("hydra/launcher", "dask"): "cfx-dask",
     ("hydra/launcher", "joblib"): f"{OWN}[joblib]",
     ("hydra/launcher", "submitit_local"): f"{OWN}[submitit]",

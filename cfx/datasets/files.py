@@ -120,6 +120,11 @@ class TextTable:
         return int(index) + 2 + self.above
 
 
+def stem(path: Path) -> str:
+    """Returns a file's name without what follows its first dot."""
+    return path.name.split(".")[0] or path.name
+
+
 def magic(path: Path) -> bytes:
     """Returns the first bytes of a file.
 

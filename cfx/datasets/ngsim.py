@@ -19,8 +19,8 @@ from pydantic import Field
 
 from cfx.component import Settings
 from cfx.datasets.base import Contents, Dataset, FileDatasetSettings, joined
-from cfx.datasets.files import FileStart
-from cfx.datasets.ngsim_file import read_ngsim, stem
+from cfx.datasets.files import FileStart, stem
+from cfx.datasets.ngsim_file import read_ngsim
 from cfx.datasets.ngsim_rows import Rows
 from cfx.errors import DataError
 from cfx.pairs import PairSet

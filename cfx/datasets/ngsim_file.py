@@ -21,6 +21,7 @@ from cfx.datasets.files import (
     magic,
     read_columns,
     sniff,
+    stem,
 )
 from cfx.datasets.ngsim_rows import DT, FOOT, Rows
 from cfx.datasets.tracks import changes
@@ -138,11 +139,6 @@ def read_ngsim(path: Path, location: str | None = None) -> Rows:
     rows = _rows(str(path), names, recording[order], ordered, count, dropped)
     _check_units(rows)
     return rows
-
-
-def stem(path: Path) -> str:
-    """Returns a file's name without what follows its first dot."""
-    return path.name.split(".")[0] or path.name
 
 
 def _rows(

@@ -16,8 +16,7 @@ from pydantic import Field
 
 from cfx.component import Settings
 from cfx.datasets.base import Dataset, FileDatasetSettings, joined
-from cfx.datasets.files import FileStart, Floats, Ints, open_text
-from cfx.datasets.ngsim_file import stem
+from cfx.datasets.files import FileStart, Floats, Ints, open_text, stem
 from cfx.datasets.tracks import NOBODY, Tracks, changes, extract_pairs
 from cfx.errors import DataError
 from cfx.pairs import PairSet

@@ -2,18 +2,78 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
+import cfx
 from cfx.contracts import DatasetContract
-from cfx.datasets.describe import describe
-from cfx.datasets.highd import HighdDataset
 from cfx.errors import DataError
-from cfx.pairs import SIGNALS
-from tests.datasets.layouts import made_pairs, write_highd
+from cfx_recordings.highd import HighdDataset
+
+SIGNALS = [
+    f"{who}_{what}"
+    for who in ("leader", "follower")
+    for what in ("position", "speed", "acceleration")
+]
+
+
+def made_pairs(pairs: int = 3, frames: int = 150) -> cfx.PairSet:
+    """Pairs whose speeds and positions belong together."""
+    made = cfx.get("dataset", "synthetic")(pairs=pairs, frames=frames, min_frames=2)
+    assert isinstance(made, cfx.Dataset)
+    return made.load()
+
+
+def write_highd(folder: Path, pairs: cfx.PairSet, number: str = "01") -> Path:
+    """highD's three files; every second pair drives to the left, as its upper lanes do."""
+    rows, meta = [], []
+    for index, pair in enumerate(pairs):
+        leader, follower = 2 * index + 1, 2 * index + 2
+        to_right = index % 2 == 0
+        for vehicle, who, length in (
+            (leader, "leader", pair.leader_length),
+            (follower, "follower", 4.0),
+        ):
+            front = getattr(pair, f"{who}_position")
+            sign = 1.0 if to_right else -1.0
+            frame = pd.DataFrame({"frame": 1 + np.arange(len(pair)), "id": vehicle})
+            frame["x"] = front - length if to_right else -front
+            frame["y"] = 8.0
+            frame["width"], frame["height"] = length, 1.8
+            frame["xVelocity"] = sign * getattr(pair, f"{who}_speed")
+            frame["yVelocity"] = 0.0
+            frame["xAcceleration"] = sign * getattr(pair, f"{who}_acceleration")
+            frame["yAcceleration"] = 0.0
+            frame["dhw"], frame["thw"], frame["ttc"], frame["precedingXVelocity"] = 0, 0, 0, 0
+            frame["precedingId"] = leader if who == "follower" else 0
+            frame["followingId"] = follower if who == "leader" else 0
+            frame["laneId"] = 2 + index
+            rows.append(frame)
+            meta.append(
+                {
+                    "id": vehicle,
+                    "width": length,
+                    "height": 1.8,
+                    "initialFrame": 1,
+                    "finalFrame": len(pair),
+                    "numFrames": len(pair),
+                    "class": "Truck" if who == "leader" else "Car",
+                    "drivingDirection": 2 if to_right else 1,
+                }
+            )
+    folder.mkdir(exist_ok=True)
+    tracks = folder / f"{number}_tracks.csv"
+    pd.concat(rows).sort_values(["frame", "id"]).to_csv(tracks, index=False)
+    pd.DataFrame(meta).to_csv(folder / f"{number}_tracksMeta.csv", index=False)
+    rate = round(1 / pairs[0].dt)
+    about = {"id": int(number), "frameRate": rate, "locationId": 1, "upperLaneMarkings": "8.5;12.6"}
+    pd.DataFrame([about]).to_csv(folder / f"{number}_recordingMeta.csv", index=False)
+    return tracks
 
 
 class TestHighd(DatasetContract):
@@ -50,8 +110,16 @@ def test_types_are_selected_and_the_others_counted(tmp_path: Path) -> None:
         HighdDataset(**options, driver_type="truck").load()
 
 
+def described(*paths: Path) -> str:
+    """Returns what `cfx data describe` says of files."""
+    command = [sys.executable, "-m", "cfx", "data", "describe", *map(str, paths)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
 def test_is_recognised(tmp_path: Path) -> None:
-    text = describe(write_highd(tmp_path, made_pairs()))
+    text = described(write_highd(tmp_path, made_pairs()))
     for words in (
         "highD tracks",
         "data=highd",
@@ -75,7 +143,7 @@ def broken(path: Path, column: str, value: object) -> None:
         ("laneId", 1.5, "row 5, column laneId: 1.5 is no whole number"),
         ("xVelocity", -12.0, "against the vehicle's drivingDirection"),
         ("x", None, "row 5, column x: the cell is empty"),
-        ("id", 99, "vehicle 99 is not in 01_tracksMeta.csv"),
+        ("id", 99, "99 is no vehicle of 01_tracksMeta.csv"),
         ("width", 0, "is no vehicle length"),
     ],
 )

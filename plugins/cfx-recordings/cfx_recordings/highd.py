@@ -11,12 +11,12 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from cfx.component import Settings
-from cfx.datasets.base import Dataset, FileDatasetSettings, joined, listed
-from cfx.datasets.files import FileStart, Floats, Ints, TextTable, bad_cells, read_columns, sniff
+from cfx import PairSet, Settings
+from cfx.datasets.base import Dataset, FileDatasetSettings, joined
+from cfx.datasets.files import FileStart, Floats, Ints, TextTable, read_columns
 from cfx.datasets.tracks import Tracks, extract_pairs
-from cfx.errors import DataError, nearest
-from cfx.pairs import PairSet
+from cfx.errors import DataError
+from cfx_recordings.tables import position, read_numbers, refuse
 
 _TRACKS, _TRACKS_META, _RECORDING_META = "_tracks.csv", "_tracksMeta.csv", "_recordingMeta.csv"
 
@@ -97,21 +97,17 @@ def _tracks(path: Path) -> Tracks:
     Raises:
         DataError: a file is missing or does not keep to the layout.
     """
-    numbers, table = _numbers(path, _COLUMNS)
+    numbers, table = read_numbers(path, [(name,) for name in _COLUMNS])
     vehicles = _vehicles(_beside(path, _TRACKS_META))
     row_of = np.searchsorted(vehicles.vehicle, numbers["id"])
     row_of[row_of == len(vehicles.vehicle)] = 0
-    unknown = np.flatnonzero(vehicles.vehicle[row_of] != numbers["id"])
-    if len(unknown):
-        raise DataError(
-            f"{path}, row {table.row(unknown[0])}, column id: vehicle"
-            f" {numbers['id'][unknown[0]]:g} is not in {_beside(path, _TRACKS_META).name}; both"
-            " files must be of the same recording"
-        )
+    is_unknown = vehicles.vehicle[row_of] != numbers["id"]
+    what = f"is no vehicle of {_beside(path, _TRACKS_META).name}; both must be of one recording"
+    refuse(table, "id", numbers["id"], is_unknown, what)
     to_right = vehicles.direction[row_of] == _RIGHT
     sign = np.where(to_right, 1.0, -1.0)
     speed = sign * numbers["xVelocity"]
-    _check(path, table, numbers, speed)
+    _check(table, numbers, speed)
     order = np.lexsort((numbers["frame"], numbers["id"]))
     whole = {name: numbers[name][order].astype(np.int64) for name in ("id", "frame", "laneId")}
     front = np.where(to_right, numbers["x"] + numbers["width"], -numbers["x"])
@@ -150,45 +146,12 @@ def _beside(path: Path, ending: str) -> Path:
     return other
 
 
-def _numbers(path: Path, wanted: tuple[str, ...]) -> tuple[dict[str, Floats], TextTable]:
-    """Returns columns of numbers; raises DataError where one is missing or a cell is empty."""
-    table = sniff(path)
-    numbers, _ = read_columns(table, _positions(table, wanted), {})
-    if not len(numbers[wanted[0]]):
-        raise DataError(f"{path}: has a header but no rows")
-    for name, values in numbers.items():
-        bad = bad_cells(values)
-        if bad is not None:
-            index, count, what = bad
-            raise DataError(
-                f"{path}, row {table.row(index)}, column {name}: the cell is {what} ({count} such"
-                " cells in this column); correct it or remove the row"
-            )
-    return numbers, table
-
-
-def _positions(table: TextTable, wanted: tuple[str, ...]) -> dict[str, int]:
-    """Returns where columns are; raises DataError where one is missing."""
-    header = table.header or ()
-    for name in wanted:
-        if name not in header:
-            raise DataError(
-                f"{table.path}: column {name} is missing.{nearest(name, header)} Columns found:"
-                f" {listed(header, 30)}"
-            )
-    return {name: header.index(name) for name in wanted}
-
-
 def _vehicles(path: Path) -> _Vehicles:
-    numbers, table = _numbers(path, ("id", "drivingDirection"))
-    _, labels = read_columns(table, {}, _positions(table, ("class",)))
+    numbers, table = read_numbers(path, [("id",), ("drivingDirection",)])
+    _, labels = read_columns(table, {}, {"class": position(table, "class")})
     direction = numbers["drivingDirection"]
-    odd = np.flatnonzero((direction != _LEFT) & (direction != _RIGHT))
-    if len(odd):
-        raise DataError(
-            f"{path}, row {table.row(odd[0])}, column drivingDirection: {direction[odd[0]]:g} is"
-            f" neither {_LEFT} nor {_RIGHT}"
-        )
+    is_odd = (direction != _LEFT) & (direction != _RIGHT)
+    refuse(table, "drivingDirection", direction, is_odd, f"is neither {_LEFT} nor {_RIGHT}")
     order = np.argsort(numbers["id"])
     kinds = (*[name.lower() for name in labels["class"].names], "")
     return _Vehicles(
@@ -201,7 +164,7 @@ def _vehicles(path: Path) -> _Vehicles:
 
 def _frame_rate(path: Path) -> float:
     """Returns frames per second."""
-    numbers, _ = _numbers(path, ("frameRate",))
+    numbers, _ = read_numbers(path, [("frameRate",)])
     rate = float(numbers["frameRate"][0])
     if not rate > 0:
         raise DataError(f"{path}, column frameRate: {rate:g} is no frame rate")
@@ -212,7 +175,7 @@ _REVERSE_MPS = 0.5
 """Speeds against the driving direction up to this are noise of vehicles that stand."""
 
 
-def _check(path: Path, table: TextTable, numbers: dict[str, Floats], speed: Floats) -> None:
+def _check(table: TextTable, numbers: dict[str, Floats], speed: Floats) -> None:
     """Raises DataError for what no such recording can hold.
 
     Args:
@@ -220,26 +183,11 @@ def _check(path: Path, table: TextTable, numbers: dict[str, Floats], speed: Floa
     """
     for name in ("frame", "id", "precedingId", "laneId"):
         values = numbers[name]
-        at = np.flatnonzero((values != np.floor(values)) | (values < 0))
-        if len(at):
-            raise DataError(
-                f"{path}, row {table.row(at[0])}, column {name}: {values[at[0]]:g} is no whole"
-                " number from 0 on"
-            )
-    at = np.flatnonzero(speed < -_REVERSE_MPS)
-    if len(at):
-        raise DataError(
-            f"{path}, row {table.row(at[0])}, column xVelocity: {numbers['xVelocity'][at[0]]:g} is"
-            f" against the vehicle's drivingDirection ({len(at)} such rows); are tracks and"
-            " tracksMeta of the same recording?"
-        )
-    at = np.flatnonzero(numbers["width"] <= 0)
-    if len(at):
-        raise DataError(
-            f"{path}, row {table.row(at[0])}, column width: {numbers['width'][at[0]]:g} is no"
-            " vehicle length"
-        )
+        is_odd = (values != np.floor(values)) | (values < 0)
+        refuse(table, name, values, is_odd, "is no whole number from 0 on")
+    against = "is against the vehicle's drivingDirection; are both files of the same recording?"
+    refuse(table, "xVelocity", numbers["xVelocity"], speed < -_REVERSE_MPS, against)
+    refuse(table, "width", numbers["width"], numbers["width"] <= 0, "is no vehicle length")
     key = numbers["id"] * (numbers["frame"].max() + 1) + numbers["frame"]
-    ordered = np.sort(key)
-    if bool((ordered[1:] == ordered[:-1]).any()):
-        raise DataError(f"{path}: a vehicle has two rows at one frame; keep one of them")
+    if len(np.unique(key)) < len(key):
+        raise DataError(f"{table.path}: a vehicle has two rows at one frame; keep one of them")

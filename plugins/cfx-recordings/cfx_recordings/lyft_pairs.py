@@ -15,14 +15,11 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from cfx.component import Settings
+from cfx import PairSet, Settings
 from cfx.datasets.base import Contents, Dataset, FileDatasetSettings, joined
-from cfx.datasets.files import FileStart, Floats, Ints
-from cfx.datasets.ngsim_file import stem
+from cfx.datasets.files import FileStart, Floats, Ints, stem
 from cfx.datasets.series import Series, frames_at, pairs_of
 from cfx.errors import DataError
-from cfx.extras import install_line
-from cfx.pairs import PairSet
 
 DT = 0.1
 """Seconds between two samples."""
@@ -69,8 +66,8 @@ class LyftPairsDataset(Dataset):
 
     **Drivers.** Pairs carry no vehicles' ids; each counts as a driver of its own.
 
-    Needs the package zarr: pip install "cfx-driving[zarr]". Stores whose arrays hold Python objects
-    or are filtered by anything are refused before they are opened: reading them could run code.
+    Stores whose arrays hold Python objects or are filtered by anything are refused before they are
+    opened: reading them could run code.
     """
 
     layout = "Lyft car-following pairs (Li et al. 2023)"
@@ -104,12 +101,8 @@ class _Store(NamedTuple):
 
 
 def _read(path: Path, automated_length: float) -> _Store:
-    try:
-        import zarr
-    except ImportError:
-        raise DataError(
-            f"data=lyft_pairs needs the package zarr: {install_line('cfx-driving[zarr]')}"
-        ) from None
+    import zarr
+
     if not path.is_dir():
         raise DataError(f"{path}: is no folder; a Zarr store such as trainHH.zarr is one")
     for name in _NEEDED:

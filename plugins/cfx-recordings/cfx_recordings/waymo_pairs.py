@@ -7,21 +7,20 @@ autonomous vehicle open dataset for driving behavior research, Transportation Re
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
-from cfx.component import Settings
-from cfx.datasets.base import Contents, Dataset, FileDatasetSettings, joined, listed
-from cfx.datasets.files import FileStart, Floats, Ints, TextTable, bad_cells, read_columns, sniff
-from cfx.datasets.ngsim_file import stem
+from cfx import PairSet, Settings
+from cfx.datasets.base import Contents, Dataset, FileDatasetSettings, joined
+from cfx.datasets.files import FileStart, Floats, Ints, TextTable, stem
 from cfx.datasets.series import Series, frames_at, pairs_of
 from cfx.datasets.tracks import changes
 from cfx.errors import DataError
-from cfx.pairs import PairSet
+from cfx_recordings.tables import read_numbers, refuse
 
 DT = 0.1
 """Seconds between two rows of a vehicle."""
@@ -88,41 +87,14 @@ class _File(NamedTuple):
 
 
 def _read(path: Path) -> _File:
-    table = sniff(path)
-    header = table.header or ()
-    wanted = {}
-    for name in (*_KEYS, _TIME, _LENGTH):
-        wanted[name] = _position(table, header, (name,))
-    for name, spellings in _MOTION.items():
-        wanted[name] = _position(table, header, spellings)
-    numbers, _ = read_columns(table, wanted, {})
-    for name in (*_KEYS, _TIME, _LENGTH):
-        bad = bad_cells(numbers[name])
-        if bad is not None:
-            index, count, what = bad
-            raise DataError(
-                f"{path}, row {table.row(index)}, column {name}: the cell is {what}"
-                f" ({count} such cells); correct it or remove the row"
-            )
-    if not len(numbers[_TIME]):
-        raise DataError(f"{path}: has a header but no rows")
-    short = np.flatnonzero(numbers[_LENGTH] <= 0)
-    if len(short):
-        raise DataError(
-            f"{path}, row {table.row(short[0])}, column {_LENGTH}:"
-            f" {numbers[_LENGTH][short[0]]:g} is no vehicle length"
-        )
+    whole = (*_KEYS, _TIME, _LENGTH)
+    wanted = [*[(name,) for name in whole], *_MOTION.values()]
+    may_lack = {spellings[0] for spellings in _MOTION.values()}
+    numbers, table = read_numbers(path, wanted, may_lack=may_lack)
+    for name, (spelling, _) in _MOTION.items():
+        numbers[name] = numbers.pop(spelling)
+    refuse(table, _LENGTH, numbers[_LENGTH], numbers[_LENGTH] <= 0, "is no vehicle length")
     return _File(table, numbers)
-
-
-def _position(table: TextTable, header: Sequence[str], spellings: Sequence[str]) -> int:
-    for name in spellings:
-        if name in header:
-            return header.index(name)
-    raise DataError(
-        f"{table.path}: column {' or '.join(spellings)} is missing. Columns found:"
-        f" {listed(header, 30)}"
-    )
 
 
 def _pairs(file: _File) -> PairSet:

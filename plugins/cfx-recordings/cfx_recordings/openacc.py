@@ -14,13 +14,21 @@ from typing import ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 
-from cfx.component import Settings
+from cfx import PairSet, Settings
 from cfx.datasets.base import Contents, Dataset, FileDatasetSettings, joined, listed
-from cfx.datasets.files import FileStart, Floats, Ints, Labels, TextTable, beginning, read_columns
-from cfx.datasets.ngsim_file import stem
+from cfx.datasets.files import (
+    FileStart,
+    Floats,
+    Ints,
+    Labels,
+    TextTable,
+    beginning,
+    read_columns,
+    stem,
+)
 from cfx.datasets.series import Series, frames_at, pairs_of
 from cfx.errors import DataError
-from cfx.pairs import PairSet
+from cfx_recordings.tables import position, refuse
 
 _Column = TypeVar("_Column", Floats, Labels)
 
@@ -116,7 +124,9 @@ def _read(path: Path) -> _File:
     header = tuple(cell.strip() for cell in start.lines[_LINES].split(","))
     table = TextTable(path, ",", header, len(header), above=_LINES)
     numbers, labels = read_columns(
-        table, {"Time": _time(table), **_places(header, "Speed", "IVS")}, _places(header, "Driver")
+        table,
+        {"Time": position(table, "Time"), **_places(header, "Speed", "IVS")},
+        _places(header, "Driver"),
     )
     time = numbers.pop("Time")
     _check_time(table, time)
@@ -128,16 +138,6 @@ def _read(path: Path) -> _File:
         _by_place(numbers, "IVS"),
         _by_place(labels, "Driver"),
     )
-
-
-def _time(table: TextTable) -> int:
-    header = table.header or ()
-    if "Time" not in header:
-        raise DataError(
-            f"{table.path}, row {_LINES + 1}: column Time is missing. Columns found:"
-            f" {listed(header, 20)}"
-        )
-    return header.index("Time")
 
 
 def _places(header: Sequence[str], *kinds: str) -> dict[str, int]:
@@ -172,12 +172,8 @@ def _check_time(table: TextTable, time: Floats) -> None:
             " row before"
         )
     at = (time - time[0]) / DT
-    off = np.flatnonzero(np.abs(at - np.rint(at)) > 0.25)
-    if len(off):
-        raise DataError(
-            f"{table.path}, row {table.row(off[0])}, column Time: {time[off[0]]:g} s is between two"
-            f" frames of {DT:g} s; OpenACC's rows are {DT:g} s apart"
-        )
+    between = f"s is between two frames of {DT:g} s; OpenACC's rows are {DT:g} s apart"
+    refuse(table, "Time", time, np.abs(at - np.rint(at)) > 0.25, between)
 
 
 def _pairs(file: _File) -> PairSet:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import json
 import pickle
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,37 +16,132 @@ import pandas as pd
 import pytest
 from scipy.io import savemat
 
+import cfx
 from cfx.contracts import DatasetContract
-from cfx.datasets.base import Dataset
-from cfx.datasets.describe import describe
-from cfx.datasets.followernet import FollowernetDataset
-from cfx.datasets.lyft_pairs import LyftPairsDataset
-from cfx.datasets.openacc import OpenaccDataset
-from cfx.datasets.waymo_pairs import WaymoPairsDataset
 from cfx.errors import DataError
-from cfx.pairs import PairSet
-from tests.datasets.layouts import events_of, made_pairs, write_lyft, write_openacc, write_waymo
+from cfx_recordings.followernet import FollowernetDataset
+from cfx_recordings.lyft_pairs import LyftPairsDataset
+from cfx_recordings.openacc import OpenaccDataset
+from cfx_recordings.waymo_pairs import WaymoPairsDataset
 
 
-def npy(folder: Path, pairs: PairSet) -> Path:
+def made_pairs(pairs: int = 3, frames: int = 150) -> cfx.PairSet:
+    """Pairs whose speeds and positions belong together."""
+    made = cfx.get("dataset", "synthetic")(pairs=pairs, frames=frames, min_frames=2)
+    assert isinstance(made, cfx.Dataset)
+    return made.load()
+
+
+OPENACC_ABOUT = (
+    "Date,30,09,2020,,",
+    "Vehicle_order,Golf,XC40,Leaf,,",
+    "Number_of_vehicles,{count},,,",
+    "ACC,{acc},,,",
+    "Distance_setting,shortest,,,",
+)
+
+
+def write_openacc(
+    path: Path, pairs: cfx.PairSet, *, acc: str = "2", drivers: dict[int, list[str]] | None = None
+) -> Path:
+    """One of OpenACC's files: pair k is vehicles k and k + 1 of a platoon."""
+    frames = min(len(pair) for pair in pairs)
+    table = pd.DataFrame({"Time": 36000.0 + 0.1 * np.arange(frames)})
+    first = pairs[0]
+    table["Speed1"], table["E1"] = first.leader_speed[:frames], 0.0
+    for place, pair in enumerate(pairs, start=1):
+        table[f"Speed{place + 1}"] = pair.follower_speed[:frames]
+        table[f"IVS{place}"] = pair.gap[:frames]
+    for place, names in (drivers or {}).items():
+        table[f"Driver{place}"] = names
+    above = [line.format(count=len(pairs) + 1, acc=acc) for line in OPENACC_ABOUT]
+    path.write_text("\n".join(above) + "\n" + table.to_csv(index=False))
+    return path
+
+
+def write_waymo(path: Path, pairs: cfx.PairSet, *, first_version: bool = False) -> Path:
+    """The Waymo pairs' CSV: rows of both vehicles; vehicle 0 is the automated one."""
+    rows = []
+    for segment, pair in enumerate(pairs):
+        follower, leader = (0, 7) if segment % 2 == 0 else (3, 0)
+        for vehicle, who, length in (
+            (leader, "leader", pair.leader_length),
+            (follower, "follower", 5.18),
+        ):
+            table = pd.DataFrame({"local_time": 0.1 * np.arange(len(pair))})
+            table["segment_id"], table["local_veh_id"], table["length"] = segment, vehicle, length
+            table["follower_id"], table["leader_id"] = follower, leader
+            table["filter_pos"] = getattr(pair, f"{who}_position") - length / 2
+            table["filter_speed"] = getattr(pair, f"{who}_speed")
+            table["filter_accer"] = getattr(pair, f"{who}_acceleration")
+            rows.append(table)
+    whole = pd.concat(rows)
+    if first_version:
+        old = {"filter_pos": "processed_position", "filter_speed": "processed_speed"}
+        whole = whole.rename(columns={**old, "filter_accer": "processed_accer"})
+    whole.to_csv(path, index=False)
+    return path
+
+
+def events_of(pairs: cfx.PairSet) -> np.ndarray:
+    """FollowNet's array `(events, 4, samples)`, padded by NaN."""
+    longest = max(len(pair) for pair in pairs)
+    events = np.full((len(pairs), 4, longest), np.nan)
+    for event, pair in zip(events, pairs, strict=True):
+        speeds = (pair.follower_speed, pair.leader_speed - pair.follower_speed, pair.leader_speed)
+        event[:, : len(pair)] = np.stack([pair.gap, *speeds])
+    return events
+
+
+def write_lyft(folder: Path, pairs: cfx.PairSet, *, with_size: bool = True) -> Path:
+    """A Zarr store of Lyft's pairs, in version 2 of the format, as they are published."""
+    import zarr
+
+    group = zarr.open_group(str(folder), mode="w", zarr_format=2)
+    ends = np.cumsum([len(pair) for pair in pairs])
+    starts = ends - [len(pair) for pair in pairs]
+    arrays = {"index_range": np.stack([starts, ends], axis=1)}
+    arrays["timestamp"] = np.concatenate([0.1 * np.arange(len(pair)) for pair in pairs])
+    sizes = {"lead": [4.85] * len(pairs), "follow": [4.0 + k for k in range(len(pairs))]}
+    if with_size:
+        sizes["lead"] = [pair.leader_length for pair in pairs]
+        arrays["lead_size"] = np.array(sizes["lead"])
+    arrays["follow_size"] = np.array(sizes["follow"])
+    for short, who in (("lead", "leader"), ("follow", "follower")):
+        middles = []
+        for pair, size in zip(pairs, sizes[short], strict=True):
+            front = getattr(pair, f"{who}_position")
+            if who == "leader":
+                front = front - pair.leader_length + size
+            middles.append(front - size / 2)
+        arrays[f"{short}_centroid"] = np.concatenate(middles)
+        for name, signal in (("velocity", "speed"), ("acceleration", "acceleration")):
+            values = [getattr(pair, f"{who}_{signal}") for pair in pairs]
+            arrays[f"{short}_{name}"] = np.concatenate(values)
+    for name, values in arrays.items():
+        group.create_array(name, data=values)
+    return folder
+
+
+def npy(folder: Path, pairs: cfx.PairSet) -> Path:
     path = folder / "HighD_train_data.npy"
     np.save(path, events_of(pairs))
     return path
 
 
-def openacc(folder: Path, pairs: PairSet) -> Path:
+def openacc(folder: Path, pairs: cfx.PairSet) -> Path:
     return write_openacc(folder / "ASta_040719_platoon3.csv", pairs)
 
 
-def waymo(folder: Path, pairs: PairSet) -> Path:
+def waymo(folder: Path, pairs: cfx.PairSet) -> Path:
     return write_waymo(folder / "all_seg_paired_cf_trj_final.csv", pairs)
 
 
-def lyft(folder: Path, pairs: PairSet) -> Path:
+def lyft(folder: Path, pairs: cfx.PairSet) -> Path:
     return write_lyft(folder / "trainHH.zarr", pairs)
 
 
-READERS: dict[str, tuple[type[Dataset], Callable[[Path, PairSet], Path]]] = {
+READERS: dict[str, tuple[type[cfx.Dataset], Callable[[Path, cfx.PairSet], Path]]] = {
     "openacc": (OpenaccDataset, openacc),
     "followernet": (FollowernetDataset, npy),
     "waymo_pairs": (WaymoPairsDataset, waymo),
@@ -55,7 +152,7 @@ READERS: dict[str, tuple[type[Dataset], Callable[[Path, PairSet], Path]]] = {
 @pytest.mark.parametrize("name", READERS)
 class TestReaders(DatasetContract):
     @pytest.fixture
-    def dataset(self, name: str, tmp_path: Path) -> Dataset:
+    def dataset(self, name: str, tmp_path: Path) -> cfx.Dataset:
         cls, write = READERS[name]
         return cls(path=write(tmp_path, made_pairs()), min_frames=100)
 
@@ -72,11 +169,19 @@ def test_gives_gaps_and_speeds_back(name: str, tmp_path: Path) -> None:
         assert pair.dt == 0.1
 
 
-@pytest.mark.parametrize("name", READERS)
-def test_is_recognised(name: str, tmp_path: Path) -> None:
-    text = describe(READERS[name][1](tmp_path, made_pairs()))
-    assert f"data={name}" in text
-    assert "3 of 3 drivers" in text
+def described(*paths: Path) -> str:
+    """Returns what `cfx data describe` says of files."""
+    command = [sys.executable, "-m", "cfx", "data", "describe", *map(str, paths)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_each_is_recognised(tmp_path: Path) -> None:
+    text = described(*[write(tmp_path, made_pairs()) for _, write in READERS.values()])
+    for name in READERS:
+        assert f"data={name}" in text
+    assert text.count("3 of 3 drivers") == len(READERS)
 
 
 # --- OpenACC --------------------------------------------------------------------------------------

@@ -15,13 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from cfx.component import Settings
+from cfx import PairSet, Settings
 from cfx.datasets.base import Contents, Dataset, FileDatasetSettings, joined
-from cfx.datasets.files import FileStart, Floats, magic
-from cfx.datasets.ngsim_file import stem
+from cfx.datasets.files import FileStart, Floats, magic, stem
 from cfx.datasets.series import Series, pairs_of
 from cfx.errors import DataError
-from cfx.pairs import PairSet
 
 _NPY, _ZIP, _MATLAB, _HDF = b"\x93NUM", b"PK\x03\x04", b"MATL", b"\x89HDF"
 

@@ -1,0 +1,1 @@
+"""Readers of recordings that others have published: highD, OpenACC, FollowNet, Waymo, Lyft."""
