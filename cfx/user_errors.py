@@ -12,7 +12,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from cfx import hydra_source
+from cfx import hydra_source, registry
 from cfx.errors import CfxError, nearest
 from cfx.extras import advice
 
@@ -52,6 +52,12 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
     return _reworded(error, overrides)
 
 
+def no_command(word: str) -> str:
+    """Returns a sentence for a word that is neither an override nor a sub-command."""
+    advised = advice("command", word, registry.names("command"))
+    return f"{word}: neither key=value nor a sub-command.{advised} See cfx --help."
+
+
 def _reworded(error: BaseException, overrides: Sequence[str]) -> str:
     """Returns Hydra's more frequent messages in other words, and the rest as they are."""
     text = str(error).strip()
@@ -78,10 +84,7 @@ def _unknown_option(path: str, options: Sequence[str]) -> str:
 def _unreadable(error: OverrideParseException) -> str:
     word = error.override
     if "=" not in word:
-        from cfx.cli import COMMANDS
-
-        advice = nearest(word, COMMANDS)
-        return f"{word}: neither key=value nor a sub-command.{advice} See cfx --help."
+        return no_command(word)
     detail = "syntax"
     for line in error.message.splitlines():
         if not line.startswith(("Error parsing", "See ")):

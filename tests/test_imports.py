@@ -56,7 +56,7 @@ FLOORS = (
         "plugins",
         "cli",
         "completion",
-        "cite",
+        "commands",
         "sumo",
         "publish",
         "benchmark",

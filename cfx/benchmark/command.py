@@ -8,21 +8,73 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cfx.benchmark.frozen import DATA_NAME, METHODS, VERSION, protocol_hash
+from cfx.commands.base import Command
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Runs the sub-command; returns the exit code."""
-    options = parser().parse_intermixed_args(list(arguments))
-    if options.table:
-        _table(options.table)
+class BenchmarkCommand(Command):
+    """Sets a model or a policy beside all others under one frozen protocol."""
+
+    summary = "a model or policy on the frozen benchmark, beside all others"
+
+    def parser(self) -> argparse.ArgumentParser:
+        made = argparse.ArgumentParser(
+            "cfx benchmark",
+            description=f"Runs one frozen protocol ({VERSION}, {protocol_hash()}), and writes a"
+            " row.",
+            epilog="cfx benchmark model=mine --data i80_reconstructed_pairs.parquet",
+        )
+        made.add_argument(
+            "overrides",
+            nargs="*",
+            metavar="OVERRIDE",
+            help="what is benchmarked: model=, policy=, learner=, objective= and their settings",
+        )
+        made.add_argument("--data", metavar="FILE", help=f"{DATA_NAME}; a tidy table")
+        made.add_argument(
+            "--method",
+            choices=list(METHODS),
+            help="how the model is used; default: constant, unless policy= or learner= is given",
+        )
+        made.add_argument("--name", help="of the row; default: made of the overrides")
+        made.add_argument(
+            "--output", type=Path, metavar="FOLDER", help="default: outputs/benchmark/NAME"
+        )
+        made.add_argument(
+            "--against",
+            action="append",
+            default=[],
+            metavar="FILE",
+            help="another's benchmark_pairs.csv, to compare with pair by pair; may be repeated",
+        )
+        made.add_argument(
+            "--other-data", action="store_true", help="allow other pairs, and mark the row"
+        )
+        made.add_argument(
+            "--table",
+            nargs="+",
+            metavar="ROW",
+            help="print these rows (files or job folders) as one table, and run nothing",
+        )
+        return made
+
+    def parse(self, arguments: Sequence[str]) -> argparse.Namespace:
+        """Reads the command line, where overrides may stand between options."""
+        parser = self.parser()
+        options = parser.parse_intermixed_args(list(arguments))
+        if options.data is None and not options.table:
+            parser.error(f"--data FILE is needed: the recordings ({DATA_NAME}) in the tidy layout")
+        options.arguments = list(arguments)
+        return options
+
+    def run(self, options: argparse.Namespace) -> int:
+        if options.table:
+            _table(options.table)
+        else:
+            _row(options)
         return 0
-    if options.data is None:
-        parser().error(f"--data FILE is needed: the recordings ({DATA_NAME}) in the tidy layout")
-    _row(options, arguments)
-    return 0
 
 
-def _row(options: argparse.Namespace, arguments: Sequence[str]) -> None:
+def _row(options: argparse.Namespace) -> None:
     from cfx.benchmark.compare import compared, lines_of, read_errors
     from cfx.benchmark.row import PAIRS, ROW, markdown
     from cfx.benchmark.run import overrides_of, row_name, run
@@ -42,7 +94,7 @@ def _row(options: argparse.Namespace, arguments: Sequence[str]) -> None:
         print("\n".join(["", *lines_of(compared(read_errors(job / PAIRS), table, file))]))
     print(f"\nThe row: {job / ROW}\nErrors of each pair: {job / PAIRS}")
     if not others:
-        again = shlex.join(["python", "-m", "cfx", "benchmark", *arguments])
+        again = shlex.join(["python", "-m", "cfx", "benchmark", *options.arguments])
         print(f"Compare it, without running again: {again} --against FILE, another's {PAIRS}")
 
 
@@ -56,45 +108,3 @@ def _table(files: Sequence[str]) -> None:
             path = path / ROW
         rows.append(Row.read(path))
     print("\n".join(markdown(rows)))
-
-
-def parser() -> argparse.ArgumentParser:
-    """Returns what the sub-command takes."""
-    made = argparse.ArgumentParser(
-        "cfx benchmark",
-        description=f"Runs one frozen protocol ({VERSION}, {protocol_hash()}) and writes a row.",
-        epilog="cfx benchmark model=mine --data i80_reconstructed_pairs.parquet",
-    )
-    made.add_argument(
-        "overrides",
-        nargs="*",
-        metavar="OVERRIDE",
-        help="what is benchmarked: model=, policy=, learner=, objective= and their settings",
-    )
-    made.add_argument("--data", metavar="FILE", help=f"{DATA_NAME}; a tidy table")
-    made.add_argument(
-        "--method",
-        choices=list(METHODS),
-        help="how the model is used; default: constant, unless policy= or learner= is given",
-    )
-    made.add_argument("--name", help="of the row; default: made of the overrides")
-    made.add_argument(
-        "--output", type=Path, metavar="FOLDER", help="default: outputs/benchmark/NAME"
-    )
-    made.add_argument(
-        "--against",
-        action="append",
-        default=[],
-        metavar="FILE",
-        help="another's benchmark_pairs.csv, to compare with pair by pair; may be repeated",
-    )
-    made.add_argument(
-        "--other-data", action="store_true", help="allow other pairs, and mark the row"
-    )
-    made.add_argument(
-        "--table",
-        nargs="+",
-        metavar="ROW",
-        help="print these rows (files or job folders) as one table, and run nothing",
-    )
-    return made
