@@ -87,8 +87,9 @@ conf: $(VENV)/.ready
 	$(BIN)/python -m cfx.nodes
 
 # The stamps are made again when what they were made from changes, so a second `make run` installs nothing.
-$(VENV)/.ready: pyproject.toml constraints.txt $(VENV)/.torch
-	$(PIP) install --quiet --constraint constraints.txt --editable .
+# What README's commands need comes from plugins/ too.
+$(VENV)/.ready: pyproject.toml constraints.txt plugins/cfx-benchmark/pyproject.toml $(VENV)/.torch
+	$(PIP) install --quiet --constraint constraints.txt --editable . --editable plugins/cfx-benchmark
 	touch $@
 
 # The plugins in this repository are distributions of their own; what they need is in the test extra.

@@ -15,6 +15,7 @@ from cfx.errors import nearest
 OWN = "cfx-driving"
 
 EXTRAS: dict[tuple[str, str], str] = {
+    ("command", "benchmark"): "cfx-benchmark",
     ("hydra/launcher", "dask"): "cfx-dask",
     ("hydra/launcher", "joblib"): f"{OWN}[joblib]",
     ("hydra/launcher", "submitit_local"): f"{OWN}[submitit]",

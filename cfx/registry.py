@@ -497,7 +497,9 @@ def _entries(distribution: importlib.metadata.Distribution) -> Iterator[Entry]:
     name, version = metadata["Name"], metadata["Version"]
     if not isinstance(name, str) or not isinstance(version, str):
         raise ValueError("the metadata name no distribution, or no version")
-    summary = str(metadata.get("Summary", ""))
+    summary = ""
+    if "Summary" in metadata:
+        summary = metadata["Summary"]
     location = str(distribution.locate_file(""))
     for point in ours:
         yield Entry(

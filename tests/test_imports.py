@@ -59,7 +59,6 @@ FLOORS = (
         "commands",
         "sumo",
         "publish",
-        "benchmark",
         "plugin_errors",
     ),
 )

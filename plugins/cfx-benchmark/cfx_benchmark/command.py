@@ -7,8 +7,8 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from cfx.benchmark.frozen import DATA_NAME, METHODS, VERSION, protocol_hash
-from cfx.commands.base import Command
+from cfx import Command
+from cfx_benchmark.frozen import DATA_NAME, METHODS, VERSION, protocol_hash
 
 
 class BenchmarkCommand(Command):
@@ -75,9 +75,9 @@ class BenchmarkCommand(Command):
 
 
 def _row(options: argparse.Namespace) -> None:
-    from cfx.benchmark.compare import compared, lines_of, read_errors
-    from cfx.benchmark.row import PAIRS, ROW, markdown
-    from cfx.benchmark.run import overrides_of, row_name, run
+    from cfx_benchmark.compare import compared, lines_of, read_errors
+    from cfx_benchmark.row import PAIRS, ROW, markdown
+    from cfx_benchmark.run import overrides_of, row_name, run
 
     overrides = overrides_of(options.method, options.overrides)
     others = [(file, read_errors(Path(file))) for file in options.against]
@@ -99,7 +99,7 @@ def _row(options: argparse.Namespace) -> None:
 
 
 def _table(files: Sequence[str]) -> None:
-    from cfx.benchmark.row import ROW, Row, markdown
+    from cfx_benchmark.row import ROW, Row, markdown
 
     rows = []
     for file in files:

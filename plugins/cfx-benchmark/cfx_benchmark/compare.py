@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pandas as pd
 
-from cfx.benchmark.row import COUNTS
 from cfx.errors import DataError
 from cfx.evaluation.result import Improvement
 from cfx.evaluation.statistics import improvement_statistics
+from cfx_benchmark.row import COUNTS
 
 _NEEDED = ("row", "pair_id", "driver")
 
