@@ -16,6 +16,7 @@ OWN = "cfx-driving"
 
 EXTRAS: dict[tuple[str, str], str] = {
     ("command", "benchmark"): "cfx-benchmark",
+    ("engine", "dask"): "cfx-dask",
     ("hydra/launcher", "dask"): "cfx-dask",
     ("hydra/launcher", "joblib"): f"{OWN}[joblib]",
     ("hydra/launcher", "submitit_local"): f"{OWN}[submitit]",

@@ -127,6 +127,7 @@ KINDS: dict[str, Kind] = {
         Kind("command", "command", "cfx.commands", "cfx.commands.base:Command", chosen=False),
     )
 }
+"""All kinds, by name."""
 
 GROUPS: dict[str, Kind] = {kind.group: kind for kind in KINDS.values() if kind.chosen}
 """Kinds by config group, of which a job chooses one component each."""

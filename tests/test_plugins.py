@@ -190,7 +190,7 @@ def test_check_names_the_extra_that_is_not_installed(
     printed = capsys.readouterr()
     assert re.search(r"^ *engine +dask .* not installed *$", printed.out, re.MULTILINE)
     assert "Hint: engine=dask needs the package distributed: " in printed.out
-    assert "[dask]" in printed.out
+    assert "cfx-dask" in printed.out
     assert printed.err == ""
 
 
