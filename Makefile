@@ -91,9 +91,10 @@ conf: $(VENV)/.ready
 	$(BIN)/python -m cfx.nodes
 
 # The stamps are made again when what they were made from changes, so a second `make run` installs nothing.
-# Readers of published recordings are a plugin that everybody gets.
-$(VENV)/.ready: pyproject.toml plugins/cfx-recordings/pyproject.toml constraints.txt $(VENV)/.torch
-	$(PIP) install --quiet --constraint constraints.txt --editable . --editable plugins/cfx-recordings
+# What README's commands need comes from plugins/ too: the readers of published recordings, the benchmark.
+EVERYBODYS = plugins/cfx-recordings plugins/cfx-benchmark
+$(VENV)/.ready: pyproject.toml $(EVERYBODYS:%=%/pyproject.toml) constraints.txt $(VENV)/.torch
+	$(PIP) install --quiet --constraint constraints.txt $(addprefix --editable ,. $(EVERYBODYS))
 	touch $@
 
 # The plugins in this repository are distributions of their own; what they need is in the test extra.

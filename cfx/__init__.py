@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from cfx import errors as errors
     from cfx.application import run as run
+    from cfx.commands.base import Command as Command
     from cfx.component import API_VERSION as API_VERSION
     from cfx.component import Settings as Settings
     from cfx.datasets.base import Dataset as Dataset
@@ -93,6 +94,7 @@ _HOMES = {
     "ProtocolResult": "cfx.protocols.base",
     "Metric": "cfx.metrics.base",
     "Trajectories": "cfx.metrics.base",
+    "Command": "cfx.commands.base",
     "Parameter": "cfx.parameters",
     "ParameterSpace": "cfx.parameters",
     "Settings": "cfx.component",

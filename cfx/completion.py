@@ -12,7 +12,11 @@ import argparse
 import contextlib
 import io
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, cast
+
+if TYPE_CHECKING:
+    from cfx.commands.base import Command
 
 
 def is_query(arguments: Sequence[str]) -> bool:
@@ -22,26 +26,25 @@ def is_query(arguments: Sequence[str]) -> bool:
     return arguments[1].startswith("query=")
 
 
-def answer(
-    parsers: Mapping[str, Callable[[], argparse.ArgumentParser]],
-    hydra: Callable[[], int],
-) -> int:
+def answer(hydra: Callable[[], int]) -> int:
     """Prints the words with which the line may go on; returns the exit code.
 
     Args:
-        parsers: makes the parser of each sub-command, by its name.
         hydra: prints Hydra's words for the line.
     """
+    from cfx import registry
+
     line = os.environ.get("COMP_LINE", "")
     line = line[: int(os.environ.get("COMP_POINT", len(line)))]
     _, _, typed = line.lstrip().partition(" ")
     typed = typed.lstrip()
     first, blank, rest = typed.partition(" ")
-    if blank and first in parsers:
-        print("\n".join(words(parsers[first](), rest)))
+    commands = registry.names("command")
+    if blank and first in commands:
+        print("\n".join(_words_of(first, rest)))
         return 0
     if not blank:
-        own = [name for name in parsers if name.startswith(first)]
+        own = [name for name in commands if name.startswith(first)]
         print("\n".join(own))
         if own and first:
             return 0
@@ -51,6 +54,18 @@ def answer(
     if code == 0:
         print(said.getvalue())
     return 0
+
+
+def _words_of(command: str, line: str) -> list[str]:
+    """Returns the words of a sub-command; none where a plugin's is broken, whatever it prints."""
+    from cfx import registry
+
+    with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
+        try:
+            made = cast("Command", registry.create("command", {"name": command}))
+            return words(made.parser(), line)
+        except Exception:  # a plugin may raise anything
+            return []
 
 
 def words(parser: argparse.ArgumentParser, line: str) -> list[str]:

@@ -21,6 +21,8 @@ EXTRAS: dict[tuple[str, str], str] = {
     ("data", "lyft_pairs"): "cfx-recordings",
     ("data", "openacc"): "cfx-recordings",
     ("data", "waymo_pairs"): "cfx-recordings",
+    ("command", "benchmark"): "cfx-benchmark",
+    ("engine", "dask"): "cfx-dask",
     ("hydra/launcher", "dask"): "cfx-dask",
     ("hydra/launcher", "joblib"): f"{OWN}[joblib]",
     ("hydra/launcher", "submitit_local"): f"{OWN}[submitit]",

@@ -18,7 +18,7 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import hydra
 import hydra.utils
@@ -32,6 +32,10 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 
 from cfx import nodes, registry
+from cfx.errors import PluginError
+
+if TYPE_CHECKING:
+    from cfx.commands.base import Command
 
 log = logging.getLogger(__name__)
 
@@ -159,13 +163,29 @@ def plugin_conf_dirs() -> dict[str, Path]:
 
 
 def register() -> None:
-    """Makes both known to Hydra.
+    """Makes both, and the list of sub-commands, known to Hydra.
 
     Call it before Hydra composes anything; doing it twice does no harm.
     """
     plugins = Plugins.instance()
     plugins.register(ComponentSource)
     plugins.register(ComponentSearchPath)
+    OmegaConf.register_new_resolver("cfx_commands", listed_commands, replace=True)
+
+
+def listed_commands() -> str:
+    """Returns a line for each sub-command, as `--help` prints them; imports cfx's own alone."""
+    lines = []
+    for name in registry.names("command"):
+        try:
+            found = registry.entry("command", name)
+            about = f"{found.summary} (from {found.distribution})".strip()
+            if found.distribution == registry.OWN:
+                about = cast("type[Command]", registry.get("command", name)).summary
+        except PluginError as error:  # two distributions bring it
+            about = str(error)
+        lines.append(f"  cfx {name:<12} {about}")
+    return "\n".join(lines).replace("$", "$$")  # Hydra fills in what follows a $
 
 
 def composed(overrides: Sequence[str]) -> DictConfig:

@@ -13,11 +13,16 @@ from cfx.errors import PluginError
 _OWN = Path(cfx.__file__).resolve().parent
 
 
-def blame(error: BaseException) -> PluginError | None:
+def blame(
+    error: BaseException, more: str = "the whole traceback is in the log"
+) -> PluginError | None:
     """Returns a sentence if an error comes from a plugin's code; None if it is cfx's own.
 
     The innermost frame that is cfx's or a plugin's decides: what a library answers to a plugin's
     call is the plugin's.
+
+    Args:
+        more: where the traceback is.
     """
     packages = _packages()
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
@@ -28,8 +33,8 @@ def blame(error: BaseException) -> PluginError | None:
             if file.is_relative_to(package):
                 where = f"{file.relative_to(package.parent)}, line {frame.lineno}"
                 return PluginError(
-                    f"{found} failed in {where}: {_in_words(error)}; the whole traceback is in the"
-                    f" log; repair that distribution, or pip uninstall {found.distribution}"
+                    f"{found} failed in {where}: {_in_words(error)}; {more};"
+                    f" repair that distribution, or pip uninstall {found.distribution}"
                 )
     return None
 

@@ -54,7 +54,8 @@ class Kind:
         base: module and class that its components extend.
         smoke_check: module and function that tries a new component for some milliseconds; "" where
             its base class checks what it gives.
-        chosen: a job chooses one of this kind, by a config group; metrics are all measured.
+        chosen: a job chooses one of this kind, by a config group; metrics are all measured, and
+            sub-commands are none of a job.
     """
 
     name: str
@@ -63,6 +64,12 @@ class Kind:
     base: str
     smoke_check: str = ""
     chosen: bool = True
+
+    def call(self, component: str) -> str:
+        """Returns what a user writes to ask for a component."""
+        if self.name == "command":
+            return f"cfx {component}"
+        return f"{self.group}={component}"
 
 
 KINDS: dict[str, Kind] = {
@@ -115,8 +122,10 @@ KINDS: dict[str, Kind] = {
             "cfx.contracts.smoke:smoke_check_metric",
             chosen=False,
         ),
+        Kind("command", "command", "cfx.commands", "cfx.commands.base:Command", chosen=False),
     )
 }
+"""All kinds, by name."""
 
 GROUPS: dict[str, Kind] = {kind.group: kind for kind in KINDS.values() if kind.chosen}
 """Kinds by config group, of which a job chooses one component each."""
@@ -131,6 +140,7 @@ class Entry:
         target: `module:Class`.
         distribution, version: who brings it.
         location: folder that the distribution's metadata lies in.
+        summary: one line about the distribution, of its author.
         api: versions of the plugin API that the distribution declares; empty if it declares none.
     """
 
@@ -140,6 +150,7 @@ class Entry:
     distribution: str
     version: str
     location: str
+    summary: str = ""
     api: tuple[str, ...] = ()
 
     @property
@@ -198,7 +209,8 @@ def entry(kind: str, name: str) -> Entry:
         PluginError: the name is unknown, or two third parties claim it. A name of cfx's own always
             means cfx's own.
     """
-    group, what = kind_of(kind).group, kind_of(kind).name
+    about = kind_of(kind)
+    call, what = about.call(name), about.name
     found = []
     for candidate in entries(kind):
         if candidate.name == name:
@@ -209,17 +221,14 @@ def entry(kind: str, name: str) -> Entry:
         known = names(kind)
         if not known:
             raise PluginError(
-                f"{group}={name}: no {what} is installed, not even cfx's own;"
+                f"{call}: no {what} is installed, not even cfx's own;"
                 " run make run, or pip install -e ."
             )
-        raise PluginError(
-            f"{group}={name}: there is no {what} '{name}'.{advice(group, name, known)}"
-        )
+        raise PluginError(f"{call}: there is no {what} '{name}'.{advice(about.group, name, known)}")
     if len(found) > 1:
         claims = " and ".join(f"{one.distribution} {one.version} ({one.target})" for one in found)
         raise PluginError(
-            f"{group}={name}: two distributions bring a {what} '{name}': {claims};"
-            " uninstall one of them"
+            f"{call}: two distributions bring a {what} '{name}': {claims}; uninstall one of them"
         )
     return found[0]
 
@@ -464,6 +473,9 @@ def _entries(distribution: importlib.metadata.Distribution) -> Iterator[Entry]:
     name, version = metadata["Name"], metadata["Version"]
     if not isinstance(name, str) or not isinstance(version, str):
         raise ValueError("the metadata name no distribution, or no version")
+    summary = ""
+    if "Summary" in metadata:
+        summary = metadata["Summary"]
     location = str(distribution.locate_file(""))
     for point in ours:
         yield Entry(
@@ -473,6 +485,7 @@ def _entries(distribution: importlib.metadata.Distribution) -> Iterator[Entry]:
             distribution=name,
             version=version,
             location=location,
+            summary=summary,
             api=api,
         )
 

@@ -12,22 +12,9 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from cfx import hydra_source
+from cfx import hydra_source, registry
 from cfx.errors import CfxError, nearest
 from cfx.extras import advice
-
-SUB_COMMANDS = (
-    "plugins",
-    "policies",
-    "data",
-    "benchmark",
-    "report",
-    "ui",
-    "drive",
-    "export",
-    "cite",
-)
-"""Names of the plain sub-commands (`cfx.cli.COMMANDS`)."""
 
 
 def is_user_error(error: BaseException) -> bool:
@@ -65,6 +52,12 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
     return _reworded(error, overrides)
 
 
+def no_command(word: str) -> str:
+    """Returns a sentence for a word that is neither an override nor a sub-command."""
+    advised = advice("command", word, registry.names("command"))
+    return f"{word}: neither key=value nor a sub-command.{advised} See cfx --help."
+
+
 def _reworded(error: BaseException, overrides: Sequence[str]) -> str:
     """Returns Hydra's more frequent messages in other words, and the rest as they are."""
     text = str(error).strip()
@@ -91,8 +84,7 @@ def _unknown_option(path: str, options: Sequence[str]) -> str:
 def _unreadable(error: OverrideParseException) -> str:
     word = error.override
     if "=" not in word:
-        advice = nearest(word, SUB_COMMANDS)
-        return f"{word}: neither key=value nor a sub-command.{advice} See cfx --help."
+        return no_command(word)
     detail = "syntax"
     for line in error.message.splitlines():
         if not line.startswith(("Error parsing", "See ")):

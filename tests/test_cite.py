@@ -7,7 +7,8 @@ import tomllib
 import pytest
 import yaml
 
-from cfx import cite, cli
+from cfx import cli
+from cfx.commands import cite
 from tests.conftest import ROOT
 
 

@@ -15,11 +15,10 @@ import pytest
 from hydra.core.hydra_config import HydraConfig
 
 import cfx
-from cfx import application, cli, ui
+from cfx import application, cli, registry, ui
 from cfx.datasets.tidy import write_tidy
 from cfx.errors import CfxError, ConfigError, DataError
 from cfx.tracking.store import open_store
-from cfx.user_errors import SUB_COMMANDS
 from tests.conftest import ROOT
 from tests.drives import straight_pairs
 
@@ -303,7 +302,7 @@ def test_help_lists_the_groups_and_names_only_keys_that_exist(run: Run, capsys) 
         assert run("--cfg", "job", override) == 0
 
 
-@pytest.mark.parametrize("command", sorted(cli.COMMANDS))
+@pytest.mark.parametrize("command", registry.names("command"))
 def test_every_sub_command_is_in_the_help_and_is_the_advice_for_a_slip(
     run: Run, command: str, capsys
 ) -> None:
@@ -331,7 +330,7 @@ def test_every_command_that_a_text_names_exists() -> None:
     for where, words in commands:
         first, *further = words.split()
         is_override = "=" in first or first.isupper() or first.startswith("-")
-        assert is_override or first in cli.COMMANDS, f"{where} names cfx {words}"
+        assert is_override or first in registry.names("command"), f"{where} names cfx {words}"
         if first in {"plugins", "data"} and further and further[0].isalpha():
             assert further[0] in {"check", "show", "new", "describe", "fetch"}, f"{where}: {words}"
 
@@ -528,7 +527,3 @@ def test_a_signal_that_comes_early_has_its_exit_code(
     _, err = started.communicate(timeout=60)
     assert started.returncode == code
     assert b"Traceback" not in err
-
-
-def test_the_sub_commands_that_messages_suggest_are_those_there_are() -> None:
-    assert tuple(cli.COMMANDS) == SUB_COMMANDS

@@ -20,10 +20,6 @@ def complete(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     return ask
 
 
-def test_every_sub_command_can_be_completed() -> None:
-    assert set(cli.PARSERS) == set(cli.COMMANDS)
-
-
 @pytest.mark.parametrize(
     ("line", "words"),
     [

@@ -14,7 +14,6 @@ import yaml
 
 import cfx
 from cfx import registry
-from cfx.cli import COMMANDS, PARSERS
 from cfx.hydra_source import composed
 from cfx.models.base import DrivingModel
 from tests.conftest import ROOT
@@ -22,6 +21,7 @@ from tests.drives import straight_pairs
 from tests.printed import Reader, all_blocks, blocks
 from tests.test_imports import FLOORS
 
+COMMANDS = registry.names("command")
 PAGES = sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").rglob("*.md"))
 DOCUMENTS = ["README.md", "CONTRIBUTING.md", *PAGES]
 GUIDES = {"docs/plugins.md", "docs/how-to/own-model.md"}
@@ -186,13 +186,9 @@ def test_the_documents_commands_compose(command: str) -> None:
 @pytest.mark.parametrize("call", of_sub_commands())
 def test_the_documents_sub_commands_have_these_options(call: str) -> None:
     name, *arguments = shlex.split(call)[3:]
-    if "--" in arguments:  # what follows is SUMO's
-        arguments = arguments[: arguments.index("--")]
-    parser = PARSERS[name]()
-    if name == "benchmark":  # its overrides may stand between options
-        parser.parse_intermixed_args(arguments)
-    else:
-        parser.parse_args(arguments)
+    command = cfx.get("command", name)()
+    assert isinstance(command, cfx.Command)
+    command.parse(arguments)
 
 
 def test_the_readmes_python_runs(

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from hydra.errors import MissingConfigException
 
+import cfx
 from cfx import extras, registry
 from cfx.errors import PluginError
 from cfx.user_errors import explain
@@ -73,6 +74,6 @@ def test_the_registry_says_it_too(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_outside_a_checkout_the_line_names_the_distribution(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(extras, "__file__", str(tmp_path / "cfx" / "extras.py"))
+    monkeypatch.setattr(cfx, "__file__", str(tmp_path / "cfx" / "__init__.py"))
     assert extras.install_line("cfx-cma").endswith(" install cfx-cma")
     assert extras.install_line("cfx-driving[sumo]").endswith(' install "cfx-driving[sumo]"')

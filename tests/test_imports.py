@@ -55,10 +55,9 @@ FLOORS = (
         "plugins",
         "cli",
         "completion",
-        "cite",
+        "commands",
         "sumo",
         "publish",
-        "benchmark",
         "plugin_errors",
     ),
 )

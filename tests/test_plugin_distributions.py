@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import configparser
+import re
 import subprocess
 import sys
 import tomllib
@@ -23,6 +24,13 @@ PUBLIC_MODULES = {"cfx", "cfx.errors", *READERS} | {
     kind.base.partition(":")[0] for kind in registry.KINDS.values()
 }
 """What a plugin may import from, and `cfx.contracts`; docs/plugins.md says so."""
+
+DOCUMENTED = {
+    name
+    for page in (ROOT / "docs" / "api").glob("*.md")
+    for name in re.findall(r"^::: (\S+)$", page.read_text(encoding="utf-8"), flags=re.MULTILINE)
+}
+"""What the reference documents besides."""
 
 BUILD = """
 import os, sys
@@ -141,6 +149,8 @@ def is_public(module: str, name: str) -> bool:
     """Says whether a plugin may use `name` of `module`; "" is the module itself."""
     if module == "cfx":
         return name in {"", "contracts", *cfx.__all__}
+    if f"{module}.{name}" in DOCUMENTED:
+        return True
     known = (
         module in PUBLIC_MODULES or module == "cfx.contracts" or module.startswith("cfx.contracts.")
     )

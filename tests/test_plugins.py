@@ -190,7 +190,7 @@ def test_check_names_the_extra_that_is_not_installed(
     printed = capsys.readouterr()
     assert re.search(r"^ *engine +dask .* not installed *$", printed.out, re.MULTILINE)
     assert "Hint: engine=dask needs the package distributed: " in printed.out
-    assert "[dask]" in printed.out
+    assert "cfx-dask" in printed.out
     assert printed.err == ""
 
 
@@ -395,6 +395,7 @@ GENERATED = [
     pytest.param("engine", marks=pytest.mark.slow),
     pytest.param("learner", marks=pytest.mark.slow),
     pytest.param("protocol", marks=pytest.mark.slow),
+    pytest.param("command"),
 ]
 
 
@@ -420,18 +421,25 @@ def test_a_new_package_installs_and_its_tests_pass(kind: str, tmp_path: Path, ca
     assert " passed" in tests
     assert "failed" not in tests
     group = registry.kind_of(kind).group
-    (preset,) = (folder / f"cfx_novel_{kind}" / "conf" / group).iterdir()
+    presets = [path.stem for path in folder.glob(f"cfx_novel_{kind}/conf/{group}/*.yaml")]
+    asked = "--help"
+    if kind != "command":
+        (preset,) = presets
+        asked = f"--cfg job {group}={preset}"
     script = (
         "import sys; from cfx.cli import main;"
         " sys.exit(max(main(words.split()) for words in sys.argv[1:]))"
     )
-    words = [f"plugins check {kind} novel_{kind}", f"--cfg job {group}={preset.stem}"]
+    words = [f"plugins check {kind} novel_{kind}", asked]
     said = run([sys.executable, "-c", script, *words], environment)
     assert re.search(
         rf"{kind} +novel_{kind} +cfx-novel-{kind} +0\.1\.0 .* fine *$", said, re.MULTILINE
     )
     assert "declares no version" not in said
-    assert f"name: novel_{kind}" in said
+    expected = f"name: novel_{kind}"
+    if kind == "command":
+        expected = "cfx novel_command The command novel_command for cfx (from cfx-novel-command)"
+    assert expected in said
 
 
 def installed(folder: Path, site: Path) -> dict[str, str]:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from cfx.contracts.contract import violations as violations
     from cfx.contracts.models import Equilibrium as Equilibrium
     from cfx.contracts.optimizers import Problems as Problems
+    from cfx.contracts.suites import CommandContract as CommandContract
     from cfx.contracts.suites import DatasetContract as DatasetContract
     from cfx.contracts.suites import EngineContract as EngineContract
     from cfx.contracts.suites import LearnerContract as LearnerContract
@@ -45,6 +46,7 @@ _CHECKS = {
     "learner": "cfx.contracts.learners",
     "protocol": "cfx.contracts.protocols",
     "metric": "cfx.contracts.metrics",
+    "command": "cfx.contracts.commands",
 }
 """Where each kind's statements are."""
 

@@ -12,11 +12,12 @@ a plugin:
 from __future__ import annotations
 
 import inspect
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import pytest
 
 from cfx.contracts import (
+    commands,
     datasets,
     engines,
     learners,
@@ -39,6 +40,9 @@ from cfx.optimizers.base import Optimizer
 from cfx.policies.base import Policy
 from cfx.protocols.base import Protocol
 from cfx.simulators.base import Simulator
+
+if TYPE_CHECKING:
+    from cfx.commands.base import Command
 
 
 def _statements(contract: Contract) -> pytest.MarkDecorator:
@@ -222,3 +226,16 @@ class MetricContract:
     @_statements(metrics.CONTRACT)
     def test_contract(self, check: Check, metric: Metric) -> None:
         hold(check, metric)
+
+
+class CommandContract:
+    """What every sub-command must hold: each statement of `cfx.contracts.commands` is a test."""
+
+    @pytest.fixture
+    def command(self) -> Command:
+        """Returns the sub-command under test."""
+        raise _undefined(self, "command")
+
+    @_statements(commands.CONTRACT)
+    def test_contract(self, check: Check, command: Command) -> None:
+        hold(check, command)

@@ -136,10 +136,10 @@ def _write(kind: registry.Kind, words: dict[str, Any], target: Path) -> None:
 
 
 def _next_steps(kind: registry.Kind, name: str, target: Path) -> str:
-    job = f"{kind.group}={name}"
+    job = kind.call(name).removeprefix("cfx ")
     if kind.name == "dataset":
         job += " data.path=FILE.csv"
-    if not kind.chosen:
+    if kind.name == "metric":
         job = "  # every job measures it"
     return (
         f"Wrote {target}, a package with the {kind.name} '{name}'. Next:\n"

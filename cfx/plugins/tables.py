@@ -56,7 +56,9 @@ def show(kind: str, name: str) -> None:
     cls: Any = registry.get(kind, name)
     group = registry.kind_of(kind).group
     chosen = f"Choose it with {group}={name}."
-    if not registry.kind_of(kind).chosen:
+    if entry.kind == "command":
+        chosen = f"Run it with cfx {name}; cfx {name} --help says what it takes."
+    elif not registry.kind_of(kind).chosen:
         chosen = f"Every job measures it; with {group}={name} no others but those that a job needs."
     print(f"{entry}\n{entry.location}\n{chosen}\n")
     if cls.deprecated:

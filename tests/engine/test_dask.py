@@ -12,9 +12,9 @@ import psutil
 import pytest
 
 from cfx import registry
-from cfx.engine.dask.engine import DaskEngine
 from cfx.errors import ConfigError, EngineError, NotInstalledError
 from cfx.extras import install_line
+from cfx_dask.engine.engine import DaskEngine
 from tests.engine.clusters import Cluster, free_port
 from tests.engine.work import dies, only_on_good, slowly, where
 
@@ -44,8 +44,8 @@ def test_wrong_settings_are_said_before_any_work(
 @pytest.mark.parametrize(
     ("missing", "settings", "line"),
     [
-        ("distributed", {}, "cfx-driving[dask]"),
-        ("dask_jobqueue", {"cluster": "slurm"}, "cfx-driving[dask]"),
+        ("distributed", {}, "cfx-dask"),
+        ("dask_jobqueue", {"cluster": "slurm"}, "cfx-dask"),
         ("dask_kubernetes", {"cluster": "kubernetes"}, "dask-kubernetes"),
     ],
 )

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from cfx.engine.dask.code import differing, installed_code
-from cfx.engine.dask.engine import DaskEngine
 from cfx.errors import EngineError
+from cfx_dask.engine.code import differing, installed_code
+from cfx_dask.engine.engine import DaskEngine
 from tests.engine.clusters import ROOT, Cluster
 from tests.engine.work import slowly
 

@@ -16,7 +16,6 @@ from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.windows import Windows, WindowSettings
 from cfx.engine.base import Engine
-from cfx.engine.dask.engine import DaskEngine
 from cfx.engine.local import LocalEngine
 from cfx.errors import EngineError
 from cfx.models.w99 import W99
@@ -24,6 +23,7 @@ from cfx.optimizers.random import RandomSearch
 from cfx.pairs import PairBatch
 from cfx.progress import Task
 from cfx.simulation.rollout import MemoryStepper
+from cfx_dask.engine.engine import DaskEngine
 from tests.drives import wavy_pairs
 from tests.engine.clusters import Cluster, meanwhile, running_cluster, until
 

@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from cfx.engine.base import Engine
-from cfx.engine.dask.engine import DaskEngine
 from cfx.engine.local import LocalEngine
 from cfx.learners.base import TrainingResult
 from cfx.learners.rollout import RolloutLearner, shard
 from cfx.simulation import threads
+from cfx_dask.engine.engine import DaskEngine
 from tests.engine.clusters import Cluster, running_cluster
 from tests.learners.made import QUICK, gru, training_data
 

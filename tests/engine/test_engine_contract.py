@@ -10,9 +10,9 @@ import cfx
 from cfx import registry
 from cfx.contracts import EngineContract
 from cfx.engine.base import Engine
-from cfx.engine.dask.engine import DaskEngine
 from cfx.engine.local import LocalEngine
 from cfx.simulation import threads
+from cfx_dask.engine.engine import DaskEngine
 from tests.engine.clusters import running_cluster
 
 

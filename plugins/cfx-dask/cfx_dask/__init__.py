@@ -1,1 +1,1 @@
-"""Sweeps on a Dask cluster: Hydra's launcher `dask`."""
+"""A Dask cluster: the engine `dask` of a job, and Hydra's launcher `dask` of a sweep."""

@@ -1,4 +1,4 @@
-"""What `hydra.launcher` holds: the settings of cfx's engine `dask`."""
+"""What `hydra.launcher` holds: the settings of the engine `dask`."""
 
 from __future__ import annotations
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping
-
-from cfx.component import content_key
 
 VERSION = "i80-1"
 """Name of the protocol; another one begins whenever anything in this module changes."""
@@ -79,4 +79,4 @@ def protocol_hash(data: str = DATA) -> str:
         "scope": SCOPE,
         "metrics": METRICS,
     }
-    return content_key(fixed)[:12]
+    return hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()[:12]

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from typing import Any, Generic
 
 from cfx.engine.base import Report, ResultT, ShardT, Work
-from cfx.engine.dask.code import installed_code
-from cfx.engine.dask.connection import Connection
-from cfx.engine.dask.settings import DaskSettings
-from cfx.engine.dask.worker import WorkerTrouble, work_on
 from cfx.errors import EngineError
+from cfx_dask.engine.code import installed_code
+from cfx_dask.engine.connection import Connection
+from cfx_dask.engine.settings import DaskSettings
+from cfx_dask.engine.worker import WorkerTrouble, work_on
 
 log = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ import importlib.util
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from cfx import registry
+from cfx.registry import KINDS, OWN, entries
 
 
 @functools.cache
@@ -17,9 +17,9 @@ def installed_code() -> Mapping[str, str]:
 
     Nothing is imported.
     """
-    packages: dict[str, set[str]] = {registry.OWN: {"cfx"}}
-    for kind in registry.KINDS:
-        for entry in registry.entries(kind):
+    packages: dict[str, set[str]] = {OWN: {"cfx"}}
+    for kind in KINDS:
+        for entry in entries(kind):
             packages.setdefault(entry.distribution, set()).add(entry.package)
     return {name: _hash(found) for name, found in packages.items()}
 

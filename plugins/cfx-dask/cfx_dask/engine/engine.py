@@ -9,12 +9,12 @@ from collections.abc import Generator, Iterable
 from contextlib import closing
 from typing import Any, ClassVar
 
-from cfx.component import Settings
+from cfx import Settings
 from cfx.engine.base import Engine, Report, ResultT, ShardT, Work
-from cfx.engine.dask.clusters import require_installed
-from cfx.engine.dask.connection import Connection
-from cfx.engine.dask.run import Run
-from cfx.engine.dask.settings import DaskSettings
+from cfx_dask.engine.clusters import require_installed
+from cfx_dask.engine.connection import Connection
+from cfx_dask.engine.run import Run
+from cfx_dask.engine.settings import DaskSettings
 
 
 class DaskEngine(Engine):

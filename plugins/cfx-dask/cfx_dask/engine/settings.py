@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from cfx.component import Settings
+from cfx import Settings
 
 Cluster = Literal["local", "slurm", "pbs", "lsf", "kubernetes"]
 

@@ -10,11 +10,11 @@ from typing import Any
 
 import pandas as pd
 
-from cfx.benchmark.frozen import METRICS, SCOPE, VERSION, protocol_hash
 from cfx.errors import DataError
 from cfx.evaluation.statistics import mean_interval
 from cfx.files import write_json
 from cfx.metrics.base import column_of
+from cfx_benchmark.frozen import METRICS, SCOPE, VERSION, protocol_hash
 
 ROW, PAIRS = "benchmark.json", "benchmark_pairs.csv"
 """What a job of the benchmark leaves beside its own results."""

@@ -10,13 +10,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
 
-from cfx import registry
-from cfx.benchmark.frozen import DATA, DATA_NAME, FROZEN_KEYS, METHODS, OVERRIDES
-from cfx.benchmark.row import PAIRS, ROW, Row, errors_of, protocol_name, values_of
-from cfx.datasets.base import Dataset
+import cfx
 from cfx.errors import ConfigError, DataError, Terminated, nearest
 from cfx.files import atomic_write
 from cfx.hydra_source import path_override
+from cfx_benchmark.frozen import DATA, DATA_NAME, FROZEN_KEYS, METHODS, OVERRIDES
+from cfx_benchmark.row import PAIRS, ROW, Row, errors_of, protocol_name, values_of
 
 _CHANGE_NOTHING = (
     "tracking",
@@ -145,8 +144,8 @@ def _require_free(overrides: Sequence[str]) -> None:
 
 def _fingerprint(data: Path) -> str:
     """Returns the fingerprint of the pairs that the benchmark takes of a file."""
-    cls = registry.get("dataset", "tidy")
-    dataset = cast(Dataset, cls(path=data, min_frames=300))
+    cls = cfx.get("dataset", "tidy")
+    dataset = cast(cfx.Dataset, cls(path=data, min_frames=300))
     return dataset.load().fingerprint
 
 
@@ -164,15 +163,15 @@ def _run_job(command: Sequence[str], job: Path) -> None:
             print(f"{job}: was finished before")
             return
         raise ConfigError(f"{job}: holds another job; give --output another folder, or --name")
-    from cfx.application import INTERRUPTED, TERMINATED, start
+    from cfx.cli import main
 
     job.mkdir(parents=True, exist_ok=True)
     record.write_text(json.dumps(list(command)), encoding="utf-8")
     began = time.monotonic()
-    code = start([*command, path_override("hydra.run.dir", job.absolute())])
-    if code == INTERRUPTED:
+    code = main([*command, path_override("hydra.run.dir", job.absolute())])
+    if code == 130:
         raise KeyboardInterrupt
-    if code == TERMINATED:
+    if code == 143:
         raise Terminated
     if code:
         raise DataError("cfx benchmark: the job failed; its words stand above")

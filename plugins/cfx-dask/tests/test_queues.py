@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from cfx.engine.dask import clusters
-from cfx.engine.dask.settings import DaskSettings
+from cfx_dask.engine import clusters
+from cfx_dask.engine.settings import DaskSettings
 
 pytest.importorskip("dask_jobqueue", reason="dask-jobqueue is not installed")
 

@@ -1,17 +1,57 @@
-"""What `cfx report` does."""
+"""`cfx report`: one page, or a paper's table, about finished jobs."""
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from cfx.commands.base import Command
 from cfx.errors import ConfigError
-from cfx.plots.words import plural
-from cfx.report.page import write_report
-from cfx.report.paper import FORMS, write_table
-from cfx.report.runs import read_runs
 
 NAME = "report.html"
+
+
+class ReportCommand(Command):
+    """Writes one HTML page about finished jobs, or the table of a paper."""
+
+    summary = "one HTML page about finished jobs, to be sent to a colleague"
+
+    def parser(self) -> argparse.ArgumentParser:
+        parser = argparse.ArgumentParser(
+            "cfx report",
+            description="Writes one HTML page about finished jobs, complete in itself.",
+        )
+        parser.add_argument(
+            "runs",
+            nargs="+",
+            metavar="RUN",
+            help="output folder of a job or a sweep, its URL (output.url), or id of an MLflow run",
+        )
+        parser.add_argument(
+            "--output",
+            metavar="FILE",
+            help="default: report.html in the folder; for several, a URL or a run: here",
+        )
+        parser.add_argument("--title", help="of the page")
+        parser.add_argument(
+            "--tables",
+            choices=["latex", "csv"],
+            help="write the table of a paper instead of the page",
+        )
+        parser.add_argument(
+            "--group-by",
+            metavar="SETTING",
+            help="with --tables: jobs that differ in this setting alone, for instance seed, share a"
+            " row with mean and standard deviation",
+        )
+        return parser
+
+    def run(self, options: argparse.Namespace) -> int:
+        chosen = {"tables": options.tables, "group_by": options.group_by}
+        for line in report(options.runs, options.output, options.title, **chosen):
+            print(line)
+        return 0
 
 
 def report(
@@ -37,6 +77,11 @@ def report(
         DataError, TrackingError: the jobs cannot be read.
         OutputError: the page cannot be written.
     """
+    from cfx.plots.words import plural
+    from cfx.report.page import write_report
+    from cfx.report.paper import FORMS, write_table
+    from cfx.report.runs import read_runs
+
     if group_by is not None and tables is None:
         raise ConfigError(f"--group-by {group_by} goes with --tables latex or --tables csv")
     found = read_runs(runs)

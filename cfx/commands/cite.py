@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 import cfx
+from cfx.commands.base import Command
+
+
+class CiteCommand(Command):
+    """Prints how to cite cfx."""
+
+    summary = "how to cite cfx, as BibTeX"
+
+    def parser(self) -> argparse.ArgumentParser:
+        return argparse.ArgumentParser("cfx cite", description="Prints how to cite cfx, as BibTeX.")
+
+    def run(self, options: argparse.Namespace) -> int:
+        print(bibtex())
+        return 0
 
 
 def citation_file() -> Path:
@@ -21,6 +34,8 @@ def citation_file() -> Path:
 
 def bibtex() -> str:
     """Returns cfx's entry of a bibliography, and that of the method that it began from."""
+    import yaml
+
     entry: dict[str, Any] = yaml.safe_load(citation_file().read_text(encoding="utf-8"))
     found = [_software(entry)]
     for reference in entry["references"]:

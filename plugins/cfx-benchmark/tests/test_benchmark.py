@@ -9,14 +9,38 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cfx import application, cli
-from cfx.benchmark.compare import compared, lines_of, read_errors
-from cfx.benchmark.frozen import DATA, METHODS, TESTED, protocol_hash
-from cfx.benchmark.row import Row, errors_of, markdown, protocol_name, values_of
-from cfx.benchmark.run import overrides_of, row_name, run
-from cfx.datasets.synthetic import SyntheticDataset
-from cfx.datasets.tidy import TidyDataset, write_tidy
+import cfx
+from cfx.cli import main
+from cfx.contracts import CommandContract
+from cfx.datasets.tidy import write_tidy
 from cfx.errors import DataError, Terminated
+from cfx_benchmark.command import BenchmarkCommand
+from cfx_benchmark.compare import compared, lines_of, read_errors
+from cfx_benchmark.frozen import DATA, METHODS, TESTED, protocol_hash
+from cfx_benchmark.row import Row, errors_of, markdown, protocol_name, values_of
+from cfx_benchmark.run import overrides_of, row_name, run
+
+
+class TestBenchmarkCommand(CommandContract):
+    @pytest.fixture
+    def command(self) -> BenchmarkCommand:
+        return BenchmarkCommand()
+
+
+def dataset(name: str, **settings: object) -> cfx.PairSet:
+    """Returns the pairs of one of cfx's datasets."""
+    made = cfx.get("dataset", name)(**settings)
+    assert isinstance(made, cfx.Dataset)
+    return made.load()
+
+
+@pytest.fixture
+def recordings() -> Path:
+    """The real recordings beside the checkout; skips where they are absent."""
+    folder = Path(__file__).resolve().parents[4] / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip(f"real recordings are not here ({folder})")
+    return folder
 
 
 def test_the_protocol_is_the_published_one() -> None:
@@ -26,9 +50,9 @@ def test_the_protocol_is_the_published_one() -> None:
     )
 
 
-def test_the_frozen_pairs_are_those_of_the_recordings(shared_data: Path) -> None:
-    path = shared_data / "i80_reconstructed_pairs.parquet"
-    pairs = TidyDataset(path=path, min_frames=300).load()
+def test_the_frozen_pairs_are_those_of_the_recordings(recordings: Path) -> None:
+    path = recordings / "i80_reconstructed_pairs.parquet"
+    pairs = dataset("tidy", path=path, min_frames=300)
     assert pairs.fingerprint == DATA
     assert sum(len(pair) >= 700 for pair in pairs) == TESTED
 
@@ -39,15 +63,15 @@ def test_the_frozen_pairs_are_those_of_the_recordings(shared_data: Path) -> None
 def test_what_is_frozen_cannot_be_overridden(
     capsys: pytest.CaptureFixture[str], override: str
 ) -> None:
-    code = cli.main(["benchmark", "model=idm", override, "--data", "x.parquet"])
+    code = main(["benchmark", "model=idm", override, "--data", "x.parquet"])
     assert code == 2
     assert "are the benchmark's" in capsys.readouterr().err
 
 
 def test_other_pairs_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "p.parquet"
-    write_tidy(SyntheticDataset(pairs=2, frames=320, min_frames=2).load(), path)
-    assert cli.main(["benchmark", "model=idm", "--data", str(path)]) == 2
+    write_tidy(dataset("synthetic", pairs=2, frames=320, min_frames=2), path)
+    assert main(["benchmark", "model=idm", "--data", str(path)]) == 2
     error = capsys.readouterr().err
     assert "holds other pairs than the benchmark's" in error
     assert "--other-data" in error
@@ -55,7 +79,7 @@ def test_other_pairs_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[s
 
 def test_data_are_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
-        cli.main(["benchmark", "model=idm"])
+        main(["benchmark", "model=idm"])
     assert ended.value.code == 2
     assert "--data FILE is needed" in capsys.readouterr().err
 
@@ -168,10 +192,10 @@ def test_a_row_of_other_pairs_is_made_and_marked(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "p.parquet"
-    write_tidy(SyntheticDataset(pairs=6, frames=720, min_frames=2).load(), path)
+    write_tidy(dataset("synthetic", pairs=6, frames=720, min_frames=2), path)
     command = ["benchmark", "model=krauss", "tracking.enabled=false", "figures.enabled=false"]
     command += ["--data", str(path), "--other-data", "--name", "krauss"]
-    assert cli.main(command) == 0
+    assert main(command) == 0
     folder = tmp_path / "outputs/benchmark/krauss"
     first = read_errors(folder / "benchmark_pairs.csv")
     assert len(first) == 6
@@ -180,7 +204,7 @@ def test_a_row_of_other_pairs_is_made_and_marked(
     )
     capsys.readouterr()
     # Once more: the finished job is not run again, and compares with itself.
-    assert cli.main([*command, "--against", str(folder / "benchmark_pairs.csv")]) == 0
+    assert main([*command, "--against", str(folder / "benchmark_pairs.csv")]) == 0
     said = capsys.readouterr().out
     assert "was finished before" in said
     assert "krauss (other pairs: p.parquet" in said
@@ -193,8 +217,8 @@ def test_a_job_that_was_broken_off_has_not_failed(
 ) -> None:
     """The exit code is that of the signal, and the same command goes on."""
     path = tmp_path / "p.parquet"
-    write_tidy(SyntheticDataset(pairs=2, frames=320, min_frames=2).load(), path)
+    write_tidy(dataset("synthetic", pairs=2, frames=320, min_frames=2), path)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(application, "start", lambda _: code)
+    monkeypatch.setattr("cfx.cli.main", lambda _: code)
     with pytest.raises(error):
         run(["model=idm"], path, None, name="mine", other_data=True)

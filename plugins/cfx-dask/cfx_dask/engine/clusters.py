@@ -12,15 +12,15 @@ import uuid
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cfx.engine.dask.settings import DaskSettings
 from cfx.errors import EngineError, NotInstalledError
 from cfx.extras import install_line
 from cfx.simulation.threads import cores
+from cfx_dask.engine.settings import DaskSettings
 
 _WORKERS_ELSEWHERE = 4
 
 
-_DASK = "cfx-driving[dask]"
+_DASK = "cfx-dask"
 
 
 class _Package(NamedTuple):

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pandas as pd
 
-from cfx.benchmark.row import COUNTS
 from cfx.errors import DataError
 from cfx.evaluation.statistics import Improvement, improvement_statistics
+from cfx_benchmark.row import COUNTS
 
 _NEEDED = ("row", "pair_id", "driver")
 

@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
-from cfx.engine.dask import clusters
-from cfx.engine.dask.settings import DaskSettings
 from cfx.errors import EngineError
+from cfx_dask.engine import clusters
+from cfx_dask.engine.settings import DaskSettings
 
 log = logging.getLogger(__name__)
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from cfx.engine.base import ResultT, ShardT, Unfit, Work
-from cfx.engine.dask.code import differing, installed_code
-from cfx.engine.dask.counting import Counted, counted
 from cfx.errors import EngineError
 from cfx.simulation.threads import limit_cores, own_cores
+from cfx_dask.engine.code import differing, installed_code
+from cfx_dask.engine.counting import Counted, counted
 
 
 class WorkerTrouble(Exception):  # noqa: N818 - the shard is well, its worker is not

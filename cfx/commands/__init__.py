@@ -1,0 +1,1 @@
+"""The sub-commands of `cfx`, each an entry point of the group `cfx.commands`."""
