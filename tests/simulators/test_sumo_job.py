@@ -51,7 +51,11 @@ def job(folder: Path, *overrides: str) -> Any:
 def test_the_table_is_the_same_with_sumo_in_the_loop(tmp_path: Path) -> None:
     memory = job(tmp_path / "memory", "model=krauss_sumo")
     sumo = job(tmp_path / "sumo", "model=krauss_sumo", "simulator=sumo", "simulator.followers=8")
-    pd.testing.assert_frame_equal(sumo.pairs, memory.pairs, rtol=0, atol=1e-9)
+    # Slices of the loss, which flatness is read from, are not simulated in SUMO.
+    slices = [name for name in memory.pairs if name.startswith("flat_")]
+    assert slices
+    expected = memory.pairs.drop(columns=slices)
+    pd.testing.assert_frame_equal(sumo.pairs, expected, rtol=0, atol=1e-9)
     assert len(list((tmp_path / "cache").rglob("*.entry"))) == 2 * 3, (
         "each simulator has its own results in the cache"
     )

@@ -98,14 +98,10 @@ class _Pool:
         self._executor = worker_pool(workers, begin, self._folder, folder=self._folder)
 
     def answer(self, asked: list[tuple[int, Request]]) -> list[Answer]:
-        futures = []
-        try:
-            for number, request in asked:
-                futures.append(self._executor.submit(answer, number, request))
-            answers = [future.result() for future in futures]
-        finally:
-            for future in futures:
-                future.cancel()  # where one failed, nobody waits for the others
+        # None is cancelled where one fails: an executor that is shut down meanwhile would trip over
+        # it, and whoever fails shuts it down soon.
+        futures = [self._executor.submit(answer, number, request) for number, request in asked]
+        answers = [future.result() for future in futures]
         for (number, _), given in zip(asked, answers, strict=True):
             if given.number != number:
                 raise RuntimeError(f"SUMO's answer {given.number} was given to request {number}")
