@@ -76,7 +76,6 @@ HEAVY = (
     "pandas",
     "matplotlib",
     "scipy",
-    "plotly",
 )
 
 

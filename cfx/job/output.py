@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 import pyarrow as pa
@@ -29,9 +29,6 @@ from cfx.protocols.base import ProtocolResult
 from cfx.style.result import StyleResult
 from cfx.tracking.provenance import commit, version
 
-if TYPE_CHECKING:
-    from cfx.engine.processes import Standby
-
 TRACKED = (
     "config.yaml",
     "metrics.json",
@@ -44,9 +41,6 @@ TRACKED = (
 )
 """Files of a job's folder that MLflow keeps too, besides its figures and its policy."""
 
-
-_SHARED_PAIRS = 500
-"""Pairs of a job whose figures two processes draw, at most: the other is sent all trajectories."""
 
 METRICS = "metrics.json"
 """The file that is written last: a folder that has it is complete."""
@@ -263,7 +257,6 @@ def write_figures(
     view: CalibrationView | None,
     *,
     adapts: bool,
-    second: Standby | None = None,
 ) -> list[Path]:
     """Writes the figures, if the configuration wants any; returns their paths.
 
@@ -275,7 +268,6 @@ def write_figures(
         protocol_result: what is drawn.
         view: slices and fits of the calibration; None without.
         adapts: as `Policy.adapts`.
-        second: a process that draws some of them.
 
     Raises:
         OutputError: a file cannot be written.
@@ -283,22 +275,26 @@ def write_figures(
     paths: list[Path] = []
     if config.figures.enabled:
         with importing():
-            from cfx.plots.matplotlib import write
+            from cfx.plots.results import Results
+            from cfx.plots.write import write_figures as write_all_figures
 
         evaluation = protocol_result.evaluation
-        draw = {**write.figures_of_job(evaluation, style, protocol_result.curves, adapts=adapts)}
-        if view is not None:
-            labels = None
-            if protocol_result.labels is not None:
-                labels = protocol_result.labels.to_frame(pairs, evaluation.names)
-            draw |= write.figures_of_calibration(evaluation, view.slices, view.fits, labels)
-        share: write.Share = write.in_turn
-        if second is not None and len(pairs) <= _SHARED_PAIRS:
-            share = second.share
+        labels = None
+        if view is not None and protocol_result.labels is not None:
+            labels = protocol_result.labels.to_frame(pairs, evaluation.names)
+        results = Results.of(
+            evaluation,
+            adapts=adapts,
+            style=style,
+            curves=protocol_result.curves,
+            slices=None if view is None else view.slices,
+            fits=None if view is None else view.fits,
+            labels=labels,
+        )
 
         def write_all() -> None:
             folder, formats = output.folder / "figures", config.figures.formats
-            paths.extend(write.write_figures(folder, draw, formats=formats, share=share))
+            paths.extend(write_all_figures(folder, results, formats=formats))
 
         output.run(write_all)
     return paths

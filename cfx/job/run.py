@@ -7,21 +7,17 @@ recordings, which needs none of them: a wrong path or column is answered at once
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from cfx import registry
-from cfx.collector import importing, runs_program
+from cfx.collector import importing
 from cfx.config import JobConfig
-from cfx.simulation.threads import cores
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from cfx.datasets.base import Dataset
-    from cfx.engine.processes import Standby
     from cfx.job.results import JobResult
     from cfx.pairs import PairSet
 
@@ -46,28 +42,10 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
     # An engine that is not installed is named at once too; it connects to nothing yet.
     registry.create("engine", config.engine)
     pairs = load_pairs(cast("Dataset", registry.create("dataset", config.data)))
-    with _second_process(config) as second:
-        with importing():
-            from cfx.job.steps import take_steps
+    with importing():
+        from cfx.job.steps import take_steps
 
-        return take_steps(config, folder, pairs, console, second)
-
-
-@contextmanager
-def _second_process(config: JobConfig) -> Iterator[Standby | None]:
-    """Starts a process that draws some of the figures later, where a core has nothing else to do.
-
-    In a sweep other jobs want the cores. In a program of somebody else the two processes might draw
-    in different looks.
-    """
-    alone = runs_program() and config.tracking.sweep is None and config.cores != 1
-    if not (alone and config.figures.enabled and cores() > 1):
-        yield None
-        return
-    from cfx.engine.processes import Standby
-
-    with Standby("cfx.plots.matplotlib.write") as second:
-        yield second
+    return take_steps(config, folder, pairs, console)
 
 
 def load_pairs(dataset: Dataset) -> PairSet:

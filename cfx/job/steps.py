@@ -44,7 +44,6 @@ from cfx.style.entropy import measure_style, select_cluster
 from cfx.style.result import StyleResult
 
 if TYPE_CHECKING:
-    from cfx.engine.processes import Standby
     from cfx.tracking.tracker import Tracker
 
 log = logging.getLogger(__name__)
@@ -58,7 +57,6 @@ def take_steps(
     folder: Path,
     loaded: PairSet,
     console: Console | None = None,
-    second: Standby | None = None,
 ) -> JobResult:
     """Runs one job and writes its results into `folder`.
 
@@ -67,7 +65,6 @@ def take_steps(
         folder: the job's output folder; made if it is not there.
         loaded: the pairs of the configuration's dataset.
         console: where the table goes; stdout unless given.
-        second: a process that draws some of the figures.
 
     Raises:
         CfxError: the user's mistake, in one sentence; nothing half-written is left.
@@ -78,8 +75,6 @@ def take_steps(
     console = console or Console()
     data = config.data
     device = choose_device(config.device)
-    if device.type != "cpu":
-        second = None  # trajectories lie where it is not
     limit_cores(config.cores)
     if config.threads is not None:
         set_threads(config.threads)
@@ -113,7 +108,7 @@ def take_steps(
             view = None
             if config.figures.enabled:
                 view = calibration_view(context, protocol_result.evaluation)
-        result = _keep(config, parts, output, pairs, style, protocol_result, view, tracker, second)
+        result = _keep(config, parts, output, pairs, style, protocol_result, view, tracker)
         if upload is not None:
             upload.finish()
             tracker.set_tags({"cfx.output_url": upload.url})
@@ -221,7 +216,6 @@ def _keep(
     protocol_result: ProtocolResult,
     view: CalibrationView | None,
     tracker: Tracker,
-    second: Standby | None,
 ) -> JobResult:
     """Writes everything into the folder, then into MLflow."""
     evaluation = protocol_result.evaluation
@@ -244,7 +238,6 @@ def _keep(
         protocol_result,
         view,
         adapts=parts.policy.adapts,
-        second=second,
     )
     demo = files.write_demo(output, config, pairs, protocol_result)
     files.write_provenance(
