@@ -74,7 +74,6 @@ HEAVY = (
     "pandas",
     "matplotlib",
     "scipy",
-    "plotly",
 )
 
 

@@ -16,6 +16,7 @@ from packaging.utils import canonicalize_name
 
 import cfx
 from cfx import nodes, registry
+from cfx.plots import figure
 
 ROOT = Path(__file__).resolve().parent.parent
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -43,6 +44,8 @@ def test_entry_points_of_pyproject_are_the_installed_ones() -> None:
             if one.distribution == nodes.DISTRIBUTION
         }
         assert installed == declared[kind.entry_points], "install again: pip install -e ."
+    own = {one.name for one in figure.installed() if one.distribution == nodes.DISTRIBUTION}
+    assert own == {name for name, _ in declared.pop(figure.GROUP)}
     assert set(declared) == {kind.entry_points for kind in registry.KINDS.values()}
     (script,) = metadata.entry_points(group="console_scripts", name="cfx")
     assert script.value == PYPROJECT["project"]["scripts"]["cfx"]

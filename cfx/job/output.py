@@ -273,19 +273,26 @@ def write_figures(
     """
     paths: list[Path] = []
     if config.figures.enabled:
-        from cfx.plots.matplotlib import write
+        from cfx.plots.results import Results
+        from cfx.plots.write import write_figures as write_all_figures
 
         evaluation = protocol_result.evaluation
-        draw = {**write.figures_of_job(evaluation, style, protocol_result.curves, adapts=adapts)}
-        if view is not None:
-            labels = None
-            if protocol_result.labels is not None:
-                labels = protocol_result.labels.to_frame(pairs, evaluation.names)
-            draw |= write.figures_of_calibration(evaluation, view.slices, view.fits, labels)
+        labels = None
+        if view is not None and protocol_result.labels is not None:
+            labels = protocol_result.labels.to_frame(pairs, evaluation.names)
+        results = Results.of(
+            evaluation,
+            adapts=adapts,
+            style=style,
+            curves=protocol_result.curves,
+            slices=None if view is None else view.slices,
+            fits=None if view is None else view.fits,
+            labels=labels,
+        )
 
         def write_all() -> None:
             folder, formats = output.folder / "figures", config.figures.formats
-            paths.extend(write.write_figures(folder, draw, formats=formats))
+            paths.extend(write_all_figures(folder, results, formats=formats))
 
         output.run(write_all)
     return paths

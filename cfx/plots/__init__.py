@@ -1,6 +1,6 @@
-"""Figures: what they show is chosen once (`choice/`) and drawn by two backends.
+"""Figures: a file each says what is shown of the results, how it is drawn and what is said of it.
 
-`choice/` holds pure functions that return plain data: lines, limits, notes, labels. `matplotlib/`
-draws them for a job's folder, `plotly/` for the HTML report. A backend decides nothing about the
-content.
+`figure.py` says what a figure is and which are installed, `results.py` what they are drawn from,
+`canvas.py` how they look. A job writes them (`write.py`), a report shows the same as SVG. `jobs.py`
+has the figures of several jobs, which reports alone have.
 """

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from cfx.plots.plotly.figure import Plot
 from cfx.report.job import Runs
 from cfx.report.tables import Sheet
 
@@ -75,10 +74,26 @@ class Table(Block):
 
 
 @dataclass(frozen=True)
-class Figure(Block):
-    """A plot."""
+class View:
+    """A figure as the page shows it: an `svg` element, and what must be said below it."""
 
-    plot: Plot
+    svg: str
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Figure(Block):
+    """A figure with one or several views, of which the reader chooses.
+
+    Attributes:
+        views: by what the reader chooses; at least one.
+        label: what it shows, for readers who do not see it.
+        chooser: what the views differ in, the label of the choice.
+    """
+
+    views: Mapping[str, View]
+    label: str
+    chooser: str = "Policy"
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from cfx.evaluation.result import METHODS, PairTrajectory
-from cfx.metrics.base import MetricInfo, key_of
-from cfx.plots.choice.trajectories import ParameterAxis
+from cfx.evaluation.result import METHODS, STATISTICS, PairTrajectory
+from cfx.evaluation.statistics import Improvement
+from cfx.metrics.base import RECORDED, MetricInfo, key_of
+from cfx.plots.results import ParameterAxis, Results
 from cfx.plots.words import TEST, scope_label
 from cfx.report.metrics import known_metrics
 from cfx.simulation.trajectory import TRANSIENT_S
+from cfx.style.result import StyleResult
 
 
 @dataclass(frozen=True)
@@ -249,6 +251,77 @@ class Job:
             low, high = _number(about.get("low")), _number(about.get("high"))
             unit, meaning = str(about.get("unit", "")), str(about.get("meaning", ""))
             axes.append(ParameterAxis(name, unit, low, high, meaning))
+        return tuple(axes)
+
+    @cached_property
+    def results(self) -> Results:
+        """What the job's figures are drawn from."""
+        from cfx.evaluation.forecasts import Forecasts
+        from cfx.evaluation.traffic.result import Traffic
+
+        forecasts = None
+        if self.forecasts is not None:
+            horizons = tuple(sorted(float(one) for one in self.forecasts["horizon_s"].unique()))
+            leader = str(self.setting("protocol.leader"))
+            forecasts = Forecasts(self.forecasts, horizons, leader, 0, self.distributions)
+        roads, growth, strips = self.traffic, self.traffic_growth, self.traffic_strips
+        traffic = None
+        if roads is not None and growth is not None and strips is not None:
+            real = self.metrics.get(key_of("traffic/wave_speed", RECORDED), math.nan)
+            # Paths stay in the job's folder: as a picture they would be most of a page.
+            traffic = Traffic(roads, growth, strips, pd.DataFrame(), real, 0)
+        stable = {}
+        for method in self.methods:
+            key = key_of("platoon/string_stable", method)
+            if key in self.metrics:
+                stable[method] = self.metrics[key]
+        return Results(
+            pairs=self.pairs,
+            methods=self.meaningful_methods,
+            parameters=self.parameters or self.described_parameters,
+            trajectories=self.pair_trajectories,
+            improvements={one: self._improvement(one) for one in self.baselines()},
+            style=self._style_result,
+            curves=self.curves,
+            platoon=self.platoon,
+            stable=stable,
+            history=self.history,
+            forecasts=forecasts,
+            traffic=traffic,
+            slices=self.slices,
+            fits=self.fits,
+            labels=self.labels,
+            transient_s=self.transient_s,
+        )
+
+    def _improvement(self, baseline: str) -> Improvement:
+        column = self.by_pair[f"improvement/{baseline}"]
+        known = int(np.isfinite(column).sum())
+        statistics = {name: self.improvement(name, baseline) for name in STATISTICS}
+        undefined, drivers = len(column) - known, self.by_pair["driver"].nunique()
+        return Improvement(**statistics, pairs=known, undefined=undefined, drivers=drivers)
+
+    @property
+    def _style_result(self) -> StyleResult | None:
+        """The scores; the weights of the indicators stand in no file."""
+        if self.style is None or not len(self.style):
+            return None
+        percentiles = self.setting("style.percentiles")
+        if not isinstance(percentiles, list):
+            percentiles = [25.0, 75.0]
+        scores = self.style["score"].to_numpy(dtype=float)
+        known = scores[np.isfinite(scores)]
+        low, high = np.percentile(known, percentiles) if len(known) else (math.nan, math.nan)
+        return StyleResult(self.style, {}, (float(low), float(high)))
+
+    @property
+    def described_parameters(self) -> tuple[ParameterAxis, ...]:
+        """The parameters of `data.json`, which stand there whatever else a job has written."""
+        axes = []
+        for about in self.data.get("parameters") or ():
+            low, high = _number(about.get("low")), _number(about.get("high"))
+            unit, meaning = str(about.get("unit", "")), str(about.get("meaning", ""))
+            axes.append(ParameterAxis(str(about.get("name")), unit, low, high, meaning))
         return tuple(axes)
 
     @cached_property

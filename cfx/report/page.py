@@ -9,9 +9,8 @@ from typing import Any
 
 from cfx.files import write_output
 from cfx.plots.look import CLUSTER_COLOURS, COLOURS
-from cfx.plots.plotly.figure import Plot
-from cfx.plots.plotly.html import embedded_json, inline_scripts, security_policy
 from cfx.report.job import Runs, calibrations
+from cfx.report.scripts import inline_scripts, security_policy
 from cfx.report.sections import SECTIONS
 from cfx.report.summary import summary
 from cfx.style.result import CLUSTERS
@@ -46,7 +45,7 @@ def render(runs: Runs, title: str | None = None) -> str:
         lstrip_blocks=True,
         loader=jinja2.FunctionLoader(_asset),
     )
-    environment.filters["embedded"] = _embedded
+    environment.filters["placed"] = _placed
     return environment.get_template("page.html.j2").render(_content(runs, title))
 
 
@@ -83,12 +82,13 @@ def _asset(name: str) -> str:
     return (_ASSETS / name).read_text(encoding="utf-8")
 
 
-def _embedded(plot: Plot) -> Any:
-    """Returns a plot as JSON for a script element."""
+def _placed(svg: str, place: str) -> Any:
+    """Returns an `svg` element with ids of its own, at a place of the page."""
     from markupsafe import Markup
 
-    content = {"views": plot.views, "orders": plot.orders, "height": plot.height}
-    return Markup(embedded_json(content))  # noqa: S704 - JSON without any sign that HTML knows
+    from cfx.plots.write import PLACE
+
+    return Markup(svg.replace(PLACE, f"{place}-"))  # noqa: S704 - Matplotlib escapes all texts
 
 
 def _colours() -> str:

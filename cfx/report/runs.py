@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from cfx.errors import DataError
-from cfx.plots.choice.common import natural_order
+from cfx.plots.values import natural_order
 from cfx.report.files import optional, read_json, without_password
 from cfx.report.job import Job, Origin, Runs, Unfinished
 from cfx.report.names import named

@@ -22,7 +22,7 @@ from cfx.config import DemoSettings, JobConfig
 from cfx.evaluation.result import Evaluation, PairTrajectory
 from cfx.files import atomic_write
 from cfx.pairs import PairSet
-from cfx.plots.choice.pairs import evenly_spread
+from cfx.plots.pairs import evenly_spread
 from cfx.simulators.sumo.installed import require_sumo
 from cfx.sumo.demo_request import PolicyKnowledge, ask, fitting_pairs, request_of
 from cfx.sumo.motorway import Motorway, read_motorway

@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from cfx.agents.agent import Agent
 from cfx.evaluation.result import Evaluation
 from cfx.files import atomic_write
-from cfx.plots.choice.trajectories import pair_panels, parameter_axes
 from cfx.plots.look import COLOURS
-from cfx.plots.plotly.figure import Plot
-from cfx.plots.plotly.html import embedded_json, inline_scripts, security_policy
-from cfx.plots.plotly.trajectories import pair_plot
+from cfx.plots.results import Results
 from cfx.plots.words import LABELS
+from cfx.report.scripts import embedded_json, inline_scripts, security_policy
 from cfx.sumo.motorway import Motorway
 from cfx.sumo.replay import CAR_LENGTH, FOLLOWERS
 from cfx.sumo.shown import Array, Shown
@@ -69,6 +67,7 @@ def render(
     rows: list[Any] = []
     for one in shown:
         rows += one.table.to_dict("records")
+    plots = _plots(evaluation)
     vehicles = ("leader", *FOLLOWERS)
     return environment.from_string(_asset("demo.html.j2")).render(
         security=security_policy(scripts),
@@ -76,8 +75,9 @@ def render(
         style=_asset("demo.css"),
         colours={kind: COLOURS[kind] for kind in vehicles},
         labels={kind: LABELS[kind] for kind in vehicles},
-        content=embedded_json(_content(road, shown, evaluation)),
+        content=embedded_json(_content(road, shown, plots)),
         shown=shown,
+        plots=plots,
         rows=rows,
         model=policy.model_node["name"],
         policy=policy.policy_node["name"],
@@ -92,17 +92,15 @@ def _asset(name: str) -> str:
     return (_ASSETS / name).read_text(encoding="utf-8")
 
 
-def _content(road: Motorway, shown: Sequence[Shown], evaluation: Evaluation) -> dict[str, Any]:
+def _content(road: Motorway, shown: Sequence[Shown], plots: Sequence[_Plot]) -> dict[str, Any]:
     """Returns what the script draws.
 
     Positions are centimetres from a corner of the road, so that they are short integers.
     """
     corner = np.concatenate([lane.shape for lane in road.lanes]).min(axis=0)
-    axes = parameter_axes(evaluation)
     pairs = []
-    for one, trajectory in zip(shown, evaluation.trajectories, strict=True):
-        plot = pair_plot(pair_panels(trajectory, evaluation.methods, axes))
-        pairs.append(_pair(one, corner) | {"plot": _plot(plot)})
+    for one, plot in zip(shown, plots, strict=True):
+        pairs.append(_pair(one, corner) | {"axes": plot.axes})
     lanes = []
     for lane in road.lanes:
         shape = _rounded(100 * (lane.shape - corner))
@@ -137,14 +135,38 @@ def _pair(one: Shown, corner: Array) -> dict[str, Any]:
     }
 
 
-def _plot(plot: Plot) -> dict[str, Any]:
-    (view,) = plot.views.values()
-    return {
-        "data": view["data"],
-        "layout": view["layout"],
-        "height": plot.height,
-        "label": plot.label,
-    }
+class _Plot(NamedTuple):
+    """Speeds, gaps and parameters of a pair, and where their axes lie.
+
+    Attributes:
+        svg: the `svg` element.
+        label: for readers who do not see it.
+        axes: of each panel left, top, width and height as shares of the figure, and the seconds at
+            its ends.
+    """
+
+    svg: str
+    label: str
+    axes: list[list[float]]
+
+
+def _plots(evaluation: Evaluation) -> list[_Plot]:
+    """Draws each pair; the axes' places are where the page puts its line of time."""
+    from cfx.plots.trajectories import draw_pair
+    from cfx.plots.write import PLACE, inline_svg
+
+    results = Results.of(evaluation)
+    found = []
+    for k, trajectory in enumerate(evaluation.trajectories):
+        figure = draw_pair(results, trajectory.pair_id)
+        svg = inline_svg(figure).replace(PLACE, f"plot-{k}-")
+        axes = []
+        for one in figure.axes:
+            box, (begin, end) = one.get_position(), one.get_xlim()
+            numbers = (box.x0, 1 - box.y1, box.width, box.height, begin, end)
+            axes.append([round(float(number), 4) for number in numbers])
+        found.append(_Plot(svg, f"Speed, gap and parameters of pair {trajectory.pair_id}", axes))
+    return found
 
 
 def _rounded(values: Array) -> list[Any]:

@@ -13,11 +13,12 @@ from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
 from cfx.evaluation.result import Evaluation
+from cfx.plots.canvas import canvas, styled
 from cfx.plots.look import COLOURS, INK
-from cfx.plots.matplotlib import figures
-from cfx.plots.matplotlib.canvas import canvas, styled
-from cfx.plots.matplotlib.write import write_figure
+from cfx.plots.results import Results
+from cfx.plots.trajectories import drives
 from cfx.plots.words import LABELS, short
+from cfx.plots.write import write_figure
 from cfx.sumo.motorway import Motorway
 from cfx.sumo.replay import CAR_LENGTH, FOLLOWERS
 from cfx.sumo.shown import Shown
@@ -47,7 +48,7 @@ def write_pictures(
     middle = shown[len(shown) // 2]
     together = [one for one in shown if one.scene == middle.scene]
     picture = write_figure(snapshots(road, middle, together), folder / "demo.png")
-    trajectories = figures.pairs(evaluation, [one.pair.pair_id for one in shown])
+    trajectories = drives(Results.of(evaluation), [one.pair.pair_id for one in shown])
     return [picture, write_figure(trajectories, folder / "demo_drives.png")]
 
 

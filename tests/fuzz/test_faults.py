@@ -20,7 +20,7 @@ import cfx.calibration.cache
 import cfx.datasets.tidy
 import cfx.files
 import cfx.job.output
-import cfx.plots.matplotlib.write
+import cfx.plots.write
 from cfx import cli
 from cfx.errors import Terminated
 from tests.broken_plugins import QUICK
@@ -34,7 +34,7 @@ MODULES = (
     cfx.datasets.tidy,
     cfx.files,
     cfx.job.output,
-    cfx.plots.matplotlib.write,
+    cfx.plots.write,
 )
 """Whoever writes files."""
 

@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cfx.plots.choice.calibration import correlations, parameter_spreads, spread_offsets
-from cfx.plots.choice.common import natural_order
-from cfx.plots.choice.improvements import WORST_WITHOUT_CUT, improvement_axis, improvement_bars
-from cfx.plots.choice.jobs import error_dots
-from cfx.plots.choice.pairs import evenly_spread, rank_pairs
-from cfx.plots.choice.style import style_histogram
-from cfx.plots.choice.trajectories import ParameterAxis
+from cfx.plots.calibration import correlations, parameter_spreads, spread_offsets
+from cfx.plots.improvements import WORST_WITHOUT_CUT, improvement_axis, improvement_bars
+from cfx.plots.jobs import error_dots
+from cfx.plots.pairs import evenly_spread, rank_pairs
+from cfx.plots.results import ParameterAxis
+from cfx.plots.style import style_histogram
+from cfx.plots.values import natural_order
 from cfx.plots.words import common_prefix, scope_label, short
 
 GAIN = st.floats(-50, 1) | st.sampled_from([np.nan, -np.inf])

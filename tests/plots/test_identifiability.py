@@ -1,4 +1,4 @@
-"""Slices, fits and labels: what is chosen, and that both back ends show it."""
+"""Slices, fits and labels: what is chosen, drawn and reported."""
 
 from __future__ import annotations
 
@@ -8,10 +8,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cfx.plots.choice.identifiability import fits_of, labels_of, slice_panels
-from cfx.plots.choice.trajectories import ParameterAxis
-from cfx.plots.matplotlib.identifiability import draw_fits, draw_labels, draw_slices
-from cfx.plots.plotly.identifiability import fits_plot, labels_plot, slices_plot
+from cfx.plots.identifiability import (
+    draw_fits,
+    draw_labels,
+    draw_slices,
+    fits_of,
+    labels_of,
+    slice_panels,
+)
+from cfx.plots.results import ParameterAxis
 from cfx.report.runs import read_runs
 from cfx.report.sections import calibration
 from tests.report.folders import write_job
@@ -89,26 +94,16 @@ def test_labels_are_in_the_order_of_time_and_weighted_by_what_they_matter() -> N
     assert labels_of(LABELS, PAIRS.iloc[:0], AXES) == ()
 
 
-def test_both_back_ends_draw_the_same() -> None:
+def test_what_was_chosen_is_drawn() -> None:
     panels = slice_panels(slices(["a", "b", "c"]), AXES)
-    drawn = draw_slices(panels).axes
-    plot = slices_plot(panels)
-    assert list(plot.views) == ["T (s)", "s0 (m)"]
-    for axes, panel, view in zip(drawn, panels, plot.views.values(), strict=False):
+    for axes, panel in zip(draw_slices(panels).axes, panels, strict=False):
         lines = [line.get_ydata() for line in axes.lines]
         np.testing.assert_allclose(lines[len(panel.ratios)], panel.median)
-        assert len(view["data"]) == len(panel.ratios) + 1
     fits = fits_of(FITS)
-    points = draw_fits(fits).axes[0].lines
-    traces = fits_plot(fits).views[""]["data"]
-    for fit, line, trace in zip(fits, points, traces, strict=False):
+    for fit, line in zip(fits, draw_fits(fits).axes[0].lines, strict=False):
         np.testing.assert_allclose(line.get_xdata(), fit.train)
-        assert len(fit.pair_ids) == len(trace["text"])
     (driver,) = labels_of(LABELS, PAIRS, AXES)
-    figure = draw_labels(driver, AXES)
-    assert len(figure.axes) == len(AXES) + 1
-    (view,) = labels_plot([driver], AXES).views.values()
-    assert len(view["data"]) == len(AXES) + 1
+    assert len(draw_labels(driver, AXES).axes) == len(AXES) + 1
 
 
 def test_a_report_shows_them(tmp_path: Path) -> None:
@@ -131,5 +126,5 @@ def test_a_report_shows_them(tmp_path: Path) -> None:
         1.0,
     ]
     blocks = calibration.blocks(runs)
-    plots = [part.plot.label for part in blocks[1].blocks if hasattr(part, "plot")]  # type: ignore[attr-defined] # a fold of parts
+    plots = [part.label for part in blocks[1].blocks if hasattr(part, "views")]  # type: ignore[attr-defined] # a fold of parts
     assert len(plots) == 4, plots

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from cfx.plots.plotly.figure import Plot, view
 from cfx.report import blocks, page
 from cfx.report.blocks import (
     Block,
@@ -22,6 +21,7 @@ from cfx.report.blocks import (
     Section,
     Table,
     Text,
+    View,
 )
 from cfx.report.job import Runs
 from cfx.report.runs import read_runs
@@ -31,7 +31,7 @@ from tests.report.folders import write_job
 from tests.report.test_page import Page
 
 SHEET = Sheet((Column("a heading", "explained so"),), ((text("a cell"),),))
-PLOT = Plot({"": view([], {}, "a note")}, 100, "a plot")
+SVG = '<svg viewBox="0 0 1 1"></svg>'
 EVERY: tuple[Block, ...] = (
     Text("a remark", "note"),
     Heading("a title", "fine print"),
@@ -39,7 +39,7 @@ EVERY: tuple[Block, ...] = (
     Facts((("a name", "a value"),)),
     Listing("a: listing"),
     Table(SHEET, compact=True, explain=True),
-    Figure(PLOT),
+    Figure({"one": View(SVG, "a note"), "another": View(SVG, "no note")}, "a figure", "Show"),
     Grid((Group((Text("in a card"),), "card"),)),
     Fold("a fold", (Fold("a fold inside", (Text("far inside"),)),), unfolded=True),
 )
@@ -74,12 +74,14 @@ def test_a_further_section_needs_nothing_but_its_blocks(
         "explained so",
         "a cell",
         "a note",
+        "another",
         "in a card",
         "a fold",
         "far inside",
         "A further section",
     ):
         assert words in found.words
+    assert "a figure" in found.having("aria-label")
     assert "further" in found.having("id")
     assert "#further" in found.having("href")
     assert "empty" not in found.having("id")

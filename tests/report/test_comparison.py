@@ -162,24 +162,18 @@ def test_jobs_of_an_older_version_have_a_page_without_what_they_did_not_measure(
 
 
 def test_a_default_far_off_does_not_shrink_the_others(tmp_path: Path) -> None:
-    metrics = write_job(tmp_path / "job", pairs=4)
+    write_job(tmp_path / "job", pairs=4)
     (job,) = read_runs([str(tmp_path)]).jobs
     view = absolute([job]).views["speed, test part"]
-    near = max(float(metrics[f"rmse_speed/{method}"] or math.nan) for method in ("fixed", "policy"))
-    assert view["layout"]["xaxis"]["range"][1] == pytest.approx(1.6 * near)
-    assert "1 job with default parameters further off" in view["note"]
+    assert "1 job with default parameters further off" in view.note
 
 
 def test_history_has_a_plot_and_a_table(sweep: Path) -> None:
     page = page_of(sweep)
     (table,) = (table for table in page.tables if "Burn-in" in table[0])
     assert len(table) == 1 + 3 * 4
-    amounts = [
-        content["views"][""]["layout"]["xaxis"].get("categoryarray")
-        for content in page.contents.values()
-        if "" in content["views"]
-    ]
-    assert amounts.count(["0 s", "10 s", "80 %"]) == 3
+    labels = page.having("aria-label")
+    assert labels.count("Improvement by the amount of burn-in") == 3
 
 
 def test_forecasts_have_plots_and_tables(tmp_path: Path) -> None:
@@ -222,8 +216,7 @@ def test_sampled_forecasts_have_a_plot_and_a_table(tmp_path: Path) -> None:
     assert sampled[2].text == f"{0.67 * error:.3f}"
     assert sampled[2].second.endswith(" %")
     assert centre[2].second == ""
-    captions = [content["label"] for content in page.contents.values() if "label" in content]
-    assert not captions or any("PIT" in caption for caption in captions)
+    assert any("PIT" in words for words in page.having("aria-label"))
 
 
 def test_traffic_has_a_plot_and_a_table(tmp_path: Path) -> None:
@@ -276,6 +269,5 @@ def test_the_comparison_fits_a_laptop_and_sorts(
     assert names.all_inner_texts() == once[::-1]
     for plot in page.locator("#comparison .plot, #safety .plot, #history .plot").all():
         if plot.is_visible():
-            plot.scroll_into_view_if_needed()
-            plot.locator(".main-svg").first.wait_for()
+            assert plot.locator("svg").first.is_visible()
     assert browser.errors == []

@@ -101,7 +101,7 @@ def test_the_animation_is_complete_in_itself_and_plays(demo: Path, browser: Brow
 
     page = browser.page
     page.goto((demo / "sumo" / "demo.html").as_uri())
-    page.wait_for_selector("#plot .main-svg")
+    page.wait_for_selector("#plot .view:visible svg")
     assert page.locator("#pair option").count() == 3
     page.locator("#time").fill("130")
     before, pictured = (

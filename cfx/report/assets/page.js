@@ -1,67 +1,11 @@
 "use strict";
 (function () {
-  const PRINTED = 680; // pixels: fits A4 and Letter with the margins that page.css sets
-  const options = {
-    responsive: true,
-    displaylogo: false,
-    modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"],
-    toImageButtonOptions: { format: "png", scale: 2 },
-  };
-  const contents = new Map();
-
-  function content(box) {
-    if (!contents.has(box)) {
-      const held = JSON.parse(document.getElementById(box.id + "-content").textContent);
-      held.view = Object.keys(held.views)[0];
-      held.order = Object.keys(held.orders)[0];
-      contents.set(box, held);
-    }
-    return contents.get(box);
-  }
-
-  function draw(box) {
-    const held = content(box);
-    const view = held.views[held.view];
-    if (held.order !== undefined) {
-      view.layout.xaxis.categoryarray = held.orders[held.order];
-    }
-    document.getElementById(box.id + "-note").textContent = view.note;
-    box.dataset.drawn = "yes";
-    return Plotly.react(box, view.data, view.layout, options);
-  }
-
-  const boxes = Array.from(document.querySelectorAll(".plot"));
-  const soon = new IntersectionObserver(
-    function (entries) {
-      entries.forEach(function (entry) {
-        if (entry.isIntersecting) {
-          soon.unobserve(entry.target);
-          draw(entry.target);
-        }
-      });
-    },
-    { rootMargin: "800px" },
-  );
-  boxes.forEach((box) => soon.observe(box));
-
+  // A choice shows one view of its figure and hides the others.
   document.querySelectorAll("select[data-plot]").forEach(function (choice) {
+    const views = document.getElementById(choice.dataset.plot).querySelectorAll(".view");
     choice.addEventListener("change", function () {
-      const box = document.getElementById(choice.dataset.plot);
-      content(box)[choice.dataset.choose] = choice.value;
-      draw(box);
+      views.forEach((view, k) => (view.hidden = k !== choice.selectedIndex));
     });
-  });
-
-  // On paper every plot that is not folded away is drawn, as wide as the paper.
-  const visible = () => boxes.filter((box) => box.offsetParent !== null);
-  window.addEventListener("beforeprint", function () {
-    visible().forEach(function (box) {
-      if (!box.dataset.drawn) draw(box);
-      Plotly.relayout(box, { autosize: false, width: PRINTED, height: box.clientHeight });
-    });
-  });
-  window.addEventListener("afterprint", function () {
-    visible().forEach((box) => Plotly.relayout(box, { autosize: true, width: null, height: null }));
   });
 
   // The contents mark the section that is being read.

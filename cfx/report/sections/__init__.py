@@ -12,6 +12,7 @@ from cfx.report.sections import (
     drivers,
     errors,
     forecasts,
+    further,
     history,
     learning,
     metrics,
@@ -44,5 +45,6 @@ SECTIONS: tuple[Section, ...] = (
     trajectories.SECTION,
     errors.SECTION,
     learning.SECTION,
+    further.SECTION,
     configurations.SECTION,
 )

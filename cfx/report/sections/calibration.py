@@ -9,51 +9,14 @@ from dataclasses import replace
 import numpy as np
 
 from cfx.calibration.flatness import NEAR
-from cfx.plots.choice.calibration import (
-    AT_BOUND,
-    ParameterSpread,
-    correlations,
-    parameter_spreads,
-)
-from cfx.plots.choice.identifiability import (
-    Fit,
-    SlicePanel,
-    fits_of,
-    labels_of,
-    slice_panels,
-)
-from cfx.plots.choice.trajectories import ParameterAxis
-from cfx.plots.plotly.calibration import calibration_plot
-from cfx.plots.plotly.identifiability import fits_plot, labels_plot, slices_plot
+from cfx.plots.calibration import AT_BOUND, ParameterSpread, parameter_spreads
+from cfx.plots.identifiability import SlicePanel, draw_labels, labels_of, slice_panels
 from cfx.plots.words import number as shown_number
-from cfx.plots.words import unit_label
+from cfx.plots.words import short, unit_label
 from cfx.report.blocks import Block, Figure, Section, Table, Text, job_fold
+from cfx.report.figures import caption, figure_of, view
 from cfx.report.job import Job, Runs, with_constant_baseline
 from cfx.report.tables import Cell, Column, Sheet, formatted, job_names, number, text
-
-_INTRODUCTION = (
-    "Each driver's own parameters (a dot per pair), calibrated on the first part of their"
-    " trajectory; pooled and default parameters beside them. Where values gather at a bound, or"
-    " spread over the whole range, these recordings may hardly determine the parameter."
-)
-
-_SLICES = (
-    "How well the recordings determine each parameter: one is moved from bound to bound, the others"
-    " stay at the driver's calibrated values. Where the loss stays near its best (dashed: 5 %"
-    " above), the parameter is not determined. Where it rises, others might still make up for it."
-)
-
-_FITS = (
-    "Each driver's error on the part of their trajectory that was calibrated on, against that on"
-    " the test part. Where a driver-specific dot lies far above the line, its parameters were"
-    " fitted to more than the driver's style."
-)
-
-_LABELS = (
-    "Per-window calibrated parameters (labels) over time. Pale ones hardly mattered in their"
-    " window, so that their values are arbitrary. The sensitivity below says how much a choice"
-    " mattered, in the objective's unit."
-)
 
 
 def blocks(runs: Runs) -> list[Block]:
@@ -66,29 +29,31 @@ def blocks(runs: Runs) -> list[Block]:
     found: list[Block] = []
     for k, jobs in enumerate(together.values()):
         spreads = spreads_of(jobs[0])
-        table = correlations(jobs[0].pairs, [spread.axis for spread in spreads])
-        parts: list[Block] = [Figure(calibration_plot(spreads, table))]
+        figure = figure_of("calibration", jobs[0])
+        parts: list[Block] = [] if figure is None else [figure]
         panels = slices_of(jobs[0])
-        parts += [Table(sheet(spreads, panels), explain=k == 0), *_beyond(jobs, panels)]
+        parts += [Table(sheet(spreads, panels), explain=k == 0), *_beyond(jobs)]
         found.append(job_fold(job_names(jobs), parts, first=k == 0))
-    return [Text(_INTRODUCTION), *found] if found else []
+    return [Text(caption("calibration")), *found] if found else []
 
 
-def _beyond(jobs: Sequence[Job], panels: Sequence[SlicePanel]) -> list[Block]:
+def _beyond(jobs: Sequence[Job]) -> list[Block]:
     """Returns what calibration found beyond its parameters, as far as a job has kept it."""
     found: list[Block] = []
-    if panels:
-        found += [Text(_SLICES), Figure(slices_plot(panels))]
-    fits: tuple[Fit, ...] = ()
-    if jobs[0].fits is not None:
-        fits = fits_of(jobs[0].fits)
-    if fits:
-        found += [Text(_FITS), Figure(fits_plot(fits))]
+    for name in ("identifiability", "fit_train_test"):
+        figure = figure_of(name, jobs[0])
+        if figure is not None:
+            found += [Text(caption(name)), figure]
     for job in jobs:
-        if job.labels is not None:
-            drivers = labels_of(job.labels, job.pairs, _axes(job))
+        results = job.results
+        if results.labels is not None:
+            drivers = labels_of(results.labels, results.pairs, results.parameters)
             if drivers:
-                found += [Text(_LABELS), Figure(labels_plot(drivers, _axes(job)))]
+                views = {}
+                for driver in drivers:
+                    views[short(driver.pair_id)] = view(draw_labels(driver, results.parameters))
+                title = "Per-window calibrated parameters over time, and how much they mattered"
+                found += [Text(caption("labels_over_time")), Figure(views, title, "Pair")]
                 break
     return found
 
@@ -97,24 +62,12 @@ def slices_of(job: Job) -> tuple[SlicePanel, ...]:
     """Returns the loss along each tuned parameter of a job; () if it has kept none."""
     if job.slices is None:
         return ()
-    return slice_panels(job.slices, _axes(job))
+    return slice_panels(job.slices, job.described_parameters)
 
 
 def spreads_of(job: Job) -> tuple[ParameterSpread, ...]:
     """Returns the spread of each tuned parameter of a job."""
-    return parameter_spreads(job.pairs, _axes(job))
-
-
-def _axes(job: Job) -> list[ParameterAxis]:
-    """Returns the parameters of `data.json`, which stand there whatever else a job has written."""
-    axes = []
-    for about in job.data.get("parameters") or ():
-        low, high = about.get("low"), about.get("high")
-        if isinstance(low, int | float) and isinstance(high, int | float):
-            name, unit = str(about.get("name")), str(about.get("unit", ""))
-            meaning = str(about.get("meaning", ""))
-            axes.append(ParameterAxis(name, unit, float(low), float(high), meaning))
-    return axes
+    return parameter_spreads(job.pairs, job.described_parameters)
 
 
 def _fingerprint(spreads: tuple[ParameterSpread, ...]) -> str:

@@ -7,11 +7,10 @@ from collections.abc import Mapping, Sequence
 import pandas as pd
 
 from cfx.evaluation.statistics import Improvement
-from cfx.plots.choice.jobs import ClusterGroup, cluster_boxes
-from cfx.plots.plotly.figure import Plot
-from cfx.plots.plotly.jobs import clusters_view
+from cfx.plots.jobs import ClusterGroup, cluster_boxes, draw_clusters
 from cfx.plots.words import explained, label
 from cfx.report.blocks import Block, Figure, Fold, Section, Table, Text
+from cfx.report.figures import view
 from cfx.report.job import Job, Runs, any_baselines, with_baseline
 from cfx.report.names import SEPARATOR, differences
 from cfx.report.tables import Cell, Column, Sheet, formatted, interval, number, share, text
@@ -33,7 +32,7 @@ def blocks(runs: Runs) -> list[Block]:
         return []
     baselines = any_baselines(jobs)
     series = cluster_series(jobs)
-    found: list[Block] = [Text(_INTRODUCTION), Figure(per_cluster(series, baselines))]
+    found: list[Block] = [Text(_INTRODUCTION), per_cluster(series, baselines)]
     for k, baseline in enumerate(baselines):
         first = k == 0
         table = Table(clusters(series, baseline), explain=first)
@@ -73,7 +72,7 @@ def _by_cluster(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
     return found
 
 
-def per_cluster(series: Series, baselines: Sequence[str]) -> Plot:
+def per_cluster(series: Series, baselines: Sequence[str]) -> Figure:
     """Distribution of the improvement by cluster; a view per baseline.
 
     Args:
@@ -88,8 +87,9 @@ def per_cluster(series: Series, baselines: Sequence[str]) -> Plot:
             tables = [table for table in by_cluster.values() if column in table]
             if tables:
                 groups.append(_group(name, pd.concat(tables, ignore_index=True), column))
-        views[f"against {label(baseline)}"] = clusters_view(cluster_boxes(groups, baseline))
-    return Plot(views, 440, "Improvement by cluster of driving style")
+        boxes = cluster_boxes(groups, baseline)
+        views[f"against {label(baseline)}"] = view(draw_clusters(boxes), boxes.axis.note)
+    return Figure(views, "Improvement by cluster of driving style")
 
 
 def _group(name: str, pairs: pd.DataFrame, column: str) -> ClusterGroup:

@@ -5,15 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from cfx.evaluation.result import METHODS
 from cfx.metrics.base import MetricInfo
-from cfx.plots.choice.jobs import error_dots
-from cfx.plots.plotly.figure import Plot
-from cfx.plots.plotly.jobs import errors_view
+from cfx.plots.jobs import draw_error_dots, error_dots
 from cfx.plots.words import (
     FULL_TRAJECTORY,
     STEADY,
@@ -22,7 +19,8 @@ from cfx.plots.words import (
     percent,
     short_label,
 )
-from cfx.report.blocks import Block, Figure, Fold, Heading, Section, Table, Text
+from cfx.report.blocks import Block, Figure, Fold, Heading, Section, Table, Text, View
+from cfx.report.figures import view
 from cfx.report.job import Job, Runs, any_baselines, any_has_metric, without_baseline
 from cfx.report.metrics import metric_title
 from cfx.report.tables import Cell, Column, Sheet, formatted, job_names, number, tested, text
@@ -177,7 +175,7 @@ def blocks(runs: Runs) -> list[Block]:
             )
         )
     found += [
-        Figure(absolute(jobs)),
+        absolute(jobs),
         Heading("Is it safe, and smooth?"),
         Text("The numbers are the policy's; the smaller line below is a baseline's."),
         Table(safety(jobs), compact=True, explain=True),
@@ -276,9 +274,9 @@ def every_metric(jobs: Sequence[Job]) -> Sheet | None:
     return Sheet(tuple(columns), tuple(rows))
 
 
-def absolute(jobs: Sequence[Job]) -> Plot:
+def absolute(jobs: Sequence[Job]) -> Figure:
     """Errors of each method in m/s and m; a view for each error and part of the trajectories."""
-    views: dict[str, dict[str, Any]] = {}
+    views: dict[str, View] = {}
     for metric, scope in _ERRORS:
         if not any(job.has_metric(metric, job.judged, scope) for job in jobs):
             continue
@@ -291,9 +289,8 @@ def absolute(jobs: Sequence[Job]) -> Plot:
         names = [job.name for job in jobs]
         what = f"RMSE of {signal}, mean over pairs"
         dots = error_dots(names, values, unit=unit, what=what)
-        views[f"{signal}, {jobs[0].scope_label(scope)}"] = errors_view(dots)
-    height = 134 + 30 * len(jobs)
-    return Plot(views, height, "Errors of every job and method", chooser="RMSE of")
+        views[f"{signal}, {jobs[0].scope_label(scope)}"] = view(draw_error_dots(dots), dots.note)
+    return Figure(views, "Errors of every job and method", chooser="RMSE of")
 
 
 def _shown_error(job: Job, metric: str, method: str, scope: str) -> float:

@@ -8,26 +8,21 @@ from dataclasses import replace
 import pandas as pd
 
 from cfx.evaluation.distributions import (
-    LEVEL,
     centre_errors,
     sampled_methods,
     summarize_distributions,
 )
-from cfx.plots.choice.distributions import distribution_view, sampled_name
-from cfx.plots.plotly.distributions import distributions_plot
-from cfx.report.blocks import Block, Figure, Section, Table, Text, job_fold
-from cfx.report.job import Runs
+from cfx.plots.distributions import sampled_name
+from cfx.report.blocks import Block, Section, Table, Text, job_fold
+from cfx.report.figures import caption, figure_of
+from cfx.report.job import Job, Runs
 from cfx.report.tables import Cell, Column, Sheet, formatted, method_cell, methods_explained, number
 
-_SHARE = f"{100 * LEVEL:.0f} %"
-
+_NAME = "distributions"
 _INTRODUCTION = (
-    "From every moment of the test trajectories several paths were sampled. The CRPS of speed is"
-    " smallest, in the mean, for the distribution that reality is drawn from; that of a single path"
-    " is its absolute error, so the policy's centre, where nothing is drawn, can stand beside it."
-    f" Coverage: the share of moments whose real speed lies in the central {_SHARE} of the sampled"
-    " ones. The last panel has the share of sampled speeds below the real one: flat if the spread"
-    " is right, high at both ends if the paths are too much alike. Means over drivers."
+    "From every moment of the test trajectories several paths were sampled. The CRPS of a single"
+    " path is its absolute error, so the policy's centre, where nothing is drawn, can stand beside"
+    " it. "
 )
 
 
@@ -37,19 +32,22 @@ def blocks(runs: Runs) -> list[Block]:
     methods: dict[str, None] = {}
     for job in runs.jobs:
         if job.distributions is not None and job.forecasts is not None:
-            shown = _job_blocks(job.distributions, job.forecasts)
+            shown = _job_blocks(job, job.distributions, job.forecasts)
             found.append(job_fold(job.name, shown, first=not found))
             methods |= dict.fromkeys(_shown(job.distributions))
     if not found:
         return []
-    return [Text(_INTRODUCTION), Text(f"Methods: {methods_explained(methods)}"), *found]
-
-
-def _job_blocks(table: pd.DataFrame, forecasts: pd.DataFrame) -> list[Block]:
     return [
-        Figure(distributions_plot(distribution_view(table, forecasts))),
-        Table(crps_sheet(table, forecasts)),
+        Text(_INTRODUCTION + caption(_NAME)),
+        Text(f"Methods: {methods_explained(methods)}"),
+        *found,
     ]
+
+
+def _job_blocks(job: Job, table: pd.DataFrame, forecasts: pd.DataFrame) -> list[Block]:
+    figure = figure_of(_NAME, job)
+    parts: list[Block] = [] if figure is None else [figure]
+    return [*parts, Table(crps_sheet(table, forecasts))]
 
 
 def crps_sheet(table: pd.DataFrame, forecasts: pd.DataFrame) -> Sheet:

@@ -8,24 +8,16 @@ from dataclasses import replace
 
 import pandas as pd
 
-from cfx.evaluation.forecasts import SCOPE, errors_by_history, forecast_methods, metric_name
+from cfx.evaluation.forecasts import SCOPE, forecast_methods, metric_name
 from cfx.metrics.base import key_of
-from cfx.plots.choice.forecasts import (
-    HISTORY_TITLE,
-    HORIZON_TITLE,
-    history_panels,
-    horizon_panels,
-)
-from cfx.plots.plotly.forecasts import forecasts_plot
-from cfx.report.blocks import Block, Figure, Group, Heading, Section, Table, Text
+from cfx.report.blocks import Block, Group, Heading, Section, Table, Text
+from cfx.report.figures import caption, figure_of
 from cfx.report.job import Job, Runs
 from cfx.report.tables import Cell, Column, Sheet, formatted, method_cell, methods_explained, number
 
 _INTRODUCTION = (
-    "From each of many moments (origins) of the test trajectories, knowing what was measured up to"
-    " it, where will the driver be some seconds later? RMSE over the origins of each driver, then"
-    " the mean over drivers; below it its 95 % bootstrap interval over drivers. Origins of one"
-    " driver overlap, so they are never counted as independent."
+    " In the tables, the smaller line below is its 95 % bootstrap interval over drivers. Origins of"
+    " one driver overlap, so they are never counted as independent."
 )
 
 _LEADERS = {
@@ -45,40 +37,24 @@ def blocks(runs: Runs) -> list[Block]:
             methods |= dict.fromkeys(forecast_methods(job.forecasts))
     if not cards:
         return []
-    return [Text(_INTRODUCTION), Text(f"Methods: {methods_explained(methods)}"), *cards]
+    return [
+        Text(caption("forecasts") + _INTRODUCTION),
+        Text(f"Methods: {methods_explained(methods)}"),
+        *cards,
+    ]
 
 
 def _job_blocks(job: Job, table: pd.DataFrame) -> list[Block]:
-    methods = forecast_methods(table)
     leader = str(job.setting("protocol.leader"))
-    shown: list[Block] = [
+    parts = [
         Heading(job.name),
         Text(_LEADERS.get(leader, "")),
-        Figure(forecasts_plot(horizon_panels(summary_of(job, table), methods), HORIZON_TITLE)),
+        figure_of("forecasts", job),
         Table(errors(job, table, "rmse_speed", "m/s")),
         Table(errors(job, table, "rmse_position", "m")),
+        figure_of("forecasts_by_history", job),
     ]
-    panels = history_panels(errors_by_history(table), methods)
-    if panels:
-        shown.append(Figure(forecasts_plot(panels, HISTORY_TITLE)))
-    return shown
-
-
-def summary_of(job: Job, table: pd.DataFrame) -> pd.DataFrame:
-    """Returns mean errors by method and horizon, as the job has written them.
-
-    Args:
-        job: of the report.
-        table: its forecasts.
-    """
-    rows = []
-    for method in forecast_methods(table):
-        for horizon in _horizons(table):
-            row: dict[str, object] = {"method": method, "horizon_s": horizon}
-            for error in ("rmse_speed", "rmse_position"):
-                row[error] = job.metric(metric_name(error, horizon), method, SCOPE)
-            rows.append(row)
-    return pd.DataFrame(rows)
+    return [part for part in parts if part is not None]
 
 
 def errors(job: Job, table: pd.DataFrame, error: str, unit: str) -> Sheet:

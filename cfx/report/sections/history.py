@@ -4,18 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from cfx.plots.choice.history import amounts_of, history_curves
-from cfx.plots.plotly.figure import Plot
-from cfx.plots.plotly.history import history_plot
-from cfx.report.blocks import Block, Figure, Group, Heading, Section, Table, Text, cards
+from cfx.plots.history import history_curves
+from cfx.report.blocks import Block, Group, Heading, Section, Table, Text, cards
+from cfx.report.figures import caption, figure_of
 from cfx.report.job import Job, Runs
 from cfx.report.tables import Cell, Column, Sheet, interval, number, share, text
 
-_INTRODUCTION = (
-    "Before the test part, the policy is fed with measured history of the driver, its burn-in. Here"
-    " the same test part after less and after more of it: mean improvement over driver-specific"
-    " calibration, with its 95 % interval."
-)
+_NAME = "history"
 
 
 def blocks(runs: Runs) -> list[Block]:
@@ -25,14 +20,10 @@ def blocks(runs: Runs) -> list[Block]:
         return []
     groups = []
     for job in jobs:
-        groups.append(Group((Heading(job.name), Figure(history(job))), "card"))
-    return [Text(_INTRODUCTION), *cards(groups), Table(histories(jobs))]
-
-
-def history(job: Job) -> Plot:
-    """Improvement of a job by the amount of burn-in; a line per base."""
-    assert job.history is not None
-    return history_plot(history_curves(job.history), amounts_of(job.history))
+        figure = figure_of(_NAME, job)
+        if figure is not None:
+            groups.append(Group((Heading(job.name), figure), "card"))
+    return [Text(caption(_NAME)), *cards(groups), Table(histories(jobs))]
 
 
 def histories(jobs: Sequence[Job]) -> Sheet:

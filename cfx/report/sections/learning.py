@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from cfx.plots.choice.learning import learning_curves
-from cfx.plots.plotly.learning import learning_plot
 from cfx.plots.words import plural
 from cfx.report.blocks import (
     MOST,
     Block,
-    Figure,
     Group,
     Heading,
     Section,
@@ -16,12 +13,10 @@ from cfx.report.blocks import (
     cards,
     missing_file,
 )
+from cfx.report.figures import caption, figure_of
 from cfx.report.job import Runs
 
-_INTRODUCTION = (
-    "Loss by epoch as the learner defines it: the median over the networks and, where there are"
-    " several, the band between the quartiles. A network that stopped early keeps its last loss."
-)
+_NAME = "learning_curve"
 
 
 def blocks(runs: Runs) -> list[Block]:
@@ -33,10 +28,12 @@ def blocks(runs: Runs) -> list[Block]:
         if not len(job.curves):
             without.append(job.name)
             continue
-        chosen = learning_curves(job.curves)
-        heading = Heading(job.name, f"({plural(chosen.networks, 'network')})")
-        groups.append(Group((heading, Figure(learning_plot(chosen))), "card"))
-    found: list[Block] = [Text(_INTRODUCTION), *cards(groups)]
+        networks = int(job.curves["network"].nunique())
+        heading = Heading(job.name, f"({plural(networks, 'network')})")
+        figure = figure_of(_NAME, job)
+        if figure is not None:
+            groups.append(Group((heading, figure), "card"))
+    found: list[Block] = [Text(caption(_NAME)), *cards(groups)]
     if len(without) > MOST:
         found.append(Text(f"Nothing was learned in {len(without)} jobs.", "fine"))
     elif without:

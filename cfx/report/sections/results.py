@@ -8,12 +8,11 @@ import numpy as np
 import pandas as pd
 
 from cfx.metrics.base import SCOPES
-from cfx.plots.choice.jobs import Statistics
-from cfx.plots.choice.jobs import overview as choose_overview
-from cfx.plots.plotly.figure import Plot
-from cfx.plots.plotly.jobs import overview_view
+from cfx.plots.jobs import Statistics, draw_overview
+from cfx.plots.jobs import overview as choose_overview
 from cfx.plots.words import FULL_TRAJECTORY, MINUS, TEST, label
 from cfx.report.blocks import Block, Figure, Heading, Section, Table, Text
+from cfx.report.figures import view
 from cfx.report.job import Job, Runs, any_baselines, with_baseline
 from cfx.report.tables import (
     Cell,
@@ -43,13 +42,13 @@ def blocks(runs: Runs) -> list[Block]:
         found += [
             Heading("How much closer the policy drives"),
             Text(words),
-            Figure(overview(jobs)),
+            overview(jobs),
             Table(improvements(jobs), explain=True),
         ]
     return [*found, Heading("Errors of each method"), Table(errors(jobs), explain=True)]
 
 
-def overview(jobs: Sequence[Job]) -> Plot:
+def overview(jobs: Sequence[Job]) -> Figure:
     """Mean improvement with its 95 % interval; a view per baseline and part of the trajectories."""
     views = {}
     for scope in SCOPES:
@@ -59,10 +58,11 @@ def overview(jobs: Sequence[Job]) -> Plot:
             for job in jobs:
                 if baseline in job.baselines(scope):
                     rows.append(_statistics(job, baseline, scope))
-            view = overview_view(choose_overview(rows, baseline))
-            views[f"against {label(baseline)}{suffix}"] = view
+            chosen = choose_overview(rows, baseline)
+            drawn = view(draw_overview(chosen), chosen.axis.note)
+            views[f"against {label(baseline)}{suffix}"] = drawn
     title = "Mean improvement of each job with its 95 % interval"
-    return Plot(views, 120 + 34 * len(jobs), title)
+    return Figure(views, title)
 
 
 def errors(jobs: Sequence[Job]) -> Sheet:

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from cfx.metrics.base import key_of
-from cfx.plots.choice.platoon import platoon_panels
-from cfx.plots.plotly.figure import Plot
-from cfx.plots.plotly.platoon import platoon_plot
 from cfx.plots.words import MINUS
-from cfx.report.blocks import Block, Figure, Fold, Heading, Section, Table, Text, job_fold
+from cfx.report.blocks import Block, Fold, Heading, Section, Table, Text, job_fold
+from cfx.report.figures import caption, figure_of
 from cfx.report.job import Job, Runs
 from cfx.report.tables import Column, Sheet, formatted, method_cell, number, text
 
@@ -36,14 +33,6 @@ _METHODS = (
     " share of frames at a limit of acceleration, where the guard steps in. Outside: share of"
     " frames outside what the policy has learned from."
 )
-_PLATOONS = (
-    "All followers use the same method, each behind the vehicle ahead; the leader brakes from 15 to"
-    " 7 m/s at 2 m/s², waits 10 s and recovers at 1 m/s². A string stable platoon damps the"
-    " disturbance: no vehicle slows down more than the vehicle ahead. One that had not settled"
-    " before, or in which vehicles collide, does not count as stable. Dark lines are the first"
-    " followers, light ones the last. Of several networks the one is shown whose last follower"
-    " becomes slowest."
-)
 _OLDER = "An older version of cfx wrote these jobs: they have no measure of it but the collisions."
 
 
@@ -57,11 +46,13 @@ def blocks(runs: Runs) -> list[Block]:
     for job in runs.jobs:
         for scope, words in job.outside.items():
             found.append(Text(f"{job.name}, {job.scope_label(scope)}: {words}."))
-    with_platoon = [job for job in runs.jobs if job.platoon is not None]
-    if with_platoon:
-        found += [Heading("Ten followers in a row"), Text(_PLATOONS)]
-    for k, job in enumerate(with_platoon):
-        found.append(job_fold(job.name, [Figure(platoon(job))], first=k == 0))
+    folds: list[Block] = []
+    for job in runs.jobs:
+        figure = figure_of("platoon", job)
+        if figure is not None:
+            folds.append(job_fold(job.name, [figure], first=not folds))
+    if folds:
+        found += [Heading("Ten followers in a row"), Text(caption("platoon")), *folds]
     return found
 
 
@@ -87,21 +78,6 @@ def safety_of_methods(jobs: Sequence[Job]) -> Sheet:
             if any(cell.sort for cell in cells):
                 rows.append((text(job.name), method_cell(method), *cells))
     return Sheet(tuple(columns), tuple(rows), groups)
-
-
-def platoon(job: Job) -> Plot:
-    """Speeds of the platoons of a job that has them, a panel per method."""
-    assert job.platoon is not None
-    present = set(job.platoon["method"])
-    methods, stable = [], {}
-    for method in job.meaningful_methods:
-        if method not in present:
-            continue
-        methods.append(method)
-        key = key_of("platoon/string_stable", method)
-        if key in job.metrics:
-            stable[method] = job.metrics[key]
-    return platoon_plot(platoon_panels(job.platoon, methods, stable))
 
 
 SECTION = Section("safety", "Safety and string stability", "Safety", blocks)

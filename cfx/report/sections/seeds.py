@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cfx.plots.choice.common import finite
+from cfx.plots.values import finite
 from cfx.plots.words import explained, percent, short_label
 from cfx.report.blocks import Block, Section, Table, Text
 from cfx.report.grouped import Row, baselines_of, methods_of, rows_over_seeds

@@ -8,10 +8,9 @@ import pandas as pd
 
 from cfx.evaluation.traffic.result import traffic_methods
 from cfx.metrics.base import RECORDED, key_of
-from cfx.plots.choice.traffic import traffic_panels
-from cfx.plots.plotly.traffic import traffic_plot
 from cfx.plots.words import MINUS
-from cfx.report.blocks import Block, Figure, Section, Table, Text, job_fold
+from cfx.report.blocks import Block, Section, Table, Text, job_fold
+from cfx.report.figures import figure_of
 from cfx.report.job import Job, Runs
 from cfx.report.tables import Cell, Column, Sheet, formatted, method_cell, methods_explained, number
 
@@ -83,16 +82,8 @@ def blocks(runs: Runs) -> list[Block]:
 
 
 def _job_blocks(job: Job, roads: pd.DataFrame) -> list[Block]:
-    shown: list[Block] = []
-    if job.traffic_growth is not None and job.traffic_strips is not None:
-        panels = traffic_panels(
-            roads,
-            job.traffic_growth,
-            job.traffic_strips,
-            job.metrics.get(f"traffic/wave_speed/{RECORDED}", math.nan),
-            traffic_methods(roads),
-        )
-        shown.append(Figure(traffic_plot(panels)))
+    figure = figure_of("traffic", job)
+    shown: list[Block] = [] if figure is None else [figure]
     shown.append(Table(traffic_sheet(job, roads), explain=True))
     return shown
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 
-from cfx.plots.choice.pairs import RankedPair, rank_pairs
-from cfx.plots.choice.trajectories import pair_panels
-from cfx.plots.plotly.figure import Plot
-from cfx.plots.plotly.trajectories import pair_plot
+from cfx.plots.pairs import RankedPair, rank_pairs
+from cfx.plots.trajectories import draw_pair
 from cfx.plots.words import percent_or_undefined, short_label
 from cfx.report.blocks import (
     Block,
@@ -19,6 +17,7 @@ from cfx.report.blocks import (
     job_fold,
     missing_file,
 )
+from cfx.report.figures import shown
 from cfx.report.job import Job, Runs, calibrations
 
 _ADAPTING = (
@@ -26,17 +25,14 @@ _ADAPTING = (
     " one that improves least, on the test part."
 )
 _CONSTANT = "Of a calibration: the pairs with the least, the median and the largest RMSE of speed."
-_CONTROLS = (
-    "A click on the legend hides a method in all"
-    " panels; drag to zoom, double-click to come back. Thin lines mark the bounds of a parameter."
-)
+_BOUNDS = "What lies outside a parameter's bounds is shaded."
 
 
 def blocks(runs: Runs) -> list[Block]:
     """Returns the chosen pairs of each job."""
     jobs = [job for job in runs.jobs if job.trajectories is not None]
     constant = calibrations(jobs)
-    chosen = [_CONTROLS]
+    chosen = [_BOUNDS]
     if constant:
         chosen.insert(0, _CONSTANT)
     if len(constant) < len(jobs):
@@ -46,7 +42,7 @@ def blocks(runs: Runs) -> list[Block]:
         groups = []
         for pair in chosen_pairs(job):
             heading = Heading(_title(job, pair), _errors(job, pair))
-            parts = (heading, Figure(pair_of(job, pair.pair_id)))
+            parts = (heading, pair_of(job, pair.pair_id))
             groups.append(Group(parts))
         found.append(job_fold(job.name, groups, first=k == 0))
     what = "speed, gap and parameters over time"
@@ -64,12 +60,10 @@ def chosen_pairs(job: Job) -> tuple[RankedPair, ...]:
     return rank_pairs(table["pair_id"].astype(str).tolist(), gains)
 
 
-def pair_of(job: Job, pair_id: str) -> Plot:
+def pair_of(job: Job, pair_id: str) -> Figure:
     """Speed, gap and each tuned parameter of one pair of a job."""
-    for trajectory in job.pair_trajectories:
-        if trajectory.pair_id == pair_id:
-            return pair_plot(pair_panels(trajectory, job.meaningful_methods, job.parameters))
-    raise KeyError(pair_id)
+    title = f"Speed, gap and parameters of pair {pair_id}"
+    return shown(draw_pair(job.results, pair_id), title)
 
 
 def _title(job: Job, pair: RankedPair) -> str:

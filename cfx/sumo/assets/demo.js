@@ -127,24 +127,16 @@
     });
   }
 
+  // A line in each panel at the moment that the road shows.
   function drawCursor() {
-    const full = plot._fullLayout;
-    if (!full) return;
     const seconds = frame * pair.dt;
-    Object.keys(full).filter((key) => /^xaxis\d*$/.test(key)).forEach(function (key) {
-      const across = full[key], down = full[across.anchor === "y" ? "yaxis" : "yaxis" + across.anchor.slice(1)];
-      let line = plot.querySelector('[data-axis="' + key + '"]');
-      if (!line) {
-        line = document.createElement("div");
-        line.className = "now";
-        line.dataset.axis = key;
-        plot.appendChild(line);
-      }
-      const inside = across.l2p(seconds);
-      line.hidden = inside < 0 || inside > across._length;
-      line.style.left = across._offset + inside + "px";
-      line.style.top = down._offset + "px";
-      line.style.height = down._length + "px";
+    const lines = plot.querySelectorAll(".now");
+    pair.axes.forEach(function ([left, top, width, height, begin, end], k) {
+      const inside = (seconds - begin) / (end - begin);
+      lines[k].hidden = inside < 0 || inside > 1;
+      lines[k].style.left = 100 * (left + inside * width) + "%";
+      lines[k].style.top = 100 * top + "%";
+      lines[k].style.height = 100 * height + "%";
     });
   }
 
@@ -175,9 +167,13 @@
     pair.span = Math.max(...reach) + pair.leaderLength + content.carLength;
     slider.max = String(last(pair));
     frame = Math.max(0, pair.first - LEAD_IN / pair.dt);
-    plot.style.height = pair.plot.height + "px";
-    plot.setAttribute("aria-label", pair.plot.label);
-    Plotly.react(plot, pair.plot.data, pair.plot.layout, { responsive: true, displaylogo: false }).then(draw);
+    plot.querySelectorAll(".view").forEach((view, k) => (view.hidden = k !== number));
+    plot.querySelectorAll(".now").forEach((line) => line.remove());
+    pair.axes.forEach(function () {
+      const line = document.createElement("div");
+      line.className = "now";
+      plot.appendChild(line);
+    });
     draw();
   }
 

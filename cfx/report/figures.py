@@ -1,0 +1,36 @@
+"""Figures of a page: those that jobs write, and others that the page alone has."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from cfx.plots.figure import figure
+from cfx.report.blocks import Figure, View
+from cfx.report.job import Job
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Drawing
+
+
+def figure_of(name: str, job: Job) -> Figure | None:
+    """Returns the figure of that name as the job has written it; None if the job lacks its data."""
+    found = figure(name)
+    drawing = found.draw(job.results)
+    return None if drawing is None else shown(drawing, found.figure.title)
+
+
+def caption(name: str) -> str:
+    """Returns what a reader needs to know of the figure of that name."""
+    return figure(name).figure.caption
+
+
+def shown(drawing: Drawing, label: str) -> Figure:
+    """Returns a drawing as a figure of the page with one view."""
+    return Figure({"": view(drawing)}, label)
+
+
+def view(drawing: Drawing, note: str = "") -> View:
+    """Returns a drawing as one view of a figure."""
+    from cfx.plots.write import inline_svg
+
+    return View(inline_svg(drawing), note)
