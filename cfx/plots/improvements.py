@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from cfx.evaluation.result import Improvement
+from cfx.evaluation.statistics import Improvement
 from cfx.plots.canvas import Dash, canvas, hover, percent_axis, say, styled
 from cfx.plots.figure import JobFigure
 from cfx.plots.look import COLOURS, INK

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from cfx.metrics.base import TRANSIENT_S
+from cfx.simulation.trajectory import TRANSIENT_S
 
 if TYPE_CHECKING:
     from cfx.evaluation.forecasts import Forecasts
-    from cfx.evaluation.result import Evaluation, Improvement, PairTrajectory
+    from cfx.evaluation.result import Evaluation, PairTrajectory
+    from cfx.evaluation.statistics import Improvement
     from cfx.evaluation.traffic.result import Traffic
     from cfx.style.result import StyleResult
 

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from cfx.evaluation.result import METHODS, STATISTICS, PairTrajectory
-from cfx.evaluation.statistics import Improvement
+from cfx.evaluation.result import METHODS, PairTrajectory
+from cfx.evaluation.statistics import STATISTICS, Improvement
 from cfx.metrics.base import RECORDED, MetricInfo, key_of
 from cfx.plots.results import ParameterAxis, Results
 from cfx.plots.words import TEST, scope_label
