@@ -14,7 +14,7 @@ from cfx.plots.identifiability import SlicePanel, draw_labels, labels_of, slice_
 from cfx.plots.words import number as shown_number
 from cfx.plots.words import short, unit_label
 from cfx.report.blocks import Block, Figure, Section, Table, Text, job_fold
-from cfx.report.figures import caption, figure_of, view
+from cfx.report.figure_blocks import caption, figure_of, view
 from cfx.report.job import Job, Runs, with_constant_baseline
 from cfx.report.tables import Cell, Column, Sheet, formatted, job_names, number, text
 

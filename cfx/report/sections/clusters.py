@@ -10,7 +10,7 @@ from cfx.evaluation.statistics import Improvement
 from cfx.plots.jobs import ClusterGroup, cluster_boxes, draw_clusters
 from cfx.plots.words import explained, label
 from cfx.report.blocks import Block, Figure, Fold, Section, Table, Text
-from cfx.report.figures import view
+from cfx.report.figure_blocks import view
 from cfx.report.job import Job, Runs, any_baselines, with_baseline
 from cfx.report.names import SEPARATOR, differences
 from cfx.report.tables import Cell, Column, Sheet, formatted, interval, number, share, text

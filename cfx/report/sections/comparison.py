@@ -20,7 +20,7 @@ from cfx.plots.words import (
     short_label,
 )
 from cfx.report.blocks import Block, Figure, Fold, Heading, Section, Table, Text, View
-from cfx.report.figures import view
+from cfx.report.figure_blocks import view
 from cfx.report.job import Job, Runs, any_baselines, any_has_metric, without_baseline
 from cfx.report.metrics import metric_title
 from cfx.report.tables import Cell, Column, Sheet, formatted, job_names, number, tested, text

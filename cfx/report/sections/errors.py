@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cfx.report.blocks import Block, Section, Text, job_fold
-from cfx.report.figures import caption, figure_of
+from cfx.report.figure_blocks import caption, figure_of
 from cfx.report.job import Runs
 
 _NAME = "error_over_time"

@@ -11,7 +11,7 @@ import pandas as pd
 from cfx.evaluation.forecasts import SCOPE, forecast_methods, metric_name
 from cfx.metrics.base import key_of
 from cfx.report.blocks import Block, Group, Heading, Section, Table, Text
-from cfx.report.figures import caption, figure_of
+from cfx.report.figure_blocks import caption, figure_of
 from cfx.report.job import Job, Runs
 from cfx.report.tables import Cell, Column, Sheet, formatted, method_cell, methods_explained, number
 

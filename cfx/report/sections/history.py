@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from cfx.plots.history import history_curves
 from cfx.report.blocks import Block, Group, Heading, Section, Table, Text, cards
-from cfx.report.figures import caption, figure_of
+from cfx.report.figure_blocks import caption, figure_of
 from cfx.report.job import Job, Runs
 from cfx.report.tables import Cell, Column, Sheet, interval, number, share, text
 

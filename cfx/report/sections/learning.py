@@ -13,7 +13,7 @@ from cfx.report.blocks import (
     cards,
     missing_file,
 )
-from cfx.report.figures import caption, figure_of
+from cfx.report.figure_blocks import caption, figure_of
 from cfx.report.job import Runs
 
 _NAME = "learning_curve"

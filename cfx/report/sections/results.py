@@ -12,7 +12,7 @@ from cfx.plots.jobs import Statistics, draw_overview
 from cfx.plots.jobs import overview as choose_overview
 from cfx.plots.words import FULL_TRAJECTORY, MINUS, TEST, label
 from cfx.report.blocks import Block, Figure, Heading, Section, Table, Text
-from cfx.report.figures import view
+from cfx.report.figure_blocks import view
 from cfx.report.job import Job, Runs, any_baselines, with_baseline
 from cfx.report.tables import (
     Cell,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from cfx.plots.words import MINUS
 from cfx.report.blocks import Block, Fold, Heading, Section, Table, Text, job_fold
-from cfx.report.figures import caption, figure_of
+from cfx.report.figure_blocks import caption, figure_of
 from cfx.report.job import Job, Runs
 from cfx.report.tables import Column, Sheet, formatted, method_cell, number, text
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 
 from cfx.report.blocks import Block, Grid, Group, Heading, Section, Text, missing_file
-from cfx.report.figures import caption, figure_of
+from cfx.report.figure_blocks import caption, figure_of
 from cfx.report.job import Job, Runs
 
 _NAME = "style_distribution"

@@ -17,7 +17,7 @@ from cfx.report.blocks import (
     job_fold,
     missing_file,
 )
-from cfx.report.figures import shown
+from cfx.report.figure_blocks import shown
 from cfx.report.job import Job, Runs, calibrations
 
 _ADAPTING = (
