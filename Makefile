@@ -88,7 +88,7 @@ dist: $(VENV)/.ready-test
 	rm -rf .venv-dist
 
 conf: $(VENV)/.ready
-	$(BIN)/python -m cfx.nodes
+	$(BIN)/python -m cfx.app.nodes
 
 # The stamps are made again when what they were made from changes, so a second `make run` installs nothing.
 # What README's commands need comes from plugins/ too: the readers of published recordings, the benchmark.

@@ -3,8 +3,8 @@
     result = cfx.run(["data=tidy", "data.path=pairs.parquet", "model=w99", "policy=gru"])
     result.metrics["rmse_improvement/mean"]
 
-The names below, `cfx.errors` and `cfx.contracts` are the public API; everything else may change.
-Importing cfx imports nothing heavy: each name is loaded when it is first used.
+The names below, `cfx.core.errors` and `cfx.contracts` are the public API; everything else may
+change. Importing cfx imports nothing heavy: each name is loaded when it is first used.
 """
 
 from __future__ import annotations
@@ -14,47 +14,47 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from cfx import errors as errors
-    from cfx.application import run as run
-    from cfx.commands.base import Command as Command
-    from cfx.component import API_VERSION as API_VERSION
-    from cfx.component import Settings as Settings
-    from cfx.datasets.base import Dataset as Dataset
-    from cfx.datasets.base import DatasetSettings as DatasetSettings
-    from cfx.engine.base import Engine as Engine
-    from cfx.job import JobResult as JobResult
-    from cfx.job import load as load
+    from cfx.app.application import run as run
+    from cfx.app.job import JobResult as JobResult
+    from cfx.app.job import load as load
+    from cfx.calibration.objectives.base import FrameValues as FrameValues
+    from cfx.calibration.objectives.base import Objective as Objective
+    from cfx.calibration.optimizers.base import CandidateLosses as CandidateLosses
+    from cfx.calibration.optimizers.base import Optimizer as Optimizer
+    from cfx.core import errors as errors
+    from cfx.core.command import Command as Command
+    from cfx.core.component import API_VERSION as API_VERSION
+    from cfx.core.component import Settings as Settings
+    from cfx.core.engine.base import Engine as Engine
+    from cfx.core.parameters import Parameter as Parameter
+    from cfx.core.parameters import ParameterSpace as ParameterSpace
+    from cfx.core.registry import get as get
+    from cfx.data.base import Dataset as Dataset
+    from cfx.data.base import DatasetSettings as DatasetSettings
+    from cfx.data.pairs import Pair as Pair
+    from cfx.data.pairs import PairBatch as PairBatch
+    from cfx.data.pairs import PairSet as PairSet
+    from cfx.evaluation.metrics.base import Metric as Metric
+    from cfx.evaluation.metrics.base import Trajectories as Trajectories
+    from cfx.evaluation.protocols.base import Protocol as Protocol
+    from cfx.evaluation.protocols.base import ProtocolContext as ProtocolContext
+    from cfx.evaluation.protocols.base import ProtocolResult as ProtocolResult
     from cfx.learners.base import Learner as Learner
     from cfx.learners.base import TrainingData as TrainingData
     from cfx.learners.base import TrainingResult as TrainingResult
-    from cfx.metrics.base import Metric as Metric
-    from cfx.metrics.base import Trajectories as Trajectories
     from cfx.models.base import DrivingModel as DrivingModel
     from cfx.models.base import Follower as Follower
     from cfx.models.base import Leader as Leader
     from cfx.models.base import ModelSettings as ModelSettings
     from cfx.models.base import bumper_gap as bumper_gap
-    from cfx.objectives.base import FrameValues as FrameValues
-    from cfx.objectives.base import Objective as Objective
-    from cfx.optimizers.base import CandidateLosses as CandidateLosses
-    from cfx.optimizers.base import Optimizer as Optimizer
-    from cfx.pairs import Pair as Pair
-    from cfx.pairs import PairBatch as PairBatch
-    from cfx.pairs import PairSet as PairSet
-    from cfx.parameters import Parameter as Parameter
-    from cfx.parameters import ParameterSpace as ParameterSpace
     from cfx.policies.base import Policy as Policy
     from cfx.policies.base import PolicyNetwork as PolicyNetwork
     from cfx.policies.base import PolicySettings as PolicySettings
-    from cfx.protocols.base import Protocol as Protocol
-    from cfx.protocols.base import ProtocolContext as ProtocolContext
-    from cfx.protocols.base import ProtocolResult as ProtocolResult
-    from cfx.registry import get as get
     from cfx.simulation.base import Stepper as Stepper
     from cfx.simulation.rollout import simulate as simulate
+    from cfx.simulation.simulator import Simulator as Simulator
+    from cfx.simulation.simulator import SimulatorSettings as SimulatorSettings
     from cfx.simulation.trajectory import Start as Start
-    from cfx.simulators.base import Simulator as Simulator
-    from cfx.simulators.base import SimulatorSettings as SimulatorSettings
 
     __version__: str
 
@@ -62,46 +62,46 @@ if TYPE_CHECKING:
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
 
 _HOMES = {
-    "run": "cfx.application",
-    "get": "cfx.registry",
+    "run": "cfx.app.application",
+    "get": "cfx.core.registry",
     "simulate": "cfx.simulation.rollout",
-    "load": "cfx.job",
-    "JobResult": "cfx.job",
-    "Dataset": "cfx.datasets.base",
-    "DatasetSettings": "cfx.datasets.base",
+    "load": "cfx.app.job",
+    "JobResult": "cfx.app.job",
+    "Dataset": "cfx.data.base",
+    "DatasetSettings": "cfx.data.base",
     "DrivingModel": "cfx.models.base",
     "Follower": "cfx.models.base",
     "Leader": "cfx.models.base",
     "ModelSettings": "cfx.models.base",
     "bumper_gap": "cfx.models.base",
     "Start": "cfx.simulation.trajectory",
-    "Simulator": "cfx.simulators.base",
-    "SimulatorSettings": "cfx.simulators.base",
+    "Simulator": "cfx.simulation.simulator",
+    "SimulatorSettings": "cfx.simulation.simulator",
     "Stepper": "cfx.simulation.base",
-    "Engine": "cfx.engine.base",
-    "Optimizer": "cfx.optimizers.base",
-    "CandidateLosses": "cfx.optimizers.base",
-    "Objective": "cfx.objectives.base",
-    "FrameValues": "cfx.objectives.base",
+    "Engine": "cfx.core.engine.base",
+    "Optimizer": "cfx.calibration.optimizers.base",
+    "CandidateLosses": "cfx.calibration.optimizers.base",
+    "Objective": "cfx.calibration.objectives.base",
+    "FrameValues": "cfx.calibration.objectives.base",
     "Policy": "cfx.policies.base",
     "PolicySettings": "cfx.policies.base",
     "PolicyNetwork": "cfx.policies.base",
     "Learner": "cfx.learners.base",
     "TrainingData": "cfx.learners.base",
     "TrainingResult": "cfx.learners.base",
-    "Protocol": "cfx.protocols.base",
-    "ProtocolContext": "cfx.protocols.base",
-    "ProtocolResult": "cfx.protocols.base",
-    "Metric": "cfx.metrics.base",
-    "Trajectories": "cfx.metrics.base",
-    "Command": "cfx.commands.base",
-    "Parameter": "cfx.parameters",
-    "ParameterSpace": "cfx.parameters",
-    "Settings": "cfx.component",
-    "API_VERSION": "cfx.component",
-    "Pair": "cfx.pairs",
-    "PairSet": "cfx.pairs",
-    "PairBatch": "cfx.pairs",
+    "Protocol": "cfx.evaluation.protocols.base",
+    "ProtocolContext": "cfx.evaluation.protocols.base",
+    "ProtocolResult": "cfx.evaluation.protocols.base",
+    "Metric": "cfx.evaluation.metrics.base",
+    "Trajectories": "cfx.evaluation.metrics.base",
+    "Command": "cfx.core.command",
+    "Parameter": "cfx.core.parameters",
+    "ParameterSpace": "cfx.core.parameters",
+    "Settings": "cfx.core.component",
+    "API_VERSION": "cfx.core.component",
+    "Pair": "cfx.data.pairs",
+    "PairSet": "cfx.data.pairs",
+    "PairBatch": "cfx.data.pairs",
 }
 
 __all__ = [  # noqa: PLE0604 - the public names, from the one table that also says where they live
@@ -114,8 +114,10 @@ __all__ = [  # noqa: PLE0604 - the public names, from the one table that also sa
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
         value = getattr(import_module(_HOMES[name]), name)
-    elif name in {"errors", "sumo"}:
-        value = import_module(f"cfx.{name}")
+    elif name == "errors":
+        value = import_module("cfx.core.errors")
+    elif name == "sumo":
+        value = import_module("cfx.sumo")
     elif name == "__version__":
         value = _version()
     else:

@@ -1,5 +1,5 @@
 """`python -m cfx`: the same program as the command `cfx`."""
 
-from cfx.cli import program
+from cfx.app.cli import program
 
 program()

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from cfx.data.pairs import Pair, PairSet
 from cfx.models.base import DrivingModel, Leader
-from cfx.pairs import Pair, PairSet
 from cfx.simulation.rollout import simulate
 from cfx.simulation.trajectory import Start
 

@@ -9,15 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from cfx.core.parameters import Parameter, ParameterSpace
+from cfx.data.style.result import CLUSTERS, StyleResult
 from cfx.evaluation.distributions import DISTRIBUTION_COLUMNS
 from cfx.evaluation.forecasts import FORECAST_COLUMNS, FORECAST_METHODS, Forecasts
+from cfx.evaluation.metrics.base import MetricInfo
 from cfx.evaluation.result import Evaluation, PairTrajectory, Platoon
 from cfx.evaluation.statistics import Improvement
 from cfx.evaluation.tables import VALUE_COLUMNS
 from cfx.evaluation.traffic.result import ROAD_COLUMNS, Traffic
-from cfx.metrics.base import MetricInfo
-from cfx.parameters import Parameter, ParameterSpace
-from cfx.style.result import CLUSTERS, StyleResult
 
 TWO = ParameterSpace.of(
     Parameter("t_r", "s", 0.1, 10.0, 1.5, "reaction time"),

@@ -7,8 +7,8 @@ import tomllib
 import pytest
 import yaml
 
-from cfx import cli
-from cfx.commands import cite
+from cfx.app import cli
+from cfx.app.commands import cite
 from tests.conftest import ROOT
 
 

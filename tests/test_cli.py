@@ -15,17 +15,18 @@ import pytest
 from hydra.core.hydra_config import HydraConfig
 
 import cfx
-from cfx import application, cli, registry, ui
-from cfx.datasets.tidy import write_tidy
-from cfx.errors import CfxError, ConfigError, DataError
-from cfx.tracking.store import open_store
+from cfx.app import application, cli, ui
+from cfx.core import registry
+from cfx.core.errors import CfxError, ConfigError, DataError
+from cfx.data.tidy import write_tidy
+from cfx.results.store import open_store
 from tests.conftest import ROOT
 from tests.drives import straight_pairs
 
 JOB = """
     import logging, os, signal, sys, time
     from dataclasses import dataclass
-    from cfx.errors import DataError
+    from cfx.core.errors import DataError
 
     log = logging.getLogger("cfx.jobs_stub")
 
@@ -259,7 +260,7 @@ def test_a_multirun_in_worker_processes_composes_a_plugin_and_reports_failures(
 ) -> None:
     install("mine-data", {"cfx.datasets": {"mine": "mine_data:Mine"}}, {"mine_data.py": PLUGIN})
     script = (
-        "import sys; from cfx.application import start;"
+        "import sys; from cfx.app.application import start;"
         " sys.exit(start(sys.argv[1:], target='jobs_stub:run_job'))"
     )
     arguments = [
@@ -508,7 +509,7 @@ def test_a_signal_that_comes_early_has_its_exit_code(
     """Before the application is there; a machine that is slower is hit even earlier."""
     ready = tmp_path / "ready"
     script = (
-        "import pathlib, signal, sys; from cfx.cli import program;"
+        "import pathlib, signal, sys; from cfx.app.cli import program;"
         # Who starts the tests in the background makes their processes deaf to Ctrl-C.
         " signal.signal(signal.SIGINT, signal.default_int_handler);"
         f" pathlib.Path({str(ready)!r}).touch();"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from cfx import cli
+from cfx.app import cli
 
 
 @pytest.fixture

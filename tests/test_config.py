@@ -13,10 +13,12 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from pydantic import Field, ValidationError
 
-from cfx import DrivingModel, Parameter, ParameterSpace, Settings, hydra_source, nodes, registry
-from cfx.config import JobConfig
-from cfx.errors import ConfigError, PluginError
-from cfx.hydra_source import path_override
+from cfx import DrivingModel, Parameter, ParameterSpace, Settings
+from cfx.app import hydra_source, nodes
+from cfx.app.hydra_source import path_override
+from cfx.core import registry
+from cfx.core.errors import ConfigError, PluginError
+from cfx.results.config import JobConfig
 
 CONF = nodes.conf_dir()
 
@@ -286,7 +288,7 @@ def test_truth_is_no_number(override: str, message: str) -> None:
 def test_a_password_in_the_tracking_uri_is_refused_before_anything_is_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from cfx import cli
+    from cfx.app import cli
 
     folder = tmp_path / "job"
     uri = "tracking.uri=postgresql://me:secret@host/db"
@@ -302,7 +304,7 @@ def test_a_password_in_the_tracking_uri_is_refused_before_anything_is_written(
 def test_more_threads_than_cores_are_not_used(caplog: pytest.LogCaptureFixture) -> None:
     import torch
 
-    from cfx.simulation.threads import cores, set_threads
+    from cfx.core.threads import cores, set_threads
 
     before = torch.get_num_threads()
     try:

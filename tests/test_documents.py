@@ -13,8 +13,8 @@ import torch
 import yaml
 
 import cfx
-from cfx import registry
-from cfx.hydra_source import composed
+from cfx.app.hydra_source import composed
+from cfx.core import registry
 from cfx.models.base import DrivingModel
 from tests.conftest import ROOT
 from tests.drives import straight_pairs

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 import cfx
-from cfx import cli, hydra_source, nodes
+from cfx.app import cli, hydra_source, nodes
 
 FOLDER = nodes.conf_dir() / "experiment"
 NAMES = sorted(str(path.relative_to(FOLDER).with_suffix("")) for path in FOLDER.rglob("*.yaml"))

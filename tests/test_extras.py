@@ -9,9 +9,9 @@ import pytest
 from hydra.errors import MissingConfigException
 
 import cfx
-from cfx import extras, registry
-from cfx.errors import PluginError
-from cfx.user_errors import explain
+from cfx.app.user_errors import explain
+from cfx.core import extras, registry
+from cfx.core.errors import PluginError
 from tests.conftest import ROOT
 
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cfx import cli
-from cfx.datasets.tidy import write_tidy
-from cfx.pairs import Pair, PairSet
+from cfx.app import cli
+from cfx.data.pairs import Pair, PairSet
+from cfx.data.tidy import write_tidy
 
 DT = 0.1
 LENGTH = 5.0

@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 import cfx
-from cfx import cli
+from cfx.app import cli
 from cfx.report.runs import read_runs
 from cfx.report.sections import calibration
 from cfx.report.tables import formatted

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from cfx import cli
-from cfx.errors import CfxError
-from cfx.files import atomic_write, remove_leftovers
-from cfx.job import steps
+from cfx.app import cli
+from cfx.app.job import steps
+from cfx.core.errors import CfxError
+from cfx.core.files import atomic_write, remove_leftovers
 from tests.broken_plugins import QUICK
 
 

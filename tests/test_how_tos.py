@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 import cfx
-from cfx.datasets.synthetic import SyntheticDataset
-from cfx.datasets.tidy import write_tidy
+from cfx.data.tidy import write_tidy
+from cfx.simulation.synthetic import SyntheticDataset
 from cfx.sumo.scenarios import SCENARIOS
 from tests.conftest import ROOT
 from tests.printed import Reader, all_blocks

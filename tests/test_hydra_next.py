@@ -16,7 +16,7 @@ import sys, warnings
 import hydra
 print("Hydra", hydra.__version__)
 warnings.filterwarnings("error", module="hydra|omegaconf|cfx")
-from cfx.application import start
+from cfx.app.application import start
 code = start(["-m", "seed=0,1", "hydra.sweep.dir=swept"], target="sweep_stub:run_job")
 again = start(["-m", "seed=0,1,2", "hydra.sweep.dir=swept"], target="sweep_stub:run_job")
 asked = start(["--config-dir", "mine", "experiment=seeds"], target="sweep_stub:run_job")

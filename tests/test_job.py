@@ -16,10 +16,11 @@ import pytest
 import yaml
 
 import cfx
-from cfx import cli, registry
-from cfx.datasets.synthetic import SyntheticDataset
-from cfx.datasets.tidy import write_tidy
-from cfx.errors import DataError
+from cfx.app import cli
+from cfx.core import registry
+from cfx.core.errors import DataError
+from cfx.data.tidy import write_tidy
+from cfx.simulation.synthetic import SyntheticDataset
 
 QUICK = [
     "debug=quick",

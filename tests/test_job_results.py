@@ -11,11 +11,11 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
+from cfx.app.job.console import report
+from cfx.app.job.output import Output, write_further_tables
+from cfx.app.job.results import JobResult
 from cfx.evaluation.result import Evaluation
 from cfx.evaluation.statistics import Improvement
-from cfx.job.console import report
-from cfx.job.output import Output, write_further_tables
-from cfx.job.results import JobResult
 from tests.made_up import GAINS, make_history, make_platoon, make_results, with_metric
 
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from filelock import FileLock, SoftFileLease, Timeout
 
-from cfx import locks
+from cfx.app.sweep import only_one
 from cfx.calibration.cache import Cache
-from cfx.locks import is_shared, lock_for
-from cfx.sweep import only_one
+from cfx.core import locks
+from cfx.core.locks import is_shared, lock_for
 
 MOUNTS = """\
 /dev/sda1 / ext4 rw 0 0
@@ -60,7 +60,7 @@ def test_there_a_lock_is_a_lease_and_elsewhere_the_systems(
 HOLD = """
 import sys, time
 from pathlib import Path
-from cfx import locks
+from cfx.core import locks
 locks.LEASE_S = 2.0
 lock = locks.lock_for(Path(sys.argv[1]))
 lock.acquire()

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from cfx import cli
-from cfx.datasets.synthetic import SyntheticDataset
-from cfx.errors import ConfigError
-from cfx.job import steps
-from cfx.memory import in_units, is_out_of_memory, require_memory
+from cfx.app import cli
+from cfx.app.job import steps
+from cfx.core.errors import ConfigError
+from cfx.core.memory import in_units, is_out_of_memory, require_memory
 from cfx.policies.gru import GruPolicy
+from cfx.simulation.synthetic import SyntheticDataset
 from tests.broken_plugins import QUICK
 
 

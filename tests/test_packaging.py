@@ -15,8 +15,9 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 import cfx
-from cfx import nodes, registry
-from cfx.plots import figure
+from cfx.app import nodes
+from cfx.core import registry
+from cfx.report.figures import figure
 
 ROOT = Path(__file__).resolve().parent.parent
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -69,7 +70,7 @@ def test_the_wheel_holds_the_package_and_its_config_files(tmp_path: Path) -> Non
         for path in (ROOT / "conf").rglob("*.yaml")
     }
     assert conf <= names
-    assert {"cfx/CITATION.cff", "cfx/cli.py", "cfx/py.typed", "cfx/models/krauss.py"} <= names
+    assert {"cfx/CITATION.cff", "cfx/app/cli.py", "cfx/py.typed", "cfx/models/krauss.py"} <= names
     for room in ("report", "sumo"):
         assets = ROOT / "cfx" / room / "assets"
         found = {

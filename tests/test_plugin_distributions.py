@@ -15,12 +15,12 @@ from pathlib import Path
 import pytest
 
 import cfx
-from cfx import registry
+from cfx.core import registry
 
 ROOT = Path(__file__).resolve().parent.parent
 PLUGINS = sorted(path.parent for path in (ROOT / "plugins").glob("*/pyproject.toml"))
-READERS = {"cfx.datasets.files", "cfx.datasets.series", "cfx.datasets.tracks"}
-PUBLIC_MODULES = {"cfx", "cfx.errors", *READERS} | {
+READERS = {"cfx.data.files", "cfx.data.series", "cfx.data.tracks"}
+PUBLIC_MODULES = {"cfx", "cfx.core.errors", *READERS} | {
     kind.base.partition(":")[0] for kind in registry.KINDS.values()
 }
 """What a plugin may import from, and `cfx.contracts`; docs/plugins.md says so."""
@@ -168,12 +168,12 @@ def test_it_uses_the_public_api_alone(plugin: Path) -> None:
 def test_the_check_of_imports_sees_what_is_private(tmp_path: Path) -> None:
     path = tmp_path / "plugin.py"
     path.write_text(
-        "import cfx\nimport cfx.registry\nfrom cfx import nodes, Settings\n"
+        "import cfx\nimport cfx.core.registry\nfrom cfx import nodes, Settings\n"
         "from cfx.models.guarded import root\nfrom cfx.models.base import DrivingModel, _x\n"
         "from cfx.contracts.models import ModelContract\ncfx.job\ncfx.get\n"
     )
     assert [text.partition(": ")[2] for text in private_uses(path)] == [
-        "cfx.registry",
+        "cfx.core.registry",
         "cfx nodes",
         "cfx.models.guarded root",
         "cfx.models.base _x",

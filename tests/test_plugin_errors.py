@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from cfx import cli
-from cfx.plugin_errors import blame
+from cfx.app import cli
+from cfx.core.plugin_errors import blame
 from tests.broken_plugins import POLICY, QUICK
 
 Job = Callable[[str, str, str], tuple[int, str]]
@@ -81,7 +81,7 @@ def test_a_model_that_fails_late_is_named_with_its_line(
 
 
 def test_errors_of_cfx_itself_are_nobody_elses() -> None:
-    from cfx.parameters import ParameterSpace
+    from cfx.core.parameters import ParameterSpace
 
     with pytest.raises(AttributeError) as caught:
         ParameterSpace(()).from_unit(None)  # type: ignore[arg-type]
@@ -143,7 +143,7 @@ def test_a_policy_that_answers_no_number_is_refused(job: Job) -> None:
 def test_a_plugins_files_never_replace_hydras_own(
     install: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
-    from cfx.hydra_source import composed
+    from cfx.app.hydra_source import composed
 
     files = {
         "shadow_models/__init__.py": MODEL.replace("{failure}", "pass"),

@@ -14,9 +14,10 @@ from pathlib import Path
 import pytest
 
 import cfx
-from cfx import application, cli, registry
-from cfx.errors import ConfigError, OutputError, PluginError
-from cfx.plugins.new import create
+from cfx.app import application, cli
+from cfx.app.plugins.new import create
+from cfx.core import registry
+from cfx.core.errors import ConfigError, OutputError, PluginError
 from tests.broken_plugins import BROKEN, QUICK, Broken
 from tests.conftest import ROOT, Installer
 
@@ -85,7 +86,7 @@ def test_all_broken_plugins_at_once_harm_nobody_else(
         )
     script = """
         import os, sys
-        from cfx.cli import main
+        from cfx.app.cli import main
         assert main(["plugins"]) == 0
         assert main(["--help"]) == 0
         os.environ["COMP_LINE"], os.environ["COMP_POINT"] = "cfx model=", "10"
@@ -427,7 +428,7 @@ def test_a_new_package_installs_and_its_tests_pass(kind: str, tmp_path: Path, ca
         (preset,) = presets
         asked = f"--cfg job {group}={preset}"
     script = (
-        "import sys; from cfx.cli import main;"
+        "import sys; from cfx.app.cli import main;"
         " sys.exit(max(main(words.split()) for words in sys.argv[1:]))"
     )
     words = [f"plugins check {kind} novel_{kind}", asked]
@@ -516,7 +517,7 @@ def test_the_templates_are_in_the_wheel(tmp_path: Path) -> None:
         names = set(archive.namelist())
     template = ROOT / "cfx" / "plugins" / "template"
     expected = {
-        f"cfx/plugins/template/{path.relative_to(template).as_posix()}"
+        f"cfx/app/plugins/template/{path.relative_to(template).as_posix()}"
         for path in template.rglob("*")
         if path.is_file()
     }

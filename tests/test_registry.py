@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-from cfx import registry
-from cfx.errors import ConfigError, ParameterError, PluginError
+from cfx.core import registry
+from cfx.core.errors import ConfigError, ParameterError, PluginError
 
 MODEL = '''
     """A third party's model."""

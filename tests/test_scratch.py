@@ -15,16 +15,16 @@ import pytest
 import torch
 
 import cfx
-from cfx import scratch
-from cfx.datasets import tidy
-from cfx.datasets.base import joined, scaled
-from cfx.datasets.resample import resampled
-from cfx.datasets.synthetic import SyntheticDataset
-from cfx.datasets.tidy import read_tidy, write_tidy
-from cfx.errors import OutputError
+from cfx.core import scratch
+from cfx.core.errors import OutputError
+from cfx.data import tidy
+from cfx.data.base import joined, scaled
+from cfx.data.pairs import PairBatch, PairSet
+from cfx.data.resample import resampled
+from cfx.data.style import entropy
+from cfx.data.tidy import read_tidy, write_tidy
 from cfx.evaluation import result, shards, trajectories
-from cfx.pairs import PairBatch, PairSet
-from cfx.style import entropy
+from cfx.simulation.synthetic import SyntheticDataset
 
 JOB = ("debug=quick", "figures.enabled=false", "tracking.enabled=false", "cache.enabled=false")
 

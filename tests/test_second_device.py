@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 import cfx
-from cfx.job import steps
+from cfx.app.job import steps
 from cfx.learners.base import TrainingData
 from tests.elsewhere import DEVICE, second_device
 from tests.learners.made import module_of, training_data

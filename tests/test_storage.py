@@ -11,16 +11,17 @@ import numpy as np
 import pytest
 
 import cfx
-from cfx import cli, registry, storage
+from cfx.app import cli
+from cfx.app.job.upload import place_of
+from cfx.app.sweep.fingerprint import fingerprint
 from cfx.calibration.cache import Cache
-from cfx.config import JobConfig
-from cfx.datasets.tidy import TidyDataset, write_tidy
-from cfx.errors import CfxError, DataError, OutputError
-from cfx.extras import install_line
-from cfx.job.upload import place_of
+from cfx.core import registry, storage
+from cfx.core.errors import CfxError, DataError, OutputError
+from cfx.core.extras import install_line
+from cfx.core.storage import RemoteFolder, is_url, local_copies, state
+from cfx.data.tidy import TidyDataset, write_tidy
 from cfx.report.runs import read_runs
-from cfx.storage import RemoteFolder, is_url, local_copies, state
-from cfx.sweep.fingerprint import fingerprint
+from cfx.results.config import JobConfig
 from tests.broken_plugins import QUICK
 from tests.drives import straight_pairs
 

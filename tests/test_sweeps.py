@@ -18,15 +18,15 @@ from typing import Any
 import pytest
 from filelock import FileLock
 
-from cfx import application, sweep
-from cfx.sweep import SweepFolder
-from cfx.tracking import provenance
+from cfx.app import application, sweep
+from cfx.app.sweep import SweepFolder
+from cfx.results import provenance
 
 JOB = """
     import json, os, time
     from dataclasses import dataclass
     from pathlib import Path
-    from cfx.errors import DataError
+    from cfx.core.errors import DataError
 
     @dataclass
     class Result:
@@ -394,7 +394,7 @@ def test_every_launcher_ends_what_was_broken_off(
     launcher: str, install: Any, run: Run, processes: list[Any]
 ) -> None:
     script = (
-        "import sys; from cfx.application import start;"
+        "import sys; from cfx.app.application import start;"
         " sys.exit(start(sys.argv[1:], target='sweep_stub:run_job'))"
     )
     command = ["-c", script, "-m", f"seed=range({JOBS})", *LAUNCHERS[launcher]]
@@ -427,7 +427,7 @@ def test_a_killed_sweep_of_worker_processes_is_made_up_for(
     run: Run, install, processes: list[Any], killed: str
 ) -> None:
     script = (
-        "import sys; from cfx.application import start;"
+        "import sys; from cfx.app.application import start;"
         " sys.exit(start(sys.argv[1:], target='sweep_stub:run_job'))"
     )
     command = [

@@ -16,10 +16,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from cfx import cli
-from cfx.tracking.store import quiet
-from cfx.tracking.tracker import MlflowTracker
-from cfx.ui import _best, _over_seeds
+from cfx.app import cli
+from cfx.app.ui import _best, _over_seeds
+from cfx.results.store import quiet
+from cfx.results.tracker import MlflowTracker
 from tests.browser import Browser
 
 IMPROVEMENTS = {"krauss": 0.1234, "w99": 0.2345, "w74": -0.0567}

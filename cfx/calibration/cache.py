@@ -26,10 +26,10 @@ import numpy as np
 from filelock import Timeout
 from numpy.typing import NDArray
 
-from cfx.errors import OutputError
-from cfx.files import atomic_write
-from cfx.locks import lock_for
-from cfx.storage import RemoteFolder
+from cfx.core.errors import OutputError
+from cfx.core.files import atomic_write
+from cfx.core.locks import lock_for
+from cfx.core.storage import RemoteFolder
 
 log = logging.getLogger(__name__)
 

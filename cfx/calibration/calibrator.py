@@ -19,9 +19,11 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from cfx import scratch
 from cfx.calibration.cache import Arrays, Cache, first_fit
 from cfx.calibration.losses import SegmentLosses
+from cfx.calibration.objectives.base import Objective
+from cfx.calibration.objectives.rmse import SpeedRmse
+from cfx.calibration.optimizers.base import Optimizer
 from cfx.calibration.shards import (
     CalibrationShard,
     DriverShard,
@@ -31,15 +33,13 @@ from cfx.calibration.shards import (
     solve_shard,
 )
 from cfx.calibration.windows import Windows, WindowSettings
-from cfx.component import content_key
-from cfx.engine.base import Engine
-from cfx.engine.local import LocalEngine
-from cfx.objectives.base import Objective
-from cfx.objectives.rmse import SpeedRmse
-from cfx.optimizers.base import Optimizer
-from cfx.pairs import Pair, PairBatch, PairSet
-from cfx.parameters import ParameterSpace
-from cfx.progress import Task
+from cfx.core import scratch
+from cfx.core.component import content_key
+from cfx.core.engine.base import Engine
+from cfx.core.engine.local import LocalEngine
+from cfx.core.parameters import ParameterSpace
+from cfx.core.progress import Task
+from cfx.data.pairs import Pair, PairBatch, PairSet
 from cfx.simulation.base import Stepper
 
 _GROUP = 1024

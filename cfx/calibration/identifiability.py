@@ -18,12 +18,12 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from cfx import scratch
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.losses import SegmentLosses
-from cfx.objectives.base import Objective
-from cfx.objectives.rmse import GapRmse, SpeedRmse
-from cfx.pairs import PairBatch
+from cfx.calibration.objectives.base import Objective
+from cfx.calibration.objectives.rmse import GapRmse, SpeedRmse
+from cfx.core import scratch
+from cfx.data.pairs import PairBatch
 
 PLACES = 21
 """G: places between a parameter's bounds, both included."""

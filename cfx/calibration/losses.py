@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from cfx.calibration.objectives.base import FrameValues, Objective
+from cfx.data.pairs import PairBatch
 from cfx.models.base import Leader
-from cfx.objectives.base import FrameValues, Objective
-from cfx.pairs import PairBatch
 from cfx.simulation.base import Stepper
 from cfx.simulation.kernel.keys import ComponentKey
 from cfx.simulation.trajectory import Segments, Start, common_shape

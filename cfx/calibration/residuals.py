@@ -11,8 +11,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from cfx.data.pairs import PairBatch
 from cfx.models.base import DrivingModel, Follower, Leader
-from cfx.pairs import PairBatch
 from cfx.simulation.step import advance_vehicle
 
 

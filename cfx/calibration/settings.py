@@ -9,7 +9,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from cfx.component import Settings
+from cfx.core.component import Settings
 
 
 class CalibrationSettings(Settings):

@@ -15,17 +15,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cfx import registry
 from cfx.calibration.cache import Arrays
 from cfx.calibration.losses import FullTrajectories, PooledLosses, SegmentLosses
+from cfx.calibration.objectives.base import Objective
+from cfx.calibration.optimizers.base import Optimizer, Solution
 from cfx.calibration.prior import LossesWithPrior
-from cfx.component import content_key, folder_hash
-from cfx.engine.base import Report, Unfit
-from cfx.errors import EngineError, PluginError
-from cfx.objectives.base import Objective
-from cfx.optimizers.base import Optimizer, Solution
-from cfx.pairs import PairBatch
-from cfx.parameters import ParameterSpace
+from cfx.core import registry
+from cfx.core.component import content_key, folder_hash
+from cfx.core.engine.base import Report, Unfit
+from cfx.core.errors import EngineError, PluginError
+from cfx.core.parameters import ParameterSpace
+from cfx.data.pairs import PairBatch
 from cfx.simulation.base import Stepper
 
 _SAME_RELATIVE, _SAME_ABSOLUTE = 1e-5, 1e-8

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.settings import WindowSettings
-from cfx.errors import DataError
-from cfx.pairs import PairSet
+from cfx.core.errors import DataError
+from cfx.data.pairs import PairSet
 from cfx.simulation.trajectory import TRANSIENT_S
 
 __all__ = ["Split", "WindowSettings", "Windows"]

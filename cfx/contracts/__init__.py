@@ -15,7 +15,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from cfx.errors import PluginError, nearest
+from cfx.core.errors import PluginError, nearest
 
 if TYPE_CHECKING:
     from cfx.contracts.contract import Contract as Contract

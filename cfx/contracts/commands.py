@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from cfx.contracts.contract import NotApplicable, contract_of
 
 if TYPE_CHECKING:
-    from cfx.commands.base import Command
+    from cfx.core.command import Command
 
 LONGEST = 100
 """Characters of a summary, which stands on one line of `cfx --help`."""

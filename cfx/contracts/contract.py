@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from cfx.errors import NotInstalledError, PluginError
+from cfx.core.errors import NotInstalledError, PluginError
 
 Check = Callable[..., None]
 """Takes a component and checks one statement of its kind's contract.

@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from cfx.contracts.contract import contract_of
-from cfx.datasets.base import Dataset, DatasetSettings
-from cfx.errors import CfxError, DataError
-from cfx.pairs import SIGNALS, PairBatch
+from cfx.core.errors import CfxError, DataError
+from cfx.data.base import Dataset, DatasetSettings
+from cfx.data.pairs import SIGNALS, PairBatch
 
 
 def every_number_is_finite(dataset: Dataset) -> None:

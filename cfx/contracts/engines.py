@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from cfx.contracts.contract import contract_of
-from cfx.engine.base import Engine, Report
-from cfx.errors import DataError
+from cfx.core.engine.base import Engine, Report
+from cfx.core.errors import DataError
 
 SHARDS = 5
 

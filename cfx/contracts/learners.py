@@ -15,22 +15,22 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-from cfx.agents.agent import Agent
-from cfx.agents.core import AgentCore, features_read
-from cfx.agents.heads import HEADS, head_name
-from cfx.agents.heads.base import ParameterHead
 from cfx.calibration.calibrator import Labels
 from cfx.calibration.windows import Split, Windows, WindowSettings
 from cfx.contracts.contract import contract_of
-from cfx.datasets.synthetic import SyntheticDataset
+from cfx.data.pairs import SIGNALS, PairBatch, PairSet
 from cfx.evaluation.closed_loop import simulate_closed_loop
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.models.krauss import Krauss
-from cfx.pairs import SIGNALS, PairBatch, PairSet
+from cfx.policies.agent import Agent
+from cfx.policies.core import AgentCore, features_read
 from cfx.policies.ensemble import Ensemble
 from cfx.policies.features import measured_history
 from cfx.policies.gru import GruPolicy
+from cfx.policies.heads import HEADS, head_name
+from cfx.policies.heads.base import ParameterHead
 from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.synthetic import SyntheticDataset
 
 PAIRS, FRAMES = 3, 126
 WINDOWS = WindowSettings()

@@ -1,4 +1,4 @@
-"""The contract of a metric, statement by statement. Shapes as in `cfx.metrics.base`."""
+"""The contract of a metric, statement by statement. Shapes as in `cfx.evaluation.metrics.base`."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from cfx.contracts.contract import NotApplicable, contract_of
-from cfx.metrics.base import Metric, Trajectories
-from cfx.parameters import Parameter, ParameterSpace
+from cfx.core.parameters import Parameter, ParameterSpace
+from cfx.evaluation.metrics.base import Metric, Trajectories
 
 PAIRS, FRAMES, DT = 5, 80, 0.1
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from cfx.contracts.contract import NotApplicable, contract_of
-from cfx.errors import CfxError
+from cfx.core.errors import CfxError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.simulation.rollout import simulate
 from cfx.simulation.trajectory import Start

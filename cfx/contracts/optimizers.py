@@ -1,4 +1,7 @@
-"""The contract of an optimizer, statement by statement. Shapes as in `cfx.optimizers.base`."""
+"""The contract of an optimizer, statement by statement.
+
+Shapes as in `cfx.calibration.optimizers.base`.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cfx.calibration.optimizers.base import CandidateLosses, Optimizer, Solution
 from cfx.contracts.contract import NotApplicable, contract_of
-from cfx.errors import PluginError
-from cfx.optimizers.base import CandidateLosses, Optimizer, Solution
+from cfx.core.errors import PluginError
 
 Function = Callable[[Tensor, Tensor], Tensor]
 """Losses `(P, q)` of candidates `(P, q, n)`, given what tells problems apart, `(P, n)`."""

@@ -17,23 +17,23 @@ import torch
 
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
+from cfx.calibration.optimizers.random import RandomSearch
 from cfx.calibration.windows import WindowSettings
 from cfx.contracts.contract import NotApplicable, contract_of
-from cfx.datasets.synthetic import SyntheticDataset
+from cfx.core.progress import Task
+from cfx.data.pairs import Pair, PairBatch, PairSet
+from cfx.data.style.entropy import measure_style
+from cfx.data.style.settings import StyleSettings
+from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.evaluation.result import METHODS, PairTrajectory
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.learners.imitation import ImitationLearner
 from cfx.models.krauss import Krauss
-from cfx.optimizers.random import RandomSearch
-from cfx.pairs import Pair, PairBatch, PairSet
 from cfx.policies.base import Policy
 from cfx.policies.fixed import FixedPolicy
 from cfx.policies.gru import GruPolicy
-from cfx.progress import Task
-from cfx.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.simulation.rollout import MemoryStepper
-from cfx.style.entropy import measure_style
-from cfx.style.settings import StyleSettings
+from cfx.simulation.synthetic import SyntheticDataset
 
 PAIRS, FRAMES = 6, 111
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from cfx.contracts.contract import NotApplicable, contract_of
-from cfx.errors import CfxError, ConfigError
+from cfx.core.errors import CfxError, ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.idm_sumo import IdmSumo
 from cfx.models.krauss import Krauss
@@ -23,8 +23,8 @@ from cfx.models.krauss_sumo import KraussSumo
 from cfx.models.w74 import W74
 from cfx.models.w99 import W99
 from cfx.simulation.base import Stepper
+from cfx.simulation.simulator import Simulator
 from cfx.simulation.trajectory import Start
-from cfx.simulators.base import Simulator
 
 DT = 0.1
 FOLLOWERS, STEPS = 9, 20

@@ -14,21 +14,21 @@ from collections.abc import Iterator, Mapping
 import torch
 from torch import Tensor
 
+from cfx.calibration.objectives.base import FrameValues, Objective
+from cfx.calibration.optimizers.base import Optimizer
 from cfx.calibration.settings import WindowSettings
 from cfx.contracts.metrics import PAIRS, trajectories
-from cfx.errors import CfxError, PluginError
-from cfx.metrics.base import Metric
+from cfx.core.errors import CfxError, PluginError
+from cfx.core.parameters import ParameterSpace
+from cfx.evaluation.metrics.base import Metric
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
-from cfx.objectives.base import FrameValues, Objective
-from cfx.optimizers.base import Optimizer
-from cfx.parameters import ParameterSpace
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import token_width
 from cfx.simulation.base import Stepper
+from cfx.simulation.simulator import Simulator
 from cfx.simulation.trajectory import Start
-from cfx.simulators.base import Simulator
 
 STATES = 24
 """Vehicles whose step is tried."""

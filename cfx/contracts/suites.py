@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import pytest
 
+from cfx.calibration.objectives.base import Objective
+from cfx.calibration.optimizers.base import Optimizer
 from cfx.contracts import (
     commands,
     datasets,
@@ -30,19 +32,17 @@ from cfx.contracts import (
     simulators,
 )
 from cfx.contracts.contract import Check, Contract, NotApplicable
-from cfx.datasets.base import Dataset
-from cfx.engine.base import Engine
+from cfx.core.engine.base import Engine
+from cfx.data.base import Dataset
+from cfx.evaluation.metrics.base import Metric
+from cfx.evaluation.protocols.base import Protocol
 from cfx.learners.base import Learner
-from cfx.metrics.base import Metric
 from cfx.models.base import DrivingModel
-from cfx.objectives.base import Objective
-from cfx.optimizers.base import Optimizer
 from cfx.policies.base import Policy
-from cfx.protocols.base import Protocol
-from cfx.simulators.base import Simulator
+from cfx.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
-    from cfx.commands.base import Command
+    from cfx.core.command import Command
 
 
 def _statements(contract: Contract) -> pytest.MarkDecorator:

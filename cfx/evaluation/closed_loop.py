@@ -14,14 +14,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cfx.agents.agent import Agent, AgentState
-from cfx.agents.context import DriverContext
+from cfx.core.threads import one_thread
+from cfx.data.pairs import PairBatch
 from cfx.models.base import Leader
 from cfx.models.limits import at_limits
-from cfx.pairs import PairBatch
+from cfx.policies.agent import Agent, AgentState
+from cfx.policies.context import DriverContext
 from cfx.policies.features import History
 from cfx.simulation.base import Stepper
-from cfx.simulation.threads import one_thread
 from cfx.simulation.trajectory import Start
 
 
@@ -35,7 +35,7 @@ class ClosedLoop(NamedTuple):
         counted: `(P, K + 1)` bool, frames within the recording; frame 0 does not count.
         at_limits: `(P, K + 1)` bool, frames at a limit of acceleration (`model.limits`).
         outside: `(P, K + 1)` bool, frames of windows that began outside what the agent learned
-            from (`cfx.agents.valid_range`).
+            from (`cfx.policies.valid_range`).
         beyond: `(2 f,)` float64, at how many frames that count each signal alone was too low, then
             too high.
 

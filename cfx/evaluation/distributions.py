@@ -20,8 +20,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from cfx.data.pairs import PairBatch, PairSet
 from cfx.evaluation.forecast_paths import Origins, Paths
-from cfx.pairs import PairBatch, PairSet
 
 Array = NDArray[np.float64]
 

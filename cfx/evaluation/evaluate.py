@@ -13,9 +13,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cfx import registry
-from cfx.agents.agent import Agent
+from cfx.core import registry
+from cfx.core.parameters import ParameterSpace
+from cfx.data.pairs import PairBatch, PairSet
+from cfx.data.style.result import CLUSTERS, StyleResult
 from cfx.evaluation.closed_loop import ClosedLoop
+from cfx.evaluation.metrics.base import RECORDED, MetricInfo, Trajectories
+from cfx.evaluation.metrics.errors import RmseGap, RmseSpeed
+from cfx.evaluation.metrics.installed import LeftOut, MeasuredMetric, MetricSet, leave_out
 from cfx.evaluation.outside import outside_in_words
 from cfx.evaluation.result import METHODS, Array, Evaluation, Platoon
 from cfx.evaluation.statistics import Improvement, improvement_statistics
@@ -28,13 +33,8 @@ from cfx.evaluation.trajectories import (
     simulated_pairs,
     trajectories_of,
 )
-from cfx.metrics.base import RECORDED, MetricInfo, Trajectories
-from cfx.metrics.errors import RmseGap, RmseSpeed
-from cfx.metrics.installed import LeftOut, MeasuredMetric, MetricSet, leave_out
-from cfx.pairs import PairBatch, PairSet
-from cfx.parameters import ParameterSpace
+from cfx.policies.agent import Agent
 from cfx.simulation.trajectory import TRANSIENT_S
-from cfx.style.result import CLUSTERS, StyleResult
 
 Measured = dict[tuple[str, str, str], NDArray[np.float64]]
 """By metric, scope and method the value of each pair, `(P,)`."""

@@ -20,10 +20,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cfx.agents.agent import Agent, AgentState
-from cfx.agents.context import DriverContext
+from cfx.data.pairs import SIGNALS, PairBatch, PairSet
 from cfx.evaluation.closed_loop import simulate_closed_loop
-from cfx.pairs import SIGNALS, PairBatch, PairSet
+from cfx.policies.agent import Agent, AgentState
+from cfx.policies.context import DriverContext
 from cfx.policies.features import measured_history
 from cfx.simulation.base import Stepper
 

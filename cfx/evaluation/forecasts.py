@@ -16,10 +16,10 @@ import numpy as np
 import pandas as pd
 from torch import Tensor
 
+from cfx.data.pairs import PairSet
 from cfx.evaluation.distributions import distribution_metrics
 from cfx.evaluation.forecast_paths import Origins, Paths
 from cfx.evaluation.statistics import mean_interval
-from cfx.pairs import PairSet
 
 FORECAST_METHODS = (
     "constant_speed",

@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
+from cfx.evaluation.metrics.base import key_of
 from cfx.evaluation.result import improvement_key
-from cfx.metrics.base import key_of
 
 RESULT = "result"
 """The tag that says it in words."""

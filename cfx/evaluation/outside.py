@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from cfx.agents.agent import Agent
-from cfx.agents.valid_range import share_in_words
 from cfx.evaluation.closed_loop import ClosedLoop
+from cfx.policies.agent import Agent
+from cfx.policies.valid_range import share_in_words
 
 
 def outside_in_words(agent: Agent, loop: ClosedLoop) -> str:

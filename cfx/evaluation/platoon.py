@@ -22,13 +22,13 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from cfx.agents.agent import Agent, AgentState
+from cfx.core.threads import one_thread
+from cfx.evaluation.metrics.safety import hard_braking_frames
 from cfx.evaluation.result import METHODS, Array, Platoon
-from cfx.metrics.safety import hard_braking_frames
 from cfx.models.base import DrivingModel, Follower, Leader
+from cfx.policies.agent import Agent, AgentState
 from cfx.policies.features import History
 from cfx.simulation.rollout import MemoryStepper
-from cfx.simulation.threads import one_thread
 from cfx.simulation.trajectory import Start
 
 VEHICLES = 10

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from cfx.calibration.flatness import with_flat_shares
 from cfx.evaluation.forecasts import Forecasts
+from cfx.evaluation.metrics.base import MetricInfo
+from cfx.evaluation.metrics.installed import LeftOut
 from cfx.evaluation.statistics import Improvement
 from cfx.evaluation.tables import in_text, summaries, values_of, wide_table
 from cfx.evaluation.traffic.result import Traffic
-from cfx.metrics.base import MetricInfo
-from cfx.metrics.installed import LeftOut
 
 Array = NDArray[np.float64]
 

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from cfx import scratch
-from cfx.agents.agent import Agent
-from cfx.engine.base import Engine, Report
+from cfx.core import scratch
+from cfx.core.engine.base import Engine, Report
+from cfx.core.memory import give_back
+from cfx.data.pairs import PairBatch
 from cfx.evaluation.closed_loop import ClosedLoop, simulate_closed_loop
-from cfx.memory import give_back
-from cfx.pairs import PairBatch
+from cfx.policies.agent import Agent
 from cfx.simulation.base import Stepper
 
 PAIRS_AT_ONCE = 1024
@@ -116,8 +116,8 @@ def _cut(whole: ClosedLoopShard) -> Iterator[ClosedLoopShard]:
 class _Joined:
     """Closed loops of P pairs, put together from shards in any order.
 
-    Those of many pairs lie in files (`cfx.scratch`). Frames that a shard has not, because all its
-    pairs end before, repeat its last one and do not count, as frames after the end of a pair.
+    Those of many pairs lie in files (`cfx.core.scratch`). Frames that a shard has not, because all
+    its pairs end before, repeat its last one and do not count, as frames after the end of a pair.
 
     Args:
         pairs: P.

@@ -15,7 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from cfx.calibration.flatness import COLUMN
-from cfx.metrics.base import RECORDED, SCOPES, MetricInfo, column_of, key_of
+from cfx.evaluation.metrics.base import RECORDED, SCOPES, MetricInfo, column_of, key_of
 
 VALUE_COLUMNS = ("pair_id", "driver", "method", "scope", "metric", "value")
 """Columns of the long table, which a job writes as `pair_metrics.parquet`."""

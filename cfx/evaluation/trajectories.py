@@ -13,13 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cfx import scratch
+from cfx.core import scratch
+from cfx.core.memory import give_back
+from cfx.core.parameters import ParameterSpace
+from cfx.data.pairs import PairBatch, PairSet
 from cfx.evaluation.closed_loop import ClosedLoop
+from cfx.evaluation.metrics.base import RECORDED, Trajectories
 from cfx.evaluation.result import Array, PairTrajectory
-from cfx.memory import give_back
-from cfx.metrics.base import RECORDED, Trajectories
-from cfx.pairs import PairBatch, PairSet
-from cfx.parameters import ParameterSpace
 
 PAIRS_AT_ONCE = 1024
 """Pairs that are measured together."""

@@ -15,19 +15,19 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from cfx.agents.scaler import Scaler
-from cfx.agents.valid_range import ValidRange
 from cfx.calibration.calibrator import Labels
+from cfx.calibration.objectives.base import Objective
+from cfx.calibration.objectives.rmse import SpeedRmse
 from cfx.calibration.windows import Split, WindowSettings
-from cfx.component import Component
-from cfx.engine.base import Engine
-from cfx.engine.local import LocalEngine
-from cfx.errors import ConfigError
+from cfx.core.component import Component
+from cfx.core.engine.base import Engine
+from cfx.core.engine.local import LocalEngine
+from cfx.core.errors import ConfigError
+from cfx.data.pairs import PairBatch
 from cfx.models.base import DrivingModel
-from cfx.objectives.base import Objective
-from cfx.objectives.rmse import SpeedRmse
-from cfx.pairs import PairBatch
 from cfx.policies.base import Policy, PolicyNetwork
+from cfx.policies.scaler import Scaler
+from cfx.policies.valid_range import ValidRange
 from cfx.simulation.base import Stepper
 
 CURVE_COLUMNS = ["network", "epoch", "train_loss", "validation_loss"]
@@ -101,7 +101,7 @@ class TrainingResult:
         curves: columns network, epoch, train_loss, validation_loss (NaN where not measured).
         base: parameters that answers refer to for drivers without a base of their own, `(N, n)`, SI
             units; None where the head needs none.
-        head: what makes parameters of answers (`cfx.agents.heads.HEADS`); None: `offset` where
+        head: what makes parameters of answers (`cfx.policies.heads.HEADS`); None: `offset` where
             there is a base, otherwise `direct`.
         valid_range: the situations that each network learned from; None: those of its training
             parts (`cfx.learners.situations`).

@@ -22,10 +22,10 @@ from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.pytorch.callbacks import ModelCheckpoint
 from torch import Tensor
 
-from cfx.files import atomic_write
+from cfx.core.files import atomic_write
+from cfx.core.threads import one_thread
 from cfx.learners.base import CURVE_COLUMNS
 from cfx.policies.base import PolicyNetwork
-from cfx.simulation.threads import one_thread
 
 log = logging.getLogger(__name__)
 

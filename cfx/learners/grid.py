@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cfx.agents.placement import driver_places
+from cfx.policies.placement import driver_places
 
 
 class Grid:

@@ -16,15 +16,15 @@ from typing import ClassVar
 import pandas as pd
 import torch
 
-from cfx.agents.heads import HEADS
-from cfx.component import Settings
+from cfx.core.component import Settings
+from cfx.core.progress import Task
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.learners.curves import warn_of_nothing_learned
 from cfx.learners.grid import Grid
 from cfx.learners.imitation_data import ImitationDataset, ImitationSettings
 from cfx.learners.situations import learned_range
 from cfx.policies.base import Policy
-from cfx.progress import Task
+from cfx.policies.heads import HEADS
 
 log = logging.getLogger(__name__)
 

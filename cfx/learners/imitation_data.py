@@ -12,14 +12,14 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from cfx.agents.heads.base import ParameterHead
-from cfx.agents.scaler import Scaler
-from cfx.component import Settings
-from cfx.errors import DataError
+from cfx.core.component import Settings
+from cfx.core.errors import DataError
 from cfx.learners.base import TrainingData
 from cfx.learners.grid import Grid
 from cfx.policies.base import Policy
 from cfx.policies.features import measured_history, tokens
+from cfx.policies.heads.base import ParameterHead
+from cfx.policies.scaler import Scaler
 from cfx.simulation.rollout import Compile
 
 

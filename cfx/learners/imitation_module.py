@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from cfx.agents.heads.base import ParameterHead
 from cfx.learners.batched import BatchedModule
 from cfx.learners.imitation_data import ImitationDataset, ImitationSettings
 from cfx.policies.base import PolicyNetwork
+from cfx.policies.heads.base import ParameterHead
 from cfx.simulation.compiling import torch_compiled
 from cfx.simulation.rollout import can_compile
 

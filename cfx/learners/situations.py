@@ -10,9 +10,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from cfx.agents.valid_range import ValidRange, stacked
 from cfx.learners.base import TrainingData
 from cfx.policies.features import History, measured_history
+from cfx.policies.valid_range import ValidRange, stacked
 
 _PAIRS_AT_MOST = 4096
 """Pairs of a network whose situations are measured: of more, as many at equal distances. A range

@@ -19,11 +19,11 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from cfx.component import Component, Settings
-from cfx.errors import ConfigError
+from cfx.core.component import Component, Settings
+from cfx.core.errors import ConfigError
+from cfx.core.parameters import ParameterOverride, ParameterSpace
 from cfx.models.limits import LimitSettings
 from cfx.models.regimes import Temperature
-from cfx.parameters import ParameterOverride, ParameterSpace
 
 
 class Follower(NamedTuple):

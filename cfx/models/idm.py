@@ -12,9 +12,9 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
 from cfx.models.vtype import VType
-from cfx.parameters import Parameter, ParameterSpace
 
 _PAPER = (
     "default: Treiber et al. (2000), table I;"

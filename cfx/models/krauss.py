@@ -14,13 +14,13 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from cfx.component import Settings
-from cfx.errors import ConfigError
+from cfx.core.component import Settings
+from cfx.core.errors import ConfigError
+from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.models.base import DrivingModel, Follower, Leader, ModelSettings, bumper_gap
 from cfx.models.guarded import root
 from cfx.models.sumo_step import sumo_speed
 from cfx.models.vtype import VType
-from cfx.parameters import Parameter, ParameterSpace
 
 _PAPER = "Yang et al. (2021); bounds: wide enough for drivers who stay far behind"
 _SUMO = "SUMO's default passenger car"

@@ -10,11 +10,11 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
 from cfx.models.guarded import divisor, root
 from cfx.models.sumo_step import sumo_speed
 from cfx.models.vtype import VType
-from cfx.parameters import Parameter, ParameterSpace
 
 _SUMO = "default: SUMO's passenger car"
 _BOUNDS = f"{_SUMO}; bounds: wide enough for drivers who stay far behind"

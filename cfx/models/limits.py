@@ -11,7 +11,7 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from cfx.component import Settings
+from cfx.core.component import Settings
 
 _AT = 1e-6
 """m/s2: an acceleration this close to a limit counts as being at it."""

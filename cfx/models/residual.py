@@ -40,12 +40,12 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from cfx.component import content_key, folder_hash
-from cfx.errors import ConfigError
+from cfx.core.component import content_key, folder_hash
+from cfx.core.errors import ConfigError
+from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
 from cfx.models.guarded import root
 from cfx.models.regimes import Temperature
-from cfx.parameters import Parameter, ParameterSpace
 
 TIME = Parameter(
     "residual_time",

@@ -14,9 +14,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cfx.component import content_key, folder_hash
+from cfx.core.component import content_key, folder_hash
+from cfx.core.parameters import ParameterSpace
 from cfx.models.base import DrivingModel, Follower, Leader
-from cfx.parameters import ParameterSpace
 
 LIMIT = "speed_limit"
 """Name of the limit among the values that the model is given, m/s; infinity: there is none."""

@@ -9,11 +9,11 @@ from typing import ClassVar, NoReturn
 from pydantic import Field
 from torch import Tensor
 
-from cfx.component import Settings
-from cfx.errors import ConfigError
+from cfx.core.component import Settings
+from cfx.core.errors import ConfigError
+from cfx.core.parameters import ParameterOverride, ParameterSpace
 from cfx.models.base import DrivingModel, Follower, Leader, ModelSettings
 from cfx.models.vtype import VType
-from cfx.parameters import ParameterOverride, ParameterSpace
 
 _UNITS = {
     "tau": "s",

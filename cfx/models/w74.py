@@ -18,10 +18,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.guarded import root
 from cfx.models.regimes import SPACING, SPEED, below, exact, up_to
-from cfx.parameters import Parameter, ParameterSpace
 
 _NEAREST_ROOM = 1e-3
 """m: bounds quotients, and their gradients, beside a threshold; the brake cap acts long before."""

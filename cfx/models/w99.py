@@ -15,14 +15,14 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from cfx.component import Settings
-from cfx.errors import ConfigError
+from cfx.core.component import Settings
+from cfx.core.errors import ConfigError
+from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.models.base import DrivingModel, Follower, Leader, ModelSettings, bumper_gap
 from cfx.models.guarded import divisor, root
 from cfx.models.regimes import SPACING, SPEED, below, exact, up_to
 from cfx.models.sumo_step import sumo_speed
 from cfx.models.vtype import VType
-from cfx.parameters import Parameter, ParameterSpace
 
 _VISSIM = "default: Vissim and SUMO; bounds: the ranges used in the calibration literature"
 _SUMO = "SUMO's default passenger car"

@@ -14,7 +14,7 @@ import torch
 from pydantic import BeforeValidator, Field
 from torch import Tensor, nn
 
-from cfx.component import Component, Settings
+from cfx.core.component import Component, Settings
 from cfx.policies.driver_features import check_driver_features, named_driver_features
 from cfx.policies.features import SITUATION, Summary, check_inputs, named_inputs
 

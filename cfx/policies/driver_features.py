@@ -18,7 +18,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cfx.pairs import PairBatch
+from cfx.data.pairs import PairBatch
 from cfx.policies.features import History, check_names, of_set
 
 MOVING = 2.0

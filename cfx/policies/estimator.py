@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.settings import WindowSettings
-from cfx.errors import ConfigError
+from cfx.core.errors import ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import History, Summary

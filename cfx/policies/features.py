@@ -12,8 +12,8 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from cfx.errors import ConfigError, nearest
-from cfx.pairs import PairBatch
+from cfx.core.errors import ConfigError, nearest
+from cfx.data.pairs import PairBatch
 
 Summary = Literal["frames", "last", "mean", "mean_std"]
 

@@ -7,7 +7,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from cfx.component import Settings
+from cfx.core.component import Settings
 from cfx.policies.base import ConstantNetwork, Policy, PolicyNetwork, ResidualSettings
 
 

@@ -16,7 +16,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from cfx.component import Settings
+from cfx.core.component import Settings
 from cfx.policies.estimator import (
     DrivenModel,
     EstimatorNetwork,

@@ -13,11 +13,11 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from cfx import registry
 from cfx.calibration.losses import SegmentLosses
-from cfx.component import Settings
-from cfx.objectives.base import Objective
-from cfx.optimizers.base import Optimizer
+from cfx.calibration.objectives.base import Objective
+from cfx.calibration.optimizers.base import Optimizer
+from cfx.core import registry
+from cfx.core.component import Settings
 from cfx.policies.base import ResidualSettings
 from cfx.policies.estimator import DrivenModel, EstimatorNetwork, EstimatorPolicy, squashed
 from cfx.policies.features import History

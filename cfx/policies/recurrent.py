@@ -14,7 +14,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from cfx.memory import require_memory
+from cfx.core.memory import require_memory
 from cfx.policies.base import PolicyNetwork, PolicySettings
 
 _BYTES = 16.0

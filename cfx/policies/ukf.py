@@ -17,7 +17,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from cfx.component import Settings
+from cfx.core.component import Settings
 from cfx.policies.base import ResidualSettings
 from cfx.policies.estimator import (
     DrivenModel,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from cfx.plots.figure import figure
 from cfx.report.blocks import Figure, View
+from cfx.report.figures.figure import figure
 from cfx.report.job import Job
 
 if TYPE_CHECKING:
@@ -31,6 +31,6 @@ def shown(drawing: Drawing, label: str) -> Figure:
 
 def view(drawing: Drawing, note: str = "") -> View:
     """Returns a drawing as one view of a figure."""
-    from cfx.plots.write import inline_svg
+    from cfx.report.figures.write import inline_svg
 
     return View(inline_svg(drawing), note)

@@ -12,9 +12,9 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cfx.errors import DataError
-from cfx.job_folder import parse_json, parse_yaml
-from cfx.memory import in_units, total_memory
+from cfx.core.errors import DataError
+from cfx.core.job_folder import parse_json, parse_yaml
+from cfx.core.memory import in_units, total_memory
 
 T = TypeVar("T")
 

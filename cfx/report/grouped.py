@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cfx.errors import ConfigError
+from cfx.core.errors import ConfigError
 from cfx.report.job import Job, any_baselines
 from cfx.report.names import shortest_names
-from cfx.tracking.provenance import flatten
+from cfx.results.provenance import flatten
 
 
 @dataclass(frozen=True)

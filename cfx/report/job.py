@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from cfx.data.style.result import StyleResult
+from cfx.evaluation.metrics.base import RECORDED, MetricInfo, key_of
 from cfx.evaluation.result import METHODS, PairTrajectory
 from cfx.evaluation.statistics import STATISTICS, Improvement
-from cfx.metrics.base import RECORDED, MetricInfo, key_of
-from cfx.plots.results import ParameterAxis, Results
-from cfx.plots.words import TEST, scope_label
+from cfx.report.figures.results import ParameterAxis, Results
+from cfx.report.figures.words import TEST, scope_label
 from cfx.report.metrics import known_metrics
 from cfx.simulation.trajectory import TRANSIENT_S
-from cfx.style.result import StyleResult
 
 
 @dataclass(frozen=True)

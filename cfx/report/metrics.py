@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from cfx.metrics.base import SUMMARIES, MetricInfo
-from cfx.plots.words import TEST, pretty_unit
+from cfx.evaluation.metrics.base import SUMMARIES, MetricInfo
+from cfx.report.figures.words import TEST, pretty_unit
 
 
 def known_metrics(data: Mapping[str, Any], metrics: Mapping[str, float]) -> tuple[MetricInfo, ...]:

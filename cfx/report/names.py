@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from cfx.plots.words import common_prefix
+from cfx.report.figures.words import common_prefix
 from cfx.report.job import Job
-from cfx.tracking.provenance import flatten
+from cfx.results.provenance import flatten
 
 GROUPS = ("model", "policy", "learner", "protocol", "objective", "optimizer", "data")
 _NO_DIFFERENCE = (

@@ -7,13 +7,13 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from cfx.files import write_output
-from cfx.plots.look import CLUSTER_COLOURS, COLOURS
+from cfx.core.files import write_output
+from cfx.data.style.result import CLUSTERS
 from cfx.report.job import Runs, calibrations
 from cfx.report.scripts import inline_scripts, security_policy
 from cfx.report.sections import SECTIONS
 from cfx.report.summary import summary
-from cfx.style.result import CLUSTERS
+from cfx.results.look import CLUSTER_COLOURS, COLOURS
 
 _ASSETS = resources.files("cfx.report") / "assets"
 _SCRIPTS = ("sortable/sortable.min.js", "sortable/sortable.a11y.min.js", "page.js")
@@ -86,7 +86,7 @@ def _placed(svg: str, place: str) -> Any:
     """Returns an `svg` element with ids of its own, at a place of the page."""
     from markupsafe import Markup
 
-    from cfx.plots.write import PLACE
+    from cfx.report.figures.write import PLACE
 
     return Markup(svg.replace(PLACE, f"{place}-"))  # noqa: S704 - Matplotlib escapes all texts
 

@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 
 from cfx.calibration.flatness import NEAR
-from cfx.files import write_output
-from cfx.plots.words import short_label
+from cfx.core.files import write_output
+from cfx.report.figures.words import short_label
 from cfx.report.files import without_folders
 from cfx.report.grouped import Row, any_adapts, baselines_of, methods_of, rows_of
 from cfx.report.job import Job, Runs

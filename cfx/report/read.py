@@ -13,10 +13,10 @@ from typing import Any
 
 import pandas as pd
 
+from cfx.core.job_folder import examine
 from cfx.evaluation.distributions import DISTRIBUTION_COLUMNS
 from cfx.evaluation.forecasts import FORECAST_COLUMNS
 from cfx.evaluation.traffic.result import GROWTH_COLUMNS, ROAD_COLUMNS, STRIP_COLUMNS
-from cfx.job_folder import examine
 from cfx.report.files import (
     optional,
     public,

@@ -6,13 +6,13 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from cfx.errors import DataError
-from cfx.plots.values import natural_order
+from cfx.core.errors import DataError
+from cfx.core.storage import is_url, local_folder
+from cfx.report.figures.values import natural_order
 from cfx.report.files import optional, read_json, without_password
 from cfx.report.job import Job, Origin, Runs, Unfinished
 from cfx.report.names import named
 from cfx.report.read import read_job
-from cfx.storage import is_url, local_folder
 
 _PASSED_OVER = {".hydra", "mlartifacts", "figures", "policy", "cache"}
 """Folders below an output folder that hold no jobs of their own."""

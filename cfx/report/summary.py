@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from cfx.evaluation.headline import Comparison, contradiction
-from cfx.plots.words import TEST, explained, few_drivers, percent, plural, short_label
+from cfx.report.figures.words import TEST, explained, few_drivers, percent, plural, short_label
 from cfx.report.grouped import Row, rows_over_seeds
 from cfx.report.job import Job, calibrations, with_baseline, without_baseline
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from cfx.plots.words import MINUS, NOTHING, explained, percent, short_label
+from cfx.report.figures.words import MINUS, NOTHING, explained, percent, short_label
 from cfx.report.job import Job
 
 

@@ -6,9 +6,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from cfx.errors import TrackingError
+from cfx.core.errors import TrackingError
 from cfx.report.job import Origin, Unfinished
-from cfx.tracking.store import (
+from cfx.results.store import (
     download_run,
     is_run_id,
     open_store,

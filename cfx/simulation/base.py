@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from cfx.errors import ConfigError
+from cfx.core.errors import ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.simulation.kernel.keys import ComponentKey
 from cfx.simulation.trajectory import Segments, Start, Terms

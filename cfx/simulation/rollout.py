@@ -24,15 +24,15 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from cfx.component import folder_hash
-from cfx.errors import ParameterError
+from cfx.core.component import folder_hash
+from cfx.core.errors import ParameterError
+from cfx.core.threads import one_thread
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.simulation.base import Stepper
 from cfx.simulation.compiling import torch_compiled
 from cfx.simulation.kernel import run as kernel
 from cfx.simulation.kernel.keys import ComponentKey
 from cfx.simulation.step import advance_vehicle
-from cfx.simulation.threads import one_thread
 from cfx.simulation.tiles import Tile, tile_size, tiles
 from cfx.simulation.trajectory import Segments, Start, Terms, Trajectory, common_shape
 

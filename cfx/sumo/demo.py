@@ -17,13 +17,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from cfx.agents.agent import Agent
-from cfx.config import DemoSettings, JobConfig
+from cfx.core.files import atomic_write
+from cfx.data.pairs import PairSet
 from cfx.evaluation.result import Evaluation, PairTrajectory
-from cfx.files import atomic_write
-from cfx.pairs import PairSet
-from cfx.plots.pairs import evenly_spread
-from cfx.simulators.sumo.installed import require_sumo
+from cfx.policies.agent import Agent
+from cfx.report.figures.pairs import evenly_spread
+from cfx.results.config import DemoSettings, JobConfig
+from cfx.simulation.sumo.installed import require_sumo
 from cfx.sumo.demo_request import PolicyKnowledge, ask, fitting_pairs, request_of
 from cfx.sumo.motorway import Motorway, read_motorway
 from cfx.sumo.shown import Shown, evaluation_in_sumo, shown_pair

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cfx.agents.agent import Agent
+from cfx.core.files import atomic_write
 from cfx.evaluation.result import Evaluation
-from cfx.files import atomic_write
-from cfx.plots.look import COLOURS
-from cfx.plots.results import Results
-from cfx.plots.words import LABELS
+from cfx.policies.agent import Agent
+from cfx.report.figures.results import Results
+from cfx.report.figures.words import LABELS
 from cfx.report.scripts import embedded_json, inline_scripts, security_policy
+from cfx.results.look import COLOURS
 from cfx.sumo.motorway import Motorway
 from cfx.sumo.replay import CAR_LENGTH, FOLLOWERS
 from cfx.sumo.shown import Array, Shown
@@ -152,8 +152,8 @@ class _Plot(NamedTuple):
 
 def _plots(evaluation: Evaluation) -> list[_Plot]:
     """Draws each pair; the axes' places are where the page puts its line of time."""
-    from cfx.plots.trajectories import draw_pair
-    from cfx.plots.write import PLACE, inline_svg
+    from cfx.report.figures.trajectories import draw_pair
+    from cfx.report.figures.write import PLACE, inline_svg
 
     results = Results.of(evaluation)
     found = []

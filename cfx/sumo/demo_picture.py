@@ -13,12 +13,12 @@ from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
 from cfx.evaluation.result import Evaluation
-from cfx.plots.canvas import canvas, styled
-from cfx.plots.look import COLOURS, INK
-from cfx.plots.results import Results
-from cfx.plots.trajectories import drives
-from cfx.plots.words import LABELS, short
-from cfx.plots.write import write_figure
+from cfx.report.figures.canvas import canvas, styled
+from cfx.report.figures.results import Results
+from cfx.report.figures.trajectories import drives
+from cfx.report.figures.words import LABELS, short
+from cfx.report.figures.write import write_figure
+from cfx.results.look import COLOURS, INK
 from cfx.sumo.motorway import Motorway
 from cfx.sumo.replay import CAR_LENGTH, FOLLOWERS
 from cfx.sumo.shown import Shown

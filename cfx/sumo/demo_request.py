@@ -17,11 +17,11 @@ import pandas as pd
 import torch
 
 import cfx
-from cfx.agents.agent import Agent
-from cfx.agents.placement import ALL
-from cfx.errors import DataError, SumoError
+from cfx.core.errors import DataError, SumoError
+from cfx.data.pairs import Pair, PairBatch, PairSet
 from cfx.evaluation.result import Evaluation, PairTrajectory
-from cfx.pairs import Pair, PairBatch, PairSet
+from cfx.policies.agent import Agent
+from cfx.policies.placement import ALL
 from cfx.sumo.channel import Message, receive, send
 from cfx.sumo.motorway import ABREAST, Motorway
 from cfx.sumo.replay import FOLLOWERS

@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
 
-from cfx.errors import ConfigError, DataError, OutputError, SumoError, nearest
-from cfx.files import atomic_write
-from cfx.progress import Task
-from cfx.simulators.sumo.installed import require_sumo
+from cfx.core.errors import ConfigError, DataError, OutputError, SumoError, nearest
+from cfx.core.files import atomic_write
+from cfx.core.progress import Task
+from cfx.simulation.sumo.installed import require_sumo
 from cfx.sumo.driver import OBEYS_ALL
 from cfx.sumo.fleet import Fleet
 from cfx.sumo.histogram import Histogram
@@ -611,7 +611,7 @@ def parse_drivers(given: Sequence[str]) -> dict[str, str]:
 
 def report(run: ScenarioRun) -> None:
     """Prints what happened: tables, and one line about speed."""
-    from cfx.console import put
+    from cfx.core.console import put
 
     put(_what_happened(run))
     put(_braking(run))
@@ -697,7 +697,7 @@ def _beside_the_recording(run: ScenarioRun) -> Table:
 
 
 def _table(*columns: str) -> Table:
-    from cfx.console import blank_table
+    from cfx.core.console import blank_table
 
     table = blank_table(*columns)
     for column in table.columns[1:]:

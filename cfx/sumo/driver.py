@@ -21,28 +21,28 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from cfx import registry
-from cfx.agents import checkpoint
-from cfx.agents.agent import Agent, AgentState
-from cfx.agents.context import DriverContext
-from cfx.agents.core import AgentCore
-from cfx.agents.heads.direct import DirectHead
-from cfx.agents.placement import ALL
-from cfx.agents.scaler import Scaler
-from cfx.agents.valid_range import share_in_words
 from cfx.calibration.settings import WindowSettings
-from cfx.errors import DataError, ParameterError, SumoError
-from cfx.job_folder import parse_json
+from cfx.core import registry
+from cfx.core.errors import DataError, ParameterError, SumoError
+from cfx.core.job_folder import parse_json
+from cfx.core.threads import one_thread
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.limits import at_limits
+from cfx.policies import checkpoint
+from cfx.policies.agent import Agent, AgentState
 from cfx.policies.base import ConstantNetwork
+from cfx.policies.context import DriverContext
+from cfx.policies.core import AgentCore
 from cfx.policies.features import History
 from cfx.policies.fixed import FixedPolicy
+from cfx.policies.heads.direct import DirectHead
+from cfx.policies.placement import ALL
+from cfx.policies.scaler import Scaler
+from cfx.policies.valid_range import share_in_words
+from cfx.results.store import folder_of
 from cfx.simulation.step import advance_vehicle
-from cfx.simulation.threads import one_thread
 from cfx.sumo.surroundings import Connection, Seen, look
 from cfx.sumo.vehicles import VehicleTable
-from cfx.tracking.store import folder_of
 
 _BOUNDS_BRAKING = 4
 """Bit of SUMO's speed mode with which a vehicle brakes no harder than its `decel`."""

@@ -13,14 +13,14 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from cfx import registry
 from cfx.calibration.flatness import COLUMN
-from cfx.errors import ConfigError, DataError
-from cfx.files import write_output
-from cfx.job_folder import examine, parse_yaml
+from cfx.core import registry
+from cfx.core.errors import ConfigError, DataError
+from cfx.core.files import write_output
+from cfx.core.job_folder import examine, parse_yaml
 from cfx.models.base import DrivingModel
 from cfx.models.vtype import InSumo, VType
-from cfx.tracking.store import folder_of
+from cfx.results.store import folder_of
 
 NAME = "drivers.add.xml"
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from cfx.agents.placement import ALL
-from cfx.errors import DataError
+from cfx.core.errors import DataError
+from cfx.policies.placement import ALL
 from cfx.sumo.driver import OBEYS_ALL, Driver
 from cfx.sumo.surroundings import Connection
 

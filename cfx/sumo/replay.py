@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from cfx.errors import CfxError
+from cfx.core.errors import CfxError
 from cfx.sumo.channel import Array, Message, receive, send
 
 FOLLOWERS = ("real", "policy", "default")

@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from cfx.data.pairs import Pair
 from cfx.evaluation.result import Evaluation, PairTrajectory
-from cfx.pairs import Pair
 from cfx.sumo.replay import FOLLOWERS
 
 Array = NDArray[np.float64]

@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cfx.errors import SumoError
-from cfx.files import write_json
-from cfx.progress import Task
-from cfx.simulators.sumo.installed import require_sumo
+from cfx.core.errors import SumoError
+from cfx.core.files import write_json
+from cfx.core.progress import Task
+from cfx.simulation.sumo.installed import require_sumo
 from cfx.sumo.drive import started
 from cfx.sumo.driver import OBEYS_ALL
 from cfx.sumo.fleet import Fleet
@@ -141,7 +141,7 @@ def run_stress(
 
 def report_stress(result: StressResult, output: Path | None = None) -> None:
     """Prints a table of the events, and writes it as JSON where `output` is given."""
-    from cfx.console import blank_table, put
+    from cfx.core.console import blank_table, put
 
     table = blank_table(
         "event",

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from cfx.errors import SumoError
+from cfx.core.errors import SumoError
 
 Connection = Any
 """The module `libsumo`, the module `traci`, or a connection that `traci.getConnection` gives."""

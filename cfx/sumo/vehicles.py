@@ -11,8 +11,8 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from cfx.agents.agent import Agent
 from cfx.models.base import DrivingModel
+from cfx.policies.agent import Agent
 from cfx.policies.features import History
 
 

@@ -15,17 +15,17 @@ from typing import cast
 
 import torch
 
-from cfx import registry
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
+from cfx.calibration.optimizers.random import RandomSearch
 from cfx.calibration.windows import Split, Windows, WindowSettings
-from cfx.datasets.tidy import TidyDataset
+from cfx.core import registry
+from cfx.core.progress import Task
+from cfx.core.threads import limit_cores
+from cfx.data.pairs import PairBatch, PairSet
+from cfx.data.tidy import TidyDataset
 from cfx.models.base import DrivingModel
-from cfx.optimizers.random import RandomSearch
-from cfx.pairs import PairBatch, PairSet
-from cfx.progress import Task
 from cfx.simulation.rollout import MemoryStepper
-from cfx.simulation.threads import limit_cores
 
 _FILE = Path(__file__).parents[3] / "shared" / "data" / "i80_reconstructed_pairs.parquet"
 _NETWORKS = 6

@@ -19,9 +19,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cfx.datasets.synthetic import SyntheticDataset
-from cfx.datasets.tidy import write_tidy
-from cfx.pairs import PairSet
+from cfx.data.pairs import PairSet
+from cfx.data.tidy import write_tidy
+from cfx.simulation.synthetic import SyntheticDataset
 
 _FRAMES, _OF_FILE = 300, 1000
 """Frames of each pair, and pairs of each file."""

@@ -18,16 +18,16 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from cfx import registry
 from cfx.calibration.losses import SegmentLosses
+from cfx.calibration.objectives.rmse import SpeedRmse
+from cfx.calibration.optimizers.base import Optimizer
 from cfx.calibration.windows import Split, WindowSettings
-from cfx.datasets.tidy import TidyDataset
+from cfx.core import registry
+from cfx.core.threads import limit_cores
+from cfx.data.pairs import PairBatch
+from cfx.data.tidy import TidyDataset
 from cfx.models.base import DrivingModel
-from cfx.objectives.rmse import SpeedRmse
-from cfx.optimizers.base import Optimizer
-from cfx.pairs import PairBatch
 from cfx.simulation.rollout import MemoryStepper
-from cfx.simulation.threads import limit_cores
 
 _FILE = Path(__file__).parents[3] / "shared" / "data" / "i80_reconstructed_pairs.parquet"
 _SPLIT = 0.8

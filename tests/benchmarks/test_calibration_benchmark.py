@@ -17,12 +17,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx import registry
 from cfx.calibration.losses import PooledLosses, SegmentLosses
+from cfx.calibration.objectives.rmse import SpeedRmse
+from cfx.calibration.optimizers.random import RandomSearch, sobol
+from cfx.core import registry, threads
 from cfx.models.base import DrivingModel
-from cfx.objectives.rmse import SpeedRmse
-from cfx.optimizers.random import RandomSearch, sobol
-from cfx.simulation import threads
 from cfx.simulation.rollout import MemoryStepper
 
 numba_loops = pytest.importorskip("tests.benchmarks.numba_loops", reason="numba is not installed")

@@ -13,11 +13,11 @@ from typing import Any
 import pytest
 import torch
 
+from cfx.core.threads import cores, limit_cores
 from cfx.learners.base import TrainingResult
 from cfx.learners.rollout import RolloutLearner
 from cfx.models.krauss import Krauss
 from cfx.policies.gru import GruPolicy
-from cfx.simulation.threads import cores, limit_cores
 from tests.benchmarks.test_rollout_learning_benchmark import POLICY, _training_data
 
 NETWORKS, EPOCHS = 6, 12

@@ -13,18 +13,18 @@ import torch
 
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
+from cfx.calibration.optimizers.random import RandomSearch
 from cfx.calibration.windows import Windows, WindowSettings
-from cfx.engine.base import Engine
-from cfx.engine.local import LocalEngine
+from cfx.core import threads
+from cfx.core.engine.base import Engine
+from cfx.core.engine.local import LocalEngine
+from cfx.core.progress import Task
+from cfx.data.pairs import PairBatch
 from cfx.models.w99 import W99
-from cfx.optimizers.random import RandomSearch
-from cfx.pairs import PairBatch
-from cfx.progress import Task
-from cfx.simulation import threads
 from cfx.simulation.rollout import MemoryStepper
 from cfx_dask.engine.engine import DaskEngine
+from tests.core.engine.work import slowly
 from tests.drives import wavy_pairs
-from tests.engine.work import slowly
 
 SHARDS = 200
 DRIVERS = 192

@@ -21,13 +21,13 @@ from gpytorch.mlls import ExactMarginalLogLikelihood
 from torch import Tensor
 
 from cfx.calibration.losses import SegmentLosses
+from cfx.calibration.objectives.rmse import SpeedRmse
+from cfx.calibration.optimizers.botorch import BotorchOptimizer
+from cfx.calibration.optimizers.gradient import GradientSearch
+from cfx.calibration.optimizers.random import RandomSearch
 from cfx.models.base import DrivingModel, Leader
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
-from cfx.objectives.rmse import SpeedRmse
-from cfx.optimizers.botorch import BotorchOptimizer
-from cfx.optimizers.gradient import GradientSearch
-from cfx.optimizers.random import RandomSearch
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.trajectory import Start
 

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from cfx.agents import checkpoint
-from cfx.simulators.sumo.network import network
+from cfx.policies import checkpoint
+from cfx.simulation.sumo.network import network
 from tests.sumo.policies import adaptive
 
 pytest.importorskip("traci", reason="needs the extra sumo")

@@ -15,10 +15,10 @@ import pytest
 import torch
 
 from cfx.calibration.losses import PooledLosses, SegmentLosses
+from cfx.calibration.objectives.rmse import SpeedRmse
 from cfx.models.base import DrivingModel
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
-from cfx.objectives.rmse import SpeedRmse
 from cfx.simulation.rollout import MemoryStepper
 
 DRIVES, FOLDS, STEPS, CANDIDATES, DT, MEMORY = 70, 5, 600, 512, 0.1, 1 << 30

@@ -16,8 +16,9 @@ from typing import Any
 import pytest
 import torch
 
-from cfx.agents.heads.offset import NONE
 from cfx.calibration.windows import Split, WindowSettings
+from cfx.core.threads import one_thread
+from cfx.data.pairs import PairBatch
 from cfx.learners.base import TrainingData
 from cfx.learners.rollout import RolloutSettings
 from cfx.learners.rollout.dataset import RolloutDataset
@@ -25,10 +26,9 @@ from cfx.learners.rollout.module import RolloutModule
 from cfx.models.base import DrivingModel
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
-from cfx.pairs import PairBatch
 from cfx.policies.gru import GruPolicy
+from cfx.policies.heads.offset import NONE
 from cfx.simulation.rollout import MemoryStepper
-from cfx.simulation.threads import one_thread
 from tests.drives import wavy_pairs
 
 NETWORKS, DRIVERS, FRAMES = 6, 57, 700

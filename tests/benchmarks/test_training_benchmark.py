@@ -11,13 +11,13 @@ from torch import nn
 
 from cfx.calibration.calibrator import Labels
 from cfx.calibration.windows import Split, Windows, WindowSettings
+from cfx.core.threads import one_thread
+from cfx.data.pairs import PairBatch
 from cfx.learners.base import TrainingData
 from cfx.learners.imitation import ImitationLearner
 from cfx.models.krauss import Krauss
-from cfx.pairs import PairBatch
 from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
-from cfx.simulation.threads import one_thread
 from tests.drives import straight_pairs
 
 PAIRS, FRAMES, EPOCHS, BATCH = 94, 700, 5, 16

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from cfx.calibration.cache import Cache
-from cfx.component import content_key
-from cfx.errors import OutputError
+from cfx.core.component import content_key
+from cfx.core.errors import OutputError
 
 ROOT = Path(__file__).resolve().parents[2]
 PAIRS, GROUP = 24, 4
@@ -26,9 +26,9 @@ import torch
 from cfx.calibration import calibrator as module
 from cfx.calibration.cache import Cache
 from cfx.models.krauss import Krauss
-from cfx.optimizers.random import RandomSearch
-from cfx.pairs import PairBatch
-from cfx.progress import Task
+from cfx.calibration.optimizers.random import RandomSearch
+from cfx.data.pairs import PairBatch
+from cfx.core.progress import Task
 from cfx.simulation.rollout import MemoryStepper
 from tests.drives import wavy_pairs
 

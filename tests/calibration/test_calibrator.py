@@ -13,27 +13,27 @@ from torch import Tensor
 
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
+from cfx.calibration.objectives.base import Objective
+from cfx.calibration.objectives.huber import SpeedHuber
+from cfx.calibration.objectives.mixed import Mixed
+from cfx.calibration.objectives.rmse import GapRmse, SpeedRmse
+from cfx.calibration.objectives.theil import TheilU
+from cfx.calibration.optimizers.base import CandidateLosses, Optimizer
+from cfx.calibration.optimizers.botorch import BotorchOptimizer
+from cfx.calibration.optimizers.gradient import GradientSearch
+from cfx.calibration.optimizers.random import RandomSearch
 from cfx.calibration.shards import CalibrationShard
 from cfx.calibration.windows import Windows, WindowSettings
-from cfx.datasets.synthetic import SyntheticDataset
-from cfx.engine.base import Engine, Report
-from cfx.errors import OutputError
+from cfx.core import threads
+from cfx.core.engine.base import Engine, Report
+from cfx.core.errors import OutputError
+from cfx.core.progress import Task
+from cfx.data.pairs import PairBatch, PairSet
 from cfx.models.base import DrivingModel
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
-from cfx.objectives.base import Objective
-from cfx.objectives.huber import SpeedHuber
-from cfx.objectives.mixed import Mixed
-from cfx.objectives.rmse import GapRmse, SpeedRmse
-from cfx.objectives.theil import TheilU
-from cfx.optimizers.base import CandidateLosses, Optimizer
-from cfx.optimizers.botorch import BotorchOptimizer
-from cfx.optimizers.gradient import GradientSearch
-from cfx.optimizers.random import RandomSearch
-from cfx.pairs import PairBatch, PairSet
-from cfx.progress import Task
-from cfx.simulation import threads
 from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.synthetic import SyntheticDataset
 from tests.drives import straight_pairs, wavy_pairs
 
 SETTINGS = WindowSettings()

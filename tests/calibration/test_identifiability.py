@@ -9,10 +9,10 @@ import torch
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.identifiability import PLACES, slices, training_errors
+from cfx.calibration.optimizers.random import RandomSearch
+from cfx.core.progress import Task
+from cfx.data.pairs import PairBatch, PairSet
 from cfx.models.krauss import Krauss
-from cfx.optimizers.random import RandomSearch
-from cfx.pairs import PairBatch, PairSet
-from cfx.progress import Task
 from cfx.simulation.rollout import MemoryStepper
 from tests.drives import wavy_pairs
 

@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from cfx.calibration.losses import FullTrajectories, PooledLosses, SegmentLosses
+from cfx.calibration.objectives.base import FrameValues, Objective
+from cfx.calibration.objectives.mixed import Mixed
+from cfx.calibration.objectives.rmse import GapRmse, SpeedRmse
+from cfx.calibration.objectives.theil import TheilU
+from cfx.data.pairs import PairBatch
 from cfx.models.base import Leader
 from cfx.models.krauss import Krauss
-from cfx.objectives.base import FrameValues, Objective
-from cfx.objectives.mixed import Mixed
-from cfx.objectives.rmse import GapRmse, SpeedRmse
-from cfx.objectives.theil import TheilU
-from cfx.pairs import PairBatch
 from cfx.simulation.kernel import run as kernel
 from cfx.simulation.rollout import MemoryStepper, simulate
 from cfx.simulation.trajectory import Start

@@ -12,17 +12,17 @@ from torch import Tensor
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.losses import SegmentLosses
+from cfx.calibration.objectives.rmse import SpeedRmse
+from cfx.calibration.optimizers.base import Optimizer
+from cfx.calibration.optimizers.botorch import BotorchOptimizer
+from cfx.calibration.optimizers.gradient import GradientSearch
+from cfx.calibration.optimizers.random import RandomSearch
 from cfx.calibration.prior import LossesWithPrior, prior_weight
+from cfx.core.parameters import Parameter, ParameterSpace
+from cfx.core.progress import Task
+from cfx.data.pairs import PairBatch
 from cfx.models.base import Follower, Leader
 from cfx.models.idm import IDM
-from cfx.objectives.rmse import SpeedRmse
-from cfx.optimizers.base import Optimizer
-from cfx.optimizers.botorch import BotorchOptimizer
-from cfx.optimizers.gradient import GradientSearch
-from cfx.optimizers.random import RandomSearch
-from cfx.pairs import PairBatch
-from cfx.parameters import Parameter, ParameterSpace
-from cfx.progress import Task
 from cfx.simulation.rollout import MemoryStepper
 from tests.drives import wavy_pairs
 

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cfx.calibration.windows import Split, Windows, WindowSettings
-from cfx.component import validate
-from cfx.errors import ConfigError, DataError
-from cfx.pairs import PairSet
+from cfx.core.component import validate
+from cfx.core.errors import ConfigError, DataError
+from cfx.data.pairs import PairSet
 from tests.drives import straight_pairs
 
 

@@ -6,10 +6,10 @@ import argparse
 
 import pytest
 
-from cfx.commands.base import Command
-from cfx.commands.cite import CiteCommand
+from cfx.app.commands.cite import CiteCommand
 from cfx.contracts import commands as checks
 from cfx.contracts.contract import Check
+from cfx.core.command import Command
 
 
 class Silent(CiteCommand):

@@ -10,9 +10,9 @@ import pytest
 import cfx.contracts
 from cfx.contracts.contract import NotApplicable
 from cfx.contracts.suites import hold
-from cfx.errors import PluginError
+from cfx.core.errors import PluginError
+from cfx.core.registry import KINDS
 from cfx.models.krauss import Krauss
-from cfx.registry import KINDS
 
 SUITES = {
     "dataset": cfx.contracts.DatasetContract,

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from cfx.contracts import datasets as checks
-from cfx.datasets.base import Dataset, DatasetSettings
-from cfx.errors import PluginError
-from cfx.pairs import Pair, PairSet
+from cfx.core.errors import PluginError
+from cfx.data.base import Dataset, DatasetSettings
+from cfx.data.pairs import Pair, PairSet
 from tests.drives import straight_pairs
 
 
@@ -63,7 +63,7 @@ class Selecting(Straight):
 
 class Silent(Straight):
     def load(self) -> PairSet:
-        from cfx.errors import DataError
+        from cfx.core.errors import DataError
 
         if self.settings.min_frames > 900:
             raise DataError("no pairs")

@@ -10,11 +10,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.agents.scaler import Scaler
 from cfx.contracts import learners as checks
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import measured_history, tokens
+from cfx.policies.scaler import Scaler
 
 EPOCHS = 12
 

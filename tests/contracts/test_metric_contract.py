@@ -8,8 +8,8 @@ from torch import Tensor
 
 from cfx.contracts import metrics as checks
 from cfx.contracts.contract import Check, NotApplicable
-from cfx.metrics.base import Metric, Trajectories
-from cfx.metrics.errors import MaeSpeed, RmseSpeed
+from cfx.evaluation.metrics.base import Metric, Trajectories
+from cfx.evaluation.metrics.errors import MaeSpeed, RmseSpeed
 
 
 class OfFrames(RmseSpeed):

@@ -10,12 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.component import Settings
 from cfx.contracts import models as checks
 from cfx.contracts import violations
+from cfx.core.component import Settings
+from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.models.base import DrivingModel
 from cfx.models.krauss import Krauss, KraussSettings
-from cfx.parameters import Parameter, ParameterSpace
 
 Step = Callable[..., Any]
 

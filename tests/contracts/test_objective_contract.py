@@ -8,13 +8,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from cfx.calibration.objectives.base import FrameValues, Objective, root_mean_square
+from cfx.calibration.objectives.rmse import SpeedRmse
+from cfx.calibration.objectives.theil import TheilU
 from cfx.contracts import objectives as checks
 from cfx.contracts import violations
 from cfx.contracts.smoke import smoke_check_objective
-from cfx.errors import PluginError
-from cfx.objectives.base import FrameValues, Objective, root_mean_square
-from cfx.objectives.rmse import SpeedRmse
-from cfx.objectives.theil import TheilU
+from cfx.core.errors import PluginError
 
 
 class Silent(SpeedRmse):

@@ -9,11 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from cfx.calibration.optimizers.base import CandidateLosses, Optimizer
+from cfx.calibration.optimizers.random import RandomSearch
 from cfx.contracts import optimizers as checks
 from cfx.contracts import violations
-from cfx.errors import PluginError
-from cfx.optimizers.base import CandidateLosses, Optimizer
-from cfx.optimizers.random import RandomSearch
+from cfx.core.errors import PluginError
 
 GOOD = RandomSearch(samples=4096)
 

@@ -10,13 +10,13 @@ import torch
 
 from cfx.calibration.windows import Split
 from cfx.contracts import protocols as checks
+from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
+from cfx.evaluation.protocols.within_driver import WithinDriver
 from cfx.evaluation.result import Evaluation, PairTrajectory
 from cfx.learners.base import TrainingData, TrainingResult
 from cfx.learners.imitation import ImitationLearner
 from cfx.policies.base import Policy
 from cfx.policies.fixed import FixedPolicy
-from cfx.protocols.base import Protocol, ProtocolContext, ProtocolResult
-from cfx.protocols.within_driver import WithinDriver
 
 
 class Retelling(WithinDriver):

@@ -11,13 +11,13 @@ import torch
 
 from cfx.contracts import simulators as checks
 from cfx.contracts.contract import violations
-from cfx.errors import ConfigError, SumoError
+from cfx.core.errors import ConfigError, SumoError
 from cfx.models.base import DrivingModel, Follower
 from cfx.models.krauss import Krauss
 from cfx.simulation.base import Stepper
+from cfx.simulation.memory import MemorySimulator
 from cfx.simulation.rollout import MemoryStepper
-from cfx.simulators.base import Simulator
-from cfx.simulators.memory import MemorySimulator
+from cfx.simulation.simulator import Simulator
 
 MakeStepper = Callable[[DrivingModel, float], Any]
 

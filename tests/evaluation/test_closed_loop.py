@@ -8,23 +8,23 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.agents.agent import Agent
-from cfx.agents.core import AgentCore
-from cfx.agents.heads.direct import DirectHead
-from cfx.agents.scaler import Scaler
 from cfx.calibration.windows import WindowSettings
+from cfx.data.pairs import PairBatch
+from cfx.data.style.result import StyleResult
 from cfx.evaluation.closed_loop import ClosedLoop, simulate_closed_loop
 from cfx.evaluation.evaluate import evaluate
 from cfx.models.base import DrivingModel, Leader
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
-from cfx.pairs import PairBatch
+from cfx.policies.agent import Agent
 from cfx.policies.base import ConstantNetwork, Policy
+from cfx.policies.core import AgentCore
 from cfx.policies.fixed import FixedPolicy
 from cfx.policies.gru import GruPolicy
+from cfx.policies.heads.direct import DirectHead
+from cfx.policies.scaler import Scaler
 from cfx.simulation.rollout import MemoryStepper, simulate
 from cfx.simulation.trajectory import Start
-from cfx.style.result import StyleResult
 from tests.drives import wavy_pairs
 
 SPEEDS = ("leader_speed", "follower_speed")

@@ -9,11 +9,11 @@ import pandas as pd
 import pytest
 import torch
 
+from cfx.data.pairs import PairBatch
+from cfx.data.style.result import StyleResult
 from cfx.evaluation.closed_loop import ClosedLoop
 from cfx.evaluation.evaluate import evaluate
 from cfx.models.krauss import Krauss
-from cfx.pairs import PairBatch
-from cfx.style.result import StyleResult
 from tests.drives import straight_pairs
 from tests.made_up import GAINS, make_history, make_results
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.agents.agent import Agent
+from cfx.data.pairs import PairBatch
 from cfx.evaluation import forecast_paths
 from cfx.evaluation.closed_loop import simulate_closed_loop
 from cfx.evaluation.forecast_paths import (
@@ -22,7 +22,7 @@ from cfx.evaluation.forecast_paths import (
 )
 from cfx.evaluation.forecasts import Forecasts, errors_by, forecast_errors
 from cfx.models.krauss import Krauss
-from cfx.pairs import PairBatch
+from cfx.policies.agent import Agent
 from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
 from tests.drives import straight_pairs, wavy_pairs

@@ -9,6 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from cfx.core.parameters import Parameter, ParameterSpace
+from cfx.data.pairs import PairBatch
 from cfx.evaluation.closed_loop import simulate_closed_loop
 from cfx.evaluation.platoon import (
     LENGTH,
@@ -22,8 +24,6 @@ from cfx.evaluation.result import Platoon
 from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
 from cfx.models.krauss import Krauss
 from cfx.models.sumo_vtype import SumoVType
-from cfx.pairs import PairBatch
-from cfx.parameters import Parameter, ParameterSpace
 from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
 from tests.evaluation.test_closed_loop import adaptive, constant

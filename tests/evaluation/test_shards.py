@@ -9,12 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.engine.local import LocalEngine
+from cfx.core.engine.local import LocalEngine
+from cfx.data.pairs import PairBatch, PairSet
 from cfx.evaluation import shards
 from cfx.evaluation.closed_loop import simulate_closed_loop
 from cfx.evaluation.shards import simulate_in_shards
 from cfx.models.krauss import Krauss
-from cfx.pairs import PairBatch, PairSet
 from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
 from tests.drives import wavy_pairs

@@ -15,30 +15,30 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-import cfx.agents.checkpoint
+import cfx.app.job.output
 import cfx.calibration.cache
-import cfx.datasets.tidy
-import cfx.files
-import cfx.job.output
-import cfx.plots.write
-from cfx import cli
-from cfx.errors import Terminated
+import cfx.core.files
+import cfx.data.tidy
+import cfx.policies.checkpoint
+import cfx.report.figures.write
+from cfx.app import cli
+from cfx.core.errors import Terminated
 from tests.broken_plugins import QUICK
 
 JOB = [one for one in QUICK if not one.startswith(("figures", "cache", "policy"))]
 JOB += ["policy=gru", "learner.epochs=1", "policy.hidden_size=4"]
 
 MODULES = (
-    cfx.agents.checkpoint,
+    cfx.policies.checkpoint,
     cfx.calibration.cache,
-    cfx.datasets.tidy,
-    cfx.files,
-    cfx.job.output,
-    cfx.plots.write,
+    cfx.data.tidy,
+    cfx.core.files,
+    cfx.app.job.output,
+    cfx.report.figures.write,
 )
 """Whoever writes files."""
 
-WHOLE = cfx.files.atomic_write
+WHOLE = cfx.core.files.atomic_write
 STRIDE = int(os.environ.get("CFX_FAULTS_STRIDE", "61"))
 """Of the faults every so manieth is tried; `make fuzz` tries all."""
 

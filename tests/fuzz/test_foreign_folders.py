@@ -17,10 +17,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import cfx
-from cfx import cli
-from cfx.agents import checkpoint
-from cfx.errors import CfxError
-from cfx.protocols.transfer import Transfer, TransferSettings
+from cfx.app import cli
+from cfx.core.errors import CfxError
+from cfx.evaluation.protocols.transfer import Transfer, TransferSettings
+from cfx.policies import checkpoint
 from cfx.report.page import render
 from cfx.report.runs import read_runs
 from cfx.sumo.driver import Driver
@@ -304,7 +304,7 @@ def test_a_table_that_fits_no_memory_is_refused(
 
 @pytest.mark.filterwarnings("ignore:.*Any type hint")
 def test_mlflow_serves_a_policy_only_from_its_weights(folder: Path) -> None:
-    from cfx.tracking.served_policy import ServedPolicy
+    from cfx.results.served_policy import ServedPolicy
 
     class Context:
         artifacts = {"policy": str(folder / "policy")}  # noqa: RUF012 - MLflow's has it so

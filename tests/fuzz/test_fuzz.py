@@ -19,17 +19,17 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from cfx import registry
-from cfx.agents import checkpoint
+from cfx.app.hydra_source import composed, plain
+from cfx.app.user_errors import explain, is_user_error
 from cfx.calibration.cache import Cache
-from cfx.config import JobConfig
-from cfx.datasets.describe import describe
-from cfx.datasets.ngsim import NgsimDataset
-from cfx.datasets.tidy import TidyDataset, write_tidy
-from cfx.errors import CfxError
-from cfx.hydra_source import composed, plain
-from cfx.tracking.tracker import MlflowTracker
-from cfx.user_errors import explain, is_user_error
+from cfx.core import registry
+from cfx.core.errors import CfxError
+from cfx.data.describe import describe
+from cfx.data.ngsim import NgsimDataset
+from cfx.data.tidy import TidyDataset, write_tidy
+from cfx.policies import checkpoint
+from cfx.results.config import JobConfig
+from cfx.results.tracker import MlflowTracker
 from tests.drives import straight_pairs
 from tests.sumo.policies import adaptive
 

@@ -10,10 +10,8 @@ from typing import Any
 
 import torch
 
-from cfx.agents.agent import Agent
-from cfx.agents.core import AgentCore
-from cfx.agents.heads import HEADS, head_name
 from cfx.calibration.windows import Split, WindowSettings
+from cfx.data.pairs import PairBatch
 from cfx.evaluation.closed_loop import ClosedLoop, simulate_closed_loop
 from cfx.learners.base import TrainingData, TrainingResult
 from cfx.learners.rollout import RolloutLearner, RolloutSettings
@@ -21,9 +19,11 @@ from cfx.learners.rollout.dataset import RolloutDataset
 from cfx.learners.rollout.inputs import RolloutBatch
 from cfx.learners.rollout.module import RolloutModule
 from cfx.models.krauss import Krauss
-from cfx.pairs import PairBatch
+from cfx.policies.agent import Agent
 from cfx.policies.base import Policy
+from cfx.policies.core import AgentCore
 from cfx.policies.gru import GruPolicy
+from cfx.policies.heads import HEADS, head_name
 from cfx.simulation.rollout import MemoryStepper
 from tests.drives import wavy_pairs
 

@@ -9,18 +9,18 @@ from pathlib import Path
 import pytest
 import torch
 
-from cfx.agents.checkpoint import load, save
-from cfx.agents.context import DriverContext
-from cfx.agents.placement import group_by
 from cfx.calibration.calibrator import Labels
 from cfx.calibration.windows import Split, Windows, WindowSettings
-from cfx.errors import DataError
+from cfx.core.errors import DataError
+from cfx.data.pairs import PairBatch
 from cfx.learners.base import TrainingData, TrainingResult
 from cfx.learners.imitation import ImitationLearner
 from cfx.models.krauss import Krauss
-from cfx.pairs import PairBatch
+from cfx.policies.checkpoint import load, save
+from cfx.policies.context import DriverContext
 from cfx.policies.features import measured_history
 from cfx.policies.gru import GruPolicy
+from cfx.policies.placement import group_by
 from cfx.simulation.rollout import MemoryStepper
 from tests.drives import wavy_pairs
 from tests.learners.made import ready

@@ -5,11 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
-from cfx import hydra_source, registry
-from cfx.agents.heads.offset import moved
-from cfx.errors import ConfigError, ParameterError
+from cfx.app import hydra_source
+from cfx.core import registry
+from cfx.core.errors import ConfigError, ParameterError
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
+from cfx.policies.heads.offset import moved
 
 
 def test_adaptation_bounds_move_bounds_outwards_for_policies_alone() -> None:

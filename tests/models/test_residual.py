@@ -10,14 +10,14 @@ import torch
 from torch import Tensor
 
 from cfx.contracts import models
-from cfx.errors import ConfigError
+from cfx.core.errors import ConfigError
+from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
 from cfx.models.residual import RESIDUAL, WithResidual
 from cfx.models.sumo_vtype import SumoVType
 from cfx.models.w99 import W99
-from cfx.parameters import Parameter, ParameterSpace
 from cfx.simulation.kernel.run import model_key
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.trajectory import Start

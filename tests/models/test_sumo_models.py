@@ -3,10 +3,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from cfx import registry
-from cfx.component import validate
 from cfx.contracts import ModelContract
-from cfx.errors import ConfigError, ParameterError
+from cfx.core import registry
+from cfx.core.component import validate
+from cfx.core.errors import ConfigError, ParameterError
 from cfx.models.idm_sumo import IdmSumo
 from cfx.models.krauss import Krauss
 from cfx.models.krauss_sumo import KraussSumo
@@ -94,7 +94,7 @@ def test_a_vtype_has_no_equations_here() -> None:
 
 
 def test_the_node_asks_for_the_parameters() -> None:
-    from cfx.nodes import render
+    from cfx.app.nodes import render
 
     assert "parameters: null  # required" in render(SumoVType, "sumo_vtype")
     with pytest.raises(ConfigError, match="a value is required"):

@@ -7,7 +7,7 @@ import torch
 
 import cfx
 from cfx.contracts import ModelContract
-from cfx.errors import ConfigError
+from cfx.core.errors import ConfigError
 from cfx.models.base import Follower, Leader
 from cfx.models.w99 import W99
 

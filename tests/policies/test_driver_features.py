@@ -16,13 +16,13 @@ from pydantic import ValidationError
 from sklearn.linear_model import Ridge
 
 import cfx
-from cfx.agents import checkpoint
-from cfx.agents.agent import Agent
-from cfx.agents.context import DriverContext
-from cfx.datasets.tidy import write_tidy
-from cfx.errors import ConfigError
+from cfx.core.errors import ConfigError
+from cfx.data.pairs import PairBatch
+from cfx.data.tidy import write_tidy
 from cfx.models.krauss import Krauss
-from cfx.pairs import PairBatch
+from cfx.policies import checkpoint
+from cfx.policies.agent import Agent
+from cfx.policies.context import DriverContext
 from cfx.policies.driver_features import DRIVER_FEATURES, LEAST, MOVING, measure
 from cfx.policies.features import History, measured_history
 from cfx.policies.gru import GruPolicy

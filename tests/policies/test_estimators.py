@@ -11,32 +11,32 @@ import torch
 from filterpy.kalman import KalmanFilter
 from torch import Tensor
 
-from cfx.agents import checkpoint
-from cfx.agents.agent import Agent
-from cfx.agents.core import AgentCore
-from cfx.agents.heads import HEADS
-from cfx.agents.heads.direct import DirectHead
-from cfx.agents.scaler import Scaler
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
+from cfx.calibration.optimizers.gradient import GradientSearch
 from cfx.calibration.windows import WindowSettings
 from cfx.contracts import PolicyContract
-from cfx.errors import ConfigError
+from cfx.core.errors import ConfigError
+from cfx.core.progress import Task
+from cfx.data.pairs import SIGNALS, PairBatch, PairSet
 from cfx.evaluation.closed_loop import simulate_closed_loop
 from cfx.evaluation.forecast_paths import Origins, simulate_from_origins
 from cfx.models.base import DrivingModel
 from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
 from cfx.models.sumo_vtype import SumoVType
-from cfx.optimizers.gradient import GradientSearch
-from cfx.pairs import SIGNALS, PairBatch, PairSet
+from cfx.policies import checkpoint
+from cfx.policies.agent import Agent
 from cfx.policies.base import Policy
+from cfx.policies.core import AgentCore
 from cfx.policies.estimator import EstimatorPolicy
 from cfx.policies.features import token_width
+from cfx.policies.heads import HEADS
+from cfx.policies.heads.direct import DirectHead
 from cfx.policies.particle_filter import ParticleFilterPolicy, reweighted
 from cfx.policies.recalibrate import RecalibratePolicy
+from cfx.policies.scaler import Scaler
 from cfx.policies.ukf import UkfPolicy, unscented_update
-from cfx.progress import Task
 from cfx.simulation.rollout import MemoryStepper
 from tests.drives import wavy_pairs
 

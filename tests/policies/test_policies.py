@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from cfx.contracts import PolicyContract
-from cfx.errors import ConfigError
+from cfx.core.errors import ConfigError
 from cfx.policies.base import Policy
 from cfx.policies.default import DefaultPolicy
 from cfx.policies.features import INPUT_SETS, INPUTS, History, token_width, tokens

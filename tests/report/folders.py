@@ -12,11 +12,11 @@ from typing import Any
 import pandas as pd
 import yaml
 
+from cfx.core.parameters import ParameterSpace
+from cfx.data.style.result import CLUSTERS
 from cfx.evaluation.result import Evaluation
 from cfx.evaluation.statistics import Improvement, improvement_statistics
 from cfx.evaluation.tables import values_of
-from cfx.parameters import ParameterSpace
-from cfx.style.result import CLUSTERS
 from tests.made_up import GAINS, TWO, info, make_history, make_platoon, make_results, with_metric
 
 WITHIN = ("default", "fixed", "policy")

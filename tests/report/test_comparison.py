@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from cfx.plots.words import MINUS
+from cfx.report.figures.words import MINUS
 from cfx.report.job import Job
 from cfx.report.page import render
 from cfx.report.runs import read_runs

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 import yaml
 
-from cfx.cli import main
+from cfx.app.cli import main
 from cfx.report.files import without_folders
 from cfx.report.runs import read_runs
 from tests.report.folders import ACROSS, write_job

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from cfx.cli import main
-from cfx.errors import DataError
+from cfx.app.cli import main
+from cfx.core.errors import DataError
 from cfx.report.runs import read_runs
 from tests.report.folders import ACROSS, write_job
 

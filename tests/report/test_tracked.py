@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from cfx.errors import DataError, TrackingError
+from cfx.core.errors import DataError, TrackingError
 from cfx.report.runs import read_runs
-from cfx.tracking.tracker import MlflowTracker
+from cfx.results.tracker import MlflowTracker
 from tests.report.folders import write_job
 
 

@@ -9,14 +9,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx import registry
+from cfx.calibration.objectives.base import FrameValues, Objective
+from cfx.calibration.objectives.rmse import SpeedRmse
+from cfx.core import registry, threads
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.krauss import Krauss
 from cfx.models.residual import WithResidual
 from cfx.models.w99 import W99
-from cfx.objectives.base import FrameValues, Objective
-from cfx.objectives.rmse import SpeedRmse
-from cfx.simulation import threads
 from cfx.simulation.base import Stepper
 from cfx.simulation.kernel import compiler
 from cfx.simulation.kernel.columns import literal

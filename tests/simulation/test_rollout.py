@@ -9,12 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.errors import ParameterError
+from cfx.core.errors import ParameterError
+from cfx.data.pairs import Pair, PairBatch, PairSet
 from cfx.models.base import DrivingModel, Leader
 from cfx.models.krauss import Krauss
 from cfx.models.w74 import W74
 from cfx.models.w99 import W99
-from cfx.pairs import Pair, PairBatch, PairSet
 from cfx.simulation import rollout
 from cfx.simulation.rollout import MemoryStepper, can_compile, simulate
 from cfx.simulation.trajectory import Start, Trajectory

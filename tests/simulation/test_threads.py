@@ -6,8 +6,8 @@ import os
 
 import pytest
 
-from cfx.simulation import threads
-from cfx.simulation.threads import cores, limit_cores, own_cores
+from cfx.core import threads
+from cfx.core.threads import cores, limit_cores, own_cores
 
 
 @pytest.fixture(autouse=True)

@@ -7,18 +7,18 @@ from typing import Any
 
 import torch
 
-from cfx import registry
-from cfx.agents.agent import Agent
-from cfx.agents.core import AgentCore
-from cfx.agents.heads.base import ParameterHead
-from cfx.agents.heads.direct import DirectHead
-from cfx.agents.heads.offset import OffsetHead
-from cfx.agents.heads.residual import ResidualHead
-from cfx.agents.heads.stochastic import StochasticHead
-from cfx.agents.scaler import Scaler
 from cfx.calibration.windows import WindowSettings
+from cfx.core import registry
 from cfx.models.base import DrivingModel
+from cfx.policies.agent import Agent
+from cfx.policies.core import AgentCore
 from cfx.policies.gru import GruPolicy
+from cfx.policies.heads.base import ParameterHead
+from cfx.policies.heads.direct import DirectHead
+from cfx.policies.heads.offset import OffsetHead
+from cfx.policies.heads.residual import ResidualHead
+from cfx.policies.heads.stochastic import StochasticHead
+from cfx.policies.scaler import Scaler
 
 INPUTS = ("leader_speed", "follower_speed", "gap", "follower_acceleration", "leader_acceleration")
 

@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 
 import cfx
-from cfx.agents import checkpoint
-from cfx.config import DemoSettings
-from cfx.errors import ConfigError, DataError, SumoError
+from cfx.core.errors import ConfigError, DataError, SumoError
+from cfx.policies import checkpoint
+from cfx.results.config import DemoSettings
 from cfx.sumo import motorway
 from cfx.sumo.channel import Message
 from cfx.sumo.demo import check_demo

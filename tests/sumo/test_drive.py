@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 
-from cfx import cli
-from cfx.agents import checkpoint
-from cfx.console import ConsoleHandler
-from cfx.errors import ConfigError
-from cfx.extras import install_line
+from cfx.app import cli
+from cfx.core.console import ConsoleHandler
+from cfx.core.errors import ConfigError
+from cfx.core.extras import install_line
+from cfx.policies import checkpoint
 from cfx.sumo.drive import Collision, ScenarioRun, Tally, parse_drivers, report
 from cfx.sumo.motorway import SHIPPED
 from tests.sumo.policies import adaptive
@@ -120,7 +120,7 @@ def test_what_cannot_be_driven_is_one_sentence_and_leaves_no_file(scenario: Path
         sys.modules["pyarrow"] = None
         import json
         from pathlib import Path
-        from cfx.errors import CfxError
+        from cfx.core.errors import CfxError
         from cfx.sumo.drive import run_scenario
         said = []
         for name, kinds in (("motorway", ["clam"]), ("motorway", ["calm", "ghost"]),

@@ -11,27 +11,27 @@ import torch
 from torch import Tensor
 
 import cfx.sumo
-from cfx.agents import checkpoint
-from cfx.agents.agent import Agent
-from cfx.agents.context import ContextRule
-from cfx.agents.core import AgentCore
-from cfx.agents.heads.direct import DirectHead
-from cfx.agents.heads.offset import shrunk
-from cfx.agents.scaler import Scaler
-from cfx.agents.valid_range import ValidRange
-from cfx.errors import DataError, ParameterError, SumoError
+from cfx.core.errors import DataError, ParameterError, SumoError
+from cfx.data.pairs import PairBatch
+from cfx.data.style.entropy import measure_style
+from cfx.data.style.result import StyleResult
+from cfx.data.style.settings import StyleSettings
 from cfx.evaluation.closed_loop import simulate_closed_loop
 from cfx.evaluation.evaluate import evaluate
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
-from cfx.pairs import PairBatch
+from cfx.policies import checkpoint
+from cfx.policies.agent import Agent
 from cfx.policies.base import ConstantNetwork
+from cfx.policies.context import ContextRule
+from cfx.policies.core import AgentCore
 from cfx.policies.default import DefaultPolicy
 from cfx.policies.fixed import FixedPolicy
+from cfx.policies.heads.direct import DirectHead
+from cfx.policies.heads.offset import shrunk
+from cfx.policies.scaler import Scaler
+from cfx.policies.valid_range import ValidRange
 from cfx.simulation.rollout import MemoryStepper
-from cfx.style.entropy import measure_style
-from cfx.style.result import StyleResult
-from cfx.style.settings import StyleSettings
 from cfx.sumo.demo import simulate_in_sumo
 from cfx.sumo.demo_request import PolicyKnowledge
 from cfx.sumo.driver import Driver, needed_deceleration

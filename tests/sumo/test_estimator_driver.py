@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from cfx.agents.agent import Agent
 from cfx.models.krauss import Krauss
+from cfx.policies.agent import Agent
 from cfx.policies.estimator import EstimatorPolicy
 from tests.policies.test_estimators import ESTIMATORS, agent_of
 

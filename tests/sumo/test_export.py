@@ -11,8 +11,9 @@ import pandas as pd
 import pytest
 import yaml
 
-from cfx import cli, registry
-from cfx.errors import ConfigError, DataError, OutputError
+from cfx.app import cli
+from cfx.core import registry
+from cfx.core.errors import ConfigError, DataError, OutputError
 from cfx.models.base import DrivingModel
 from cfx.sumo.export import export
 from cfx.sumo.motorway import SHIPPED

@@ -86,7 +86,7 @@ print(json.dumps(result.to_json()))
 def test_without_a_window_gui_is_one_sentence(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from cfx import cli
+    from cfx.app import cli
     from cfx.sumo import drive as driving
 
     monkeypatch.setitem(sys.modules, "pyarrow", sys.modules.get("pyarrow"))

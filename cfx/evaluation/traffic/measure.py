@@ -13,6 +13,8 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from cfx.data.pairs import PairBatch
+from cfx.evaluation.metrics.base import RECORDED
 from cfx.evaluation.traffic.edie import PER_HOUR, PER_KM, Strips, region, strips_of
 from cfx.evaluation.traffic.result import (
     GROWTH_COLUMNS,
@@ -23,8 +25,6 @@ from cfx.evaluation.traffic.result import (
 )
 from cfx.evaluation.traffic.roads import Driven, Lanes, Road
 from cfx.evaluation.traffic.waves import PairWaves, pair_waves, ring_waves
-from cfx.metrics.base import RECORDED
-from cfx.pairs import PairBatch
 
 KMH = 3.6
 

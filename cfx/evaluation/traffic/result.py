@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 
-from cfx.metrics.base import RECORDED
+from cfx.evaluation.metrics.base import RECORDED
 
 TRAFFIC_METHODS = (
     "population",

@@ -16,17 +16,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cfx import scratch
-from cfx.agents.heads.base import ParameterHead
-from cfx.agents.heads.offset import OffsetHead, coordinates
-from cfx.agents.scaler import Scaler
+from cfx.core import scratch
+from cfx.data.pairs import SIGNALS, PairBatch
 from cfx.learners.base import TrainingData
 from cfx.learners.grid import Grid
 from cfx.learners.rollout.inputs import RolloutBatch
-from cfx.pairs import SIGNALS, PairBatch
 from cfx.policies.base import Policy
 from cfx.policies.driver_features import measure
 from cfx.policies.features import measured_history, tokens
+from cfx.policies.heads.base import ParameterHead
+from cfx.policies.heads.offset import OffsetHead, coordinates
+from cfx.policies.scaler import Scaler
 
 _FEW_DRIVERS = 5
 """A network with fewer drivers keeps the end of each trajectory for validation, not drivers."""

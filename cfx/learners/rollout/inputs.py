@@ -12,8 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from cfx.data.pairs import PairBatch
 from cfx.learners.rollout.window import LeaderWindow, LoopState, WindowStep
-from cfx.pairs import PairBatch
 
 
 class RolloutBatch(NamedTuple):

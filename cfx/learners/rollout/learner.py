@@ -21,11 +21,9 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from cfx.agents.heads import HEADS
-from cfx.agents.heads.base import ParameterHead
-from cfx.agents.scaler import Scaler
-from cfx.component import Settings
-from cfx.engine.base import Engine
+from cfx.core.component import Settings
+from cfx.core.engine.base import Engine
+from cfx.core.progress import Task
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.learners.curves import warn_of_nothing_learned
 from cfx.learners.rollout.dataset import RolloutDataset, time_gaps
@@ -45,7 +43,9 @@ from cfx.learners.rollout.shard import (
 from cfx.learners.situations import learned_range
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.ensemble import Ensemble
-from cfx.progress import Task
+from cfx.policies.heads import HEADS
+from cfx.policies.heads.base import ParameterHead
+from cfx.policies.scaler import Scaler
 
 log = logging.getLogger(__name__)
 
@@ -53,9 +53,9 @@ log = logging.getLogger(__name__)
 class RolloutLearner(Learner):
     """Back-propagates the job's objective through closed-loop simulation into the policy.
 
-    Networks answer offsets (`cfx.agents.heads.offset`): untrained, each driver is driven by their
+    Networks answer offsets (`cfx.policies.heads.offset`): untrained, each driver is driven by their
     base parameters, so training starts from a fixed model. With `head=residual` they also choose
-    how the model takes over from the acceleration at the start (`cfx.agents.heads.residual`).
+    how the model takes over from the acceleration at the start (`cfx.policies.heads.residual`).
 
     Before a trajectory the policy observes the driver's measured history; cold starts, as of unseen
     drivers, have none. The drivers of all networks (at most `drivers` of each) are simulated at

@@ -16,8 +16,6 @@ from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from cfx.agents.core import AgentCore
-from cfx.agents.heads import HEADS
 from cfx.learners.base import TrainingData
 from cfx.learners.batched import BatchedModule
 from cfx.learners.rollout.dataset import RolloutDataset
@@ -34,6 +32,8 @@ from cfx.learners.rollout.window import (
     WindowStep,
 )
 from cfx.policies.base import Policy, PolicyNetwork
+from cfx.policies.core import AgentCore
+from cfx.policies.heads import HEADS
 from cfx.simulation.rollout import can_compile
 
 _WORTH_COMPILING = 5_000

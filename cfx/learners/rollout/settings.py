@@ -10,7 +10,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from cfx.component import Settings
+from cfx.core.component import Settings
 from cfx.simulation.rollout import Compile
 
 

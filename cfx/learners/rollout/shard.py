@@ -20,10 +20,8 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from cfx.agents.heads.base import ParameterHead
-from cfx.agents.heads.offset import OffsetHead
-from cfx.component import content_key, folder_hash
-from cfx.engine.local import LocalEngine
+from cfx.core.component import content_key, folder_hash
+from cfx.core.engine.local import LocalEngine
 from cfx.learners import base
 from cfx.learners.base import TrainingData
 from cfx.learners.rollout.dataset import RolloutDataset
@@ -31,6 +29,8 @@ from cfx.learners.rollout.loss import BaseErrors
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.models.direct import Direct
 from cfx.policies.base import Policy, PolicyNetwork
+from cfx.policies.heads.base import ParameterHead
+from cfx.policies.heads.offset import OffsetHead
 from cfx.simulation.rollout import MemoryStepper
 
 

@@ -12,9 +12,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from cfx.agents.heads import HEADS
-from cfx.agents.heads.offset import OffsetHead
-from cfx.engine.base import Report
+from cfx.core.engine.base import Report
 from cfx.learners.batched import fit
 from cfx.learners.rollout.loop import Expert
 from cfx.learners.rollout.module import RolloutModule, StepNumbers
@@ -27,6 +25,8 @@ from cfx.learners.rollout.shard import (
     for_experts,
     untrained,
 )
+from cfx.policies.heads import HEADS
+from cfx.policies.heads.offset import OffsetHead
 
 log = logging.getLogger(__name__)
 

@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 
 from cfx.calibration.flatness import NEAR
-from cfx.plots.calibration import AT_BOUND, ParameterSpread, parameter_spreads
-from cfx.plots.identifiability import SlicePanel, draw_labels, labels_of, slice_panels
-from cfx.plots.words import number as shown_number
-from cfx.plots.words import short, unit_label
 from cfx.report.blocks import Block, Figure, Section, Table, Text, job_fold
 from cfx.report.figure_blocks import caption, figure_of, view
+from cfx.report.figures.calibration import AT_BOUND, ParameterSpread, parameter_spreads
+from cfx.report.figures.identifiability import SlicePanel, draw_labels, labels_of, slice_panels
+from cfx.report.figures.words import number as shown_number
+from cfx.report.figures.words import short, unit_label
 from cfx.report.job import Job, Runs, with_constant_baseline
 from cfx.report.tables import Cell, Column, Sheet, formatted, job_names, number, text
 

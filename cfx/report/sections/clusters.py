@@ -6,15 +6,15 @@ from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
+from cfx.data.style.result import CLUSTERS
 from cfx.evaluation.statistics import Improvement
-from cfx.plots.jobs import ClusterGroup, cluster_boxes, draw_clusters
-from cfx.plots.words import explained, label
 from cfx.report.blocks import Block, Figure, Fold, Section, Table, Text
 from cfx.report.figure_blocks import view
+from cfx.report.figures.jobs import ClusterGroup, cluster_boxes, draw_clusters
+from cfx.report.figures.words import explained, label
 from cfx.report.job import Job, Runs, any_baselines, with_baseline
 from cfx.report.names import SEPARATOR, differences
 from cfx.report.tables import Cell, Column, Sheet, formatted, interval, number, share, text
-from cfx.style.result import CLUSTERS
 
 Series = Mapping[str, Mapping[str, pd.DataFrame]]
 """By name of some jobs and by cluster, some rows of `Job.by_pair`."""

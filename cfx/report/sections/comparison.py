@@ -8,19 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from cfx.evaluation.metrics.base import MetricInfo
 from cfx.evaluation.result import METHODS
-from cfx.metrics.base import MetricInfo
-from cfx.plots.jobs import draw_error_dots, error_dots
-from cfx.plots.words import (
-    FULL_TRAJECTORY,
-    STEADY,
-    TEST,
-    explained,
-    percent,
-    short_label,
-)
 from cfx.report.blocks import Block, Figure, Fold, Heading, Section, Table, Text, View
 from cfx.report.figure_blocks import view
+from cfx.report.figures.jobs import draw_error_dots, error_dots
+from cfx.report.figures.words import FULL_TRAJECTORY, STEADY, TEST, explained, percent, short_label
 from cfx.report.job import Job, Runs, any_baselines, any_has_metric, without_baseline
 from cfx.report.metrics import metric_title
 from cfx.report.tables import Cell, Column, Sheet, formatted, job_names, number, tested, text

@@ -12,9 +12,9 @@ from cfx.evaluation.distributions import (
     sampled_methods,
     summarize_distributions,
 )
-from cfx.plots.distributions import sampled_name
 from cfx.report.blocks import Block, Section, Table, Text, job_fold
 from cfx.report.figure_blocks import caption, figure_of
+from cfx.report.figures.distributions import sampled_name
 from cfx.report.job import Job, Runs
 from cfx.report.tables import Cell, Column, Sheet, formatted, method_cell, methods_explained, number
 

@@ -8,11 +8,11 @@ from dataclasses import replace
 
 import pandas as pd
 
-from cfx.plots.improvements import improvement_bars
-from cfx.plots.jobs import draw_every_pair
-from cfx.plots.words import label, short_label
 from cfx.report.blocks import Block, Figure, Fold, Section, Table, Text, View
 from cfx.report.figure_blocks import view
+from cfx.report.figures.improvements import improvement_bars
+from cfx.report.figures.jobs import draw_every_pair
+from cfx.report.figures.words import label, short_label
 from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs, any_baselines, with_baseline
 from cfx.report.tables import Column, Sheet, formatted, number, share, text

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pandas as pd
 
 from cfx.evaluation.forecasts import SCOPE, forecast_methods, metric_name
-from cfx.metrics.base import key_of
+from cfx.evaluation.metrics.base import key_of
 from cfx.report.blocks import Block, Group, Heading, Section, Table, Text
 from cfx.report.figure_blocks import caption, figure_of
 from cfx.report.job import Job, Runs

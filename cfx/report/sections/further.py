@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from cfx.plots.figure import installed
-from cfx.registry import OWN
+from cfx.core.registry import OWN
 from cfx.report.blocks import Block, Heading, Section, Text, job_fold
 from cfx.report.figure_blocks import figure_of
+from cfx.report.figures.figure import installed
 from cfx.report.job import Runs
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from cfx.plots.history import history_curves
 from cfx.report.blocks import Block, Group, Heading, Section, Table, Text, cards
 from cfx.report.figure_blocks import caption, figure_of
+from cfx.report.figures.history import history_curves
 from cfx.report.job import Job, Runs
 from cfx.report.tables import Cell, Column, Sheet, interval, number, share, text
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from cfx.plots.words import plural
 from cfx.report.blocks import (
     MOST,
     Block,
@@ -14,6 +13,7 @@ from cfx.report.blocks import (
     missing_file,
 )
 from cfx.report.figure_blocks import caption, figure_of
+from cfx.report.figures.words import plural
 from cfx.report.job import Runs
 
 _NAME = "learning_curve"

@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from cfx.plots.words import explained, short_label
 from cfx.report.blocks import Block, Section, Table, Text, job_fold
+from cfx.report.figures.words import explained, short_label
 from cfx.report.job import Job, Runs
 from cfx.report.metrics import metric_title
 from cfx.report.tables import Cell, Column, Sheet, formatted, number, text

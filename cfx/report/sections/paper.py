@@ -10,12 +10,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from cfx.plots.words import MINUS, percent
+from cfx.data.style.result import CLUSTERS
 from cfx.report.blocks import Block, Heading, Items, Section, Table, Text
+from cfx.report.figures.words import MINUS, percent
 from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs
 from cfx.report.tables import Cell, Column, Sheet, number, share, text
-from cfx.style.result import CLUSTERS
 
 PAPER_PAIRS = 94
 PAIR_11 = {"default": 3.393, "fixed": 1.033, "policy": 0.666}

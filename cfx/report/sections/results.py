@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from cfx.metrics.base import SCOPES
-from cfx.plots.jobs import Statistics, draw_overview
-from cfx.plots.jobs import overview as choose_overview
-from cfx.plots.words import FULL_TRAJECTORY, MINUS, TEST, label
+from cfx.evaluation.metrics.base import SCOPES
 from cfx.report.blocks import Block, Figure, Heading, Section, Table, Text
 from cfx.report.figure_blocks import view
+from cfx.report.figures.jobs import Statistics, draw_overview
+from cfx.report.figures.jobs import overview as choose_overview
+from cfx.report.figures.words import FULL_TRAJECTORY, MINUS, TEST, label
 from cfx.report.job import Job, Runs, any_baselines, with_baseline
 from cfx.report.tables import (
     Cell,

@@ -8,8 +8,8 @@ from typing import Any
 
 import pandas as pd
 
-from cfx.plots.words import NOTHING
 from cfx.report.blocks import Block, Facts, Heading, Items, Section, Table, Text
+from cfx.report.figures.words import NOTHING
 from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs
 from cfx.report.tables import Column, Sheet, text

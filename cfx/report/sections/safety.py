@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from cfx.plots.words import MINUS
 from cfx.report.blocks import Block, Fold, Heading, Section, Table, Text, job_fold
 from cfx.report.figure_blocks import caption, figure_of
+from cfx.report.figures.words import MINUS
 from cfx.report.job import Job, Runs
 from cfx.report.tables import Column, Sheet, formatted, method_cell, number, text
 

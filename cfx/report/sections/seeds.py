@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from cfx.plots.values import finite
-from cfx.plots.words import explained, percent, short_label
 from cfx.report.blocks import Block, Section, Table, Text
+from cfx.report.figures.values import finite
+from cfx.report.figures.words import explained, percent, short_label
 from cfx.report.grouped import Row, baselines_of, methods_of, rows_over_seeds
 from cfx.report.job import Job, Runs
 from cfx.report.tables import Cell, Column, Sheet, number, tested, text

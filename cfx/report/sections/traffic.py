@@ -6,11 +6,11 @@ import math
 
 import pandas as pd
 
+from cfx.evaluation.metrics.base import RECORDED, key_of
 from cfx.evaluation.traffic.result import traffic_methods
-from cfx.metrics.base import RECORDED, key_of
-from cfx.plots.words import MINUS
 from cfx.report.blocks import Block, Section, Table, Text, job_fold
 from cfx.report.figure_blocks import figure_of
+from cfx.report.figures.words import MINUS
 from cfx.report.job import Job, Runs
 from cfx.report.tables import Cell, Column, Sheet, formatted, method_cell, methods_explained, number
 

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import math
 
-from cfx.plots.pairs import RankedPair, rank_pairs
-from cfx.plots.trajectories import draw_pair
-from cfx.plots.words import percent_or_undefined, short_label
 from cfx.report.blocks import (
     Block,
     Figure,
@@ -18,6 +15,9 @@ from cfx.report.blocks import (
     missing_file,
 )
 from cfx.report.figure_blocks import shown
+from cfx.report.figures.pairs import RankedPair, rank_pairs
+from cfx.report.figures.trajectories import draw_pair
+from cfx.report.figures.words import percent_or_undefined, short_label
 from cfx.report.job import Job, Runs, calibrations
 
 _ADAPTING = (

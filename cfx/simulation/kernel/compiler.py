@@ -18,7 +18,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from cfx.files import atomic_write
+from cfx.core.files import atomic_write
 
 log = logging.getLogger(__name__)
 

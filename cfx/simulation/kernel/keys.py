@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import torch
 
-from cfx.component import content_key, folder_hash
+from cfx.core.component import content_key, folder_hash
 from cfx.simulation import step
 
 

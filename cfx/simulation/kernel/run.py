@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from cfx.core.threads import share
 from cfx.models.base import DrivingModel
 from cfx.simulation import pages
 from cfx.simulation.kernel import compiler
@@ -21,7 +22,6 @@ from cfx.simulation.kernel.columns import Unsupported
 from cfx.simulation.kernel.graph import record
 from cfx.simulation.kernel.keys import ComponentKey, KernelKey
 from cfx.simulation.kernel.source import BLOCK, SIGNALS, write
-from cfx.simulation.threads import share
 from cfx.simulation.trajectory import Segments, Terms, common_shape
 
 log = logging.getLogger(__name__)

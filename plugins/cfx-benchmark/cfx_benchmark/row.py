@@ -10,10 +10,10 @@ from typing import Any
 
 import pandas as pd
 
-from cfx.errors import DataError
+from cfx.core.errors import DataError
+from cfx.core.files import write_json
+from cfx.evaluation.metrics.base import column_of
 from cfx.evaluation.statistics import mean_interval
-from cfx.files import write_json
-from cfx.metrics.base import column_of
 from cfx_benchmark.frozen import METRICS, SCOPE, VERSION, protocol_hash
 
 ROW, PAIRS = "benchmark.json", "benchmark_pairs.csv"

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import cast
 
 import cfx
-from cfx.errors import ConfigError, DataError, Terminated, nearest
-from cfx.files import atomic_write
-from cfx.hydra_source import path_override
+from cfx.app.hydra_source import path_override
+from cfx.core.errors import ConfigError, DataError, Terminated, nearest
+from cfx.core.files import atomic_write
 from cfx_benchmark.frozen import DATA, DATA_NAME, FROZEN_KEYS, METHODS, OVERRIDES
 from cfx_benchmark.row import PAIRS, ROW, Row, errors_of, protocol_name, values_of
 
@@ -163,7 +163,7 @@ def _run_job(command: Sequence[str], job: Path) -> None:
             print(f"{job}: was finished before")
             return
         raise ConfigError(f"{job}: holds another job; give --output another folder, or --name")
-    from cfx.cli import main
+    from cfx.app.cli import main
 
     job.mkdir(parents=True, exist_ok=True)
     record.write_text(json.dumps(list(command)), encoding="utf-8")

@@ -10,10 +10,10 @@ import pandas as pd
 import pytest
 
 import cfx
-from cfx.cli import main
+from cfx.app.cli import main
 from cfx.contracts import CommandContract
-from cfx.datasets.tidy import write_tidy
-from cfx.errors import DataError, Terminated
+from cfx.core.errors import DataError, Terminated
+from cfx.data.tidy import write_tidy
 from cfx_benchmark.command import BenchmarkCommand
 from cfx_benchmark.compare import compared, lines_of, read_errors
 from cfx_benchmark.frozen import DATA, METHODS, TESTED, protocol_hash
@@ -219,6 +219,6 @@ def test_a_job_that_was_broken_off_has_not_failed(
     path = tmp_path / "p.parquet"
     write_tidy(dataset("synthetic", pairs=2, frames=320, min_frames=2), path)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("cfx.cli.main", lambda _: code)
+    monkeypatch.setattr("cfx.app.cli.main", lambda _: code)
     with pytest.raises(error):
         run(["model=idm"], path, None, name="mine", other_data=True)

@@ -16,7 +16,7 @@ from pydantic import Field
 from torch import Tensor
 
 from cfx import DrivingModel, Follower, Leader, ParameterSpace, Settings
-from cfx.errors import ConfigError
+from cfx.core.errors import ConfigError
 from cfx.models.base import ModelSettings
 from cfx_classics.delay import frames_seen, memory_width, perceive, recall, remember
 from cfx_classics.gipps import GIPPS_PARAMETERS, intended_speed

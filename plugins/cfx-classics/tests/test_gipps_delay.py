@@ -14,7 +14,7 @@ import cfx
 from cfx import DrivingModel, Follower, Leader, Start, simulate
 from cfx.contracts import ModelContract
 from cfx.contracts.models import Equilibrium
-from cfx.errors import ConfigError
+from cfx.core.errors import ConfigError
 from cfx_classics.gipps import Gipps
 from cfx_classics.gipps_delay import GippsDelay
 

@@ -18,7 +18,7 @@ from pydantic import Field
 from torch import Tensor
 
 from cfx import CandidateLosses, Optimizer, Settings
-from cfx.errors import ConfigError
+from cfx.core.errors import ConfigError
 
 if TYPE_CHECKING:
     Floats = NDArray[np.float64]

@@ -7,7 +7,7 @@ import torch
 
 import cfx
 from cfx.contracts import OptimizerContract, Problems
-from cfx.errors import ConfigError
+from cfx.core.errors import ConfigError
 from cfx_cma.evolution import CmaOptimizer
 
 

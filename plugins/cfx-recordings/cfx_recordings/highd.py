@@ -12,10 +12,10 @@ import numpy as np
 from pydantic import Field
 
 from cfx import PairSet, Settings
-from cfx.datasets.base import Dataset, FileDatasetSettings, joined
-from cfx.datasets.files import FileStart, Floats, Ints, TextTable, read_columns
-from cfx.datasets.tracks import Tracks, extract_pairs
-from cfx.errors import DataError
+from cfx.core.errors import DataError
+from cfx.data.base import Dataset, FileDatasetSettings, joined
+from cfx.data.files import FileStart, Floats, Ints, TextTable, read_columns
+from cfx.data.tracks import Tracks, extract_pairs
 from cfx_recordings.tables import position, read_numbers, refuse
 
 _TRACKS, _TRACKS_META, _RECORDING_META = "_tracks.csv", "_tracksMeta.csv", "_recordingMeta.csv"
@@ -52,7 +52,7 @@ class HighdDataset(Dataset):
 
     `data.path` names the tracks; the other two files lie beside them under the same number.
 
-    **Pairs** are cut by `cfx.datasets.tracks.extract_pairs`: the leader is `precedingId` (0 is
+    **Pairs** are cut by `cfx.data.tracks.extract_pairs`: the leader is `precedingId` (0 is
     none), in the same `laneId`.
 
     **Positions.** `x` is the left edge of a vehicle's box and `width` its length along the road;

@@ -16,10 +16,10 @@ import numpy as np
 from pydantic import Field
 
 from cfx import PairSet, Settings
-from cfx.datasets.base import Contents, Dataset, FileDatasetSettings, joined
-from cfx.datasets.files import FileStart, Floats, Ints, stem
-from cfx.datasets.series import Series, frames_at, pairs_of
-from cfx.errors import DataError
+from cfx.core.errors import DataError
+from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
+from cfx.data.files import FileStart, Floats, Ints, stem
+from cfx.data.series import Series, frames_at, pairs_of
 
 DT = 0.1
 """Seconds between two samples."""

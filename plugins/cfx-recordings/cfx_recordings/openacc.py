@@ -15,19 +15,10 @@ from typing import ClassVar, NamedTuple, TypeVar
 import numpy as np
 
 from cfx import PairSet, Settings
-from cfx.datasets.base import Contents, Dataset, FileDatasetSettings, joined, listed
-from cfx.datasets.files import (
-    FileStart,
-    Floats,
-    Ints,
-    Labels,
-    TextTable,
-    beginning,
-    read_columns,
-    stem,
-)
-from cfx.datasets.series import Series, frames_at, pairs_of
-from cfx.errors import DataError
+from cfx.core.errors import DataError
+from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined, listed
+from cfx.data.files import FileStart, Floats, Ints, Labels, TextTable, beginning, read_columns, stem
+from cfx.data.series import Series, frames_at, pairs_of
 from cfx_recordings.tables import position, refuse
 
 _Column = TypeVar("_Column", Floats, Labels)
@@ -56,7 +47,7 @@ class OpenaccDataset(Dataset):
 
     **Positions.** Cars are located by satellite on roads that bend, so positions are made of what
     was measured along the road: the leader's is the distance that its speed gives, the follower's
-    is that less the gap (`cfx.datasets.series`). Lengths are not recorded, and are 0: positions of
+    is that less the gap (`cfx.data.series`). Lengths are not recorded, and are 0: positions of
     leaders are those of rear bumpers. Accelerations are central differences of the speeds, which
     most campaigns left unfiltered.
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cfx.datasets.base import listed
-from cfx.datasets.files import Floats, TextTable, bad_cells, read_columns, sniff
-from cfx.errors import DataError, nearest
+from cfx.core.errors import DataError, nearest
+from cfx.data.base import listed
+from cfx.data.files import Floats, TextTable, bad_cells, read_columns, sniff
 
 
 def position(table: TextTable, *spellings: str) -> int:

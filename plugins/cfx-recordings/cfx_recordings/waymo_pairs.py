@@ -15,11 +15,11 @@ import numpy as np
 from pydantic import Field
 
 from cfx import PairSet, Settings
-from cfx.datasets.base import Contents, Dataset, FileDatasetSettings, joined
-from cfx.datasets.files import FileStart, Floats, Ints, TextTable, stem
-from cfx.datasets.series import Series, frames_at, pairs_of
-from cfx.datasets.tracks import changes
-from cfx.errors import DataError
+from cfx.core.errors import DataError
+from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
+from cfx.data.files import FileStart, Floats, Ints, TextTable, stem
+from cfx.data.series import Series, frames_at, pairs_of
+from cfx.data.tracks import changes
 from cfx_recordings.tables import read_numbers, refuse
 
 DT = 0.1

@@ -12,7 +12,7 @@ import pytest
 
 import cfx
 from cfx.contracts import DatasetContract
-from cfx.errors import DataError
+from cfx.core.errors import DataError
 from cfx_recordings.highd import HighdDataset
 
 SIGNALS = [

@@ -18,7 +18,7 @@ from scipy.io import savemat
 
 import cfx
 from cfx.contracts import DatasetContract
-from cfx.errors import DataError
+from cfx.core.errors import DataError
 from cfx_recordings.followernet import FollowernetDataset
 from cfx_recordings.lyft_pairs import LyftPairsDataset
 from cfx_recordings.openacc import OpenaccDataset

@@ -9,7 +9,7 @@ from scipy.optimize import differential_evolution
 
 import cfx
 from cfx.contracts import OptimizerContract, Problems
-from cfx.errors import ConfigError
+from cfx.core.errors import ConfigError
 from cfx_scipy.differential_evolution import DifferentialEvolution
 
 

@@ -7,13 +7,13 @@ from dataclasses import replace
 import pytest
 import torch
 
+from cfx.calibration.objectives.rmse import GapRmse
+from cfx.calibration.objectives.theil import TheilU
 from cfx.learners.rollout import loss
 from cfx.learners.rollout.dataset import RolloutDataset
 from cfx.learners.rollout.inputs import RolloutBatch
 from cfx.learners.rollout.loss import BaseErrors
 from cfx.models.krauss import Krauss
-from cfx.objectives.rmse import GapRmse
-from cfx.objectives.theil import TheilU
 from cfx.simulation.rollout import MemoryStepper
 from tests.learners.made import TRUE, batch_of, gru, loop, placed, training_data, untrained
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from cfx.agents.heads.offset import coordinates
 from cfx.learners.rollout import dataset as dataset_module
 from cfx.learners.rollout.dataset import RolloutDataset, time_gaps
 from cfx.learners.rollout.loss import BaseErrors
 from cfx.policies.driver_features import measure
+from cfx.policies.heads.offset import coordinates
 from tests.learners.made import TRUE, batch_of, gru, placed, training_data
 
 

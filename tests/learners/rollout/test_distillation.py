@@ -7,14 +7,14 @@ from typing import Any
 
 import torch
 
-from cfx.agents.core import AgentCore
-from cfx.agents.heads.offset import OffsetHead
 from cfx.learners.base import TrainingData
 from cfx.learners.rollout.inputs import RolloutInputs
 from cfx.learners.rollout.loop import Expert, burn_in
 from cfx.learners.rollout.module import RolloutModule
 from cfx.learners.rollout.window import WindowStep
 from cfx.models.direct import Direct
+from cfx.policies.core import AgentCore
+from cfx.policies.heads.offset import OffsetHead
 from tests.learners.made import WINDOWS, batch_of, gru, module_of, training_data
 
 

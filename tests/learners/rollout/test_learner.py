@@ -10,17 +10,17 @@ import pandas as pd
 import pytest
 import torch
 
-from cfx.errors import ConfigError
+from cfx.calibration.objectives.base import Objective
+from cfx.calibration.objectives.huber import SpeedHuber
+from cfx.calibration.objectives.mixed import Mixed
+from cfx.calibration.objectives.rmse import GapRmse
+from cfx.calibration.objectives.theil import TheilU
+from cfx.core.errors import ConfigError
 from cfx.learners.base import TrainingResult
 from cfx.learners.rollout import RolloutLearner
 from cfx.learners.rollout.module import RolloutModule
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
-from cfx.objectives.base import Objective
-from cfx.objectives.huber import SpeedHuber
-from cfx.objectives.mixed import Mixed
-from cfx.objectives.rmse import GapRmse
-from cfx.objectives.theil import TheilU
 from cfx.policies.ensemble import Ensemble
 from cfx.policies.gru import GruPolicy
 from cfx.policies.lstm import LstmPolicy

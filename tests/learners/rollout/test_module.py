@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 import torch
 
-from cfx.agents.heads.offset import coordinates
 from cfx.learners.rollout import RolloutLearner, RolloutSettings
 from cfx.learners.rollout.inputs import RolloutBatch
 from cfx.learners.rollout.loop import burn_in, simulate
@@ -17,6 +16,7 @@ from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.policies.driver_features import measure
+from cfx.policies.heads.offset import coordinates
 from tests.learners.made import (
     QUICK,
     TRUE,

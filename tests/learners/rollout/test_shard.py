@@ -11,13 +11,13 @@ import pandas as pd
 import pytest
 import torch
 
-from cfx.engine.base import Engine, Report
+from cfx.core import threads
+from cfx.core.engine.base import Engine, Report
 from cfx.learners.base import TrainingData, TrainingResult
 from cfx.learners.rollout import RolloutLearner, shard
 from cfx.learners.rollout import train as training
 from cfx.learners.rollout.dataset import RolloutDataset
 from cfx.learners.rollout.shard import networks_of_shards
-from cfx.simulation import threads
 from tests.learners.made import QUICK, TRUE, gru, training_data
 from tests.scripts import run_script
 
@@ -162,7 +162,7 @@ _SCRIPT = """
 import torch
 from cfx.learners.rollout import RolloutLearner, shard
 from cfx.learners.rollout import train as training
-from cfx.simulation.threads import limit_cores
+from cfx.core.threads import limit_cores
 from tests.learners.made import TRUE, gru, training_data
 from tests.learners.rollout.test_shard import SHORT
 

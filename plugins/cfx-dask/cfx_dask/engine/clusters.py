@@ -12,9 +12,9 @@ import uuid
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cfx.errors import EngineError, NotInstalledError
-from cfx.extras import install_line
-from cfx.simulation.threads import cores
+from cfx.core.errors import EngineError, NotInstalledError
+from cfx.core.extras import install_line
+from cfx.core.threads import cores
 from cfx_dask.engine.settings import DaskSettings
 
 _WORKERS_ELSEWHERE = 4

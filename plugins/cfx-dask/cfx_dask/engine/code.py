@@ -8,7 +8,7 @@ import importlib.util
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from cfx.registry import KINDS, OWN, entries
+from cfx.core.registry import KINDS, OWN, entries
 
 
 @functools.cache

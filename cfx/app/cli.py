@@ -1,0 +1,118 @@
+"""The command line: `cfx` and `python -m cfx`.
+
+A first word that is no `key=value` names a sub-command, an entry point of the group `cfx.commands`;
+everything else goes to the Hydra application. Nothing heavy is imported here.
+"""
+
+from __future__ import annotations
+
+import gc
+import io
+import os
+import re
+import sys
+import traceback
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NoReturn, cast
+
+from cfx.core.errors import CfxError, ConfigError, Terminated
+from cfx.core.signals import ignore_signals, terminable
+
+if TYPE_CHECKING:
+    from cfx.core.command import Command
+
+_GC_THRESHOLD = 100_000
+"""Objects after which Python looks for cycles; its own 700 costs a tenth of the time of imports."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the program.
+
+    Returns:
+        The exit code: 0; 2 for a user's mistake; 1 for a bug; 130 after Ctrl-C; 143 after SIGTERM.
+    """
+    if argv is None:
+        argv = sys.argv[1:]
+    arguments = list(argv)
+    _print_anything()
+    try:
+        with terminable():
+            if arguments and re.match(r"\w[^=]*$", arguments[0]):
+                return _command(*arguments)
+            return _hydra(arguments)
+    except CfxError as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        return 130
+    except Terminated:
+        return 143
+    except BrokenPipeError:  # `cfx plugins | head`: the reader has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _command(name: str, *arguments: str) -> int:
+    """Runs a sub-command.
+
+    Raises:
+        ConfigError: there is none of that name.
+        PluginError: it cannot be loaded, two distributions claim its name, or its code failed.
+    """
+    from cfx.core import registry
+
+    if name not in registry.names("command"):
+        from cfx.app.user_errors import no_command
+
+        raise ConfigError(no_command(name))
+    command = cast("Command", registry.create("command", {"name": name}))
+    try:
+        return command.run(command.parse(arguments))
+    except (CfxError, OSError):
+        raise
+    except Exception as error:
+        from cfx.core.plugin_errors import blame
+
+        blamed = blame(error, "CFX_TRACEBACK=1 shows the whole traceback")
+        if blamed is None:
+            raise
+        if os.environ.get("CFX_TRACEBACK", "") not in {"", "0"}:
+            traceback.print_exception(error)
+        raise blamed from error
+
+
+def _hydra(arguments: Sequence[str]) -> int:
+    """Runs the Hydra application, or completes what a shell asks for."""
+
+    def start() -> int:
+        from cfx.app import application
+
+        return application.start(arguments)
+
+    from cfx.app import completion
+
+    if completion.is_query(arguments):
+        return completion.answer(start)
+    return start()
+
+
+def program() -> NoReturn:
+    """Runs the program and ends the process; a signal that comes too late changes nothing.
+
+    Raises:
+        SystemExit: always, with the exit code.
+    """
+    gc.set_threshold(_GC_THRESHOLD)
+    try:
+        code = main()
+    except KeyboardInterrupt:
+        code = 130
+    ignore_signals()
+    sys.exit(code)
+
+
+def _print_anything() -> None:
+    r"""Lets terminals that know few letters print the others as `\xe4`, instead of failing."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")

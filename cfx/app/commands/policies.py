@@ -1,0 +1,80 @@
+"""`cfx policies`: the ready-made policies and their cards."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from cfx.app.completion import complete_with
+from cfx.core.command import Command
+from cfx.policies import ready
+
+
+class PoliciesCommand(Command):
+    """Lists the ready-made policies, shows a card, or makes one anew."""
+
+    summary = "the ready-made policies; the card of one (show)"
+
+    def parser(self) -> argparse.ArgumentParser:
+        made = argparse.ArgumentParser(
+            "cfx policies", description="Lists the ready-made policies that come with cfx."
+        )
+        actions = made.add_subparsers(dest="action")
+        show = actions.add_parser("show", help="the card of a policy: what it knows, and how well")
+        name = show.add_argument("name", help="such as i80-idm")
+        complete_with(name, lambda _: ready.names())
+        make = actions.add_parser(
+            "make", help="train policies anew and write them into the package"
+        )
+        make.add_argument("names", nargs="*", help="such as i80-idm; all if left out")
+        make.add_argument("--data", type=Path, required=True, help="the recordings, a tidy table")
+        make.add_argument(
+            "--work",
+            type=Path,
+            default=Path("outputs/policies"),
+            help="where jobs run; finished ones are not run again",
+        )
+        return made
+
+    def run(self, options: argparse.Namespace) -> int:
+        if options.action == "show":
+            folder = ready.folder_of_ready_made(f"cfx://{options.name}")
+            print((folder / "CARD.md").read_text("utf-8"))
+            return 0
+        if options.action == "make":
+            from cfx.app.publish.make import make
+
+            make(options.names, options.data, options.work)
+            return 0
+        _overview()
+        return 0
+
+
+def _overview() -> None:
+    from cfx.core.console import blank_table, put
+
+    table = blank_table(
+        "policy",
+        "model",
+        "RMSE speed [m/s]",
+        "over pooled",
+        "RMS jerk [m/s3]",
+        "size",
+        "what it is",
+    )
+    for name in ready.names():
+        card = ready.card_of(name)
+        errors = card["errors_on_unseen_drivers"]
+        table.add_row(
+            f"{ready.SCHEME}{name}",
+            card["model"],
+            f"{errors['rmse_speed']:.3f}",
+            f"{errors['improvement_over_pooled']:+.1%}",
+            f"{card['safety']['jerk']:.2f}",
+            f"{card['size_kb']} kB",
+            card["summary"],
+        )
+    put(table)
+    print(
+        "A policy's card: cfx policies show NAME. Drive with it: cfx drive --drivers car=cfx://NAME"
+    )

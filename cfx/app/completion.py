@@ -1,0 +1,117 @@
+"""Tab completion of the sub-commands; what begins with a group or a key is Hydra's.
+
+Hydra's script for the shell asks the program for words (`cfx -sc query=bash`, the line in the
+environment). Where the line begins with a sub-command, argcomplete answers from its parser, in
+a tenth of Hydra's time. Nothing is ever printed but words: a message would land in the middle of
+what somebody types.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import os
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, cast
+
+if TYPE_CHECKING:
+    from cfx.core.command import Command
+
+
+def is_query(arguments: Sequence[str]) -> bool:
+    """Says whether a shell asks for words: `-sc query=bash`."""
+    if len(arguments) != 2 or arguments[0] not in {"-sc", "--shell-completion"}:
+        return False
+    return arguments[1].startswith("query=")
+
+
+def answer(hydra: Callable[[], int]) -> int:
+    """Prints the words with which the line may go on; returns the exit code.
+
+    Args:
+        hydra: prints Hydra's words for the line.
+    """
+    from cfx.core import registry
+
+    line = os.environ.get("COMP_LINE", "")
+    line = line[: int(os.environ.get("COMP_POINT", len(line)))]
+    _, _, typed = line.lstrip().partition(" ")
+    typed = typed.lstrip()
+    first, blank, rest = typed.partition(" ")
+    commands = registry.names("command")
+    if blank and first in commands:
+        print("\n".join(_words_of(first, rest)))
+        return 0
+    if not blank:
+        own = [name for name in commands if name.startswith(first)]
+        print("\n".join(own))
+        if own and first:
+            return 0
+    said = io.StringIO()
+    with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(said):
+        code = hydra()
+    if code == 0:
+        print(said.getvalue())
+    return 0
+
+
+def _words_of(command: str, line: str) -> list[str]:
+    """Returns the words of a sub-command; none where a plugin's is broken, whatever it prints."""
+    from cfx.core import registry
+
+    with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
+        try:
+            made = cast("Command", registry.create("command", {"name": command}))
+            return words(made.parser(), line)
+        except Exception:  # a plugin may raise anything
+            return []
+
+
+def words(parser: argparse.ArgumentParser, line: str) -> list[str]:
+    """Returns what the last word of a line may become; nothing where it is a file.
+
+    Args:
+        parser: of the sub-command.
+        line: what was typed after the sub-command, the last word unfinished.
+    """
+    from argcomplete.completers import SuppressCompleter
+    from argcomplete.finders import CompletionFinder
+
+    nothing = SuppressCompleter()
+    finder = CompletionFinder(parser, always_complete_options=False, default_completer=nothing)
+    before = line[: len(line) - len(line.rpartition(" ")[2])]
+    found: list[str] = []
+    while (whole := finder.rl_complete(line, len(found))) is not None:
+        found.append(whole.removeprefix(before).strip())
+    return found
+
+
+def complete_with(
+    action: argparse.Action, answers: Callable[[argparse.Namespace], Iterable[str]]
+) -> None:
+    """Lets an argument be completed with more than its choices.
+
+    Args:
+        action: what `add_argument` returned.
+        answers: gives the words, from the arguments that stand before.
+    """
+
+    def completer(parsed_args: argparse.Namespace, **_: object) -> list[str]:
+        return list(answers(parsed_args))
+
+    action.completer = completer  # type: ignore[attr-defined] # where argcomplete looks for it
+
+
+def kinds(_: argparse.Namespace) -> Iterable[str]:
+    """Returns the kinds of components."""
+    from cfx.core import registry
+
+    return registry.KINDS
+
+
+def names(options: argparse.Namespace) -> Iterable[str]:
+    """Returns the components of the kind that was named, from metadata alone."""
+    from cfx.core import registry
+
+    return registry.names(options.kind)

@@ -1,0 +1,255 @@
+"""How installed components become Hydra's config options: the source `cfx://` and the search path.
+
+The search path is: Hydra's own, `conf/` of cfx, the `conf/` folder in each plugin's package, and
+last `cfx://`. That source lists every component by the metadata of its distribution and imports
+only the one that is chosen. So a plugin's own YAML wins over the node written from its class. That
+node stays available as `_NAME` in a defaults list:
+
+    # my_package/conf/model/mine.yaml: the generated node with another default
+    defaults: [_mine, _self_]
+    parameters: {tau: {default: 1.2}}
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import hydra
+import hydra.utils
+from hydra import compose, initialize_config_dir
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.object_type import ObjectType
+from hydra.core.plugins import Plugins
+from hydra.plugins.config_source import ConfigLoadError, ConfigResult, ConfigSource
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import DictConfig, OmegaConf
+
+from cfx.app import nodes
+from cfx.core import registry
+from cfx.core.errors import PluginError
+
+if TYPE_CHECKING:
+    from cfx.core.command import Command
+
+log = logging.getLogger(__name__)
+
+_MADE_BY_HYDRA = {"hydra/config.yaml", "hydra/launcher/basic.yaml", "hydra/sweeper/basic.yaml"}
+"""Options that Hydra has in code; a file of the same name on the search path replaces them."""
+
+_PLAIN = re.compile(r"[\w./+-]+", re.ASCII)
+"""Values that Hydra's grammar takes as they are."""
+
+
+def path_override(key: str, path: Path) -> str:
+    """Returns the override that gives a setting a path, quoted where its signs ask for it."""
+    text = str(path)
+    if _PLAIN.fullmatch(text):
+        return f"{key}={text}"
+    # Backslashes count as such in a quoted value only before a quote.
+    escaped = re.sub(r"(\\*)'", r"\1\1\\'", text)
+    ending = re.search(r"\\*$", escaped)
+    assert ending is not None
+    return f"{key}='{escaped}{ending[0]}'"
+
+
+_MAKES = ("cfx.*", "hydra.*", "hydra_plugins.*", "logging.*", "optuna.*", "nevergrad.*")
+"""What a configuration may make under Hydra 1.4: callbacks, launchers, sweepers and log handlers.
+
+Components are none of Hydra's objects: the registry makes them."""
+
+
+class ComponentSource(ConfigSource):
+    """Serves `cfx://`: one config group per kind, one option per component."""
+
+    @staticmethod
+    def scheme() -> str:
+        return "cfx"
+
+    def available(self) -> bool:
+        return True
+
+    def is_group(self, config_path: str) -> bool:
+        return config_path.strip("/") in {"", *registry.GROUPS}
+
+    def is_config(self, config_path: str) -> bool:
+        group, name = _split(config_path)
+        return group in registry.GROUPS and name.removeprefix("_") in registry.names(group)
+
+    def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
+        path = config_path.strip("/")
+        if path == "" and results_filter != ObjectType.CONFIG:
+            return sorted(registry.GROUPS)
+        if path in registry.GROUPS and results_filter != ObjectType.GROUP:
+            return list(registry.names(path))
+        return []
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        """Imports the chosen component and writes its node.
+
+        Raises:
+            PluginError: the component cannot be loaded, or two distributions claim its name.
+        """
+        group, name = _split(config_path)
+        if not self.is_config(config_path):
+            raise ConfigLoadError(f"Config not found: {config_path}")
+        name = name.removeprefix("_")
+        text = nodes.render(registry.get(group, name), name)
+        return ConfigResult(
+            provider=self.provider,
+            path="cfx://",
+            config=OmegaConf.create(text),
+            header={"package": None},
+        )
+
+
+class ComponentSearchPath(SearchPathPlugin):
+    """Appends each plugin's `conf/` and then `cfx://` to Hydra's search path."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for package, folder in plugin_conf_dirs().items():
+            replaced = _replaced_of_hydra(folder)
+            if replaced:
+                log.warning(
+                    "The plugin %s brings %s, which would replace Hydra's own; its folder %s is"
+                    " left out: repair that package, or uninstall it",
+                    package,
+                    ", ".join(replaced),
+                    folder,
+                )
+                continue
+            search_path.append(package, f"file://{folder}")
+        search_path.append("cfx", "cfx://")
+
+
+def _replaced_of_hydra(folder: Path) -> list[str]:
+    """Returns the files in a plugin's `conf/` that Hydra has under the same name."""
+    own = Path(hydra.__file__).parent / "conf"
+    found = []
+    for path in sorted(folder.rglob("*.yaml")):
+        name = path.relative_to(folder)
+        if (own / name).is_file() or name.as_posix() in _MADE_BY_HYDRA:
+            found.append(name.as_posix())
+    return found
+
+
+def plugin_conf_dirs() -> dict[str, Path]:
+    """Returns the `conf/` folder of every third party's top-level package that has one.
+
+    Runs no code of theirs.
+    """
+    packages = set()
+    for kind in registry.KINDS:
+        for entry in registry.entries(kind):
+            packages.add(entry.package)
+    found: dict[str, Path] = {}
+    for package in sorted(packages - {"cfx"}):
+        try:
+            spec = importlib.util.find_spec(package)
+        except (ImportError, ValueError):  # a broken distribution harms nobody else
+            continue
+        if spec is None or spec.submodule_search_locations is None:
+            continue
+        for location in spec.submodule_search_locations:
+            folder = Path(location) / "conf"
+            if folder.is_dir():
+                found.setdefault(package, folder)
+    return found
+
+
+def register() -> None:
+    """Makes both, and the list of sub-commands, known to Hydra.
+
+    Call it before Hydra composes anything; doing it twice does no harm.
+    """
+    plugins = Plugins.instance()
+    plugins.register(ComponentSource)
+    plugins.register(ComponentSearchPath)
+    OmegaConf.register_new_resolver("cfx_commands", listed_commands, replace=True)
+
+
+def listed_commands() -> str:
+    """Returns a line for each sub-command, as `--help` prints them; imports cfx's own alone."""
+    lines = []
+    for name in registry.names("command"):
+        try:
+            found = registry.entry("command", name)
+            about = f"{found.summary} (from {found.distribution})".strip()
+            if found.distribution == registry.OWN:
+                about = cast("type[Command]", registry.get("command", name)).summary
+        except PluginError as error:  # two distributions bring it
+            about = str(error)
+        lines.append(f"  cfx {name:<12} {about}")
+    return "\n".join(lines).replace("$", "$$")  # Hydra fills in what follows a $
+
+
+def composed(overrides: Sequence[str]) -> DictConfig:
+    """Composes a configuration as the command line does, Hydra's own node included.
+
+    A running Hydra application is left alone.
+
+    Raises:
+        HydraException: an override fits nothing.
+        PluginError: a chosen component cannot be loaded.
+    """
+    with initialize_config_dir(config_dir=str(nodes.conf_dir()), job_name="cfx", **version_base()):
+        return compose("config", overrides=list(overrides), return_hydra_config=True)
+
+
+def version_base() -> dict[str, str]:
+    """Returns the keyword by which Hydra 1.3 is asked for its own defaults; 1.4 wants none."""
+    if _has_whitelist():
+        return {}
+    return {"version_base": "1.3"}
+
+
+def main_keywords() -> dict[str, Any]:
+    """Returns the keywords of `hydra.main` besides the configuration.
+
+    Hydra 1.4 asks which objects a configuration may make.
+    """
+    if _has_whitelist():
+        return {"execution_whitelist": list(_MAKES)}
+    return dict(version_base())
+
+
+def _has_whitelist() -> bool:
+    return hasattr(hydra.utils, "execution_whitelist")
+
+
+@contextmanager
+def resolving(config: DictConfig) -> Iterator[None]:
+    """Lets `${hydra:...}` mean this configuration, and puts a running application's back."""
+    holder = HydraConfig.instance()
+    before = holder.cfg
+    holder.set_config(config)
+    try:
+        yield
+    finally:
+        holder.cfg = before
+
+
+def plain(config: DictConfig) -> dict[str, Any]:
+    """Returns the job's part of a composed configuration as plain data, interpolations resolved.
+
+    Raises:
+        OmegaConfBaseException: an interpolation leads nowhere.
+    """
+    job = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    with resolving(config):
+        return cast("dict[str, Any]", OmegaConf.to_container(job, resolve=True))
+
+
+def _split(config_path: str) -> tuple[str, str]:
+    group, _, name = config_path.strip("/").removesuffix(".yaml").rpartition("/")
+    return group, name
+
+
+# A worker process imports this module with the sources that it is sent, and needs them registered.
+register()

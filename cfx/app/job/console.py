@@ -1,0 +1,328 @@
+"""What a job prints when it is done: tables of methods and improvements, then some sentences."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from cfx.app.job.results import JobResult
+from cfx.calibration.flatness import NEAR, flat_for
+from cfx.evaluation.distributions import (
+    LEVEL,
+    centre_errors,
+    sampled_methods,
+    summarize_distributions,
+)
+from cfx.evaluation.forecasts import Forecasts
+from cfx.evaluation.headline import headline
+from cfx.evaluation.metrics.base import RECORDED, MetricInfo, key_of
+from cfx.evaluation.result import Evaluation
+from cfx.evaluation.statistics import Improvement
+from cfx.evaluation.traffic.result import Traffic
+from cfx.report.figures.words import few_drivers
+from cfx.simulation.trajectory import TRANSIENT_S
+
+if TYPE_CHECKING:
+    from cfx.results.tracker import Tracker
+
+_SCOPES = {"test": "test part", "full_trajectory": "full trajectories"}
+"""The scopes that have a table of their own, in words."""
+
+
+def report(
+    result: JobResult,
+    evaluation: Evaluation,
+    console: Console,
+    tracker: Tracker,
+    *,
+    has_constant_baseline: bool = True,
+    adapts: bool = True,
+    copied_to: str | None = None,
+) -> None:
+    """Prints the table, where the results are and how to open them.
+
+    Args:
+        result: of the job.
+        evaluation: what was measured.
+        console: where it is printed.
+        tracker: says how to open the job's run.
+        has_constant_baseline: as `DrivingModel.has_constant_baseline`.
+        adapts: as `Policy.adapts`.
+        copied_to: URL of the folder's copy; None without.
+    """
+    console.print(methods_table(evaluation, result.metrics))
+    if evaluation.full_trajectory_improvements:
+        console.print(methods_table(evaluation, result.metrics, "full_trajectory"))
+    if not adapts:
+        text = (
+            "The policy keeps its parameters constant: this is a calibration, without adaptation."
+        )
+        console.print(text, soft_wrap=True)
+        _print_headline(result, console)
+    elif has_constant_baseline:
+        _print_improvements(evaluation, console)
+        _print_headline(result, console)
+    else:
+        text = (
+            "With constant parameters the model follows no leader: compare the policy's RMSE"
+            " with other jobs'."
+        )
+        console.print(text, soft_wrap=True)
+    if evaluation.forecasts is not None:
+        console.print(forecasts_table(evaluation.forecasts))
+        if evaluation.forecasts.distributions is not None:
+            console.print(distributions_table(evaluation.forecasts))
+    if evaluation.traffic is not None:
+        console.print(traffic_table(evaluation.traffic))
+    _print_safety(evaluation, result.metrics, console)
+    _print_flat(evaluation, console)
+    for scope, words in evaluation.outside.items():
+        text = f"Policy, {_SCOPES[scope]}: {words}; there it fades towards its base parameters."
+        console.print(text, soft_wrap=True, highlight=False)
+    for one in evaluation.left_out:
+        text = f"Not measured: {one.name} of the distribution {one.distribution} ({one.reason})."
+        console.print(text, soft_wrap=True, highlight=False)
+    console.print(f"Results: {result.folder}", soft_wrap=True, highlight=False)
+    if copied_to is not None:
+        console.print(f"Copied to: {copied_to}", soft_wrap=True, highlight=False)
+    animation = result.folder / "sumo" / "demo.html"
+    if animation.is_file():
+        console.print(f"Animation, for any browser: {animation}", soft_wrap=True, highlight=False)
+    for line in tracker.how_to_open():
+        console.print(line, soft_wrap=True, highlight=False)
+
+
+def methods_table(
+    evaluation: Evaluation, metrics: Mapping[str, float], scope: str = "test"
+) -> Table:
+    """Returns the metrics of one scope that are headlines: a row per method that has any."""
+    count = len(evaluation.trajectories)
+    plural = "" if count == 1 else "s"
+    title = f"{count} pair{plural}, {_SCOPES[scope]} in closed loop"
+    table = Table(title=title, title_justify="left")
+    table.add_column("method")
+    shown = [one for one in evaluation.measured if one.headline and scope in one.scopes]
+    for metric in shown:
+        table.add_column(escape(metric.title), justify="right")
+    for method in evaluation.methods:
+        values = [metrics.get(key_of(metric.name, method, scope)) for metric in shown]
+        if all(value is None for value in values):
+            continue
+        cells = []
+        for metric, value in zip(shown, values, strict=True):
+            cells.append(_cell(metric, value))
+        table.add_row(method, *cells)
+    return table
+
+
+def forecasts_table(forecasts: Forecasts) -> Table:
+    """Returns the RMSE of speed of each method at each horizon: mean over drivers.
+
+    Errors of position and intervals are in `metrics.json` and in the report.
+    """
+    leader = "given"
+    if forecasts.leader != "given":
+        leader = f"predicted at {forecasts.leader.replace('_', ' ')}"
+    drivers = int(forecasts.summary["drivers"].max())
+    title = f"Forecasts of {drivers} drivers, leader {leader}: RMSE of speed (m/s) after"
+    table = Table(title=title, title_justify="left")
+    table.add_column("method")
+    for horizon in forecasts.horizons:
+        table.add_column(f"{horizon:g} s", justify="right")
+    by_method = forecasts.summary.set_index(["method", "horizon_s"])["rmse_speed"]
+    for method in forecasts.methods:
+        cells = []
+        for horizon in forecasts.horizons:
+            value = by_method.get((method, horizon))
+            cells.append("" if value is None else f"{value:.3f}")
+        table.add_row(method, *cells)
+    return table
+
+
+def distributions_table(forecasts: Forecasts) -> Table:
+    """Returns the CRPS of speed of each sampled method at each horizon, and its coverage below.
+
+    The policy's centre, a single path, has its absolute error instead, and no coverage.
+    """
+    assert forecasts.distributions is not None
+    share = f"{100 * LEVEL:.0f} %"
+    title = f"Sampled forecasts: CRPS of speed (m/s), coverage of {share}, after"
+    table = Table(title=title, title_justify="left")
+    table.add_column("method")
+    for horizon in forecasts.horizons:
+        table.add_column(f"{horizon:g} s", justify="right")
+    summary = summarize_distributions(forecasts.distributions).set_index(["method", "horizon_s"])
+    for method in sampled_methods(forecasts.distributions):
+        cells = []
+        for horizon in forecasts.horizons:
+            crps = summary["crps_speed"].get((method, horizon))
+            coverage = summary["coverage"].get((method, horizon))
+            if crps is None or coverage is None:
+                cells.append("")
+            else:
+                cells.append(f"{crps:.3f}\n{100 * coverage:.0f} %")
+        table.add_row(method, *cells)
+    centre = centre_errors(forecasts.table).set_index("horizon_s")["crps_speed"]
+    cells = []
+    for horizon in forecasts.horizons:
+        value = centre.get(horizon)
+        cells.append("" if value is None else f"{value:.3f}")
+    table.add_row("policy's centre", *cells)
+    return table
+
+
+_TRAFFIC = (
+    ("capacity", "capacity", ".0f"),
+    ("error", "flow_error", ".0f"),
+    ("std", "speed_std", ".2f"),
+    ("waves", "wave_speed", ".1f"),
+    ("last", "growth_last", ".2f"),
+    ("half", "growth_half", ".2f"),
+    ("hits", "collisions", ".0f"),
+)
+"""Columns of the table of traffic: heading, metric, format."""
+
+
+def traffic_table(traffic: Traffic) -> Table:
+    """Returns what traffic looks like for each method, and recorded; it fits 80 columns."""
+    title = "Traffic: rings in vehicles/h, m/s and km/h; platoons in m/s; collisions"
+    table = Table(title=title, title_justify="left")
+    table.add_column("method")
+    for heading, _, _ in _TRAFFIC:
+        table.add_column(heading, justify="right")
+    metrics = traffic.metrics()
+    for method in (*traffic.methods, RECORDED):
+        cells = []
+        for _, metric, form in _TRAFFIC:
+            value = metrics.get(f"traffic/{metric}/{method}", math.nan)
+            cells.append(f"{value:{form}}" if math.isfinite(value) else "")
+        table.add_row(method, *cells)
+    return table
+
+
+def _cell(metric: MetricInfo, value: float | None) -> str:
+    """Returns a number as the table shows it: sums of whole numbers without decimals."""
+    if value is None:
+        return ""
+    if not math.isfinite(value):
+        return "not defined"
+    if metric.summary == "sum" and value == round(value):
+        return f"{value:.0f}"
+    return f"{value:.3f}"
+
+
+def _print_improvements(evaluation: Evaluation, console: Console) -> None:
+    """Prints a table of the comparisons of the policy with baselines, and what limits it."""
+    compared = _comparisons(evaluation)
+    if not compared:
+        return
+    console.print(improvements_table(compared))
+    for over, one in compared.items():
+        if one.undefined:
+            console.print(
+                f"Over {over}: {one.undefined} of {one.pairs + one.undefined} pairs have no"
+                f" improvement: a simulation diverged, or {over.partition(',')[0]} has no error at"
+                " all.",
+                soft_wrap=True,
+                highlight=False,
+            )
+    drivers = max(one.drivers for one in compared.values())
+    warning = few_drivers(drivers)
+    if warning:
+        console.print(warning, soft_wrap=True, highlight=False)
+
+
+def _print_headline(result: JobResult, console: Console) -> None:
+    """Prints the one number by which the job is known elsewhere: in MLflow, a report, Python."""
+    _, words = headline(result.metrics)
+    if words:
+        console.print(f"In short: {words}.", soft_wrap=True, highlight=False)
+
+
+def _comparisons(evaluation: Evaluation) -> dict[str, Improvement]:
+    """Returns what the table compares, by what it says in its first column."""
+    test, full = evaluation.improvements, evaluation.full_trajectory_improvements
+    steady = f"fixed, after {TRANSIENT_S:g} s"
+    candidates = [
+        (test, "fixed", "fixed"),
+        (evaluation.steady_improvements, "fixed", steady),
+        (test, "shrunk", "shrunk"),
+        (test, "population", "population"),
+        (full, "population", "population, full"),
+    ]
+    found = {}
+    for improvements, baseline, words in candidates:
+        if baseline in improvements:
+            found[words] = improvements[baseline]
+    return found
+
+
+def improvements_table(compared: Mapping[str, Improvement]) -> Table:
+    """Returns a row per baseline: mean, interval, median, and for how many pairs it is better.
+
+    It fits 80 columns. The other statistics are in `metrics.json` and in the report.
+    """
+    title = "Improvement of the policy over other methods, RMSE of speed, %"
+    table = Table(title=title, title_justify="left")
+    table.add_column("over")
+    for column in ("mean", "95 % interval", "median", "better for", "p"):
+        table.add_column(column, justify="right")
+    for over, one in compared.items():
+        if one.pairs == 0:
+            table.add_row(over, "not defined")
+            continue
+        interval = "one driver"
+        if math.isfinite(one.ci95_low):
+            interval = f"{100 * one.ci95_low:+.1f} to {100 * one.ci95_high:+.1f}"
+        table.add_row(
+            over,
+            f"{100 * one.mean:+.1f}",
+            interval,
+            f"{100 * one.median:+.1f}",
+            f"{one.win_rate * one.pairs:.0f} of {one.pairs}",
+            f"{one.p_value:.2g}" if math.isfinite(one.p_value) else "",
+        )
+    return table
+
+
+def _print_safety(evaluation: Evaluation, metrics: Mapping[str, float], console: Console) -> None:
+    """Prints a line about hard braking and parameters at their bounds, if there are any."""
+    sentences = []
+    braking = _methods_above(evaluation, metrics, "hard_braking", 1, ".0f")
+    if braking:
+        sentences.append(f"Frames with an acceleration below -8 m/s2: {braking}.")
+    if metrics.get("at_bounds/policy", 0.0) >= 0.01:
+        at_bounds = _methods_above(evaluation, metrics, "at_bounds", 0.01, ".0%")
+        sentences.append(f"Parameters at their bounds: {at_bounds}.")
+    if sentences:
+        console.print(" ".join(sentences), soft_wrap=True, highlight=False)
+
+
+def _print_flat(evaluation: Evaluation, console: Console) -> None:
+    """Prints which driver-specific parameters the recordings do not determine, if there are any."""
+    shares = flat_for(evaluation.table, evaluation.names)
+    pairs = int((evaluation.about["method"] == "fixed").sum())
+    found = [f"{name} for {share * pairs:.0f}" for name, share in shares.items() if share > 0]
+    if found:
+        text = (
+            f"Not determined: {', '.join(found)} of {pairs} pairs (within {100 * NEAR:.0f} % of the"
+            " best loss from bound to bound; flat_NAME is 1 in pairs.csv)."
+        )
+        console.print(text, soft_wrap=True, highlight=False)
+
+
+def _methods_above(
+    evaluation: Evaluation, metrics: Mapping[str, float], name: str, least: float, form: str
+) -> str:
+    """Lists the methods whose metric is at least so much, with its value."""
+    found = []
+    for method in evaluation.methods:
+        value = metrics.get(key_of(name, method), 0.0)
+        if value >= least:
+            found.append(f"{method} {value:{form}}")
+    return ", ".join(found)

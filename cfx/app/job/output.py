@@ -1,0 +1,399 @@
+"""The files of a job's folder; each appears whole or not at all."""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import yaml
+
+from cfx.app.job.calibration_view import CalibrationView
+from cfx.core.errors import OutputError
+from cfx.core.files import atomic_write, remove_leftovers
+from cfx.data.pairs import PairSet
+from cfx.data.style.result import StyleResult
+from cfx.data.tidy import write_tidy
+from cfx.evaluation.protocols.base import ProtocolResult
+from cfx.evaluation.result import Evaluation
+from cfx.results.config import JobConfig
+from cfx.results.provenance import commit, version
+from cfx.simulation.trajectory import TRANSIENT_S
+
+TRACKED = (
+    "config.yaml",
+    "metrics.json",
+    "pairs.csv",
+    "pair_metrics.parquet",
+    "style.csv",
+    "data.json",
+    "trajectories.parquet",
+    "curves.parquet",
+)
+"""Files of a job's folder that MLflow keeps too, besides its figures and its policy."""
+
+
+METRICS = "metrics.json"
+"""The file that is written last: a folder that has it is complete."""
+
+
+class Output:
+    """Writes a job's files.
+
+    Attributes:
+        folder: the job's output folder.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    @classmethod
+    def make(cls, folder: Path) -> Output:
+        """Makes the folder, if it is not there.
+
+        Raises:
+            OutputError: it cannot be made.
+        """
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(
+                f"cannot make the output folder {folder}: {error.strerror};"
+                " set hydra.run.dir to a place that can be written"
+            ) from error
+        output = cls(folder)
+        output.run(lambda: remove_leftovers(folder))
+        return output
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the folder holds the results of an earlier job."""
+        return (self.folder / METRICS).is_file()
+
+    def begin(self, config: JobConfig) -> None:
+        """Writes the configuration of the job that begins.
+
+        Where the folder holds an earlier job's results, these stay as they are until the new ones
+        are there (`replace`), so that the folder never mixes two jobs.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        if not self.is_complete:
+            write_config(self, config)
+
+    def replace(self, config: JobConfig) -> None:
+        """Removes what marks results as complete, and writes the configuration of new ones.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        self.run(lambda: (self.folder / METRICS).unlink(missing_ok=True))
+        write_config(self, config)
+
+    def file(self, name: str, write: Callable[[Path], object]) -> None:
+        """Writes one file, whole.
+
+        Args:
+            write: is given a path to write to; the file takes its name when it returns.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+
+        def write_whole() -> None:
+            with atomic_write(self.folder / name) as temporary:
+                write(temporary)
+
+        self.run(write_whole)
+
+    def text(self, name: str, text: str) -> None:
+        """Writes a text file.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        self.file(name, lambda path: path.write_text(text, encoding="utf-8"))
+
+    def json(self, name: str, values: Mapping[str, Any]) -> None:
+        """Writes a JSON file.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        self.text(name, json.dumps(values, indent=2) + "\n")
+
+    def run(self, write: Callable[[], object]) -> None:
+        """Calls a function that writes into the folder.
+
+        Raises:
+            OutputError: it cannot write.
+        """
+        try:
+            write()
+        except OSError as error:
+            raise OutputError(
+                f"cannot write into {self.folder}: {error.strerror or error};"
+                " the calibration is cached, so run again"
+            ) from error
+
+
+def write_config(output: Output, config: JobConfig) -> None:
+    """Writes `config.yaml`.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    values = config.model_dump(mode="json")
+    output.text("config.yaml", yaml.safe_dump(values, sort_keys=False))
+
+
+def write_tables(
+    output: Output,
+    pairs: PairSet,
+    style: StyleResult,
+    protocol_result: ProtocolResult,
+    view: CalibrationView | None = None,
+) -> list[Path]:
+    """Writes the tables of the results.
+
+    Returns:
+        The paths of the tables that only some protocols deliver.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    evaluation = protocol_result.evaluation
+    curves = typed_curves(protocol_result.curves)
+    output.file("pairs.csv", lambda path: evaluation.table.to_csv(path, index=False))
+    values, trajectories = evaluation.values_tables, evaluation.trajectories_tables
+    output.file("pair_metrics.parquet", lambda path: write_parquet(values(), path))
+    output.file("trajectories.parquet", lambda path: write_parquet(trajectories(), path))
+    output.file("curves.parquet", lambda path: curves.to_parquet(path, index=False))
+    output.file("style.csv", lambda path: style.table.to_csv(path, index=False))
+    if protocol_result.labels is not None:
+        labels = protocol_result.labels.to_frame(pairs, evaluation.names)
+        output.file("labels.parquet", lambda path: labels.to_parquet(path, index=False))
+    if any(pair.truth for pair in pairs):
+        output.file("data.parquet", lambda path: write_tidy(pairs, path))
+    return write_further_tables(output, evaluation, view)
+
+
+def write_parquet(parts: Iterable[pd.DataFrame], path: Path) -> None:
+    """Writes a table, of which there may be more than fits into memory.
+
+    Args:
+        parts: its rows, some after the other; one part at least.
+        path: of the file.
+    """
+    with ExitStack() as opened:
+        writer: pq.ParquetWriter | None = None
+        for part in parts:
+            schema = None if writer is None else writer.schema
+            table = pa.Table.from_pandas(part, schema, preserve_index=False)
+            if writer is None:
+                writer = opened.enter_context(pq.ParquetWriter(path, table.schema))
+            writer.write_table(table)
+
+
+def write_further_tables(
+    output: Output, evaluation: Evaluation, view: CalibrationView | None = None
+) -> list[Path]:
+    """Writes the tables that only some protocols deliver; returns their paths.
+
+    Those that an earlier job left in the folder go.
+    """
+    platoon = None
+    if evaluation.platoon is not None:
+        platoon = evaluation.platoon.table
+    forecasts, distributions = None, None
+    if evaluation.forecasts is not None:
+        forecasts = evaluation.forecasts.table
+        distributions = evaluation.forecasts.distributions
+    tables = {
+        "platoon.parquet": platoon,
+        "history.parquet": evaluation.history,
+        "forecasts.parquet": forecasts,
+        "slices.parquet": None if view is None else view.slices,
+        "fits.parquet": None if view is None else view.fits,
+        "distributions.parquet": distributions,
+    } | _traffic_tables(evaluation)
+    paths = []
+    for name, table in tables.items():
+        path = output.folder / name
+        if table is None:
+            output.run(functools.partial(path.unlink, missing_ok=True))
+        else:
+            output.file(name, functools.partial(table.to_parquet, index=False))
+            paths.append(path)
+    return paths
+
+
+def _traffic_tables(evaluation: Evaluation) -> dict[str, pd.DataFrame | None]:
+    """Returns the tables of simulated traffic by file; None where none was simulated."""
+    traffic = evaluation.traffic
+    tables = {}
+    for name in ("roads", "growth", "strips", "paths"):
+        file = "traffic.parquet" if name == "roads" else f"traffic_{name}.parquet"
+        tables[file] = None if traffic is None else getattr(traffic, name)
+    return tables
+
+
+def write_figures(
+    output: Output,
+    config: JobConfig,
+    pairs: PairSet,
+    style: StyleResult,
+    protocol_result: ProtocolResult,
+    view: CalibrationView | None,
+    *,
+    adapts: bool,
+) -> list[Path]:
+    """Writes the figures, if the configuration wants any; returns their paths.
+
+    Args:
+        output: the job's folder.
+        config: of the job.
+        pairs: of the job.
+        style: of its drivers.
+        protocol_result: what is drawn.
+        view: slices and fits of the calibration; None without.
+        adapts: as `Policy.adapts`.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    paths: list[Path] = []
+    if config.figures.enabled:
+        from cfx.report.figures.results import Results
+        from cfx.report.figures.write import write_figures as write_all_figures
+
+        evaluation = protocol_result.evaluation
+        labels = None
+        if view is not None and protocol_result.labels is not None:
+            labels = protocol_result.labels.to_frame(pairs, evaluation.names)
+        results = Results.of(
+            evaluation,
+            adapts=adapts,
+            style=style,
+            curves=protocol_result.curves,
+            slices=None if view is None else view.slices,
+            fits=None if view is None else view.fits,
+            labels=labels,
+        )
+
+        def write_all() -> None:
+            folder, formats = output.folder / "figures", config.figures.formats
+            paths.extend(write_all_figures(folder, results, formats=formats))
+
+        output.run(write_all)
+    return paths
+
+
+def write_demo(
+    output: Output, config: JobConfig, pairs: PairSet, protocol_result: ProtocolResult
+) -> list[Path]:
+    """Writes the demonstration in SUMO, if the configuration wants it; returns its paths.
+
+    The policy must have been saved before.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    paths: list[Path] = []
+    if config.demo.enabled:
+        from cfx.sumo import demo
+
+        def write_all() -> None:
+            paths.extend(
+                demo.write_demo(
+                    output.folder / "sumo",
+                    output.folder / "policy",
+                    pairs,
+                    protocol_result.policy,
+                    protocol_result.evaluation,
+                    config,
+                )
+            )
+
+        output.run(write_all)
+    return paths
+
+
+def write_provenance(
+    output: Output,
+    pairs: PairSet,
+    protocol_result: ProtocolResult,
+    *,
+    has_constant_baseline: bool,
+    adapts: bool,
+    objective: Mapping[str, str],
+) -> None:
+    """Writes `data.json`: where the data came from, and what a report must know of the model.
+
+    Args:
+        objective: name and unit of what calibration has minimised; losses of labels have this unit.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    evaluation = protocol_result.evaluation
+    dropped = []
+    for drop in pairs.dropped:
+        dropped.append({"reason": drop.reason, "count": drop.count, "unit": drop.unit})
+    parameters = []
+    lows, highs = evaluation.bounds
+    meanings = evaluation.meanings or ("",) * len(evaluation.names)
+    for k, name in enumerate(evaluation.names):
+        about = {"name": name, "unit": evaluation.units[k], "meaning": meanings[k]}
+        parameters.append({**about, "low": float(lows[k]), "high": float(highs[k])})
+    values = {
+        "source": pairs.source,
+        "fingerprint": pairs.fingerprint,
+        "pairs": len(pairs),
+        "protocol": dict(protocol_result.notes),
+        "dropped": dropped,
+        "parameters": parameters,
+        "has_constant_baseline": has_constant_baseline,
+        "adapts": adapts,
+        "objective": dict(objective),
+        "transient_s": TRANSIENT_S,
+        "metrics": [metric.to_json() for metric in evaluation.measured],
+        "outside": dict(evaluation.outside),
+        "metrics_left_out": [asdict(one) for one in evaluation.left_out],
+        "cfx": version(),
+        "commit": commit(Path.cwd()),
+    }
+    output.json("data.json", values)
+
+
+def write_metrics(output: Output, metrics: Mapping[str, float]) -> None:
+    """Writes `metrics.json`; null stands for a metric that is not defined.
+
+    It is the last file of a job, so that a folder with a `metrics.json` is complete.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    defined: dict[str, float | None] = {}
+    for name, value in metrics.items():
+        if math.isfinite(value):
+            defined[name] = value
+        else:
+            defined[name] = None
+    output.json("metrics.json", defined)
+
+
+def typed_curves(curves: pd.DataFrame) -> pd.DataFrame:
+    """Returns learning curves with the same column types whether anything was learned or not."""
+    return curves.astype(
+        {"network": str, "epoch": "int64", "train_loss": float, "validation_loss": float}
+    )

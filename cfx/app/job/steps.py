@@ -1,0 +1,272 @@
+"""The steps of one job, once its pairs are there."""
+
+from __future__ import annotations
+
+import logging
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from rich.console import Console
+
+from cfx.app.job import output as files
+from cfx.app.job.calibration_view import CalibrationView, calibration_view
+from cfx.app.job.console import report
+from cfx.app.job.description import described
+from cfx.app.job.output import Output
+from cfx.app.job.parts import Parts, choose_device, complete, make_protocol, reported_objectives
+from cfx.app.job.results import JobResult
+from cfx.app.job.upload import Upload
+from cfx.calibration.cache import Cache
+from cfx.calibration.calibrator import Calibrator
+from cfx.calibration.flatness import flat_for
+from cfx.calibration.prior import prior_weight
+from cfx.calibration.settings import WindowSettings
+from cfx.core import registry
+from cfx.core.errors import PluginError
+from cfx.core.memory import require_memory
+from cfx.core.progress import Task
+from cfx.core.threads import limit_cores, set_threads
+from cfx.data.base import load_pairs
+from cfx.data.pairs import PairBatch, PairSet
+from cfx.data.style.entropy import measure_style, select_cluster
+from cfx.data.style.result import StyleResult
+from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
+from cfx.learners.curves import best_losses
+from cfx.policies import checkpoint
+from cfx.results.config import JobConfig
+
+if TYPE_CHECKING:
+    from cfx.results.tracker import Tracker
+
+log = logging.getLogger(__name__)
+
+_WINDOW_S = 0.5
+"""Length of a window in the paper, and with default settings at NGSIM's time step of 0.1 s."""
+
+
+def take_steps(
+    config: JobConfig,
+    folder: Path,
+    loaded: PairSet,
+    console: Console | None = None,
+) -> JobResult:
+    """Runs one job and writes its results into `folder`.
+
+    Args:
+        config: the validated configuration.
+        folder: the job's output folder; made if it is not there.
+        loaded: the pairs of the configuration's dataset.
+        console: where the table goes; stdout unless given.
+
+    Raises:
+        CfxError: the user's mistake, in one sentence; nothing half-written is left.
+    """
+    from cfx.results.tracker import Tracker
+
+    console = console or Console()
+    data = config.data
+    device = choose_device(config.device)
+    limit_cores(config.cores)
+    if config.threads is not None:
+        set_threads(config.threads)
+    protocol = make_protocol(config)
+    config = complete(config, protocol)
+    parts = Parts.of(config, protocol)
+    output = Output.make(folder)
+    output.begin(config)
+    upload = None
+    if config.output.url is not None:
+        upload = Upload(config.output.url, folder)
+        upload.begin()
+    with Tracker.open(config, folder) as tracker:
+        if config.data != data:  # the protocol has determined other data
+            loaded = load_pairs(parts.dataset)
+        pairs, style = _select_pairs(loaded, config)
+        if config.demo.enabled:
+            from cfx.sumo.demo import check_demo
+
+            check_demo(config.demo, pairs)
+        tracker.set_tags(
+            {
+                "dataset.fingerprint": pairs.fingerprint,
+                "dataset.source": pairs.source,
+                "dataset.pairs": str(len(pairs)),
+            }
+        )
+        context = _context(config, parts, pairs, style, device)
+        with closing(context.simulator), closing(parts.engine):
+            protocol_result = _run_protocol(parts.protocol, context)
+            if not parts.policy.adapts:
+                shown = protocol_result.evaluation.constant_methods()
+                protocol_result = replace(protocol_result, evaluation=shown)
+            view = calibration_view(context, protocol_result.evaluation)
+        if view is not None:
+            evaluation = protocol_result.evaluation.with_slices(view.slices)
+            protocol_result = replace(protocol_result, evaluation=evaluation)
+        result = _keep(config, parts, output, pairs, style, protocol_result, view, tracker)
+        if upload is not None:
+            upload.finish()
+            tracker.set_tags({"cfx.output_url": upload.url})
+            log.info("The job's folder was copied to %s", upload.url)
+    report(
+        result,
+        protocol_result.evaluation,
+        console,
+        tracker,
+        has_constant_baseline=parts.model.has_constant_baseline,
+        adapts=parts.policy.adapts,
+        copied_to=None if upload is None else upload.url,
+    )
+    return result
+
+
+def _select_pairs(pairs: PairSet, config: JobConfig) -> tuple[PairSet, StyleResult]:
+    """Returns the pairs of the wanted driving style."""
+    style = measure_style(pairs, config.style)
+    pairs = select_cluster(pairs, style, config.style.cluster)
+    for drop in pairs.dropped:
+        log.info("Left out: %d %s (%s)", drop.count, drop.unit, drop.reason)
+    _check_window(config.windows.length, pairs.dt)
+    return pairs, style
+
+
+def _check_window(length: int, dt: float) -> None:
+    """Says so if the default number of steps makes windows much shorter or longer than usual."""
+    lasts = length * dt
+    usual = 0.5 * _WINDOW_S < lasts < 2 * _WINDOW_S
+    if length == WindowSettings().length and not usual:
+        log.info(
+            "A window of %d steps lasts %.3g s in these recordings; settings are made for %g s:"
+            " say data.time_step=%g, or change windows.length and windows.stride",
+            length,
+            lasts,
+            _WINDOW_S,
+            _WINDOW_S / length,
+        )
+
+
+def _context(
+    config: JobConfig, parts: Parts, pairs: PairSet, style: StyleResult, device: torch.device
+) -> ProtocolContext:
+    """Returns what the protocol works with."""
+    bound = parts.simulator.settings.memory_mb * 2**20
+    require_memory(bound, f"simulator.memory_mb={parts.simulator.settings.memory_mb}")
+    batch = PairBatch.of(pairs, dtype=getattr(torch, config.dtype), device=device)
+    stepper = parts.simulator.stepper(parts.model, batch.dt)
+    cache_folder: Path | str | None = None
+    workspace = None
+    if config.cache.enabled:
+        cache_folder = config.cache.folder
+        # Behind a URL there is no place for what a training writes every few seconds.
+        workspace = Path("outputs") / "training"
+        if isinstance(cache_folder, Path):
+            cache_folder = cache_folder.expanduser()
+            workspace = cache_folder / "training"
+    calibrator = Calibrator(
+        stepper,
+        parts.optimizer,
+        seed=config.seed,
+        cache=Cache(cache_folder),
+        memory=bound,
+        progress=Task,
+        objective=parts.objective,
+        reported=reported_objectives(config, parts.objective),
+        prior=prior_weight(config.calibration.prior),
+        engine=parts.engine,
+    )
+    return ProtocolContext(
+        pairs=pairs,
+        batch=batch,
+        style=style,
+        simulator=stepper,
+        model_node=config.model,
+        policy_node=config.policy,
+        calibrator=calibrator,
+        policy=parts.policy.for_model(parts.model, batch.dt, config.windows),
+        learner=parts.learner,
+        windows=config.windows,
+        split=config.split,
+        seed=config.seed,
+        workspace=workspace,
+        metrics=parts.metrics,
+    )
+
+
+def _run_protocol(protocol: Protocol, context: ProtocolContext) -> ProtocolResult:
+    result: object = protocol.run(context)
+    if not isinstance(result, ProtocolResult):
+        raise PluginError(
+            f"{registry.origin(protocol)}: run must return a cfx.ProtocolResult,"
+            f" but returned a {type(result).__name__}"
+        )
+    return result
+
+
+def _keep(
+    config: JobConfig,
+    parts: Parts,
+    output: Output,
+    pairs: PairSet,
+    style: StyleResult,
+    protocol_result: ProtocolResult,
+    view: CalibrationView | None,
+    tracker: Tracker,
+) -> JobResult:
+    """Writes everything into the folder, then into MLflow."""
+    evaluation = protocol_result.evaluation
+    of_training: dict[str, float] = {}
+    if protocol_result.labels is not None:
+        of_training |= protocol_result.labels.metrics()
+    of_training |= best_losses(protocol_result.curves)
+    of_training |= protocol_result.calibration
+    for name, share in flat_for(evaluation.table, evaluation.names).items():
+        of_training[f"flat/{name}"] = share
+    metrics = evaluation.metrics() | of_training
+
+    output.replace(config)
+    policy_folder = output.folder / "policy"
+    further = files.write_tables(output, pairs, style, protocol_result, view)
+    output.run(lambda: checkpoint.save(protocol_result.policy, policy_folder))
+    figures = files.write_figures(
+        output,
+        config,
+        pairs,
+        style,
+        protocol_result,
+        view,
+        adapts=parts.policy.adapts,
+    )
+    demo = files.write_demo(output, config, pairs, protocol_result)
+    files.write_provenance(
+        output,
+        pairs,
+        protocol_result,
+        has_constant_baseline=parts.model.has_constant_baseline,
+        adapts=parts.policy.adapts,
+        objective={"name": config.objective["name"], "unit": parts.objective.unit},
+    )
+    # Before MLflow, so that no failure there loses it.
+    files.write_metrics(output, metrics)
+
+    tracker.log_evaluation(evaluation, adapts=parts.policy.adapts)
+    tracker.log_data(pairs, str(config.data["name"]))
+    tracker.describe(described(config, pairs, metrics, adapts=parts.policy.adapts))
+    tracker.log_metrics(of_training)
+    tracker.log_curves(protocol_result.curves)
+    tracker.log_figures(figures)
+    tracker.log_policy(policy_folder, pairs)
+    tracked = [output.folder / name for name in files.TRACKED]
+    tracker.log_files(tracked + further + demo)
+    return JobResult(
+        metrics,
+        evaluation.table,
+        protocol_result.policy,
+        tuple(figures),
+        output.folder,
+        tracker.run_id,
+        evaluation,
+        style,
+    )

@@ -1,0 +1,175 @@
+"""`cfx plugins check`: loads components and holds each to the quick part of its kind's contract."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+
+from cfx.app import nodes
+from cfx.core import registry
+from cfx.core.component import API_VERSION
+from cfx.core.console import blank_table, put
+from cfx.core.errors import CfxError, ConfigError, NotInstalledError
+from cfx.core.progress import Task
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is known of a component after it was tried.
+
+    Attributes:
+        entry: which component.
+        state: fine, broken, shadowed, or not installed: an extra that it needs is not there.
+        complaint: what is wrong, in one sentence that names the distribution; "" if nothing is.
+        hint: what could be better; "" if nothing could.
+    """
+
+    entry: registry.Entry
+    state: str
+    complaint: str = ""
+    hint: str = ""
+
+
+def check(kind: str | None = None, name: str | None = None) -> int:
+    """Tries components and prints a table, hints, and complaints on stderr.
+
+    Args:
+        kind: one kind alone.
+        name: one name of that kind alone.
+
+    Returns:
+        1 if a component is broken or shadowed, else 0.
+
+    Raises:
+        PluginError: there is no such kind or name.
+        ConfigError: Python was started with -O.
+    """
+    if not __debug__:
+        raise ConfigError(
+            "cfx plugins check is made of assertions, which python -O removes;"
+            " start python without -O"
+        )
+    chosen = _chosen(kind, name)
+    verdicts = []
+    with Task("Checking components", len(chosen)) as task:
+        for entry in chosen:
+            verdicts.append(examine(entry))
+            task.advance()
+    rows = blank_table("kind", "name", "distribution", "version", "from", "state")
+    for one in verdicts:
+        entry = one.entry
+        rows.add_row(
+            entry.kind, entry.name, entry.distribution, entry.version, entry.location, one.state
+        )
+    put(rows)
+    for hint in _once([one.hint for one in verdicts]):
+        print(f"Hint: {hint}")
+    complaints = _once([one.complaint for one in verdicts])
+    for complaint in complaints:
+        print(complaint, file=sys.stderr)
+    if complaints:
+        return 1
+    return 0
+
+
+def _once(texts: list[str]) -> list[str]:
+    """Returns each text once, without empty ones."""
+    found: list[str] = []
+    for text in texts:
+        if text and text not in found:
+            found.append(text)
+    return found
+
+
+def _chosen(kind: str | None, name: str | None) -> list[registry.Entry]:
+    """Returns the entries of all kinds or one, of all names or one."""
+    kinds = list(registry.KINDS)
+    if kind is not None:
+        kinds = [registry.kind_of(kind).name]
+    found = []
+    for one in kinds:
+        for entry in registry.entries(one):
+            if name is None or entry.name == name:
+                found.append(entry)
+    if not found and kind is not None and name is not None:
+        registry.entry(kind, name)  # says which names there are
+    return found
+
+
+def examine(entry: registry.Entry) -> Verdict:
+    """Tries one component with its default settings, or those of its `trial`.
+
+    Whatever the component does, this returns.
+    """
+    shadow = _shadow(entry)
+    if shadow:
+        return Verdict(entry, "shadowed", shadow)
+    try:
+        cls = registry.get(entry.kind, entry.name)
+        nodes.render(cls, entry.name)
+        required = []
+        for name, field in cls.schema.model_fields.items():
+            if registry.is_blank(field):
+                required.append(name)
+        if required:
+            return Verdict(entry, "fine", hint=_not_tried(entry, required))
+        component = registry.create(entry.kind, {"name": entry.name, **cls.trial})
+        complaint = _broken_contract(entry, component)
+    except NotInstalledError as error:
+        return Verdict(entry, "not installed", hint=str(error))
+    except CfxError as error:
+        complaint = " ".join(str(error).split())
+        if entry.distribution not in complaint:
+            complaint = f"{entry}: {complaint}"
+    except Exception as error:  # a plugin may raise anything
+        complaint = f"{entry} cannot be used with its default settings: {registry.in_words(error)}"
+    if complaint:
+        return Verdict(entry, "broken", complaint)
+    return Verdict(entry, "fine", hint=_undeclared(entry))
+
+
+def _shadow(entry: registry.Entry) -> str:
+    """Returns why another component of that name is used instead; "" if none is."""
+    rivals = registry.rivals(entry)
+    if not rivals:
+        return ""
+    if rivals[0].distribution == registry.OWN:
+        return (
+            f"{entry} is never used, because cfx has a {entry.kind} '{entry.name}' of its own;"
+            f" its author must rename it, or pip uninstall {entry.distribution}"
+        )
+    others = " and ".join(f"{one.distribution} {one.version}" for one in rivals)
+    return (
+        f"{entry} cannot be used, because {others} brings a {entry.kind} of that name too;"
+        " uninstall one of them"
+    )
+
+
+def _broken_contract(entry: registry.Entry, component: object) -> str:
+    """Returns the first statement of the contract that does not hold; "" if all hold."""
+    from cfx.contracts import contract_for, violations
+
+    found = list(violations(contract_for(entry.kind), component))
+    if not found:
+        return ""
+    check, sentence = found[0]
+    text = f"{entry} breaks its contract: {' '.join(sentence.split())} ({check})"
+    if len(found) > 1:
+        text += f"; and {len(found) - 1} more"
+    return f"{text}; its own tests with cfx.contracts's suite show all of it"
+
+
+def _not_tried(entry: registry.Entry, required: list[str]) -> str:
+    keys = ", ".join(f"{registry.kind_of(entry.kind).group}.{name}" for name in required)
+    return f"{entry.kind} '{entry.name}' was loaded but not tried: it needs {keys}."
+
+
+def _undeclared(entry: registry.Entry) -> str:
+    """Returns a hint for a distribution that declares no version of the plugin API."""
+    if entry.distribution == registry.OWN or entry.api:
+        return ""
+    return (
+        f"{entry.distribution} declares no version of cfx's plugin API and counts as built for the"
+        " current one; its author can add to pyproject.toml:"
+        f' [project.entry-points."{registry.API_GROUP}"] {API_VERSION} = "{entry.package}"'
+    )

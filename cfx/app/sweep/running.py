@@ -1,0 +1,231 @@
+"""A sweep that runs in this process: it finds its folder and leaves a summary there."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import logging
+import shlex
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Self, cast
+
+from filelock import BaseFileLock
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+from omegaconf.errors import OmegaConfBaseException
+
+from cfx.app.hydra_source import resolving
+from cfx.app.sweep.fingerprint import command_of
+from cfx.app.sweep.folder import LOCK, find_folder
+from cfx.app.sweep.record import RECORD, Record
+from cfx.app.sweep.status import JobStatus, worst
+from cfx.app.sweep.summary import SUMMARY, metric_columns, rows, summary_table, write_summary
+from cfx.core.console import put
+
+log = logging.getLogger(__name__)
+
+_AGAIN = "The same command again runs only the jobs that are not done."
+
+
+class Sweep:
+    """A sweep that runs in this process.
+
+    Attributes:
+        folder: of the sweep, as people see it.
+        record: what `sweep.json` says.
+        tracking: the resolved configuration of tracking.
+        resumable: the folders of its jobs are named by what the jobs are.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        lock: BaseFileLock,
+        record: Record,
+        tracking: Mapping[str, Any],
+        *,
+        resumable: bool,
+    ) -> None:
+        self.folder = folder
+        self.record = record
+        self.tracking = tracking
+        self.resumable = resumable
+        self._lock = lock
+
+    @classmethod
+    def open(cls, config: DictConfig) -> Self:
+        """Finds or makes the folder of a multirun, and holds its lock until `close`.
+
+        Args:
+            config: the master configuration, with Hydra's node.
+
+        Raises:
+            ConfigError: another sweep runs in the folder that was asked for.
+            OSError: the folder cannot be made.
+        """
+        command, digest, jobs = command_of(config)
+        raw: Any = OmegaConf.to_container(config.hydra.sweep, resolve=False)
+        wanted = Path(str(config.hydra.sweep.dir))
+        resumable = "cfx_job" in str(raw["subdir"])
+        folder, lock = find_folder(str(raw["dir"]), wanted, digest, resumable=resumable)
+        earlier = Record.read(folder)
+        record = Record(str(folder), command, digest, _now(), jobs)
+        if earlier is not None:
+            record = replace(record, name=earlier.name)
+            if earlier.command_hash == digest:
+                record = replace(record, started=earlier.started)
+            print(_continuing(folder, record, earlier), flush=True)
+        record.write(folder)
+        return cls(folder, lock, record, _tracking(config), resumable=resumable)
+
+    def lead(self, config: DictConfig) -> None:
+        """Sends Hydra into the folder.
+
+        Args:
+            config: the master configuration; changed in place, as are the overrides in it that each
+                job is composed from.
+        """
+        path = str(self.folder)
+        escaped = path.replace("'", "\\'")
+        given: Any = OmegaConf.to_container(config.hydra.overrides.hydra, resolve=False)
+        overrides = []
+        for override in given:
+            if not override.startswith("hydra.sweep.dir="):
+                overrides.append(override)
+        overrides.append(f"hydra.sweep.dir='{escaped}'")
+        with writable(config):
+            config.hydra.sweep.dir = path
+            config.hydra.overrides.hydra = overrides
+
+    def close(self, multirun: str, code: int, *, interrupted: bool) -> int:
+        """Says how the sweep ended, on the terminal and in `summary.csv`, and frees its folder.
+
+        Args:
+            multirun: this start of the sweep.
+            code: exit code so far.
+            interrupted: a signal ended it.
+
+        Returns:
+            The exit code.
+        """
+        try:
+            statuses = self.record.statuses(self.folder, multirun)
+            if statuses:
+                return self._finish(statuses, code)
+            if interrupted:
+                self._close_runs()
+            return self._finish_without_jobs(code, interrupted=interrupted)
+        finally:
+            self._lock.release()
+
+    def _finish(self, statuses: Mapping[Path, JobStatus], code: int) -> int:
+        """Writes and prints the summary, and says how to go on; returns the exit code."""
+        lines = self._close_runs()
+        table = rows(statuses)
+        write_summary(self.folder / SUMMARY, table)
+        put(summary_table(table, metric_columns(list(statuses))))
+        code = self._count(statuses, code)
+        if any(status.code == 0 for status in statuses.values()):
+            for line in lines:
+                print(line)
+            folder = shlex.quote(str(self.folder))
+            print(f"Report of the whole sweep: python -m cfx report {folder}")
+        if code == 0:
+            replace(self.record, completed=_now()).write(self.folder)
+        elif self.resumable:
+            print(_AGAIN)
+        return code
+
+    def _count(self, statuses: Mapping[Path, JobStatus], code: int) -> int:
+        """Prints how many jobs are done, and which failed and why; returns the exit code."""
+        failed = {path: status for path, status in statuses.items() if status.code}
+        total = max(self.record.jobs or 0, len(statuses))
+        missing = total - len(statuses)
+        print(f"{len(statuses) - len(failed)} of {total} jobs done; their folders: {self.folder}")
+        for path, status in failed.items():
+            overrides = " ".join(status.overrides)
+            print(f"failed: {overrides}: {status.message} ({path})", file=sys.stderr)
+        if missing and code == 0:
+            print(f"{missing} jobs left no outcome; see the launcher's own logs", file=sys.stderr)
+            code = 1
+        return worst(code, *(status.code for status in failed.values()))
+
+    def _finish_without_jobs(self, code: int, *, interrupted: bool) -> int:
+        """Says that no job ended, or removes a wrong command's folder; returns the exit code."""
+        if code == 0:
+            text = f"no job left its outcome in {self.folder}; see the launcher's own logs"
+            print(text, file=sys.stderr)
+            return 1
+        has_jobs = any(path.is_dir() for path in self.folder.iterdir())
+        if interrupted or has_jobs:
+            if self.resumable:
+                print(_AGAIN)
+            return code
+        for name in (RECORD, "multirun.yaml", LOCK):
+            (self.folder / name).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            self.folder.rmdir()
+        return code
+
+    def _close_runs(self) -> tuple[str, ...]:
+        """Closes MLflow's runs that killed jobs left open; returns lines that lead to them."""
+        from cfx.core.errors import TrackingError
+        from cfx.results.store import sqlite_file, tracking_uri
+
+        if not self.tracking.get("enabled"):
+            return ()
+        try:
+            uri = tracking_uri(self.tracking.get("uri"))
+            file = sqlite_file(uri)
+            if file is not None and not file.is_file():
+                return ()
+            from cfx.results.tracker import end_sweep
+
+            return end_sweep(
+                uri,
+                str(self.tracking.get("experiment")),
+                self.tracking.get("sweep") or self.record.name,
+            )
+        except TrackingError as error:
+            log.warning("%s", error)
+            return ()
+
+
+@contextlib.contextmanager
+def writable(config: DictConfig) -> Iterator[None]:
+    """Lets the block change Hydra's node, which Hydra 1.4 has made read-only by then."""
+    with read_write(config.hydra), open_dict(config.hydra):
+        yield
+
+
+def _continuing(folder: Path, record: Record, earlier: Record) -> str:
+    if earlier.command_hash != record.command_hash:
+        return (
+            f"continuing in {folder}, which holds another command's sweep:"
+            " jobs that both have in common are not run again"
+        )
+    statuses = record.statuses(folder, "").values()
+    done = sum(status.code == 0 for status in statuses)
+    total = ""
+    if record.jobs:
+        total = f" of {record.jobs}"
+    return f"continuing sweep {folder}: {done}{total} jobs are done"
+
+
+def _tracking(config: DictConfig) -> dict[str, Any]:
+    """Returns the resolved configuration of tracking.
+
+    It is empty where only a job's own configuration can say it.
+    """
+    try:
+        with resolving(copy.deepcopy(config)):  # it makes what it is given read-only
+            return cast("dict[str, Any]", OmegaConf.to_container(config.tracking, resolve=True))
+    except (OmegaConfBaseException, ValueError):
+        return {}
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="microseconds")

@@ -1,0 +1,86 @@
+"""How a job of a sweep ended, and the file in its folder that says so."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Self
+
+from cfx.core.files import write_json
+
+STATUS = "outcome.json"
+"""The marker in a job's folder; written whole and last."""
+
+
+@dataclass(frozen=True)
+class JobStatus:
+    """How a job of a sweep ended.
+
+    Attributes:
+        code: exit code: 0; 2 for a user's mistake; 1 for a bug.
+        message: one sentence for people; empty if all went well.
+        detail: the traceback of a bug.
+        overrides: what was asked for.
+        multirun: the start of the sweep that last saw this job.
+        command: the sweep's command, see `Record.command_hash`.
+        fingerprint: of everything that the results depend on, see `fingerprint`.
+        number: the job's place in the sweep.
+        seconds: how long it took, s.
+        before: an earlier start of the sweep did it.
+    """
+
+    code: int
+    message: str
+    detail: str
+    overrides: tuple[str, ...]
+    multirun: str = ""
+    command: str = ""
+    fingerprint: str = ""
+    number: int = 0
+    seconds: float = 0.0
+    before: bool = False
+
+    @classmethod
+    def read(cls, folder: Path) -> Self | None:
+        """Returns how the job in `folder` ended; None if it left no marker that can be read."""
+        try:
+            values = json.loads((folder / STATUS).read_text(encoding="utf-8"))
+            return cls(**{**values, "overrides": tuple(values["overrides"])})
+        except (OSError, ValueError, TypeError, KeyError):
+            return None
+
+    def write(self, folder: Path) -> None:
+        """Writes it, whole, into the job's folder."""
+        write_json(folder / STATUS, asdict(self))
+
+    @property
+    def state(self) -> str:
+        """For people: done, done before or failed."""
+        if self.code:
+            return "failed"
+        if self.before:
+            return "done before"
+        return "done"
+
+
+def metrics_of(folder: Path) -> dict[str, float]:
+    """Returns the finite metrics of a finished job; empty if there are none."""
+    try:
+        values = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    if not isinstance(values, dict):
+        return {}
+    finite = {}
+    for name, value in values.items():
+        if isinstance(value, int | float) and math.isfinite(value):
+            finite[name] = float(value)
+    return finite
+
+
+def worst(*codes: int) -> int:
+    """Returns the exit code that weighs most: a signal, then a bug, then a user's mistake."""
+    weights = {0: 0, 2: 1, 1: 2}
+    return max(codes, key=lambda code: weights.get(code, 3))

@@ -1,0 +1,176 @@
+"""What Hydra says about a wrong command line, in one sentence with the nearest right name."""
+
+from __future__ import annotations
+
+import re
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, TypeGuard
+
+import yaml
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from cfx.app import hydra_source
+from cfx.core import registry
+from cfx.core.errors import CfxError, nearest
+from cfx.core.extras import advice
+
+
+def is_user_error(error: BaseException) -> bool:
+    """Says whether an error raised outside the job itself is the user's to mend."""
+    if isinstance(
+        error, CfxError | HydraException | OmegaConfBaseException | yaml.YAMLError | OSError
+    ):
+        return True
+    if isinstance(error, ValueError) and isinstance(error.__cause__, OSError):
+        return str(error).startswith("Unable to configure handler")  # the log cannot be opened
+    # Hydra raises plain errors for contradictory flags and for options of the wrong type.
+    if not isinstance(error, ValueError | AssertionError | RuntimeError | ImportError):
+        return False
+    return _raised_in(error).startswith(("hydra.", "hydra_plugins.", "omegaconf."))
+
+
+def explain(error: BaseException, overrides: Sequence[str]) -> str:
+    """Returns one sentence (for several wrong keys, one each) that says what to write instead."""
+    if isinstance(error, CfxError):
+        return str(error)
+    for cause in _chain(error):
+        if _is_about_a_file(cause):
+            return (
+                f"{cause.filename}: {cause.strerror}; choose an output folder that can be written"
+                " with hydra.run.dir=FOLDER (multiruns: hydra.sweep.dir=FOLDER)"
+            )
+    if (
+        isinstance(error, MissingConfigException)
+        and error.missing_cfg_file
+        and error.options is not None
+    ):
+        return _unknown_option(error.missing_cfg_file, error.options)
+    if isinstance(error, OverrideParseException):
+        return _unreadable(error)
+    return _reworded(error, overrides)
+
+
+def no_command(word: str) -> str:
+    """Returns a sentence for a word that is neither an override nor a sub-command."""
+    advised = advice("command", word, registry.names("command"))
+    return f"{word}: neither key=value nor a sub-command.{advised} See cfx --help."
+
+
+def _reworded(error: BaseException, overrides: Sequence[str]) -> str:
+    """Returns Hydra's more frequent messages in other words, and the rest as they are."""
+    text = str(error).strip()
+    unknown = re.search(r"Could not override '([^']+)'", text)
+    if unknown:
+        return _unknown_key(unknown[1], overrides)
+    several = re.search(
+        r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?:\n| requires)", text
+    )
+    if several:
+        return (
+            f"{several[1]}: several values need a multirun; add -m (or write key=[a,b] for a list)"
+        )
+    if text.startswith("Config group override must be"):
+        return f"{text}; choose an option by its name, such as model=w99"
+    return _plain(error)
+
+
+def _unknown_option(path: str, options: Sequence[str]) -> str:
+    group, _, name = path.rpartition("/")
+    return f"{group}={name}: there is no {group} '{name}'.{advice(group, name, options)}"
+
+
+def _unreadable(error: OverrideParseException) -> str:
+    word = error.override
+    if "=" not in word:
+        return no_command(word)
+    detail = "syntax"
+    for line in error.message.splitlines():
+        if not line.startswith(("Error parsing", "See ")):
+            detail = re.sub(r" expecting \{.*\}", "", line)
+            break
+    return (
+        f"{word}: cannot be read as key=value ({detail});"
+        " quote a value that holds special characters: key=\\'value\\'"
+    )
+
+
+def _unknown_key(key: str, overrides: Sequence[str]) -> str:
+    """Returns a sentence with the keys that there are where `key` was looked for."""
+    given = key
+    for override in overrides:
+        if re.match(rf"\+*{re.escape(key)}\b", override):
+            given = override
+            break
+    others = [override for override in overrides if override != given]
+    try:
+        config: Any = hydra_source.composed(others)
+    except Exception:  # the other overrides may be wrong too; the sentence is then without advice
+        return f"{given}: there is no key '{key}'; cfx --cfg job prints every key"
+    parent, _, last = key.rpartition(".")
+    siblings = config
+    if parent:
+        siblings = OmegaConf.select(config, parent)
+    if isinstance(siblings, DictConfig):
+        names = sorted(str(name) for name in siblings if name != "hydra")
+        advice = nearest(last, names)
+        known = "Known keys"
+        if parent:
+            advice = advice.replace("'", f"'{parent}.", 1)
+            known = f"Known keys of {parent}"
+        return f"{given}: there is no key '{key}'.{advice} {known}: {', '.join(names)}."
+    everything: Any = OmegaConf.to_container(config, resolve=False)
+    paths = _keys(everything)
+    return f"{given}: there is no key '{key}'.{nearest(key, paths)} cfx --cfg job prints every key."
+
+
+def _keys(values: Mapping[Any, Any], prefix: str = "") -> Iterator[str]:
+    """Yields the path of every key of nested mappings."""
+    for name, value in values.items():
+        path = f"{prefix}{name}"
+        yield path
+        if isinstance(value, Mapping):
+            yield from _keys(value, f"{path}.")
+
+
+def _plain(error: BaseException) -> str:
+    """Returns Hydra's own words, and those of the error behind it, on one line."""
+    noise = ("object_type=", "See https://", "Config search path", "provider=")
+    parts: list[str] = []
+    for cause in _chain(error):
+        kept = []
+        for line in str(cause).splitlines():
+            words = line.strip()
+            if words and not words.startswith(noise):
+                kept.append(words)
+        part = " ".join(kept)
+        if part and part not in parts:
+            parts.append(part)
+    if not parts:
+        return f"{type(error).__name__} while composing the configuration"
+    return ": ".join(parts)
+
+
+def _chain(error: BaseException) -> Iterator[BaseException]:
+    current: BaseException | None = error
+    while current is not None:
+        yield current
+        current = current.__cause__
+
+
+def _is_about_a_file(error: BaseException) -> TypeGuard[OSError]:
+    return (
+        isinstance(error, OSError)
+        and not isinstance(error, HydraException)
+        and bool(error.filename and error.strerror)
+    )
+
+
+def _raised_in(error: BaseException) -> str:
+    """Returns the module of the innermost frame."""
+    module = ""
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        module = str(frame.f_globals.get("__name__", ""))
+    return module

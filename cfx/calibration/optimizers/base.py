@@ -1,0 +1,370 @@
+"""The contract of an optimizer: many independent bounded problems in one call.
+
+Shapes: P problems, q candidates for each in one call, n parameters, g guesses, e evaluations of
+each problem in all. Everything here is float64: Gaussian processes need it, and losses of
+neighbouring candidates differ by little.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from threading import Event
+from typing import ClassVar, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cfx.core import registry
+from cfx.core.component import Component
+from cfx.core.errors import PluginError
+from cfx.core.memory import require_memory
+from cfx.core.threads import cores, share
+
+Progress = Callable[[int], None]
+"""Called with how many more evaluations are done; they sum to problems times evaluations."""
+
+Tried = Tensor | tuple[Tensor, ...]
+"""Candidates `(P, e, n)`, whole or in blocks along e."""
+
+TIE_RELATIVE, TIE_ABSOLUTE = 1e-6, 1e-9
+"""Losses within `TIE_ABSOLUTE + TIE_RELATIVE * best` of the best count as equal: above rounding,
+below anything that matters."""
+
+
+_LOSSES_AT_ONCE = 1 << 19
+"""Losses of one chunk on a CPU, at most: 4 MB, which are written and read again in its cache."""
+
+
+class CandidateLosses(Protocol):
+    """What an optimizer minimises: the losses of candidates in P independent problems.
+
+    In a calibration these are values of the job's objective (`cfx.Objective`), in its unit.
+    """
+
+    @property
+    def problems(self) -> int:
+        """P."""
+        ...
+
+    def __call__(self, candidates: Tensor) -> Tensor:
+        """Returns losses `(P, q)`; NaN or infinity where a candidate diverges.
+
+        Args:
+            candidates: `(P, q, n)` in unit space.
+        """
+        ...
+
+    def select(self, first: int, last: int) -> CandidateLosses:
+        """Returns the losses of problems `first` to `last - 1` alone."""
+        ...
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What an optimizer found.
+
+    Attributes:
+        best: `(P, n)` in unit space: of the candidates whose loss ties with the lowest, the nearest
+            to the problem's first guess; the first guess itself if every candidate diverged.
+        loss: `(P,)`, the loss of `best`; infinity if every candidate diverged.
+        filling: `(P, 3)`, lowest, median and highest finite loss of the space-filling candidates
+            (`Optimizer.space_filling`): neither guesses nor what an optimizer chose by looking at
+            losses. The median of an even number is the lower of the middle two. NaN if none is
+            finite.
+        diverged: `(P,)` int64, number of candidates whose loss was NaN or infinite.
+    """
+
+    best: Tensor
+    loss: Tensor
+    filling: Tensor
+    diverged: Tensor
+
+    @property
+    def sensitivity(self) -> Tensor:
+        """How much the choice of parameters matters, `(P,)`, in the unit of the loss.
+
+        The median loss of the space-filling candidates minus `loss`; never negative. It is 0 where
+        nothing tells candidates apart or every candidate diverged.
+        """
+        difference = self.filling[:, 1] - self.loss
+        return difference.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0).clamp(min=0.0)
+
+
+class Optimizer(Component):
+    """Base of every optimizer.
+
+    Life cycle: calibration calls `minimize` once per group of problems. `minimize` cuts the group
+    into chunks that respect the memory bound, calls `solve` for each, checks what comes back and
+    reduces it to a `Solution`. A subclass implements `solve`, `evaluations` and
+    `bytes_per_problem`. It keeps no state between calls. The result of a problem must not depend on
+    which other problems stand beside it, beyond rounding.
+    `cfx.contracts.OptimizerContract` tests all this.
+    """
+
+    kind = "optimizer"
+    in_threads: ClassVar[bool] = False
+    """`solve` may be called for several chunks at once, in threads of one process: how problems are
+    cut into chunks changes no bit, and a cluster cuts them further."""
+    in_parts: ClassVar[bool] = False
+    """Groups of whole trajectories are cut into the same parts on every engine, so that the workers
+    of a cluster share them: for an optimizer whose last bits depend on how problems are cut. One
+    with neither solves a group as a whole."""
+
+    @abstractmethod
+    def solve(
+        self, objective: CandidateLosses, guesses: Tensor, *, seed: int
+    ) -> tuple[Tried, Tensor]:
+        """Evaluates candidates of all problems of one chunk.
+
+        Args:
+            objective: returns the losses of candidates within [0, 1]: finite or infinity, never
+                NaN. It counts evaluations.
+            guesses: `(P, g, n)` in unit space, g >= 1: candidates to evaluate first; they count as
+                evaluations.
+            seed: the same for every chunk; 0 is a seed like any other.
+
+        Returns:
+            Candidates `(P, e, n)` and their losses `(P, e)` in the order of evaluation. Candidates
+            may be expanded views, and may come in blocks along e, a tuple of `(P, q, n)`: those
+            that all problems share then need no copy for each.
+        """
+
+    @abstractmethod
+    def evaluations(self) -> int:
+        """Returns e, the number of evaluations of each problem."""
+
+    @abstractmethod
+    def bytes_per_problem(self, n: int) -> int:
+        """Returns an upper estimate of the memory that `solve` needs for one problem.
+
+        Its result and the losses do not count.
+
+        Args:
+            n: number of parameters.
+        """
+
+    def evaluations_at_once(self) -> int:
+        """Returns the most candidates of one problem in one call of the losses; 1 by default."""
+        return 1
+
+    def space_filling(self) -> int:
+        """Returns how many first evaluations are chosen without looking at losses.
+
+        Guesses are included. All evaluations unless overridden.
+        """
+        return self.evaluations()
+
+    def minimize(
+        self,
+        objective: CandidateLosses,
+        guesses: Tensor,
+        *,
+        seed: int,
+        objective_bytes: int = 0,
+        memory: int = 1 << 30,
+        progress: Progress = lambda _: None,
+        tolerance: float = 0.0,
+    ) -> Solution:
+        """Solves all problems.
+
+        Args:
+            objective: losses of the problems.
+            guesses: `(P, g, n)` in unit space, g >= 1.
+            seed: the same seed gives the same result.
+            objective_bytes: memory that the loss of one candidate of one problem needs.
+            memory: bound in bytes for one chunk; a chunk holds at least one problem.
+            progress: called with the number of evaluations done since the last call.
+            tolerance: losses this close to the lowest, in their unit, count as equal besides those
+                that rounding makes equal.
+
+        Raises:
+            PluginError: the optimizer asks for a candidate outside [0, 1], of another shape or not
+                in float64; or it returns NaN, anything of another shape or dtype, or another number
+                of evaluations than it says.
+        """
+        problems, _, n = guesses.shape
+        returned = 8 * self.evaluations() * (2 * n + 4)
+        each = self.bytes_per_problem(n) + returned + objective_bytes * self.evaluations_at_once()
+        require_memory(
+            each, f"an optimizer with {self.evaluations():,} evaluations of each problem"
+        )
+        chunks_at_once = cores() if self.in_threads else 1
+        chunk = max(1, min(problems, memory // (each * chunks_at_once)))
+        if guesses.device.type == "cpu":
+            chunk = min(chunk, max(1, _LOSSES_AT_ONCE // self.evaluations()))
+        guesses = guesses.double().clamp(0.0, 1.0)
+        ended = Event()
+
+        def solve(first: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+            last = min(first + chunk, problems)
+            own_losses, origin = objective.select(first, last), registry.origin(self)
+            guarded = _Guarded(own_losses, progress, n, origin, ended)
+            own = guesses[first:last]
+            tried, losses = self.solve(guarded, own, seed=seed)
+            blocks = tried if isinstance(tried, tuple) else (tried,)
+            self._check(blocks, losses, own)
+            return _reduce(blocks, losses, own, self.space_filling(), tolerance)
+
+        starts = range(0, problems, chunk)
+        try:
+            if self.in_threads and guesses.device.type == "cpu":
+                pieces = share(solve, starts, level="chunks")
+            else:
+                pieces = [solve(first) for first in starts]
+        finally:
+            ended.set()  # one thread failed, or a signal came: nobody waits for the others
+        best, loss, filling, diverged = (torch.cat(parts) for parts in zip(*pieces, strict=True))
+        return Solution(best, loss, filling, diverged)
+
+    def _check(self, blocks: tuple[Tensor, ...], losses: Tensor, guesses: Tensor) -> None:
+        problems, _, n = guesses.shape
+        expected = (problems, self.evaluations())
+        evaluations = sum(block.shape[1] for block in blocks)
+        shapes = {(block.shape[0], evaluations, *block.shape[2:]) for block in blocks}
+        if losses.shape != expected or shapes != {(*expected, n)}:
+            raise PluginError(
+                f"{registry.origin(self)}: solve must return candidates {(*expected, n)} and losses"
+                f" {expected} as evaluations() says, but returned"
+                f" {', '.join(str(tuple(block.shape)) for block in blocks)} and"
+                f" {tuple(losses.shape)}"
+            )
+        dtypes = {losses.dtype, *[block.dtype for block in blocks]}
+        if dtypes != {torch.float64}:
+            raise PluginError(
+                f"{registry.origin(self)}: solve must return float64, but returned candidates in"
+                f" {blocks[0].dtype} and losses in {losses.dtype}"
+            )
+        if bool(losses.isnan().any()) or not all(_in_unit_space(block) for block in blocks):
+            raise PluginError(
+                f"{registry.origin(self)}: solve must return candidates within [0, 1] and losses"
+                " that are numbers or infinity, but returned NaN or a candidate outside"
+            )
+
+
+def _reduce(
+    blocks: tuple[Tensor, ...],
+    losses: Tensor,
+    guesses: Tensor,
+    space_filling: int,
+    tolerance: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Reduces a chunk to best `(P, n)`, loss `(P,)`, filling `(P, 3)` and diverged `(P,)`."""
+    g = guesses.shape[1]
+    finite = losses.isfinite()
+    lowest = losses.amin(dim=1, keepdim=True)
+    ties = finite & (losses <= lowest + tolerance + TIE_ABSOLUTE + TIE_RELATIVE * lowest.abs())
+    distance = torch.cat([_squared_distance(block, guesses[:, 0]) for block in blocks], dim=1)
+    index = distance.where(ties, torch.inf).argmin(dim=1)
+    best = _at(blocks, index)
+    some = finite.any(dim=1)
+    best = best.where(some[:, None], guesses[:, 0])
+    loss = losses.gather(1, index[:, None]).squeeze(1).where(some, torch.inf)
+    # Where all space-filling evaluations are guesses, the guesses count.
+    first = 0
+    if space_filling > g:
+        first = g
+    filling = _low_median_high(losses[:, first:space_filling], finite[:, first:space_filling])
+    return best, loss, filling, (~finite).sum(dim=1)
+
+
+def _low_median_high(losses: Tensor, finite: Tensor) -> Tensor:
+    """Returns the lowest, median and highest finite loss of each row, `(P, 3)`; NaN if none is."""
+    if bool(finite.all()) and losses.device.type == "cpu" and losses.shape[1]:
+        # NumPy sorts with vector instructions, in less time than PyTorch finds the median.
+        ordered = np.sort(losses.detach().numpy(), axis=1)
+        return torch.as_tensor(ordered[:, [0, (losses.shape[1] - 1) // 2, -1]])
+    if bool(finite.all()):
+        low, high = losses.aminmax(dim=1)
+        return torch.stack([low, losses.median(dim=1).values, high], dim=1)
+    usable = finite.any(dim=1)
+    low = losses.where(finite, torch.inf).amin(dim=1)
+    high = losses.where(finite, -torch.inf).amax(dim=1)
+    median = losses.where(finite, torch.nan).nanmedian(dim=1).values
+    return torch.stack([low, median, high], dim=1).where(usable[:, None], torch.nan)
+
+
+def _squared_distance(block: Tensor, guess: Tensor) -> Tensor:
+    """Returns squared distances `(P, q)` of candidates `(P, q, n)` to guesses `(P, n)`."""
+    total = guess.new_zeros(block.shape[:2])
+    for value, origin in zip(block.unbind(-1), guess.unbind(-1), strict=True):
+        total += (value - origin[:, None]).square_()
+    return total
+
+
+def _at(blocks: tuple[Tensor, ...], index: Tensor) -> Tensor:
+    """Returns the candidates `(P, n)` of numbers `(P,)`, counted through all blocks."""
+    best = blocks[0].new_empty((len(index), blocks[0].shape[2]))
+    first = 0
+    for block in blocks:
+        rows = ((index >= first) & (index < first + block.shape[1])).nonzero()[:, 0]
+        best[rows] = block[rows, index[rows] - first]
+        first += block.shape[1]
+    return best
+
+
+def _in_unit_space(candidates: Tensor) -> bool:
+    """Says whether all candidates lie within [0, 1]. Written so that NaN fails too."""
+    if candidates.stride(0) == 0:
+        candidates = candidates[:1]
+    return bool(((candidates >= 0) & (candidates <= 1)).all())
+
+
+class _Guarded:
+    """Losses without NaN, which becomes infinity.
+
+    Counts evaluations and refuses candidates outside the bounds, and all once the work has ended.
+    """
+
+    def __init__(
+        self,
+        objective: CandidateLosses,
+        progress: Progress,
+        n: int,
+        optimizer: str,
+        ended: Event,
+    ) -> None:
+        self._objective = objective
+        self._progress = progress
+        self._n = n
+        self._optimizer = optimizer
+        self._ended = ended
+
+    @property
+    def problems(self) -> int:
+        return self._objective.problems
+
+    def __call__(self, candidates: Tensor) -> Tensor:
+        if self._ended.is_set():
+            raise RuntimeError("nobody waits for these losses any more")
+        shape = tuple(candidates.shape)
+        if (
+            candidates.dtype != torch.float64
+            or len(shape) != 3
+            or (shape[0], shape[2]) != (self.problems, self._n)
+        ):
+            raise PluginError(
+                f"{self._optimizer}: it asked for candidates {shape} in {candidates.dtype}; it must"
+                f" ask for ({self.problems}, q, {self._n}) in float64"
+            )
+        if not _in_unit_space(candidates):
+            raise PluginError(
+                f"{self._optimizer}: it asked for a candidate outside the bounds [0, 1] of unit"
+                " space"
+            )
+        losses = self._objective(candidates).to(torch.float64)
+        self._progress(losses.numel())
+        if bool(losses.sum().isfinite()):
+            return losses
+        return losses.nan_to_num(nan=torch.inf, posinf=torch.inf, neginf=torch.inf)
+
+    def select(self, first: int, last: int) -> CandidateLosses:
+        return _Guarded(
+            self._objective.select(first, last),
+            self._progress,
+            self._n,
+            self._optimizer,
+            self._ended,
+        )

@@ -1,0 +1,289 @@
+"""Local search from the best of many points, along gradients (`optimizer=gradient`).
+
+J. Nocedal and S. J. Wright (2006), *Numerical Optimization*, second edition: BFGS (chapter 6),
+finite differences (chapter 8), projection onto bounds (chapter 16).
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, NamedTuple
+
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor
+
+from cfx.calibration.optimizers.base import CandidateLosses, Optimizer, Tried
+from cfx.calibration.optimizers.random import AT_ONCE, check_room, evaluate_in_blocks, sobol
+from cfx.core.component import Settings
+
+_DIFFERENCE = 1e-6
+"""The distance in unit space over which a slope is measured. Losses are exact to about 1e-14, so
+rounding adds 1e-8 to a slope; piecewise smooth losses want a short distance."""
+
+_SAMPLES_OF_SEARCH = 512
+"""Samples for each local search, those of the screening included."""
+
+_KEPT = 4
+"""One search of so many goes on to its minimum."""
+
+_LENGTHS = (3.0, 1.0, 0.5, 0.2, 0.05, 0.01)
+"""Multiples of a step that are tried at once."""
+
+_FIRST_RADIUS, _LARGEST_RADIUS, _SMALLEST_RADIUS = 0.1, 0.5, 1e-6
+"""How far one step may go in any coordinate of unit space."""
+
+
+class GradientSettings(Settings):
+    """Settings of `GradientSearch`."""
+
+    samples: int = Field(
+        4096, ge=1, description="evaluations of each problem, slopes and guesses included"
+    )
+    screening: float = Field(
+        0.75, gt=0.0, le=1.0, description="share of the samples that chooses where searches start"
+    )
+    starts: int | None = Field(
+        None, ge=1, description="local searches of each problem; null: one for each 512 samples"
+    )
+
+    @model_validator(mode="after")
+    def _enough(self) -> GradientSettings:
+        if self.starts is not None and self.first < self.starts:
+            raise ValueError(
+                f"optimizer.starts={self.starts}: only {self.first} samples choose among;"
+                " set fewer starts or more samples"
+            )
+        return self
+
+    @property
+    def first(self) -> int:
+        """Samples that are evaluated first."""
+        return max(1, int(self.samples * self.screening))
+
+    @property
+    def searches(self) -> int:
+        """Local searches of each problem."""
+        if self.starts is None:
+            return max(1, min(self.samples // _SAMPLES_OF_SEARCH, self.first))
+        return self.starts
+
+
+class GradientSearch(Optimizer):
+    """Evaluates guesses and Sobol points, and goes downhill from the best few.
+
+    Each search is BFGS within the bounds. Slopes are differences towards the middle of the bounds,
+    so any model and any simulator will do. Six lengths of each step are tried at once: where
+    simulation is batched this costs no more time than one. A step that finds nothing better starts
+    again along the plain gradient, ten times shorter. All searches of all problems go on together.
+
+    More samples become more searches, not longer ones: models with regimes, such as Wiedemann's,
+    have many local minima. A few steps show which searches are promising; the best quarter of them
+    goes on to its minimum, with as many evaluations as all had before.
+
+    What is left of the samples, too little for one more round, becomes further Sobol points.
+    """
+
+    schema: ClassVar[type[Settings]] = GradientSettings
+    settings: GradientSettings
+    in_threads = True
+
+    def evaluations(self) -> int:
+        return self.settings.samples
+
+    def evaluations_at_once(self) -> int:
+        return min(AT_ONCE, self.settings.samples)
+
+    def space_filling(self) -> int:
+        return self.settings.first
+
+    def bytes_per_problem(self, n: int) -> int:
+        matrices = self.settings.searches * n * (4 * n + 20)
+        return 8 * (self.evaluations() * (n + 2) + matrices)
+
+    def solve(
+        self, objective: CandidateLosses, guesses: Tensor, *, seed: int
+    ) -> tuple[Tried, Tensor]:
+        problems, g, n = guesses.shape
+        settings = self.settings
+        check_room(settings.first, g, key="samples")
+        each_step = n + len(_LENGTHS)
+        stages, rest = _stages(settings.searches, settings.samples - settings.first, each_step)
+        points = sobol(settings.first - g + rest, n, seed=seed, like=guesses)
+        shared = points.expand(problems, -1, -1)
+        tried, losses = [guesses, shared], [evaluate_in_blocks(objective, guesses)]
+        losses.append(evaluate_in_blocks(objective, shared))
+        search = _start(torch.cat(losses, dim=1), guesses, shared, settings.searches)
+        for searches, rounds in stages:
+            search = _best(search, searches)
+            for _ in range(rounds):
+                around = _around(search.point)
+                found = objective(around.flatten(1, 2))
+                search = _with_slope(search, around, found.view(around.shape[:3]))
+                steps = _steps(search)
+                lower = objective(steps.flatten(1, 2))
+                search = _stepped(search, steps, lower.view(steps.shape[:3]))
+                tried += [around.flatten(1, 2), steps.flatten(1, 2)]
+                losses += [found, lower]
+        # The extra points stand before the searches, in the order of evaluation.
+        return tuple(tried), torch.cat(losses, dim=1)
+
+
+class _Stage(NamedTuple):
+    """Some searches that go on together.
+
+    Attributes:
+        searches: of each problem.
+        rounds: steps of each.
+    """
+
+    searches: int
+    rounds: int
+
+
+def _stages(searches: int, samples: int, each_step: int) -> tuple[list[_Stage], int]:
+    """Returns the stages of a search, and how many samples are left over.
+
+    All searches share the first half of the samples, and the best quarter of them the other one:
+    few steps show which are promising, and these go on to their minimum.
+
+    Args:
+        searches: at first.
+        samples: for all steps.
+        each_step: evaluations of one step of one search.
+    """
+    stages = []
+    if searches >= _KEPT:
+        every = _Stage(searches, samples // (2 * searches * each_step))
+        samples -= every.searches * every.rounds * each_step
+        stages.append(every)
+        searches //= _KEPT
+    rounds, rest = divmod(samples, searches * each_step)
+    return [*stages, _Stage(searches, rounds)], rest
+
+
+class _Search(NamedTuple):
+    """S local searches of P problems.
+
+    Attributes:
+        point: `(P, S, n)`, where each stands.
+        loss: `(P, S)`, there.
+        slope: `(P, S, n)`, there; of the step before until it is measured anew.
+        moved: `(P, S, n)`, the last step.
+        inverse: `(P, S, n, n)`, estimate of the inverse second derivatives.
+        fresh: `(P, S)` bool, nothing is known of the second derivatives.
+        radius: `(P, S)`, how far a step may go.
+    """
+
+    point: Tensor
+    loss: Tensor
+    slope: Tensor
+    moved: Tensor
+    inverse: Tensor
+    fresh: Tensor
+    radius: Tensor
+
+
+def _start(losses: Tensor, guesses: Tensor, shared: Tensor, starts: int) -> _Search:
+    """Returns searches at the `starts` best points of each problem."""
+    loss, index = losses.topk(starts, dim=1, largest=False)
+    g, n = guesses.shape[1:]
+    of_guess = guesses.gather(1, index.clamp(max=g - 1)[..., None].expand(-1, -1, n))
+    if shared.shape[1]:
+        place = (index - g).clamp(min=0)
+        of_guess = of_guess.where((index < g)[..., None], shared[0][place])
+    nothing = torch.zeros_like(of_guess)
+    return _Search(
+        point=of_guess,
+        loss=loss,
+        slope=nothing,
+        moved=nothing,
+        inverse=_identity(of_guess),
+        fresh=torch.ones_like(loss, dtype=torch.bool),
+        radius=torch.full_like(loss, _FIRST_RADIUS),
+    )
+
+
+def _best(search: _Search, count: int) -> _Search:
+    """Returns the searches of each problem that have come lowest."""
+    if count == search.loss.shape[1]:
+        return search
+    index = search.loss.topk(count, dim=1, largest=False).indices
+    chosen = []
+    for value in search:
+        places = index.view(*index.shape, *[1] * (value.dim() - 2))
+        chosen.append(value.gather(1, places.expand(-1, -1, *value.shape[2:])))
+    return _Search(*chosen)
+
+
+def _identity(point: Tensor) -> Tensor:
+    n = point.shape[-1]
+    return torch.eye(n, dtype=point.dtype, device=point.device).expand(*point.shape, n).clone()
+
+
+def _around(point: Tensor) -> Tensor:
+    """Returns a point beside each in every coordinate, inside the bounds, `(P, S, n, n)`."""
+    n = point.shape[-1]
+    shift = torch.eye(n, dtype=point.dtype, device=point.device)
+    inwards = torch.where(point > 0.5, -_DIFFERENCE, _DIFFERENCE)
+    return point[:, :, None] + shift * inwards[:, :, None]
+
+
+def _with_slope(search: _Search, around: Tensor, losses: Tensor) -> _Search:
+    """Measures slopes, and learns the second derivatives from how they changed."""
+    apart = torch.diagonal(around, dim1=-2, dim2=-1) - search.point
+    slope = (losses - search.loss[:, :, None]) / apart
+    slope = slope.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+    inverse, fresh = _learned(search, slope)
+    return search._replace(slope=slope, inverse=inverse, fresh=fresh)
+
+
+def _learned(search: _Search, slope: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns the inverse after the BFGS update, where the last step says something."""
+    s, y = search.moved[..., None], (slope - search.slope)[..., None]
+    curvature = (s * y).sum((-2, -1))
+    usable = curvature > 1e-12
+    rho = (1.0 / curvature.where(usable, 1.0))[..., None, None]
+    # The first estimate has the scale of the curvature along the step (Nocedal and Wright, 6.20).
+    scale = (curvature / (y * y).sum((-2, -1)).clamp(min=1e-300)).where(search.fresh, 1.0)
+    h = search.inverse * scale.where(usable, 1.0)[..., None, None]
+    hy = h @ y
+    # Both halves of the update, of which one is the other's transpose.
+    half = s @ (rho * (0.5 * (1.0 + rho * (y.mT @ hy)) * s - hy)).mT
+    updated = h + half + half.mT
+    inverse = updated.where(usable[..., None, None], search.inverse)
+    return inverse, search.fresh & ~usable
+
+
+def _steps(search: _Search) -> Tensor:
+    """Returns where steps of several lengths lead, `(P, S, lengths, n)`."""
+    slope = search.slope
+    blocked = ((search.point <= 0.0) & (slope > 0.0)) | ((search.point >= 1.0) & (slope < 0.0))
+    free = slope.where(~blocked, 0.0)
+    wanted = -(search.inverse @ free[..., None]).squeeze(-1).where(~blocked, 0.0)
+    downhill = ((wanted * free).sum(-1) < 0.0) & ~search.fresh
+    step = wanted.where(downhill[..., None], -free)
+    longest = step.abs().amax(-1).clamp(min=1e-300)
+    # Plain gradients have no scale: they go as far as they may.
+    scale = search.radius / longest
+    scale = torch.where(downhill, scale.clamp(max=1.0), scale)
+    lengths = torch.tensor(_LENGTHS, dtype=step.dtype, device=step.device)
+    moved = (step * scale[..., None])[:, :, None] * lengths[:, None]
+    return (search.point[:, :, None] + moved).clamp(0.0, 1.0)
+
+
+def _stepped(search: _Search, steps: Tensor, losses: Tensor) -> _Search:
+    """Takes the best length of each step; where none is better, the next one is shorter."""
+    lowest, index = losses.min(dim=2)
+    n = steps.shape[-1]
+    best = steps.gather(2, index[..., None, None].expand(-1, -1, 1, n)).squeeze(2)
+    better = lowest < search.loss
+    point = best.where(better[..., None], search.point)
+    radius = torch.where(better, 2.0 * search.radius, 0.1 * search.radius)
+    return search._replace(
+        point=point,
+        loss=lowest.where(better, search.loss),
+        moved=point - search.point,
+        inverse=search.inverse.where(better[..., None, None], _identity(point)),
+        fresh=search.fresh | ~better,
+        radius=radius.clamp(_SMALLEST_RADIUS, _LARGEST_RADIUS),
+    )

@@ -1,0 +1,93 @@
+"""Random search over a scrambled Sobol sequence: the baseline of every optimizer.
+
+It is nearly free where simulation is batched.
+
+I. M. Sobol' (1967), *On the distribution of points in a cube and the approximate evaluation of
+integrals*; scrambling after A. B. Owen (1998) and J. Matousek (1998), as PyTorch implements it.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from cfx.calibration.optimizers.base import CandidateLosses, Optimizer, Tried
+from cfx.core.component import Settings
+from cfx.core.errors import ConfigError
+
+AT_ONCE = 4096
+"""Candidates of one problem in one call of the losses: intermediate values stay small whatever
+`samples` is."""
+
+
+class RandomSettings(Settings):
+    """Settings of `RandomSearch`."""
+
+    samples: int = Field(4096, ge=1, description="evaluations of each problem, guesses included")
+
+
+class RandomSearch(Optimizer):
+    """Evaluates the guesses and the same scrambled Sobol points in every problem.
+
+    The points are the same for every problem, so that neighbouring windows are compared on the same
+    ground, and a problem's result does not depend on its companions.
+    """
+
+    schema: ClassVar[type[Settings]] = RandomSettings
+    settings: RandomSettings
+    in_threads = True
+
+    def evaluations(self) -> int:
+        return self.settings.samples
+
+    def evaluations_at_once(self) -> int:
+        return min(AT_ONCE, self.settings.samples)
+
+    def bytes_per_problem(self, n: int) -> int:
+        return 8 * self.evaluations_at_once() * (n + 2)
+
+    def solve(
+        self, objective: CandidateLosses, guesses: Tensor, *, seed: int
+    ) -> tuple[Tried, Tensor]:
+        problems, g, n = guesses.shape
+        check_room(self.settings.samples, g, key="samples")
+        points = sobol(self.settings.samples - g, n, seed=seed, like=guesses)
+        blocks = (guesses, points.expand(problems, -1, -1))
+        losses = [evaluate_in_blocks(objective, block) for block in blocks]
+        return blocks, torch.cat(losses, dim=1)
+
+
+def evaluate_in_blocks(objective: CandidateLosses, candidates: Tensor) -> Tensor:
+    """Returns losses `(P, q)` of candidates `(P, q, n)`, asked for in blocks of `AT_ONCE`."""
+    losses = [candidates.new_empty(candidates.shape[:2])[:, :0]]
+    for block in torch.split(candidates, AT_ONCE, dim=1):
+        if block.shape[1]:
+            losses.append(objective(block))
+    return torch.cat(losses, dim=1)
+
+
+def check_room(evaluations: int, guesses: int, *, key: str) -> None:
+    """Checks that the setting `key` allows as many evaluations as there are first guesses.
+
+    Raises:
+        ConfigError: it does not.
+    """
+    if evaluations < guesses:
+        raise ConfigError(
+            f"optimizer.{key}={evaluations}: there are {guesses} first guesses;"
+            f" set optimizer.{key} >= {guesses}"
+        )
+
+
+def sobol(count: int, n: int, *, seed: int, like: Tensor) -> Tensor:
+    """Returns scrambled Sobol points `(count, n)` within [0, 1], float64, on `like`'s device."""
+    if count == 0:
+        return like.new_empty((0, n))
+    # torch leaves the engine untyped.
+    make: Any = torch.quasirandom.SobolEngine
+    engine = make(n, scramble=True, seed=seed)
+    points: Tensor = engine.draw(count, dtype=torch.float64)
+    return points.to(like.device)

@@ -1,0 +1,1 @@
+"""What everything stands on: errors, components, the registry, files, where work runs."""

@@ -1,0 +1,48 @@
+"""The contract of a sub-command: `cfx NAME ...`."""
+
+from __future__ import annotations
+
+import argparse
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar
+
+from cfx.core.component import Component
+
+
+class Command(Component):
+    """Base of every sub-command.
+
+    Its name on the command line is that of its entry point. `cfx --help` imports cfx's own
+    sub-commands and tab completion the one that is typed, so the module imports nothing heavy:
+    what `run` needs, it imports itself.
+
+    Attributes:
+        summary: one line for `cfx --help`, which prints for a third party's sub-command the summary
+            of its distribution instead.
+    """
+
+    kind = "command"
+    summary: ClassVar[str] = ""
+
+    @abstractmethod
+    def parser(self) -> argparse.ArgumentParser:
+        """Returns what the sub-command takes, with a line of help for each argument."""
+
+    def parse(self, arguments: Sequence[str]) -> argparse.Namespace:
+        """Reads the command line behind the sub-command's name."""
+        return self.parser().parse_args(list(arguments))
+
+    @abstractmethod
+    def run(self, options: argparse.Namespace) -> int:
+        """Does the work.
+
+        Args:
+            options: as `parse` returns them.
+
+        Returns:
+            The exit code: 0; 1 where the answer is no.
+
+        Raises:
+            CfxError: the user's mistake, in one sentence; the exit code is then 2.
+        """

@@ -1,0 +1,174 @@
+"""What every component is: a class with typed settings that an entry point names."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import inspect
+import json
+from abc import ABC
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar, get_args
+
+from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, field_validator
+
+from cfx.core.errors import ConfigError, nearest
+
+Schema = TypeVar("Schema", bound=BaseModel)
+
+API_VERSION = 1
+"""Version of what plugins may use.
+
+It rises only when a plugin that keeps to the public API would have to change.
+"""
+
+
+class Settings(BaseModel):
+    """Base of every component's settings: frozen, no unknown keys, no NaN or infinity.
+
+    Give each field a `Field(description=...)` with its unit: the text becomes the comment in the
+    config node and the line in `python -m cfx plugins show`.
+    """
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False
+    )
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _no_truth_for_a_number(cls, value: Any, info: ValidationInfo) -> Any:
+        """Refuses true and false where a number is wanted; Python would take them for 1 and 0."""
+        if isinstance(value, bool) and info.field_name is not None:
+            kinds = _kinds(cls.model_fields[info.field_name].annotation)
+            if bool not in kinds and kinds & {int, float}:
+                raise ValueError("give a number, not true or false")
+        return value
+
+
+def _kinds(annotation: Any) -> set[Any]:
+    """Returns the types that an annotation such as `int | None` names."""
+    parts = get_args(annotation)
+    if not parts:
+        return {annotation}
+    found = set()
+    for part in parts:
+        found |= _kinds(part)
+    return found
+
+
+class Component(ABC):
+    """Base of every dataset, model, policy, optimizer and whatever else has a kind.
+
+    Life cycle: the registry imports the class when a config names it, validates the config node
+    against its `schema`, and calls the class with the result. Nothing else happens at construction:
+    reading files, compiling and training wait for the first method call.
+
+    Attributes:
+        kind: as in `cfx.get(kind, name)`; the base class of each kind sets it.
+        deprecated: what to use instead of a component that goes; jobs that name it log a warning.
+        trial: settings with which `plugins check` tries the component, where trying it with the
+            default ones takes long.
+        schema: class of its settings.
+        settings: the validated settings.
+    """
+
+    kind: ClassVar[str]
+    deprecated: ClassVar[str] = ""
+    trial: ClassVar[Mapping[str, Any]] = {}
+    schema: ClassVar[type[Settings]] = Settings
+    settings: Settings
+
+    def __init__(self, settings: Settings | None = None, **options: Any) -> None:
+        """Takes either a ready `Settings` object or its fields as keywords.
+
+        Raises:
+            ConfigError: a key is unknown or a value is wrong.
+        """
+        if settings is not None and options:
+            raise TypeError("give either a Settings object or keyword options, not both")
+        if settings is None:
+            # A dataset's config group is `data`, as Hydra users expect; every other kind's is its
+            # own name.
+            group = "data" if self.kind == "dataset" else self.kind
+            settings = validate(self.schema, options, where=group)
+        self.settings = settings
+
+    def identity(self) -> dict[str, Any]:
+        """Returns what results of this component depend on: its class, its settings and its code.
+
+        Cached results carry it. The code is every source file beside the one that defines the
+        class, so that a changed equation is never answered from the cache.
+        """
+        return {
+            "class": f"{type(self).__module__}.{type(self).__qualname__}",
+            "settings": self.settings.model_dump(mode="json"),
+            "code": folder_hash(inspect.getfile(type(self))),
+        }
+
+
+def content_key(description: Any) -> str:
+    """Returns the SHA-256 of a description as JSON.
+
+    Values that JSON does not know count as what `str` makes of them.
+    """
+    text = json.dumps(description, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+@functools.cache
+def folder_hash(module_file: str) -> str:
+    """Returns the SHA-256 of the Python files in the folder of a module."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(module_file).parent.glob("*.py")):
+        digest.update(path.name.encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def validate(schema: type[Schema], values: Any, *, where: str) -> Schema:
+    """Validates `values` against `schema`.
+
+    Args:
+        where: the config path that the error message starts with, such as `model`.
+
+    Raises:
+        ConfigError: one sentence for each wrong key, joined by newlines.
+    """
+    try:
+        return schema.model_validate(values)
+    except ValidationError as error:
+        sentences = [_sentence(schema, problem, where) for problem in error.errors()]
+        raise ConfigError("\n".join(sentences)) from None
+
+
+def _sentence(schema: type[BaseModel], problem: Any, where: str) -> str:
+    """Returns what one of pydantic's errors says, with the full path of the key."""
+    location = [str(part) for part in problem["loc"]]
+    path = ".".join(part for part in [where, *location] if part)
+    if problem["type"] == "extra_forbidden":
+        known = sorted(_fields_at(schema, location[:-1]))
+        text = f"{path}: unknown key.{nearest(location[-1], known)}"
+        if known:
+            text += f" Known keys: {', '.join(known)}."
+        return text
+    if problem["type"] == "missing":
+        return f"{path}: a value is required; give one as {path}=..."
+    message = str(problem["msg"]).removeprefix("Value error, ").removeprefix("Input ")
+    if isinstance(problem["input"], Mapping):
+        # Several settings contradict each other; the message names them.
+        if message.startswith(path):
+            return f"{message}."
+        return f"{path}: {message}."
+    return f"{path}={problem['input']!r}: {message}."
+
+
+def _fields_at(schema: type[BaseModel], location: list[str]) -> list[str]:
+    """Returns the names of the settings at a path; nothing where no settings are."""
+    current: Any = schema
+    for part in location:
+        field = getattr(current, "model_fields", {}).get(part)
+        if field is None:
+            return []
+        current = field.annotation
+    return list(getattr(current, "model_fields", {}))

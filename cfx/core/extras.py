@@ -1,0 +1,91 @@
+"""What is not installed, and the line that installs it: cfx's extras, and the plugins beside it."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import cfx
+from cfx.core.errors import nearest
+
+OWN = "cfx-driving"
+
+EXTRAS: dict[tuple[str, str], str] = {
+    ("data", "followernet"): "cfx-recordings",
+    ("data", "follownet"): "cfx-recordings",
+    ("data", "highd"): "cfx-recordings",
+    ("data", "lyft_pairs"): "cfx-recordings",
+    ("data", "openacc"): "cfx-recordings",
+    ("data", "waymo_pairs"): "cfx-recordings",
+    ("command", "benchmark"): "cfx-benchmark",
+    ("engine", "dask"): "cfx-dask",
+    ("hydra/launcher", "dask"): "cfx-dask",
+    ("hydra/launcher", "joblib"): f"{OWN}[joblib]",
+    ("hydra/launcher", "submitit_local"): f"{OWN}[submitit]",
+    ("hydra/launcher", "submitit_slurm"): f"{OWN}[submitit]",
+    ("model", "fvdm"): "cfx-classics",
+    ("model", "gipps"): "cfx-classics",
+    ("model", "gipps_delay"): "cfx-classics",
+    ("model", "idm_city"): "cfx-idm",
+    ("model", "iidm"): "cfx-idm",
+    ("model", "newell"): "cfx-classics",
+    ("model", "ovm"): "cfx-classics",
+    ("model", "ovm_city"): "cfx-classics",
+    ("optimizer", "cma"): "cfx-cma",
+    ("optimizer", "differential_evolution"): "cfx-scipy",
+    ("policy", "tcn"): "cfx-tcn",
+}
+"""Options that come with another distribution or an extra, by group and name."""
+
+
+def advice(group: str, name: str, known: Sequence[str]) -> str:
+    """Returns what to do about an option that is not there: install it, or take another.
+
+    Args:
+        group: such as `model`.
+        name: what was asked for.
+        known: the options that are installed.
+    """
+    if (group, name) in EXTRAS:
+        wanted = EXTRAS[group, name]
+        return f" It comes with {wanted}: {install_line(wanted)}"
+    others = [option for where, option in EXTRAS if where == group]
+    text = nearest(name, [*known, *others])
+    if known:
+        text += f" Known: {', '.join(known)}."
+    return text
+
+
+def install_line(wanted: str) -> str:
+    """Returns the command that installs a distribution, or an extra of cfx's, for this Python.
+
+    In a checkout it is the folder's: `pip install --editable plugins/cfx-classics`.
+    """
+    name, bracket, extra = wanted.partition("[")
+    checkout = Path(cfx.__file__).resolve().parent.parent
+    if name != OWN:
+        checkout = checkout / "plugins" / name
+    source = shlex.quote(wanted)
+    if bracket:
+        source = f'"{wanted}"'
+    if (checkout / "pyproject.toml").is_file():
+        source = f"--editable {shlex.quote(_from_here(checkout) + bracket + extra)}"
+    return f"{_pip()} install {source}"
+
+
+def _pip() -> str:
+    """Returns `pip`, or how to call this Python's where the shell has another."""
+    found = shutil.which("pip")
+    if found is not None and Path(found).parent == Path(sys.executable).parent:
+        return "pip"
+    return f"{shlex.quote(_from_here(Path(sys.executable)))} -m pip"
+
+
+def _from_here(path: Path) -> str:
+    """Returns a path from the working directory on, if it lies there, else the whole one."""
+    inside = path.is_relative_to(Path.cwd())
+    return os.path.relpath(path) if inside else str(path)

@@ -1,0 +1,133 @@
+"""Paths that users write, and files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import secrets
+import socket
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator
+from pydantic_core import PydanticCustomError
+
+from cfx.core.errors import OutputError
+
+_DAY_S = 86400.0
+"""Seconds after which another machine's temporary file that nobody has written to is left over."""
+
+_TEMPORARY = re.compile(r"\.(?P<process>\d+)@(?P<host>[\w-]*)-[0-9a-f]{8}\..")
+"""How names of temporary files begin: process, machine, and what tells those of one apart."""
+
+
+def absolute(value: Any) -> Path:
+    """Returns an absolute path; `~` is the user's home.
+
+    A later change of the working directory then changes nothing.
+
+    Raises:
+        PydanticCustomError: it is no path.
+    """
+    # "???" is how a config file says that a value is missing.
+    if value is None or str(value).strip() in {"", "???"}:
+        raise PydanticCustomError("missing", "a value is required")
+    if not isinstance(value, str | Path):
+        raise PydanticCustomError("path", "write a path")
+    return Path(value).expanduser().absolute()
+
+
+FilePath = Annotated[Path, BeforeValidator(absolute)]
+"""A path that a user writes."""
+
+
+@contextmanager
+def atomic_write(path: Path) -> Iterator[Path]:
+    """Gives the block a temporary file beside `path`, which takes its place if the block ends well.
+
+    The temporary file has the same suffixes, and is this block's own: other threads, processes and
+    machines may write the same file at the same time. If the block fails, nothing of it is left and
+    an earlier file stays as it was.
+
+    Raises:
+        OSError: the place cannot be written.
+    """
+    own = f"{os.getpid()}@{_host()}-{secrets.token_hex(4)}"
+    partial = path.with_name(f".{own}.{path.name}")
+    try:
+        yield partial
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_output(path: Path, text: str, what: str) -> None:
+    """Writes a text where the user's `--output` names it, whole; makes its folders.
+
+    Args:
+        path: the file; what was there is replaced once the new text is complete.
+        text: of the file.
+        what: it is, for the error: "the report".
+
+    Raises:
+        OutputError: the place cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_dir():
+            raise IsADirectoryError(None, "it is a folder", str(path))
+        with atomic_write(path) as partial:
+            partial.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(
+            f"{path}: {what} cannot be written ({error.strerror or error}); name another --output"
+        ) from error
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Removes temporary files of `atomic_write` whose processes have ended, here and below.
+
+    Nobody here knows which processes run on another machine: its files go when they are a day old.
+
+    Raises:
+        OSError: one cannot be removed.
+    """
+    for path in sorted(folder.rglob(".*@*.*")):
+        found = _TEMPORARY.match(path.name)
+        if found is not None and path.is_file() and _is_left_over(path, found):
+            path.unlink(missing_ok=True)
+
+
+def _is_left_over(path: Path, found: re.Match[str]) -> bool:
+    if found["host"] == _host():
+        return not _runs(int(found["process"]))
+    return time.time() - path.stat().st_mtime > _DAY_S
+
+
+def _host() -> str:
+    """Returns this machine's name, as far as it is fit for the name of a file."""
+    return re.sub(r"[^\w-]", "", socket.gethostname())[:32]
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
+
+
+def write_json(path: Path, values: Mapping[str, Any]) -> None:
+    """Writes a JSON file, whole.
+
+    Raises:
+        OSError: the place cannot be written.
+    """
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")

@@ -1,0 +1,127 @@
+"""A job's folder, as data that somebody else may have made.
+
+Nothing in it is run, nothing outside it is read, and nothing is read that is larger or more deeply
+nested than what a job writes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from cfx.core.errors import DataError
+
+_LARGEST_MB = 256
+"""Texts and weights of a job are smaller."""
+
+_BOUNDED = frozenset({".json", ".yaml", ".log", ".safetensors", ".pt"})
+"""Files that are read as a whole. Tables are bounded by memory, where they are read."""
+
+_DEPTH = 3
+"""Folders below a job's own that hold what it wrote: `policy`, `figures`, `.hydra`."""
+
+_NESTED = 60
+"""Lists and mappings within one another; a job writes about six."""
+
+
+def examine(folder: Path) -> None:
+    """Checks what a folder consists of, before anything in it is read.
+
+    Raises:
+        DataError: it holds a link that leads out of it, something that is no file, or a text or
+            weights that no job writes.
+    """
+    home = folder.resolve()
+    for path in _entries(home):
+        try:
+            if not path.resolve(strict=True).is_relative_to(home):
+                raise DataError(
+                    f"{path} is a link that leads out of its folder, and is not followed; copy"
+                    " there what it leads to, if you trust it"
+                )
+            status = path.stat()
+        except (OSError, RuntimeError) as error:
+            raise DataError(f"{path} is a link that leads nowhere; remove it") from error
+        if stat.S_ISDIR(status.st_mode):
+            continue
+        if not stat.S_ISREG(status.st_mode):
+            raise DataError(f"{path} is no file; a job's folder holds files alone")
+        if path.suffix in _BOUNDED and status.st_size > _LARGEST_MB * 2**20:
+            raise DataError(
+                f"{path} has {status.st_size / 2**20:.0f} MB, at most {_LARGEST_MB} are read;"
+                " no job writes so much"
+            )
+
+
+def _entries(home: Path) -> Iterator[Path]:
+    for place, folders, files in os.walk(home):
+        here = Path(place)
+        if len(here.relative_to(home).parts) >= _DEPTH - 1:
+            folders.clear()
+        for name in (*folders, *files):
+            yield here / name
+
+
+def parse_json(text: str) -> Any:
+    """Parses JSON.
+
+    Raises:
+        ValueError: it is none, or nested too deeply.
+    """
+    try:
+        values = json.loads(text)
+    except RecursionError:
+        raise _too_deep() from None
+    _check_depth(values)
+    return values
+
+
+def parse_yaml(text: str) -> Any:
+    """Parses YAML as plain data: no tag makes an object, and nothing stands for something else.
+
+    Raises:
+        ValueError: it is none, has an alias, or is nested too deeply.
+    """
+    try:
+        # The loader is PyYAML's safe one, without aliases.
+        values = yaml.load(text, Loader=_PlainLoader)  # noqa: S506
+    except yaml.YAMLError as error:
+        raise ValueError(next(iter(str(error).splitlines()), "no YAML")) from error
+    except RecursionError:
+        raise _too_deep() from None
+    _check_depth(values)
+    return values
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """YAML's safe loader; an alias, with which a short text can mean a huge one, is an error."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.events.AliasEvent):
+            raise yaml.composer.ComposerError(None, None, "an alias is not read", None)
+        return super().compose_node(parent, index)
+
+
+def _check_depth(values: Any) -> None:
+    level = [values]
+    for _ in range(_NESTED):
+        below: list[Any] = []
+        for value in level:
+            if isinstance(value, dict):
+                below += value.values()
+            elif isinstance(value, list):
+                below += value
+        if not below:
+            return
+        level = below
+    raise _too_deep()
+
+
+def _too_deep() -> ValueError:
+    return ValueError(f"it is nested more than {_NESTED} levels deep")

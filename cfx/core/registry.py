@@ -1,0 +1,586 @@
+"""One lazy registry for every kind of component, of cfx itself and of third parties.
+
+All components come in by entry points. `names` and `entries` read the metadata of installed
+distributions and import nothing. `get` imports the one component that is asked for, checks it, and
+only then keeps it. `create` tries it for some milliseconds before a job relies on it. A broken
+plugin therefore never harms a run that does not name it, and stops one that does with a sentence
+that names its distribution.
+
+A distribution says which version of the plugin API it was built for by an entry point of the group
+`cfx.api` whose name is the version, so that this is known without importing it:
+
+    [project.entry-points."cfx.api"]
+    1 = "my_package"
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import importlib.metadata
+import inspect
+import logging
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, get_args
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from cfx.core.component import API_VERSION, Component, Settings, validate
+from cfx.core.errors import CfxError, ConfigError, PluginError, nearest
+from cfx.core.extras import advice
+
+log = logging.getLogger(__name__)
+
+OWN = "cfx-driving"
+"""The distribution whose components nobody else's can replace."""
+
+API_GROUP = "cfx.api"
+"""Entry-point group in which a distribution says which version of the plugin API it needs."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of component.
+
+    Attributes:
+        name: as in `cfx.get(kind, name)`.
+        group: its config group, the folder in `conf/` and the key in configs.
+        entry_points: its entry-point group.
+        base: module and class that its components extend.
+        smoke_check: module and function that tries a new component for some milliseconds; "" where
+            its base class checks what it gives.
+        chosen: a job chooses one of this kind, by a config group; metrics are all measured, and
+            sub-commands are none of a job.
+    """
+
+    name: str
+    group: str
+    entry_points: str
+    base: str
+    smoke_check: str = ""
+    chosen: bool = True
+
+    def call(self, component: str) -> str:
+        """Returns what a user writes to ask for a component."""
+        if self.name == "command":
+            return f"cfx {component}"
+        return f"{self.group}={component}"
+
+
+KINDS: dict[str, Kind] = {
+    kind.name: kind
+    for kind in (
+        Kind("dataset", "data", "cfx.datasets", "cfx.data.base:Dataset"),
+        Kind(
+            "model",
+            "model",
+            "cfx.models",
+            "cfx.models.base:DrivingModel",
+            "cfx.contracts.smoke:smoke_check_model",
+        ),
+        Kind(
+            "policy",
+            "policy",
+            "cfx.policies",
+            "cfx.policies.base:Policy",
+            "cfx.contracts.smoke:smoke_check_policy",
+        ),
+        Kind(
+            "optimizer",
+            "optimizer",
+            "cfx.optimizers",
+            "cfx.calibration.optimizers.base:Optimizer",
+            "cfx.contracts.smoke:smoke_check_optimizer",
+        ),
+        Kind(
+            "simulator",
+            "simulator",
+            "cfx.simulators",
+            "cfx.simulation.simulator:Simulator",
+            "cfx.contracts.smoke:smoke_check_simulator",
+        ),
+        Kind(
+            "objective",
+            "objective",
+            "cfx.objectives",
+            "cfx.calibration.objectives.base:Objective",
+            "cfx.contracts.smoke:smoke_check_objective",
+        ),
+        Kind("engine", "engine", "cfx.engines", "cfx.core.engine.base:Engine"),
+        Kind("learner", "learner", "cfx.learners", "cfx.learners.base:Learner"),
+        Kind("protocol", "protocol", "cfx.protocols", "cfx.evaluation.protocols.base:Protocol"),
+        Kind(
+            "metric",
+            "metrics",
+            "cfx.metrics",
+            "cfx.evaluation.metrics.base:Metric",
+            "cfx.contracts.smoke:smoke_check_metric",
+            chosen=False,
+        ),
+        Kind("command", "command", "cfx.commands", "cfx.core.command:Command", chosen=False),
+    )
+}
+"""All kinds, by name."""
+
+GROUPS: dict[str, Kind] = {kind.group: kind for kind in KINDS.values() if kind.chosen}
+"""Kinds by config group, of which a job chooses one component each."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One component as its distribution's metadata announces it.
+
+    Attributes:
+        kind, name: how it is asked for.
+        target: `module:Class`.
+        distribution, version: who brings it.
+        location: folder that the distribution's metadata lies in.
+        summary: one line about the distribution, of its author.
+        api: versions of the plugin API that the distribution declares; empty if it declares none.
+    """
+
+    kind: str
+    name: str
+    target: str
+    distribution: str
+    version: str
+    location: str
+    summary: str = ""
+    api: tuple[str, ...] = ()
+
+    @property
+    def package(self) -> str:
+        """Top-level package of the class."""
+        return self.target.partition(":")[0].partition(".")[0]
+
+    def __str__(self) -> str:
+        return (
+            f"{self.kind} '{self.name}' ({self.target})"
+            f" of the distribution {self.distribution} {self.version}"
+        )
+
+
+_loaded: dict[Entry, type[Component]] = {}
+"""Classes that were imported and passed their checks."""
+
+_smoke_checked: set[tuple[Entry, str]] = set()
+"""Components that were tried, with their settings as JSON."""
+
+
+def kind_of(kind: str) -> Kind:
+    """Returns a kind by its name or by its config group (`dataset` or `data`).
+
+    Raises:
+        PluginError: there is no such kind.
+    """
+    for found in KINDS.values():
+        if kind in {found.name, found.group}:
+            return found
+    raise PluginError(
+        f"there is no kind of component '{kind}'.{nearest(kind, KINDS)} Known: {', '.join(KINDS)}."
+    )
+
+
+def entries(kind: str) -> tuple[Entry, ...]:
+    """Returns what the installed distributions announce, sorted by name. Imports nothing.
+
+    Two entries may share a name.
+
+    Raises:
+        PluginError: there is no such kind.
+    """
+    return _announced(_search_path())[kind_of(kind).name]
+
+
+def names(kind: str) -> tuple[str, ...]:
+    """Returns the names of all components of a kind, sorted. Imports nothing."""
+    return tuple(sorted({entry.name for entry in entries(kind)}))
+
+
+def entry(kind: str, name: str) -> Entry:
+    """Returns the one entry of that name. Imports nothing.
+
+    Raises:
+        PluginError: the name is unknown, or two third parties claim it. A name of cfx's own always
+            means cfx's own.
+    """
+    about = kind_of(kind)
+    call, what = about.call(name), about.name
+    found = []
+    for candidate in entries(kind):
+        if candidate.name == name:
+            if candidate.distribution == OWN:
+                return candidate
+            found.append(candidate)
+    if not found:
+        known = names(kind)
+        if not known:
+            raise PluginError(
+                f"{call}: no {what} is installed, not even cfx's own;"
+                " run make run, or pip install -e ."
+            )
+        raise PluginError(f"{call}: there is no {what} '{name}'.{advice(about.group, name, known)}")
+    if len(found) > 1:
+        claims = " and ".join(f"{one.distribution} {one.version} ({one.target})" for one in found)
+        raise PluginError(
+            f"{call}: two distributions bring a {what} '{name}': {claims}; uninstall one of them"
+        )
+    return found[0]
+
+
+def get(kind: str, name: str) -> type[Component]:
+    """Imports, checks and returns a component's class.
+
+    Raises:
+        PluginError: the name is unknown or claimed twice; or the component was built for another
+            version of the plugin API, cannot be imported, or breaks the contract of its kind.
+    """
+    found = entry(kind, name)
+    if found not in _loaded:
+        complaint = other_api(found)
+        if complaint:
+            raise PluginError(complaint)
+        cls = _import(found)
+        _check(found, cls)
+        _loaded[found] = cls
+    return _loaded[found]
+
+
+def create(kind: str, node: Mapping[str, Any]) -> Component:
+    """Creates a component from its config node: `name` and its settings.
+
+    Raises:
+        PluginError: as `get`; or it cannot be created, or breaks its contract when it is tried for
+            a moment.
+        ConfigError: the node has no name, an unknown key or a wrong value.
+        ParameterError: a model's parameters contradict each other.
+    """
+    group = kind_of(kind).group
+    if not isinstance(node, Mapping):
+        raise ConfigError(
+            f"{group}={node!r}: choose a {kind} by its name; known: {', '.join(names(kind))}"
+        )
+    name = node.get("name")
+    if not isinstance(name, str):
+        raise ConfigError(
+            f"{group}.name: a value is required; choose a {kind}: {', '.join(names(kind))}"
+        )
+    cls, found = get(kind, name), entry(kind, name)
+    values = {key: value for key, value in node.items() if key != "name"}
+    settings = validate(cls.schema, _without_blanks(cls.schema, values), where=group)
+    _warn_of_deprecated(found, cls, settings)
+    try:
+        component = cls(settings)
+    except CfxError:
+        raise
+    except Exception as error:
+        raise PluginError(
+            f"{found} cannot be created: {in_words(error)}{_remedy(found)}"
+        ) from error
+    _smoke_check(found, component, settings)
+    return component
+
+
+def is_loaded(found: Entry) -> bool:
+    """Says whether the component was imported and passed its checks."""
+    return found in _loaded
+
+
+def rivals(found: Entry) -> tuple[Entry, ...]:
+    """Returns the entries of other distributions that keep this one from being used.
+
+    It is empty for most. Imports nothing.
+    """
+    if found.distribution == OWN:
+        return ()
+    others = []
+    for other in entries(found.kind):
+        if other.name == found.name and other != found:
+            if other.distribution == OWN:
+                return (other,)
+            others.append(other)
+    return tuple(others)
+
+
+def other_api(found: Entry) -> str:
+    """Returns a sentence if the distribution was built for other versions of the plugin API only.
+
+    Returns "" if it was not. Imports nothing.
+    """
+    if found.distribution == OWN or not found.api or str(API_VERSION) in found.api:
+        return ""
+    versions = [int(one) for one in found.api if one.isdecimal()]
+    if not versions:
+        return (
+            f"{found} declares '{found.api[0]}' as its version of cfx's plugin API, which is no"
+            f" number; its author must name the entry point of the group {API_GROUP} by one,"
+            f" such as {API_VERSION}"
+        )
+    outdated = found.distribution
+    if min(versions) > API_VERSION:
+        outdated = OWN
+    return (
+        f"{found} was built for version {' and '.join(found.api)} of cfx's plugin API, this cfx has"
+        f" version {API_VERSION}; pip install --upgrade {outdated}, or pip uninstall"
+        f" {found.distribution}"
+    )
+
+
+def origin(component: Component | type[Component]) -> str:
+    """Returns whose a component is, for messages: kind, name, class and distribution.
+
+    A class that no distribution announces is named alone.
+    """
+    cls = component if isinstance(component, type) else type(component)
+    for found, loaded in _loaded.items():
+        if loaded is cls:
+            return str(found)
+    return f"{cls.kind} {cls.__name__}"
+
+
+def is_own(component: Component) -> bool:
+    """Says whether a component is one of cfx's own."""
+    for found, loaded in _loaded.items():
+        if loaded is type(component):
+            return found.distribution == OWN
+    return False
+
+
+def name_of(component: Component) -> str:
+    """Returns the name under which configs choose a component; its class's if it is none's."""
+    for found, loaded in _loaded.items():
+        if loaded is type(component):
+            return found.name
+    return type(component).__name__
+
+
+def in_words(error: BaseException) -> str:
+    """Returns an error's type and the first line of its text."""
+    first = next(iter(str(error).splitlines()), "")
+    return f"{type(error).__name__}: {first}".rstrip(": ")
+
+
+def _smoke_check(found: Entry, component: Component, settings: BaseModel) -> None:
+    """Tries a component once for each of its settings.
+
+    Raises:
+        PluginError: it breaks its contract; names the distribution.
+    """
+    kind = KINDS[found.kind]
+    key = (found, settings.model_dump_json())
+    if not kind.smoke_check or key in _smoke_checked:
+        return
+    try:
+        _resolve(kind.smoke_check)(component)
+    except PluginError as broken:
+        raise PluginError(f"{found} breaks its contract: {broken}{_remedy(found)}") from broken
+    except Exception as error:  # a plugin may raise anything
+        raise PluginError(
+            f"{found} breaks its contract: trying it raised {in_words(error)}{_remedy(found)}"
+        ) from error
+    _smoke_checked.add(key)
+
+
+def _remedy(found: Entry) -> str:
+    return (
+        f"; repair that distribution (cfx plugins check {found.kind} {found.name}),"
+        f" or pip uninstall {found.distribution}"
+    )
+
+
+def _warn_of_deprecated(found: Entry, cls: type[Component], settings: BaseModel) -> None:
+    """Logs a warning for a deprecated component, and for each deprecated setting that is set."""
+    if cls.deprecated:
+        log.warning("%s is deprecated: %s", found, cls.deprecated)
+    for name, field in cls.schema.model_fields.items():
+        if not field.deprecated:
+            continue
+        default = field.get_default(call_default_factory=True, validated_data={})
+        if settings.__dict__[name] != default:  # getattr would raise pydantic's own warning
+            path = f"{kind_of(found.kind).group}.{name}"
+            log.warning("%s of %s is deprecated: %s", path, found, field.deprecation_message)
+
+
+def _search_path() -> tuple[tuple[str, ...], ...]:
+    """Returns what changes when a distribution is installed.
+
+    With it as a key of a cache, a new plugin is seen without a restart.
+    """
+    found = []
+    for folder in sys.path:
+        if folder and Path(folder).exists():
+            found.append(_metadata_in(folder, Path(folder).stat().st_mtime))
+    return tuple(found)
+
+
+@functools.lru_cache(maxsize=64)
+def _metadata_in(folder: str, changed: float) -> tuple[str, ...]:
+    """Returns a folder and the metadata of distributions that lie in it, with their times.
+
+    Other files come and go where a job is started: they announce nothing.
+    """
+    found = [folder]
+    try:
+        for path in sorted(Path(folder).iterdir()):
+            if path.suffix in {".dist-info", ".egg-info", ".egg-link", ".egg"}:
+                found.append(f"{path.name} {path.stat().st_mtime}")
+    except OSError:  # such as an archive, which says nothing of its parts
+        found.append(str(changed))
+    return tuple(found)
+
+
+@functools.lru_cache(maxsize=1)
+def _announced(
+    search_path: tuple[tuple[str, ...], ...],  # noqa: ARG001 - the cache's key
+) -> dict[str, tuple[Entry, ...]]:
+    """Returns the entries of every kind, sorted."""
+    found: dict[str, list[Entry]] = {name: [] for name in KINDS}
+    seen = set()
+    for distribution in importlib.metadata.distributions():
+        try:
+            announced = list(_entries(distribution))
+        except Exception:  # noqa: S112 - metadata that cannot be read announces nothing
+            continue
+        # The first of a name on the search path is the one that is imported.
+        if announced and announced[0].distribution not in seen:
+            seen.add(announced[0].distribution)
+            for one in announced:
+                found[one.kind].append(one)
+    ordered = {}
+    for name, ones in found.items():
+        ordered[name] = tuple(sorted(ones, key=attrgetter("name", "distribution")))
+    return ordered
+
+
+def _entries(distribution: importlib.metadata.Distribution) -> Iterator[Entry]:
+    """Yields what one distribution announces.
+
+    Raises:
+        ValueError: its metadata are damaged.
+    """
+    kinds = {kind.entry_points: kind.name for kind in KINDS.values()}
+    points = list(distribution.entry_points)
+    api = tuple(sorted(point.name for point in points if point.group == API_GROUP))
+    ours = [point for point in points if point.group in kinds]
+    if not ours:
+        return
+    metadata = distribution.metadata  # read anew each time that it is asked for
+    name, version = metadata["Name"], metadata["Version"]
+    if not isinstance(name, str) or not isinstance(version, str):
+        raise ValueError("the metadata name no distribution, or no version")
+    summary = ""
+    if "Summary" in metadata:
+        summary = metadata["Summary"]
+    location = str(distribution.locate_file(""))
+    for point in ours:
+        yield Entry(
+            kind=kinds[point.group],
+            name=point.name,
+            target=point.value,
+            distribution=name,
+            version=version,
+            location=location,
+            summary=summary,
+            api=api,
+        )
+
+
+def _import(found: Entry) -> Any:
+    module, _, attribute = found.target.partition(":")
+    try:
+        imported = importlib.import_module(module)
+        return functools.reduce(getattr, attribute.split("."), imported)
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # a plugin may raise anything, even SystemExit
+        raise PluginError(
+            f"{found} cannot be imported: {in_words(error)};"
+            f" repair that distribution, or pip uninstall {found.distribution}"
+        ) from error
+
+
+def _check(found: Entry, cls: Any) -> None:
+    """Raises PluginError unless `cls` keeps the contract of its kind."""
+    base = _resolve(KINDS[found.kind].base)
+    if not inspect.isclass(cls):
+        raise PluginError(
+            f"{found} is no class but {type(cls).__name__};"
+            f" point its entry point at a subclass of {base.__name__}"
+        )
+    if not issubclass(cls, Component) or not issubclass(cls, base):
+        raise PluginError(f"{found} does not extend {base.__module__}.{base.__name__}")
+    if cls.kind != base.kind:
+        raise PluginError(
+            f"{found} says kind='{cls.kind}',"
+            f" but a {found.kind} keeps kind='{base.kind}' of its base class"
+        )
+    missing = sorted(cls.__abstractmethods__)
+    if missing:
+        raise PluginError(f"{found} does not implement {', '.join(missing)}")
+    schema = cls.schema
+    if not (inspect.isclass(schema) and issubclass(schema, Settings)):
+        raise PluginError(f"{found}: its schema must be a subclass of cfx.Settings, not {schema!r}")
+    if "name" in schema.model_fields:
+        raise PluginError(
+            f"{found}: its settings must not have a field 'name',"
+            " which chooses the component itself"
+        )
+    if found.kind == "model":
+        _check_model(found, cls)
+    if found.kind in {"model", "simulator"} and not issubclass(schema, base.schema):
+        raise PluginError(
+            f"{found}: its schema must extend {base.schema.__module__}.{base.schema.__name__}"
+        )
+    if found.kind == "metric":
+        wrong = _resolve("cfx.evaluation.metrics.base:declared_wrongly")(cls)
+        if wrong:
+            raise PluginError(f"{found} {wrong}")
+
+
+def _check_model(found: Entry, cls: Any) -> None:
+    from cfx.core.parameters import ParameterSpace
+
+    space = getattr(cls, "parameters", None)
+    if not isinstance(space, ParameterSpace):
+        raise PluginError(
+            f"{found}: its attribute 'parameters' must be a cfx.ParameterSpace,"
+            f" not {type(space).__name__}"
+        )
+    if not space.tuned and not space.open:
+        raise PluginError(f"{found}: at least one of its parameters must be tuned")
+
+
+def _resolve(target: str) -> Any:
+    module, _, attribute = target.partition(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def _without_blanks(schema: type[BaseModel], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Leaves out null for settings that are required and cannot be null.
+
+    The error then asks for a value.
+    """
+    kept: dict[str, Any] = {}
+    for key, value in values.items():
+        kept[key] = value
+        field = schema.model_fields.get(key)
+        if field is None:
+            continue
+        nested: Any = field.annotation
+        if value is None and is_blank(field):
+            del kept[key]
+        elif (
+            isinstance(value, Mapping) and inspect.isclass(nested) and issubclass(nested, BaseModel)
+        ):
+            kept[key] = _without_blanks(nested, value)
+    return kept
+
+
+def is_blank(field: FieldInfo) -> bool:
+    """Says whether null in a config node means that the user must give a value."""
+    return field.is_required() and type(None) not in get_args(field.annotation)

@@ -1,0 +1,441 @@
+"""The contract of a dataset: recordings in, leader-follower pairs out."""
+
+from __future__ import annotations
+
+import logging
+from abc import abstractmethod
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, NamedTuple
+
+import numpy as np
+from pydantic import BeforeValidator, Field
+from pydantic_core import PydanticCustomError
+
+from cfx.core import registry, scratch
+from cfx.core.component import Component, Settings
+from cfx.core.errors import DataError, PluginError, nearest
+from cfx.core.files import absolute
+from cfx.core.memory import give_back
+from cfx.core.storage import is_url, local_copies
+from cfx.data.files import FileStart
+from cfx.data.pairs import SIGNALS, Dropped, Pair, PairSet
+from cfx.data.resample import resampled
+from cfx.data.tracks import summed
+
+log = logging.getLogger(__name__)
+
+
+def _files(value: Any) -> Path | str | tuple[Path | str, ...]:
+    """Returns one path, or several, as absolute ones; URLs as they are."""
+    several = isinstance(value, list | tuple)
+    written = value if several else [value]
+    if not written:
+        raise PydanticCustomError("path", "the list is empty; write at least one file")
+    for one in written:
+        if not isinstance(one, str | Path | None):
+            raise PydanticCustomError(
+                "path", "write a file, a list of files, or a pattern such as 'i-80/*.txt'"
+            )
+    paths = tuple(one if is_url(one) else absolute(one) for one in written)
+    if several:
+        return paths
+    return paths[0]
+
+
+FilePaths = Annotated[Path | str | tuple[Path | str, ...], BeforeValidator(_files)]
+"""One or several paths or URLs that a user writes.
+
+`~` is their home, and a relative path starts at the working directory.
+"""
+
+
+class DatasetSettings(Settings):
+    """What every dataset lets its user select."""
+
+    min_frames: int = Field(
+        700, ge=2, description="shortest pair that is kept, frames; the paper keeps 700"
+    )
+    time_step: float | None = Field(
+        None,
+        ge=0.001,
+        le=10.0,
+        description="s: bring all pairs to this step, in which windows and policies count too;"
+        " null: as recorded",
+    )
+    recording: str | None = Field(None, description="keep this recording alone; null: all")
+    lanes: list[int] | None = Field(None, description="keep pairs in these lanes alone; null: all")
+    pair_ids: list[str] | None = Field(
+        None, description="keep these pairs alone, by their ids; null: all"
+    )
+    driver_type: str | None = Field(
+        None,
+        description="keep followers of this type alone, as the recording labels them: human, acc,"
+        " automated, truck, a vType; null: all",
+    )
+    leader_driver_type: str | None = Field(
+        None, description="keep pairs behind leaders of this type alone; null: all"
+    )
+    max_pairs: int | None = Field(None, ge=1, description="keep the first so many pairs; null: all")
+    scale: float = Field(
+        1.0,
+        gt=0,
+        le=10,
+        description="factor on all distances, speeds and accelerations, vehicles' lengths excepted:"
+        " shows what becomes of policies beyond what they were recorded at",
+    )
+
+
+class FileDatasetSettings(DatasetSettings):
+    """What every dataset that reads a file has."""
+
+    path: FilePaths = Field(
+        description="the file to read, a list of files, or a pattern such as 'i-80/*.txt';"
+        " ~, relative paths and URLs such as s3://bucket/file work"
+    )
+
+    def files(self) -> list[Path]:
+        """Returns the files in the order in which they are written.
+
+        The files of a pattern are sorted by name. Those behind URLs are copied to this machine.
+
+        Raises:
+            DataError: no file matches a pattern, or a file is named twice.
+        """
+        written = self.path
+        if isinstance(written, Path | str):
+            written = (written,)
+        files: list[Path] = []
+        for path in written:
+            for file in _matching(path):
+                if file in files:
+                    raise DataError(
+                        f"data.path: {file} is named more than once; name each file once"
+                    )
+                files.append(file)
+        return files
+
+
+def _matching(path: Path | str) -> list[Path]:
+    """Returns the files that a path, a URL or a pattern stands for, sorted by name."""
+    if isinstance(path, str):
+        return local_copies(path)
+    is_pattern = any(mark in str(path) for mark in "*?[")
+    if path.exists() or not is_pattern:
+        return [path]
+    found = []
+    for file in Path(path.anchor).glob(str(path.relative_to(path.anchor))):
+        if file.is_file():
+            found.append(file)
+    if not found:
+        raise DataError(f"data.path={path}: no file matches this pattern")
+    return sorted(found)
+
+
+class Contents(NamedTuple):
+    """A file's pairs, and what the pairs do not show, for `data describe`.
+
+    Attributes:
+        rows: of the file.
+        vehicles: how many there are, over all recordings.
+        problem: a sentence on what a user should know before they use it; "" if there is none.
+    """
+
+    pairs: PairSet
+    rows: int
+    vehicles: int
+    problem: str = ""
+
+
+class Dataset(Component):
+    """Base of every dataset.
+
+    Life cycle: constructed once per job; `load` is called once, calls `read`, and selects.
+
+    A subclass implements `read`. Its settings extend `DatasetSettings`. One that reads files tells
+    `data describe` about its layout by `layout` and `recognises`.
+
+    Attributes:
+        layout: what the layout is called, units included; "" for a dataset that reads no files.
+    """
+
+    kind = "dataset"
+    layout: ClassVar[str] = ""
+    schema: ClassVar[type[Settings]] = DatasetSettings
+    settings: DatasetSettings
+
+    @classmethod
+    def recognises(cls, start: FileStart) -> bool:  # noqa: ARG003 - what overrides look at
+        """Says whether a file is in this dataset's layout, from its beginning alone."""
+        return False
+
+    def contents(self) -> Contents:
+        """Returns everything in the file, before any selection.
+
+        Raises:
+            DataError: as `read`.
+        """
+        pairs = self.read()
+        rows = sum(len(pair) for pair in pairs)
+        vehicles = set()
+        for pair in pairs:
+            vehicles.add((pair.recording, pair.leader_id))
+            vehicles.add((pair.recording, pair.follower_id))
+        return Contents(pairs, rows, len(vehicles))
+
+    @abstractmethod
+    def read(self) -> PairSet:
+        """Returns every pair found, in a fixed order, with a count of whatever it had to leave out.
+
+        Raises:
+            DataError: the source is missing, cannot be read, or holds what no recording can hold.
+        """
+
+    def load(self) -> PairSet:
+        """Returns the pairs that the settings select.
+
+        They are selected by recording, lane, id, what drives them, and length; of those the first
+        `max_pairs` are kept. Lengths count in steps of `time_step`.
+
+        Raises:
+            DataError: as `read`; or the recording, a pair id or a type of driver is unknown, the
+                source has no lanes, or too few pairs remain.
+            PluginError: `read` gives anything but pairs of finite numbers.
+        """
+        pairs = self.read()
+        give_back()
+        self._check(pairs)
+        if not len(pairs):
+            raise DataError(f"{pairs.source}: no leader-follower pair found{_why(pairs.dropped)}")
+        if self.settings.recording is not None:
+            pairs = _select_recording(pairs, self.settings.recording)
+        if self.settings.lanes is not None:
+            pairs = _select_lanes(pairs, self.settings.lanes)
+        if self.settings.pair_ids is not None:
+            pairs = _select_ids(pairs, self.settings.pair_ids)
+        for name in ("driver_type", "leader_driver_type"):
+            pairs = _select_type(pairs, name, getattr(self.settings, name))
+        if self.settings.time_step is not None:
+            pairs = resampled(pairs, self.settings.time_step)
+            if not len(pairs):
+                raise DataError(
+                    f"data.time_step={self.settings.time_step:g}: no pair in {pairs.source} lasts"
+                    " two such steps; give a shorter one"
+                )
+        selected = _select_first(_select_long(pairs, self.settings.min_frames), self.settings)
+        return scaled(selected, self.settings.scale)
+
+    def _check(self, pairs: Any) -> None:
+        """Raises PluginError unless these are pairs of finite numbers."""
+        if not isinstance(pairs, PairSet):
+            raise PluginError(
+                f"{registry.origin(self)}: read must return a cfx.PairSet,"
+                f" but returned a {type(pairs).__name__}"
+            )
+        for pair in pairs:
+            for name in SIGNALS:
+                if not bool(np.isfinite(getattr(pair, name)).all()):
+                    raise PluginError(
+                        f"{registry.origin(self)}: pair {pair.pair_id} has a {name} that is not"
+                        " finite; a dataset splits or leaves out what has gaps"
+                    )
+
+
+def scaled(pairs: PairSet, factor: float) -> PairSet:
+    """Returns pairs with all distances, speeds and accelerations multiplied by a factor.
+
+    Time and vehicles' lengths stay as they are, so every gap is multiplied too.
+    """
+    if factor == 1.0:
+        return pairs
+
+    def scale(pair: Pair) -> Pair:
+        signals = {name: getattr(pair, name) * factor for name in SIGNALS}
+        # The leader's rear bumper is scaled, then its length added again.
+        signals["leader_position"] = signals["leader_position"] + pair.leader_length * (1 - factor)
+        return replace(pair, **signals)
+
+    source = f"{pairs.source}, {factor:g} times as fast"
+    return replace(pairs.changed(scale), source=source)
+
+
+def joined(files: Iterable[PairSet]) -> PairSet:
+    """Returns the pairs of several files as one set, in their order.
+
+    What was left out for the same reason is counted together. Where there are many pairs, their
+    signals are moved into temporary files (`cfx.core.scratch`), so that memory holds those of one
+    file.
+
+    Args:
+        files: read one after the other.
+
+    Raises:
+        DataError: a pair stands in two of the files, by its id or by its content, however it is
+            called: a driver who counts twice would be learned from and tested.
+        OutputError: the disk of temporary files is full.
+    """
+    parts = _compact(files)
+    if len(parts) == 1:
+        return parts[0]
+    _require_different(parts)
+    pairs: list[Pair] = []
+    dropped: list[Dropped] = []
+    ends: list[Dropped] = []
+    for part in parts:
+        pairs += part
+        dropped += part.dropped
+        ends += part.ends
+    sources = listed([part.source for part in parts], 3)
+    return PairSet(tuple(pairs), f"{len(parts)} files ({sources})", summed(dropped), summed(ends))
+
+
+def _compact(files: Iterable[PairSet]) -> list[PairSet]:
+    """Returns the pairs of each file; where there are many, their signals lie in files."""
+    parts: list[PairSet] = []
+    size = moved = 0
+    for part in files:
+        parts.append(part)
+        size += part.size
+        if size >= scratch.LARGE:
+            for number in range(moved, len(parts)):
+                parts[number] = parts[number].in_file()
+            moved = len(parts)
+            give_back()
+    return parts
+
+
+def _require_different(parts: Sequence[PairSet]) -> None:
+    """Raises DataError if a pair stands in two of the files."""
+    seen: dict[str, tuple[str, str]] = {}
+    for part in parts:
+        here: dict[str, tuple[str, str]] = {}
+        for pair in part:
+            for key in (pair.pair_id, pair.content):
+                if key in seen:
+                    raise DataError(_twice(*seen[key], part, pair))
+                here[key] = (part.source, pair.pair_id)
+        seen |= here
+
+
+def _twice(source: str, name: str, part: PairSet, pair: Pair) -> str:
+    """Returns that a pair called `name` in one file stands in another one too."""
+    which = f"pair '{name}'"
+    if name != pair.pair_id:
+        which += f", there '{pair.pair_id}',"
+    return f"{source} and {part.source}: {which} stands in both files; leave it out of one of them"
+
+
+def _why(dropped: Sequence[Dropped]) -> str:
+    """Returns what was left out, in brackets; "" if nothing was."""
+    if not dropped:
+        return ""
+    reasons = [f"{drop.count:,} {drop.unit}: {drop.reason}" for drop in dropped]
+    return f" (left out: {'; '.join(reasons)})"
+
+
+def listed(values: Iterable[object], limit: int = 12) -> str:
+    """Returns the values separated by commas, cut off after `limit` of them."""
+    texts = [str(value) for value in values]
+    text = ", ".join(texts[:limit])
+    if len(texts) > limit:
+        text += f", ... ({len(texts)} in all)"
+    return text
+
+
+def _select_recording(pairs: PairSet, recording: str) -> PairSet:
+    known = list(dict.fromkeys(pair.recording for pair in pairs))
+    if recording not in known:
+        raise DataError(
+            f"data.recording={recording}: {pairs.source} has no such recording."
+            f"{nearest(recording, known)} Known: {listed(known)}."
+        )
+    kept = [pair.recording == recording for pair in pairs]
+    return pairs.select(kept, f"other recordings than '{recording}'")
+
+
+def _select_lanes(pairs: PairSet, lanes: Sequence[int]) -> PairSet:
+    known = sorted({pair.lane for pair in pairs if pair.lane is not None})
+    if not known:
+        raise DataError(
+            f"data.lanes={list(lanes)}: {pairs.source} does not say in which lane its pairs are;"
+            " leave data.lanes out"
+        )
+    if not lanes or not set(lanes) <= set(known):
+        raise DataError(
+            f"data.lanes={list(lanes)}: {pairs.source} has pairs in lanes {listed(known)} only;"
+            " choose among these"
+        )
+    kept = [pair.lane in lanes for pair in pairs]
+    return pairs.select(kept, f"in other lanes than {listed(sorted(set(lanes)))}")
+
+
+def _select_ids(pairs: PairSet, wanted: Sequence[str]) -> PairSet:
+    known = [pair.pair_id for pair in pairs]
+    what = ""
+    if not wanted:
+        what = "the list is empty."
+    for name in wanted:
+        if name not in known:
+            what = f"there is no pair '{name}'.{nearest(name, known)}"
+            break
+    if what:
+        raise DataError(
+            f"data.pair_ids={list(wanted)}: {pairs.source}: {what} Known: {listed(known)}."
+        )
+    return pairs.select([name in wanted for name in known], "other pairs than data.pair_ids")
+
+
+def _select_type(pairs: PairSet, name: str, wanted: str | None) -> PairSet:
+    """Keeps the pairs whose follower or leader is of a type; all where None is wanted."""
+    if wanted is None:
+        return pairs
+    types = [getattr(pair, name) for pair in pairs]
+    known = sorted(set(types) - {""})
+    if not known:
+        raise DataError(
+            f"data.{name}={wanted}: {pairs.source} does not say what drives its vehicles; leave"
+            f" data.{name} out"
+        )
+    if wanted not in known:
+        raise DataError(
+            f"data.{name}={wanted}: {pairs.source} has no such type.{nearest(wanted, known)}"
+            f" Known: {listed(known)}."
+        )
+    return pairs.select([one == wanted for one in types], f"another {name} than '{wanted}'")
+
+
+def _select_long(pairs: PairSet, min_frames: int) -> PairSet:
+    kept = [len(pair) >= min_frames for pair in pairs]
+    long = pairs.select(kept, f"shorter than {min_frames} frames")
+    if not len(long):
+        longest = max(len(pair) for pair in pairs)
+        raise DataError(
+            f"{pairs.source}: none of its {len(pairs)} pairs has at least {min_frames} frames, the"
+            f" longest has {longest}; lower data.min_frames"
+        )
+    return long
+
+
+def _select_first(pairs: PairSet, settings: DatasetSettings) -> PairSet:
+    wanted = settings.max_pairs
+    if wanted is None or len(pairs) == wanted:
+        return pairs
+    if len(pairs) < wanted:
+        where = ""
+        if settings.recording or settings.lanes:
+            where = " in the selected recording and lanes"
+        raise DataError(
+            f"{pairs.source}: asked for {wanted} pairs but only {len(pairs)} have at least"
+            f" {settings.min_frames} frames{where}; lower data.max_pairs or data.min_frames"
+        )
+    beyond = Dropped(f"beyond max_pairs ({wanted})", len(pairs) - wanted)
+    return replace(pairs, pairs=pairs.pairs[:wanted], dropped=(*pairs.dropped, beyond))
+
+
+def load_pairs(dataset: Dataset) -> PairSet:
+    """Returns all pairs of a dataset, and says what they are."""
+    pairs = dataset.load()
+    drivers = len({pair.driver for pair in pairs})
+    log.info("%d pairs of %d drivers from %s", len(pairs), drivers, pairs.source)
+    return pairs

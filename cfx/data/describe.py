@@ -1,0 +1,370 @@
+"""What a recording holds, in words and tables: `python -m cfx data describe FILE`."""
+
+from __future__ import annotations
+
+import io
+import logging
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console, RenderableType
+from rich.table import Table
+
+from cfx.core import registry
+from cfx.core.errors import DataError, PluginError
+from cfx.core.registry import Entry
+from cfx.data.base import Contents, Dataset, listed
+from cfx.data.files import Floats, beginning
+from cfx.data.pairs import Dropped, Pair, PairSet
+from cfx.data.partitions import partitions
+from cfx.data.resample import frames_in_steps
+from cfx.data.style.entropy import STANDING_MPS
+
+log = logging.getLogger(__name__)
+
+Marks = NDArray[np.bool_]
+
+_THRESHOLDS = (300, 500, 700)
+"""Lengths in frames for which pairs are counted."""
+
+_QUANTILES = {
+    0.0: "least",
+    0.01: "1%",
+    0.25: "25%",
+    0.5: "median",
+    0.75: "75%",
+    0.99: "99%",
+    1.0: "most",
+}
+"""Quantiles in the table of motion, and their headings."""
+
+_TYPES = {"driver_type": "followers", "leader_driver_type": "leaders"}
+"""Labels of a pair, and the questions that they answer."""
+
+_WIDTH = 110
+
+_ROUND = 50
+"""Frames; a least length that is advised is a multiple of it, if pairs are that long."""
+
+
+def describe(path: Path) -> str:
+    """Says what a recording holds.
+
+    These are its rows, recordings and pairs, their motion, what was left out and why, and what
+    looks wrong. The layout is found from the file itself: each dataset says whether it is its own,
+    those of plugins too.
+
+    Raises:
+        DataError: the file cannot be used; the message says why.
+    """
+    path = path.expanduser()
+    name = _dataset_of(path)
+    cls = cast(type[Dataset], registry.get("dataset", name))
+    if name == "tidy" and path.is_dir():
+        return _describe_partitions(path, cls)
+    dataset = cls(path=path)
+    contents = dataset.contents()
+    pieces: list[RenderableType] = [str(path), "", _overview(cls.layout, contents)]
+    if len(contents.pairs):
+        pieces += ["", _motion(contents.pairs)]
+    pieces += ["", *_left_out(contents.pairs)]
+    if contents.pairs.ends:
+        pieces += ["", "Why pairs end:", *_counts(contents.pairs.ends)]
+    pieces += ["", *_problems(contents)]
+    options, kept = _advice(_lengths(contents.pairs), dataset.settings.min_frames)
+    pieces += ["", f"Use it: data={name} data.path={path}{options}", *kept]
+    return _text(pieces)
+
+
+def _describe_partitions(folder: Path, cls: type[Dataset]) -> str:
+    """Says what each file of a folder holds; reads one file after the other."""
+    table = Table(box=None, padding=(0, 2), header_style="")
+    table.add_column("file")
+    for heading in ("recordings", "rows", "pairs", "drivers", "frames", "of at least 700 frames"):
+        table.add_column(heading, justify="right")
+    totals = [0] * 5
+    names: set[str] = set()
+    lengths: list[_Length] = []
+    files = partitions(folder)
+    for file in files:
+        contents = cls(path=file).contents()
+        pairs = contents.pairs
+        recordings = {pair.recording for pair in pairs}
+        drivers = {pair.driver for pair in pairs}
+        long = sum(len(pair) >= _THRESHOLDS[-1] for pair in pairs)
+        counts = [contents.rows, len(pairs), len(drivers), _frames(pairs), long]
+        totals = [before + count for before, count in zip(totals, counts, strict=True)]
+        names |= recordings
+        lengths += _lengths(pairs)
+        cells = [f"{count:,}" for count in counts]
+        table.add_row(str(file.relative_to(folder)), listed(sorted(recordings), 2), *cells)
+    table.add_row("all", f"{len(names):,}", *[f"{count:,}" for count in totals])
+    options, kept = _advice(lengths, cls.schema.model_fields["min_frames"].default)
+    return _text(
+        [
+            str(folder),
+            "",
+            f"{cls.layout}, {len(files)} files, read one after the other",
+            "",
+            table,
+            "",
+            "A recording alone: python -m cfx data describe FILE",
+            f"Use it: data=tidy data.path={folder}{options}",
+            *kept,
+            "One recording of it: data.recording=NAME",
+        ]
+    )
+
+
+def _text(pieces: Sequence[RenderableType]) -> str:
+    """Returns paragraphs and tables as one text."""
+    text = io.StringIO()
+    console = Console(file=text, width=_WIDTH, highlight=False, markup=False, emoji=False)
+    for piece in pieces:
+        console.print(piece, soft_wrap=isinstance(piece, str))
+    return "\n".join(line.rstrip() for line in text.getvalue().splitlines())
+
+
+def _dataset_of(path: Path) -> str:
+    """Returns the name of the dataset that reads a file; cfx's own are asked before plugins'.
+
+    Raises:
+        DataError: it has columns that none of them knows.
+    """
+    start = beginning(path)
+    layouts = []
+    found = sorted(registry.entries("dataset"), key=lambda one: one.distribution != registry.OWN)
+    for one in found:
+        cls = _usable(one)
+        if cls is None:
+            continue
+        if cls.recognises(start):
+            return one.name
+        if cls.layout:
+            layouts.append(f"{cls.layout} (data={one.name})")
+    has_names = any(character.isalpha() for character in "".join(start.columns))
+    if start.path.is_dir() or has_names:
+        columns = listed(start.columns, 20) or "none: it is a folder"
+        raise DataError(
+            f"{path}: no dataset knows this layout. Columns found: {columns}. Known layouts:"
+            f" {'; '.join(layouts)}. Write its pairs in the tidy layout, or see docs/readers.md"
+        )
+    return "ngsim"  # whose reader says what is wrong with a file without column names
+
+
+def _usable(found: Entry) -> type[Dataset] | None:
+    """Returns a dataset's class; None, and a warning, for a plugin that is broken."""
+    if registry.rivals(found):
+        return None
+    try:
+        return cast(type[Dataset], registry.get("dataset", found.name))
+    except PluginError as error:
+        log.warning("%s", error)
+        return None
+
+
+def _frames(pairs: PairSet) -> int:
+    return sum(len(pair) for pair in pairs)
+
+
+class _Length(NamedTuple):
+    """How long a pair is."""
+
+    frames: int
+    dt: float
+
+    def in_steps(self, step: float) -> int:
+        """Returns its frames after `data.time_step=STEP`."""
+        return frames_in_steps(self.frames, self.dt, step)
+
+
+def _lengths(pairs: PairSet) -> list[_Length]:
+    return [_Length(len(pair), round(pair.dt, 9)) for pair in pairs]
+
+
+def _advice(pairs: Sequence[_Length], usual: int) -> tuple[str, list[str]]:
+    """Returns the options that a job needs to use at least half of the pairs, and what it keeps.
+
+    Args:
+        pairs: of all files.
+        usual: shortest pair, in frames, that a job keeps unless told otherwise.
+    """
+    if not pairs:
+        return "", []
+    options = ""
+    steps = {pair.dt for pair in pairs}
+    step = max(steps)
+    if len(steps) > 1:
+        options = f" data.time_step={step:g}"
+    lengths = sorted(pair.in_steps(step) for pair in pairs)
+    median = lengths[(len(lengths) - 1) // 2]
+    least = usual
+    if sum(length >= usual for length in lengths) * 2 < len(lengths):
+        least = max(median // _ROUND * _ROUND, min(median, _ROUND))
+        options += f" data.min_frames={least}"
+    kept = sum(length >= least for length in lengths)
+    if kept == len(lengths):
+        return options, [f"It keeps all {kept:,} pairs."]
+    return options, [
+        f"It keeps {kept:,} of {len(lengths):,} pairs and leaves out {len(lengths) - kept:,}"
+        f" shorter than {least} frames; data.min_frames={lengths[0]} keeps all."
+    ]
+
+
+def _overview(layout: str, contents: Contents) -> Table:
+    """Returns what a file holds, a row per question."""
+    pairs = contents.pairs
+    recordings: dict[str, int] = {}
+    for pair in pairs:
+        recordings[pair.recording] = recordings.get(pair.recording, 0) + 1
+    counted = [f"{name} ({count} pairs)" for name, count in recordings.items()]
+    drivers = {pair.driver for pair in pairs}
+    lanes = sorted({pair.lane for pair in pairs if pair.lane is not None})
+    steps = sorted({pair.dt for pair in pairs})
+    truth = {pair.truth_model for pair in pairs if pair.truth}
+
+    table = Table.grid(padding=(0, 3))
+    table.add_row("layout", layout)
+    table.add_row("rows", f"{contents.rows:,}")
+    table.add_row("vehicles", f"{contents.vehicles:,}")
+    if counted:
+        table.add_row("recordings", f"{len(recordings)}: {listed(counted, 6)}")
+    else:
+        table.add_row("recordings", "none with pairs")
+    table.add_row("lanes", listed(lanes) or "not known")
+    table.add_row("pairs", f"{len(pairs):,} of {len(drivers):,} drivers, {_frames(pairs):,} frames")
+    table.add_row("time step", listed([f"{step:g} s" for step in steps]) or "-")
+    for frames in _THRESHOLDS:
+        count = sum(len(pair) >= frames for pair in pairs)
+        table.add_row(f"  of at least {frames} frames", f"{count:,}")
+    for name, title in _TYPES.items():
+        types = Counter(getattr(pair, name) or "not known" for pair in pairs)
+        if set(types) - {"not known"}:
+            table.add_row(title, listed([f"{one} ({count} pairs)" for one, count in types.items()]))
+    if truth:
+        table.add_row("true parameters", f"known, of {listed(sorted(truth))}")
+    return table
+
+
+def _motion(pairs: PairSet) -> Table:
+    """Returns how the vehicles move: quantiles over all frames."""
+    table = Table(box=None, padding=(0, 2), header_style="")
+    table.add_column("over all pairs")
+    for heading in _QUANTILES.values():
+        table.add_column(heading, justify="right")
+    for name, values in _quantities(pairs):
+        if not len(values):
+            continue
+        decimals = 0 if name == "frames" else 2
+        cells = [f"{value:.{decimals}f}" for value in np.quantile(values, list(_QUANTILES))]
+        table.add_row(name, *cells)
+    return table
+
+
+def _quantities(pairs: PairSet) -> Iterator[tuple[str, Floats]]:
+    """Yields what the table of motion is about: a name with its unit, and the values."""
+    speed = _joined(pairs, "follower_speed")
+    gap = _joined(pairs, "gap")
+    headway = _joined(pairs, "leader_position") - _joined(pairs, "follower_position")
+    moving = speed >= STANDING_MPS
+    yield "frames", np.array([len(pair) for pair in pairs], dtype=np.float64)
+    yield "leader speed, m/s", _joined(pairs, "leader_speed")
+    yield "follower speed, m/s", speed
+    yield "follower acceleration, m/s2", _joined(pairs, "follower_acceleration")
+    yield "gap (bumper to bumper), m", gap
+    yield "space headway (front to front), m", headway
+    yield f"time headway (above {STANDING_MPS:g} m/s), s", headway[moving] / speed[moving]
+    yield "leader length, m", np.array([pair.leader_length for pair in pairs])
+
+
+def _joined(pairs: PairSet, name: str) -> Floats:
+    return np.concatenate([getattr(pair, name) for pair in pairs])
+
+
+def _left_out(pairs: PairSet) -> list[str]:
+    if not pairs.dropped:
+        return ["Left out in reading: nothing"]
+    return ["Left out in reading:", *_counts(pairs.dropped)]
+
+
+def _counts(counts: Sequence[Dropped]) -> list[str]:
+    return [f"  {one.count:,} {one.unit}: {one.reason}" for one in counts]
+
+
+def _problems(contents: Contents) -> list[str]:
+    """Returns what a recording may hold but rarely should."""
+    found = list(_suspicions(contents.pairs))
+    if contents.problem:
+        found.append(contents.problem)
+    if not found:
+        return ["Problems: none found"]
+    return ["Problems:", *(f"  {sentence}" for sentence in found)]
+
+
+def _suspicions(pairs: PairSet) -> Iterator[str]:
+    """Yields a sentence for each kind of values that a recording rarely holds."""
+    if not len(pairs):
+        yield "there is no leader-follower pair in it"
+        return
+    if len({round(pair.dt, 9) for pair in pairs}) > 1:
+        yield (
+            "the pairs have different time steps; a job needs one: set data.time_step, or split"
+            " the file"
+        )
+    length = float(np.median([pair.leader_length for pair in pairs]))
+    if length > 11:
+        yield f"leaders are typically {length:.1f} m long: feet, or lorries only?"
+    without = sum(pair.leader_length == 0 for pair in pairs)
+    if without:
+        yield (
+            f"{without} pairs have leaders of length 0: their gaps are bumper to bumper if"
+            " leader positions are those of rear bumpers, and too long by a vehicle if not"
+        )
+    for what, wrong in _CHECKS.items():
+        yield from _counted(pairs, what, wrong)
+
+
+def _is_close(pair: Pair) -> Marks:
+    return pair.gap < 0.5
+
+
+def _is_fast(pair: Pair) -> Marks:
+    return np.maximum(pair.leader_speed, pair.follower_speed) > 50
+
+
+def _is_harsh(pair: Pair) -> Marks:
+    return np.abs(pair.follower_acceleration) > 8
+
+
+def _jumps(pair: Pair) -> Marks:
+    moved = np.diff(pair.follower_position)
+    return np.abs(moved - pair.follower_speed[1:] * pair.dt) > 1.0
+
+
+def _reverses(pair: Pair) -> Marks:
+    return np.diff(pair.follower_position) < 0
+
+
+_CHECKS: dict[str, Callable[[Pair], Marks]] = {
+    "frames with a gap below 0.5 m": _is_close,
+    "frames with a speed above 50 m/s": _is_fast,
+    "frames with an acceleration or braking above 8 m/s2": _is_harsh,
+    "steps in which a position moves 1 m more or less than its speed says": _jumps,
+    "steps in which a vehicle moves backwards": _reverses,
+}
+"""What is counted, and which frames or steps of a pair count."""
+
+
+def _counted(pairs: PairSet, what: str, wrong: Callable[[Pair], Marks]) -> Iterator[str]:
+    """Yields how many frames are wrong and where most of them are; nothing if none is."""
+    counts = [int(np.count_nonzero(wrong(pair))) for pair in pairs]
+    if any(counts):
+        worst = pairs[int(np.argmax(counts))].pair_id
+        yield (
+            f"{sum(counts):,} {what}, in {np.count_nonzero(counts)} of {len(pairs)} pairs,"
+            f" most of them in '{worst}'"
+        )

@@ -1,0 +1,431 @@
+"""Leader-follower pairs: what every dataset delivers and everything else reads.
+
+Glossary (SI units everywhere): *leader* drives ahead of *follower*; *position* is the front
+bumper's, along the lane; *gap* is bumper to bumper, `leader position - leader length - follower
+position`; *relative speed* is leader minus follower.
+Shapes: P pairs, T frames of the longest pair.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfx.core import scratch
+from cfx.core.errors import DataError
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+Array = NDArray[np.float64]
+SIGNALS = (
+    "leader_position",
+    "leader_speed",
+    "leader_acceleration",
+    "follower_position",
+    "follower_speed",
+    "follower_acceleration",
+)
+
+_LIKENESS_FRAMES = 8
+"""Frames of a pair at which its likeness is taken."""
+
+_ALIKE = 0.1 + 1e-9
+"""m/s and m; the same trajectory saved with one decimal differs by less, two drivers by more."""
+
+_TOGETHER = 1024
+"""Pairs that one part of the work reads before their signals are let go of."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One follower behind one leader over consecutive frames; the arrays are `(T,)` float64.
+
+    Attributes:
+        pair_id: unique within a `PairSet`.
+        recording: name of the recording; vehicle ids are unique only within one.
+        first_frame: frame number of the first row in the source.
+        dt: time step, s.
+        leader_length: m.
+        lane: lane number, None where the source has none.
+        driver_type: what drives the follower, as the source labels it: "human", "acc", "automated",
+            "truck", a vType; "" where it has no labels.
+        leader_driver_type: what drives the leader.
+        truth: true parameters over time, name -> `(T,)`, known only for synthetic pairs.
+        truth_model: name of the model these parameters belong to.
+    """
+
+    pair_id: str
+    recording: str
+    leader_id: str
+    follower_id: str
+    first_frame: int
+    dt: float
+    leader_length: float
+    leader_position: Array
+    leader_speed: Array
+    leader_acceleration: Array
+    follower_position: Array
+    follower_speed: Array
+    follower_acceleration: Array
+    lane: int | None = None
+    truth: Mapping[str, Array] = field(default_factory=dict)
+    truth_model: str = ""
+    driver_type: str = ""
+    leader_driver_type: str = ""
+
+    def __post_init__(self) -> None:
+        shapes = {name: getattr(self, name).shape for name in SIGNALS}
+        if len(set(shapes.values())) != 1 or len(shapes["leader_position"]) != 1:
+            raise DataError(
+                f"pair {self.pair_id}: all signals must have the same length, got {shapes}"
+            )
+        if not self.dt > 0:
+            raise DataError(f"pair {self.pair_id}: the time step must be positive, got {self.dt} s")
+
+    def __len__(self) -> int:
+        return len(self.leader_position)
+
+    @property
+    def driver(self) -> str:
+        """The follower, unique across recordings."""
+        return f"{self.recording}/{self.follower_id}"
+
+    @property
+    def gap(self) -> Array:
+        """Bumper-to-bumper gap `(T,)`, m."""
+        return self.leader_position - self.leader_length - self.follower_position
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 of everything that calibration and learning read."""
+        return self._digest(f"{self.pair_id}|{self.recording}|{self.dt!r}|{self.leader_length!r}")
+
+    @cached_property
+    def content(self) -> str:
+        """SHA-256 of the trajectories alone, whatever the pair and its recording are called."""
+        return self._digest(f"{self.dt!r}|{self.leader_length!r}")
+
+    @cached_property
+    def likeness(self) -> str:
+        """What the trajectories are recognised by, however they are called and in whatever units.
+
+        In plain numbers: frames, time step (ms), then at frames evenly spread over the pair both
+        speeds (m/s) and the gap (m); see `LearnedFrom`.
+        """
+        at = np.linspace(0, len(self) - 1, _LIKENESS_FRAMES).round().astype(np.int64)
+        values = (self.leader_speed[at], self.follower_speed[at], self.gap[at])
+        numbers = [f"{value:.2f}" for value in np.concatenate(values)]
+        return " ".join([str(len(self)), f"{1000 * self.dt:.0f}", *numbers])
+
+    def _digest(self, header: str) -> str:
+        digest = hashlib.sha256(header.encode())
+        for name in SIGNALS:
+            digest.update(np.ascontiguousarray(getattr(self, name), dtype=np.float64).tobytes())
+        return digest.hexdigest()
+
+
+class LearnedFrom:
+    """Trajectories that were learned from, by what they are recognised by.
+
+    A pair is one of them if it has as many frames of the same step, and if both speeds and the gap
+    agree to 0.1 m/s and 0.1 m wherever they are compared: other units, names and decimals of a file
+    do not hide it. Another cut of it, in time or in another time step, is not recognised.
+
+    Args:
+        likenesses: `Pair.likeness` of each.
+    """
+
+    def __init__(self, likenesses: Iterable[str]) -> None:
+        found: dict[str, list[list[float]]] = {}
+        for one in likenesses:
+            frames, step, *numbers = one.split()
+            found.setdefault(f"{frames} {step}", []).append([float(value) for value in numbers])
+        self._known = {length: np.array(numbers) for length, numbers in found.items()}
+
+    def __contains__(self, pair: Pair) -> bool:
+        frames, step, *numbers = pair.likeness.split()
+        known = self._known.get(f"{frames} {step}")
+        if known is None:
+            return False
+        differences = np.abs(known - np.array([float(value) for value in numbers]))
+        return bool((differences <= _ALIKE).all(1).any())
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """A count of what a dataset left out or cut, and why.
+
+    Attributes:
+        unit: what was counted: rows, pairs or vehicles.
+    """
+
+    reason: str
+    count: int
+    unit: str = "pairs"
+
+
+@dataclass(frozen=True)
+class PairSet(Sequence[Pair]):
+    """Pairs in a fixed order, where they came from, and a count of everything that was left out.
+
+    Attributes:
+        ends: why the pairs that were cut out of tracks end, counted over all that were found.
+    """
+
+    pairs: tuple[Pair, ...]
+    source: str
+    dropped: tuple[Dropped, ...] = ()
+    ends: tuple[Dropped, ...] = ()
+
+    def __post_init__(self) -> None:
+        seen: set[str] = set()
+        for pair in self.pairs:
+            if pair.pair_id in seen:
+                raise DataError(f"{self.source}: pair id '{pair.pair_id}' stands for two pairs")
+            seen.add(pair.pair_id)
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self.pairs[index]
+
+    def __iter__(self) -> Iterator[Pair]:
+        for start in range(0, len(self.pairs), _TOGETHER):
+            yield from self.pairs[start : start + _TOGETHER]
+            scratch.release()
+
+    @property
+    def size(self) -> int:
+        """Bytes of all signals."""
+        return len(SIGNALS) * 8 * sum(len(pair) for pair in self.pairs)
+
+    def changed(self, change: Callable[[Pair], Pair | None]) -> PairSet:
+        """Returns changed pairs, without those of which None is left.
+
+        Raises:
+            OutputError: the disk of temporary files is full.
+        """
+        is_large = self.size >= scratch.LARGE
+        changed: list[Pair] = []
+        for start in range(0, len(self.pairs), _TOGETHER):
+            part = []
+            for pair in self.pairs[start : start + _TOGETHER]:
+                made = change(pair)
+                if made is not None:
+                    part.append(made)
+            some = replace(self, pairs=tuple(part))
+            changed += some.in_file() if is_large else some
+            scratch.release()
+        return replace(self, pairs=tuple(changed))
+
+    def in_file(self) -> PairSet:
+        """Returns the same pairs, whose signals and true parameters lie in a file.
+
+        Raises:
+            OutputError: the disk is full.
+        """
+        rows = [len(SIGNALS) + len(pair.truth) for pair in self.pairs]
+        sizes = [count * len(pair) for count, pair in zip(rows, self.pairs, strict=True)]
+        values = scratch.in_file((sum(sizes),))
+        ends = np.cumsum(sizes)
+        stored = []
+        for pair, count, size, end in zip(self, rows, sizes, ends.tolist(), strict=True):
+            own = values[end - size : end].reshape(count, len(pair))
+            arrays = {name: getattr(pair, name) for name in SIGNALS}
+            kept = {}
+            for row, (name, array) in zip(own, (arrays | dict(pair.truth)).items(), strict=True):
+                row[:] = array
+                kept[name] = row
+            signals: dict[str, Any] = {name: kept[name] for name in SIGNALS}
+            truth = {name: kept[name] for name in pair.truth}
+            stored.append(replace(pair, **signals, truth=truth))
+        return replace(self, pairs=tuple(stored))
+
+    def select(self, keep: Sequence[bool], reason: str) -> PairSet:
+        """Keeps the pairs marked True and counts the others under `reason`."""
+        kept = []
+        for pair, wanted in zip(self.pairs, keep, strict=True):
+            if wanted:
+                kept.append(pair)
+        lost = len(self.pairs) - len(kept)
+        if lost == 0:
+            return replace(self, pairs=tuple(kept))
+        return replace(self, pairs=tuple(kept), dropped=(*self.dropped, Dropped(reason, lost)))
+
+    @property
+    def dt(self) -> float:
+        """The common time step, s.
+
+        Raises:
+            DataError: the pairs have different time steps.
+        """
+        steps = sorted({round(pair.dt, 9) for pair in self.pairs})
+        if len(steps) != 1:
+            listed = ", ".join(f"{step:g} s" for step in steps)
+            raise DataError(
+                f"{self.source}: the pairs have different time steps ({listed}); a job needs one:"
+                " bring them to one with data.time_step, or split the file"
+            )
+        return steps[0]
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 over all pairs, in order."""
+        digest = hashlib.sha256()
+        for pair in self.pairs:
+            digest.update(pair.fingerprint.encode())
+        return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class PairBatch:
+    """Pairs as padded tensors; those of many pairs lie in files (`cfx.core.scratch`).
+
+    Beyond its end a pair is continued at its last speed with zero acceleration, so that a rollout
+    stays finite there; `mask` says what is real. Positions are relative to the follower's first
+    position, so that float32 resolves millimetres on a road of any length.
+
+    Attributes:
+        leader_position ... follower_acceleration: `(P, T)`, SI units.
+        leader_length: `(P,)`, m.
+        lengths: `(P,)` int64, frames of each pair.
+        mask: `(P, T)` bool, True within the pair.
+        dt: time step, s.
+    """
+
+    leader_position: Tensor
+    leader_speed: Tensor
+    leader_acceleration: Tensor
+    follower_position: Tensor
+    follower_speed: Tensor
+    follower_acceleration: Tensor
+    leader_length: Tensor
+    lengths: Tensor
+    mask: Tensor
+    dt: float
+
+    @classmethod
+    def of(
+        cls,
+        pairs: PairSet | Sequence[Pair],
+        *,
+        dtype: torch.dtype | None = None,
+        device: torch.device | str | None = None,
+    ) -> PairBatch:
+        """Stacks pairs; float64 on the CPU unless told otherwise.
+
+        Raises:
+            DataError: there are no pairs, or their time steps differ.
+        """
+        import torch
+
+        if not len(pairs):
+            raise DataError("no pairs to stack")
+        pair_set = pairs if isinstance(pairs, PairSet) else PairSet(tuple(pairs), "pairs")
+        dt, dtype = pair_set.dt, dtype or torch.float64
+        length = max(len(pair) for pair in pair_set.pairs)
+        shape = (len(pair_set), length)
+        signals = {}
+        for name in SIGNALS:
+            # Filled row by row: a list of rows would hold the signal twice.
+            values = scratch.empty(shape, together=len(SIGNALS))
+            for row, pair in zip(values, pair_set, strict=True):
+                row[:] = _extend(pair, name, length)
+            signals[name] = torch.as_tensor(values).to(device=device, dtype=dtype)
+        leader_lengths = [pair.leader_length for pair in pair_set.pairs]
+        lengths = torch.tensor([len(pair) for pair in pair_set.pairs])
+        mask = torch.as_tensor(scratch.empty(shape, bool))
+        torch.lt(torch.arange(length), lengths[:, None], out=mask)
+        return cls(
+            **signals,
+            leader_length=torch.tensor(leader_lengths, dtype=dtype, device=device),
+            lengths=lengths.to(device),
+            mask=mask.to(device),
+            dt=dt,
+        )
+
+    def __len__(self) -> int:
+        return len(self.lengths)
+
+    @property
+    def gap(self) -> Tensor:
+        """Bumper-to-bumper gap `(P, T)`, m."""
+        return self.leader_position - self.leader_length[:, None] - self.follower_position
+
+    def to(self, device: torch.device | str) -> PairBatch:
+        """Returns the same pairs on a device."""
+        import torch
+
+        if self.lengths.device == torch.device(device):
+            return self
+        return self._changed(lambda values: values.to(device))
+
+    def trimmed(self) -> PairBatch:
+        """Returns the same pairs without the frames that none of them has."""
+        frames = int(self.lengths.max())
+        signals: dict[str, Any] = {}
+        for name in (*SIGNALS, "mask"):
+            signals[name] = getattr(self, name)[:, :frames]
+        return replace(self, **signals)
+
+    def __getitem__(self, index: Any) -> PairBatch:
+        """Selects pairs (a slice, an index tensor or a boolean mask over P); time stays whole."""
+        chosen = self._changed(lambda values: _selected(values, index))
+        scratch.release()
+        return chosen
+
+    def _changed(self, change: Callable[[Tensor], Tensor]) -> PairBatch:
+        """Returns these pairs with each of their tensors changed."""
+        changed: dict[str, Any] = {}
+        for one in fields(self):
+            if one.name != "dt":
+                changed[one.name] = change(getattr(self, one.name))
+        return replace(self, **changed)
+
+
+def _selected(values: Tensor, index: Any) -> Tensor:
+    """Returns rows of values `(P, ...)`; many rows lie in a file, as those that they are copies of.
+
+    Args:
+        values: of all pairs.
+        index: a slice, an index tensor, or a boolean mask `(P,)`.
+    """
+    import torch
+
+    is_copy = isinstance(index, torch.Tensor) and index.dtype == torch.int64 and values.ndim == 2
+    if not is_copy or values.device.type != "cpu":
+        return values[index]
+    size = len(index) * values.shape[1] * values.itemsize
+    if len(SIGNALS) * size < scratch.LARGE:
+        return values[index]
+    rows = scratch.in_file((len(index), values.shape[1]), values[:0].numpy().dtype)
+    return torch.index_select(values, 0, index, out=torch.as_tensor(rows))
+
+
+def _extend(pair: Pair, name: str, length: int) -> Array:
+    """Returns a signal `(length,)`, continued at constant speed.
+
+    Positions are relative to the follower's first.
+    """
+    values = np.asarray(getattr(pair, name), dtype=np.float64)
+    missing = length - len(values)
+    tail: Array
+    if name.endswith("position"):
+        speed = getattr(pair, name.replace("position", "speed"))[-1]
+        tail = values[-1] + speed * pair.dt * np.arange(1, missing + 1)
+        origin = float(pair.follower_position[0])
+    else:
+        last = values[-1] if name.endswith("speed") else 0.0
+        tail = np.full(missing, last)
+        origin = 0.0
+    extended: Array = np.concatenate([values, tail]) - origin
+    return extended

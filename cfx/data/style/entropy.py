@@ -1,0 +1,223 @@
+"""Driving style by the objective entropy weight method.
+
+The more unevenly an indicator is distributed over the drivers, the more it weighs: its weight comes
+from the Shannon entropy of its normalised column (C. E. Shannon, 1948; as used for driving style by
+the paper's reference on entropy weights).
+
+Shapes: m drivers, n = 6 indicators.
+
+Differences from the paper: the normalisation prints `Min = max(...)` and chooses its case by the
+sign of the value; here Min is the minimum, and the case follows from the indicator
+(`direction=signed`) or, as printed, from the value's sign (`direction=printed`). The weights'
+leading minus sign, with which they would all be negative, is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from cfx.core import scratch
+from cfx.core.errors import DataError
+from cfx.data.pairs import Pair, PairSet
+from cfx.data.style.result import CLUSTERS, StyleResult
+from cfx.data.style.settings import StyleSettings
+
+Floats = NDArray[np.float64]
+
+
+_PAIRS_AT_ONCE = 4096
+"""Pairs whose frames are looked at together."""
+
+
+class Indicator(NamedTuple):
+    """A column of the evaluation matrix; `sign` is +1 if more of it is more aggressive, else -1."""
+
+    name: str
+    sign: int
+
+
+INDICATORS = (
+    Indicator("mean_speed", 1),
+    Indicator("variance_speed", 1),
+    Indicator("mean_acceleration", 1),
+    Indicator("variance_acceleration", 1),
+    Indicator("mean_space_headway", -1),
+    Indicator("mean_time_headway", -1),
+)
+
+STANDING_MPS = 0.5
+"""Below this speed a vehicle stands: its time headway, headway over speed, says nothing."""
+
+
+def measure_style(pairs: PairSet, settings: StyleSettings) -> StyleResult:
+    """Scores every driver (`Pair.driver`) and sorts the drivers into three clusters.
+
+    The frames of all pairs of a driver count together. Scores lie in [0, 1]; the more aggressive,
+    the higher. A driver whose score is below the lower percentile is conservative, above the upper
+    one aggressive, and normal otherwise, so that equal scores always share a cluster. A single
+    driver is normal, with score 0.
+
+    Returns:
+        The drivers in the order in which they first appear. The table also has `frames` and
+        `standing_frames`, the number of frames that did not count for the time headway.
+
+    Raises:
+        DataError: there are no pairs.
+    """
+    if not len(pairs):
+        raise DataError(f"{pairs.source}: no pairs, so no driving style to measure")
+    table = indicators(pairs)
+    names = [indicator.name for indicator in INDICATORS]
+    raw = table[names].to_numpy(dtype=np.float64)
+    normalised = normalise(raw, settings.direction)
+    weights = entropy_weights(normalised)
+    score = (normalised * weights).sum(axis=1)
+    low, high = np.percentile(score, settings.percentiles)
+    cluster = np.where(score < low, 0, np.where(score > high, 2, 1))
+    table.insert(1, "score", score)
+    table.insert(2, "cluster", cluster)
+    table.insert(3, "cluster_name", [CLUSTERS[number] for number in cluster])
+    by_name = dict(zip(names, weights.tolist(), strict=True))
+    return StyleResult(table, by_name, (float(low), float(high)))
+
+
+def select_cluster(pairs: PairSet, style: StyleResult, cluster: str) -> PairSet:
+    """Keeps the pairs of the drivers of one cluster and counts the others; `all` keeps every pair.
+
+    Raises:
+        DataError: no driver is in this cluster.
+    """
+    if cluster == "all":
+        return pairs
+    drivers = set(style.table.loc[style.table["cluster_name"] == cluster, "driver"])
+    chosen = pairs.select([pair.driver in drivers for pair in pairs], f"driver is not {cluster}")
+    if not len(chosen):
+        sizes = style.table["cluster_name"].value_counts()
+        counted = ", ".join(f"{sizes.get(name, 0)} {name}" for name in CLUSTERS)
+        raise DataError(
+            f"style.cluster={cluster}: none of the {len(style.table)} drivers is in this cluster"
+            f" ({counted}); give more pairs, another style.cluster, or"
+            " style.percentiles further apart from 0 and 100"
+        )
+    return chosen
+
+
+def indicators(pairs: PairSet) -> pd.DataFrame:
+    """Returns a row per driver with the six indicators, in SI units.
+
+    The space headway is front bumper to front bumper, `x_l - x_s`, as NGSIM's Space_Headway. The
+    time headway is that over the follower's speed, averaged over the frames with a speed of 0.5 m/s
+    or more; for a driver who is never that fast, it is the mean space headway over 0.5 m/s.
+    Variances are those of the population (divided by the number of frames).
+    """
+    parts = [_indicators(some) for some in _by_driver(pairs)]
+    return pd.concat(parts, ignore_index=True)
+
+
+def _by_driver(pairs: PairSet) -> Iterator[list[Pair]]:
+    """Yields the pairs of some drivers, then of some others: frames of all need much memory."""
+    of_driver: dict[str, list[int]] = {}
+    for index, pair in enumerate(pairs.pairs):
+        of_driver.setdefault(pair.driver, []).append(index)
+    some: list[Pair] = []
+    for indices in of_driver.values():
+        some += [pairs[index] for index in indices]
+        if len(some) >= _PAIRS_AT_ONCE:
+            yield some
+            some = []
+            scratch.release()
+    if some:
+        yield some
+
+
+def _indicators(pairs: Sequence[Pair]) -> pd.DataFrame:
+    """Returns the indicators of drivers all of whose pairs are given."""
+    sizes = [len(pair) for pair in pairs]
+    code, drivers = pd.factorize(np.array([pair.driver for pair in pairs], dtype=object))
+    code = np.repeat(code, sizes)
+    speed = np.concatenate([pair.follower_speed for pair in pairs])
+    acceleration = np.concatenate([pair.follower_acceleration for pair in pairs])
+    space = np.concatenate([pair.leader_position - pair.follower_position for pair in pairs])
+    moving = speed >= STANDING_MPS
+    time = np.where(moving, space / np.where(moving, speed, 1.0), 0.0)
+
+    def total(values: Floats) -> Floats:
+        return np.bincount(code, values, len(drivers)).astype(np.float64, copy=False)
+
+    frames = np.bincount(code, minlength=len(drivers))
+    counted = np.bincount(code[moving], minlength=len(drivers))
+    mean_speed = total(speed) / frames
+    mean_acceleration = total(acceleration) / frames
+    mean_space = total(space) / frames
+    mean_time = np.where(
+        counted > 0, total(time) / np.maximum(counted, 1), mean_space / STANDING_MPS
+    )
+    return pd.DataFrame(
+        {
+            "driver": drivers,
+            "mean_speed": mean_speed,
+            "variance_speed": total((speed - mean_speed[code]) ** 2) / frames,
+            "mean_acceleration": mean_acceleration,
+            "variance_acceleration": total((acceleration - mean_acceleration[code]) ** 2) / frames,
+            "mean_space_headway": mean_space,
+            "mean_time_headway": mean_time,
+            "frames": frames,
+            "standing_frames": frames - counted,
+        }
+    )
+
+
+def normalise(raw: Floats, direction: Literal["signed", "printed"] = "signed") -> Floats:
+    """Maps each column of `raw` `(m, n)` to [0, 1], 1 being the most aggressive.
+
+    A constant column becomes 0.
+
+    With `printed`, (max - e) / (max - min) where e < 0 and (e - min) / (max - min) elsewhere, as
+    the paper prints it: a column with both signs is then not monotonic.
+    """
+    low, high = raw.min(axis=0), raw.max(axis=0)
+    extent = high - low
+    # An extent that rounding alone can cause is none.
+    varies = extent > 1e-9 * np.maximum(np.abs(low), np.abs(high)) + 1e-12
+    if direction == "printed":
+        backwards = raw < 0
+    else:
+        signs = np.array([indicator.sign for indicator in INDICATORS])
+        backwards = signs[: raw.shape[1]] < 0
+    rise = np.where(backwards, high - raw, raw - low) / np.where(varies, extent, 1.0)
+    scaled: Floats = np.where(varies, np.clip(rise, 0.0, 1.0), 0.0)
+    return scaled
+
+
+def entropies(normalised: Floats) -> Floats:
+    """Returns the entropy of each column of `(m, n)`, in [0, 1]: 1 is evenly spread.
+
+    ent_j = -(1 / ln m) sum_i p_ij ln p_ij with p_ij = e_ij / sum_i e_ij and 0 ln 0 = 0. A column of
+    zeros (a constant indicator) and a single driver carry no information: 1.
+    """
+    drivers = len(normalised)
+    sums = normalised.sum(axis=0)
+    if drivers < 2:
+        return np.ones(normalised.shape[1])
+    share = normalised / np.where(sums > 0, sums, 1.0)
+    terms = share * np.log(np.where(share > 0, share, 1.0))
+    entropy: Floats = np.where(sums > 0, -terms.sum(axis=0) / np.log(drivers), 1.0)
+    return np.clip(entropy, 0.0, 1.0)
+
+
+def entropy_weights(normalised: Floats) -> Floats:
+    """Returns the weight of each column `(n,)`: not negative, sum 1; 0 for a constant column.
+
+    w_j = (1 - ent_j) / (n - sum_j ent_j). If no indicator varies, as with a single driver, all
+    weigh the same.
+    """
+    information = 1.0 - entropies(normalised)
+    total = float(information.sum())
+    if total <= 0:
+        return np.full(normalised.shape[1], 1.0 / normalised.shape[1])
+    return np.asarray(information / total, dtype=np.float64)

@@ -1,0 +1,317 @@
+"""The tidy pair layout: the door through which any dataset enters.
+
+One row per pair and frame, SI units, a constant time step within a pair, no gaps:
+
+| column | unit | meaning |
+| --- | --- | --- |
+| `recording`, `pair_id` | | names; a pair id is unique in the file |
+| `leader_id`, `follower_id`, `frame` | | as in the source; frames are consecutive |
+| `time_s` | s | |
+| `leader_position_m`, `follower_position_m` | m | front bumper, along the lane |
+| `leader_speed_mps`, `follower_speed_mps` | m/s | |
+| `leader_acceleration_mps2`, `follower_acceleration_mps2` | m/s2 | |
+| `leader_length_m` | m | net gap = leader position - leader length - follower position |
+| `gap_m` | m | optional, the net gap: lengths, positions and accelerations may then be left out |
+| `driver_type`, `leader_driver_type` | | optional labels such as human or acc, one for each pair |
+| `lane` | | optional, one value for each pair |
+| `true_model`, `true_NAME` | | optional: a synthetic driver's model and its parameters over time |
+
+A length of 0 says that the leader's position is that of its rear bumper. See
+`cfx.data.tidy_gaps` for what follows from a column of gaps.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet as pq
+
+from cfx.core import scratch
+from cfx.core.component import Settings
+from cfx.core.errors import DataError, OutputError
+from cfx.core.files import atomic_write
+from cfx.data.base import Dataset, FileDatasetSettings, joined, listed
+from cfx.data.files import PARQUET, FileStart, Floats, Ints
+from cfx.data.pairs import Dropped, Pair, PairSet
+from cfx.data.partitions import are_partitions, of_recording, partitions
+from cfx.data.tidy_checks import check
+from cfx.data.tidy_gaps import time_steps
+from cfx.data.tidy_table import (
+    DRIVER_TYPES,
+    LABELS,
+    LANE,
+    NUMBERS,
+    SIGNAL_COLUMNS,
+    TRUE,
+    TRUE_MODEL,
+    TidyTable,
+    read_table,
+    table_of,
+)
+
+
+class TidyDataset(Dataset):
+    """Pairs in the tidy layout (see the module), from parquet or CSV; gzipped CSV is fine.
+
+    A folder stands for the parquet files in it, one recording each (`cfx.data.partitions`).
+    With `data.recording` the others are not read.
+
+    Rows may be in any order. Several files are read as one: a recording may go on in another file,
+    a pair may not.
+
+    Columns beyond the layout are ignored and counted. Everything else that does not fit is an error
+    that names row and column.
+    """
+
+    layout = "tidy pairs (SI units)"
+    schema: ClassVar[type[Settings]] = FileDatasetSettings
+    settings: FileDatasetSettings
+
+    @classmethod
+    def recognises(cls, start: FileStart) -> bool:
+        if are_partitions(start.path):
+            return True
+        return start.magic == PARQUET or len(set(start.columns) & {*LABELS, *NUMBERS}) >= 3
+
+    def read(self) -> PairSet:
+        files: list[Path] = []
+        for path in self.settings.files():
+            files += partitions(path)
+        files = of_recording(files, self.settings.recording)
+        return joined(read_tidy(file) for file in files)
+
+
+def read_tidy(path: Path) -> PairSet:
+    """Reads a tidy file.
+
+    Raises:
+        DataError: the file cannot be read or does not keep to the layout.
+    """
+    return _pairs(read_table(path))
+
+
+def pairs_from_frame(frame: pd.DataFrame, source: str = "table") -> PairSet:
+    """Takes pairs from a table in the tidy layout.
+
+    Args:
+        source: what messages call the table; its rows are counted from 1.
+
+    Raises:
+        DataError: the table does not keep to the layout.
+    """
+    return _pairs(table_of(frame, source))
+
+
+def _pairs(table: TidyTable) -> PairSet:
+    if not len(table):
+        raise DataError(f"{table.source}: has the right columns but no rows")
+    table, order, starts = check(table)
+    dropped: tuple[Dropped, ...] = ()
+    if table.ignored:
+        reason = f"not part of the layout: {listed(table.ignored)}"
+        dropped = (Dropped(reason, len(table.ignored), "columns"),)
+    return PairSet(tuple(_build(table, order, starts)), table.source, dropped)
+
+
+def _build(table: TidyTable, order: Ints, starts: Ints) -> list[Pair]:
+    """Returns the pairs of a table that was checked.
+
+    Args:
+        order: see `cfx.data.tidy_checks.check`.
+        starts: see there.
+    """
+    numbers = {name: values[order] for name, values in table.numbers.items()}
+    steps = time_steps(numbers["time_s"], starts)
+    ends = np.append(starts[1:], len(order))
+    pairs = []
+    for start, end, step in zip(starts.tolist(), ends.tolist(), steps.tolist(), strict=True):
+        label = _labels_at(table, int(order[start]))
+        truth = {}
+        for name in table.truth_names:
+            if not np.isnan(numbers[name][start]):
+                truth[name.removeprefix(TRUE)] = numbers[name][start:end]
+        lane = None
+        if LANE in numbers and not np.isnan(numbers[LANE][start]):
+            lane = int(numbers[LANE][start])
+        signals: dict[str, Any] = {}
+        for signal, column in SIGNAL_COLUMNS.items():
+            signals[signal] = numbers[column][start:end]
+        pair = Pair(
+            pair_id=label["pair_id"],
+            recording=label["recording"],
+            leader_id=label["leader_id"],
+            follower_id=label["follower_id"],
+            first_frame=int(numbers["frame"][start]),
+            dt=_simplest(step),
+            leader_length=float(numbers["leader_length_m"][start]),
+            **signals,
+            lane=lane,
+            truth=truth,
+            truth_model=label.get(TRUE_MODEL, ""),
+            driver_type=label.get("driver_type", ""),
+            leader_driver_type=label.get("leader_driver_type", ""),
+        )
+        pairs.append(pair)
+    return pairs
+
+
+def _labels_at(table: TidyTable, row: int) -> dict[str, str]:
+    """Returns the names in a row; "" for an empty cell."""
+    found = {}
+    for name, labels in table.labels.items():
+        code = labels.codes[row]
+        found[name] = ""
+        if code >= 0:
+            found[name] = labels.names[code]
+    return found
+
+
+_CAMERAS = tuple(Fraction(1001, 1000 * rate) for rate in (24, 30, 48, 60, 120))
+"""Time steps of television's frame rates, s: 30 frames per second are 29.97."""
+
+
+def _simplest(step: float) -> float:
+    """Returns the time step that a mean of rounded times stands for.
+
+    It is 0.1 for 0.09999999998, 1/30 for 0.0333333, and 1001/30000 for a camera's 29.97 frames per
+    second.
+    """
+    candidates = [Fraction(step).limit_denominator(100), *_CAMERAS]
+    candidates.append(Fraction(step).limit_denominator(10_000))
+    for simple in candidates:
+        if simple > 0 and abs(float(simple) - step) < 1e-6 * step:
+            return float(simple)
+    return step
+
+
+_ATTRIBUTES = {TRUE_MODEL: "truth_model"} | {name: name for name in DRIVER_TYPES}
+"""Optional columns of labels, and the attributes of pairs that they hold."""
+
+_PAIRS_AT_ONCE = 1024
+"""Pairs that are in one table while they are written."""
+
+# --- writing --------------------------------------------------------------------------------------
+
+
+def write_tidy(pairs: PairSet, path: Path | str) -> None:
+    """Writes pairs in the tidy layout.
+
+    Reading the file gives the same pairs to the last bit, truth included. The file appears whole or
+    not at all. `time_s` is frame times time step.
+
+    Args:
+        path: ends in .parquet, .csv or .csv.gz.
+
+    Raises:
+        OutputError: the name ends otherwise, or the file cannot be written.
+    """
+    path = Path(path).expanduser()
+    if not path.name.lower().endswith((".parquet", ".csv", ".csv.gz")):
+        raise OutputError(f"{path}: a tidy file is named .parquet, .csv or .csv.gz")
+    try:
+        with atomic_write(path) as temporary:
+            _write(_tables(pairs), temporary, path.name.lower())
+    except OSError as error:
+        raise OutputError(
+            f"{path}: cannot be written ({error.strerror or error});"
+            " choose another folder or free some space"
+        ) from None
+
+
+def frame_of(pairs: PairSet) -> pd.DataFrame:
+    """Returns pairs as a table in the tidy layout."""
+    frame: pd.DataFrame = pa.concat_tables(_tables(pairs)).to_pandas()
+    return frame
+
+
+def _write(tables: Iterator[Any], temporary: Path, name: str) -> None:
+    """Writes tables with the same columns, one behind the other."""
+    first = next(tables)
+    with ExitStack() as opened:
+        if name.endswith(".parquet"):
+            writer = pq.ParquetWriter(temporary, first.schema, compression="zstd")
+        else:
+            compression = None
+            if name.endswith(".gz"):
+                compression = "gzip"
+            stream = opened.enter_context(pa.output_stream(str(temporary), compression=compression))
+            writer = pa.csv.CSVWriter(stream, first.schema)
+        opened.enter_context(writer)
+        for table in itertools.chain([first], tables):
+            writer.write_table(table)
+
+
+def _tables(pairs: PairSet) -> Iterator[Any]:
+    """Yields pairs as Arrow tables in the tidy layout, some pairs after the other; one at least."""
+    optional = []
+    if any(pair.lane is not None for pair in pairs.pairs):
+        optional.append(LANE)
+    for name, attribute in _ATTRIBUTES.items():
+        if any(getattr(pair, attribute) for pair in pairs.pairs):
+            optional.append(name)
+    truths = _truth_names(pairs)
+    for start in range(0, max(1, len(pairs)), _PAIRS_AT_ONCE):
+        yield _as_table(pairs[start : start + _PAIRS_AT_ONCE], optional, truths)
+        scratch.release()
+
+
+def _as_table(pairs: Sequence[Pair], optional: Sequence[str], truths: Sequence[str]) -> Any:
+    """Returns pairs as an Arrow table in the tidy layout.
+
+    Args:
+        pairs: the rows.
+        optional: columns of labels that only some files have.
+        truths: true parameters.
+    """
+    sizes = [len(pair) for pair in pairs]
+    pair_of_row = pa.array(np.repeat(np.arange(len(sizes)), sizes))
+
+    def per_pair(values: Sequence[Any], kind: Any) -> Any:
+        return pa.array(values, kind).take(pair_of_row)
+
+    frames = [pair.first_frame + np.arange(len(pair)) for pair in pairs]
+    times = []
+    for frame, pair in zip(frames, pairs, strict=True):
+        times.append(np.asarray(frame * pair.dt, np.float64))
+
+    columns: dict[str, Any] = {}
+    for name in LABELS:
+        columns[name] = per_pair([getattr(pair, name) for pair in pairs], pa.string())
+    columns["frame"] = pa.array(np.concatenate([np.zeros(0, np.int64), *frames]), pa.int64())
+    columns["time_s"] = _over_time(times)
+    for signal, column in SIGNAL_COLUMNS.items():
+        columns[column] = _over_time([getattr(pair, signal) for pair in pairs])
+    columns["leader_length_m"] = per_pair([pair.leader_length for pair in pairs], pa.float64())
+    if LANE in optional:
+        columns[LANE] = per_pair([pair.lane for pair in pairs], pa.int64())
+    for name, attribute in _ATTRIBUTES.items():
+        if name in optional:
+            columns[name] = per_pair([getattr(pair, attribute) for pair in pairs], pa.string())
+    for name in truths:
+        values = [pair.truth.get(name, np.full(len(pair), np.nan)) for pair in pairs]
+        columns[TRUE + name] = _over_time(values)
+    return pa.table(columns)
+
+
+def _over_time(arrays: Sequence[Floats]) -> Any:
+    """Returns the values of all pairs one after the other."""
+    return pa.array(np.concatenate([np.zeros(0), *arrays]), pa.float64())
+
+
+def _truth_names(pairs: PairSet) -> list[str]:
+    """Returns the true parameters that any pair has, in the order in which they come."""
+    names: list[str] = []
+    for pair in pairs.pairs:
+        for name in pair.truth:
+            if name not in names:
+                names.append(name)
+    return names

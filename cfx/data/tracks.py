@@ -1,0 +1,341 @@
+"""Tracks of vehicles, and the pairs that they make: one extraction for every such recording."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfx.data.files import Floats, Ints
+from cfx.data.pairs import Dropped, Pair, PairSet
+
+Marks = NDArray[np.bool_]
+
+NOBODY = 0
+"""Stands where no vehicle is ahead."""
+
+SINGLE_FRAME = "a single frame makes no pair"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tracks:
+    """Rows of vehicles, sorted by recording, vehicle and frame, without duplicates.
+
+    Shapes: every array is `(N,)`, in SI units.
+
+    Attributes:
+        source: the file.
+        dt: time step, s.
+        recordings: names.
+        recording: index into `recordings`.
+        vehicle: a number from 1 on, unique within a recording.
+        frame: number of the frame.
+        lane: a number; where it changes, the vehicle has changed lane.
+        leader: number of the vehicle ahead; 0 is none.
+        position: front bumper along the lane, m. Where gaps are recorded, each vehicle may have an
+            origin of its own.
+        speed: m/s.
+        acceleration: m/s2.
+        length: m, one value for each vehicle of a recording.
+        gap: bumper to bumper to the vehicle ahead, m, where the recording gives it; None: it
+            follows from positions, and leaders must be in the follower's lane.
+        driver_type: index into `driver_types`; None: the recording has no such labels.
+        driver_types: labels.
+        names: what vehicle number i is called, at index i; empty: by its number.
+        dropped: what has been left out so far.
+    """
+
+    source: str
+    dt: float
+    recordings: tuple[str, ...]
+    recording: Ints
+    vehicle: Ints
+    frame: Ints
+    lane: Ints
+    leader: Ints
+    position: Floats
+    speed: Floats
+    acceleration: Floats
+    length: Floats
+    gap: Floats | None = None
+    driver_type: Ints | None = None
+    driver_types: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
+    dropped: tuple[Dropped, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.vehicle)
+
+    @property
+    def vehicles(self) -> int:
+        """How many vehicles there are, over all recordings."""
+        return int(np.count_nonzero(changes(self.recording, self.vehicle)))
+
+    def take(self, index: NDArray[Any]) -> Self:
+        """Returns the rows at an index or a mask."""
+        taken = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                taken[field.name] = value[index]
+        return replace(self, **taken)
+
+    def name(self, vehicle: int) -> str:
+        """Returns what a vehicle is called."""
+        if self.names:
+            return self.names[vehicle]
+        return str(vehicle)
+
+    def type_at(self, row: int) -> str:
+        """Returns what drives the vehicle of a row; "" if that is not known."""
+        if self.driver_type is None:
+            return ""
+        return self.driver_types[int(self.driver_type[row])]
+
+
+def extract_pairs(tracks: Tracks, *, max_gap: float | None = None) -> PairSet:
+    """Cuts tracks into leader-follower pairs.
+
+    A pair is a maximal run of consecutive frames in which one vehicle has the same leader and keeps
+    its lane. Only frames count at which the leader's own row exists, in the same lane (unless the
+    recording gives gaps), with its rear bumper ahead of the follower's front bumper, and no farther
+    than `max_gap`. Any other frame ends the run and is counted in `dropped`: every row is in a pair
+    or counted once. `ends` counts why runs end: lane changes of either vehicle, cut-ins, missing
+    rows. Runs of a single frame are no pairs.
+
+    Args:
+        max_gap: m; None: leaders may be anywhere ahead.
+    """
+    facts = _Facts.of(tracks, max_gap)
+    rows = np.flatnonzero(facts.is_following)
+    follower = tracks.take(rows)
+    leader = tracks.take(facts.ahead[rows])
+    starts, sizes = runs(
+        follower.recording,
+        follower.vehicle,
+        follower.leader,
+        follower.lane,
+        follower.frame - np.arange(len(follower)),
+    )
+    is_pair = sizes > 1
+    reasons = {**facts.left_out(), SINGLE_FRAME: sizes < 2}
+    starts, sizes = starts[is_pair], sizes[is_pair]
+    return PairSet(
+        tuple(_build(follower, leader, facts.gap[rows], starts, sizes)),
+        tracks.source,
+        (*tracks.dropped, *counted(reasons, "rows")),
+        counted(_ends(tracks, facts, rows[starts + sizes - 1]), "pairs"),
+    )
+
+
+def counted(reasons: Mapping[str, Marks], unit: str) -> tuple[Dropped, ...]:
+    """Returns how often each reason holds; reasons that never hold are left out."""
+    found = []
+    for reason, holds in reasons.items():
+        count = int(np.count_nonzero(holds))
+        if count:
+            found.append(Dropped(reason, count, unit))
+    return tuple(found)
+
+
+def summed(counts: Sequence[Dropped]) -> tuple[Dropped, ...]:
+    """Returns one count for each reason, in the order in which they first come."""
+    sums: dict[tuple[str, str], int] = {}
+    for one in counts:
+        key = (one.reason, one.unit)
+        sums[key] = sums.get(key, 0) + one.count
+    return tuple(Dropped(reason, count, unit) for (reason, unit), count in sums.items())
+
+
+def changes(*keys: NDArray[Any]) -> Marks:
+    """Returns `(N,)`, True where a row differs from the one before in any key.
+
+    The first row always does.
+    """
+    changed = np.zeros(len(keys[0]), dtype=bool)
+    changed[:1] = True
+    for key in keys:
+        changed[1:] |= key[1:] != key[:-1]
+    return changed
+
+
+def runs(*keys: NDArray[Any]) -> tuple[Ints, Ints]:
+    """Returns where runs of rows with equal keys start, and how many rows each has."""
+    starts = np.flatnonzero(changes(*keys))
+    return starts, np.diff(np.append(starts, len(keys[0])))
+
+
+@dataclass(frozen=True)
+class _Facts:
+    """What is known of each row and the vehicle ahead; every array is `(N,)`.
+
+    Attributes:
+        ahead: index of the leader's row at that frame, 0 where there is none.
+        has_row: whether there is one.
+        in_lane: whether it is in the same lane.
+        gap: m; meaningless where `has_row` is False.
+        max_gap: m.
+    """
+
+    tracks: Tracks
+    ahead: Ints
+    has_row: Marks
+    in_lane: Marks
+    gap: Floats
+    max_gap: float
+
+    @classmethod
+    def of(cls, tracks: Tracks, max_gap: float | None) -> _Facts:
+        ahead, has_row = _rows_of(tracks, tracks.recording, tracks.leader, tracks.frame)
+        if tracks.gap is None:
+            in_lane = has_row & (tracks.lane[ahead] == tracks.lane)
+            gap = tracks.position[ahead] - tracks.length[ahead] - tracks.position
+        else:
+            in_lane = has_row
+            gap = tracks.gap
+        if max_gap is None:
+            max_gap = np.inf
+        return cls(tracks, ahead, has_row, in_lane, gap, max_gap)
+
+    @property
+    def is_behind(self) -> Marks:
+        """Whether the leader's rear bumper is not ahead of the follower's front bumper."""
+        return self.in_lane & ~(self.gap > 0)
+
+    @property
+    def is_far(self) -> Marks:
+        """Whether the leader is farther than any that counts."""
+        return self.in_lane & (self.gap > self.max_gap)
+
+    @property
+    def is_following(self) -> Marks:
+        """Whether the row belongs to a pair."""
+        return self.in_lane & ~self.is_behind & ~self.is_far
+
+    def left_out(self) -> dict[str, Marks]:
+        """Returns the rows that belong to no pair, by reason."""
+        has_leader = self.tracks.leader != NOBODY
+        return {
+            "no vehicle ahead": ~has_leader,
+            "the vehicle ahead has no row at that frame": has_leader & ~self.has_row,
+            "the vehicle ahead is in another lane": self.has_row & ~self.in_lane,
+            "the leader is behind its follower (gap of 0 or less)": self.is_behind,
+            f"the leader is farther than {self.max_gap:g} m": self.is_far,
+        }
+
+
+def _rows_of(tracks: Tracks, recording: Ints, vehicle: Ints, frame: Ints) -> tuple[Ints, Marks]:
+    """Returns where the rows of vehicles at frames are, `(M,)` each.
+
+    Returns:
+        The index of the row, 0 if there is none; and whether there is one.
+    """
+    if not len(tracks) or not len(vehicle):
+        return np.zeros(len(vehicle), dtype=np.int64), np.zeros(len(vehicle), dtype=bool)
+    first = int(min(tracks.frame.min(), frame.min()))
+    frames = int(max(tracks.frame.max(), frame.max())) - first + 1
+    _, ids = np.unique(np.concatenate([tracks.vehicle, vehicle]), return_inverse=True)
+    known, wanted = ids[: len(tracks)], ids[len(tracks) :]
+    vehicles = int(ids.max()) + 1
+    # One number for each recording, vehicle and frame; sorted, as the rows are.
+    keys = (tracks.recording * vehicles + known) * frames + tracks.frame - first
+    asked = (recording * vehicles + wanted) * frames + frame - first
+    at = np.searchsorted(keys, asked)
+    at[at == len(keys)] = 0
+    has_row = (keys[at] == asked) & (vehicle != NOBODY)
+    return np.where(has_row, at, 0), has_row
+
+
+def _ends(tracks: Tracks, facts: _Facts, last: Ints) -> dict[str, Marks]:
+    """Returns why each pair ends, by reason, `(P,)` each.
+
+    Args:
+        last: index of each pair's last row.
+    """
+    after = np.minimum(last + 1, len(tracks) - 1)
+    goes_on = (
+        (tracks.vehicle[after] == tracks.vehicle[last])
+        & (tracks.recording[after] == tracks.recording[last])
+        & (tracks.frame[after] == tracks.frame[last] + 1)
+    )
+    old = tracks.leader[last]
+    at, old_goes_on = _rows_of(tracks, tracks.recording[last], old, tracks.frame[last] + 1)
+    new = tracks.leader[after]
+    has_new = (new != old) & (new != NOBODY)
+    if tracks.gap is None:
+        old_left = tracks.lane[at] != tracks.lane[last]
+    else:
+        # Lanes of different roads cannot be compared: a vehicle that cuts in comes nearer.
+        old_left = has_new & (facts.gap[after] >= facts.gap[last])
+    reasons = {
+        "the follower's rows end or pause": ~goes_on,
+        "the follower changed lane": tracks.lane[after] != tracks.lane[last],
+        "the leader's rows end or pause": ~old_goes_on,
+        "the leader changed lane": old_left,
+        "another vehicle cut in": has_new,
+        "the leader fell behind its follower": facts.is_behind[after],
+        f"the leader went farther than {facts.max_gap:g} m": facts.is_far[after],
+        "the recording names no leader any more": np.ones(len(last), dtype=bool),
+    }
+    return first_of(reasons)
+
+
+def first_of(reasons: Mapping[str, Marks]) -> dict[str, Marks]:
+    """Returns the same reasons; each row has only the first that holds for it."""
+    result = {}
+    is_open: Marks | None = None
+    for reason, holds in reasons.items():
+        if is_open is None:
+            is_open = np.ones(len(holds), dtype=bool)
+        result[reason] = holds & is_open
+        is_open = is_open & ~holds
+    return result
+
+
+def _build(follower: Tracks, leader: Tracks, gap: Floats, starts: Ints, sizes: Ints) -> list[Pair]:
+    """Returns a pair for each run of rows."""
+    position = follower.position
+    if follower.gap is not None:
+        position = leader.position - leader.length - gap
+    pairs: list[Pair] = []
+    seen: dict[str, int] = {}
+    for start, size in zip(starts.tolist(), sizes.tolist(), strict=True):
+        run = slice(start, start + size)
+        recording = follower.recordings[follower.recording[start]]
+        leader_id = leader.name(int(leader.vehicle[start]))
+        follower_id = follower.name(int(follower.vehicle[start]))
+        pair = Pair(
+            pair_id=unique_name(f"{recording}-{follower_id}-{leader_id}", seen),
+            recording=recording,
+            leader_id=leader_id,
+            follower_id=follower_id,
+            first_frame=int(follower.frame[start]),
+            dt=follower.dt,
+            leader_length=float(leader.length[start]),
+            leader_position=leader.position[run],
+            leader_speed=leader.speed[run],
+            leader_acceleration=leader.acceleration[run],
+            follower_position=position[run],
+            follower_speed=follower.speed[run],
+            follower_acceleration=follower.acceleration[run],
+            lane=int(follower.lane[start]),
+            driver_type=follower.type_at(start),
+            leader_driver_type=leader.type_at(start),
+        )
+        pairs.append(pair)
+    return pairs
+
+
+def unique_name(name: str, seen: dict[str, int]) -> str:
+    """Returns a pair's id; the second one of a name ends with -run2.
+
+    Args:
+        seen: how often each name was given; this call counts too.
+    """
+    seen[name] = seen.get(name, 0) + 1
+    if seen[name] > 1:
+        return f"{name}-run{seen[name]}"
+    return name

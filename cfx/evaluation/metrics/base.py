@@ -1,0 +1,194 @@
+"""What a metric is, and what it is given.
+
+Shapes: P pairs, K + 1 frames, n tuned parameters. Frame 0 is the measured state that the simulation
+starts from. SI units.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from cfx.core.component import Component
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from cfx.core.parameters import ParameterSpace
+
+Scope = Literal["test", "steady", "full_trajectory"]
+
+SCOPES: tuple[Scope, ...] = ("test", "steady", "full_trajectory")
+"""Which frames count, in the order in which they are shown.
+
+`test`: the test part. `steady`: the test part after the transient (`TRANSIENT_S`).
+`full_trajectory`: everything from the first frame on, by methods that nothing of these drivers went
+into.
+"""
+
+RECORDED = "real"
+"""The method under which the recorded drivers stand in tables and names of metrics."""
+
+DIRECTIONS = ("lower", "higher", "none")
+SUMMARIES = ("mean", "sum", "min", "max")
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """P simulated trajectories beside the recorded ones, on the same frames.
+
+    A frame that does not count (`counted`) may hold anything, NaN included, and must not matter.
+    The acceleration at a frame is that on the way to it: `(speed[:, k] - speed[:, k - 1]) / dt`.
+    The leader is the recorded one for both, so the difference of two positions of the follower is
+    the difference of the gaps with the other sign.
+
+    Attributes:
+        speed, gap: `(P, K + 1)`, m/s and m, simulated; the gap is bumper to bumper.
+        measured_speed, measured_gap: `(P, K + 1)`, the same as recorded.
+        leader_speed: `(P, K + 1)`, m/s, recorded.
+        parameters: `(P, K + 1, n)`, SI units, what held on the way to each frame; NaN for recorded
+            drivers.
+        counted: `(P, K + 1)` bool, which frames count; frame 0 never does.
+        dt: time step, s.
+        space: the tuned parameters, in the bounds within which they were chosen.
+        at_limits: `(P, K + 1)` bool, frames at a limit of acceleration; None: unknown.
+        outside: `(P, K + 1)` bool, frames outside what a policy has learned from; None: unknown,
+            or no policy drove.
+    """
+
+    speed: Tensor
+    gap: Tensor
+    measured_speed: Tensor
+    measured_gap: Tensor
+    leader_speed: Tensor
+    parameters: Tensor
+    counted: Tensor
+    dt: float
+    space: ParameterSpace
+    at_limits: Tensor | None = None
+    outside: Tensor | None = None
+
+    def counting(self, counted: Tensor) -> Trajectories:
+        """Returns the same trajectories with other frames that count, `(P, K + 1)` bool."""
+        return replace(self, counted=counted)
+
+    def __len__(self) -> int:
+        return len(self.speed)
+
+
+class Metric(Component):
+    """Base of every metric: one number for each pair, and what it means.
+
+    Life cycle: a job makes every metric that is installed (or those that `metrics` names) before
+    any work begins, and calls `compute` for each method and scope when all methods have been
+    simulated. A metric has no settings, so that its name means the same number in every job.
+
+    Attributes:
+        unit: of the number, "" for a ratio.
+        direction: whether "lower" or "higher" numbers are better; "none" where neither is.
+        summary: how the pairs become one number: "mean", "sum", "min" or "max" of those that are
+            defined.
+        heading: of a column, short and without the unit.
+        meaning: one sentence for a reader who knows no other document.
+        scopes: frames for which the summary stands in `metrics.json`, `pairs.csv` and MLflow. The
+            table of all values, `pair_metrics.parquet`, holds every scope.
+        is_error: it is a distance from the recording, and 0 for a simulation without error.
+        is_of_recording: it says something of a recorded driver too, who then stands beside the
+            methods.
+        headline: it is shown in the tables that a job and a sweep print.
+        order: its place in tables; smaller numbers come first.
+    """
+
+    kind = "metric"
+    unit: ClassVar[str]
+    direction: ClassVar[Literal["lower", "higher", "none"]]
+    heading: ClassVar[str]
+    meaning: ClassVar[str]
+    summary: ClassVar[Literal["mean", "sum", "min", "max"]] = "mean"
+    scopes: ClassVar[tuple[Scope, ...]] = ("test",)
+    is_error: ClassVar[bool] = False
+    is_of_recording: ClassVar[bool] = False
+    headline: ClassVar[bool] = True
+    order: ClassVar[int] = 100
+
+    @abstractmethod
+    def compute(self, trajectories: Trajectories) -> Tensor:
+        """Measures P trajectories: pure, batched, over the frames that count.
+
+        Returns:
+            `(P,)` floating point; NaN where the metric is not defined.
+        """
+
+
+@dataclass(frozen=True)
+class MetricInfo:
+    """What tables, figures and reports need to know of a metric; attributes as in `Metric`.
+
+    Attributes:
+        name: under which it was found.
+        scopes: those that `Metric.scopes` names and that were measured.
+        distribution: who brings it.
+    """
+
+    name: str
+    unit: str
+    direction: str
+    summary: str
+    heading: str
+    meaning: str
+    scopes: tuple[str, ...]
+    headline: bool
+    distribution: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns the item of the list `metrics` in `data.json`."""
+        return {**asdict(self), "scopes": list(self.scopes)}
+
+    @property
+    def title(self) -> str:
+        """The heading with its unit: `RMSE speed [m/s]`."""
+        if not self.unit:
+            return self.heading
+        return f"{self.heading} [{self.unit}]"
+
+
+def key_of(metric: str, method: str, scope: str = "test") -> str:
+    """Returns the name of a metric's summary in `metrics.json` and MLflow."""
+    if scope == "test":
+        return f"{metric}/{method}"
+    return f"{scope}/{metric}/{method}"
+
+
+def column_of(metric: str, scope: str = "test") -> str:
+    """Returns the column of `pairs.csv` with a metric of each pair and method."""
+    if scope == "test":
+        return metric
+    return f"{scope}_{metric}"
+
+
+def declared_wrongly(cls: type[Metric]) -> str:
+    """Returns what is wrong with the declarations of a metric's class; "" if nothing is.
+
+    It is the end of a sentence whose subject is the metric.
+    """
+    for name in ("unit", "direction", "heading", "meaning", "summary"):
+        if not isinstance(getattr(cls, name, None), str):
+            return f"must say its `{name}`, a text"
+    for name in ("heading", "meaning"):
+        if not getattr(cls, name).strip():
+            return f"must say its `{name}`: tables explain their columns with it"
+    allowed: Sequence[tuple[str, Sequence[str]]] = (
+        ("direction", DIRECTIONS),
+        ("summary", SUMMARIES),
+    )
+    for name, choices in allowed:
+        if getattr(cls, name) not in choices:
+            return f"says {name}={getattr(cls, name)!r}; choose one of {', '.join(choices)}"
+    unknown = [scope for scope in cls.scopes if scope not in SCOPES]
+    if unknown or not cls.scopes:
+        return f"says scopes={cls.scopes!r}; choose some of {', '.join(SCOPES)}"
+    if cls.schema.model_fields:
+        return "must have no settings, so that its name means the same number in every job"
+    return ""

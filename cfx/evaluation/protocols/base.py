@@ -1,0 +1,338 @@
+"""The contract of a protocol: who is calibrated, trained and tested on what."""
+
+from __future__ import annotations
+
+import logging
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pandas as pd
+import torch
+from torch import Tensor
+
+from cfx.calibration.calibrator import Calibrator, Labels
+from cfx.calibration.objectives.base import Objective
+from cfx.calibration.windows import Windows, WindowSettings
+from cfx.core import registry
+from cfx.core.component import Component
+from cfx.core.engine.base import Engine
+from cfx.core.errors import PluginError
+from cfx.core.parameters import ParameterSpace
+from cfx.data.pairs import PairBatch, PairSet
+from cfx.data.style.result import StyleResult
+from cfx.evaluation.metrics.installed import MetricSet
+from cfx.evaluation.result import Evaluation
+from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingResult
+from cfx.models.residual import TIME
+from cfx.policies.agent import Agent
+from cfx.policies.base import ConstantNetwork, Policy
+from cfx.policies.core import AgentCore, features_read
+from cfx.policies.features import token_width
+from cfx.policies.fixed import FixedPolicy
+from cfx.policies.heads import HEADS, head_name
+from cfx.policies.heads.base import ParameterHead
+from cfx.policies.heads.stochastic import SCALE, StochasticHead
+from cfx.policies.scaler import Scaler
+from cfx.policies.valid_range import recorded_quantiles
+from cfx.simulation.base import Stepper
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ProtocolContext:
+    """Everything that a protocol composes.
+
+    Attributes:
+        pairs, batch: the trajectories, as objects and as tensors on the job's device.
+        style: score and cluster of each driver.
+        simulator: the driving model and its time step.
+        model_node, policy_node: config nodes, kept with the trained policy.
+        calibrator, policy, learner: the components.
+        windows: how trajectories are cut.
+        split: share of each pair's windows for training.
+        seed: for everything random.
+        metrics: what is measured; None: cfx's own metrics.
+        workspace: a folder where interrupted training finds what it needs to go on; None: training
+            begins again.
+    """
+
+    pairs: PairSet
+    batch: PairBatch
+    style: StyleResult
+    simulator: Stepper
+    model_node: Mapping[str, Any]
+    policy_node: Mapping[str, Any]
+    calibrator: Calibrator
+    policy: Policy
+    learner: Learner
+    windows: WindowSettings
+    split: float
+    seed: int
+    workspace: Path | None = None
+    metrics: MetricSet | None = None
+
+    @property
+    def space(self) -> ParameterSpace:
+        """The driving model's parameters."""
+        return self.simulator.model.space
+
+    @property
+    def objective(self) -> Objective:
+        """What calibration minimises and closed-loop training back-propagates."""
+        return self.calibrator.objective
+
+    @property
+    def engine(self) -> Engine:
+        """Where calibration, training and evaluation run."""
+        return self.calibrator.engine
+
+    @cached_property
+    def _recorded(self) -> dict[str, tuple[float, ...]]:
+        """`Agent.recorded` of all agents here."""
+        return recorded_quantiles(self.batch)
+
+    def labels(self, counts: Tensor, fixed: Tensor) -> Labels | None:
+        """Calibrates parameters per window (labels), if the learner needs any.
+
+        Args:
+            counts: `(P,)`, how many windows of each pair, from its first.
+            fixed: `(P, n)`, driver-specific parameters.
+        """
+        if not (self.policy.trainable and self.learner.needs_labels):
+            return None
+        labels = self.calibrator.labels(
+            self.pairs, self.batch, Windows.of(counts, self.windows), fixed
+        )
+        tolerance = self.calibrator.tie_tolerance(self.windows)
+        sensitive = float((labels.sensitivity > tolerance).double().mean())
+        log.info(
+            "Per-window calibrated parameters (labels): %d windows; the choice of parameters"
+            " changes the loss by more than %s in %.0f %% of them",
+            len(labels.windows),
+            self.objective.worded(tolerance),
+            100 * sensitive,
+        )
+        return labels
+
+    def calibration_metrics(
+        self, method: str, last: Tensor, parameters: Tensor, members: Tensor | None = None
+    ) -> dict[str, float]:
+        """Returns mean losses of constant parameters on the data that they were calibrated on.
+
+        The metrics are called `calibration/OBJECTIVE/METHOD`.
+
+        Args:
+            method: what the parameters are called in metrics: `fixed` or `population`.
+            last: `(P,)`, the last frame of each pair's calibrated part.
+            parameters: `(P, n)`, one set per pair; with `members` `(K, n)`, one per group. SI
+                units.
+            members: `(K, P)` bool, the pairs of each group.
+        """
+        losses = self.calibrator.losses(self.batch, last, parameters, members)
+        return {f"calibration/{name}/{method}": loss for name, loss in losses.items()}
+
+    def constant(self, policy: Policy, parameters: Tensor) -> Agent:
+        """Returns an agent of a policy as built, without training: the baselines.
+
+        Args:
+            policy: the component.
+            parameters: `(N, n)`, SI units: what `fixed` answers, and recurrent networks start from;
+                one network for each row.
+        """
+        names = tuple(str(number) for number in range(len(parameters)))
+        return self.ready(policy, self.untrained(policy, parameters), names)
+
+    def constant_with_noise(self, parameters: Tensor, time: Tensor, scale: Tensor) -> Agent:
+        """Returns an agent with constant parameters and auto-regressive noise on the acceleration.
+
+        Args:
+            parameters: `(N, n)`, SI units; one network for each row.
+            time: time constant with which the noise forgets, `(N,)`, s.
+            scale: standard deviation of the noise, `(N,)`, m/s2.
+
+        Raises:
+            ConfigError: the model has equations in a simulator only.
+        """
+        model, device = self.simulator.model, parameters.device
+        head = StochasticHead.for_model(model, device).of_acceleration()
+        complete = head.completed(parameters).clone()
+        for parameter, values in ((TIME, time), (SCALE, scale)):
+            column = head.space.names.index(parameter.name)
+            complete[:, column] = values.clamp(parameter.low, parameter.high)
+        policy = FixedPolicy()
+        width = features_read(policy, head, self.windows.length)
+        blank = complete.new_zeros((len(complete), width))
+        network = ConstantNetwork(head.untrained_answer(complete))
+        return Agent(
+            core=AgentCore(policy, network, Scaler(blank, blank + 1.0), head),
+            model_node=self.model_node,
+            policy_node={"name": "fixed"},
+            windows=self.windows,
+            dt=self.simulator.dt,
+            names=tuple(str(number) for number in range(len(complete))),
+            base=complete,
+        )
+
+    def untrained(self, policy: Policy, parameters: Tensor) -> TrainingResult:
+        """Returns a policy's networks as built; see `constant`.
+
+        They are in double precision, so that constants stay what calibration found.
+        """
+        space = self.simulator.model.space
+        width = token_width(policy.inputs, policy.summary, self.windows.length)
+        unit = space.to_unit(parameters.cpu())
+        network = policy.build(
+            width, space.to_unit(space.defaults()), unit, torch.Generator().manual_seed(self.seed)
+        )
+        scaler = Scaler(unit.new_zeros((len(unit), width)), unit.new_ones((len(unit), width)))
+        device = parameters.device
+        return TrainingResult(
+            network.to(device).eval(),
+            scaler.to(device),
+            pd.DataFrame(columns=CURVE_COLUMNS),
+            head=policy.untrained_head,
+        )
+
+    def ready(
+        self, policy: Policy, training_result: TrainingResult, names: tuple[str, ...]
+    ) -> Agent:
+        """Returns an agent of trained networks; `names` says what each is for.
+
+        Raises:
+            PluginError: the learner or the policy did not deliver such networks.
+        """
+        who = registry.origin(self.learner if policy.trainable else policy)
+        _check_training_result(who, training_result)
+        head = self._head(policy, training_result)
+        _check_networks(who, training_result, len(names), head.answers)
+        # Constant parameters are calibrated on these pairs, too.
+        learned_from = {pair.likeness: pair.driver for pair in self.pairs}
+        return Agent(
+            core=AgentCore(policy, training_result.network, training_result.scaler, head),
+            model_node=self.model_node,
+            policy_node=self.policy_node,
+            windows=self.windows,
+            dt=self.simulator.dt,
+            names=names,
+            base=training_result.base,
+            learned_from=learned_from,
+            valid_range=training_result.valid_range,
+            dispersion=training_result.dispersion,
+            recorded=self._recorded,
+        )
+
+    def _head(self, policy: Policy, training_result: TrainingResult) -> ParameterHead:
+        """Returns the head that the learner trained its networks for."""
+        has_base = training_result.base is not None
+        name = training_result.head or head_name(has_base=has_base)
+        if name not in HEADS:
+            raise PluginError(
+                f"{registry.origin(self.learner)} breaks its contract: there is no head '{name}';"
+                f" write one of {', '.join(HEADS)}"
+            )
+        model = self.simulator.model
+        head = HEADS[name].for_model(model, training_result.scaler.mean.device)
+        if policy.trainable and head.model_space != model.adaptation_space:
+            log.info(
+                "model.adaptation_bounds changes nothing here: this policy answers parameters,"
+                " not offsets (learner=rollout, or learner.head=offset)"
+            )
+        return head
+
+
+@dataclass(frozen=True)
+class ProtocolResult:
+    """What a protocol delivers.
+
+    Attributes:
+        evaluation: the comparison of all methods.
+        policy: the policy that drove in it.
+        curves: learning curves; empty if nothing was learned.
+        labels: per-window calibrated parameters; None if none were needed.
+        calibration: further metrics, of the calibration itself:
+            `ProtocolContext.calibration_metrics`.
+        notes: what a reader of the results should know of the design, name -> a number or text;
+            kept in `data.json`.
+    """
+
+    evaluation: Evaluation
+    policy: Agent
+    curves: pd.DataFrame
+    labels: Labels | None
+    notes: Mapping[str, Any] = field(default_factory=dict)
+    calibration: Mapping[str, float] = field(default_factory=dict)
+
+
+def _check_training_result(who: str, training_result: object) -> None:
+    if not isinstance(training_result, TrainingResult):
+        raise PluginError(
+            f"{who}: fit must return a cfx.TrainingResult, but returned a"
+            f" {type(training_result).__name__}"
+        )
+
+
+@torch.no_grad()
+def _check_networks(
+    who: str, training_result: TrainingResult, networks: int, parameters: int
+) -> None:
+    """Asks the networks about one window, so that a wrong shape or dtype ends in a sentence."""
+    mean = training_result.scaler.mean
+    expected = (networks, 1, 1, parameters)
+    if mean.shape[0] == networks:
+        tokens = mean.new_zeros((networks, 1, 1, mean.shape[1]))
+        state = training_result.network.initial_state(networks, 1)
+        answer, _ = training_result.network(tokens, state)
+        finite = answer.isfinite().all() and mean.isfinite().all()
+        if answer.shape == expected and answer.dtype == mean.dtype and not bool(finite):
+            raise PluginError(
+                f"{who}: its networks answer numbers that are not finite; train with a smaller"
+                " learner.learning_rate, or repair it"
+            )
+        if answer.shape == expected and answer.dtype == mean.dtype:
+            return
+        got = (
+            f"its networks answer {tuple(answer.shape)} in {answer.dtype} where {expected} in"
+            f" {mean.dtype} are wanted"
+        )
+    else:
+        got = f"its scaler is for {mean.shape[0]} networks where {networks} are wanted"
+    raise PluginError(f"{who} breaks its contract: {got}")
+
+
+class Protocol(Component):
+    """Base of every protocol.
+
+    Life cycle: a job calls `determines` and then `run`, once each. All methods are tested on the
+    same frames from the same measured state.
+
+    Attributes:
+        jobs: settings that name the output folders of finished jobs. Where one is the id of an
+            MLflow run, the job puts the folder with that run's files in its place.
+    """
+
+    kind = "protocol"
+    jobs: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def trains(self) -> bool:
+        """Whether it has a `trainable` policy trained; not if it brings one."""
+        return True
+
+    def determines(self) -> Mapping[str, Any]:
+        """Returns what this protocol determines of a job's configuration: key -> value.
+
+        It holds whatever else is chosen there.
+
+        Raises:
+            DataError: it depends on something that cannot be read.
+        """
+        return {}
+
+    @abstractmethod
+    def run(self, context: ProtocolContext) -> ProtocolResult:
+        """Calibrates, trains and evaluates."""

@@ -1,0 +1,201 @@
+"""Folds of a cross-validation over drivers: who is tested in which, and who is learned from.
+
+A pair's fold is a number: k where it is tested in fold k; -1 where it is only learned from; -2 - k
+where it is too short to be tested, but belongs to a driver (platoon, recording) that is tested in
+fold k, so that fold k does not learn from it.
+
+Shapes: P pairs, K folds.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from sklearn.model_selection import GroupKFold
+from torch import Tensor
+
+from cfx.core.errors import DataError
+from cfx.data.pairs import Pair, PairSet
+
+log = logging.getLogger(__name__)
+
+Together = Literal["driver", "platoon", "recording"]
+"""What a fold keeps together."""
+
+
+def assign_folds(
+    pairs: PairSet, folds: int, together: Together, min_frames: int | None, *, seed: int
+) -> Tensor:
+    """Returns the fold of each pair, `(P,)` int64.
+
+    Pairs that are too short to be tested do not change the folds of the others.
+
+    Args:
+        pairs: P pairs.
+        folds: K.
+        together: what a fold keeps together.
+        min_frames: frames that a tested pair has at least; None: all are tested.
+        seed: of the shuffle.
+
+    Raises:
+        DataError: there are fewer drivers (platoons, recordings) than folds.
+    """
+    groups = _GROUPS[together](pairs)
+    tested = []
+    for number, pair in enumerate(pairs):
+        if min_frames is None or len(pair) >= min_frames:
+            tested.append(number)
+    groups_tested = [groups[number] for number in tested]
+    found = len(set(groups_tested))
+    if found < folds:
+        raise DataError(_too_few(pairs, folds, together, min_frames, found))
+    splitter = GroupKFold(folds, shuffle=True, random_state=seed)
+    fold_of_group: dict[Any, int] = {}
+    parts = splitter.split(np.zeros(len(tested)), groups=groups_tested)
+    for fold, (_, part) in enumerate(parts):
+        for index in part:
+            fold_of_group[groups_tested[index]] = fold
+    long_enough = set(tested)
+    assigned = []
+    for number, group in enumerate(groups):
+        if number in long_enough:
+            assigned.append(fold_of_group[group])
+        elif group in fold_of_group:
+            assigned.append(-2 - fold_of_group[group])
+        else:
+            assigned.append(-1)
+    return torch.tensor(assigned)
+
+
+def learned_from(fold: Tensor, folds: int) -> Tensor:
+    """Returns which pairs each network learns from, bool `(K + 1, P)`; the last from all."""
+    number = torch.arange(folds + 1)[:, None]
+    elsewhere = (fold != number) & (fold != -2 - number)
+    return elsewhere | (number == folds)
+
+
+def _too_few(
+    pairs: PairSet, folds: int, together: Together, min_frames: int | None, found: int
+) -> str:
+    what = together if found == 1 else f"{together}s"
+    if min_frames:
+        what += f" with {min_frames} frames or more"
+    more = "recordings" if together == "recording" else "pairs"
+    return (
+        f"protocol.folds={folds}: {pairs.source} has only {found} {what} here; lower protocol.folds"
+        f" (2 at least) or use more {more}"
+    )
+
+
+def _drivers(pairs: PairSet) -> list[str]:
+    return [pair.driver for pair in pairs]
+
+
+def _recordings(pairs: PairSet) -> list[str]:
+    return [pair.recording for pair in pairs]
+
+
+def _platoons(pairs: PairSet) -> list[int]:
+    """Numbers the platoon of each pair: vehicles that follow one another, also through others."""
+    leaders = [_leader(pair) for pair in pairs]
+    followers = _drivers(pairs)
+    vehicles = sorted({*leaders, *followers})
+    number = {vehicle: index for index, vehicle in enumerate(vehicles)}
+    rows = [number[leader] for leader in leaders]
+    columns = [number[follower] for follower in followers]
+    edges = (np.ones(len(rows)), (np.array(rows), np.array(columns)))
+    graph = coo_array(edges, shape=(len(vehicles), len(vehicles)))
+    _, platoon = connected_components(graph, directed=False)
+    return [int(platoon[index]) for index in columns]
+
+
+_GROUPS: Mapping[str, Callable[[PairSet], Sequence[Any]]] = {
+    "driver": _drivers,
+    "platoon": _platoons,
+    "recording": _recordings,
+}
+"""What each pair's fold is chosen for: `protocol.together`."""
+
+
+def _leader(pair: Pair) -> str:
+    return f"{pair.recording}/{pair.leader_id}"
+
+
+def describe_folds(pairs: PairSet, fold: Tensor, *, apart: bool) -> dict[str, Any]:
+    """Counts vehicles that stand on both sides of a fold, though never as followers; logs it.
+
+    Args:
+        pairs: P pairs.
+        fold: `(P,)`, as `assign_folds` returns it.
+        apart: no recording is on both sides.
+
+    Returns:
+        What `data.json` says of the folds.
+    """
+    places = [int(number) for number in fold]
+    fold_of_driver: dict[str, int] = {}
+    for pair, place in zip(pairs, places, strict=True):
+        if place >= 0:
+            fold_of_driver[pair.driver] = place
+    behind_trained, leaders = _on_both_sides(pairs, places, fold_of_driver)
+    folds = max(places) + 1
+    tested = sum(place >= 0 for place in places)
+    recordings = _recordings_per_fold(pairs, places, folds)
+    log.info(
+        "%d folds over %d drivers; %d of %d test pairs follow a driver of the training part,"
+        " %d test drivers lead one there",
+        folds,
+        len(fold_of_driver),
+        behind_trained,
+        tested,
+        len(leaders),
+    )
+    if tested < len(pairs):
+        log.info("%d shorter pairs are only learned from", len(pairs) - tested)
+    if apart:
+        for number, names in enumerate(recordings):
+            text = "Fold %d is tested on %s and learns nothing from there"
+            log.info(text, number, ", ".join(names))
+    in_folds = list(fold_of_driver.values())
+    return {
+        "folds": folds,
+        "recordings_per_fold": recordings,
+        "drivers": len(fold_of_driver),
+        "drivers_per_fold": [in_folds.count(number) for number in range(folds)],
+        "test_pairs_behind_a_training_driver": behind_trained,
+        "test_drivers_who_lead_a_training_pair": len(leaders),
+        "pairs_only_learned_from": len(pairs) - tested,
+    }
+
+
+def _on_both_sides(
+    pairs: PairSet, places: Sequence[int], fold_of_driver: Mapping[str, int]
+) -> tuple[int, set[str]]:
+    """Returns how many test pairs follow a training driver, and the test drivers who lead one."""
+    not_learned_in: dict[str, int] = {}
+    for pair, place in zip(pairs, places, strict=True):
+        not_learned_in[pair.driver] = place if place >= 0 else -2 - place
+    behind_trained = 0
+    leaders = set()
+    for pair, place in zip(pairs, places, strict=True):
+        leader = _leader(pair)
+        if place >= 0 and leader in not_learned_in and not_learned_in[leader] != place:
+            behind_trained += 1
+        leads_in = fold_of_driver.get(leader)
+        if leads_in is not None and place not in {leads_in, -2 - leads_in}:
+            leaders.add(leader)
+    return behind_trained, leaders
+
+
+def _recordings_per_fold(pairs: PairSet, places: Sequence[int], folds: int) -> list[list[str]]:
+    found: list[set[str]] = [set() for _ in range(folds)]
+    for pair, place in zip(pairs, places, strict=True):
+        if place >= 0:
+            found[place].add(pair.recording)
+    return [sorted(names) for names in found]

@@ -1,0 +1,211 @@
+"""The test of unseen drivers, the same for all protocols that have some.
+
+Shapes: Q test pairs, N networks, n tuned parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from cfx.data.pairs import PairBatch, PairSet
+from cfx.evaluation.closed_loop import ClosedLoop
+from cfx.evaluation.evaluate import closed_loop_errors, evaluate
+from cfx.evaluation.platoon import measure_platoons
+from cfx.evaluation.protocols.base import ProtocolContext
+from cfx.evaluation.result import Evaluation, Platoon
+from cfx.evaluation.shards import simulate_in_shards
+from cfx.policies.agent import Agent
+from cfx.policies.default import DefaultPolicy
+from cfx.policies.fixed import FixedPolicy
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Q pairs of drivers from whom nothing was learned, and the methods that are tested on them.
+
+    Attributes:
+        context: what the protocol composes.
+        pairs, batch: the trajectories.
+        network: which of the policy's N networks, and of the pooled sets, each pair is tested with,
+            `(Q,)`.
+        first: the last measured frame before the test part, `(Q,)`.
+        fixed: driver-specific parameters, `(Q, n)`, SI units.
+        base: driver-specific base parameters, `(Q, n)`; None: `unseen_base` for every driver.
+        unseen_base: base parameters of drivers of whom nothing is known, `(Q, n)`.
+        population: pooled parameters, `(N, n)`; None if there are none.
+        policy: what was learned.
+    """
+
+    context: ProtocolContext
+    pairs: PairSet
+    batch: PairBatch
+    network: Tensor
+    first: Tensor
+    fixed: Tensor
+    base: Tensor | None
+    unseen_base: Tensor
+    population: Tensor | None
+    policy: Agent
+
+    @property
+    def drivers(self) -> list[str]:
+        """The driver of each pair, Q of them."""
+        return [pair.driver for pair in self.pairs]
+
+    def evaluation(
+        self, histories: Sequence[float] = (), *, fold: Tensor | None = None
+    ) -> Evaluation:
+        """Simulates all methods and compares them.
+
+        Args:
+            histories: s, other amounts of history to compare, for policies of offsets.
+            fold: in which fold each pair is tested, `(Q,)`; None: there are none.
+        """
+        context = self.context
+        methods = self.methods_without_history()
+        loops = self._test_part(methods)
+        history = None
+        if self.policy.base is not None and histories:
+            history = self.history(histories, loops["fixed"])
+        return evaluate(
+            self.pairs,
+            self.batch,
+            self.first,
+            loops,
+            context.space,
+            context.style,
+            adaptation_space=self.policy.model_space,
+            seed=context.seed,
+            fold=fold,
+            full_trajectory=self._full_trajectory(methods),
+            metrics=context.metrics,
+            agent=self.policy,
+            platoon=self._platoons(methods),
+            history=history,
+        )
+
+    def methods_without_history(self) -> dict[str, Agent]:
+        """Returns the agents that need nothing of a test driver beforehand, by method."""
+        context, networks = self.context, len(self.policy.names)
+        default = context.space.defaults(dtype=self.fixed.dtype, device=self.fixed.device)
+        methods = {
+            "default": context.constant(DefaultPolicy(), default.expand(networks, -1)),
+            "policy": self.policy,
+        }
+        if self.population is not None:
+            methods["population"] = context.constant(FixedPolicy(), self.population)
+        return methods
+
+    def _test_part(self, methods: Mapping[str, Agent]) -> dict[str, ClosedLoop]:
+        """Simulates the test part by all methods."""
+        context, rule = self.context, self.policy.context_rule
+        base = self.unseen_base if self.base is None else self.base
+        loops = {}
+        for name, agent in methods.items():
+            loops[name] = simulate_in_shards(
+                context.engine,
+                context.simulator,
+                agent,
+                self.batch,
+                self.first,
+                self.network,
+                base=base,
+                history=rule.history_s,
+            )
+        loops["fixed"] = self._constant(self.fixed)
+        if self.base is not None and self.policy.base is not None and rule.shrinkage > 0:
+            loops["shrunk"] = self._constant(self.base)
+        return loops
+
+    def _constant(self, parameters: Tensor) -> ClosedLoop:
+        """Simulates the test part with constant parameters of each driver, `(Q, n)`."""
+        agent = self.context.constant(FixedPolicy(), parameters)
+        each = torch.arange(len(self.first), device=self.first.device)
+        return simulate_in_shards(
+            self.context.engine, self.context.simulator, agent, self.batch, self.first, each
+        )
+
+    def _full_trajectory(self, methods: Mapping[str, Agent]) -> dict[str, ClosedLoop]:
+        """Simulates the test trajectories from their first frame on."""
+        begin = torch.zeros_like(self.first)
+        loops = {}
+        for name, agent in methods.items():
+            loops[name] = simulate_in_shards(
+                self.context.engine,
+                self.context.simulator,
+                agent,
+                self.batch,
+                begin,
+                self.network,
+            )
+        return loops
+
+    def _platoons(self, methods: Mapping[str, Agent]) -> Platoon | None:
+        context, names = self.context, self.policy.names
+        default = context.space.defaults(dtype=self.fixed.dtype, device=self.fixed.device)
+        agents: dict[str, tuple[Agent, Sequence[str]]] = {}
+        for name, agent in methods.items():
+            agents[name] = (agent, names)
+        agents["default"] = (context.constant(DefaultPolicy(), default[None]), ("any",))
+        return measure_platoons(context.simulator.model, agents)
+
+    def history(self, histories: Sequence[float], fixed: ClosedLoop) -> pd.DataFrame:
+        """Simulates the test part after different amounts of history; see `Evaluation.history`.
+
+        Args:
+            histories: s; besides them, all there is.
+            fixed: the simulation with driver-specific parameters.
+        """
+        bases = {}
+        if self.base is not None:
+            bases["own"] = self.base
+        bases["population"] = self.unseen_base
+        error_of_fixed, _ = closed_loop_errors(self.batch, self.first, fixed)
+        tables = []
+        for name, values in bases.items():
+            for amount in (*sorted(histories), None):
+                table = self._after_history(values, amount, error_of_fixed)
+                table.insert(2, "base", name)
+                tables.append(table)
+        return pd.concat(tables, ignore_index=True)
+
+    def _after_history(
+        self, base: Tensor, amount: float | None, error_of_fixed: np.ndarray
+    ) -> pd.DataFrame:
+        """Simulates the test part after one amount of history, s; None: all there is."""
+        context = self.context
+        loop = simulate_in_shards(
+            context.engine,
+            context.simulator,
+            self.policy,
+            self.batch,
+            self.first,
+            self.network,
+            base=base,
+            history=amount,
+        )
+        speed, gap = closed_loop_errors(self.batch, self.first, loop)
+        observed = self.first.cpu().numpy() * context.simulator.dt
+        text = f"{100 * context.split:.0f} %"
+        if amount is not None:
+            observed = np.minimum(observed, amount)
+            text = f"{amount:g} s"
+        improvement = np.full_like(error_of_fixed, np.nan)
+        np.divide(error_of_fixed - speed, error_of_fixed, out=improvement, where=error_of_fixed > 0)
+        return pd.DataFrame(
+            {
+                "pair_id": [pair.pair_id for pair in self.pairs],
+                "driver": [pair.driver for pair in self.pairs],
+                "history_s": observed,
+                "amount": text,
+                "rmse_speed": speed,
+                "rmse_gap": gap,
+                "improvement": improvement,
+            }
+        )

@@ -1,0 +1,137 @@
+"""Each driver alone: the first part of each pair to calibrate and train, the rest to test."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from cfx.calibration.windows import Split
+from cfx.core.component import Settings
+from cfx.evaluation.closed_loop import ClosedLoop
+from cfx.evaluation.evaluate import evaluate
+from cfx.evaluation.platoon import measure_platoons
+from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
+from cfx.evaluation.result import Platoon
+from cfx.evaluation.shards import simulate_in_shards
+from cfx.learners.base import TrainingData
+from cfx.policies.agent import Agent
+from cfx.policies.default import DefaultPolicy
+from cfx.policies.fixed import FixedPolicy
+from cfx.policies.placement import ALL, group_by
+
+
+class WithinDriverSettings(Settings):
+    """Settings of `within_driver`."""
+
+    networks: Literal["pair", "all"] = Field(
+        "pair",
+        description="pair: a network for each pair, as in the paper; all: one network for all"
+        " pairs",
+    )
+
+
+class WithinDriver(Protocol):
+    """The paper's first experiment, on each driver alone.
+
+    The first 80 % of each pair's windows serve to calibrate and train, the last 20 % to test. The
+    fixed parameters come from one closed-loop simulation of the training part. The test starts from
+    the last measured state of the training part. No frame of the test part is read before the
+    evaluation.
+    """
+
+    schema: ClassVar[type[Settings]] = WithinDriverSettings
+    settings: WithinDriverSettings
+
+    def run(self, context: ProtocolContext) -> ProtocolResult:
+        pairs, batch = context.pairs, context.batch
+        split = Split.of(pairs, context.windows, context.split)
+        split.check_test_parts(pairs, context.windows, context.split)
+        fixed = context.calibrator.fixed(pairs, batch, split.frame)
+        labels = context.labels(split.windows, fixed)
+        network, names = self._networks(context)
+        if context.policy.trainable:
+            training_data = TrainingData(
+                simulator=context.simulator,
+                recorded=batch,
+                pair=torch.arange(len(batch), device=batch.lengths.device),
+                split=split,
+                windows=context.windows,
+                fixed=fixed,
+                labels=labels,
+                network=network,
+                names=names,
+                seed=context.seed,
+                objective=context.objective,
+                base=fixed if self.settings.networks == "all" else None,
+                drivers=tuple(pair.driver for pair in pairs),
+                workspace=context.workspace,
+                engine=context.engine,
+            )
+            training_result = context.learner.fit(context.policy, training_data)
+        else:
+            training_result = context.untrained(context.policy, fixed)
+        policy = context.ready(context.policy, training_result, names)
+        first = split.frame.to(batch.lengths.device)
+        evaluation = evaluate(
+            pairs,
+            batch,
+            first,
+            _test_part(context, policy, network, first, fixed),
+            context.space,
+            context.style,
+            adaptation_space=policy.model_space,
+            seed=context.seed,
+            platoon=self._platoons(context, policy, fixed),
+            metrics=context.metrics,
+            agent=policy,
+        )
+        return ProtocolResult(
+            evaluation,
+            policy,
+            training_result.curves,
+            labels,
+            calibration=context.calibration_metrics("fixed", split.frame, fixed),
+        )
+
+    def _networks(self, context: ProtocolContext) -> tuple[Tensor, tuple[str, ...]]:
+        """Returns which network learns from each pair `(P,)`, and the networks' names."""
+        pairs, device = context.pairs, context.batch.lengths.device
+        if context.policy.trainable and self.settings.networks == "all":
+            network, names = group_by([ALL] * len(pairs))
+            return network.to(device), names
+        network = torch.arange(len(pairs), device=device)
+        return network, tuple(pair.pair_id for pair in pairs)
+
+    def _platoons(self, context: ProtocolContext, policy: Agent, fixed: Tensor) -> Platoon | None:
+        """Simulates platoons where one network drives any driver; otherwise None."""
+        if self.settings.networks != "all" or not context.policy.trainable:
+            return None
+        default = context.constant(DefaultPolicy(), fixed[:1])
+        agents = {"default": (default, ("any",)), "policy": (policy, policy.names)}
+        return measure_platoons(context.simulator.model, agents)
+
+
+def _test_part(
+    context: ProtocolContext, policy: Agent, network: Tensor, first: Tensor, fixed: Tensor
+) -> dict[str, ClosedLoop]:
+    """Simulates the test part of P pairs by all methods.
+
+    Args:
+        context: what the protocol composes.
+        policy: what was learned.
+        network: which of its networks each pair is tested with, `(P,)`.
+        first: the last measured frame before the test part, `(P,)`.
+        fixed: driver-specific parameters, `(P, n)`.
+    """
+    default = context.constant(DefaultPolicy(), fixed)
+    constant = context.constant(FixedPolicy(), fixed)
+    each = torch.arange(len(first), device=first.device)
+    together = (context.engine, context.simulator)
+    return {
+        "default": simulate_in_shards(*together, default, context.batch, first, each),
+        "fixed": simulate_in_shards(*together, constant, context.batch, first, each),
+        "policy": simulate_in_shards(*together, policy, context.batch, first, network, base=fixed),
+    }

@@ -1,0 +1,472 @@
+"""The agent: what drives in evaluation, in platoons and in SUMO, and what a saved policy is.
+
+An agent is made of three things: a context of each driver (`cfx.policies.context`), networks with
+their scaler and inputs, and a parameter head (both in `cfx.policies.core`). Training through the
+simulation uses the same core on the same grid.
+
+Life cycle for D drivers: `begin` once; `observe` (or `burn_in` over measured history) any number of
+times; then `act` once per window.
+
+Shapes: N networks, D drivers in any order, B drivers of the network that has most, L frames of a
+token, n tuned parameters, c features of conditioning, s width of the networks' state, q numbers
+that a stochastic head keeps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from cfx.calibration.windows import WindowSettings
+from cfx.core import registry
+from cfx.core.errors import DataError, PluginError
+from cfx.core.parameters import ParameterSpace
+from cfx.data.pairs import PairBatch, PairSet
+from cfx.policies.base import Policy, PolicyNetwork
+from cfx.policies.context import UNSEEN, ContextRule, DriverContext
+from cfx.policies.core import AgentCore
+from cfx.policies.driver_features import measure
+from cfx.policies.features import History, measured_history
+from cfx.policies.heads.base import ParameterHead
+from cfx.policies.heads.offset import blended, shrunk
+from cfx.policies.placement import ALL, driver_places
+from cfx.policies.scaler import Scaler
+from cfx.policies.valid_range import SIGNALS, ValidRange, situation_of, weight_of_answer
+from cfx.simulation.base import Stepper
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+class AgentState(NamedTuple):
+    """Where D drivers stand between two windows.
+
+    Attributes:
+        network: which network drives each, `(D,)` int64.
+        place: its place among that network's drivers, `(D,)` int64.
+        state: of the networks, `(N, B, s)`.
+        base: `(D, n)` in unit space; None where the head needs none.
+        conditioning: what networks read of each driver in every window, `(D, c)`.
+        score: how far outside what was learned each was in the last window, `(D,)`; up to 1 is
+            inside. 0 where nothing is known of that.
+        beyond: which signals alone were unusual, too low and then too high, bool `(D, 2 f)`.
+        latent: what a stochastic head keeps of its random numbers, `(D, q)`; 0 before any.
+    """
+
+    network: Tensor
+    place: Tensor
+    state: Tensor
+    base: Tensor | None
+    conditioning: Tensor
+    score: Tensor
+    beyond: Tensor
+    latent: Tensor
+
+    def of(self, drivers: Tensor) -> AgentState:
+        """Returns the state of some of the drivers, each as often as it is named.
+
+        Args:
+            drivers: their indices, `(E,)`.
+        """
+        network = self.network[drivers]
+        place = driver_places(network)
+        shape = (self.state.shape[0], int(place.max()) + 1, *self.state.shape[2:])
+        state = self.state.new_zeros(shape)
+        state[network, place] = self.state[network, self.place[drivers]]
+        base = None
+        if self.base is not None:
+            base = self.base[drivers]
+        return AgentState(
+            network,
+            place,
+            state,
+            base,
+            self.conditioning[drivers],
+            self.score[drivers],
+            self.beyond[drivers],
+            self.latent[drivers],
+        )
+
+
+@dataclass(frozen=True)
+class Agent:
+    """N networks that are ready to drive.
+
+    Attributes:
+        core: the networks with their scaler, inputs and head.
+        model_node, policy_node: config nodes of the driving model and of the policy.
+        windows: how often parameters change, and how many frames a token holds.
+        dt: time step, s.
+        names: what each network was trained for (a pair's id, a fold, or `ALL`), N of them.
+        base: parameters that answers refer to for drivers without a base of their own, `(N, n)`, SI
+            units; None where the head needs none.
+        context_rule: how a driver's context is made.
+        population: pooled parameters calibrated on the drivers that each network learned from,
+            `(N, n)`, SI units; None if there are none.
+        learned_from: the pairs that were learned from or calibrated on: `Pair.likeness` and the
+            driver's name.
+        recorded: quantiles (5, 50, 95 %) of speed (m/s), acceleration (m/s2) and time gap (s) of
+            the drivers learned from; empty if they are not known.
+        valid_range: the situations that each network learned from; None if they are not known.
+            Outside, answers fade towards the base, or towards the pooled parameters where the head
+            has no base.
+        dispersion: factor on the noise of each network, `(N,)`, found on drivers kept for
+            validation; None: 1.
+    """
+
+    core: AgentCore
+    model_node: Mapping[str, Any]
+    policy_node: Mapping[str, Any]
+    windows: WindowSettings
+    dt: float
+    names: tuple[str, ...]
+    base: Tensor | None = None
+    context_rule: ContextRule = field(default_factory=ContextRule)
+    population: Tensor | None = None
+    learned_from: Mapping[str, str] = field(default_factory=dict)
+    valid_range: ValidRange | None = None
+    dispersion: Tensor | None = None
+    recorded: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+
+    @property
+    def policy(self) -> Policy:
+        """The component that built the networks."""
+        return self.core.policy
+
+    @property
+    def network(self) -> PolicyNetwork:
+        """The networks."""
+        return self.core.network
+
+    @property
+    def scaler(self) -> Scaler:
+        """Normalises what the networks read."""
+        return self.core.scaler
+
+    @property
+    def head(self) -> ParameterHead:
+        """Makes parameters of answers."""
+        return self.core.head
+
+    @property
+    def space(self) -> ParameterSpace:
+        """The parameters that the agent chooses, with their bounds."""
+        return self.core.head.space
+
+    @property
+    def model_space(self) -> ParameterSpace:
+        """Those of them that the driving model has."""
+        return self.core.head.model_space
+
+    @property
+    def is_stochastic(self) -> bool:
+        """Whether it leaves something to chance."""
+        return self.head.noise_width > 0
+
+    def stepper(self, simulator: Stepper) -> Stepper:
+        """Returns what takes the steps of the model that this agent drives.
+
+        Args:
+            simulator: takes those of the job's driving model.
+
+        Raises:
+            ConfigError: the head needs a model around it, which this simulator does not have.
+        """
+        model = self.head.driven_model(simulator.model)
+        if model is simulator.model:
+            return simulator
+        return simulator.for_model(model)
+
+    def base_of(self, parameters: Tensor) -> Tensor:
+        """Returns the base of drivers with these calibrated parameters, `(D, n)`, SI units.
+
+        Args:
+            parameters: of the driving model, `(D, m)`, SI units.
+        """
+        complete = self.head.completed(parameters)
+        return shrunk(self.space, complete, self.context_rule.shrinkage)
+
+    def driver_features_of(
+        self, batch: PairBatch, until: Tensor, since: Tensor | None = None
+    ) -> Tensor | None:
+        """Measures the driver features of D drivers.
+
+        Args:
+            batch: their D pairs.
+            until: `(D,)`, the frame before which each is measured.
+            since: `(D,)`, the frame from which on; None: the first.
+
+        Returns:
+            `(D, k)`, NaN for drivers of whom too little was measured; None if the policy reads
+            none.
+        """
+        if not self.core.driver_features:
+            return None
+        if since is None:
+            since = torch.zeros_like(until)
+        return measure(batch, self.core.driver_features, self.dt, since, until)
+
+    def begin(self, network: Tensor, context: DriverContext = UNSEEN) -> AgentState:
+        """Returns the state of D drivers before their first window.
+
+        Args:
+            network: which network drives each, `(D,)`.
+            context: what is known of them.
+        """
+        place = driver_places(network)
+        base = self._unit_base(network, context)
+        known = base if base is not None else self.scaler.mean.new_zeros((len(network), 0)).double()
+        features = self._known_features(network, context)
+        state = self.network.initial_state(len(self.names), int(place.max()) + 1)
+        conditioning = self.core.condition(known, features)
+        score = torch.zeros(len(network), dtype=torch.float64, device=network.device)
+        beyond = torch.zeros(
+            (len(network), 2 * len(SIGNALS)), dtype=torch.bool, device=network.device
+        )
+        latent = score.new_zeros((len(network), self.head.latent_width))
+        return AgentState(network, place, state, base, conditioning, score, beyond, latent)
+
+    def observe(self, history: History, state: AgentState, present: Tensor) -> AgentState:
+        """Lets networks see one window of D drivers without acting.
+
+        Args:
+            history: the last `windows.length` frames, `(D, L)` each, SI units.
+            state: where the drivers stand.
+            present: which of them have this window; the others keep their state, bool `(D,)`.
+        """
+        grid = self._features(history, state)
+        seen = torch.zeros(grid.shape[:2], dtype=torch.bool, device=grid.device)
+        seen[state.network, state.place] = present
+        with torch.no_grad():
+            return state._replace(state=self.core.observe(grid, state.state, seen))
+
+    @torch.no_grad()
+    def act(
+        self, history: History, state: AgentState, generator: torch.Generator | None = None
+    ) -> tuple[Tensor, AgentState]:
+        """Chooses the parameters of the next window.
+
+        Outside the situations that were learned from, the answer fades towards the base.
+
+        Args:
+            history: the last `windows.length` frames of D drivers, `(D, L)` each, SI units.
+            state: where they stand.
+            generator: draws, on the CPU, what a stochastic head leaves to chance; None: nothing is
+                drawn.
+
+        Returns:
+            Parameters `(D, n)` in SI units, in the dtype of the history, and the state afterwards.
+        """
+        dtype = history.follower_speed.dtype
+        answers, after = self.core.answer(self._features(history, state), state.state)
+        answer = answers[state.network, state.place].to(dtype)
+        if not bool(answer.isfinite().all()):
+            raise PluginError(
+                f"{registry.origin(self.policy)}: its networks answer numbers that are not finite;"
+                " train with a smaller learner.learning_rate, or repair that policy"
+            )
+        state = self._judged(history, state)
+        unit = self._faded(answer.double(), state).to(dtype)
+        chosen = self.head.measured(self.space.from_unit(unit), history, self.dt)
+        if generator is not None and self.is_stochastic:
+            chosen, state = self._drawn(chosen, state, generator)
+        return chosen, state._replace(state=after)
+
+    def burn_in(
+        self, batch: PairBatch, until: Tensor, state: AgentState, since: Tensor | None = None
+    ) -> AgentState:
+        """Lets networks observe the measured history of D drivers.
+
+        Args:
+            batch: their D pairs.
+            until: `(D,)`, the frame at which each starts to drive; windows that start before it are
+                observed.
+            state: where the drivers stand.
+            since: `(D,)`, the frame from which on; None: the first.
+        """
+        if since is None:
+            since = torch.zeros_like(until)
+        stride = self.windows.stride
+        pairs = torch.arange(len(batch), device=until.device)
+        for first in range(int(since.min()) // stride * stride, int(until.max()), stride):
+            frame = torch.full_like(until, first)
+            history = measured_history(batch, pairs, frame, self.windows.length)
+            state = self.observe(history, state, (frame < until) & (frame >= since))
+        return state
+
+    def predict_frame(self, frame: pd.DataFrame) -> pd.DataFrame:
+        """Chooses parameters for the end of each pair in a tidy table.
+
+        Args:
+            frame: measured history in the tidy pair layout, one or more pairs with the agent's time
+                step.
+
+        Returns:
+            A row per pair: `pair_id` and one column per tuned parameter (SI units), for the window
+            that starts at the pair's last frame. A pair that the agent was trained for is driven by
+            its own network; any other by the only network there is, or the one named `all`.
+
+        Raises:
+            DataError: the table is not in the tidy layout, its time step is another, or it is not
+                clear which network to use.
+        """
+        import pandas as pd
+
+        from cfx.data.tidy import pairs_from_frame
+
+        pairs = pairs_from_frame(frame, source="the table given to the policy")
+        if abs(pairs.dt - self.dt) > 1e-6:
+            raise DataError(
+                f"the policy was trained at time steps of {self.dt:g} s, the table has"
+                f" {pairs.dt:g} s; resample the table"
+            )
+        batch = PairBatch.of(pairs)
+        until = batch.lengths - 1
+        context = DriverContext(driver_features=self.driver_features_of(batch, until))
+        state = self.burn_in(batch, until, self.begin(self.networks_for(pairs), context))
+        everyone = torch.arange(len(batch))
+        now = measured_history(batch, everyone, until, self.windows.length)
+        chosen, _ = self.act(now, state)
+        table = pd.DataFrame(chosen.tolist(), columns=list(self.space.names))
+        table.insert(0, "pair_id", [pair.pair_id for pair in pairs])
+        return table
+
+    def networks_for(self, pairs: PairSet) -> Tensor:
+        """Returns which network drives each pair, `(P,)`.
+
+        Raises:
+            DataError: a pair is none of those that the networks were trained for, and no network is
+                for any driver.
+        """
+        if len(self.names) == 1:
+            return torch.zeros(len(pairs), dtype=torch.int64)
+        numbers = []
+        for pair in pairs:
+            if pair.pair_id in self.names:
+                numbers.append(self.names.index(pair.pair_id))
+            elif ALL in self.names:
+                numbers.append(self.names.index(ALL))
+            else:
+                raise DataError(
+                    f"pair '{pair.pair_id}' has no network of its own among the {len(self.names)}"
+                    " that were trained, one per pair; train with protocol.networks=all or"
+                    " protocol=across_drivers to drive others"
+                )
+        return torch.tensor(numbers)
+
+    def for_unseen_drivers(self) -> Agent:
+        """Returns the agent with one network for any driver: the only one, or the one named `all`.
+
+        Raises:
+            DataError: each network is for a pair of its own.
+        """
+        if len(self.names) == 1:
+            return self
+        if ALL not in self.names:
+            raise DataError(
+                f"the policy has {len(self.names)} networks, one for each of its own pairs, and"
+                " none for others; train one with protocol.networks=all or protocol=across_drivers"
+            )
+        return self.only(torch.tensor([self.names.index(ALL)]))
+
+    def only(self, numbers: Tensor) -> Agent:
+        """Returns the agent with some of its networks, `(M,)` int64, which are numbered anew."""
+
+        def rows(values: Tensor | None) -> Tensor | None:
+            return None if values is None else values[numbers.to(values.device)]
+
+        return replace(
+            self,
+            core=self.core.only(numbers),
+            names=tuple(self.names[number] for number in numbers.tolist()),
+            base=rows(self.base),
+            population=rows(self.population),
+            valid_range=None if self.valid_range is None else self.valid_range.only(numbers),
+            dispersion=rows(self.dispersion),
+        )
+
+    def to(self, device: torch.device) -> Agent:
+        """Moves everything to a device."""
+        return replace(
+            self,
+            core=self.core.to(device),
+            base=None if self.base is None else self.base.to(device),
+            population=None if self.population is None else self.population.to(device),
+            valid_range=None if self.valid_range is None else self.valid_range.to(device),
+            dispersion=None if self.dispersion is None else self.dispersion.to(device),
+        )
+
+    def _drawn(
+        self, chosen: Tensor, state: AgentState, generator: torch.Generator
+    ) -> tuple[Tensor, AgentState]:
+        """Draws the parameters `(D, n)` of a window, SI units, around those that were chosen."""
+        shape = (len(chosen), self.head.noise_width)
+        noise = torch.randn(shape, generator=generator, dtype=torch.float64).to(chosen)
+        if self.dispersion is not None:
+            noise = noise * self.dispersion[state.network, None].to(noise)
+        window_s = self.windows.stride * self.dt
+        drawn, latent = self.head.sampled(chosen, noise, state.latent.to(chosen), window_s)
+        return drawn, state._replace(latent=latent.to(state.latent))
+
+    def _judged(self, history: History, state: AgentState) -> AgentState:
+        """Notes how far outside what was learned the drivers are."""
+        if self.valid_range is None:
+            return state
+        situation = situation_of(history)
+        return state._replace(
+            score=self.valid_range.score(situation, state.network),
+            beyond=self.valid_range.beyond(situation, state.network),
+        )
+
+    def _faded(self, answer: Tensor, state: AgentState) -> Tensor:
+        """Returns the parameters `(D, n)`, in unit space, of answers as far as they are used."""
+        unit = self.head.unit_parameters(answer, state.base)
+        weight = weight_of_answer(state.score)[:, None]
+        fallback = self._fallback(state)
+        if fallback is None or not bool((weight < 1.0).any()):
+            return unit
+        return torch.where(weight < 1.0, blended(fallback, unit, weight), unit)
+
+    def _fallback(self, state: AgentState) -> Tensor | None:
+        """Returns what is driven with far outside, `(D, n)` in unit space; None if nothing is."""
+        if state.base is not None:
+            return state.base
+        if self.population is None:
+            return None
+        population = self.population[state.network].double()
+        return self.space.to_unit(self.head.completed(population))
+
+    def _unit_base(self, network: Tensor, context: DriverContext) -> Tensor | None:
+        """Returns the drivers' base in unit space, `(D, n)`, in double precision."""
+        if not self.head.needs_base:
+            return None
+        base = context.base
+        if base is None:
+            if self.base is None:
+                raise ValueError(f"the {self.head.name} head needs a base, and this agent has none")
+            base = self.base[network]
+        return self.space.to_unit(self.head.completed(base.double()))
+
+    def _known_features(self, network: Tensor, context: DriverContext) -> Tensor | None:
+        """Returns driver features `(D, k)`, the training drivers' mean where they are unknown."""
+        count = len(self.core.driver_features)
+        if count == 0:
+            return None
+        usual = self.scaler.mean[network, -count:].double()
+        features = context.driver_features
+        if features is None:
+            return usual
+        return torch.where(features.isnan(), usual, features.to(usual))
+
+    def _features(self, history: History, state: AgentState) -> Tensor:
+        """Returns what the networks read, `(N, B, f + c)`, not normalised; 0 at empty places."""
+        seen = self.core.encode(history)
+        features = torch.cat([seen, state.conditioning.to(seen.dtype)], -1)
+        networks, drivers, _ = state.state.shape
+        grid = self.scaler.mean.new_zeros((networks, drivers, features.shape[-1]))
+        grid[state.network, state.place] = features.to(grid.dtype)
+        return grid

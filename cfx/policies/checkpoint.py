@@ -1,0 +1,257 @@
+"""Saved policies: an agent in a folder.
+
+`policy.json` holds everything that is text or a number, `policy.safetensors` the tensors: neither
+can hold code.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from safetensors import SafetensorError
+from torch import Tensor
+
+from cfx.calibration.windows import WindowSettings
+from cfx.core import registry
+from cfx.core.errors import ConfigError, DataError, ParameterError
+from cfx.core.files import atomic_write
+from cfx.core.job_folder import examine, parse_json
+from cfx.models.base import DrivingModel
+from cfx.policies.agent import Agent
+from cfx.policies.base import Policy
+from cfx.policies.context import ContextRule
+from cfx.policies.core import AgentCore, features_read, network_with_weights
+from cfx.policies.heads import HEADS
+from cfx.policies.heads.base import ParameterHead
+from cfx.policies.scaler import Scaler
+from cfx.policies.valid_range import SIGNALS, ValidRange
+
+_FORMAT = 3
+
+_DESCRIPTION = "policy.json"
+_TENSORS = "policy.safetensors"
+
+_RANGE = "valid_range."
+"""What names of tensors of the valid range begin with."""
+
+
+def save(agent: Agent, folder: Path) -> None:
+    """Writes `policy.safetensors` and `policy.json`; each appears whole.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    tensors = {name: value.contiguous() for name, value in _tensors(agent).items()}
+    with atomic_write(folder / _TENSORS) as temporary:
+        temporary.write_bytes(safetensors.torch.save(tensors))
+    with atomic_write(folder / _DESCRIPTION) as temporary:
+        text = json.dumps(_description(agent), indent=2)
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def load(folder: Path | str) -> Agent:
+    """Reads what `save` wrote, on the CPU.
+
+    Raises:
+        DataError: the folder holds no policy, or one of another format.
+        PluginError: the model or the policy is not installed.
+    """
+    folder = Path(folder)
+    examine(folder)
+    written, weights = _read(folder)
+    description = _validated(folder, written)
+    try:
+        policy = registry.create("policy", description.policy)
+        model = registry.create("model", description.model)
+    except (ConfigError, ParameterError) as error:
+        raise DataError(f"{folder}/{_DESCRIPTION}: {error}") from None
+    assert isinstance(policy, Policy)
+    assert isinstance(model, DrivingModel)
+    policy = policy.for_model(model, description.dt, description.windows)
+    head = _head(folder, description, model)
+    try:
+        return _agent(description, weights, policy, head)
+    except (ValueError, KeyError, TypeError, IndexError, AttributeError, RuntimeError) as error:
+        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        raise DataError(f"{folder}: the weights do not fit the description ({reason})") from error
+
+
+class _Description(BaseModel):
+    """What `policy.json` must hold."""
+
+    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
+
+    policy: dict[str, Any]
+    model: dict[str, Any]
+    windows: WindowSettings
+    dt: float = Field(gt=0, le=100)
+    names: tuple[str, ...] = Field(min_length=1)
+    parameters: tuple[str, ...] = Field(min_length=1)
+    head: str
+    ensemble_size: int = Field(ge=1, le=64)
+    own: bool
+    shrinkage: float = Field(ge=0, le=1)
+    history: float | None = Field(ge=0)
+    learned_from: dict[str, str]
+    recorded: dict[str, tuple[float, ...]]
+
+
+def _validated(folder: Path, written: Mapping[str, Any]) -> _Description:
+    try:
+        return _Description.model_validate(written)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise DataError(
+            f"{folder}/{_DESCRIPTION}: {key}: {first['msg']}; give a folder that a job has written"
+        ) from None
+
+
+def _agent(
+    description: _Description,
+    weights: Mapping[str, Tensor],
+    policy: Policy,
+    head: ParameterHead,
+) -> Agent:
+    """Puts an agent together.
+
+    Raises:
+        ValueError, KeyError, RuntimeError and others: the weights do not fit.
+    """
+    scaler = Scaler(weights["scaler.mean"], weights["scaler.scale"])
+    expected = features_read(policy, head, description.windows.length)
+    networks, found = scaler.mean.shape
+    if found != expected:
+        raise ValueError(
+            f"the weights read {found} features, the policy's settings give {expected}"
+        )
+    if networks != len(description.names) or scaler.scale.shape != scaler.mean.shape:
+        raise ValueError(f"there are weights of {networks} networks")
+    if head.needs_base and "base" not in weights:
+        raise ValueError(f"the head '{head.name}' needs 'base'")
+    widths = {"base": len(head.space), "population": len(head.model_space)}
+    for name, width in widths.items():
+        if name in weights and weights[name].shape != (networks, width):
+            raise ValueError(f"'{name}' has the shape {tuple(weights[name].shape)}")
+    if "dispersion" in weights and weights["dispersion"].shape != (networks,):
+        raise ValueError(f"'dispersion' has the shape {tuple(weights['dispersion'].shape)}")
+    for name, value in weights.items():
+        if not bool(value.isfinite().all()):
+            raise ValueError(f"'{name}' holds a number that is not finite")
+    trained = {}
+    for name, value in weights.items():
+        if name.startswith("network."):
+            trained[name.removeprefix("network.")] = value
+    network = network_with_weights(policy, trained, description.ensemble_size, scaler, head.answers)
+    return Agent(
+        core=AgentCore(policy, network, scaler, head),
+        model_node=description.model,
+        policy_node=description.policy,
+        windows=description.windows,
+        dt=description.dt,
+        names=description.names,
+        base=weights.get("base"),
+        context_rule=ContextRule(
+            driver_specific=description.own,
+            shrinkage=description.shrinkage,
+            history_s=description.history,
+        ),
+        population=weights.get("population"),
+        learned_from=description.learned_from,
+        valid_range=_valid_range(weights),
+        dispersion=weights.get("dispersion"),
+        recorded=description.recorded,
+    )
+
+
+def _tensors(agent: Agent) -> dict[str, Tensor]:
+    tensors = {}
+    for name, value in agent.network.state_dict().items():
+        tensors[f"network.{name}"] = value.cpu()
+    for name, value in agent.scaler.state_dict().items():
+        tensors[f"scaler.{name}"] = value.cpu()
+    if agent.base is not None:
+        tensors["base"] = agent.base.cpu()
+    if agent.population is not None:
+        tensors["population"] = agent.population.cpu()
+    if agent.dispersion is not None:
+        tensors["dispersion"] = agent.dispersion.cpu()
+    if agent.valid_range is not None:
+        for name, value in agent.valid_range.state_dict().items():
+            tensors[f"{_RANGE}{name}"] = value.cpu()
+    return tensors
+
+
+def _valid_range(weights: Mapping[str, Tensor]) -> ValidRange | None:
+    found = {}
+    for name, value in weights.items():
+        if name.startswith(_RANGE):
+            found[name.removeprefix(_RANGE)] = value
+    if not found:
+        return None
+    valid_range = ValidRange(**found)
+    networks, signals = len(weights["scaler.mean"]), len(SIGNALS)
+    expected = [
+        (networks, signals),
+        (networks, signals, signals),
+        (networks,),
+        (networks, signals),
+        (networks, signals),
+    ]
+    if [tuple(value.shape) for value in valid_range.state_dict().values()] != expected:
+        raise ValueError("the valid range has another shape")
+    return valid_range
+
+
+def _description(agent: Agent) -> dict[str, Any]:
+    rule = agent.context_rule
+    return {
+        "format": _FORMAT,
+        "policy": dict(agent.policy_node),
+        "model": dict(agent.model_node),
+        "parameters": list(agent.space.names),
+        "head": agent.head.name,
+        "windows": agent.windows.model_dump(),
+        "dt": agent.dt,
+        "names": list(agent.names),
+        "ensemble_size": agent.core.ensemble_size,
+        "shrinkage": rule.shrinkage,
+        "own": rule.driver_specific,
+        "history": rule.history_s,
+        "learned_from": dict(agent.learned_from),
+        "recorded": {name: list(values) for name, values in agent.recorded.items()},
+    }
+
+
+def _read(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    try:
+        text = (folder / _DESCRIPTION).read_text(encoding="utf-8")
+        description = parse_json(text)
+        if not isinstance(description, dict):
+            raise ValueError(f"{_DESCRIPTION} is no JSON object")
+        weights = safetensors.torch.load((folder / _TENSORS).read_bytes())
+    except (OSError, ValueError, RuntimeError, SafetensorError) as error:
+        raise DataError(
+            f"{folder} holds no policy that can be read ({error}); give a job's folder"
+        ) from error
+    if description.get("format") != _FORMAT:
+        raise DataError(
+            f"{folder}/{_DESCRIPTION} has format {description.get('format')}; this version of cfx"
+            f" reads format {_FORMAT}"
+        )
+    return description, weights
+
+
+def _head(folder: Path, description: _Description, model: DrivingModel) -> ParameterHead:
+    if description.head not in HEADS:
+        raise DataError(
+            f"{folder}/{_DESCRIPTION}: this version of cfx has no head '{description.head}'; it has"
+            f" {', '.join(HEADS)}"
+        )
+    return HEADS[description.head].for_model(model)

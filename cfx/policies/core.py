@@ -1,0 +1,170 @@
+"""Networks on a grid: what training through the simulation, evaluation and live drivers share.
+
+Shapes: N networks, D drivers of each, L frames of a token, f features of a token, c features of
+conditioning, n tuned parameters, s width of the policy's state. `*batch` are any leading
+dimensions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from cfx.policies.base import Policy, PolicyNetwork
+from cfx.policies.ensemble import Ensemble
+from cfx.policies.features import History, token_width, tokens
+from cfx.policies.heads.base import ParameterHead
+from cfx.policies.scaler import Scaler
+
+
+class AgentCore:
+    """N networks with their scaler, their inputs and their head, as pure functions of tensors.
+
+    `network` and `scaler` are shared, not copied. State is passed in and returned, never kept.
+
+    Attributes:
+        policy: the component that built the networks.
+        network: the networks.
+        scaler: normalises what the networks read: tokens, then the head's conditioning on the base,
+            then driver features.
+        head: makes parameters of answers.
+        inputs, summary, driver_features: what the networks read, as the policy's settings say.
+    """
+
+    def __init__(
+        self, policy: Policy, network: PolicyNetwork, scaler: Scaler, head: ParameterHead
+    ) -> None:
+        self.policy = policy
+        self.network = network
+        self.scaler = scaler
+        self.head = head
+        self.inputs = policy.inputs
+        self.summary = policy.summary
+        self.driver_features = policy.driver_features
+
+    @property
+    def ensemble_size(self) -> int:
+        """How many networks answer together."""
+        return ensemble_size(self.network)
+
+    def to(self, device: torch.device) -> AgentCore:
+        """Returns the same core on a device; networks and scaler are moved, not copied."""
+        return AgentCore(
+            self.policy, self.network.to(device), self.scaler.to(device), self.head.to(device)
+        )
+
+    def only(self, numbers: Tensor) -> AgentCore:
+        """Returns the core of some of the N networks, `(M,)` int64."""
+        at = numbers.to(self.scaler.mean.device)
+        scaler = Scaler(self.scaler.mean[at], self.scaler.scale[at])
+        size = self.ensemble_size
+        members = (at[:, None] * size + torch.arange(size, device=at.device)).flatten()
+        weights = {}
+        for name, value in self.network.state_dict().items():
+            weights[name] = value[members]
+        network = network_with_weights(self.policy, weights, size, scaler, self.head.answers)
+        return AgentCore(self.policy, network.to(at.device), scaler, self.head)
+
+    def condition(self, base: Tensor, driver_features: Tensor | None) -> Tensor:
+        """Returns what networks read of drivers in every window.
+
+        Args:
+            base: `(*batch, n)` in unit space; heads without a base ignore it.
+            driver_features: `(*batch, k)`, all known; None where the policy has none.
+
+        Returns:
+            `(*batch, c)` in the dtype of the base, not normalised.
+        """
+        conditioning = self.head.condition(base)
+        if driver_features is None or driver_features.shape[-1] == 0:
+            return conditioning
+        return torch.cat([conditioning, driver_features.to(base.dtype)], -1)
+
+    def encode(self, history: History) -> Tensor:
+        """Returns tokens `(*batch, f)` of recent frames `(*batch, L)`."""
+        return tokens(history, self.inputs, self.summary)
+
+    def answer(self, features: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Asks the networks about one window.
+
+        Args:
+            features: token and conditioning, `(N, D, f + c)`, not normalised.
+            state: `(N, D, s)`.
+
+        Returns:
+            Answers `(N, D, n)` in [0, 1] and the networks' state afterwards.
+        """
+        answer, after = self.network(self.scaler(features[:, :, None]), state)
+        return answer[:, :, 0], after
+
+    def observe(self, features: Tensor, state: Tensor, present: Tensor) -> Tensor:
+        """Lets the networks see one window without acting.
+
+        Args:
+            features: token and conditioning, `(N, D, f + c)`, not normalised.
+            state: `(N, D, s)`.
+            present: which drivers have this window; the others keep their state, bool `(N, D)`.
+
+        Returns:
+            The networks' state afterwards.
+        """
+        after = self.network.observe(self.scaler(features[:, :, None]), state)
+        return torch.where(present[..., None], after, state)
+
+    def act(
+        self, history: History, base: Tensor, conditioning: Tensor, state: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Chooses the parameters of the next window in the networks' own precision.
+
+        Args:
+            history: the last L frames, `(N, D, L)` each, SI units.
+            base: `(N, D, n)` in unit space.
+            conditioning: as `condition` returns it, `(N, D, c)`.
+            state: `(N, D, s)`.
+
+        Returns:
+            Parameters `(N, D, n)` in unit space and the networks' state afterwards.
+        """
+        features = torch.cat([self.encode(history), conditioning], -1)
+        answer, after = self.answer(features, state)
+        return self.head.unit_parameters(answer, base), after
+
+
+def ensemble_size(network: PolicyNetwork) -> int:
+    """Returns how many networks answer together; 1 where each answers alone."""
+    if isinstance(network, Ensemble):
+        return network.size
+    return 1
+
+
+def features_read(policy: Policy, head: ParameterHead, length: int) -> int:
+    """Returns how many features a policy's networks read where a token holds `length` frames."""
+    token = token_width(policy.inputs, policy.summary, length)
+    return token + head.width + len(policy.driver_features)
+
+
+def network_with_weights(
+    policy: Policy, weights: Mapping[str, Tensor], size: int, scaler: Scaler, parameters: int
+) -> PolicyNetwork:
+    """Builds a policy's networks and gives them saved weights.
+
+    Args:
+        policy: the component that builds them.
+        weights: their state dict.
+        size: networks of an ensemble.
+        scaler: of N networks; says how many there are and what they read.
+        parameters: n.
+
+    Returns:
+        N networks in evaluation mode, in the precision of the scaler.
+    """
+    networks, features = scaler.mean.shape
+    blank = torch.zeros((networks * size, parameters), dtype=scaler.mean.dtype)
+    network = policy.build(features, blank[0], blank, torch.Generator().manual_seed(0))
+    network = network.to(blank.dtype)
+    if size > 1:
+        network = Ensemble(network, size)
+    network.load_state_dict(dict(weights))
+    return network.eval()

@@ -1,0 +1,228 @@
+"""What an agent has learned from, and how far a situation lies outside it.
+
+A situation is five signals: the follower's speed and acceleration, the leader's acceleration, the
+relative speed and the logarithm of the gap. Its score is its Mahalanobis distance from those that
+were learned from (P. C. Mahalanobis 1936, On the generalised distance in statistics), over the
+distance that all but a few of them keep to: up to 1 it counts as inside. So a speed is judged
+together with its gap, which minimum and maximum of each alone would not do.
+
+Outside, an agent's answer fades towards the base parameters and has faded altogether at a score of
+`FADED`.
+
+Shapes: N networks, D drivers, S situations, f = 5 signals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cfx.data.pairs import PairBatch
+from cfx.policies.features import History
+
+FADED = 2.5
+"""Score from which on nothing is left of an agent's answer. Nearer bounds are worse: mixtures of an
+answer and the base can be worse than either, and just outside the answers are still good."""
+
+SIGNALS = (
+    "follower_speed",
+    "follower_acceleration",
+    "leader_acceleration",
+    "relative_speed",
+    "log_gap",
+)
+"""The signals of a situation."""
+
+_WORDS = ("speed", "acceleration", "leader's acceleration", "relative speed", "gap")
+_UNITS = ("m/s", "m/s2", "m/s2", "m/s", "m")
+
+_INSIDE = 0.995
+"""Share of the situations learned from that lie inside."""
+
+_EXTREMES = (0.001, 0.999)
+"""Quantiles between which a single signal counts as usual, for naming what is unusual."""
+
+_RECORDED = (0.05, 0.5, 0.95)
+"""Quantiles of recordings that are kept, to be set beside live traffic."""
+
+_MOST_PAIRS = 4096
+"""Pairs whose recordings are looked at for these quantiles."""
+
+_WALKING_MPS = 1.5
+"""Speed below which a time gap means nothing."""
+
+_LEAST_VARIANCE = 1e-6
+"""Added to variances, so that a signal that never changes does no harm."""
+
+
+@dataclass(frozen=True)
+class ValidRange:
+    """The situations that each of N networks learned from.
+
+    Attributes:
+        mean: `(N, f)`.
+        precision: inverse covariance, `(N, f, f)`.
+        distance: Mahalanobis distance that counts as 1, `(N,)`.
+        low, high: usual values of each signal alone, `(N, f)`.
+    """
+
+    mean: Tensor
+    precision: Tensor
+    distance: Tensor
+    low: Tensor
+    high: Tensor
+
+    @classmethod
+    def of(cls, situations: Sequence[Tensor]) -> ValidRange:
+        """Measures situations `(S, f)` of each network, in double precision."""
+        found = []
+        for learned in situations:
+            found.append(_measured(learned.double()))
+        return cls(*(torch.stack(column) for column in zip(*found, strict=True)))
+
+    def score(self, situation: Tensor, network: Tensor) -> Tensor:
+        """Returns how far outside situations lie, `(D,)`; up to 1 is inside.
+
+        Args:
+            situation: `(D, f)`.
+            network: whose range each is compared with, `(D,)`.
+        """
+        away = situation.to(self.mean) - self.mean[network]
+        squared = torch.einsum("di,dij,dj->d", away, self.precision[network], away)
+        return squared.clamp(min=0.0).sqrt() / self.distance[network]
+
+    def beyond(self, situation: Tensor, network: Tensor) -> Tensor:
+        """Says which signals alone are unusual, bool `(D, 2 f)`: too low, then too high."""
+        value = situation.to(self.mean)
+        return torch.cat([value < self.low[network], value > self.high[network]], -1)
+
+    def only(self, numbers: Tensor) -> ValidRange:
+        """Returns the ranges of some of the N networks, `(M,)` int64."""
+        return ValidRange(*(value[numbers.to(value.device)] for value in self._tensors()))
+
+    def to(self, device: torch.device) -> ValidRange:
+        """Returns the same on a device."""
+        return ValidRange(*(value.to(device) for value in self._tensors()))
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Returns the tensors by name."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def _tensors(self) -> list[Tensor]:
+        return list(self.state_dict().values())
+
+
+def situation_of(history: History) -> Tensor:
+    """Returns the situations at the last frame of histories `(*batch, L)`, `(*batch, f)`."""
+    speed = history.follower_speed[..., -1]
+    return stacked(
+        speed,
+        history.follower_acceleration[..., -1],
+        history.leader_acceleration[..., -1],
+        history.leader_speed[..., -1],
+        history.gap[..., -1],
+    )
+
+
+def stacked(
+    speed: Tensor,
+    acceleration: Tensor,
+    leader_acceleration: Tensor,
+    leader_speed: Tensor,
+    gap: Tensor,
+) -> Tensor:
+    """Returns situations `(*batch, f)` of signals `(*batch,)` each, SI units."""
+    log_gap = torch.log(gap.clamp(min=0.0) + 1.0)
+    signals = [speed, acceleration, leader_acceleration, leader_speed - speed, log_gap]
+    return torch.stack(signals, -1)
+
+
+def weight_of_answer(score: Tensor) -> Tensor:
+    """Returns how much of an agent's answer is used at these scores, 1 to 0, `(*batch,)`."""
+    return ((FADED - score) / (FADED - 1.0)).clamp(0.0, 1.0)
+
+
+def recorded_quantiles(batch: PairBatch) -> dict[str, tuple[float, ...]]:
+    """Returns quantiles of what recorded drivers do: see `Agent.recorded`.
+
+    Of very many pairs only some are looked at, which are spread evenly over all.
+    """
+    if len(batch) > _MOST_PAIRS:
+        chosen = torch.linspace(0, len(batch) - 1, _MOST_PAIRS).round().long()
+        batch = batch[chosen.to(batch.lengths.device)]
+    speed = batch.follower_speed[batch.mask]
+    moves = speed > _WALKING_MPS
+    signals = {
+        "speed": speed,
+        "acceleration": batch.follower_acceleration[batch.mask],
+        "time_gap": batch.gap[batch.mask][moves] / speed[moves],
+    }
+    found = {}
+    for name, values in signals.items():
+        quantiles: tuple[float, ...] = ()
+        if len(values):
+            quantiles = tuple(_quantiles(values, _RECORDED).tolist())
+        found[name] = quantiles
+    return found
+
+
+def share_in_words(valid_range: ValidRange, outside: int, steps: int, beyond: Tensor) -> str:
+    """Returns how many steps were outside and why, in words; "" if none was.
+
+    Args:
+        valid_range: of one network or more; the first is quoted.
+        outside: steps outside.
+        steps: all steps.
+        beyond: as `in_words` takes it.
+    """
+    if outside == 0:
+        return ""
+    share = 100 * outside / steps
+    number = f"{share:.0f}" if share >= 1 else f"{share:.1g}"
+    reason = in_words(valid_range, beyond)
+    if reason:
+        reason = f" ({reason})"
+    return f"{number} % of steps outside what the policy has learned{reason}"
+
+
+def in_words(valid_range: ValidRange, beyond: Tensor) -> str:
+    """Returns what was unusual most often: "speed above 18 m/s"; "" if no signal alone was.
+
+    Args:
+        valid_range: of one network or more; the first is quoted.
+        beyond: how often each signal alone was too low, then too high, `(2 f,)`.
+    """
+    if float(beyond.sum()) == 0:
+        return ""
+    signal = int(beyond.argmax())
+    side, bounds = "below", valid_range.low[0]
+    if signal >= len(SIGNALS):
+        side, bounds, signal = "above", valid_range.high[0], signal - len(SIGNALS)
+    bound = float(bounds[signal])
+    if SIGNALS[signal] == "log_gap":
+        bound = float(torch.expm1(bounds[signal]))
+    return f"{_WORDS[signal]} {side} {bound:.3g} {_UNITS[signal]}"
+
+
+def _measured(learned: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    mean = learned.mean(0)
+    away = learned - mean
+    covariance = away.T @ away / max(1, len(learned) - 1)
+    covariance = covariance + _LEAST_VARIANCE * torch.eye(len(mean)).to(covariance)
+    precision = torch.linalg.inv(covariance)
+    distances = ((away @ precision) * away).sum(-1).clamp(min=0.0).sqrt()
+    inside = _quantiles(distances, [_INSIDE])[0].clamp(min=1.0)
+    low, high = _quantiles(learned, _EXTREMES)
+    return mean, precision, inside, low, high
+
+
+def _quantiles(values: Tensor, shares: Sequence[float]) -> Tensor:
+    """Returns quantiles along the first dimension of any number of values, one by one."""
+    places = [round(share * (len(values) - 1)) for share in shares]
+    # Nothing is sorted but what stands at these places.
+    ordered = np.partition(values.cpu().numpy(), places, axis=0)
+    return torch.as_tensor(ordered[places]).to(values.device)

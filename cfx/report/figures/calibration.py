@@ -1,0 +1,225 @@
+"""Calibrated parameters: where between their bounds they lie, and how they go together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
+
+from cfx.report.figures.canvas import canvas, styled
+from cfx.report.figures.figure import JobFigure
+from cfx.report.figures.results import ParameterAxis, Results
+from cfx.report.figures.values import Array
+from cfx.report.figures.words import label, number, percent, unit_label
+from cfx.results.look import EDGE, INK, colour_of
+
+AT_BOUND = 0.01
+"""So near to a bound, as a share of the distance between both, a value is at it."""
+
+
+@dataclass(frozen=True)
+class ParameterSpread:
+    """Calibrated values of one parameter, D drivers' pairs; SI units.
+
+    Attributes:
+        axis: its name, unit and bounds.
+        values: `(D,)`, driver-specific.
+        pooled: `(F,)`, each different pooled value; empty if none was calibrated.
+        default: the model's.
+    """
+
+    axis: ParameterAxis
+    values: Array
+    pooled: Array
+    default: float
+
+    def places(self, values: Array) -> Array:
+        """Returns where values lie between the bounds: 0 at the lower, 1 at the upper."""
+        assert self.axis.low is not None
+        assert self.axis.high is not None
+        return (values - self.axis.low) / (self.axis.high - self.axis.low)
+
+    @property
+    def at_low(self) -> float:
+        """Share of the pairs at the lower bound."""
+        return float((self.places(self.values) < AT_BOUND).mean())
+
+    @property
+    def at_high(self) -> float:
+        """Share of the pairs at the upper bound."""
+        return float((self.places(self.values) > 1 - AT_BOUND).mean())
+
+
+def parameter_spreads(
+    table: pd.DataFrame, axes: Sequence[ParameterAxis]
+) -> tuple[ParameterSpread, ...]:
+    """Returns the spread of each parameter whose bounds and values are known.
+
+    Args:
+        table: a row per pair and method with columns `method` and `parameter_NAME`.
+        axes: the tuned parameters.
+    """
+    found = []
+    for axis in axes:
+        column = f"parameter_{axis.name}"
+        if column not in table or axis.low is None or axis.high is None or axis.high <= axis.low:
+            continue
+        values = _known(table, "fixed", column)
+        default = _known(table, "default", column)
+        if len(values) and len(default):
+            pooled = np.unique(_known(table, "population", column))
+            found.append(ParameterSpread(axis, values, pooled, float(default[0])))
+    return tuple(found)
+
+
+def _known(table: pd.DataFrame, method: str, column: str) -> Array:
+    values = np.asarray(table.loc[table["method"] == method, column], dtype=np.float64)
+    return np.asarray(values[np.isfinite(values)], dtype=np.float64)
+
+
+def spread_offsets(count: int) -> Array:
+    """Returns offsets of dots across their line, `(count,)`, -1 to 1, the same each time.
+
+    They follow the golden ratio, so that neighbours lie apart.
+    """
+    steps = np.arange(count, dtype=np.float64) * 0.6180339887498949
+    return np.asarray(2 * (steps % 1) - 1, dtype=np.float64)
+
+
+def correlations(table: pd.DataFrame, axes: Sequence[ParameterAxis]) -> pd.DataFrame:
+    """Returns Spearman's rank correlations of driver-specific parameters, names by names.
+
+    NaN where a parameter does not vary.
+    """
+    columns = {}
+    for axis in axes:
+        if f"parameter_{axis.name}" in table:
+            columns[f"parameter_{axis.name}"] = axis.name
+    rows = table.loc[table["method"] == "fixed", list(columns)].rename(columns=columns)
+    return rows.astype(float).corr("spearman")
+
+
+_WIDTH = 0.3
+"""Of a line of dots, half of it; lines are 1 apart."""
+
+
+@styled
+def draw_calibration(spreads: Sequence[ParameterSpread], table: pd.DataFrame) -> Figure:
+    """Draws each parameter's calibrated values between its bounds; beside it their correlations.
+
+    Args:
+        spreads: of at least one parameter.
+        table: as `correlations` returns it.
+    """
+    figure = canvas(1.7 + 0.42 * max(len(spreads), 4))
+    left, right = figure.subplots(1, 2, width_ratios=(2.0, 1.0))
+    _values(left, spreads)
+    _correlations(right, table)
+    figure.legend(
+        *left.get_legend_handles_labels(), loc="outside upper center", ncols=3, handlelength=1.2
+    )
+    return figure
+
+
+def _values(axes: Axes, spreads: Sequence[ParameterSpread]) -> None:
+    rows = np.arange(len(spreads), dtype=float)
+    for row, spread in zip(rows, spreads, strict=True):
+        axes.vlines((0, 1), row - 0.42, row + 0.42, color=EDGE, linewidth=1)
+        places = spread.places(spread.values)
+        named = {method: label(method) if row == 0 else "" for method in ("fixed", "default")}
+        axes.plot(
+            places,
+            row + _WIDTH * spread_offsets(len(places)),
+            linestyle="none",
+            marker="o",
+            markersize=3.2,
+            alpha=0.55,
+            color=colour_of("fixed"),
+            markeredgewidth=0,
+            label=named["fixed"],
+        )
+        pooled = spread.places(spread.pooled)
+        axes.plot(
+            pooled,
+            np.full(len(pooled), row),
+            linestyle="none",
+            marker="D",
+            markersize=6,
+            color=colour_of("population"),
+            label=label("population") if row == 0 and len(pooled) else "",
+        )
+        axes.plot(
+            spread.places(np.array([spread.default])),
+            [row],
+            linestyle="none",
+            marker="|",
+            markersize=17,
+            markeredgewidth=2.2,
+            color=colour_of("default"),
+            label=named["default"],
+        )
+        _ends(axes, spread, row)
+    names = [unit_label(spread.axis.name, spread.axis.unit) for spread in spreads]
+    axes.set_yticks(rows, names)
+    axes.set_ylim(len(spreads) - 0.4, -0.6)
+    axes.set_xlim(-0.16, 1.16)
+    axes.set_xticks((0, 0.25, 0.5, 0.75, 1.0))
+    axes.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+    axes.grid(visible=False, axis="y")
+    axes.tick_params(axis="y", length=0)
+    axes.set_xlabel(
+        "place between the bounds; at the ends: the bound, and the share of pairs at it"
+    )
+
+
+def _ends(axes: Axes, spread: ParameterSpread, row: float) -> None:
+    for place, bound, share, side in (
+        (-0.02, spread.axis.low, spread.at_low, "right"),
+        (1.02, spread.axis.high, spread.at_high, "left"),
+    ):
+        assert bound is not None
+        text = number(bound)
+        if share > 0:
+            text += f"\n{percent(share).lstrip('+')}"
+        axes.text(place, row, text, ha=side, va="center", fontsize=8.5, color=INK)
+
+
+def _correlations(axes: Axes, table: pd.DataFrame) -> None:
+    values = table.to_numpy(dtype=float)
+    axes.imshow(values, cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto")
+    places = np.arange(len(table))
+    axes.set_xticks(places, list(table.columns), rotation=90)
+    axes.set_yticks(places, list(table.columns))
+    axes.grid(visible=False)
+    axes.tick_params(length=0)
+    if len(table) <= 7:
+        for row, column in np.argwhere(np.isfinite(values)):
+            value = values[row, column]
+            colour = "white" if abs(value) > 0.6 else INK
+            axes.text(column, row, f"{value:.1f}", ha="center", va="center", color=colour, size=9)
+    axes.set_title("rank correlation over drivers")
+
+
+class Calibration(JobFigure):
+    """Calibrated parameters of all drivers between their bounds, and their correlations."""
+
+    title = "Calibrated parameters of all drivers, and their rank correlations"
+    caption = (
+        "Each driver's own parameters (a dot per pair), calibrated on the first part of their"
+        " trajectory; pooled and default parameters beside them. Where values gather at a bound, or"
+        " spread over the whole range, these recordings may hardly determine the parameter."
+    )
+    order = 70
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it where drivers have parameters of their own."""
+        spreads = parameter_spreads(results.pairs, results.parameters)
+        if not spreads:
+            return None
+        table = correlations(results.pairs, [spread.axis for spread in spreads])
+        return draw_calibration(spreads, table)

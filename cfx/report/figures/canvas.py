@@ -1,0 +1,223 @@
+"""One look for all figures: fonts, paper, dashes, lines of methods, what the mouse shows."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, ParamSpec
+from weakref import WeakKeyDictionary
+
+import matplotlib as mpl
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from cfx.report.figures.values import Array
+from cfx.report.figures.words import label, percent
+from cfx.results.look import EDGE, INK, PALE, colour_of
+
+P = ParamSpec("P")
+
+DPI = 150
+WIDTH = 10.5
+"""Inches: at 150 dpi twice the width of a README column, with text that is still read there."""
+
+Dash = Literal["solid"] | tuple[float, tuple[float, ...]]
+
+DASHES: dict[str, Dash] = {
+    "default": (0, (1.2, 1.4)),
+    "population": (0, (6.0, 1.5, 1.2, 1.5)),
+    "fixed": (0, (5.0, 1.8)),
+    "shrunk": (0, (8.0, 1.5, 1.2, 1.5, 1.2, 1.5)),
+    "constant_speed": (0, (1.2, 1.4)),
+    "constant_acceleration": (0, (5.0, 1.8)),
+    "population_residual": (0, (6.0, 1.5, 1.2, 1.5)),
+    "fixed_residual": (0, (5.0, 1.8)),
+    "population_ar": (0, (1.2, 1.4)),
+    "fixed_ar": (0, (1.2, 1.4)),
+    "policy_sampled": (0, (1.2, 1.4)),
+}
+_WIDTHS = {"real": 1.8, "leader": 1.0, "policy": 1.8}
+_ORDER = ("leader", "default", "population", "fixed", "shrunk", "real", "policy")
+"""The real driver lies on top of leader and baselines, and below the policy compared with it."""
+
+HIDDEN = frozenset({"shrunk"})
+"""Methods whose lines are left out: with one more nobody tells the lines apart."""
+
+_HOVER: WeakKeyDictionary[Artist, str] = WeakKeyDictionary()
+"""What the mouse shows over parts of figures."""
+
+_LEGEND_ROW = 5
+"""Methods that fit into one row of a legend."""
+
+_STYLE: dict[str, Any] = {
+    "font.family": "DejaVu Sans",  # comes with matplotlib: the same figure on every machine
+    "font.size": 10.5,
+    "axes.titlesize": 10.5,
+    "axes.titlelocation": "left",
+    "axes.labelsize": 10.5,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": EDGE,
+    "axes.linewidth": 0.8,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.unicode_minus": True,
+    "grid.color": PALE,
+    "grid.linewidth": 0.8,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "xtick.labelsize": 9.5,
+    "ytick.labelsize": 9.5,
+    "legend.frameon": False,
+    "legend.fontsize": 10.0,
+    "figure.dpi": DPI,
+    "savefig.dpi": DPI,
+    "pdf.fonttype": 42,  # letters stay letters, as journals ask
+    "svg.hashsalt": "cfx",  # the same figure has the same ids
+    # A pair id may hold a dollar sign: it is text, never a formula.
+    "text.parse_math": False,
+}
+
+
+@dataclass(frozen=True)
+class Line:
+    """A signal.
+
+    Attributes:
+        method: whose it is: a method, `real` or `leader`.
+        time: `(T,)` s.
+        values: `(T,)`, NaN where there is none.
+        steps: whether a value holds until the next frame.
+    """
+
+    method: str
+    time: Array
+    values: Array
+    steps: bool = False
+
+    @property
+    def hidden(self) -> bool:
+        """Whether it is left out."""
+        return self.method in HIDDEN
+
+
+def look() -> Any:
+    """Returns a context in which matplotlib draws in this look; the reader's settings come back."""
+    return mpl.rc_context(_STYLE)  # type: ignore[arg-type]  # the stubs want literal keys
+
+
+def hover(artist: Artist, text: str) -> None:
+    """Says what the mouse shows over a part of a figure on a page; files of figures show none."""
+    _HOVER[artist] = text
+
+
+def hover_text(artist: Artist) -> str:
+    """Returns what the mouse shows over a part of a figure, "" for nothing."""
+    return _HOVER.get(artist, "")
+
+
+def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+    """Makes a function draw its figure in the common look."""
+
+    @functools.wraps(draw)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> Figure:
+        with look():
+            return draw(*args, **kwargs)
+
+    return wrapped
+
+
+def canvas(height: float, width: float = WIDTH) -> Figure:
+    """Returns an empty figure; sizes in inches. It belongs to no pyplot state and no window."""
+    return Figure(figsize=(width, height), dpi=DPI, layout="constrained")
+
+
+def draw_lines(axes: Axes, lines: Sequence[Line]) -> None:
+    """Draws the lines of methods that are not hidden, in their colours and dashes."""
+    for line in lines:
+        if line.hidden:
+            continue
+        method = line.method
+        above = _ORDER.index(method) if method in _ORDER else 0
+        (drawn,) = axes.plot(
+            line.time,
+            line.values,
+            color=colour_of(method),
+            linestyle=DASHES.get(method, "solid"),
+            linewidth=_WIDTHS.get(method, 1.6),
+            drawstyle="steps-post" if line.steps else "default",
+            zorder=2.0 + 0.05 * above,
+        )
+        hover(drawn, label(method))
+    axes.margins(x=0.01)
+
+
+def mark_points(axes: Axes) -> None:
+    """Puts a point where each value of the lines stands."""
+    for line in axes.lines:
+        line.set_marker("o")
+        line.set_markersize(3.5)
+
+
+def logarithmic(axes: Axes) -> None:
+    """Makes the vertical axis logarithmic, with plain numbers at 1, 2 and 5."""
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(FuncFormatter(_plain_tick))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+def _plain_tick(value: float, _position: int) -> str:
+    return f"{value:g}"
+
+
+def method_handles(methods: Iterable[str]) -> list[Line2D]:
+    """Returns legend entries."""
+    handles = []
+    for method in methods:
+        width = _WIDTHS.get(method, 1.6) + 0.4
+        handles.append(
+            Line2D(
+                [],
+                [],
+                color=colour_of(method),
+                linestyle=DASHES.get(method, "solid"),
+                linewidth=width,
+                label=label(method),
+            )
+        )
+    return handles
+
+
+def method_legend(figure: Figure, methods: Sequence[str], title: str | None = None) -> None:
+    """Puts a legend of methods above a figure, in one row; many take two."""
+    rows = 1 if len(methods) <= _LEGEND_ROW else 2
+    figure.legend(
+        handles=method_handles(methods),
+        loc="outside upper center",
+        ncols=-(-len(methods) // rows),
+        columnspacing=1.4,
+        handlelength=2.2,
+        title=title,
+        title_fontsize=11,
+    )
+
+
+def percent_axis(axes: Axes) -> None:
+    """Makes the vertical axis say signed percentages."""
+    axes.yaxis.set_major_formatter(FuncFormatter(percent_tick))
+
+
+def percent_tick(value: float, _position: int) -> str:
+    """Returns what stands beside a tick of signed percentages."""
+    return percent(value) if value else "0 %"
+
+
+def say(axes: Axes, text: str) -> None:
+    """Writes a sentence into an empty panel."""
+    axes.text(0.5, 0.75, text, transform=axes.transAxes, ha="center", va="center", color=INK)

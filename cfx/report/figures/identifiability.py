@@ -1,0 +1,346 @@
+"""What calibration found beyond its parameters: slices of the loss, fits, labels over time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from cfx.calibration.flatness import NEAR, flat_shares
+from cfx.report.figures.canvas import canvas, styled
+from cfx.report.figures.figure import JobFigure
+from cfx.report.figures.results import ParameterAxis, Results
+from cfx.report.figures.trajectories import TIME_TITLE
+from cfx.report.figures.values import Array
+from cfx.report.figures.words import label, number, percent, plural, short, unit_label
+from cfx.results.look import EDGE, INK, colour_of
+
+RATIO_TITLE = "loss, as a multiple of the best"
+HIGHEST = 2.0
+"""Multiple of the best loss at which the axis ends."""
+
+MOST_LINES = 60
+"""Pairs whose slices are drawn, spread evenly over all."""
+
+MOST_DRIVERS = 6
+"""Drivers whose labels are shown."""
+
+
+@dataclass(frozen=True)
+class SlicePanel:
+    """The loss along one parameter; D pairs, G places.
+
+    Attributes:
+        axis: name, unit and bounds.
+        places: `(G,)`, 0 at the lower bound to 1 at the upper.
+        values: `(G,)`, the parameter there, SI units.
+        ratios: `(D, G)`, the loss as a multiple of the pair's best.
+        near: median over pairs of the share of the range in which the loss is nearly the best
+            (`cfx.calibration.flatness`).
+        flat: share of the pairs for which that is the whole range.
+    """
+
+    axis: ParameterAxis
+    places: Array
+    values: Array
+    ratios: Array
+    near: float
+    flat: float
+
+    @property
+    def lines(self) -> Array:
+        """The ratios of those pairs that are drawn."""
+        few = min(len(self.ratios), MOST_LINES)
+        chosen = np.linspace(0, len(self.ratios) - 1, few).round().astype(int)
+        return np.asarray(self.ratios[chosen], dtype=np.float64)
+
+    @property
+    def median(self) -> Array:
+        """Median over the pairs, `(G,)`."""
+        return np.asarray(np.median(self.ratios, axis=0), dtype=np.float64)
+
+
+def slice_panels(table: pd.DataFrame, axes: Sequence[ParameterAxis]) -> tuple[SlicePanel, ...]:
+    """Returns a panel per parameter.
+
+    Args:
+        table: as `cfx.calibration.identifiability.slices` returns it.
+        axes: the tuned parameters.
+    """
+    panels = []
+    shares = flat_shares(table)
+    for axis in axes:
+        rows = table[table["parameter"] == axis.name]
+        if rows.empty:
+            continue
+        wide = rows.pivot_table(index="pair_id", columns="place", values="loss", sort=True)
+        best = rows.drop_duplicates("pair_id").set_index("pair_id")["best_loss"]
+        best = best.reindex(wide.index)
+        counts = np.isfinite(best.to_numpy(dtype=float)) & (best.to_numpy(dtype=float) > 0)
+        losses = wide.to_numpy(dtype=np.float64)[counts]
+        ratios = losses / best.to_numpy(dtype=np.float64)[counts, None]
+        ratios = np.where(np.isfinite(ratios), ratios, np.inf)
+        if not len(ratios):
+            continue
+        values = rows.drop_duplicates("place").sort_values("place")["value"]
+        known = shares[axis.name].dropna()
+        near, flat = float(known.median()), float((known == 1).mean())
+        places = wide.columns.to_numpy(dtype=np.float64)
+        of_axis = values.to_numpy(dtype=np.float64)
+        panels.append(SlicePanel(axis, places, of_axis, ratios, near, flat))
+    return tuple(panels)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Errors of one method on both parts of P pairs.
+
+    Attributes:
+        method: whose.
+        pair_ids: of the pairs.
+        train, test: `(P,)`, RMSE of speed, m/s, on the part that was calibrated on and on the test.
+    """
+
+    method: str
+    pair_ids: tuple[str, ...]
+    train: Array
+    test: Array
+
+
+def fits_of(table: pd.DataFrame) -> tuple[Fit, ...]:
+    """Returns the fit of each method, driver-specific parameters first.
+
+    Args:
+        table: columns pair_id, method, train_rmse_speed, test_rmse_speed.
+    """
+    found = []
+    for method in ("fixed", "population", "default"):
+        rows = table[table["method"] == method]
+        train = rows["train_rmse_speed"].to_numpy(dtype=np.float64)
+        test = rows["test_rmse_speed"].to_numpy(dtype=np.float64)
+        known = np.isfinite(train) & np.isfinite(test)
+        if known.any():
+            ids = tuple(rows["pair_id"].astype(str)[known])
+            found.append(Fit(method, ids, train[known], test[known]))
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class DriverLabels:
+    """Per-window calibrated parameters of one pair; W windows, n parameters.
+
+    Attributes:
+        pair_id: which pair.
+        time: `(W,)` s, from the start of the pair.
+        values: by parameter, `(W,)`, SI units.
+        weight: `(W,)`, 0 to 1: how much the choice mattered in the window, as a share of the 90 %
+            quantile over all windows; 0 is arbitrary.
+        sensitivity: `(W,)`, in the objective's unit.
+        fixed: by parameter, the driver-specific one.
+    """
+
+    pair_id: str
+    time: Array
+    values: dict[str, Array]
+    weight: Array
+    sensitivity: Array
+    fixed: dict[str, float]
+
+
+def labels_of(
+    labels: pd.DataFrame, pairs: pd.DataFrame, axes: Sequence[ParameterAxis]
+) -> tuple[DriverLabels, ...]:
+    """Returns the labels of some pairs, spread evenly over those that have driver-specific ones.
+
+    Args:
+        labels: as `Labels.to_frame` returns it.
+        pairs: a row per pair and method with columns `pair_id`, `method`, `parameter_NAME`.
+        axes: the tuned parameters.
+    """
+    names = [axis.name for axis in axes if f"parameter_{axis.name}" in labels]
+    if labels.empty or not names:
+        return ()
+    own = pairs[pairs["method"] == "fixed"].drop_duplicates("pair_id").set_index("pair_id")
+    known = [one for one in own.index.astype(str) if one in set(labels["pair_id"].astype(str))]
+    if not known:
+        return ()
+    scale = float(np.quantile(labels["sensitivity"].to_numpy(dtype=float), 0.9)) or 1.0
+    places = np.linspace(0, len(known) - 1, min(len(known), MOST_DRIVERS)).round().astype(int)
+    found = []
+    for place in dict.fromkeys(places.tolist()):
+        rows = labels[labels["pair_id"].astype(str) == known[place]].sort_values("time_s")
+        sensitivity = rows["sensitivity"].to_numpy(dtype=np.float64)
+        values = {}
+        fixed = {}
+        for name in names:
+            values[name] = rows[f"parameter_{name}"].to_numpy(dtype=np.float64)
+            fixed[name] = float(own.loc[known[place], f"parameter_{name}"])
+        found.append(
+            DriverLabels(
+                known[place],
+                rows["time_s"].to_numpy(dtype=np.float64),
+                values,
+                np.clip(sensitivity / scale, 0, 1),
+                sensitivity,
+                fixed,
+            )
+        )
+    return tuple(found)
+
+
+_ACROSS = 5
+_MARKERS = {"fixed": "o", "population": "D", "default": "|"}
+
+
+@styled
+def draw_slices(panels: Sequence[SlicePanel]) -> Figure:
+    """Draws the loss along each parameter: a line per pair, and their median."""
+    across = min(_ACROSS, len(panels))
+    rows = -(-len(panels) // across)
+    figure = canvas(0.9 + 2.3 * rows)
+    grid = figure.subplots(rows, across, squeeze=False, sharey=True)
+    for place, panel in zip(grid.flat, panels, strict=False):
+        place.plot(panel.places, panel.lines.T, color=colour_of("fixed"), alpha=0.15, linewidth=0.8)
+        place.plot(panel.places, panel.median, color=INK, linewidth=2)
+        place.axhline(1 + NEAR, color=EDGE, linestyle="--", linewidth=1)
+        share = percent(panel.near).lstrip("+")
+        place.set_title(f"{unit_label(panel.axis.name, panel.axis.unit)}: {share}")
+        ends = [number(panel.values[0]), number(panel.values[-1])]
+        place.set_xticks([0, 1], ends)
+        place.set_ylim(0.97, HIGHEST)
+    for unused in grid.flat[len(panels) :]:
+        unused.set_visible(False)
+    figure.supylabel(RATIO_TITLE, fontsize=10.5, color=INK)
+    drivers = plural(len(panels[0].ratios), "pair")
+    figure.supxlabel(
+        f"one parameter moved from bound to bound, the others held; {drivers} and their median."
+        " Percentages: the range on which\na pair's loss is within"
+        f" {percent(NEAR).lstrip('+')} of its best (dashed), median over pairs",
+        fontsize=10.5,
+        color=INK,
+    )
+    return figure
+
+
+@styled
+def draw_fits(fits: Sequence[Fit]) -> Figure:
+    """Draws each pair's error on the part that was calibrated on against that on the test part."""
+    figure = canvas(5.2, 6.4)
+    axes = figure.subplots()
+    highest = 0.0
+    for fit in fits:
+        highest = max(highest, float(np.quantile(np.concatenate([fit.train, fit.test]), 0.98)))
+        medians = f"median {np.median(fit.train):.2f} and {np.median(fit.test):.2f} m/s"
+        axes.plot(
+            fit.train,
+            fit.test,
+            linestyle="none",
+            marker=_MARKERS[fit.method],
+            markersize=4.5 if fit.method == "fixed" else 5.5,
+            alpha=0.65,
+            color=colour_of(fit.method),
+            markerfacecolor=colour_of(fit.method) if fit.method == "fixed" else "none",
+            label=f"{label(fit.method)}: {medians}",
+            zorder=3 if fit.method == "fixed" else 2,
+        )
+    end = 1.15 * highest
+    axes.plot([0, end], [0, end], color=EDGE, linewidth=1, zorder=1)
+    axes.set_xlim(0, end)
+    axes.set_ylim(0, end)
+    axes.set_aspect("equal")
+    axes.set_xlabel("RMSE of speed on the part calibrated on (m/s)")
+    axes.set_ylabel("RMSE of speed on the test part (m/s)")
+    figure.legend(loc="outside upper center", ncols=1, handlelength=1.0)
+    return figure
+
+
+@styled
+def draw_labels(driver: DriverLabels, axes: Sequence[ParameterAxis]) -> Figure:
+    """Draws one pair's per-window parameters; pale ones did not matter in their window."""
+    shown = [axis for axis in axes if axis.name in driver.values]
+    figure = canvas(1.0 + 1.15 * (len(shown) + 1))
+    grid = figure.subplots(len(shown) + 1, 1, sharex=True)
+    for place, axis in zip(grid, shown, strict=False):
+        place.scatter(
+            driver.time,
+            driver.values[axis.name],
+            s=11,
+            color=colour_of("policy"),
+            alpha=np.maximum(driver.weight, 0.08),
+            linewidths=0,
+        )
+        place.axhline(driver.fixed[axis.name], color=colour_of("fixed"), linewidth=1.6)
+        place.set_ylabel(unit_label(axis.name, axis.unit).replace(" ", "\n"), fontsize=9)
+        if axis.low is not None and axis.high is not None:
+            room = 0.06 * (axis.high - axis.low)
+            place.set_ylim(axis.low - room, axis.high + room)
+    grid[-1].plot(driver.time, driver.sensitivity, color=INK, linewidth=1.2)
+    grid[-1].set_ylabel("sensi-\ntivity", fontsize=9)
+    grid[-1].set_ylim(bottom=0)
+    grid[-1].set_xlabel(TIME_TITLE)
+    figure.suptitle(
+        f"{short(driver.pair_id)}: per-window calibrated parameters; the paler, the less the choice"
+        " mattered; line: driver-specific",
+        fontsize=10.5,
+        color=INK,
+    )
+    return figure
+
+
+class Slices(JobFigure):
+    """How well recordings determine each calibrated parameter."""
+
+    title = "The loss when one parameter is moved and the others are held"
+    caption = (
+        "How well the recordings determine each parameter: one is moved from bound to bound, the"
+        " others stay at the driver's calibrated values. Where the loss stays near its best"
+        " (dashed: 5 % above), the parameter is not determined. Where it rises, others might still"
+        " make up for it."
+    )
+    order = 130
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it where the loss was examined."""
+        if results.slices is None:
+            return None
+        panels = slice_panels(results.slices, results.parameters)
+        return draw_slices(panels) if panels else None
+
+
+class FitTrainTest(JobFigure):
+    """Errors where calibrated, and on the test part."""
+
+    title = "Errors where calibrated, and on the test part"
+    caption = (
+        "Each driver's error on the part of their trajectory that was calibrated on, against that"
+        " on the test part. Where a driver-specific dot lies far above the line, its parameters"
+        " were fitted to more than the driver's style."
+    )
+    order = 131
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it where errors on both parts are known."""
+        found = () if results.fits is None else fits_of(results.fits)
+        return draw_fits(found) if found else None
+
+
+class LabelsOverTime(JobFigure):
+    """Per-window calibrated parameters of one driver."""
+
+    title = "Per-window calibrated parameters over time, and how much they mattered"
+    caption = (
+        "Per-window calibrated parameters (labels) over time. Pale ones hardly mattered in their"
+        " window, so that their values are arbitrary. The sensitivity below says how much a choice"
+        " mattered, in the objective's unit."
+    )
+    order = 132
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it where windows were calibrated."""
+        if results.labels is None:
+            return None
+        drivers = labels_of(results.labels, results.pairs, results.parameters)
+        return draw_labels(drivers[len(drivers) // 2], results.parameters) if drivers else None

@@ -1,0 +1,364 @@
+"""Several jobs beside each other: their mean improvements, their errors, their clusters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter
+
+from cfx.data.style.result import CLUSTERS
+from cfx.report.figures.calibration import spread_offsets
+from cfx.report.figures.canvas import canvas, hover, percent_axis, percent_tick, styled
+from cfx.report.figures.improvements import ImprovementAxis, ImprovementBars, improvement_axis
+from cfx.report.figures.values import Array, finite
+from cfx.report.figures.words import (
+    common_prefix,
+    label,
+    number,
+    percent_or_undefined,
+    plural,
+    short,
+)
+from cfx.results.look import INK, JOB_COLOURS, colour_of
+
+_WIDE = 1.6
+"""An axis of errors reaches so many times as far as the largest error but the default's."""
+
+
+_MARKERS = ("o", "s", "D", "P", "X", "*", "h", "p")
+_NAMED = 90
+"""Up to so many pairs carry their names under the axis."""
+
+_BARS = 3
+"""Up to so many jobs are drawn as bars beside each other, more as dots."""
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """A job's improvement over one baseline, fractions; NaN where it is not defined."""
+
+    job: str
+    mean: float
+    low: float
+    high: float
+    trimmed_mean: float
+    median: float
+
+
+@dataclass(frozen=True)
+class Overview:
+    """Statistics of several jobs over one baseline, and their common axis."""
+
+    baseline: str
+    rows: tuple[Statistics, ...]
+    axis: ImprovementAxis
+
+
+@dataclass(frozen=True)
+class ErrorDots:
+    """Errors of several jobs.
+
+    Attributes:
+        title: of the axis.
+        unit: of the errors.
+        jobs: J names.
+        values: by method `(J,)`; NaN where a job has no such method.
+        high: end of the axis.
+        note: a sentence on what lies beyond it, else "".
+    """
+
+    title: str
+    unit: str
+    jobs: tuple[str, ...]
+    values: Mapping[str, Array]
+    high: float
+    note: str
+
+
+@dataclass(frozen=True)
+class ClusterGroup:
+    """The pairs of some jobs, by cluster.
+
+    Attributes:
+        name: of the jobs.
+        clusters: of P pairs, their clusters' names.
+        pair_ids: of P pairs.
+        values: `(P,)` improvements, fractions.
+    """
+
+    name: str
+    clusters: tuple[str, ...]
+    pair_ids: tuple[str, ...]
+    values: Array
+
+
+@dataclass(frozen=True)
+class ClusterBoxes:
+    """Improvements over one baseline by cluster, and their common axis."""
+
+    groups: tuple[ClusterGroup, ...]
+    axis: ImprovementAxis
+
+
+def overview(rows: Sequence[Statistics], baseline: str) -> Overview:
+    """Chooses the axis of several jobs' statistics."""
+    values: list[float] = []
+    for row in rows:
+        values += finite([row.mean, row.low, row.high, row.trimmed_mean, row.median]).tolist()
+    what = "means, medians and ends of intervals"
+    axis = improvement_axis(np.array(values), baseline=baseline, what=what)
+    return Overview(baseline, tuple(rows), axis)
+
+
+def error_dots(
+    jobs: Sequence[str], values: Mapping[str, Array], *, unit: str, what: str
+) -> ErrorDots:
+    """Chooses the axis of several jobs' errors; a default far off the others does not stretch it.
+
+    Args:
+        jobs: J names.
+        values: by method `(J,)`.
+        unit: of the values.
+        what: what they are, in the axis' title.
+    """
+    near, far = [0.0], np.empty(0)
+    for method, errors in values.items():
+        if method == "default":
+            far = finite(errors)
+        else:
+            near += finite(errors).tolist()
+    largest = max(*near, 1e-9)
+    beyond = far[far > _WIDE * largest]
+    note = ""
+    if len(beyond):
+        high = _WIDE * largest
+        note = (
+            f"{plural(len(beyond), 'job')} with {label('default')} further off, up to"
+            f" {number(float(beyond.max()))} {unit}."
+        )
+    else:
+        high = 1.06 * max(largest, float(far.max(initial=0.0)))
+    return ErrorDots(f"{what} ({unit})", unit, tuple(jobs), dict(values), high, note)
+
+
+def cluster_boxes(groups: Sequence[ClusterGroup], baseline: str) -> ClusterBoxes:
+    """Chooses the axis of the improvements by cluster."""
+    every = np.concatenate([np.empty(0), *(group.values for group in groups)])
+    return ClusterBoxes(tuple(groups), improvement_axis(every, baseline=baseline))
+
+
+@styled
+def draw_overview(chosen: Overview) -> Figure:
+    """Draws mean improvement with its 95 % interval, trimmed mean and median: a line per job."""
+    figure, axes, places = _by_job([row.job for row in chosen.rows])
+    colour = colour_of(chosen.baseline)
+    for row, place in zip(chosen.rows, places, strict=True):
+        reach = np.nan_to_num([[row.mean - row.low], [row.high - row.mean]])
+        drawn = axes.errorbar(
+            [row.mean], [place], xerr=reach, color=colour, marker="o", markersize=8, capsize=4
+        )
+        low, high = percent_or_undefined(row.low, 1), percent_or_undefined(row.high, 1)
+        said = f"{row.job}: mean {percent_or_undefined(row.mean, 1)}, 95 % interval {low} to {high}"
+        hover(drawn.lines[0], said)
+        for name, value, marker in (
+            ("trimmed mean", row.trimmed_mean, "D"),
+            ("median", row.median, "|"),
+        ):
+            (mark,) = axes.plot(
+                [value],
+                [place],
+                color="black",
+                marker=marker,
+                markersize=8 if marker == "D" else 13,
+                markerfacecolor="none",
+                markeredgewidth=1.3,
+                linestyle="none",
+            )
+            hover(mark, f"{row.job}: {name} {percent_or_undefined(value, 1)}")
+    axes.axvline(0, color=INK, linewidth=0.9, zorder=1)
+    axes.set_xlim(chosen.axis.low, chosen.axis.high)
+    axes.xaxis.set_major_formatter(FuncFormatter(percent_tick))
+    axes.set_xlabel(f"{chosen.axis.title} (%)")
+    handles = [_mark("o", colour, "mean and its 95 % interval")]
+    handles += [_mark("D", "black", "trimmed mean"), _mark("|", "black", "median")]
+    figure.legend(handles=handles, loc="outside upper center", ncols=3)
+    return figure
+
+
+@styled
+def draw_error_dots(chosen: ErrorDots) -> Figure:
+    """Draws the errors of each method: a line per job."""
+    figure, axes, places = _by_job(chosen.jobs)
+    handles = []
+    for method, values in chosen.values.items():
+        marker = "D" if method == "policy" else "o"
+        handles.append(_mark(marker, colour_of(method), label(method)))
+        for job, value, place in zip(chosen.jobs, values, places, strict=True):
+            (mark,) = axes.plot(
+                [value],
+                [place],
+                color=colour_of(method),
+                marker=marker,
+                markersize=8,
+                linestyle="none",
+            )
+            hover(mark, f"{job}, {label(method)}: {value:.3f} {chosen.unit}")
+    axes.set_xlim(0, chosen.high)
+    axes.set_xlabel(chosen.title)
+    figure.legend(handles=handles, loc="outside upper center", ncols=min(5, len(handles)))
+    return figure
+
+
+@styled
+def draw_clusters(chosen: ClusterBoxes) -> Figure:
+    """Draws the improvement by cluster: a box and its pairs for each group of jobs."""
+    figure = canvas(4.4)
+    axes = figure.subplots()
+    present: set[str] = set()
+    for group in chosen.groups:
+        present |= set(group.clusters)
+    order = [cluster for cluster in CLUSTERS if cluster in present]
+    width = 0.8 / max(len(chosen.groups), 1)
+    handles = []
+    for k, group in enumerate(chosen.groups):
+        colour = JOB_COLOURS[k % len(JOB_COLOURS)]
+        handles.append(Patch(color=colour, label=short(group.name, 60)))
+        for place, cluster in enumerate(order):
+            inside = np.array([one == cluster for one in group.clusters], dtype=bool)
+            values = finite(group.values[inside])
+            if not len(values):
+                continue
+            centre = place + (k - 0.5 * (len(chosen.groups) - 1)) * width
+            _box(axes, values, centre, 0.8 * width, colour)
+            offsets = 0.25 * width * spread_offsets(len(values))
+            axes.plot(
+                centre + offsets,
+                values,
+                color=colour,
+                marker="o",
+                markersize=3.5,
+                alpha=0.6,
+                markeredgewidth=0,
+                linestyle="none",
+            )
+    axes.axhline(0, color=INK, linewidth=0.9, zorder=1)
+    axes.set_xticks(range(len(order)), order)
+    axes.set_xlim(-0.6, max(len(order), 1) - 0.4)
+    axes.grid(visible=False, axis="x")
+    axes.set_xlabel("cluster of driving style")
+    _improvement_axis(axes, chosen.axis)
+    figure.legend(handles=handles, loc="outside upper center", ncols=min(3, max(len(handles), 1)))
+    return figure
+
+
+def _box(axes: Axes, values: Array, centre: float, width: float, colour: str) -> None:
+    axes.boxplot(
+        [values],
+        positions=[centre],
+        widths=[width],
+        manage_ticks=False,
+        showfliers=False,
+        showmeans=True,
+        meanline=True,
+        boxprops={"color": colour},
+        whiskerprops={"color": colour},
+        capprops={"color": colour},
+        medianprops={"color": colour, "linewidth": 2},
+        meanprops={"color": colour, "linestyle": "--"},
+    )
+
+
+@styled
+def draw_every_pair(bars: ImprovementBars, pair_ids: Sequence[str]) -> Figure:
+    """Draws the improvement of every pair, of all jobs beside each other.
+
+    Args:
+        bars: of J jobs.
+        pair_ids: all pairs, in the order of the axis.
+    """
+    named = len(pair_ids) <= _NAMED
+    prefix = common_prefix(list(pair_ids)) if named else ""
+    ticks = [short(pair.removeprefix(prefix), 18) for pair in pair_ids] if named else []
+    figure = canvas(4.3 + 0.075 * max(map(len, ticks), default=0))
+    axes = figure.subplots()
+    place_of = {pair: place for place, pair in enumerate(pair_ids)}
+    as_bars = len(bars.series) <= _BARS
+    width = 0.82 / max(len(bars.series), 1) if as_bars else 0.0
+    handles: list[Line2D | Patch] = []
+    for k, series in enumerate(bars.series):
+        colour = JOB_COLOURS[k % len(JOB_COLOURS)]
+        marker = _MARKERS[(k // len(JOB_COLOURS)) % len(_MARKERS)]
+        aside = (k - 0.5 * (len(bars.series) - 1)) * width
+        places = np.array([place_of[pair] for pair in series.pair_ids], dtype=float) + aside
+        named_as = short(series.name, 60)
+        if as_bars:
+            drawn = axes.bar(places, series.shown, width=width, color=colour)
+            for bar, pair, value in zip(drawn, series.pair_ids, series.values, strict=True):
+                hover(bar, f"pair {pair}, {series.name}: {percent_or_undefined(float(value), 1)}")
+            handles.append(Patch(color=colour, label=named_as))
+        else:
+            (dots,) = axes.plot(
+                places,
+                series.shown,
+                marker=marker,
+                color=colour,
+                markersize=4.5,
+                linestyle="none",
+            )
+            hover(dots, series.name)
+            handles.append(_mark(marker, colour, named_as))
+        axes.plot(
+            places[series.clipped],
+            series.shown[series.clipped],
+            marker="v",
+            color=colour,
+            markeredgecolor="black",
+            markersize=8,
+            linestyle="none",
+            clip_on=False,
+        )
+    axes.axhline(0, color=INK, linewidth=0.9)
+    axes.set_xlim(-0.7, max(len(pair_ids), 8) - 0.3)
+    axes.set_xticks(range(len(ticks)), ticks, rotation=90, fontsize=8.5)
+    axes.grid(visible=False, axis="x")
+    of_what = f" of {short(prefix.rstrip('_-/:.'), 30)}" if prefix else ""
+    axes.set_xlabel(f"{plural(len(pair_ids), 'pair')} of a leader and a follower{of_what}")
+    _improvement_axis(axes, bars.axis)
+    figure.legend(handles=handles, loc="outside upper center", ncols=min(3, max(len(handles), 1)))
+    return figure
+
+
+def _by_job(jobs: Sequence[str]) -> tuple[Figure, Axes, Array]:
+    """Returns a figure with a line for each job, the first on top."""
+    figure = canvas(1.35 + 0.34 * len(jobs))
+    axes = figure.subplots()
+    places = np.arange(len(jobs), dtype=np.float64)
+    axes.set_yticks(places, [short(job, 60) for job in jobs])
+    axes.set_ylim(len(jobs) - 0.4, -0.6)
+    axes.tick_params(axis="y", length=0)
+    return figure, axes, places
+
+
+def _improvement_axis(axes: Axes, chosen: ImprovementAxis) -> None:
+    axes.set_ylim(chosen.low, chosen.high)
+    axes.set_ylabel(chosen.title.replace(" over ", "\nover ") + " (%)")
+    percent_axis(axes)
+
+
+def _mark(marker: str, colour: str, text: str) -> Line2D:
+    return Line2D(
+        [],
+        [],
+        color=colour,
+        marker=marker,
+        markersize=8,
+        markerfacecolor="none" if colour == "black" else colour,
+        linestyle="none",
+        label=text,
+    )

@@ -1,0 +1,248 @@
+"""String stability: what becomes of a leader's braking along a platoon of ten followers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from cfx.report.figures.canvas import canvas, styled
+from cfx.report.figures.figure import JobFigure
+from cfx.report.figures.results import Results
+from cfx.report.figures.values import Array, finite
+from cfx.report.figures.words import label, number
+from cfx.results.look import COLLISION_COLOUR, COLOURS, vehicle_colour
+
+TIME_TITLE = "time from the braking of the leader (s)"
+
+_SHOWN_BEFORE = 10.0
+"""Seconds before the leader brakes from which on the platoon is shown; before that it settles."""
+
+_MOST_POINTS = 400
+
+
+@dataclass(frozen=True)
+class VehicleLine:
+    """A vehicle's speed.
+
+    Attributes:
+        vehicle: 0 is the leader.
+        colour: from dark to light along the platoon.
+        time: `(T,)` s since the leader began to brake.
+        speed: `(T,)` m/s.
+        collision: time and speed at which its gap became negative; None if it never did.
+    """
+
+    vehicle: int
+    colour: str
+    time: Array
+    speed: Array
+    collision: tuple[float, float] | None
+
+    @property
+    def name(self) -> str:
+        """Which vehicle."""
+        return "leader" if self.vehicle == 0 else f"follower {self.vehicle}"
+
+
+@dataclass(frozen=True)
+class PlatoonPanel:
+    """The platoon of one method.
+
+    Attributes:
+        method: who drives all followers.
+        network: whose platoon it is: of several that with the slowest last follower.
+        title: the method.
+        verdicts: whether it is string stable, and by how much the last follower slows down.
+        lines: the leader first.
+    """
+
+    method: str
+    network: str
+    title: str
+    verdicts: tuple[str, ...]
+    lines: tuple[VehicleLine, ...]
+
+
+def platoon_panels(
+    table: pd.DataFrame, methods: Sequence[str], stable: Mapping[str, float]
+) -> tuple[PlatoonPanel, ...]:
+    """Chooses a panel per method.
+
+    Args:
+        table: as `Platoon.table`.
+        methods: those to show, in their order.
+        stable: by method the share of its platoons that are string stable; one that is not known
+            is left out of the verdicts.
+    """
+    panels = []
+    for method in methods:
+        of_method = table[table["method"] == method]
+        rows, network = worst_platoon(of_method)
+        verdicts = []
+        if method in stable:
+            verdicts.append(_stability(stable[method], int(of_method["network"].nunique())))
+        verdicts.append(f"last follower: {_slowing(rows)}")
+        panels.append(PlatoonPanel(method, network, label(method), tuple(verdicts), _lines(rows)))
+    return tuple(panels)
+
+
+def speed_range(panels: Sequence[PlatoonPanel]) -> tuple[float, float]:
+    """Returns the ends of the panels' common axis of speed, m/s."""
+    speeds = [np.empty(0)]
+    for panel in panels:
+        speeds += [line.speed for line in panel.lines]
+    values = finite(np.concatenate(speeds))
+    if not len(values):
+        return 0.0, 1.0
+    margin = 0.04 * max(float(np.ptp(values)), 1.0)
+    return float(values.min()) - margin, float(values.max()) + margin
+
+
+def worst_platoon(table: pd.DataFrame) -> tuple[pd.DataFrame, str]:
+    """Returns the rows of the network whose last follower becomes slowest, and the network's name.
+
+    Args:
+        table: one method's rows of a platoon's table.
+    """
+    is_last = table["vehicle"] == table["vehicle"].max()
+    last = table[is_last & (table["time_s"] >= braking_time(table))]
+    network = last.loc[last["speed"].idxmin(), "network"]
+    return table[table["network"] == network], str(network)
+
+
+def braking_time(table: pd.DataFrame) -> float:
+    """Returns when the leader of a platoon's table begins to brake, s."""
+    leader = table[table["vehicle"] == 0].drop_duplicates("time_s").sort_values("time_s")
+    speed = leader["speed"].to_numpy()
+    first_slower = int(np.argmax(speed < speed[0]))
+    return float(leader["time_s"].iloc[max(first_slower - 1, 0)])
+
+
+def _lines(rows: pd.DataFrame) -> tuple[VehicleLine, ...]:
+    begin = braking_time(rows)
+    shown = rows[rows["time_s"] >= begin - _SHOWN_BEFORE]
+    last = int(shown["vehicle"].max())
+    lines = []
+    for key, of_vehicle in shown.groupby("vehicle", sort=True):
+        vehicle = int(float(str(key)))
+        colour = COLOURS["real"] if vehicle == 0 else vehicle_colour(vehicle, last)
+        hit = of_vehicle[of_vehicle["gap"] < 0]
+        collision = None
+        if len(hit):
+            collision = (float(hit["time_s"].iloc[0]) - begin, float(hit["speed"].iloc[0]))
+        kept = of_vehicle.iloc[:: -(-len(of_vehicle) // _MOST_POINTS)]
+        time = kept["time_s"].to_numpy(dtype=float) - begin
+        speed = kept["speed"].to_numpy(dtype=float)
+        lines.append(VehicleLine(vehicle, colour, time, speed, collision))
+    return tuple(lines)
+
+
+def _stability(share: float, networks: int) -> str:
+    stable = round(share * networks)
+    if networks > 1:
+        return f"{stable} of {networks} platoons are string stable"
+    return "string stable" if stable else "not string stable"
+
+
+def _slowing(rows: pd.DataFrame) -> str:
+    """Says by how many times as much as the leader the last follower slows down."""
+    if bool((rows["gap"] < 0).any()):
+        return "not defined, as vehicles collide"
+    after = rows[rows["time_s"] >= braking_time(rows)].sort_values("time_s")
+    leader = _drop(after[after["vehicle"] == 0])
+    last = _drop(after[after["vehicle"] == after["vehicle"].max()])
+    if not (leader > 0 and np.isfinite(last)):
+        return "not defined"
+    return f"{number(last / leader)} times the leader's drop"
+
+
+def _drop(rows: pd.DataFrame) -> float:
+    """Returns from the highest speed before it to the lowest speed, m/s."""
+    speed = rows["speed"].to_numpy(dtype=float)
+    when = int(speed.argmin())
+    return float(speed[: when + 1].max() - speed[when])
+
+
+@styled
+def draw_platoons(panels: Sequence[PlatoonPanel]) -> Figure:
+    """Draws speeds of the leader and its followers over time, a panel per method."""
+    figure = canvas(4.3, width=10.5 if len(panels) > 1 else 6.5)
+    grid = figure.subplots(1, len(panels), sharey=True, sharex=True, squeeze=False)[0]
+    for axes, panel in zip(grid, panels, strict=True):
+        _speeds(axes, panel)
+        axes.set_title("\n".join([panel.title, *panel.verdicts]), fontsize=_title_size(panels))
+        axes.margins(x=0.01)
+    figure.supxlabel(TIME_TITLE, fontsize=10.5)
+    grid[0].set_ylabel("speed (m/s)")
+    grid[0].set_ylim(*speed_range(panels))
+    figure.legend(handles=_handles(), loc="outside upper center", ncols=4, columnspacing=1.8)
+    return figure
+
+
+def _title_size(panels: Sequence[PlatoonPanel]) -> float:
+    return 9.5 if len(panels) < 4 else 7.5
+
+
+def _speeds(axes: Axes, panel: PlatoonPanel) -> None:
+    for line in panel.lines:
+        leads = line.vehicle == 0
+        width, above = (2.0, 3) if leads else (1.3, 2)
+        axes.plot(line.time, line.speed, color=line.colour, linewidth=width, zorder=above)
+        if line.collision is not None:
+            axes.plot(
+                *line.collision,
+                marker="X",
+                color=COLLISION_COLOUR,
+                markeredgecolor="white",
+                markersize=9,
+                zorder=4,
+            )
+
+
+def _handles() -> list[Line2D]:
+    return [
+        Line2D([], [], color=COLOURS["real"], linewidth=2.0, label="leader"),
+        Line2D([], [], color=vehicle_colour(1, 10), linewidth=1.6, label="first follower"),
+        Line2D([], [], color=vehicle_colour(10, 10), linewidth=1.6, label="last follower"),
+        Line2D(
+            [],
+            [],
+            color=COLLISION_COLOUR,
+            marker="X",
+            linestyle="none",
+            markeredgecolor="white",
+            markersize=9,
+            label="collision",
+        ),
+    ]
+
+
+class PlatoonSpeeds(JobFigure):
+    """Ten followers behind a leader that brakes."""
+
+    title = "Speeds of ten followers behind a braking leader"
+    caption = (
+        "All followers use the same method, each behind the vehicle ahead; the leader brakes from"
+        " 15 to 7 m/s at 2 m/s², waits 10 s and recovers at 1 m/s². A string stable platoon damps"
+        " the disturbance: no vehicle slows down more than the vehicle ahead. One that had not"
+        " settled before, or in which vehicles collide, does not count as stable. Dark lines are"
+        " the first followers, light ones the last. Of several networks the one is shown whose"
+        " last follower becomes slowest."
+    )
+    order = 90
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it where platoons were simulated."""
+        if results.platoon is None:
+            return None
+        present = set(results.platoon["method"])
+        methods = [method for method in results.methods if method in present]
+        if not methods:
+            return None
+        return draw_platoons(platoon_panels(results.platoon, methods, results.stable))

@@ -1,0 +1,126 @@
+"""What a finished job has measured, as its figures read it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import pandas as pd
+
+from cfx.simulation.trajectory import TRANSIENT_S
+
+if TYPE_CHECKING:
+    from cfx.data.style.result import StyleResult
+    from cfx.evaluation.forecasts import Forecasts
+    from cfx.evaluation.result import Evaluation, PairTrajectory
+    from cfx.evaluation.statistics import Improvement
+    from cfx.evaluation.traffic.result import Traffic
+
+
+@dataclass(frozen=True)
+class ParameterAxis:
+    """A tuned parameter: its name, its unit, and the bounds within which policies choose.
+
+    `meaning` says in words what it is.
+    """
+
+    name: str
+    unit: str = ""
+    low: float | None = None
+    high: float | None = None
+    meaning: str = ""
+
+
+def parameter_axes(evaluation: Evaluation) -> tuple[ParameterAxis, ...]:
+    """Returns the tuned parameters of an evaluation."""
+    lows, highs = evaluation.bounds
+    meanings = evaluation.meanings or ("",) * len(evaluation.names)
+    axes = []
+    for k, name in enumerate(evaluation.names):
+        low, high = float(lows[k]), float(highs[k])
+        axes.append(ParameterAxis(name, evaluation.units[k], low, high, meanings[k]))
+    return tuple(axes)
+
+
+@dataclass(frozen=True)
+class Results:
+    """What a finished job has measured; a running job and a report make it, each of what it has.
+
+    Attributes:
+        pairs: a row per pair and method, as in `pairs.csv`.
+        methods: those that are shown, in their order; without the policy if it does not adapt.
+        parameters: the tuned ones.
+        trajectories: test parts of all pairs; empty if none are known.
+        improvements: of the policy by baseline; empty if it does not adapt.
+        style: of the drivers; None if it is not known. Without weights these are not known.
+        curves: losses by network and epoch; None or empty if nothing was learned.
+        platoon: as `Platoon.table`; None if none was simulated.
+        stable: by method the share of its platoons that are string stable.
+        history: as `Evaluation.history`; None if that was not tried.
+        forecasts: None if there were none.
+        traffic: None if none was simulated.
+        slices: the loss along each calibrated parameter; None if that is not known.
+        fits: errors of constant parameters on both parts of each trajectory; None likewise.
+        labels: per-window calibrated parameters; None if there are none.
+        transient_s: length of the transient at the beginning of the test part, s.
+    """
+
+    pairs: pd.DataFrame
+    methods: tuple[str, ...]
+    parameters: tuple[ParameterAxis, ...]
+    trajectories: Sequence[PairTrajectory] = ()
+    improvements: Mapping[str, Improvement] = field(default_factory=dict)
+    style: StyleResult | None = None
+    curves: pd.DataFrame | None = None
+    platoon: pd.DataFrame | None = None
+    stable: Mapping[str, float] = field(default_factory=dict)
+    history: pd.DataFrame | None = None
+    forecasts: Forecasts | None = None
+    traffic: Traffic | None = None
+    slices: pd.DataFrame | None = None
+    fits: pd.DataFrame | None = None
+    labels: pd.DataFrame | None = None
+    transient_s: float = TRANSIENT_S
+
+    @classmethod
+    def of(
+        cls,
+        evaluation: Evaluation,
+        *,
+        adapts: bool = True,
+        style: StyleResult | None = None,
+        curves: pd.DataFrame | None = None,
+        slices: pd.DataFrame | None = None,
+        fits: pd.DataFrame | None = None,
+        labels: pd.DataFrame | None = None,
+    ) -> Results:
+        """Returns the results of an evaluation and what else a job has found.
+
+        Args:
+            evaluation: of the job.
+            adapts: as `Policy.adapts`; if it does not, the policy is no method of its own.
+            style, curves, slices, fits, labels: as in the attributes.
+        """
+        shown = evaluation if adapts else evaluation.constant_methods()
+        stable: dict[str, float] = {}
+        if evaluation.platoon is not None:
+            shares = evaluation.platoon.measures.groupby("method")["string_stable"].mean()
+            stable = {method: float(shares[method]) for method in evaluation.platoon.methods}
+        return cls(
+            pairs=shown.table,
+            methods=shown.methods,
+            parameters=parameter_axes(evaluation),
+            trajectories=evaluation.trajectories,
+            improvements=evaluation.improvements if adapts else {},
+            style=style,
+            curves=curves,
+            platoon=None if evaluation.platoon is None else evaluation.platoon.table,
+            stable=stable,
+            history=evaluation.history,
+            forecasts=evaluation.forecasts,
+            traffic=evaluation.traffic,
+            slices=slices,
+            fits=fits,
+            labels=labels,
+        )

@@ -1,0 +1,594 @@
+"""One pair over time: speed, gap and the parameters of each method."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from cfx.core.errors import ConfigError, nearest
+from cfx.evaluation.result import PairTrajectory
+from cfx.report.figures.canvas import HIDDEN, Line, canvas, draw_lines, method_legend, styled
+from cfx.report.figures.figure import JobFigure
+from cfx.report.figures.improvements import improvement_title
+from cfx.report.figures.pairs import RankedPair, rank_pairs
+from cfx.report.figures.results import ParameterAxis, Results
+from cfx.report.figures.values import Array, finite, without_infinity
+from cfx.report.figures.words import label, number, percent, short, short_label, unit_label
+from cfx.results.look import BAND, EDGE, INK, colour_of
+
+TIME_TITLE = "time from the start of the pair (s)"
+
+_ROOM = 1.5
+"""The default may stretch an axis by so many times the range of the other lines, on either side."""
+
+
+@dataclass(frozen=True)
+class Note:
+    """A remark inside a panel, at its upper end or at its lower end."""
+
+    text: str
+    method: str
+    above: bool
+
+
+@dataclass(frozen=True)
+class Collision:
+    """Where a simulated gap first becomes negative."""
+
+    method: str
+    time: float
+    gap: float
+
+    @property
+    def text(self) -> str:
+        """What stands beside the symbol."""
+        return f"{short_label(self.method)} collides"
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Lines on common axes.
+
+    Attributes:
+        title: what is shown, with its unit.
+        lines: those that are drawn, the hidden ones too.
+        low, high: ends of the vertical axis; None where nothing is known of them.
+        notes: remarks.
+        collisions: of a gap.
+        bounds: of a parameter, if they are known.
+        meaning: of a parameter, in words.
+    """
+
+    title: str
+    lines: tuple[Line, ...]
+    low: float | None
+    high: float | None
+    notes: tuple[Note, ...] = ()
+    collisions: tuple[Collision, ...] = ()
+    bounds: tuple[float, float] | None = None
+    meaning: str = ""
+
+
+@dataclass(frozen=True)
+class PairPanels:
+    """What is shown of one pair.
+
+    Attributes:
+        pair_id: which pair.
+        speed, gap: over the test part.
+        parameters: a panel for each tuned parameter.
+    """
+
+    pair_id: str
+    speed: Panel
+    gap: Panel
+    parameters: tuple[Panel, ...]
+
+
+def pair_panels(
+    trajectory: PairTrajectory, methods: Sequence[str], parameters: Sequence[ParameterAxis]
+) -> PairPanels:
+    """Chooses the panels of one pair.
+
+    Args:
+        trajectory: the pair.
+        methods: those to show, in their order; what a trajectory lacks is left out.
+        parameters: in the order in which the trajectory has them.
+    """
+    time = trajectory.time
+    present = [method for method in methods if method in trajectory.speed]
+    speed_lines = [_line("leader", time, trajectory.leader_speed)]
+    speed_lines += _lines(time, trajectory.real_speed, trajectory.speed, present)
+    gap_lines = _lines(time, trajectory.real_gap, trajectory.gap, present)
+    panels = []
+    for k, parameter in enumerate(parameters):
+        lines = []
+        for method in present:
+            values = without_infinity(trajectory.parameters[method][:, k])
+            lines.append(Line(method, time, values, steps=True))
+        panels.append(_parameter_panel(parameter, tuple(lines)))
+    return PairPanels(
+        trajectory.pair_id,
+        _signal_panel("speed", "m/s", tuple(speed_lines)),
+        _signal_panel("gap", "m", tuple(gap_lines), _collisions(gap_lines)),
+        tuple(panels),
+    )
+
+
+def method_panels(
+    trajectory: PairTrajectory, methods: Sequence[str], errors: Mapping[str, float]
+) -> tuple[Panel, ...]:
+    """Chooses a panel per method: its speed against the real driver's.
+
+    Args:
+        trajectory: the pair.
+        methods: those to show.
+        errors: by method, RMSE of speed, m/s.
+    """
+    panels = []
+    for method in methods:
+        lines = (
+            _line("real", trajectory.time, trajectory.real_speed),
+            _line(method, trajectory.time, trajectory.speed[method]),
+        )
+        low, high = _range(lines)
+        title = f"{label(method)}: RMSE of speed {errors[method]:.3f} m/s"
+        panels.append(Panel(title, lines, low, high))
+    return tuple(panels)
+
+
+def errors_text(what: str, unit: str, errors: Mapping[str, float]) -> str:
+    """Returns a title such as "RMSE of speed (m/s): default 1.02, policy 0.31".
+
+    Args:
+        what: the signal.
+        unit: of the errors.
+        errors: by method; hidden methods are left out.
+    """
+    listed = []
+    for method, error in errors.items():
+        if method not in HIDDEN:
+            value = f"{error:.2f}" if np.isfinite(error) else "none"
+            listed.append(f"{short_label(method)} {value}")
+    return f"RMSE of {what} ({unit}): {', '.join(listed)}"
+
+
+def _line(method: str, time: Array, values: Array) -> Line:
+    return Line(method, time, without_infinity(values))
+
+
+def _lines(
+    time: Array, real: Array, simulated: Mapping[str, Array], methods: Sequence[str]
+) -> list[Line]:
+    lines = [_line("real", time, real)]
+    for method in methods:
+        lines.append(_line(method, time, simulated[method]))
+    return lines
+
+
+def _signal_panel(
+    name: str, unit: str, lines: tuple[Line, ...], collisions: tuple[Collision, ...] = ()
+) -> Panel:
+    """Chooses the axis by the lines that matter; a note says how far a default lies off them."""
+    low, high = _range(tuple(line for line in lines if line.method != "default"))
+    notes: list[Note] = []
+    if low is not None and high is not None:
+        far = finite(np.concatenate([np.empty(0), *_of("default", lines)]))
+        height = max(high - low, 1.0)
+        lowest, highest = low - _ROOM * height, high + _ROOM * height
+        if len(far):
+            least, most = float(far.min()), float(far.max())
+            if most > highest:
+                notes.append(Note(f"default up to {number(most)} {unit} ↑", "default", above=True))
+            if least < lowest:
+                text = f"default down to {number(least)} {unit} ↓"
+                notes.append(Note(text, "default", above=False))
+            low, high = min(low, max(least, lowest)), max(high, min(most, highest))
+        low, high = low - 0.06 * height, high + 0.06 * height
+    title = unit_label(name, unit)
+    return Panel(title, lines, low, high, tuple(notes), collisions)
+
+
+def _of(method: str, lines: Sequence[Line]) -> list[Array]:
+    return [line.values for line in lines if line.method == method]
+
+
+def _range(lines: Sequence[Line]) -> tuple[float | None, float | None]:
+    """Returns the lowest and the highest value of the lines that are not hidden; None for none."""
+    seen = [line.values for line in lines if not line.hidden]
+    values = finite(np.concatenate([np.empty(0), *seen]))
+    if not len(values):
+        return None, None
+    return float(values.min()), float(values.max())
+
+
+def _collisions(lines: Sequence[Line]) -> tuple[Collision, ...]:
+    found = []
+    for line in lines:
+        hit = np.flatnonzero(line.values < 0)
+        if line.method != "real" and not line.hidden and len(hit):
+            first = int(hit[0])
+            found.append(Collision(line.method, float(line.time[first]), float(line.values[first])))
+    return tuple(found)
+
+
+def _parameter_panel(parameter: ParameterAxis, lines: tuple[Line, ...]) -> Panel:
+    """Chooses an axis of at least a fifth of the range: a small change looks small."""
+    title, said = unit_label(parameter.name, parameter.unit), parameter.meaning
+    lowest, highest = _range(lines)
+    if parameter.low is None or parameter.high is None:
+        if lowest is None or highest is None:
+            return Panel(title, lines, None, None, meaning=said)
+        margin = 0.15 * max(highest - lowest, 1e-3 * abs(highest), 1e-6)
+        return Panel(title, lines, lowest - margin, highest + margin, meaning=said)
+    bounds = (parameter.low, parameter.high)
+    if lowest is None or highest is None:
+        lowest, highest = bounds
+    width = max(1.3 * (highest - lowest), 0.2 * (bounds[1] - bounds[0]))
+    centre, margin = (highest + lowest) / 2, 0.06 * width
+    low = max(centre - width / 2, min(bounds[0], lowest)) - margin
+    high = min(centre + width / 2, max(bounds[1], highest)) + margin
+    return Panel(title, lines, low, high, bounds=bounds, meaning=said)
+
+
+def bounds_text(panel: Panel) -> str:
+    """Returns a panel's title with the parameter's bounds, if they are known."""
+    if panel.bounds is None:
+        return panel.title
+    return f"{panel.title}, {number(panel.bounds[0])} to {number(panel.bounds[1])}"
+
+
+_LINE = 150
+"""Characters of a small title that fit into the width of a figure."""
+
+
+@styled
+def draw_pairs(
+    titles: Sequence[tuple[str, str, str]],
+    pairs: Sequence[PairPanels],
+    methods: Sequence[str],
+    explained: str | None = None,
+) -> Figure:
+    """Draws speed and gap of some pairs over the test part, a row per pair.
+
+    Args:
+        titles: of each pair: its own, that of its speeds, that of its gaps.
+        pairs: what is shown.
+        methods: for the legend.
+        explained: what percentages in the titles mean; stands above the legend.
+    """
+    figure = canvas(0.75 + 2.35 * len(pairs))
+    grid = figure.subplots(len(pairs), 2, squeeze=False, sharex="row", width_ratios=(1.12, 1.0))
+    for (speed_axes, gap_axes), pair, title in zip(grid, pairs, titles, strict=True):
+        draw_panel(speed_axes, pair.speed)
+        draw_panel(gap_axes, pair.gap)
+        _two_line_title(speed_axes, title[0], title[1])
+        _two_line_title(gap_axes, "", title[2])
+    for axes in grid[-1]:
+        axes.set_xlabel(TIME_TITLE)
+    method_legend(figure, ["real", "leader", *_visible(methods)], explained)
+    return figure
+
+
+@styled
+def draw_speeds(pair_id: str, panels: Sequence[Panel], methods: Sequence[str]) -> Figure:
+    """Draws the simulated speed of each method against the real driver's, a panel per method.
+
+    Args:
+        pair_id: which pair.
+        panels: of each method.
+        methods: for the legend.
+    """
+    figure = canvas(0.8 + 1.9 * len(panels))
+    grid = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, panel in zip(grid, panels, strict=True):
+        draw_lines(axes, panel.lines)
+        axes.set_title(panel.title, fontsize=9.5, color=INK)
+        axes.set_ylabel("speed (m/s)")
+    grid[-1].set_xlabel(TIME_TITLE)
+    title = f"pair {short(pair_id, 60)}, test part"
+    method_legend(figure, ["real", *methods], title)
+    return figure
+
+
+@styled
+def draw_parameters(pair: PairPanels, methods: Sequence[str]) -> Figure:
+    """Draws the parameters that each method used over time, a small panel per parameter.
+
+    The first panel shows the speeds, so that a reader sees what the policy answers to. What lies
+    outside a parameter's bounds is shaded, and its bounds and its meaning stand in the title.
+    """
+    count = len(pair.parameters)
+    columns = _columns(count)
+    rows = -(-(count + 1) // columns)
+    figure = canvas(1.0 + (1.75 if columns == 1 else 2.0) * rows)
+    grid = figure.add_gridspec(rows, columns)
+    # The speeds take the cells that the parameters leave over, so that the grid has no hole.
+    span = rows * columns - count
+    speeds = figure.add_subplot(grid[0, :span])
+    shown = [line for line in pair.speed.lines if line.method in {"leader", "real", "policy"}]
+    draw_lines(speeds, shown)
+    speeds.set_title(pair.speed.title)
+    panels = [speeds]
+    for k, panel in enumerate(pair.parameters):
+        axes = figure.add_subplot(grid[divmod(k + span, columns)], sharex=speeds)
+        draw_panel(axes, panel)
+        _titles_of_parameter(axes, panel, _LINE // columns)
+        axes.set_ylabel("")
+        panels.append(axes)
+    # Shared by all; labels of small axes must not touch.
+    speeds.xaxis.set_major_locator(MaxNLocator(12 // columns, integer=True))
+    for axes in panels:
+        axes.tick_params(labelbottom=axes in panels[-columns:])
+    figure.supxlabel(TIME_TITLE, fontsize=10.5, color=INK)
+    title = f"pair {short(pair.pair_id, 60)}"
+    method_legend(figure, ["real", "leader", *_visible(methods)], title)
+    return figure
+
+
+@styled
+def draw_pair(results: Results, pair_id: str) -> Figure:
+    """Draws speed, gap and each tuned parameter of one pair over the test part.
+
+    Raises:
+        ConfigError: the pair id is not in the results.
+    """
+    ((_, trajectory),) = _chosen(results, pair_id, 1)
+    pair = pair_panels(trajectory, results.methods, results.parameters)
+    columns = 2 if len(pair.parameters) <= 4 else 4
+    rows = -(-len(pair.parameters) // columns)
+    figure = canvas(3.4 + 1.75 * rows)
+    grid = figure.add_gridspec(rows + 1, columns, height_ratios=(1.6, *[1.0] * rows))
+    speeds = figure.add_subplot(grid[0, : columns // 2])
+    gaps = figure.add_subplot(grid[0, columns // 2 :], sharex=speeds)
+    draw_panel(speeds, pair.speed)
+    draw_panel(gaps, pair.gap)
+    for k, panel in enumerate(pair.parameters):
+        row, column = divmod(k, columns)
+        axes = figure.add_subplot(grid[row + 1, column], sharex=speeds)
+        draw_panel(axes, panel)
+        _titles_of_parameter(axes, panel, _LINE // columns)
+        axes.set_ylabel("")
+    figure.supxlabel(TIME_TITLE, fontsize=10.5, color=INK)
+    method_legend(figure, ["real", "leader", *_visible(results.methods)])
+    return figure
+
+
+def draw_panel(axes: Axes, panel: Panel) -> None:
+    """Draws lines, notes, collisions and bounds of one panel."""
+    draw_lines(axes, panel.lines)
+    if panel.low is not None and panel.high is not None:
+        axes.set_ylim(panel.low, panel.high)
+        if panel.bounds is not None:
+            _shade_outside(axes, panel.bounds, panel.low, panel.high)
+    axes.set_ylabel(panel.title)
+    for note in panel.notes:
+        _write_note(axes, note)
+    for collision in panel.collisions:
+        colour = colour_of(collision.method)
+        place = (collision.time, collision.gap)
+        axes.plot(*place, marker="X", markersize=9, color=colour, mec="white", zorder=6)
+        axes.annotate(
+            collision.text,
+            place,
+            (6, 6),
+            textcoords="offset points",
+            color=colour,
+            fontsize=9,
+            annotation_clip=True,
+        )
+        axes.axhline(0, color=INK, linewidth=0.8)
+
+
+def _visible(methods: Sequence[str]) -> list[str]:
+    return [method for method in methods if method not in HIDDEN]
+
+
+def _columns(parameters: int) -> int:
+    for columns, most in ((1, 2), (2, 5), (3, 8)):
+        if parameters <= most:
+            return columns
+    return 4
+
+
+def _shade_outside(axes: Axes, bounds: tuple[float, float], low: float, high: float) -> None:
+    width = high - low
+    axes.axhspan(min(low, bounds[0]) - width, bounds[0], color=BAND, zorder=0)
+    axes.axhspan(bounds[1], max(high, bounds[1]) + width, color=BAND, zorder=0)
+    for bound in bounds:
+        axes.axhline(bound, color=EDGE, linewidth=0.9, zorder=1)
+    axes.set_ylim(low, high)
+
+
+def _titles_of_parameter(axes: Axes, panel: Panel, length: int) -> None:
+    """Writes name, unit and bounds, and below them what the parameter means."""
+    lines = textwrap.wrap(panel.meaning, length, max_lines=2, placeholder=" …")
+    axes.set_title("\n".join(lines), fontsize=8, color=INK)
+    raised = 6 + 11 * len(lines)
+    axes.annotate(
+        bounds_text(panel),
+        (0, 1),
+        (0, raised),
+        xycoords="axes fraction",
+        textcoords="offset points",
+        fontsize=10.5,
+        color="black",
+    )
+
+
+def _two_line_title(axes: Axes, strong: str, fine: str) -> None:
+    axes.set_title(fine, fontsize=7.6, color=INK)  # several methods' errors beside each other
+    if strong:
+        axes.annotate(
+            strong,
+            (0, 1),
+            (0, 20),
+            xycoords="axes fraction",
+            textcoords="offset points",
+            fontsize=11,
+            fontweight="bold",
+            color="black",
+        )
+
+
+def _write_note(axes: Axes, note: Note) -> None:
+    height, aligned = (0.97, "top") if note.above else (0.03, "bottom")
+    axes.text(
+        0.985,
+        height,
+        note.text,
+        transform=axes.transAxes,
+        ha="right",
+        va=aligned,
+        color=colour_of(note.method),
+        fontsize=9,
+        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5},
+        zorder=5,
+    )
+
+
+def drives(results: Results, pair_id: str | Sequence[str] | None = None, count: int = 3) -> Figure:
+    """Speed and gap over the test part, a row per pair.
+
+    Args:
+        results: of a job.
+        pair_id: the pairs to show; None for `count` pairs from the best to the worst improvement,
+            without a policy from the smallest to the largest error.
+        count: how many.
+
+    Raises:
+        ConfigError: a pair id is not in the results.
+    """
+    titles, panels = [], []
+    explained: str | None = None
+    for ranked, trajectory in _chosen(results, pair_id, count):
+        name = RankedPair(short(ranked.pair_id), ranked.rank, ranked.improvement).title
+        if np.isfinite(ranked.improvement):
+            name += f":  {percent(ranked.improvement)}"
+            explained = f"percentages: {improvement_title('fixed')}"
+        elif {"fixed", "policy"} <= set(results.methods):
+            name += ":  improvement undefined"
+        rmse = errors_text("speed", "m/s", _errors(results, trajectory.pair_id, "rmse_speed"))
+        rmse_gap = errors_text("gap", "m", _errors(results, trajectory.pair_id, "rmse_gap"))
+        titles.append((name, rmse, rmse_gap))
+        panels.append(pair_panels(trajectory, results.methods, results.parameters))
+    return draw_pairs(titles, panels, results.methods, explained)
+
+
+def speeds(results: Results, pair_id: str | None = None) -> Figure:
+    """The simulated speed of each method against the real driver's: the paper's speed plots.
+
+    Args:
+        results: of a job.
+        pair_id: the pair to show; None for the one with the median improvement.
+
+    Raises:
+        ConfigError: the pair id is not in the results.
+    """
+    ((_, trajectory),) = _chosen(results, pair_id, 1)
+    errors = _errors(results, trajectory.pair_id, "rmse_speed")
+    panels = method_panels(trajectory, results.methods, errors)
+    return draw_speeds(trajectory.pair_id, panels, results.methods)
+
+
+def parameters(results: Results, pair_id: str | None = None) -> Figure:
+    """The parameters of each method over time.
+
+    Args:
+        results: of a job.
+        pair_id: the pair to show; None for the one with the median improvement.
+
+    Raises:
+        ConfigError: the pair id is not in the results.
+    """
+    ((_, trajectory),) = _chosen(results, pair_id, 1)
+    return draw_parameters(
+        pair_panels(trajectory, results.methods, results.parameters), results.methods
+    )
+
+
+class Drives(JobFigure):
+    """Speed and gap of the best, the median and the worst pair."""
+
+    title = "Speed and gap of the best, the median and the worst pair"
+    caption = "The test part of three pairs, simulated behind the recorded leader by each method."
+    order = 20
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it where trajectories are known."""
+        return drives(results) if len(results.trajectories) else None
+
+
+class Speeds(JobFigure):
+    """The paper's speed plots: each method's speed against the real driver's."""
+
+    title = "Speed of each method against the real driver's, median pair"
+    caption = "The test part of the pair in the middle, a panel per method."
+    order = 30
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it where trajectories are known."""
+        return speeds(results) if len(results.trajectories) else None
+
+
+class ChosenParameters(JobFigure):
+    """The parameters that each method used over time."""
+
+    title = "Parameters of each method over time, median pair"
+    caption = "The test part of the pair in the middle; what lies outside the bounds is shaded."
+    order = 50
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it where trajectories are known."""
+        return parameters(results) if len(results.trajectories) else None
+
+
+def _chosen(
+    results: Results, pair_id: str | Sequence[str] | None, count: int
+) -> list[tuple[RankedPair, PairTrajectory]]:
+    by_id = {trajectory.pair_id: trajectory for trajectory in results.trajectories}
+    is_calibration = "policy" not in results.methods
+    judged = _constant(results) if is_calibration else "policy"
+    rows = results.pairs[results.pairs["method"] == judged]
+    rows = rows[rows["pair_id"].isin(list(by_id))]
+    gains = pd.Series(np.nan, index=rows["pair_id"].astype(str))
+    # Without driver-specific calibration there is nothing to be better than.
+    if "improvement" in rows and not is_calibration:
+        gains[:] = rows["improvement"].to_numpy(dtype=float)
+    if pair_id is None:
+        values = gains.to_numpy(dtype=float)
+        if is_calibration:
+            values = -rows["rmse_speed"].to_numpy(dtype=float)
+        ranked = rank_pairs(list(gains.index), values, count)
+        if is_calibration:
+            ranked = tuple(RankedPair(pair.pair_id, pair.rank, math.nan) for pair in ranked)
+        return [(pair, by_id[pair.pair_id]) for pair in ranked]
+    wanted = [pair_id] if isinstance(pair_id, str) else list(pair_id)
+    chosen = []
+    for name in wanted:
+        if name not in by_id:
+            hint = nearest(name, by_id)
+            raise ConfigError(f"pair '{name}' is not in this results.{hint}")
+        chosen.append((RankedPair(name, "", float(gains[name])), by_id[name]))
+    return chosen
+
+
+def _constant(results: Results) -> str:
+    """Returns the calibrated constant set that is shown: the drivers' own, if there are any."""
+    shown = [method for method in results.methods if method not in HIDDEN]
+    return shown[-1]
+
+
+def _errors(results: Results, pair_id: str, column: str) -> dict[str, float]:
+    """Returns the errors of one pair by method, in the methods' order."""
+    rows = results.pairs[results.pairs["pair_id"] == pair_id].drop_duplicates("method")
+    errors = rows.set_index("method")[column]
+    return {method: float(errors[method]) for method in results.methods if method in errors}

@@ -1,0 +1,161 @@
+"""Writes figures: as files of a job's folder, and as SVG that stands inside a page."""
+
+from __future__ import annotations
+
+import html
+import io
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.collections import PathCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from cfx.core.errors import OutputError
+from cfx.core.files import atomic_write
+from cfx.report.figures.canvas import DPI, WIDTH, hover_text, look
+from cfx.report.figures.figure import installed
+from cfx.report.figures.results import Results
+
+_METADATA: dict[str, dict[str, None]] = {
+    "png": {"Software": None},
+    "pdf": {"Creator": None, "Producer": None, "CreationDate": None},
+    "svg": {"Creator": None, "Date": None},
+}
+"""What Matplotlib writes of itself and of today into each format, left out."""
+
+_MANY_POINTS = 400
+"""A cloud of more points is a picture inside a page's SVG: each point would be an element."""
+
+_MANY_LINES = 60
+"""Likewise pale lines of one panel."""
+
+PLACE = "\ue000"
+"""Stands before each id of an inline SVG until the page says where the figure stands."""
+
+
+def write_figures(
+    folder: Path, results: Results, *, formats: Sequence[str] = ("png",)
+) -> list[Path]:
+    """Draws and writes all figures that the results allow; returns their paths.
+
+    Args:
+        folder: made if it is not there.
+        results: of a job.
+        formats: files of each figure: `png`, `pdf`, `svg`.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    paths = []
+    for one in installed():
+        figure = one.draw(results)
+        if figure is not None:
+            for form in formats:
+                paths.append(write_figure(figure, folder / f"{one.name}.{form}"))
+    return paths
+
+
+def write_figure(figure: Figure, path: Path) -> Path:
+    """Writes one figure under its final name only once it is complete; returns the path.
+
+    The same figure gives the same bytes: no date and no version of Matplotlib is in it.
+
+    Args:
+        figure: what is drawn.
+        path: its ending says the format.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(path) as unfinished, _quiet_look():
+            form = path.suffix.removeprefix(".")
+            figure.savefig(unfinished, format=form, dpi=DPI, metadata=_METADATA[form])
+    except OSError as error:
+        raise OutputError(
+            f"{path}: this figure cannot be written ({error.strerror or error});"
+            " free the path or choose another folder"
+        ) from error
+    return path
+
+
+def inline_svg(figure: Figure) -> str:
+    """Returns a figure as an `svg` element for a page.
+
+    Its words are text in the page's font, its clouds of points are pictures, and what `hover` says
+    of its parts stands in `title` elements. `PLACE` stands before every id, so that a page can hold
+    several figures.
+    """
+    hovers = _prepare(figure)
+    stream = io.StringIO()
+    with _quiet_look(), mpl.rc_context({"svg.fonttype": "none", "path.simplify_threshold": 0.3}):
+        # `savefig` would draw twice, once for the layout alone.
+        paper = FigureCanvasSVG(figure)
+        paper.print_svg(stream, metadata=_METADATA["svg"])  # type: ignore[no-untyped-call]
+    text = stream.getvalue()
+    text = text[text.index("<svg") :]
+    for pattern in (
+        r"<metadata>.*?</metadata>\s*",
+        r"<style[^>]*>.*?</style>\s*",
+        r"<!--.*?-->\s*",
+    ):
+        text = re.sub(pattern, "", text, flags=re.DOTALL)
+    text = re.sub(r' d="[^"]*"', _shorter, text)
+    used = set(re.findall(r"(?:href=\"|url\()#([^\")]+)", text))
+    hovered = re.compile(r'<g id="hover-(\d+)">')
+    text = hovered.sub(lambda found: f"<g><title>{hovers[int(found[1])]}</title>", text)
+    text = re.sub(
+        r' id="([^"]*)"',
+        lambda found: f' id="{PLACE}{found[1]}"' if found[1] in used else "",
+        text,
+    )
+    text = re.sub(r"(href=\"|url\()#", lambda found: f"{found[1]}#{PLACE}", text)
+    # As wide as its paper, beside others that take the page's whole width.
+    wide = f"max-width: {100 * figure.get_size_inches()[0] / WIDTH:.0f}%"
+    head = rf'<svg \1 aria-hidden="true" style="{wide}">'
+    return re.sub(r'<svg [^>]*(viewBox="[^"]*")[^>]*>', head, text, count=1)
+
+
+def _prepare(figure: Figure) -> list[str]:
+    """Turns clouds into pictures and marks what the mouse says something of; returns the texts."""
+    hovers: list[str] = []
+    for artist in figure.findobj(Artist):
+        text = hover_text(artist)
+        if text:
+            artist.set_gid(f"hover-{len(hovers)}")
+            hovers.append(html.escape(text))
+        points = 0
+        if isinstance(artist, PathCollection):
+            points = np.shape(artist.get_offsets())[0]
+        elif isinstance(artist, Line2D) and artist.get_linestyle() == "None":
+            points = np.size(artist.get_xdata())
+        if points > _MANY_POINTS:
+            artist.set_rasterized(True)
+    for axes in figure.axes:
+        pale = [line for line in axes.lines if line.get_alpha() is not None]
+        for line in pale if len(pale) > _MANY_LINES else ():
+            line.set_rasterized(True)
+    return hovers
+
+
+def _shorter(found: re.Match[str]) -> str:
+    """Returns the path of an SVG with hundredths of a point."""
+    return re.sub(r"(\.\d\d)\d+", r"\1", found[0])
+
+
+@contextmanager
+def _quiet_look() -> Iterator[None]:
+    """Draws in the common look; a name in a script that the font lacks is no warning."""
+    with look(), warnings.catch_warnings():
+        # It shows boxes; the names are in pairs.csv.
+        warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
+        yield

@@ -1,0 +1,184 @@
+"""The configuration of a job as one frozen object.
+
+Nothing below the command line knows where it came from.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, field_validator
+
+from cfx.calibration.settings import CalibrationSettings, WindowSettings
+from cfx.core.component import Settings, validate
+from cfx.core.errors import ConfigError, without_passwords
+from cfx.core.storage import is_url
+from cfx.data.style.settings import StyleSettings
+
+Node = dict[str, Any]
+"""A component's node, `{name: ..., settings...}`: `cfx.core.registry.create` validates it against
+the component's own schema."""
+
+
+class CacheSettings(Settings):
+    """Where calibrations are kept, so that each is done once."""
+
+    enabled: bool = Field(True, description="read and write the cache")
+    folder: Path | str = Field(
+        Path("outputs/cache"), description="where it lies: a path, or a URL such as s3://bucket/cfx"
+    )
+
+    @field_validator("folder", mode="before")
+    @classmethod
+    def _path_or_url(cls, folder: Any) -> Any:
+        if isinstance(folder, str) and not is_url(folder):
+            return Path(folder)
+        return folder
+
+
+SAYS_TOO_MUCH = (
+    "holds a password, and a job's configuration is written to files and to MLflow; put the URI"
+    " into the environment variable MLFLOW_TRACKING_URI instead"
+)
+"""What is said of a tracking URI that holds one."""
+
+
+class OutputSettings(Settings):
+    """Where a job's folder is copied to."""
+
+    url: str | None = Field(
+        None,
+        description="the job's folder is copied below this URL when it is done, such as"
+        " s3://bucket/jobs; null: it stays on this machine alone",
+    )
+
+    @field_validator("url")
+    @classmethod
+    def _is_url(cls, url: str | None) -> str | None:
+        if url is None:
+            return None
+        if not is_url(url):
+            raise ValueError("write a URL such as s3://bucket/jobs; hydra.run.dir names a folder")
+        if without_passwords(url) != url:
+            raise ValueError("holds a password, and a job's configuration is written to files")
+        return url
+
+
+class TrackingSettings(Settings):
+    """What MLflow keeps."""
+
+    enabled: bool = Field(True, description="log the job to MLflow")
+    uri: str | None = Field(
+        None, description="tracking store; null: MLFLOW_TRACKING_URI, or SQLite beside the outputs"
+    )
+    experiment: str = Field("cfx", min_length=1, description="MLflow's experiment")
+
+    @field_validator("uri")
+    @classmethod
+    def _no_password(cls, uri: str | None) -> str | None:
+        if uri is not None and without_passwords(uri) != uri:
+            raise ValueError(SAYS_TOO_MUCH)
+        return uri
+
+    sweep: str | None = Field(
+        None, description="name that the jobs of a multirun share: they get a common parent run"
+    )
+
+
+class FigureSettings(Settings):
+    """What is drawn."""
+
+    enabled: bool = Field(True, description="write figures")
+    formats: tuple[Literal["png", "pdf", "svg"], ...] = Field(
+        ("png",), min_length=1, description="files of each figure; pdf and svg for a paper"
+    )
+
+
+class DemoSettings(Settings):
+    """The demonstration in SUMO that follows a job."""
+
+    enabled: bool = Field(
+        False,
+        description="show the job's trajectories on a motorway in SUMO; into the folder `sumo` of"
+        " the job's",
+    )
+    osm: Path | None = Field(
+        None,
+        description="an OpenStreetMap extract of your own (.osm.xml), or a SUMO network"
+        " (.net.xml); null: a hand-made motorway",
+    )
+    pairs: int = Field(
+        6, ge=1, description="pairs at most, spread evenly from the best to the worst improvement"
+    )
+
+
+class JobConfig(Settings):
+    """Everything that one job needs to know; `conf/config.yaml` says the same in YAML."""
+
+    preset: str | None = Field(
+        None, description="the experiment that these settings come from; a report reads it"
+    )
+    data: Node = Field(description="the dataset's node")
+    model: Node = Field(description="the driving model's node")
+    policy: Node = Field(description="the policy's node")
+    optimizer: Node = Field(description="the optimizer's node")
+    objective: Node = Field({"name": "speed_rmse"}, description="the objective's node")
+    learner: Node = Field(description="the learner's node")
+    protocol: Node = Field(description="the protocol's node")
+    simulator: Node = Field({"name": "memory"}, description="the simulator's node")
+    engine: Node = Field({"name": "local"}, description="the engine's node")
+    metrics: Literal["all"] | tuple[str, ...] = Field(
+        "all", description="what is measured: all that are installed, or some by name"
+    )
+    seed: int = Field(0, ge=0, lt=2**32, description="seed of everything random")
+    device: str = Field("auto", description="auto, cpu, cuda or cuda:N")
+    dtype: Literal["float32", "float64"] = Field("float64", description="precision of simulations")
+    cores: int | None = Field(
+        None,
+        ge=1,
+        description="cores that calibration and training share their work among; null: all",
+    )
+    threads: int | None = Field(1, ge=1, description="torch's threads; null: torch's own choice")
+    split: float = Field(
+        0.8, gt=0, lt=1, description="share of each pair that is calibrated and learned on"
+    )
+    windows: WindowSettings = Field(WindowSettings(), description="how trajectories are cut")
+    calibration: CalibrationSettings = Field(
+        CalibrationSettings(), description="how constant parameters are calibrated"
+    )
+    style: StyleSettings = Field(StyleSettings(), description="driving style")
+    cache: CacheSettings = Field(CacheSettings(), description="cache of calibrations")
+    output: OutputSettings = Field(OutputSettings(), description="where results go")
+    tracking: TrackingSettings = Field(TrackingSettings(), description="MLflow")
+    figures: FigureSettings = Field(FigureSettings(), description="figures")
+    demo: DemoSettings = Field(DemoSettings(), description="demonstration in SUMO")
+
+    @field_validator("device")
+    @classmethod
+    def _known(cls, device: str) -> str:
+        if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", device):
+            raise ValueError("choose auto, cpu, cuda or cuda:N")
+        return device
+
+    @field_validator("metrics", mode="before")
+    @classmethod
+    def _several(cls, metrics: Any) -> Any:
+        if isinstance(metrics, str) and metrics != "all":
+            return (metrics,)
+        return metrics
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> JobConfig:
+        """Validates a resolved configuration.
+
+        Raises:
+            ConfigError: one sentence for each key that is wrong, with its full path.
+        """
+        if not isinstance(values, Mapping):
+            raise ConfigError(
+                f"a configuration is a mapping of keys to values, not {type(values).__name__}"
+            )
+        return validate(cls, values, where="")

@@ -1,1 +1,0 @@
-"""Simulators: what takes the steps of calibration, learning and evaluation."""

@@ -1,0 +1,167 @@
+"""`data describe`: what a file holds, in words."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from cfx.core.errors import DataError
+from cfx.data.describe import describe
+from cfx.data.pairs import PairSet
+from cfx.data.tidy import TidyDataset, write_tidy
+from cfx.simulation.synthetic import SyntheticDataset
+from tests.conftest import Installer
+from tests.drives import straight_pairs
+
+
+def test_describes_real_tidy_pairs(shared_data: Path) -> None:
+    text = describe(shared_data / "i80_reconstructed_pairs.parquet")
+    for words in (
+        "147,521",
+        "i80-0400 (113 pairs), i80-0500 (116 pairs)",
+        "229 of 221 drivers",
+        "0.1 s",
+        "Left out in reading: nothing",
+    ):
+        assert words in text
+    line = next(line for line in text.splitlines() if "at least 700" in line)
+    assert line.split()[-1] == "71"
+
+
+def test_describes_a_real_raw_recording(shared_data: Path) -> None:
+    text = describe(shared_data / "i80_0400_raw_sample.csv.gz")
+    for words in (
+        "NGSIM (feet)",
+        "110,905",
+        "222",
+        "145 of 142 drivers",
+        "42,566 rows: no vehicle ahead",
+        "data=ngsim",
+    ):
+        assert words in text
+
+
+def test_describes_synthetic_pairs_with_their_truth(tmp_path: Path) -> None:
+    write_tidy(SyntheticDataset(pairs=2, frames=50).load(), tmp_path / "s.csv")
+    text = describe(tmp_path / "s.csv")
+    assert "known, of krauss" in text
+    assert "Problems: none found" in text
+
+
+def test_points_at_what_looks_wrong(tmp_path: Path) -> None:
+    pairs = SyntheticDataset(pairs=2, frames=50, noise_position_m=1.0).load()
+    write_tidy(pairs, tmp_path / "s.csv")
+    assert "position moves 1 m more or less" in describe(tmp_path / "s.csv")
+
+
+def test_a_file_that_cannot_be_used_says_why(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no such file"):
+        describe(tmp_path / "none.csv")
+    (tmp_path / "x.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(DataError, match=r"Columns found: a, b\. Known layouts:.*NGSIM"):
+        describe(tmp_path / "x.csv")
+
+
+def test_needs_no_torch() -> None:
+    code = (
+        "import sys, cfx.data.describe, cfx.simulation.synthetic; sys.exit('torch' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+MINE = """
+import numpy as np
+from cfx import Dataset, Pair, PairSet
+from cfx.data.base import FileDatasetSettings
+
+
+class Mine(Dataset):
+    layout = "my recorder (m)"
+    schema = FileDatasetSettings
+
+    @classmethod
+    def recognises(cls, start):
+        return start.has_columns("my_time", "my_gap")
+
+    def read(self):
+        speed = np.full(50, 10.0)
+        there = np.cumsum(speed) * 0.1
+        signals = [there + 20, speed, 0 * speed, there, speed, 0 * speed]
+        return PairSet((Pair("p", "r", "1", "2", 0, 0.1, 4.0, *signals),), "mine")
+"""
+
+
+def test_a_plugin_tells_about_its_layout(tmp_path: Path, install: Installer) -> None:
+    install("cfx-mine", {"cfx.datasets": {"mine": "cfx_mine:Mine"}}, {"cfx_mine.py": MINE})
+    path = tmp_path / "m.csv"
+    path.write_text("my_time,my_gap\n0,1\n")
+    text = describe(path)
+    assert "my recorder (m)" in text
+    assert f"Use it: data=mine data.path={path}" in text
+
+
+def test_a_broken_plugin_is_warned_of_and_stops_nothing(
+    tmp_path: Path, install: Installer, caplog: pytest.LogCaptureFixture
+) -> None:
+    install("cfx-bad", {"cfx.datasets": {"bad": "cfx_bad:Bad"}}, {"cfx_bad.py": "1 / 0"})
+    (tmp_path / "m.csv").write_text("my_time,my_gap\n0,1\n")
+    with pytest.raises(DataError, match="no dataset knows this layout"):
+        describe(tmp_path / "m.csv")
+    assert "cfx-bad" in caplog.text
+
+
+def advice(path: Path, pairs: PairSet) -> list[str]:
+    """Writes pairs; returns the options behind the path of the line to use, and what stands below.
+
+    A job leaves out pairs of fewer than 700 frames, unless told otherwise.
+    """
+    write_tidy(pairs, path)
+    used, kept = describe(path).splitlines()[-2:]
+    assert used.startswith(f"Use it: data=tidy data.path={path}")
+    return [used.partition(str(path))[2].strip(), kept]
+
+
+@pytest.mark.parametrize(
+    ("lengths", "options", "kept"),
+    [
+        ([430, 260, 380], "data.min_frames=350", (2, 3)),
+        ([30, 20], "data.min_frames=20", (2, 2)),
+        ([700, 20], "", (1, 2)),
+        ([700, 320, 310], "data.min_frames=300", (3, 3)),
+        ([700, 320, 100], "data.min_frames=300", (2, 3)),
+    ],
+)
+def test_the_advice_keeps_at_least_half_of_the_pairs_and_says_what_it_leaves_out(
+    tmp_path: Path, lengths: list[int], options: str, kept: tuple[int, int]
+) -> None:
+    path = tmp_path / "pairs.parquet"
+    said = advice(path, straight_pairs(lengths))
+    assert said[0] == options
+    few, every = kept
+    if few == every:
+        assert said[1] == f"It keeps all {every} pairs."
+    else:
+        least = options.rpartition("=")[2] or "700"
+        assert said[1] == (
+            f"It keeps {few} of {every} pairs and leaves out {every - few} shorter than {least}"
+            f" frames; data.min_frames={min(lengths)} keeps all."
+        )
+    given = {"path": path} | ({"min_frames": int(options.rpartition("=")[2])} if options else {})
+    assert len(TidyDataset(**given).load()) == few
+
+
+def test_the_advice_brings_recordings_to_one_step(tmp_path: Path) -> None:
+    """A job needs one time step; lengths count in it."""
+    slow = straight_pairs([400])
+    fast = [
+        replace(pair, dt=0.05, pair_id=f"f{pair.pair_id}", recording="fast")
+        for pair in SyntheticDataset(pairs=1, frames=801, dt=0.05).load()
+    ]
+    both = PairSet((*slow, *fast), "both")
+    path = tmp_path / "pairs.parquet"
+    assert advice(path, both) == ["data.time_step=0.1 data.min_frames=400", "It keeps all 2 pairs."]
+    assert len(TidyDataset(path=path, time_step=0.1, min_frames=400).load()) == 2

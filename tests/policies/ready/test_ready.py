@@ -1,0 +1,174 @@
+"""Ready-made policies: complete, safe to read, and usable wherever a job is named."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+import cfx
+from cfx.app import cli
+from cfx.app.job.parts import Parts, complete, make_protocol
+from cfx.app.publish.recipes import RECIPES
+from cfx.core.errors import DataError
+from cfx.policies import checkpoint, ready
+from cfx.policies.features import History
+
+NAMES = ready.names()
+
+
+def test_there_is_one_for_each_recipe() -> None:
+    assert set(NAMES) == set(RECIPES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_is_small_and_holds_no_code_and_no_recording(name: str) -> None:
+    folder = ready.folder_of_ready_made(f"cfx://{name}")
+    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert files == {
+        "card.json",
+        "CARD.md",
+        "metrics.json",
+        "policy/policy.json",
+        "policy/policy.safetensors",
+    }
+    assert sum((folder / file).stat().st_size for file in files) < 600_000
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_drives_an_unseen_driver(name: str) -> None:
+    agent = cfx.load(f"cfx://{name}").policy
+    assert agent.names == ("all",) or len(agent.names) == 1
+    assert agent.valid_range is not None
+    assert agent.recorded
+    frames = torch.full((1, agent.windows.length), 10.0, dtype=torch.float64)
+    history = History(frames, frames * 0, frames, frames * 0, frames * 2)
+    chosen, state = agent.act(history, agent.begin(torch.zeros(1, dtype=torch.int64)))
+    low, high = agent.space.bounds()
+    assert bool(((chosen >= low - 1e-9) & (chosen <= high + 1e-9)).all())
+    assert float(state.score[0]) < 1.0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_card_says_what_a_user_must_know(name: str) -> None:
+    card = ready.card_of(name)
+    assert card["errors_on_unseen_drivers"]["rmse_speed"] < 0.61
+    assert card["errors_on_unseen_drivers"]["improvement_over_pooled"] > 0
+    assert card["safety"]["collisions"] == 0
+    assert card["safety"]["jerk"] < 1.5
+    kinds = {event["kind"]: event for event in card["stress"]["events"]}
+    assert kinds["cut-ins"]["number"] >= 1000
+    assert kinds["cut-ins"]["headway"][0] < 0.1
+    for event in kinds.values():
+        assert event["collisions"] == 0
+        assert event["hardest_braking"] <= 9.0 + 1e-6
+        assert event["hardest_acceleration"] <= 2.6 + 1e-6
+    text = (ready.FOLDER / name / "CARD.md").read_text(encoding="utf-8")
+    assert card["command"] in text
+    assert "Valid range" in text
+
+
+def test_stochastic_drivers_vary_with_the_seed_and_are_calibrated() -> None:
+    name = "i80-idm-stochastic"
+    agent = cfx.load(f"cfx://{name}").policy
+    assert agent.is_stochastic
+    frames = torch.full((2, agent.windows.length), 10.0, dtype=torch.float64)
+    history = History(frames, frames * 0, frames, frames * 0, frames * 2)
+
+    def chosen(seed: int | None) -> torch.Tensor:
+        generator = None if seed is None else torch.Generator().manual_seed(seed)
+        state = agent.begin(torch.zeros(2, dtype=torch.int64))
+        return agent.act(history, state, generator)[0]
+
+    assert torch.equal(chosen(1), chosen(1))
+    assert not torch.equal(chosen(1), chosen(2))
+    assert not torch.equal(chosen(1)[0], chosen(1)[1])
+    centre = chosen(None)
+    assert torch.equal(centre[0], centre[1])
+    rows = ready.card_of(name)["distributions"]
+    assert [row["horizon_s"] for row in rows] == [0.5, 1.0, 2.0, 3.0, 5.0, 10.0]
+    for row in rows:
+        assert 0.85 <= row["coverage"] <= 0.95
+    text = (ready.FOLDER / name / "CARD.md").read_text(encoding="utf-8")
+    assert "Sampled forecasts" in text
+    assert "residual_scale" not in text
+
+
+def test_what_was_loaded_is_shown_in_two_lines() -> None:
+    lines = repr(cfx.load("cfx://i80-idm")).splitlines()
+    assert len(lines) == 2
+    assert lines[0].startswith("JobResult(model=idm, policy=gru, +12.6 % (")
+    assert "over driver-specific; RMSE of speed 0.579 m/s" in lines[0]
+    assert lines[1].strip().startswith("folder=")
+
+
+def test_an_unknown_one_is_one_sentence() -> None:
+    with pytest.raises(DataError, match=r"there is no ready-made policy 'i80-idn'\. Did you mean"):
+        cfx.load("cfx://i80-idn")
+
+
+def test_the_command_lists_and_shows_them(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["policies"]) == 0
+    listed = capsys.readouterr().out
+    for name in NAMES:
+        assert f"cfx://{name}" in listed
+    assert cli.main(["policies", "show", NAMES[0]]) == 0
+    assert capsys.readouterr().out.startswith(f"# {NAMES[0]}")
+    assert cli.main(["policies", "show", "nobody"]) == 2
+
+
+def test_transfer_takes_one_by_its_name() -> None:
+    from cfx.results.config import JobConfig
+
+    node = {"name": "transfer", "run": f"cfx://{NAMES[0]}"}
+    config = JobConfig.of(
+        {
+            "data": {"name": "synthetic"},
+            "model": {"name": "idm"},
+            "policy": {"name": "gru"},
+            "optimizer": {"name": "random"},
+            "learner": {"name": "rollout"},
+            "protocol": node,
+        }
+    )
+    determined = make_protocol(config).determines()
+    assert determined["model"]["name"] == ready.card_of(NAMES[0])["model"]
+
+
+def test_a_policy_that_answers_what_its_model_does_not_use_is_tested_all_the_same() -> None:
+    from cfx.results.config import JobConfig
+
+    node = {"name": "transfer", "run": "cfx://i80-w99"}
+    config = JobConfig.of(
+        {
+            "data": {"name": "synthetic"},
+            "model": {"name": "w99"},
+            "policy": {"name": "fixed"},
+            "optimizer": {"name": "random"},
+            "learner": {"name": "rollout"},
+            "protocol": node,
+        }
+    )
+    protocol = make_protocol(config)
+    model = Parts.of(complete(config, protocol), protocol).model
+    assert model.space.names == cfx.load("cfx://i80-w99").policy.model_space.names
+    assert "cc9" in model.space.names
+
+
+def test_a_policy_that_is_too_large_or_no_object_is_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    agent = checkpoint.load(ready.FOLDER / NAMES[0] / "policy")
+    checkpoint.save(agent, tmp_path)
+    monkeypatch.setattr("cfx.core.job_folder._LARGEST_MB", 0.2)
+    with pytest.raises(DataError, match=r"policy\.safetensors has 0 MB, at most 0\.2"):
+        checkpoint.load(tmp_path)
+    monkeypatch.undo()
+    (tmp_path / "policy.json").write_text(json.dumps([1, 2]))
+    with pytest.raises(DataError, match="is no JSON object"):
+        checkpoint.load(tmp_path)
+    (tmp_path / "policy.safetensors").write_bytes(b"\xff" * 100)
+    with pytest.raises(DataError, match="holds no policy that can be read"):
+        checkpoint.load(tmp_path)

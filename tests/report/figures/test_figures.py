@@ -1,0 +1,173 @@
+"""What holds for every figure that is installed, and how third parties bring one."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import logging
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib import pyplot as plt
+from matplotlib.figure import Figure
+
+from cfx.report.figures import figure as figures
+from cfx.report.figures.canvas import canvas, hover
+from cfx.report.figures.figure import Installed, JobFigure, installed
+from cfx.report.figures.results import Results
+from cfx.report.figures.write import PLACE, inline_svg, write_figure, write_figures
+from cfx.report.page import render
+from cfx.report.runs import read_runs
+from tests.made_up import (
+    GAINS,
+    make_distributions,
+    make_forecasts,
+    make_history,
+    make_platoon,
+    make_results,
+    make_traffic,
+)
+from tests.report.folders import write_job
+
+
+@pytest.fixture(scope="module")
+def everything() -> Results:
+    """Results of a job that measured all that figures can show."""
+    made = make_results(pairs=5, frames=60)
+    forecasts = make_forecasts()
+    forecasts = dataclasses.replace(forecasts, distributions=make_distributions(forecasts))
+    evaluation = dataclasses.replace(
+        made.evaluation,
+        platoon=make_platoon({"policy": 2}),
+        history=make_history(made.evaluation.trajectories, GAINS),
+        forecasts=forecasts,
+        traffic=make_traffic(),
+    )
+    results = Results.of(evaluation, style=made.style, curves=made.curves)
+    ids, axis = evaluation.table["pair_id"].unique(), results.parameters[0]
+    slices = pd.DataFrame(
+        [(ids[0], axis.name, place, place, 1 + place, 1.0) for place in (0.0, 0.5, 1.0)],
+        columns=["pair_id", "parameter", "place", "value", "loss", "best_loss"],
+    )
+    fits = pd.DataFrame({"pair_id": ids, "method": "fixed"})
+    labels = pd.DataFrame({"pair_id": ids[0], "time_s": [0.0, 0.5], "sensitivity": [0.1, 0.2]})
+    return dataclasses.replace(
+        results,
+        slices=slices,
+        fits=fits.assign(train_rmse_speed=0.3, test_rmse_speed=0.4),
+        labels=labels.assign(**{f"parameter_{axis.name}": 1.0}),
+    )
+
+
+@pytest.mark.parametrize("one", installed(), ids=lambda one: one.name)
+def test_every_figure_keeps_its_contract(
+    one: Installed, everything: Results, tmp_path: Path
+) -> None:
+    settings = dict(mpl.rcParams)
+    drawn = one.draw(everything)
+    assert drawn is not None
+    assert one.figure.title
+    assert one.figure.caption.endswith(".")
+    for axes in drawn.axes:
+        named = axes.get_xlabel() or axes.get_ylabel() or axes.get_title(loc="left")
+        shared = drawn.get_supxlabel() or drawn.get_supylabel()
+        assert named or shared, "nothing says what a panel shows"
+    path = write_figure(drawn, tmp_path / "figure.png")
+    again = one.draw(everything)
+    assert again is not None
+    assert write_figure(again, tmp_path / "again.png").read_bytes() == path.read_bytes()
+    svg = inline_svg(again)
+    assert svg.startswith("<svg viewBox=")
+    assert "http" not in svg.replace("http://www.w3.org/", "")
+    assert len(svg) < 400_000
+    assert not plt.get_fignums()
+    assert dict(mpl.rcParams) == settings
+
+
+@pytest.mark.parametrize("one", installed(), ids=lambda one: one.name)
+def test_a_figure_of_what_was_not_measured_is_left_out(one: Installed) -> None:
+    table = make_results(pairs=1, frames=5).evaluation.table
+    bare = Results(table[table["method"] == "default"], ("default",), ())
+    assert one.draw(bare) is None
+
+
+def test_an_inline_figure_has_text_pictures_of_clouds_and_says_what_the_mouse_shows() -> None:
+    figure = canvas(3.0)
+    axes = figure.subplots()
+    axes.scatter(np.arange(1000), np.arange(1000))
+    (line,) = axes.plot([0, 1], [0, 1])
+    axes.set_xlabel("a < b & </script><img src=x>")
+    hover(line, "one <b>line</b>")
+    svg = inline_svg(figure)
+    assert "a &lt; b &amp; &lt;/script&gt;&lt;img src=x&gt;</text>" in svg
+    assert "<title>one &lt;b&gt;line&lt;/b&gt;</title>" in svg
+    assert svg.count("<image") == 1
+    assert svg.count("<use") < 100
+    assert f'id="{PLACE}' in svg
+    assert f"#{PLACE}" in svg
+
+
+class Further(JobFigure):
+    """A figure of a third party."""
+
+    title = "Something further"
+    caption = "It shows nothing."
+    order = 5
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws nothing."""
+        return canvas(2.0)
+
+
+class Broken(Further):
+    """One that fails."""
+
+    def draw(self, results: Results) -> Figure | None:
+        """Fails."""
+        raise ValueError("no luck")
+
+
+def test_a_third_partys_figure_needs_a_class_and_an_entry_point(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.WARNING)
+
+    class Distribution:
+        name = "somebody-else"
+
+    found = list(importlib.metadata.entry_points(group=figures.GROUP))
+    for name, target in (
+        ("further", f"{__name__}:Further"),
+        ("broken", f"{__name__}:Broken"),
+        ("drives", f"{__name__}:Further"),
+        ("missing", "no_such_module:Figure"),
+    ):
+        entry = importlib.metadata.EntryPoint(name, target, figures.GROUP)
+        vars(entry)["dist"] = Distribution()
+        found.append(entry)
+    write_job(tmp_path / "job", pairs=3)
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda **_: found)
+    figures.installed.cache_clear()
+    try:
+        names = [one.name for one in installed()]
+        made = make_results(pairs=1, frames=5)
+        paths = write_figures(tmp_path / "figures", Results.of(made.evaluation))
+        page = render(read_runs([str(tmp_path / "job")]))
+    finally:
+        figures.installed.cache_clear()
+    assert names[:2] == ["broken", "further"]
+    assert "missing" not in names
+    written = [path.stem for path in paths]
+    assert written[0] == "further"
+    assert {"broken", "missing"}.isdisjoint(written)
+    assert "drives" in written
+    assert page.count("Something further") == 2, "its heading, and the words for who sees none"
+    said = caplog.text
+    assert (
+        "figure broken of the distribution somebody-else is left out: ValueError: no luck" in said
+    )
+    assert "figure drives of the distribution somebody-else is left out" in said
+    assert "figure missing of the distribution somebody-else is left out" in said

@@ -1,0 +1,251 @@
+"""Figures show the numbers that were chosen: lines, limits, marks and intervals."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+
+from cfx.evaluation.forecasts import errors_by_history
+from cfx.evaluation.result import Evaluation
+from cfx.report.figures.calibration import correlations, draw_calibration, parameter_spreads
+from cfx.report.figures.distributions import distribution_view, draw_distributions
+from cfx.report.figures.errors import draw_errors, error_panels
+from cfx.report.figures.forecasts import draw_forecasts, history_panels, horizon_panels
+from cfx.report.figures.improvements import draw_improvements, improvement_bars
+from cfx.report.figures.jobs import draw_every_pair
+from cfx.report.figures.learning import draw_learning, learning_curves
+from cfx.report.figures.pairs import rank_pairs
+from cfx.report.figures.platoon import draw_platoons, platoon_panels, speed_range
+from cfx.report.figures.results import Results, parameter_axes
+from cfx.report.figures.traffic import draw_paths, draw_traffic, path_panels, traffic_panels
+from cfx.report.figures.trajectories import (
+    PairPanels,
+    draw_pair,
+    draw_pairs,
+    draw_parameters,
+    drives,
+    pair_panels,
+)
+from cfx.report.figures.words import label
+from cfx.report.runs import read_runs
+from cfx.report.sections.trajectories import chosen_pairs
+from cfx.results.look import colour_of
+from tests.made_up import (
+    make_distributions,
+    make_forecasts,
+    make_platoon,
+    make_results,
+    make_traffic,
+)
+from tests.report.folders import write_job
+
+
+def drawn_lines(axes: Axes) -> dict[str, Any]:
+    """Returns the lines by colour, those of references and marks left out."""
+    found = {}
+    for line in axes.lines:
+        if len(line.get_xdata()) > 2:
+            found[line.get_color()] = line
+    return found
+
+
+def make_panels(far: float = 0.0) -> tuple[Evaluation, PairPanels]:
+    evaluation = make_results(pairs=1, frames=30).evaluation
+    trajectory = evaluation.trajectories[0]
+    gap = dict(trajectory.gap)
+    gap["default"] = gap["default"] + np.linspace(0, far, 31)
+    gap["policy"] = trajectory.real_gap - np.linspace(0, 40, 31)
+    trajectory = dataclasses.replace(trajectory, gap=gap)
+    axes = parameter_axes(evaluation)
+    return evaluation, pair_panels(trajectory, evaluation.methods, axes)
+
+
+@pytest.mark.parametrize("far", [0.0, 500.0])
+def test_a_pair_has_its_lines_limits_notes_and_collisions(far: float) -> None:
+    evaluation, panels = make_panels(far)
+    figure = draw_pairs([("", "", "")], [panels], evaluation.methods)
+    for axes, panel in zip(figure.axes, (panels.speed, panels.gap), strict=True):
+        assert list(axes.get_ylim()) == pytest.approx([panel.low, panel.high])
+        lines = drawn_lines(axes)
+        for line in panel.lines:
+            np.testing.assert_allclose(lines[colour_of(line.method)].get_ydata(), line.values)
+        written = "\n".join(text.get_text() for text in axes.texts)
+        for note in panel.notes:
+            assert note.text in written
+    assert [one.method for one in panels.gap.collisions] == ["policy"]
+    assert "policy collides" in "\n".join(text.get_text() for text in figure.axes[1].texts)
+    assert bool(panels.gap.notes) == (far > 0)
+
+
+def test_parameters_have_their_limits_and_say_what_they_mean() -> None:
+    evaluation = make_results(pairs=1, frames=30).evaluation
+    meanings = ("reaction time; the equilibrium time gap", "")
+    evaluation = dataclasses.replace(evaluation, meanings=meanings)
+    axes = parameter_axes(evaluation)
+    panels = pair_panels(evaluation.trajectories[0], evaluation.methods, axes)
+    alone = draw_parameters(panels, evaluation.methods).axes[1:]
+    of_pair = draw_pair(Results.of(evaluation), panels.pair_id).axes[2:]
+    for drawn in (alone, of_pair):
+        for panel, one in zip(panels.parameters, drawn, strict=True):
+            assert list(one.get_ylim()) == pytest.approx([panel.low, panel.high])
+        assert [one.get_title(loc="left") for one in drawn] == list(meanings)
+
+
+def test_a_hidden_method_is_left_out() -> None:
+    methods = ("default", "fixed", "shrunk", "policy")
+    evaluation = make_results(pairs=1, frames=30, methods=methods).evaluation
+    panels = pair_panels(evaluation.trajectories[0], methods, parameter_axes(evaluation))
+    figure = draw_pairs([("", "", "")], [panels], methods)
+    assert colour_of("shrunk") not in drawn_lines(figure.axes[0])
+
+
+def test_improvements_are_cut_off_at_one_place() -> None:
+    values = np.array([0.3, 0.25, 0.2, 0.1, np.nan, -0.1, -0.2, -7.0, 0.15, 0.05])
+    ids = [f"p{k}" for k in range(10)]
+    summary = make_results(pairs=3).evaluation.improvement
+    bars = improvement_bars(["job"], [ids], [values], marks=(summary.mean,))
+    (series,) = bars.series
+    for figure in (draw_improvements(bars, summary), draw_every_pair(bars, series.pair_ids)):
+        heights = [patch.get_height() for patch in figure.axes[0].patches if patch.get_width() < 1]
+        np.testing.assert_allclose(heights[: len(series.shown)], series.shown)
+        assert list(figure.axes[0].get_ylim()) == pytest.approx([bars.axis.low, bars.axis.high])
+    assert bars.undefined == 1
+    assert "1 of 9 improvements are lower" in bars.axis.note
+
+
+def test_learning_curves_are_medians_and_quartiles() -> None:
+    curves = make_results(pairs=9).curves
+    chosen = learning_curves(curves)
+    axes = draw_learning(chosen).axes[0]
+    assert chosen.logarithmic
+    assert axes.get_yscale() == "log"
+    for k, curve in enumerate(chosen.curves):
+        np.testing.assert_allclose(axes.lines[k].get_ydata(), curve.median)
+        outline = axes.collections[k].get_paths()[0].vertices
+        assert outline[:, 1].min() == pytest.approx(curve.low.min())
+        assert outline[:, 1].max() == pytest.approx(curve.high.max())
+    half = curves["epoch"].median()
+    sampled = learning_curves(curves.assign(sampled_paths=2 * (curves["epoch"] >= half)))
+    assert draw_learning(sampled).axes[0].lines[-1].get_xdata()[0] >= half
+
+
+def test_platoons_show_speeds_collisions_and_verdicts() -> None:
+    platoon = make_platoon({"default": 1, "policy": 3})
+    panels = platoon_panels(platoon.table, platoon.methods, {"default": 1.0, "policy": 2 / 3})
+    figure = draw_platoons(panels)
+    for axes, panel in zip(figure.axes, panels, strict=True):
+        lines = [line for line in axes.lines if len(line.get_xdata()) > 1]
+        for line in panel.lines:
+            np.testing.assert_allclose(lines[line.vehicle].get_ydata(), line.speed)
+        hits = sum(line.collision is not None for line in panel.lines)
+        assert len(axes.lines) - len(lines) == hits
+        for verdict in panel.verdicts:
+            assert verdict in axes.get_title(loc="left")
+    assert figure.axes[0].get_ylim() == pytest.approx(speed_range(panels))
+
+
+def test_forecasts_have_a_line_per_method() -> None:
+    forecasts = make_forecasts()
+    panels = horizon_panels(forecasts.summary, forecasts.methods)
+    panels += history_panels(errors_by_history(forecasts.table), forecasts.methods)
+    assert len(panels) == 5
+    figure = draw_forecasts(panels, forecasts.methods, "any")
+    for axes, panel in zip(figure.axes, panels, strict=True):
+        lines = drawn_lines(axes)
+        assert len(panel.lines) == len(lines) == len(forecasts.methods)
+        for line in panel.lines:
+            np.testing.assert_allclose(lines[colour_of(line.method)].get_ydata(), line.values)
+        assert (axes.get_yscale() == "log") == panel.logarithmic
+
+
+def test_longer_histories_stand_to_the_right() -> None:
+    forecasts = make_forecasts()
+    (short, *_, long) = history_panels(errors_by_history(forecasts.table), ["policy"])
+    assert long.title.startswith("RMSE of speed after 10 s")
+    (line,) = short.lines
+    assert bool((np.diff(line.time) > 0).all())
+    assert bool((np.diff(line.values) < 0).all())
+
+
+def test_distributions_have_lines_and_histograms() -> None:
+    forecasts = make_forecasts()
+    shown = distribution_view(make_distributions(forecasts), forecasts.table)
+    assert shown.methods == ("population_ar", "fixed_ar", "policy_sampled", "policy")
+    assert shown.horizon == 2.0
+    figure = draw_distributions(shown)
+    for axes, panel in zip(figure.axes, (shown.crps, shown.coverage), strict=False):
+        for line in panel.lines:
+            drawn = drawn_lines(axes)[colour_of(line.method)]
+            np.testing.assert_allclose(drawn.get_ydata(), line.values)
+    for histogram, patch in zip(shown.pit, figure.axes[2].patches, strict=True):
+        assert histogram.density.mean() == pytest.approx(1.0)
+        np.testing.assert_allclose(patch.get_data().values, histogram.density)
+
+
+def test_traffic_has_lines_points_and_a_panel_of_paths_per_method() -> None:
+    traffic = make_traffic()
+    tables = (traffic.roads, traffic.growth, traffic.strips, traffic.real_wave_speed)
+    panels = traffic_panels(*tables, traffic.methods)
+    figure = draw_traffic(panels, traffic.methods)
+    assert len(panels) == 4
+    for axes, panel in zip(figure.axes, panels, strict=True):
+        for line in panel.lines:
+            if len(line.time) > 2:
+                drawn = drawn_lines(axes)[colour_of(line.method)]
+                np.testing.assert_allclose(drawn.get_ydata(), line.values)
+    points = np.asarray(figure.axes[0].collections[0].get_offsets())
+    np.testing.assert_allclose(points[:, 0], panels[0].cloud[0])
+    without = traffic_panels(traffic.roads, traffic.growth.iloc[:0], *tables[2:], traffic.methods)
+    assert len(without) == 3
+    paths = draw_paths(path_panels(traffic.paths, traffic.methods))
+    assert [axes.get_title(loc="left") for axes in paths.axes[:3]] == [
+        label(method) for method in traffic.methods
+    ]
+
+
+def test_errors_over_time_show_where_the_transient_ends() -> None:
+    evaluation = make_results(pairs=5, frames=80).evaluation
+    panels = error_panels(evaluation.trajectories, evaluation.methods, 5.0)
+    for axes, panel in zip(draw_errors(panels, evaluation.methods).axes, panels, strict=True):
+        for line in panel.lines:
+            drawn = drawn_lines(axes)[colour_of(line.method)]
+            np.testing.assert_allclose(drawn.get_ydata(), line.values)
+        assert panel.shows_transient
+        assert [5.0, 5.0] in [list(line.get_xdata()) for line in axes.lines]
+
+
+def test_the_report_of_a_job_shows_the_pairs_of_its_figures(tmp_path: Path) -> None:
+    """The one reads files, the other an evaluation: both rank the same pairs."""
+    write_job(tmp_path / "job", pairs=8)
+    (job,) = read_runs([str(tmp_path)]).jobs
+    evaluation = make_results(pairs=8, frames=40, epochs=12).evaluation
+    rows = evaluation.table[evaluation.table["method"] == "policy"]
+    gains = rows["improvement"].to_numpy(dtype=float)
+    ranked = rank_pairs(rows["pair_id"].tolist(), gains)
+    assert [one.pair_id for one in chosen_pairs(job)] == [one.pair_id for one in ranked]
+    for results in (Results.of(evaluation), job.results):
+        figure = drives(results)
+        titles = "\n".join(text.get_text() for axes in figure.axes for text in axes.texts)
+        for one in ranked:
+            assert f"{one.rank} pair, {one.pair_id}" in titles
+
+
+def test_calibrated_parameters_have_their_places_and_correlations() -> None:
+    evaluation = make_results(
+        pairs=9, frames=20, methods=("default", "population", "fixed")
+    ).evaluation
+    spreads = parameter_spreads(evaluation.table, parameter_axes(evaluation))
+    table = correlations(evaluation.table, parameter_axes(evaluation))
+    drawn, image = draw_calibration(spreads, table).axes[:2]
+    places = []
+    for line in drawn.lines:
+        if line.get_color() == colour_of("fixed"):
+            places.append(np.asarray(line.get_xdata(), dtype=float))
+    for found, spread in zip(places, spreads, strict=True):
+        np.testing.assert_allclose(found, spread.places(spread.values))
+    np.testing.assert_allclose(np.asarray(image.images[0].get_array()), table.to_numpy())

@@ -1,0 +1,161 @@
+"""cfx's own simulators, how configs choose them, and what third parties' must be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import cfx
+from cfx.app.hydra_source import composed, plain
+from cfx.app.job import run_job
+from cfx.contracts import SimulatorContract
+from cfx.core import registry
+from cfx.core.errors import ConfigError, PluginError
+from cfx.models.krauss import Krauss
+from cfx.models.sumo_vtype import SumoVType
+from cfx.results.config import JobConfig
+from cfx.simulation.memory import MemorySimulator
+from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.simulator import Simulator
+from cfx.simulation.sumo.simulator import SumoSimulator
+
+QUICK = [
+    "model=krauss",
+    "learner=imitation",
+    "protocol=within_driver",
+    "data=synthetic",
+    "data.pairs=2",
+    "data.frames=150",
+    "optimizer=random",
+    "optimizer.samples=16",
+    "policy=fixed",
+    "figures.enabled=false",
+    "tracking.enabled=false",
+    "cache.enabled=false",
+]
+
+HALVING = """
+    from cfx import Simulator
+    from cfx.simulation.rollout import MemoryStepper
+
+    class Mine(Simulator):
+        differentiable = True
+
+        def stepper(self, model, dt):
+            return Halving(model, dt)
+
+    class Halving(MemoryStepper):
+        def advance(self, follower, leader, p):
+            return super().advance(follower, leader, {**p, "a": 0.5 * p["a"]})
+
+        def identity(self):
+            return "halving"
+"""
+
+
+class TestMemory(SimulatorContract):
+    @pytest.fixture
+    def simulator(self) -> Simulator:
+        return MemorySimulator()
+
+
+@pytest.fixture(scope="module")
+def sumo() -> Simulator:
+    """Returns one for all statements: a SUMO process takes a second to start."""
+    return SumoSimulator(workers=1)
+
+
+class TestSumo(SimulatorContract):
+    @pytest.fixture
+    def simulator(self, sumo: Simulator) -> Simulator:
+        return sumo
+
+
+def values_of(*overrides: str) -> dict[str, Any]:
+    return plain(composed(overrides))
+
+
+def test_it_is_the_public_name_and_memory_the_default() -> None:
+    assert cfx.Simulator is Simulator
+    assert cfx.get("simulator", "memory") is MemorySimulator
+    made = registry.create("simulator", JobConfig.of(values_of()).simulator)
+    assert isinstance(made, MemorySimulator)
+    stepper = made.stepper(Krauss(), 0.1)
+    assert isinstance(stepper, MemoryStepper)
+    assert stepper.identity() == MemoryStepper(Krauss(), 0.1).identity()
+
+
+def test_a_model_without_equations_is_refused_by_what_uses_equations() -> None:
+    model = SumoVType(parameters={"tau": {"low": 0.5, "high": 3.0, "default": 1.0}})
+    with pytest.raises(ConfigError, match=r"no equations in Python; add simulator=sumo, which"):
+        MemorySimulator().require(model)
+
+
+def test_a_third_partys_simulator_takes_the_steps_of_a_job(install: Any, tmp_path: Path) -> None:
+    install("mine-sims", {"cfx.simulators": {"mine": "mine_sims:Mine"}}, {"mine_sims.py": HALVING})
+    own = run_job(JobConfig.of(values_of(*QUICK)), tmp_path / "memory")
+    theirs = run_job(JobConfig.of(values_of(*QUICK, "simulator=mine")), tmp_path / "mine")
+    assert own.metrics["rmse_speed/fixed"] != theirs.metrics["rmse_speed/fixed"]
+    node = JobConfig.of(values_of("simulator=mine", "simulator.memory_mb=64")).simulator
+    assert node == {"name": "mine", "memory_mb": 64}
+
+
+@pytest.mark.parametrize(
+    ("returned", "complaint"),
+    [
+        ("None", "stepper returns a NoneType and no Stepper"),
+        ("Unnamed(model, dt)", r"identity\(\) must give a text"),
+        ("Single(model, dt)", r"advance's positions gives torch.float32"),
+        ("Short(model, dt)", r"advance's positions gives the shape \(1, 24\)"),
+    ],
+)
+def test_a_broken_simulator_is_found_before_any_work(
+    returned: str, complaint: str, install: Any
+) -> None:
+    text = f"""
+        from cfx import Simulator
+        from cfx.simulation.rollout import MemoryStepper
+
+        class Unnamed(MemoryStepper):
+            def identity(self):
+                return 1
+
+        class Single(MemoryStepper):
+            def advance(self, *inputs):
+                end, position, speed = super().advance(*inputs)
+                return end, position.float(), speed.float()
+
+        class Short(MemoryStepper):
+            def advance(self, *inputs):
+                end, position, speed = super().advance(*inputs)
+                return end, position[1:], speed[1:]
+
+        class Bad(Simulator):
+            differentiable = True
+
+            def stepper(self, model, dt):
+                return {returned}
+    """
+    install("bad-sims", {"cfx.simulators": {"bad": "bad_sims:Bad"}}, {"bad_sims.py": text})
+    with pytest.raises(PluginError, match=rf"bad-sims 1\.0 breaks its contract: .*{complaint}"):
+        registry.create("simulator", {"name": "bad"})
+
+
+def test_what_was_never_a_setting_is_refused_by_its_name() -> None:
+    values = values_of()
+    values["simulation"] = {"memory_gb": 1}
+    with pytest.raises(ConfigError, match="simulation: unknown key"):
+        JobConfig.of(values)
+
+
+def test_the_chunks_do_not_change_the_numbers(tmp_path: Path) -> None:
+    """The bound of memory cuts the work into chunks, and nothing else."""
+    torch.manual_seed(0)
+    few, many = (
+        run_job(JobConfig.of(values_of(*QUICK, f"simulator.memory_mb={size}")), tmp_path / size)
+        for size in ("16", "1024")
+    )
+    assert few.metrics["rmse_speed/fixed"] == many.metrics["rmse_speed/fixed"]
