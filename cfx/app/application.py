@@ -4,7 +4,7 @@ Hydra's own error handling prints tracebacks and exits with 1. `HYDRA_FULL_ERROR
 for the time of the call, so that exceptions reach this module. A job itself never raises into
 Hydra; it leaves a `JobStatus`, in a multirun as `outcome.json` in its folder, which is how worker
 processes and other machines report too. So one failed job stops no other, and a multirun that was
-broken off goes on where it stopped: see `cfx.sweep`.
+broken off goes on where it stopped: see `cfx.app.sweep`.
 """
 
 from __future__ import annotations
