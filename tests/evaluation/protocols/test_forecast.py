@@ -53,12 +53,12 @@ def test_forecasts_stand_in_every_table(result: cfx.JobResult) -> None:
     long = pd.read_parquet(result.folder / "pair_metrics.parquet")
     own = long[(long["scope"] == "forecast") & (long["metric"] == "rmse_speed_2s")]
     means = own.groupby("method")["value"].mean()
-    for method in ("constant_speed", "fixed", "policy"):
+    for method in ("constant_speed", "fixed", "population"):
         # Each driver has one pair here, so the mean over pairs is that over drivers.
         key = f"forecast/rmse_speed_2s/{method}"
         assert result.metrics[key] == pytest.approx(means[method])
-    wide = result.pairs[result.pairs["method"] == "policy"].set_index("pair_id")
-    rows = own[own["method"] == "policy"].set_index("pair_id")["value"]
+    wide = result.pairs[result.pairs["method"] == "fixed"].set_index("pair_id")
+    rows = own[own["method"] == "fixed"].set_index("pair_id")["value"]
     pd.testing.assert_series_equal(
         wide["forecast_rmse_speed_2s"], rows, check_names=False, rtol=1e-9
     )
