@@ -72,8 +72,9 @@ def improvement_statistics(
     and the test compares drivers.
 
     Args:
-        baseline, policy: RMSE of speed of each pair, `(P,)`, m/s; a pair counts where both are
-            finite and `baseline` is positive.
+        baseline: RMSE of speed of each pair, `(P,)`, m/s; a pair counts where both methods' are
+            finite and this one is positive.
+        policy: that of the other method, `(P,)`, m/s.
         drivers: the driver of each pair, `(P,)`; None if each pair has a driver of its own.
         seed: of the bootstrap.
     """
