@@ -118,7 +118,7 @@ def test_the_animation_is_complete_in_itself_and_plays(demo: Path, browser: Brow
     page.locator("#pair").select_option("2")
     assert "take over in 3.0 s" in page.inner_text("#state")
     assert page.locator("tbody tr").count() == 6
-    assert page.locator(".now").count() == 12, "a cursor in speed, gap and each of ten parameters"
+    assert page.locator(".now").count() == 11, "a cursor in speed, gap and each of nine parameters"
     assert browser.errors == []
     assert browser.over_network() == []
 

@@ -348,6 +348,10 @@ def test_platoon_and_history_are_written_where_a_protocol_delivered_them(tmp_pat
 
 def test_a_policy_that_does_not_adapt_has_no_figure_of_improvements() -> None:
     made = make_results(pairs=3, frames=20)
+    values = made.evaluation.values
+    same = values[values["method"] == "fixed"].assign(method="policy")
+    values = pd.concat([values[values["method"] != "policy"], same], ignore_index=True)
+    made = dataclasses.replace(made, evaluation=dataclasses.replace(made.evaluation, values=values))
     still = all_of(made, adapts=False)
     assert figure("improvement_per_driver").draw(still) is None
     assert figure("calibration").draw(still) is not None
