@@ -143,7 +143,7 @@ def test_ctrl_c_and_sigterm_have_their_exit_codes(run: Run, seed: int, code: int
         (["+sede=1"], "sede: unknown key. Did you mean 'seed'?"),
         (
             ["plugin"],
-            "plugin: neither key=value nor a sub-command. Did you mean 'plugins'? See cfx --help.",
+            "plugin: neither key=value nor a sub-command. Did you mean 'plugins'? Known: ",
         ),
         (["model=krauss,w99"], "model=krauss,w99: several values need a multirun; add -m"),
         (["seed=choice(1,2)"], "seed=choice(1,2): several values need a multirun; add -m"),
