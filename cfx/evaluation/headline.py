@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from cfx.evaluation.metrics.base import key_of
-from cfx.evaluation.result import improvement_key
 
 RESULT = "result"
 """The tag that says it in words."""
@@ -18,6 +17,15 @@ SPEED_ERROR = "rmse_speed_mps"
 
 _CONSTANT = {"fixed": "driver-specific", "population": "pooled", "default": "default"}
 """Constant parameters, the first of which is a calibration's number."""
+
+
+def improvement_key(baseline: str, scope: str = "test") -> str:
+    """Returns how the metrics of the improvement over a baseline begin."""
+    if scope != "test":
+        return f"{scope}/rmse_improvement/{baseline}"
+    if baseline == "fixed":
+        return "rmse_improvement"
+    return f"rmse_improvement/{baseline}"
 
 
 class Comparison(NamedTuple):

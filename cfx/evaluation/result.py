@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from cfx.calibration.flatness import with_flat_shares
 from cfx.evaluation.forecasts import Forecasts
+from cfx.evaluation.headline import improvement_key
 from cfx.evaluation.metrics.base import MetricInfo
 from cfx.evaluation.metrics.installed import LeftOut
 from cfx.evaluation.statistics import Improvement
@@ -305,15 +306,6 @@ class Evaluation:
             for k, name in enumerate(self.names):
                 columns[f"{name}_{method}"] = chosen[:, k]
         return pd.DataFrame(columns)
-
-
-def improvement_key(baseline: str, scope: str = "test") -> str:
-    """Returns how the metrics of the improvement over a baseline begin."""
-    if scope != "test":
-        return f"{scope}/rmse_improvement/{baseline}"
-    if baseline == "fixed":
-        return "rmse_improvement"
-    return f"rmse_improvement/{baseline}"
 
 
 def _in_order(methods: pd.Series) -> tuple[str, ...]:
