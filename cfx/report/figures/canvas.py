@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, ParamSpec
@@ -126,7 +127,9 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
 
     @functools.wraps(draw)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> Figure:
-        with look():
+        with look(), warnings.catch_warnings():
+            # Values of a damaged folder may all be one, or farther apart than floats can tell.
+            warnings.filterwarnings("ignore", message="Attempting to set identical")
             return draw(*args, **kwargs)
 
     return wrapped

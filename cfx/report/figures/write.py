@@ -158,4 +158,5 @@ def _quiet_look() -> Iterator[None]:
     with look(), warnings.catch_warnings():
         # It shows boxes; the names are in pairs.csv.
         warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
+        warnings.filterwarnings("ignore", message="Attempting to set identical")
         yield
