@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 
 from cfx.data.style.result import StyleResult
+from cfx.evaluation.headline import improvement_key
 from cfx.evaluation.metrics.base import RECORDED, MetricInfo, key_of
 from cfx.evaluation.result import METHODS, PairTrajectory
 from cfx.evaluation.statistics import STATISTICS, Improvement
@@ -422,13 +423,6 @@ def any_baselines(jobs: Iterable[Job], scope: str = TEST) -> list[str]:
 def any_has_metric(jobs: Iterable[Job], name: str, method: str, scope: str = TEST) -> bool:
     """Says whether any of the jobs has measured a metric."""
     return any(job.has_metric(name, method, scope) for job in jobs)
-
-
-def improvement_key(baseline: str, scope: str = TEST) -> str:
-    """Returns how the metrics of the improvement over a baseline begin."""
-    if scope != TEST:
-        return f"{scope}/rmse_improvement/{baseline}"
-    return "rmse_improvement" if baseline == "fixed" else f"rmse_improvement/{baseline}"
 
 
 def improvement_column(baseline: str) -> str:
