@@ -33,7 +33,6 @@ def worker_pool(
     begin: Callable[..., None],
     *arguments: object,
     folder: Path | None = None,
-    timeout: float | None = None,
 ) -> loky.ProcessPoolExecutor:
     """Returns an executor whose processes start with the first call that it is given.
 
@@ -43,7 +42,6 @@ def worker_pool(
         count: processes.
         begin: called with `arguments` in each process before anything else.
         folder: of temporary files; a process that has outlived this one removes it.
-        timeout: seconds after which a process ends that has nothing to do; None: never.
 
     Raises:
         OSError, ImportError: this system cannot have any.
@@ -53,7 +51,7 @@ def worker_pool(
     return loky.ProcessPoolExecutor(
         count,
         context=get_context("loky"),
-        timeout=timeout,
+        timeout=None,  # however long they have nothing to do
         initializer=_begin,
         initargs=(os.getpid(), folder, begin, arguments),
         env=_ENVIRONMENT,

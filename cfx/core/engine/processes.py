@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import logging
 from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from typing import Any, Generic
@@ -15,8 +14,6 @@ from cfx.core.engine.base import Report, ResultT, ShardT, Work
 from cfx.core.errors import EngineError
 from cfx.core.threads import limit_cores, one_core, one_thread
 from cfx.core.workers import worker_pool
-
-log = logging.getLogger(__name__)
 
 _LOOK = 0.5
 """Seconds between looks at the workers' progress."""
