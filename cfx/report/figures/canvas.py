@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal, ParamSpec
 from weakref import WeakKeyDictionary
@@ -107,9 +108,18 @@ class Line:
         return self.method in HIDDEN
 
 
-def look() -> Any:
-    """Returns a context in which matplotlib draws in this look; the reader's settings come back."""
-    return mpl.rc_context(_STYLE)  # type: ignore[arg-type]  # the stubs want literal keys
+@contextmanager
+def look() -> Iterator[None]:
+    """Draws in this look, without warnings of names and values; the reader's settings come back."""
+    with (
+        mpl.rc_context(_STYLE),  # type: ignore[arg-type]  # the stubs want literal keys
+        warnings.catch_warnings(),
+    ):
+        # A name in a script that the font lacks shows boxes; the names are in pairs.csv.
+        warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
+        # Values of a damaged folder may all be one, or farther apart than floats can tell.
+        warnings.filterwarnings("ignore", message="Attempting to set identical")
+        yield
 
 
 def hover(artist: Artist, text: str) -> None:
@@ -127,9 +137,7 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
 
     @functools.wraps(draw)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> Figure:
-        with look(), warnings.catch_warnings():
-            # Values of a damaged folder may all be one, or farther apart than floats can tell.
-            warnings.filterwarnings("ignore", message="Attempting to set identical")
+        with look():
             return draw(*args, **kwargs)
 
     return wrapped

@@ -5,9 +5,7 @@ from __future__ import annotations
 import html
 import io
 import re
-import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib as mpl
@@ -77,7 +75,7 @@ def write_figure(figure: Figure, path: Path) -> Path:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_write(path) as unfinished, _quiet_look():
+        with atomic_write(path) as unfinished, look():
             form = path.suffix.removeprefix(".")
             figure.savefig(unfinished, format=form, dpi=DPI, metadata=_METADATA[form])
     except OSError as error:
@@ -97,7 +95,7 @@ def inline_svg(figure: Figure) -> str:
     """
     hovers = _prepare(figure)
     stream = io.StringIO()
-    with _quiet_look(), mpl.rc_context({"svg.fonttype": "none", "path.simplify_threshold": 0.3}):
+    with look(), mpl.rc_context({"svg.fonttype": "none", "path.simplify_threshold": 0.3}):
         # `savefig` would draw twice, once for the layout alone.
         paper = FigureCanvasSVG(figure)
         paper.print_svg(stream, metadata=_METADATA["svg"])  # type: ignore[no-untyped-call]
@@ -150,13 +148,3 @@ def _prepare(figure: Figure) -> list[str]:
 def _shorter(found: re.Match[str]) -> str:
     """Returns the path of an SVG with hundredths of a point."""
     return re.sub(r"(\.\d\d)\d+", r"\1", found[0])
-
-
-@contextmanager
-def _quiet_look() -> Iterator[None]:
-    """Draws in the common look; a name in a script that the font lacks is no warning."""
-    with look(), warnings.catch_warnings():
-        # It shows boxes; the names are in pairs.csv.
-        warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
-        warnings.filterwarnings("ignore", message="Attempting to set identical")
-        yield
