@@ -6,7 +6,6 @@
 #   make golden | make golden-write           compare the results of small jobs, bit for bit, with recorded ones | record them anew
 #   make fuzz [EXAMPLES=5000]                 bad configurations, recordings, policies and caches; each file of a job fails once
 #   make kills [KILLS=100]                    kill a sweep at random moments, with each launcher
-#   make hydra-next                           the sweeps' tests with the newest release candidate of Hydra
 #   make policies                             train the ready-made policies anew from ../shared/data (an hour)
 #   make dist                                 build cfx and the plugins into dist/, install them into a clean environment, try them
 #   make docs                                 build the site from docs/ and the docstrings into site/; warnings are errors
@@ -27,7 +26,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 TORCH = $(shell sed -n 's/^torch==//p' constraints.txt)
 
-.PHONY: run test test-slow golden golden-write fuzz kills hydra-next bench policies docs tutorials dist conf lock clean
+.PHONY: run test test-slow golden golden-write fuzz kills bench policies docs tutorials dist conf lock clean
 
 run: $(VENV)/.ready
 	$(BIN)/python -m cfx $(ARGS)
@@ -49,13 +48,6 @@ fuzz: $(VENV)/.ready-test
 
 kills: $(VENV)/.ready-test
 	CFX_KILLS=$(or $(KILLS),100) $(BIN)/python -m pytest -m slow tests/fuzz/test_kills.py -s
-
-# Beside the environment, not in it: what the other packages ask for is Hydra 1.3.
-$(VENV)/hydra-next: $(VENV)/.ready-test
-	$(PIP) install --quiet --pre --no-deps --target $@ "hydra-core>=1.4.0rc3" "omegaconf>=2.4.1rc1"
-
-hydra-next: $(VENV)/hydra-next
-	PYTHONPATH=$(VENV)/hydra-next $(BIN)/python -m pytest tests/test_sweeps.py tests/test_config.py tests/test_experiments.py tests/test_hydra_next.py
 
 bench: $(VENV)/.ready-test
 	$(BIN)/python -m pytest tests/benchmarks -m "" --override-ini addopts="--import-mode=importlib" --benchmark-only

@@ -45,7 +45,7 @@ from cfx.core import registry
 from cfx.core.errors import CfxError, ConfigError, Terminated, printable, without_passwords
 from cfx.core.memory import is_out_of_memory
 from cfx.core.plugin_errors import blame
-from cfx.core.signals import terminable
+from cfx.core.signals import signal_behind, terminable
 from cfx.core.storage import is_url
 
 if TYPE_CHECKING:
@@ -148,7 +148,7 @@ class JobFunction:
 
     def _failed(self, error: BaseException, blank: JobStatus) -> JobStatus:
         """Returns the status of a job that ended in an error; raises a signal that caused it."""
-        signalled = _signal_behind(error)
+        signalled = signal_behind(error)
         if signalled is not None:
             raise signalled from None
         detail = traceback.format_exc().rstrip()
@@ -239,7 +239,7 @@ def _run_hydra(job: JobFunction, arguments: Sequence[str]) -> int:
     except BrokenPipeError:
         raise  # the reader of stdout has gone; `cfx.app.cli.main` knows what that means
     except Exception as error:
-        signalled = _signal_behind(error)
+        signalled = signal_behind(error)
         if signalled is not None:
             return _interrupted(signalled)
         return _report(error, overrides, job.show_traceback)
@@ -247,28 +247,13 @@ def _run_hydra(job: JobFunction, arguments: Sequence[str]) -> int:
 
 
 def _call_hydra(job: JobFunction, arguments: Sequence[str]) -> None:
-    """Lets Hydra compose and call `job`, once more where a file asks for a multirun."""
+    """Lets Hydra compose and call `job`."""
     application = hydra.main(
-        config_path=str(nodes.conf_dir()), config_name="config", **hydra_source.main_keywords()
+        config_path=str(nodes.conf_dir()), config_name="config", version_base="1.3"
     )
-    try:
-        with _process_state(arguments):
-            hydra_source.register()
-            application(job)()
-    except Exception as error:
-        if not _asks_for_a_multirun(error) or "--multirun" in arguments:
-            raise
-    else:
-        return
-    _call_hydra(job, [*arguments, "--multirun"])
-
-
-def _asks_for_a_multirun(error: Exception) -> bool:
-    """Says whether a file such as an experiment's asks for a multirun.
-
-    Hydra 1.3 finds out by itself; 1.4 wants to know from the command line.
-    """
-    return "hydra.mode changed during config composition" in str(error)
+    with _process_state(arguments):
+        hydra_source.register()
+        application(job)()
 
 
 def run(overrides: Sequence[str] = (), *, target: str = JOB) -> JobResult:
@@ -319,7 +304,7 @@ def _call(target: str, values: Any, folder: Path) -> Any:
     except CfxError:
         raise
     except (Exception, SystemExit) as error:  # a plugin may raise anything
-        if _signal_behind(error) is not None:
+        if signal_behind(error) is not None:
             raise
         blamed: CfxError | None = blame(error)
         if blamed is None and is_out_of_memory(error):
@@ -353,20 +338,6 @@ def _interrupted(signalled: BaseException) -> int:
         return TERMINATED
     print("interrupted; what was finished is kept", file=sys.stderr)
     return INTERRUPTED
-
-
-def _signal_behind(error: BaseException) -> BaseException | None:
-    """Returns the Ctrl-C or SIGTERM that an error comes from.
-
-    Lightning answers Ctrl-C with sys.exit, and a library that a signal hits while it tidies up may
-    raise an error of its own.
-    """
-    current: BaseException | None = error
-    while current is not None:
-        if isinstance(current, KeyboardInterrupt | Terminated):
-            return current
-        current = current.__context__
-    return None
 
 
 def _metric(metrics: Mapping[str, float]) -> float:

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn, cast
 
 from cfx.core.errors import CfxError, ConfigError, Terminated
-from cfx.core.signals import ignore_signals, terminable
+from cfx.core.signals import ignore_signals, signal_behind, terminable
 
 if TYPE_CHECKING:
     from cfx.core.command import Command
@@ -36,10 +36,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(argv)
     _print_anything()
     try:
-        with terminable():
-            if arguments and re.match(r"\w[^=]*$", arguments[0]):
-                return _command(*arguments)
-            return _hydra(arguments)
+        with terminable() as raised:
+            try:
+                code = _run(arguments)
+            except Exception as error:
+                signalled = next(iter(raised), signal_behind(error))
+                if signalled is not None:
+                    raise signalled from error
+                raise
+            if code == 1 and raised:
+                raise raised[0]
+            return code
     except CfxError as error:
         print(error, file=sys.stderr)
         return error.exit_code
@@ -50,6 +57,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # `cfx plugins | head`: the reader has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+
+
+def _run(arguments: Sequence[str]) -> int:
+    """Runs a sub-command or the Hydra application; returns the exit code."""
+    if arguments and re.match(r"\w[^=]*$", arguments[0]):
+        return _command(*arguments)
+    return _hydra(arguments)
 
 
 def _command(name: str, *arguments: str) -> int:

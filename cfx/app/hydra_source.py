@@ -59,12 +59,6 @@ def path_override(key: str, path: Path) -> str:
     return f"{key}='{escaped}{ending[0]}'"
 
 
-_MAKES = ("cfx.*", "hydra.*", "hydra_plugins.*", "logging.*", "optuna.*", "nevergrad.*")
-"""What a configuration may make under Hydra 1.4: callbacks, launchers, sweepers and log handlers.
-
-Components are none of Hydra's objects: the registry makes them."""
-
-
 class ComponentSource(ConfigSource):
     """Serves `cfx://`: one config group per kind, one option per component."""
 
@@ -198,29 +192,10 @@ def composed(overrides: Sequence[str]) -> DictConfig:
         HydraException: an override fits nothing.
         PluginError: a chosen component cannot be loaded.
     """
-    with initialize_config_dir(config_dir=str(nodes.conf_dir()), job_name="cfx", **version_base()):
+    with initialize_config_dir(
+        config_dir=str(nodes.conf_dir()), job_name="cfx", version_base="1.3"
+    ):
         return compose("config", overrides=list(overrides), return_hydra_config=True)
-
-
-def version_base() -> dict[str, str]:
-    """Returns the keyword by which Hydra 1.3 is asked for its own defaults; 1.4 wants none."""
-    if _has_whitelist():
-        return {}
-    return {"version_base": "1.3"}
-
-
-def main_keywords() -> dict[str, Any]:
-    """Returns the keywords of `hydra.main` besides the configuration.
-
-    Hydra 1.4 asks which objects a configuration may make.
-    """
-    if _has_whitelist():
-        return {"execution_whitelist": list(_MAKES)}
-    return dict(version_base())
-
-
-def _has_whitelist() -> bool:
-    return hasattr(hydra.utils, "execution_whitelist")
 
 
 @contextmanager

@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import omegaconf
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
@@ -128,15 +127,4 @@ def _sources(config: Any) -> tuple[Any, ...]:
     return str(config.hydra.job.config_name), given
 
 
-def _register_job_name() -> None:
-    """Makes `${cfx_job:}` known.
-
-    OmegaConf 2.4 does it under a name that meant something else before.
-    """
-    register: Any = OmegaConf.register_new_resolver
-    if not omegaconf.__version__.startswith("2.3"):
-        register = OmegaConf.register_resolver
-    register("cfx_job", job_name, replace=True)
-
-
-_register_job_name()
+OmegaConf.register_new_resolver("cfx_job", job_name, replace=True)

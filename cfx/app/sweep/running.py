@@ -196,7 +196,7 @@ class Sweep:
 
 @contextlib.contextmanager
 def writable(config: DictConfig) -> Iterator[None]:
-    """Lets the block change Hydra's node, which Hydra 1.4 has made read-only by then."""
+    """Lets the block change Hydra's node."""
     with read_write(config.hydra), open_dict(config.hydra):
         yield
 
