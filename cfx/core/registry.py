@@ -31,7 +31,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from cfx.core.component import API_VERSION, Component, Settings, validate
-from cfx.core.errors import CfxError, ConfigError, PluginError, nearest
+from cfx.core.errors import CfxError, ConfigError, PluginError, Terminated, nearest
 from cfx.core.extras import advice
 
 log = logging.getLogger(__name__)
@@ -495,7 +495,7 @@ def _import(found: Entry) -> Any:
     try:
         imported = importlib.import_module(module)
         return functools.reduce(getattr, attribute.split("."), imported)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, Terminated):
         raise
     except BaseException as error:  # a plugin may raise anything, even SystemExit
         raise PluginError(
