@@ -45,7 +45,7 @@ from cfx.core import registry
 from cfx.core.errors import CfxError, ConfigError, Terminated, printable, without_passwords
 from cfx.core.memory import is_out_of_memory
 from cfx.core.plugin_errors import blame
-from cfx.core.signals import signal_behind, terminable
+from cfx.core.signals import raise_if_terminated, signal_behind, terminable
 from cfx.core.storage import is_url
 
 if TYPE_CHECKING:
@@ -84,6 +84,7 @@ class JobFunction:
         Returns:
             The policy's RMSE of speed, m/s, for sweepers that optimise; NaN if the job failed.
         """
+        raise_if_terminated()
         hydra_config = HydraConfig.get()
         folder = Path(hydra_config.runtime.output_dir)
         # As typed, `${...}` included.

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn, cast
 
 from cfx.core.errors import CfxError, ConfigError, Terminated
-from cfx.core.signals import ignore_signals, signal_behind, terminable
+from cfx.core.signals import ignore_signals, raise_if_terminated, signal_behind, terminable
 
 if TYPE_CHECKING:
     from cfx.core.command import Command
@@ -36,16 +36,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(argv)
     _print_anything()
     try:
-        with terminable() as raised:
+        with terminable():
             try:
                 code = _run(arguments)
             except Exception as error:
-                signalled = next(iter(raised), signal_behind(error))
+                raise_if_terminated()
+                signalled = signal_behind(error)
                 if signalled is not None:
                     raise signalled from error
                 raise
-            if code == 1 and raised:
-                raise raised[0]
+            if code == 1:
+                raise_if_terminated()
             return code
     except CfxError as error:
         print(error, file=sys.stderr)

@@ -10,29 +10,45 @@ from types import FrameType
 from cfx.core.errors import Terminated
 
 
+class _Terminate:
+    """A handler of SIGTERM that remembers what it raised."""
+
+    def __init__(self) -> None:
+        self.raised: Terminated | None = None
+
+    def __call__(self, _number: int, _frame: FrameType | None) -> None:
+        self.raised = Terminated()
+        raise self.raised
+
+
 @contextlib.contextmanager
-def terminable() -> Iterator[list[BaseException]]:
-    """Turns SIGTERM into `Terminated`.
-
-    Yields:
-        What was raised so far: code that a signal hits, such as C code that imports a module, may
-        raise an error of its own instead, without a context.
-    """
-    raised: list[BaseException] = []
-
-    def terminate(_number: int, _frame: FrameType | None) -> None:
-        raised.append(Terminated())
-        raise raised[-1]
-
-    try:
-        before = signal.signal(signal.SIGTERM, terminate)
-    except ValueError:  # not in the main thread, where signals do not arrive either
-        yield raised
+def terminable() -> Iterator[None]:
+    """Turns SIGTERM into `Terminated`."""
+    if isinstance(signal.getsignal(signal.SIGTERM), _Terminate):
+        yield
         return
     try:
-        yield raised
+        before = signal.signal(signal.SIGTERM, _Terminate())
+    except ValueError:  # not in the main thread, where signals do not arrive either
+        yield
+        return
+    try:
+        yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def raise_if_terminated() -> None:
+    """Raises again what SIGTERM raised in code that went on or failed otherwise.
+
+    OmegaConf and C code that imports a module do so.
+
+    Raises:
+        Terminated: SIGTERM arrived in a block of `terminable`.
+    """
+    handler = signal.getsignal(signal.SIGTERM)
+    if isinstance(handler, _Terminate) and handler.raised is not None:
+        raise handler.raised
 
 
 def signal_behind(error: BaseException) -> BaseException | None:
