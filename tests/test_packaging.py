@@ -17,7 +17,8 @@ from packaging.utils import canonicalize_name
 import cfx
 from cfx.app import nodes
 from cfx.core import registry
-from cfx.report.figures import figure
+from cfx.report.figures.figure import JobFigure
+from cfx.report.section import Section
 
 ROOT = Path(__file__).resolve().parent.parent
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -45,8 +46,9 @@ def test_entry_points_of_pyproject_are_the_installed_ones() -> None:
             if one.distribution == nodes.DISTRIBUTION
         }
         assert installed == declared[kind.entry_points], "install again: pip install -e ."
-    own = {one.name for one in figure.installed() if one.distribution == nodes.DISTRIBUTION}
-    assert own == {name for name, _ in declared.pop(figure.GROUP)}
+    for base in (JobFigure, Section):
+        own = {one.name for one in base.installed() if one.distribution == nodes.DISTRIBUTION}
+        assert own == {name for name, _ in declared.pop(base.group)}
     assert set(declared) == {kind.entry_points for kind in registry.KINDS.values()}
     (script,) = metadata.entry_points(group="console_scripts", name="cfx")
     assert script.value == PYPROJECT["project"]["scripts"]["cfx"]

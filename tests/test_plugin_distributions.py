@@ -20,7 +20,18 @@ from cfx.core import registry
 ROOT = Path(__file__).resolve().parent.parent
 PLUGINS = sorted(path.parent for path in (ROOT / "plugins").glob("*/pyproject.toml"))
 READERS = {"cfx.data.files", "cfx.data.series", "cfx.data.tracks"}
-PUBLIC_MODULES = {"cfx", "cfx.core.errors", *READERS} | {
+REPORTS = {
+    "cfx.report.blocks",
+    "cfx.report.figure_blocks",
+    "cfx.report.figures.canvas",
+    "cfx.report.figures.figure",
+    "cfx.report.figures.results",
+    "cfx.report.figures.words",
+    "cfx.report.job",
+    "cfx.report.section",
+    "cfx.report.tables",
+}
+PUBLIC_MODULES = {"cfx", "cfx.core.errors", *READERS, *REPORTS} | {
     kind.base.partition(":")[0] for kind in registry.KINDS.values()
 }
 """What a plugin may import from, and `cfx.contracts`; docs/plugins.md says so."""

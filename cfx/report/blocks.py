@@ -1,8 +1,8 @@
-"""What sections are made of: small objects that one template draws, and the section itself."""
+"""What sections are made of: small objects that one template draws."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from cfx.report.job import Runs
@@ -126,23 +126,6 @@ class Fold(Block):
     blocks: tuple[Block, ...]
     unfolded: bool = False
     style: str = ""
-
-
-@dataclass(frozen=True)
-class Section:
-    """A section of the page.
-
-    Attributes:
-        id: its anchor.
-        title: its heading.
-        entry: its name in the contents.
-        blocks: returns what it shows of some jobs; a section without blocks is left out.
-    """
-
-    id: str
-    title: str
-    entry: str
-    blocks: Callable[[Runs], Sequence[Block]]
 
 
 MOST = 6

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from cfx.report.blocks import Figure, View
-from cfx.report.figures.figure import figure
+from cfx.report.figures.figure import JobFigure, draw
 from cfx.report.job import Job
 
 if TYPE_CHECKING:
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
 
 def figure_of(name: str, job: Job) -> Figure | None:
     """Returns the figure of that name as the job has written it; None if the job lacks its data."""
-    found = figure(name)
-    drawing = found.draw(job.results)
-    return None if drawing is None else shown(drawing, found.figure.title)
+    found = JobFigure.named(name)
+    drawing = draw(found, job.results)
+    return None if drawing is None else shown(drawing, found.part.title)
 
 
 def caption(name: str) -> str:
     """Returns what a reader needs to know of the figure of that name."""
-    return figure(name).figure.caption
+    return JobFigure.named(name).part.caption
 
 
 def shown(drawing: Drawing, label: str) -> Figure:

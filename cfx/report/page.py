@@ -11,7 +11,7 @@ from cfx.core.files import write_output
 from cfx.data.style.result import CLUSTERS
 from cfx.report.job import Runs, calibrations
 from cfx.report.scripts import inline_scripts, security_policy
-from cfx.report.sections import SECTIONS
+from cfx.report.section import Section
 from cfx.report.summary import summary
 from cfx.results.look import CLUSTER_COLOURS, COLOURS
 
@@ -54,10 +54,10 @@ def _content(runs: Runs, title: str | None) -> dict[str, Any]:
 
     scripts = inline_scripts([_asset(name) for name in _SCRIPTS])
     sections = []
-    for section in SECTIONS:
-        blocks = section.blocks(runs)
+    for one in Section.installed():
+        blocks = one.attempt(lambda section: section.blocks(runs))
         if blocks:
-            sections.append((section, blocks))
+            sections.append((one, blocks))
     subject = "Parameters that adapt"
     if len(calibrations(runs.jobs)) == len(runs.jobs):
         subject = "Calibration"

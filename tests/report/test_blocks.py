@@ -18,14 +18,14 @@ from cfx.report.blocks import (
     Heading,
     Items,
     Listing,
-    Section,
     Table,
     Text,
     View,
 )
+from cfx.report.installed import Installed
 from cfx.report.job import Runs
 from cfx.report.runs import read_runs
-from cfx.report.sections import SECTIONS
+from cfx.report.section import Section
 from cfx.report.tables import Column, Sheet, text
 from tests.report.folders import write_job
 from tests.report.test_page import Page
@@ -45,22 +45,43 @@ EVERY: tuple[Block, ...] = (
 )
 
 
-def of_some(runs: Runs) -> Sequence[Block]:
-    return EVERY
+class Further(Section):
+    """A section of a third party."""
+
+    title = "A further section"
+    entry = "Further"
+
+    def blocks(self, runs: Runs) -> Sequence[Block]:
+        """Return every kind of block."""
+        return EVERY
 
 
-def of_none(runs: Runs) -> Sequence[Block]:
-    return ()
+class Empty(Further):
+    """A section that has nothing to show."""
+
+    def blocks(self, runs: Runs) -> Sequence[Block]:
+        """Return nothing."""
+        return ()
+
+
+class Broken(Further):
+    """A section that fails."""
+
+    def blocks(self, runs: Runs) -> Sequence[Block]:
+        """Fail."""
+        raise ValueError("no luck")
 
 
 def test_a_further_section_needs_nothing_but_its_blocks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     kinds = {block.kind for block in EVERY} | {"group"}
     assert kinds == {one.__name__.lower() for one in blocks.Block.__subclasses__()}
-    further = Section("further", "A further section", "Further", of_some)
-    empty = Section("empty", "An empty section", "Empty", of_none)
-    monkeypatch.setattr(page, "SECTIONS", (*SECTIONS, further, empty))
+    added = []
+    for name, section in (("mine", Further()), ("empty", Empty()), ("broken", Broken())):
+        added.append(Installed(name, section, "somebody-else"))
+    known = (*Section.installed()[-2:], *added)
+    monkeypatch.setattr(Section, "installed", lambda: known)
     write_job(tmp_path / "job", pairs=3)
     found = Page(page.render(read_runs([str(tmp_path)])))
     for words in (
@@ -82,6 +103,7 @@ def test_a_further_section_needs_nothing_but_its_blocks(
     ):
         assert words in found.words
     assert "a figure" in found.having("aria-label")
-    assert "further" in found.having("id")
-    assert "#further" in found.having("href")
-    assert "empty" not in found.having("id")
+    assert "mine" in found.having("id")
+    assert "#mine" in found.having("href")
+    assert {"empty", "broken"}.isdisjoint(found.having("id"))
+    assert "section broken of the distribution somebody-else is left out: ValueError" in caplog.text

@@ -373,7 +373,7 @@ def test_a_calibration_is_none_of_the_policies_that_adapt(tmp_path: Path) -> Non
     assert "Improvement of every pair" not in page.words
     assert "policy" not in alone[0].meaningful_methods, "a constant set is shown once"
     (moves,) = [job for job in runs.jobs if job.adapts]
-    figure, fold = clusters_section.blocks(runs)[1:3]
+    figure, fold = clusters_section.ClustersSection().blocks(runs)[1:3]
     assert isinstance(figure, Figure)
     assert isinstance(fold, Fold)
     (table,) = fold.blocks

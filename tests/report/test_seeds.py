@@ -10,7 +10,7 @@ import pytest
 from cfx.report.grouped import rows_over_seeds
 from cfx.report.job import Runs
 from cfx.report.runs import read_runs
-from cfx.report.sections.seeds import blocks, over_seeds
+from cfx.report.sections.seeds import SeedsSection, over_seeds
 from cfx.report.summary import summary
 from tests.report.folders import ACROSS, write_job
 
@@ -60,5 +60,5 @@ def test_the_summary_names_the_best_over_seeds(runs: Runs) -> None:
 def test_jobs_without_seeds_of_their_own_have_no_such_section(runs: Runs) -> None:
     different = tuple(job for job in runs.jobs if job.config["seed"] == 1)
     assert len(different) == 4
-    assert blocks(Runs(different, ())) == []
-    assert len(blocks(runs)) == 2
+    assert SeedsSection().blocks(Runs(different, ())) == []
+    assert len(SeedsSection().blocks(runs)) == 2

@@ -19,7 +19,7 @@ from matplotlib.lines import Line2D
 from cfx.core.errors import OutputError
 from cfx.core.files import atomic_write
 from cfx.report.figures.canvas import DPI, WIDTH, hover_text, look
-from cfx.report.figures.figure import installed
+from cfx.report.figures.figure import JobFigure, draw
 from cfx.report.figures.results import Results
 
 _METADATA: dict[str, dict[str, None]] = {
@@ -53,8 +53,8 @@ def write_figures(
         OutputError: a file cannot be written.
     """
     paths = []
-    for one in installed():
-        figure = one.draw(results)
+    for one in JobFigure.installed():
+        figure = draw(one, results)
         if figure is not None:
             for form in formats:
                 paths.append(write_figure(figure, folder / f"{one.name}.{form}"))

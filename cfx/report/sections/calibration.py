@@ -9,32 +9,40 @@ from dataclasses import replace
 import numpy as np
 
 from cfx.calibration.flatness import NEAR
-from cfx.report.blocks import Block, Figure, Section, Table, Text, job_fold
+from cfx.report.blocks import Block, Figure, Table, Text, job_fold
 from cfx.report.figure_blocks import caption, figure_of, view
 from cfx.report.figures.calibration import AT_BOUND, ParameterSpread, parameter_spreads
 from cfx.report.figures.identifiability import SlicePanel, draw_labels, labels_of, slice_panels
 from cfx.report.figures.words import number as shown_number
 from cfx.report.figures.words import short, unit_label
 from cfx.report.job import Job, Runs, with_constant_baseline
+from cfx.report.section import Section
 from cfx.report.tables import Cell, Column, Sheet, formatted, job_names, number, text
 
 
-def blocks(runs: Runs) -> list[Block]:
-    """Returns a plot and a table for each different calibration, with the jobs that share it."""
-    together: dict[str, list[Job]] = {}
-    for job in with_constant_baseline(runs.jobs):
-        spreads = spreads_of(job)
-        if spreads:
-            together.setdefault(_fingerprint(spreads), []).append(job)
-    found: list[Block] = []
-    for k, jobs in enumerate(together.values()):
-        spreads = spreads_of(jobs[0])
-        figure = figure_of("calibration", jobs[0])
-        parts: list[Block] = [] if figure is None else [figure]
-        panels = slices_of(jobs[0])
-        parts += [Table(sheet(spreads, panels), explain=k == 0), *_beyond(jobs)]
-        found.append(job_fold(job_names(jobs), parts, first=k == 0))
-    return [Text(caption("calibration")), *found] if found else []
+class CalibrationSection(Section):
+    """Calibrated parameters: their spread over drivers, shares at bounds, correlations."""
+
+    title = "Calibrated parameters"
+    entry = "Calibration"
+    order = 1400
+
+    def blocks(self, runs: Runs) -> list[Block]:
+        """Return a plot and a table for each calibration, with the jobs that share it."""
+        together: dict[str, list[Job]] = {}
+        for job in with_constant_baseline(runs.jobs):
+            spreads = spreads_of(job)
+            if spreads:
+                together.setdefault(_fingerprint(spreads), []).append(job)
+        found: list[Block] = []
+        for k, jobs in enumerate(together.values()):
+            spreads = spreads_of(jobs[0])
+            figure = figure_of("calibration", jobs[0])
+            parts: list[Block] = [] if figure is None else [figure]
+            panels = slices_of(jobs[0])
+            parts += [Table(sheet(spreads, panels), explain=k == 0), *_beyond(jobs)]
+            found.append(job_fold(job_names(jobs), parts, first=k == 0))
+        return [Text(caption("calibration")), *found] if found else []
 
 
 def _beyond(jobs: Sequence[Job]) -> list[Block]:
@@ -127,6 +135,3 @@ def _row(spread: ParameterSpread, panels: Mapping[str, SlicePanel]) -> tuple[Cel
         number(share, formatted(share, ".0%")),
         number(flat, formatted(flat, ".0%")),
     )
-
-
-SECTION = Section("calibration", "Calibrated parameters", "Calibration", blocks)

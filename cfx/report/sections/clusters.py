@@ -8,12 +8,13 @@ import pandas as pd
 
 from cfx.data.style.result import CLUSTERS
 from cfx.evaluation.statistics import Improvement
-from cfx.report.blocks import Block, Figure, Fold, Section, Table, Text
+from cfx.report.blocks import Block, Figure, Fold, Table, Text
 from cfx.report.figure_blocks import view
 from cfx.report.figures.jobs import ClusterGroup, cluster_boxes, draw_clusters
 from cfx.report.figures.words import explained, label
 from cfx.report.job import Job, Runs, any_baselines, with_baseline
 from cfx.report.names import SEPARATOR, differences
+from cfx.report.section import Section
 from cfx.report.tables import Cell, Column, Sheet, formatted, interval, number, share, text
 
 Series = Mapping[str, Mapping[str, pd.DataFrame]]
@@ -25,19 +26,26 @@ _INTRODUCTION = (
 )
 
 
-def blocks(runs: Runs) -> list[Block]:
-    """Returns the plot and a table per baseline, if any job has a baseline."""
-    jobs = with_baseline(runs.jobs)
-    if not jobs:
-        return []
-    baselines = any_baselines(jobs)
-    series = cluster_series(jobs)
-    found: list[Block] = [Text(_INTRODUCTION), per_cluster(series, baselines)]
-    for k, baseline in enumerate(baselines):
-        first = k == 0
-        table = Table(clusters(series, baseline), explain=first)
-        found.append(Fold(f"Policy against {label(baseline)}", (table,), unfolded=first))
-    return found
+class ClustersSection(Section):
+    """Improvement by cluster of driving style."""
+
+    title = "By cluster of driving style"
+    entry = "By cluster"
+    order = 1300
+
+    def blocks(self, runs: Runs) -> list[Block]:
+        """Return the plot and a table per baseline, if any job has a baseline."""
+        jobs = with_baseline(runs.jobs)
+        if not jobs:
+            return []
+        baselines = any_baselines(jobs)
+        series = cluster_series(jobs)
+        found: list[Block] = [Text(_INTRODUCTION), per_cluster(series, baselines)]
+        for k, baseline in enumerate(baselines):
+            first = k == 0
+            table = Table(clusters(series, baseline), explain=first)
+            found.append(Fold(f"Policy against {label(baseline)}", (table,), unfolded=first))
+        return found
 
 
 def cluster_series(jobs: Sequence[Job]) -> dict[str, dict[str, pd.DataFrame]]:
@@ -154,6 +162,3 @@ def statistics(table: pd.DataFrame, baseline: str) -> Improvement:
     before = table[f"rmse_speed/{baseline}"].to_numpy(dtype=float)
     after = table["rmse_speed/policy"].to_numpy(dtype=float)
     return improvement_statistics(before, after, table["driver"].astype(str).tolist(), seed=0)
-
-
-SECTION = Section("clusters", "By cluster of driving style", "By cluster", blocks)

@@ -10,12 +10,13 @@ import numpy as np
 
 from cfx.evaluation.metrics.base import MetricInfo
 from cfx.evaluation.result import METHODS
-from cfx.report.blocks import Block, Figure, Fold, Heading, Section, Table, Text, View
+from cfx.report.blocks import Block, Figure, Fold, Heading, Table, Text, View
 from cfx.report.figure_blocks import view
 from cfx.report.figures.jobs import draw_error_dots, error_dots
 from cfx.report.figures.words import FULL_TRAJECTORY, STEADY, TEST, explained, percent, short_label
 from cfx.report.job import Job, Runs, any_baselines, any_has_metric, without_baseline
 from cfx.report.metrics import metric_title
+from cfx.report.section import Section
 from cfx.report.tables import Cell, Column, Sheet, formatted, job_names, number, tested, text
 
 _RECORDED = "Behind recorded leaders"
@@ -144,41 +145,50 @@ _GAINS = (
 )
 
 
-def blocks(runs: Runs) -> list[Block]:
-    """Returns the comparison of all jobs."""
-    jobs = runs.jobs
-    introduction = (
-        "Errors in m/s and m compare across driving models and learners; lower is closer to the"
-        " real driver."
-    )
-    if len(jobs) > 1:
-        introduction += " The best of a column is bold where all jobs are tested on the same pairs."
-    found: list[Block] = [
-        Text(introduction),
-        Table(closeness(jobs), compact=True, explain=True),
-    ]
-    unconditional = without_baseline(jobs)
-    if unconditional:
-        found.append(
-            Text(
-                f"{job_names(unconditional)}: the policy sets the acceleration itself. With"
-                " constant parameters the model follows no leader, so that no calibration is a"
-                " baseline. Its errors are an upper reference for the models that follow.",
-                "note",
-            )
+class ComparisonSection(Section):
+    """All jobs side by side: how close each is to the real drivers, and how safely it drives."""
+
+    title = "Side by side"
+    entry = "Side by side"
+    order = 200
+
+    def blocks(self, runs: Runs) -> list[Block]:
+        """Return the comparison of all jobs."""
+        jobs = runs.jobs
+        introduction = (
+            "Errors in m/s and m compare across driving models and learners; lower is closer to the"
+            " real driver."
         )
-    found += [
-        absolute(jobs),
-        Heading("Is it safe, and smooth?"),
-        Text("The numbers are the policy's; the smaller line below is a baseline's."),
-        Table(safety(jobs), compact=True, explain=True),
-    ]
-    further = every_metric(jobs)
-    if further is not None:
-        words = "The numbers are the policy's; the smaller line: driver-specific calibration."
-        table = Table(further, compact=True, explain=True)
-        found.append(Fold("Every metric of every job, test part", (Text(words), table)))
-    return found
+        if len(jobs) > 1:
+            introduction += (
+                " The best of a column is bold where all jobs are tested on the same pairs."
+            )
+        found: list[Block] = [
+            Text(introduction),
+            Table(closeness(jobs), compact=True, explain=True),
+        ]
+        unconditional = without_baseline(jobs)
+        if unconditional:
+            found.append(
+                Text(
+                    f"{job_names(unconditional)}: the policy sets the acceleration itself. With"
+                    " constant parameters the model follows no leader, so that no calibration is a"
+                    " baseline. Its errors are an upper reference for the models that follow.",
+                    "note",
+                )
+            )
+        found += [
+            absolute(jobs),
+            Heading("Is it safe, and smooth?"),
+            Text("The numbers are the policy's; the smaller line below is a baseline's."),
+            Table(safety(jobs), compact=True, explain=True),
+        ]
+        further = every_metric(jobs)
+        if further is not None:
+            words = "The numbers are the policy's; the smaller line: driver-specific calibration."
+            table = Table(further, compact=True, explain=True)
+            found.append(Fold("Every metric of every job, test part", (Text(words), table)))
+        return found
 
 
 def closeness(jobs: Sequence[Job]) -> Sheet:
@@ -348,6 +358,3 @@ def _mark_best(rows: list[list[Cell]], jobs: Sequence[Job], columns: Sequence[Co
             best = min(known) if is_error else max(known)
             for row in rows:
                 row[k] = replace(row[k], best=row[k].sort == repr(best))
-
-
-SECTION = Section("comparison", "Side by side", "Side by side", blocks)

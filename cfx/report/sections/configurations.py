@@ -6,19 +6,30 @@ from collections.abc import Mapping
 
 import yaml
 
-from cfx.report.blocks import Block, Fold, Listing, Section, Text
+from cfx.report.blocks import Block, Fold, Listing, Text
 from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs
+from cfx.report.section import Section
 
 
-def blocks(runs: Runs) -> list[Block]:
-    """Returns a fold for each job."""
-    found: list[Block] = [Text("The whole configuration of each job, as it ran.")]
-    for job in runs.jobs:
-        found.append(
-            Fold(job.name, (Text(without_folders(job.place), "fine"), Listing(_configuration(job))))
-        )
-    return found
+class ConfigurationsSection(Section):
+    """The whole configuration of each job."""
+
+    title = "Configurations"
+    entry = "Configurations"
+    order = 2000
+
+    def blocks(self, runs: Runs) -> list[Block]:
+        """Return a fold for each job."""
+        found: list[Block] = [Text("The whole configuration of each job, as it ran.")]
+        for job in runs.jobs:
+            found.append(
+                Fold(
+                    job.name,
+                    (Text(without_folders(job.place), "fine"), Listing(_configuration(job))),
+                )
+            )
+        return found
 
 
 def _configuration(job: Job) -> str:
@@ -30,6 +41,3 @@ def _configuration(job: Job) -> str:
             design += f"# {str(name).replace('_', ' ')}: {value}\n"
     text = yaml.safe_dump(dict(job.config), sort_keys=False, allow_unicode=True)
     return design + without_folders(str(text))
-
-
-SECTION = Section("configs", "Configurations", "Configurations", blocks)

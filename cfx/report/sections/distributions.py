@@ -12,10 +12,11 @@ from cfx.evaluation.distributions import (
     sampled_methods,
     summarize_distributions,
 )
-from cfx.report.blocks import Block, Section, Table, Text, job_fold
+from cfx.report.blocks import Block, Table, Text, job_fold
 from cfx.report.figure_blocks import caption, figure_of
 from cfx.report.figures.distributions import sampled_name
 from cfx.report.job import Job, Runs
+from cfx.report.section import Section
 from cfx.report.tables import Cell, Column, Sheet, formatted, method_cell, methods_explained, number
 
 _NAME = "distributions"
@@ -26,22 +27,29 @@ _INTRODUCTION = (
 )
 
 
-def blocks(runs: Runs) -> list[Block]:
-    """Returns plots and a table for each job with sampled forecasts."""
-    found: list[Block] = []
-    methods: dict[str, None] = {}
-    for job in runs.jobs:
-        if job.distributions is not None and job.forecasts is not None:
-            shown = _job_blocks(job, job.distributions, job.forecasts)
-            found.append(job_fold(job.name, shown, first=not found))
-            methods |= dict.fromkeys(_shown(job.distributions))
-    if not found:
-        return []
-    return [
-        Text(_INTRODUCTION + caption(_NAME)),
-        Text(f"Methods: {methods_explained(methods)}"),
-        *found,
-    ]
+class DistributionsSection(Section):
+    """Sampled forecasts: proper scores, coverage, PIT."""
+
+    title = "Sampled forecasts"
+    entry = "Distributions"
+    order = 800
+
+    def blocks(self, runs: Runs) -> list[Block]:
+        """Return plots and a table for each job with sampled forecasts."""
+        found: list[Block] = []
+        methods: dict[str, None] = {}
+        for job in runs.jobs:
+            if job.distributions is not None and job.forecasts is not None:
+                shown = _job_blocks(job, job.distributions, job.forecasts)
+                found.append(job_fold(job.name, shown, first=not found))
+                methods |= dict.fromkeys(_shown(job.distributions))
+        if not found:
+            return []
+        return [
+            Text(_INTRODUCTION + caption(_NAME)),
+            Text(f"Methods: {methods_explained(methods)}"),
+            *found,
+        ]
 
 
 def _job_blocks(job: Job, table: pd.DataFrame, forecasts: pd.DataFrame) -> list[Block]:
@@ -89,6 +97,3 @@ def _shown(table: pd.DataFrame) -> tuple[str, ...]:
 
 def _number(value: float) -> Cell:
     return number(value, formatted(value, ".3f"))
-
-
-SECTION = Section("distributions", "Sampled forecasts", "Distributions", blocks)

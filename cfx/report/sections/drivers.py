@@ -8,13 +8,14 @@ from dataclasses import replace
 
 import pandas as pd
 
-from cfx.report.blocks import Block, Figure, Fold, Section, Table, Text, View
+from cfx.report.blocks import Block, Figure, Fold, Table, Text, View
 from cfx.report.figure_blocks import view
 from cfx.report.figures.improvements import improvement_bars
 from cfx.report.figures.jobs import draw_every_pair
 from cfx.report.figures.words import label, short_label
 from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs, any_baselines, with_baseline
+from cfx.report.section import Section
 from cfx.report.tables import Column, Sheet, formatted, number, share, text
 
 _INTRODUCTION = (
@@ -25,15 +26,22 @@ _INTRODUCTION = (
 _STATISTICS = ("mean", "ci95_low", "ci95_high")
 
 
-def blocks(runs: Runs) -> list[Block]:
-    """Returns the plot, if any job has a baseline."""
-    jobs = with_baseline(runs.jobs)
-    if not jobs:
-        return []
-    found: list[Block] = [Text(_INTRODUCTION), per_driver(jobs)]
-    for job in jobs:
-        found.append(Fold(f"Every pair: {job.name}", (Table(pairs_of(job), compact=True),)))
-    return found
+class DriversSection(Section):
+    """Improvement of every pair, all jobs beside each other."""
+
+    title = "Driver by driver"
+    entry = "Driver by driver"
+    order = 1200
+
+    def blocks(self, runs: Runs) -> list[Block]:
+        """Return the plot, if any job has a baseline."""
+        jobs = with_baseline(runs.jobs)
+        if not jobs:
+            return []
+        found: list[Block] = [Text(_INTRODUCTION), per_driver(jobs)]
+        for job in jobs:
+            found.append(Fold(f"Every pair: {job.name}", (Table(pairs_of(job), compact=True),)))
+        return found
 
 
 def per_driver(jobs: Sequence[Job]) -> Figure:
@@ -99,6 +107,3 @@ def pairs_of(job: Job) -> Sheet:
     groups = (("", 4), ("Improvement of the policy", len(job.baselines())))
     errors = ("RMSE of speed in m/s, below it of gap in m", len(job.methods))
     return Sheet(tuple(columns), tuple(rows), (*groups, errors))
-
-
-SECTION = Section("drivers", "Driver by driver", "Driver by driver", blocks)

@@ -10,9 +10,10 @@ import pandas as pd
 
 from cfx.evaluation.forecasts import SCOPE, forecast_methods, metric_name
 from cfx.evaluation.metrics.base import key_of
-from cfx.report.blocks import Block, Group, Heading, Section, Table, Text
+from cfx.report.blocks import Block, Group, Heading, Table, Text
 from cfx.report.figure_blocks import caption, figure_of
 from cfx.report.job import Job, Runs
+from cfx.report.section import Section
 from cfx.report.tables import Cell, Column, Sheet, formatted, method_cell, methods_explained, number
 
 _INTRODUCTION = (
@@ -27,21 +28,28 @@ _LEADERS = {
 }
 
 
-def blocks(runs: Runs) -> list[Block]:
-    """Returns plots and a table for each job with forecasts."""
-    cards: list[Block] = []
-    methods: dict[str, None] = {}
-    for job in runs.jobs:
-        if job.forecasts is not None:
-            cards.append(Group(tuple(_job_blocks(job, job.forecasts)), "card"))
-            methods |= dict.fromkeys(forecast_methods(job.forecasts))
-    if not cards:
-        return []
-    return [
-        Text(caption("forecasts") + _INTRODUCTION),
-        Text(f"Methods: {methods_explained(methods)}"),
-        *cards,
-    ]
+class ForecastsSection(Section):
+    """Errors of forecasts from many moments, by horizon and by the history that was read."""
+
+    title = "Forecasts from every moment"
+    entry = "Forecasts"
+    order = 700
+
+    def blocks(self, runs: Runs) -> list[Block]:
+        """Return plots and a table for each job with forecasts."""
+        cards: list[Block] = []
+        methods: dict[str, None] = {}
+        for job in runs.jobs:
+            if job.forecasts is not None:
+                cards.append(Group(tuple(_job_blocks(job, job.forecasts)), "card"))
+                methods |= dict.fromkeys(forecast_methods(job.forecasts))
+        if not cards:
+            return []
+        return [
+            Text(caption("forecasts") + _INTRODUCTION),
+            Text(f"Methods: {methods_explained(methods)}"),
+            *cards,
+        ]
 
 
 def _job_blocks(job: Job, table: pd.DataFrame) -> list[Block]:
@@ -93,6 +101,3 @@ def _cell(job: Job, metric: str, method: str) -> Cell:
 
 def _horizons(table: pd.DataFrame) -> Sequence[float]:
     return sorted(float(horizon) for horizon in table["horizon_s"].unique())
-
-
-SECTION = Section("forecasts", "Forecasts from every moment", "Forecasts", blocks)

@@ -4,26 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from cfx.report.blocks import Block, Group, Heading, Section, Table, Text, cards
+from cfx.report.blocks import Block, Group, Heading, Table, Text, cards
 from cfx.report.figure_blocks import caption, figure_of
 from cfx.report.figures.history import history_curves
 from cfx.report.job import Job, Runs
+from cfx.report.section import Section
 from cfx.report.tables import Cell, Column, Sheet, interval, number, share, text
 
 _NAME = "history"
 
 
-def blocks(runs: Runs) -> list[Block]:
-    """Returns a plot for each job that varied the history, and a table."""
-    jobs = [job for job in runs.jobs if job.history is not None]
-    if not jobs:
-        return []
-    groups = []
-    for job in jobs:
-        figure = figure_of(_NAME, job)
-        if figure is not None:
-            groups.append(Group((Heading(job.name), figure), "card"))
-    return [Text(caption(_NAME)), *cards(groups), Table(histories(jobs))]
+class HistorySection(Section):
+    """How much burn-in the policy needs."""
+
+    title = "How much history the policy needs"
+    entry = "History"
+    order = 1000
+
+    def blocks(self, runs: Runs) -> list[Block]:
+        """Return a plot for each job that varied the history, and a table."""
+        jobs = [job for job in runs.jobs if job.history is not None]
+        if not jobs:
+            return []
+        groups = []
+        for job in jobs:
+            figure = figure_of(_NAME, job)
+            if figure is not None:
+                groups.append(Group((Heading(job.name), figure), "card"))
+        return [Text(caption(_NAME)), *cards(groups), Table(histories(jobs))]
 
 
 def histories(jobs: Sequence[Job]) -> Sheet:
@@ -64,6 +72,3 @@ def histories(jobs: Sequence[Job]) -> Sheet:
                     )
                 )
     return Sheet(columns, tuple(rows))
-
-
-SECTION = Section("history", "How much history the policy needs", "History", blocks)

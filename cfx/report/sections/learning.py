@@ -7,7 +7,6 @@ from cfx.report.blocks import (
     Block,
     Group,
     Heading,
-    Section,
     Text,
     cards,
     missing_file,
@@ -15,30 +14,35 @@ from cfx.report.blocks import (
 from cfx.report.figure_blocks import caption, figure_of
 from cfx.report.figures.words import plural
 from cfx.report.job import Runs
+from cfx.report.section import Section
 
 _NAME = "learning_curve"
 
 
-def blocks(runs: Runs) -> list[Block]:
-    """Returns a plot for each job that learned something."""
-    groups, without = [], []
-    for job in runs.jobs:
-        if job.curves is None:
-            continue
-        if not len(job.curves):
-            without.append(job.name)
-            continue
-        networks = int(job.curves["network"].nunique())
-        heading = Heading(job.name, f"({plural(networks, 'network')})")
-        figure = figure_of(_NAME, job)
-        if figure is not None:
-            groups.append(Group((heading, figure), "card"))
-    found: list[Block] = [Text(caption(_NAME)), *cards(groups)]
-    if len(without) > MOST:
-        found.append(Text(f"Nothing was learned in {len(without)} jobs.", "fine"))
-    elif without:
-        found.append(Text(f"Nothing was learned in {', '.join(without)}.", "fine"))
-    return [*found, *missing_file(runs, "curves.parquet", "the learning curves")]
+class LearningSection(Section):
+    """Learning curves."""
 
+    title = "Learning curves"
+    entry = "Learning curves"
+    order = 1800
 
-SECTION = Section("learning", "Learning curves", "Learning curves", blocks)
+    def blocks(self, runs: Runs) -> list[Block]:
+        """Return a plot for each job that learned something."""
+        groups, without = [], []
+        for job in runs.jobs:
+            if job.curves is None:
+                continue
+            if not len(job.curves):
+                without.append(job.name)
+                continue
+            networks = int(job.curves["network"].nunique())
+            heading = Heading(job.name, f"({plural(networks, 'network')})")
+            figure = figure_of(_NAME, job)
+            if figure is not None:
+                groups.append(Group((heading, figure), "card"))
+        found: list[Block] = [Text(caption(_NAME)), *cards(groups)]
+        if len(without) > MOST:
+            found.append(Text(f"Nothing was learned in {len(without)} jobs.", "fine"))
+        elif without:
+            found.append(Text(f"Nothing was learned in {', '.join(without)}.", "fine"))
+        return [*found, *missing_file(runs, "curves.parquet", "the learning curves")]

@@ -6,10 +6,11 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from cfx.report.blocks import Block, Section, Table, Text, job_fold
+from cfx.report.blocks import Block, Table, Text, job_fold
 from cfx.report.figures.words import explained, short_label
 from cfx.report.job import Job, Runs
 from cfx.report.metrics import metric_title
+from cfx.report.section import Section
 from cfx.report.tables import Cell, Column, Sheet, formatted, number, text
 
 _INTRODUCTION = (
@@ -19,15 +20,22 @@ _INTRODUCTION = (
 )
 
 
-def blocks(runs: Runs) -> list[Block]:
-    """Returns a table for each job."""
-    found: list[Block] = [Text(_INTRODUCTION)]
-    for k, job in enumerate(runs.jobs):
-        parts: list[Block] = [Table(all_metrics(job), compact=True)]
-        for one in job.data.get("metrics_left_out") or ():
-            parts.append(Text(_left_out(one), "lacking"))
-        found.append(job_fold(job.name, parts, first=k == 0))
-    return found
+class MetricsSection(Section):
+    """All metrics of all methods, whoever brought them: what the files of a job say of them."""
+
+    title = "All metrics"
+    entry = "All metrics"
+    order = 600
+
+    def blocks(self, runs: Runs) -> list[Block]:
+        """Return a table for each job."""
+        found: list[Block] = [Text(_INTRODUCTION)]
+        for k, job in enumerate(runs.jobs):
+            parts: list[Block] = [Table(all_metrics(job), compact=True)]
+            for one in job.data.get("metrics_left_out") or ():
+                parts.append(Text(_left_out(one), "lacking"))
+            found.append(job_fold(job.name, parts, first=k == 0))
+        return found
 
 
 def _left_out(one: Mapping[str, Any]) -> str:
@@ -69,6 +77,3 @@ def _value(value: float) -> Cell:
     if math.isfinite(value) and value == round(value) and abs(value) < 1e6:
         return number(value, formatted(value, ".0f"))
     return number(value, formatted(value, ".3g"))
-
-
-SECTION = Section("metrics", "All metrics", "All metrics", blocks)

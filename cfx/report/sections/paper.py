@@ -11,10 +11,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from cfx.data.style.result import CLUSTERS
-from cfx.report.blocks import Block, Heading, Items, Section, Table, Text
+from cfx.report.blocks import Block, Heading, Items, Table, Text
 from cfx.report.figures.words import MINUS, percent
 from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs
+from cfx.report.section import Section
 from cfx.report.tables import Cell, Column, Sheet, number, share, text
 
 PAPER_PAIRS = 94
@@ -45,17 +46,24 @@ class Comparison:
     explanation: str
 
 
-def blocks(runs: Runs) -> list[Block]:
-    """Returns the comparisons; nothing if no job ran an experiment of the paper."""
-    found: list[Block] = []
-    for one in comparisons(runs.jobs):
-        found += [
-            Heading(one.heading),
-            Table(one.sheet, sortable=False),
-            Items(one.verdicts),
-            Text(one.explanation),
-        ]
-    return [Text(_CITATION), *found] if found else []
+class PaperSection(Section):
+    """The published numbers beside a job's, where the job ran one of the paper's experiments."""
+
+    title = "The paper's numbers beside these"
+    entry = "The paper's numbers"
+    order = 1100
+
+    def blocks(self, runs: Runs) -> list[Block]:
+        """Return the comparisons; nothing if no job ran an experiment of the paper."""
+        found: list[Block] = []
+        for one in comparisons(runs.jobs):
+            found += [
+                Heading(one.heading),
+                Table(one.sheet, sortable=False),
+                Items(one.verdicts),
+                Text(one.explanation),
+            ]
+        return [Text(_CITATION), *found] if found else []
 
 
 def comparisons(jobs: Sequence[Job]) -> list[Comparison]:
@@ -288,6 +296,3 @@ def _explanation(jobs: Sequence[Job], pairs: int) -> str:
     )
     listed = "; ".join(parts)
     return f"The numbers need not agree, because these things differ, or may: {listed}."
-
-
-SECTION = Section("paper", "The paper's numbers beside these", "The paper's numbers", blocks)

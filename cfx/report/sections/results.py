@@ -8,12 +8,13 @@ import numpy as np
 import pandas as pd
 
 from cfx.evaluation.metrics.base import SCOPES
-from cfx.report.blocks import Block, Figure, Heading, Section, Table, Text
+from cfx.report.blocks import Block, Figure, Heading, Table, Text
 from cfx.report.figure_blocks import view
 from cfx.report.figures.jobs import Statistics, draw_overview
 from cfx.report.figures.jobs import overview as choose_overview
 from cfx.report.figures.words import FULL_TRAJECTORY, MINUS, TEST, label
 from cfx.report.job import Job, Runs, any_baselines, with_baseline
+from cfx.report.section import Section
 from cfx.report.tables import (
     Cell,
     Column,
@@ -30,22 +31,29 @@ from cfx.report.tables import (
 )
 
 
-def blocks(runs: Runs) -> list[Block]:
-    """Returns improvements over each baseline, and errors."""
-    jobs = runs.jobs
-    found: list[Block] = []
-    if with_baseline(jobs):
-        words = (
-            "Mean improvement of the RMSE of speed over each baseline, with its 95 % interval."
-            " Where the interval contains 0, the job does not tell whether the policy helps."
-        )
-        found += [
-            Heading("How much closer the policy drives"),
-            Text(words),
-            overview(jobs),
-            Table(improvements(jobs), explain=True),
-        ]
-    return [*found, Heading("Errors of each method"), Table(errors(jobs), explain=True)]
+class ResultsSection(Section):
+    """How much closer the policy drives, and the errors of each method."""
+
+    title = "Results"
+    entry = "Results"
+    order = 400
+
+    def blocks(self, runs: Runs) -> list[Block]:
+        """Return improvements over each baseline, and errors."""
+        jobs = runs.jobs
+        found: list[Block] = []
+        if with_baseline(jobs):
+            words = (
+                "Mean improvement of the RMSE of speed over each baseline, with its 95 % interval."
+                " Where the interval contains 0, the job does not tell whether the policy helps."
+            )
+            found += [
+                Heading("How much closer the policy drives"),
+                Text(words),
+                overview(jobs),
+                Table(improvements(jobs), explain=True),
+            ]
+        return [*found, Heading("Errors of each method"), Table(errors(jobs), explain=True)]
 
 
 def overview(jobs: Sequence[Job]) -> Figure:
@@ -221,6 +229,3 @@ def _statistics(job: Job, baseline: str, scope: str) -> Statistics:
         trimmed_mean=job.improvement("trimmed_mean", baseline, scope),
         median=job.improvement("median", baseline, scope),
     )
-
-
-SECTION = Section("results", "Results", "Results", blocks)

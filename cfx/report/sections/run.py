@@ -8,28 +8,38 @@ from typing import Any
 
 import pandas as pd
 
-from cfx.report.blocks import Block, Facts, Heading, Items, Section, Table, Text
+from cfx.report.blocks import Block, Facts, Heading, Items, Table, Text
 from cfx.report.figures.words import NOTHING
 from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs
+from cfx.report.section import Section
 from cfx.report.tables import Column, Sheet, text
 
 _TOGETHER = {"platoon": " of whole platoons", "recording": " of whole recordings"}
 
 
-def blocks(runs: Runs) -> list[Block]:
-    """Returns what all jobs share, and a table of what they do not."""
-    found: list[Block] = []
-    if runs.unfinished:
-        found.append(Text("Not in this page, because they have not finished:", "lacking"))
-        found.append(
-            Items(tuple(f"{without_folders(one.place)}: {one.reason}" for one in runs.unfinished))
-        )
-    common, own = facts(runs.jobs)
-    found.append(Facts(tuple(common)))
-    if own is not None:
-        found += [Heading("What differs between the jobs"), Table(own)]
-    return found
+class RunSection(Section):
+    """What was run: data, components and settings of each job."""
+
+    title = "What was run"
+    entry = "What was run"
+    order = 300
+
+    def blocks(self, runs: Runs) -> list[Block]:
+        """Return what all jobs share, and a table of what they do not."""
+        found: list[Block] = []
+        if runs.unfinished:
+            found.append(Text("Not in this page, because they have not finished:", "lacking"))
+            found.append(
+                Items(
+                    tuple(f"{without_folders(one.place)}: {one.reason}" for one in runs.unfinished)
+                )
+            )
+        common, own = facts(runs.jobs)
+        found.append(Facts(tuple(common)))
+        if own is not None:
+            found += [Heading("What differs between the jobs"), Table(own)]
+        return found
 
 
 def facts(jobs: Sequence[Job]) -> tuple[list[tuple[str, str]], Sheet | None]:
@@ -186,6 +196,3 @@ def _protocol(job: Job) -> str:
     else:
         return name
     return f"{name}: {said}"
-
-
-SECTION = Section("run", "What was run", "What was run", blocks)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from cfx.report.blocks import Block, Fold, Heading, Section, Table, Text, job_fold
+from cfx.report.blocks import Block, Fold, Heading, Table, Text, job_fold
 from cfx.report.figure_blocks import caption, figure_of
 from cfx.report.figures.words import MINUS
 from cfx.report.job import Job, Runs
+from cfx.report.section import Section
 from cfx.report.tables import Column, Sheet, formatted, method_cell, number, text
 
 _COLUMNS = (
@@ -36,24 +37,31 @@ _METHODS = (
 _OLDER = "An older version of cfx wrote these jobs: they have no measure of it but the collisions."
 
 
-def blocks(runs: Runs) -> list[Block]:
-    """Returns a table of all methods, and the platoons."""
-    sheet = safety_of_methods(runs.jobs)
-    found: list[Block] = [Text(_OLDER)]
-    if sheet.rows:
-        table = Table(sheet, compact=True)
-        found = [Fold("Every method of every job", (Text(_METHODS), table))]
-    for job in runs.jobs:
-        for scope, words in job.outside.items():
-            found.append(Text(f"{job.name}, {job.scope_label(scope)}: {words}."))
-    folds: list[Block] = []
-    for job in runs.jobs:
-        figure = figure_of("platoon", job)
-        if figure is not None:
-            folds.append(job_fold(job.name, [figure], first=not folds))
-    if folds:
-        found += [Heading("Ten followers in a row"), Text(caption("platoon")), *folds]
-    return found
+class SafetySection(Section):
+    """Safety and string stability of every method."""
+
+    title = "Safety and string stability"
+    entry = "Safety"
+    order = 500
+
+    def blocks(self, runs: Runs) -> list[Block]:
+        """Return a table of all methods, and the platoons."""
+        sheet = safety_of_methods(runs.jobs)
+        found: list[Block] = [Text(_OLDER)]
+        if sheet.rows:
+            table = Table(sheet, compact=True)
+            found = [Fold("Every method of every job", (Text(_METHODS), table))]
+        for job in runs.jobs:
+            for scope, words in job.outside.items():
+                found.append(Text(f"{job.name}, {job.scope_label(scope)}: {words}."))
+        folds: list[Block] = []
+        for job in runs.jobs:
+            figure = figure_of("platoon", job)
+            if figure is not None:
+                folds.append(job_fold(job.name, [figure], first=not folds))
+        if folds:
+            found += [Heading("Ten followers in a row"), Text(caption("platoon")), *folds]
+        return found
 
 
 def safety_of_methods(jobs: Sequence[Job]) -> Sheet:
@@ -78,6 +86,3 @@ def safety_of_methods(jobs: Sequence[Job]) -> Sheet:
             if any(cell.sort for cell in cells):
                 rows.append((text(job.name), method_cell(method), *cells))
     return Sheet(tuple(columns), tuple(rows), groups)
-
-
-SECTION = Section("safety", "Safety and string stability", "Safety", blocks)

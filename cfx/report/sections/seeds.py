@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from cfx.report.blocks import Block, Section, Table, Text
+from cfx.report.blocks import Block, Table, Text
 from cfx.report.figures.values import finite
 from cfx.report.figures.words import explained, percent, short_label
 from cfx.report.grouped import Row, baselines_of, methods_of, rows_over_seeds
 from cfx.report.job import Job, Runs
+from cfx.report.section import Section
 from cfx.report.tables import Cell, Column, Sheet, number, tested, text
 
 _INTRODUCTION = (
@@ -22,12 +23,19 @@ _INTRODUCTION = (
 )
 
 
-def blocks(runs: Runs) -> list[Block]:
-    """Returns a table of the jobs over their seeds; nothing where no two differ in it alone."""
-    rows = rows_over_seeds(runs.jobs)
-    if len(rows) == len(runs.jobs):
-        return []
-    return [Text(_INTRODUCTION), Table(over_seeds(rows), compact=True, explain=True)]
+class SeedsSection(Section):
+    """How much results depend on the seed: jobs that differ in it alone, in one row."""
+
+    title = "Over seeds"
+    entry = "Over seeds"
+    order = 100
+
+    def blocks(self, runs: Runs) -> list[Block]:
+        """Return a table of the jobs over their seeds; nothing where no two differ in it alone."""
+        rows = rows_over_seeds(runs.jobs)
+        if len(rows) == len(runs.jobs):
+            return []
+        return [Text(_INTRODUCTION), Table(over_seeds(rows), compact=True, explain=True)]
 
 
 def over_seeds(rows: Sequence[Row]) -> Sheet:
@@ -83,6 +91,3 @@ def _with_range(cell: Cell, ends: Sequence[str]) -> Cell:
     if len(set(ends)) < 2:
         return cell
     return replace(cell, second=" to ".join(ends))
-
-
-SECTION = Section("seeds", "Over seeds", "Over seeds", blocks)

@@ -8,10 +8,11 @@ import pandas as pd
 
 from cfx.evaluation.metrics.base import RECORDED, key_of
 from cfx.evaluation.traffic.result import traffic_methods
-from cfx.report.blocks import Block, Section, Table, Text, job_fold
+from cfx.report.blocks import Block, Table, Text, job_fold
 from cfx.report.figure_blocks import figure_of
 from cfx.report.figures.words import MINUS
 from cfx.report.job import Job, Runs
+from cfx.report.section import Section
 from cfx.report.tables import Cell, Column, Sheet, formatted, method_cell, methods_explained, number
 
 _INTRODUCTION = (
@@ -68,17 +69,25 @@ _COLUMNS = (
 )
 
 
-def blocks(runs: Runs) -> list[Block]:
-    """Returns plots and a table for each job with traffic."""
-    found: list[Block] = []
-    methods: dict[str, None] = {}
-    for job in runs.jobs:
-        if job.traffic is not None:
-            found.append(job_fold(job.name, _job_blocks(job, job.traffic), first=not found))
-            methods |= dict.fromkeys(traffic_methods(job.traffic))
-    if not found:
-        return []
-    return [Text(_INTRODUCTION), Text(f"Methods: {methods_explained(methods)}"), *found]
+class TrafficSection(Section):
+    """Traffic of sampled drivers: fundamental diagram, waves, growth along platoons."""
+
+    title = "Traffic of sampled drivers"
+    entry = "Traffic"
+    order = 900
+    figures = ("traffic", "traffic_paths")
+
+    def blocks(self, runs: Runs) -> list[Block]:
+        """Return plots and a table for each job with traffic."""
+        found: list[Block] = []
+        methods: dict[str, None] = {}
+        for job in runs.jobs:
+            if job.traffic is not None:
+                found.append(job_fold(job.name, _job_blocks(job, job.traffic), first=not found))
+                methods |= dict.fromkeys(traffic_methods(job.traffic))
+        if not found:
+            return []
+        return [Text(_INTRODUCTION), Text(f"Methods: {methods_explained(methods)}"), *found]
 
 
 def _job_blocks(job: Job, roads: pd.DataFrame) -> list[Block]:
@@ -105,6 +114,3 @@ def traffic_sheet(job: Job, roads: pd.DataFrame) -> Sheet:
             cells.append(number(value, formatted(value, form)))
         rows.append(tuple(cells))
     return Sheet(tuple(columns), tuple(rows))
-
-
-SECTION = Section("traffic", "Traffic of sampled drivers", "Traffic", blocks)

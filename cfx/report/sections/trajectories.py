@@ -9,7 +9,6 @@ from cfx.report.blocks import (
     Figure,
     Group,
     Heading,
-    Section,
     Text,
     job_fold,
     missing_file,
@@ -19,6 +18,7 @@ from cfx.report.figures.pairs import RankedPair, rank_pairs
 from cfx.report.figures.trajectories import draw_pair
 from cfx.report.figures.words import percent_or_undefined, short_label
 from cfx.report.job import Job, Runs, calibrations
+from cfx.report.section import Section
 
 _ADAPTING = (
     "The pair that improves most over driver-specific calibration, the one in the middle and the"
@@ -28,25 +28,32 @@ _CONSTANT = "Of a calibration: the pairs with the least, the median and the larg
 _BOUNDS = "What lies outside a parameter's bounds is shaded."
 
 
-def blocks(runs: Runs) -> list[Block]:
-    """Returns the chosen pairs of each job."""
-    jobs = [job for job in runs.jobs if job.trajectories is not None]
-    constant = calibrations(jobs)
-    chosen = [_BOUNDS]
-    if constant:
-        chosen.insert(0, _CONSTANT)
-    if len(constant) < len(jobs):
-        chosen.insert(0, _ADAPTING)
-    found: list[Block] = [Text(" ".join(chosen))]
-    for k, job in enumerate(jobs):
-        groups = []
-        for pair in chosen_pairs(job):
-            heading = Heading(_title(job, pair), _errors(job, pair))
-            parts = (heading, pair_of(job, pair.pair_id))
-            groups.append(Group(parts))
-        found.append(job_fold(job.name, groups, first=k == 0))
-    what = "speed, gap and parameters over time"
-    return [*found, *missing_file(runs, "trajectories.parquet", what)]
+class TrajectoriesSection(Section):
+    """Speed, gap and parameters of the best, the median and the worst pair over time."""
+
+    title = "Trajectories"
+    entry = "Trajectories"
+    order = 1600
+
+    def blocks(self, runs: Runs) -> list[Block]:
+        """Return the chosen pairs of each job."""
+        jobs = [job for job in runs.jobs if job.trajectories is not None]
+        constant = calibrations(jobs)
+        chosen = [_BOUNDS]
+        if constant:
+            chosen.insert(0, _CONSTANT)
+        if len(constant) < len(jobs):
+            chosen.insert(0, _ADAPTING)
+        found: list[Block] = [Text(" ".join(chosen))]
+        for k, job in enumerate(jobs):
+            groups = []
+            for pair in chosen_pairs(job):
+                heading = Heading(_title(job, pair), _errors(job, pair))
+                parts = (heading, pair_of(job, pair.pair_id))
+                groups.append(Group(parts))
+            found.append(job_fold(job.name, groups, first=k == 0))
+        what = "speed, gap and parameters over time"
+        return [*found, *missing_file(runs, "trajectories.parquet", what)]
 
 
 def chosen_pairs(job: Job) -> tuple[RankedPair, ...]:
@@ -80,6 +87,3 @@ def _errors(job: Job, pair: RankedPair) -> str:
     for method in job.meaningful_methods:
         errors.append(f"{short_label(method)} {row[f'rmse_speed/{method}']:.3f}")
     return f"RMSE of speed (m/s): {', '.join(errors)}"
-
-
-SECTION = Section("trajectories", "Trajectories", "Trajectories", blocks)

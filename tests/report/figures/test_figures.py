@@ -14,13 +14,14 @@ import pytest
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
-from cfx.report.figures import figure as figures
 from cfx.report.figures.canvas import canvas, hover
-from cfx.report.figures.figure import Installed, JobFigure, installed
+from cfx.report.figures.figure import JobFigure, draw
 from cfx.report.figures.results import Results
 from cfx.report.figures.write import PLACE, inline_svg, write_figure, write_figures
+from cfx.report.installed import Installed, _installed
 from cfx.report.page import render
 from cfx.report.runs import read_runs
+from cfx.report.section import Section
 from tests.made_up import (
     GAINS,
     make_distributions,
@@ -62,21 +63,21 @@ def everything() -> Results:
     )
 
 
-@pytest.mark.parametrize("one", installed(), ids=lambda one: one.name)
+@pytest.mark.parametrize("one", JobFigure.installed(), ids=lambda one: one.name)
 def test_every_figure_keeps_its_contract(
-    one: Installed, everything: Results, tmp_path: Path
+    one: Installed[JobFigure], everything: Results, tmp_path: Path
 ) -> None:
     settings = dict(mpl.rcParams)
-    drawn = one.draw(everything)
+    drawn = draw(one, everything)
     assert drawn is not None
-    assert one.figure.title
-    assert one.figure.caption.endswith(".")
+    assert one.part.title
+    assert one.part.caption.endswith(".")
     for axes in drawn.axes:
         named = axes.get_xlabel() or axes.get_ylabel() or axes.get_title(loc="left")
         shared = drawn.get_supxlabel() or drawn.get_supylabel()
         assert named or shared, "nothing says what a panel shows"
     path = write_figure(drawn, tmp_path / "figure.png")
-    again = one.draw(everything)
+    again = draw(one, everything)
     assert again is not None
     assert write_figure(again, tmp_path / "again.png").read_bytes() == path.read_bytes()
     svg = inline_svg(again)
@@ -87,11 +88,11 @@ def test_every_figure_keeps_its_contract(
     assert dict(mpl.rcParams) == settings
 
 
-@pytest.mark.parametrize("one", installed(), ids=lambda one: one.name)
-def test_a_figure_of_what_was_not_measured_is_left_out(one: Installed) -> None:
+@pytest.mark.parametrize("one", JobFigure.installed(), ids=lambda one: one.name)
+def test_a_figure_of_what_was_not_measured_is_left_out(one: Installed[JobFigure]) -> None:
     table = make_results(pairs=1, frames=5).evaluation.table
     bare = Results(table[table["method"] == "default"], ("default",), ())
-    assert one.draw(bare) is None
+    assert draw(one, bare) is None
 
 
 def test_an_inline_figure_has_text_pictures_of_clouds_and_says_what_the_mouse_shows() -> None:
@@ -138,26 +139,31 @@ def test_a_third_partys_figure_needs_a_class_and_an_entry_point(
     class Distribution:
         name = "somebody-else"
 
-    found = list(importlib.metadata.entry_points(group=figures.GROUP))
+    found = list(importlib.metadata.entry_points(group=JobFigure.group))
     for name, target in (
         ("further", f"{__name__}:Further"),
         ("broken", f"{__name__}:Broken"),
         ("drives", f"{__name__}:Further"),
         ("missing", "no_such_module:Figure"),
     ):
-        entry = importlib.metadata.EntryPoint(name, target, figures.GROUP)
+        entry = importlib.metadata.EntryPoint(name, target, JobFigure.group)
         vars(entry)["dist"] = Distribution()
         found.append(entry)
+    sections = importlib.metadata.entry_points(group=Section.group)
     write_job(tmp_path / "job", pairs=3)
-    monkeypatch.setattr(importlib.metadata, "entry_points", lambda **_: found)
-    figures.installed.cache_clear()
+    monkeypatch.setattr(
+        importlib.metadata,
+        "entry_points",
+        lambda group: found if group == JobFigure.group else sections,
+    )
+    _installed.cache_clear()
     try:
-        names = [one.name for one in installed()]
+        names = [one.name for one in JobFigure.installed()]
         made = make_results(pairs=1, frames=5)
         paths = write_figures(tmp_path / "figures", Results.of(made.evaluation))
         page = render(read_runs([str(tmp_path / "job")]))
     finally:
-        figures.installed.cache_clear()
+        _installed.cache_clear()
     assert names[:2] == ["broken", "further"]
     assert "missing" not in names
     written = [path.stem for path in paths]

@@ -125,6 +125,6 @@ def test_a_report_shows_them(tmp_path: Path) -> None:
         pytest.approx(0.2),
         1.0,
     ]
-    blocks = calibration.blocks(runs)
+    blocks = calibration.CalibrationSection().blocks(runs)
     plots = [part.label for part in blocks[1].blocks if hasattr(part, "views")]  # type: ignore[attr-defined] # a fold of parts
     assert len(plots) == 4, plots
