@@ -19,7 +19,7 @@ from cfx.core import registry
 
 ROOT = Path(__file__).resolve().parent.parent
 PLUGINS = sorted(path.parent for path in (ROOT / "plugins").glob("*/pyproject.toml"))
-READERS = {"cfx.data.files", "cfx.data.series", "cfx.data.tracks"}
+READERS = {"cfx.data.files", "cfx.data.series", "cfx.data.table", "cfx.data.tracks"}
 REPORTS = {
     "cfx.report.blocks",
     "cfx.report.figure_blocks",

@@ -85,3 +85,12 @@ def nearest(name: str, choices: Iterable[str]) -> str:
     if not close:
         return ""
     return f" Did you mean '{close[0]}'?"
+
+
+def listed(values: Iterable[object], limit: int = 12) -> str:
+    """Return the values separated by commas, cut off after `limit` of them."""
+    texts = [str(value) for value in values]
+    text = ", ".join(texts[:limit])
+    if len(texts) > limit:
+        text += f", ... ({len(texts)} in all)"
+    return text

@@ -15,7 +15,7 @@ from pydantic_core import PydanticCustomError
 
 from cfx.core import registry, scratch
 from cfx.core.component import Component, Settings
-from cfx.core.errors import DataError, PluginError, nearest
+from cfx.core.errors import DataError, PluginError, listed, nearest
 from cfx.core.files import absolute
 from cfx.core.memory import give_back
 from cfx.core.storage import is_url, local_copies
@@ -332,15 +332,6 @@ def _why(dropped: Sequence[Dropped]) -> str:
         return ""
     reasons = [f"{drop.count:,} {drop.unit}: {drop.reason}" for drop in dropped]
     return f" (left out: {'; '.join(reasons)})"
-
-
-def listed(values: Iterable[object], limit: int = 12) -> str:
-    """Returns the values separated by commas, cut off after `limit` of them."""
-    texts = [str(value) for value in values]
-    text = ", ".join(texts[:limit])
-    if len(texts) > limit:
-        text += f", ... ({len(texts)} in all)"
-    return text
 
 
 def _select_recording(pairs: PairSet, recording: str) -> PairSet:

@@ -15,12 +15,11 @@ from rich.console import Console, RenderableType
 from rich.table import Table
 
 from cfx.core import registry
-from cfx.core.errors import DataError, PluginError
+from cfx.core.errors import DataError, PluginError, listed
 from cfx.core.registry import Entry
-from cfx.data.base import Contents, Dataset, listed
-from cfx.data.files import Floats, beginning
+from cfx.data.base import Contents, Dataset
+from cfx.data.files import Floats, beginning, partitions
 from cfx.data.pairs import Dropped, Pair, PairSet
-from cfx.data.partitions import partitions
 from cfx.data.resample import frames_in_steps
 from cfx.data.style.entropy import STANDING_MPS
 

@@ -29,7 +29,7 @@ from filelock import FileLock, Timeout
 from cfx.core.errors import ConfigError, DataError, OutputError
 from cfx.core.files import atomic_write
 from cfx.core.progress import Task
-from cfx.data.ngsim_file import LAYOUTS
+from cfx.data.ngsim_rows import MOTORWAY
 
 if TYPE_CHECKING:
     from requests import Response, Session
@@ -48,7 +48,7 @@ TOKEN = "SOCRATA_APP_TOKEN"  # noqa: S105 - the name of the environment variable
 It is not needed.
 """
 
-COLUMNS = (*LAYOUTS[18], "Location")
+COLUMNS = (*MOTORWAY, "Location")
 """NGSIM's columns for a highway; the service writes them in small letters."""
 
 _QUARTER_MS = 900_000

@@ -21,8 +21,7 @@ from cfx.core.component import Settings
 from cfx.core.errors import DataError
 from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
 from cfx.data.files import FileStart, stem
-from cfx.data.ngsim_file import read_ngsim
-from cfx.data.ngsim_rows import Rows
+from cfx.data.ngsim_rows import Rows, read_ngsim
 from cfx.data.pairs import PairSet
 
 log = logging.getLogger(__name__)
@@ -104,7 +103,7 @@ class NgsimDataset(Dataset):
         )
 
     def _rows(self) -> list[Rows]:
-        """Returns the rows of each file."""
+        """Return the rows of each file."""
         return [read_ngsim(path, self.settings.location) for path in self.settings.files()]
 
     def _pairs(self, files: Sequence[Rows]) -> PairSet:
@@ -121,7 +120,7 @@ class NgsimDataset(Dataset):
 
 
 def _with_different_names(parts: Sequence[Rows]) -> list[Rows]:
-    """Returns the rows of several files; no two recordings have the same name.
+    """Return the rows of several files; no two recordings have the same name.
 
     Vehicles' ids start anew in each recording.
 
@@ -149,7 +148,7 @@ def _with_different_names(parts: Sequence[Rows]) -> list[Rows]:
 
 
 def _name_in(rows: Rows, name: str, *, is_shared: bool) -> str:
-    """Returns a recording's name; the file's stands before one that several files share."""
+    """Return a recording's name; the file's stands before one that several files share."""
     file = stem(Path(rows.source))
     if not is_shared:
         return name

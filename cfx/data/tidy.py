@@ -17,7 +17,7 @@ One row per pair and frame, SI units, a constant time step within a pair, no gap
 | `true_model`, `true_NAME` | | optional: a synthetic driver's model and its parameters over time |
 
 A length of 0 says that the leader's position is that of its rear bumper. See
-`cfx.data.tidy_gaps` for what follows from a column of gaps.
+`cfx.data.tidy_checks.with_positions` for what follows from a column of gaps.
 """
 
 from __future__ import annotations
@@ -37,25 +37,73 @@ import pyarrow.parquet as pq
 
 from cfx.core import scratch
 from cfx.core.component import Settings
-from cfx.core.errors import DataError, OutputError
+from cfx.core.errors import OutputError, listed
 from cfx.core.files import atomic_write
-from cfx.data.base import Dataset, FileDatasetSettings, joined, listed
-from cfx.data.files import PARQUET, FileStart, Floats, Ints
+from cfx.data.base import Dataset, FileDatasetSettings, joined
+from cfx.data.files import (
+    PARQUET,
+    FileStart,
+    Floats,
+    Ints,
+    are_partitions,
+    of_recording,
+    partitions,
+    recording_of,
+)
 from cfx.data.pairs import Dropped, Pair, PairSet
-from cfx.data.partitions import are_partitions, of_recording, partitions
-from cfx.data.tidy_checks import check
-from cfx.data.tidy_gaps import time_steps
-from cfx.data.tidy_table import (
-    DRIVER_TYPES,
-    LABELS,
-    LANE,
-    NUMBERS,
-    SIGNAL_COLUMNS,
-    TRUE,
-    TRUE_MODEL,
-    TidyTable,
-    read_table,
-    table_of,
+from cfx.data.table import Column, Layout, Table, read_table, table_of
+from cfx.data.tidy_checks import GAP, LANE, LENGTH, TRUE, check, time_steps
+
+LABELS = ("recording", "pair_id", "leader_id", "follower_id")
+"""Columns of names that every file has."""
+
+SIGNAL_COLUMNS = {
+    "leader_position": "leader_position_m",
+    "leader_speed": "leader_speed_mps",
+    "leader_acceleration": "leader_acceleration_mps2",
+    "follower_position": "follower_position_m",
+    "follower_speed": "follower_speed_mps",
+    "follower_acceleration": "follower_acceleration_mps2",
+}
+"""A pair's signals, and the columns that they are written in."""
+
+TRUE_MODEL = "true_model"
+DRIVER_TYPES = ("driver_type", "leader_driver_type")
+
+_NGSIM = "This looks like an NGSIM file: use data=ngsim."
+_REVERSING = "is negative; speeds count along the lane and must be 0 or more"
+
+LAYOUT = Layout(
+    name="the tidy layout",
+    columns=(
+        *[Column(name, is_name=True) for name in LABELS],
+        Column("frame", whole=True, wrong="is no whole number; number the frames 0, 1, 2, ..."),
+        Column("time_s", "s"),
+        Column("leader_position_m", "m", unless=GAP),
+        Column("leader_speed_mps", "m/s", least=0, wrong=_REVERSING),
+        Column("leader_acceleration_mps2", "m/s2", unless=GAP),
+        Column("follower_position_m", "m", unless=GAP),
+        Column("follower_speed_mps", "m/s", least=0, wrong=_REVERSING),
+        Column("follower_acceleration_mps2", "m/s2", unless=GAP),
+        Column(
+            LENGTH,
+            "m",
+            unless=GAP,
+            least=0,
+            wrong="is no vehicle length; give metres, or 0 where positions are of rear bumpers",
+        ),
+        Column(GAP, "m", needed=False),
+        Column(LANE, needed=False, may_be_empty=True, whole=True, wrong="is no lane number"),
+        *[
+            Column(name, is_name=True, needed=False, may_be_empty=True)
+            for name in (TRUE_MODEL, *DRIVER_TYPES)
+        ],
+        Column(f"{TRUE}.+", many=True, needed=False, may_be_empty=True),
+    ),
+    keys={"pair": "pair_id", "frame": "frame"},
+    elsewhere=dict.fromkeys(("Vehicle_ID", "vehicle_id", "Local_Y", "local_y"), _NGSIM),
+    remedy="correct it or leave out the pair",
+    parquet=True,
 )
 
 
@@ -80,7 +128,8 @@ class TidyDataset(Dataset):
     def recognises(cls, start: FileStart) -> bool:
         if are_partitions(start.path):
             return True
-        return start.magic == PARQUET or len(set(start.columns) & {*LABELS, *NUMBERS}) >= 3
+        known = {column.name for column in LAYOUT.columns if column.needed}
+        return start.magic == PARQUET or len(known & set(start.columns)) >= 3
 
     def read(self) -> PairSet:
         files: list[Path] = []
@@ -91,16 +140,18 @@ class TidyDataset(Dataset):
 
 
 def read_tidy(path: Path) -> PairSet:
-    """Reads a tidy file.
+    """Read a tidy file.
 
     Raises:
         DataError: the file cannot be read or does not keep to the layout.
     """
-    return _pairs(read_table(path))
+    recording = recording_of(path)
+    given = {} if recording is None else {"recording": recording}
+    return _pairs(read_table(path, LAYOUT, given))
 
 
 def pairs_from_frame(frame: pd.DataFrame, source: str = "table") -> PairSet:
-    """Takes pairs from a table in the tidy layout.
+    """Take pairs from a table in the tidy layout.
 
     Args:
         source: what messages call the table; its rows are counted from 1.
@@ -108,12 +159,10 @@ def pairs_from_frame(frame: pd.DataFrame, source: str = "table") -> PairSet:
     Raises:
         DataError: the table does not keep to the layout.
     """
-    return _pairs(table_of(frame, source))
+    return _pairs(table_of(frame, LAYOUT, source))
 
 
-def _pairs(table: TidyTable) -> PairSet:
-    if not len(table):
-        raise DataError(f"{table.source}: has the right columns but no rows")
+def _pairs(table: Table) -> PairSet:
     table, order, starts = check(table)
     dropped: tuple[Dropped, ...] = ()
     if table.ignored:
@@ -122,8 +171,8 @@ def _pairs(table: TidyTable) -> PairSet:
     return PairSet(tuple(_build(table, order, starts)), table.source, dropped)
 
 
-def _build(table: TidyTable, order: Ints, starts: Ints) -> list[Pair]:
-    """Returns the pairs of a table that was checked.
+def _build(table: Table, order: Ints, starts: Ints) -> list[Pair]:
+    """Return the pairs of a table that was checked.
 
     Args:
         order: see `cfx.data.tidy_checks.check`.
@@ -134,10 +183,10 @@ def _build(table: TidyTable, order: Ints, starts: Ints) -> list[Pair]:
     ends = np.append(starts[1:], len(order))
     pairs = []
     for start, end, step in zip(starts.tolist(), ends.tolist(), steps.tolist(), strict=True):
-        label = _labels_at(table, int(order[start]))
+        label = {name: labels.at(int(order[start])) for name, labels in table.labels.items()}
         truth = {}
-        for name in table.truth_names:
-            if not np.isnan(numbers[name][start]):
+        for name in numbers:
+            if name.startswith(TRUE) and not np.isnan(numbers[name][start]):
                 truth[name.removeprefix(TRUE)] = numbers[name][start:end]
         lane = None
         if LANE in numbers and not np.isnan(numbers[LANE][start]):
@@ -152,7 +201,7 @@ def _build(table: TidyTable, order: Ints, starts: Ints) -> list[Pair]:
             follower_id=label["follower_id"],
             first_frame=int(numbers["frame"][start]),
             dt=_simplest(step),
-            leader_length=float(numbers["leader_length_m"][start]),
+            leader_length=float(numbers[LENGTH][start]),
             **signals,
             lane=lane,
             truth=truth,
@@ -164,23 +213,12 @@ def _build(table: TidyTable, order: Ints, starts: Ints) -> list[Pair]:
     return pairs
 
 
-def _labels_at(table: TidyTable, row: int) -> dict[str, str]:
-    """Returns the names in a row; "" for an empty cell."""
-    found = {}
-    for name, labels in table.labels.items():
-        code = labels.codes[row]
-        found[name] = ""
-        if code >= 0:
-            found[name] = labels.names[code]
-    return found
-
-
 _CAMERAS = tuple(Fraction(1001, 1000 * rate) for rate in (24, 30, 48, 60, 120))
 """Time steps of television's frame rates, s: 30 frames per second are 29.97."""
 
 
 def _simplest(step: float) -> float:
-    """Returns the time step that a mean of rounded times stands for.
+    """Return the time step that a mean of rounded times stands for.
 
     It is 0.1 for 0.09999999998, 1/30 for 0.0333333, and 1001/30000 for a camera's 29.97 frames per
     second.
@@ -203,7 +241,7 @@ _PAIRS_AT_ONCE = 1024
 
 
 def write_tidy(pairs: PairSet, path: Path | str) -> None:
-    """Writes pairs in the tidy layout.
+    """Write pairs in the tidy layout.
 
     Reading the file gives the same pairs to the last bit, truth included. The file appears whole or
     not at all. `time_s` is frame times time step.
@@ -228,13 +266,13 @@ def write_tidy(pairs: PairSet, path: Path | str) -> None:
 
 
 def frame_of(pairs: PairSet) -> pd.DataFrame:
-    """Returns pairs as a table in the tidy layout."""
+    """Return pairs as a table in the tidy layout."""
     frame: pd.DataFrame = pa.concat_tables(_tables(pairs)).to_pandas()
     return frame
 
 
 def _write(tables: Iterator[Any], temporary: Path, name: str) -> None:
-    """Writes tables with the same columns, one behind the other."""
+    """Write tables with the same columns, one behind the other."""
     first = next(tables)
     with ExitStack() as opened:
         if name.endswith(".parquet"):
@@ -251,7 +289,7 @@ def _write(tables: Iterator[Any], temporary: Path, name: str) -> None:
 
 
 def _tables(pairs: PairSet) -> Iterator[Any]:
-    """Yields pairs as Arrow tables in the tidy layout, some pairs after the other; one at least."""
+    """Yield pairs as Arrow tables in the tidy layout, some pairs after the other; one at least."""
     optional = []
     if any(pair.lane is not None for pair in pairs.pairs):
         optional.append(LANE)
@@ -265,7 +303,7 @@ def _tables(pairs: PairSet) -> Iterator[Any]:
 
 
 def _as_table(pairs: Sequence[Pair], optional: Sequence[str], truths: Sequence[str]) -> Any:
-    """Returns pairs as an Arrow table in the tidy layout.
+    """Return pairs as an Arrow table in the tidy layout.
 
     Args:
         pairs: the rows.
@@ -290,7 +328,7 @@ def _as_table(pairs: Sequence[Pair], optional: Sequence[str], truths: Sequence[s
     columns["time_s"] = _over_time(times)
     for signal, column in SIGNAL_COLUMNS.items():
         columns[column] = _over_time([getattr(pair, signal) for pair in pairs])
-    columns["leader_length_m"] = per_pair([pair.leader_length for pair in pairs], pa.float64())
+    columns[LENGTH] = per_pair([pair.leader_length for pair in pairs], pa.float64())
     if LANE in optional:
         columns[LANE] = per_pair([pair.lane for pair in pairs], pa.int64())
     for name, attribute in _ATTRIBUTES.items():
@@ -303,12 +341,12 @@ def _as_table(pairs: Sequence[Pair], optional: Sequence[str], truths: Sequence[s
 
 
 def _over_time(arrays: Sequence[Floats]) -> Any:
-    """Returns the values of all pairs one after the other."""
+    """Return the values of all pairs one after the other."""
     return pa.array(np.concatenate([np.zeros(0), *arrays]), pa.float64())
 
 
 def _truth_names(pairs: PairSet) -> list[str]:
-    """Returns the true parameters that any pair has, in the order in which they come."""
+    """Return the true parameters that any pair has, in the order in which they come."""
     names: list[str] = []
     for pair in pairs.pairs:
         for name in pair.truth:

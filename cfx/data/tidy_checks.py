@@ -1,17 +1,22 @@
-"""What a tidy file must hold, each broken rule a sentence with its row; see `cfx.data.tidy`."""
+"""What the rows of a tidy file must be to each other; each broken rule is a sentence with its row.
+
+What single cells may hold is declared in `cfx.data.tidy.LAYOUT`.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cfx.core.errors import DataError
-from cfx.data.files import Ints, bad_cells
-from cfx.data.tidy_gaps import time_steps, with_positions
-from cfx.data.tidy_table import GAP, LABELS, LANE, LENGTH, NUMBERS, TidyTable
+from cfx.data.files import Floats, Ints
+from cfx.data.series import accelerations, driven
+from cfx.data.table import Table
 
 Marks = NDArray[np.bool_]
 
@@ -26,12 +31,19 @@ _FACTORS = {
 }
 """Distance over speed times time, if one of them has another unit than it should."""
 
+GAP, LENGTH, LANE = "gap_m", "leader_length_m", "lane"
+TRUE = "true_"
+"""What the columns of true parameters begin with."""
+
+_AGREE_M = 0.5
+"""How far a gap may be from that between the positions; beyond it one of them is wrong."""
+
 _TOO_LITTLE_M = 10.0
 """Distance below which positions and speeds cannot be compared."""
 
 
-def check(table: TidyTable) -> tuple[TidyTable, Ints, Ints]:
-    """Checks everything that the layout asks for.
+def check(table: Table) -> tuple[Table, Ints, Ints]:
+    """Check everything that the layout asks for.
 
     Returns:
         The table, completed where it has gaps in place of other columns; the order `(N,)` that
@@ -40,7 +52,6 @@ def check(table: TidyTable) -> tuple[TidyTable, Ints, Ints]:
     Raises:
         DataError: names file, row and column.
     """
-    _check_cells(table)
     order, starts = _check_frames(table)
     _check_pairs(table, order, starts)
     if GAP in table.numbers:
@@ -50,49 +61,8 @@ def check(table: TidyTable) -> tuple[TidyTable, Ints, Ints]:
     return table, order, starts
 
 
-def _check_cells(table: TidyTable) -> None:
-    """Raises DataError for an empty name, and for a cell that is no finite or possible number."""
-    for name in LABELS:
-        empty = np.flatnonzero(table.labels[name].codes < 0)
-        if len(empty):
-            raise DataError(
-                f"{table.at(empty[0], name)}: the cell is empty ({len(empty)} such cells);"
-                " give a name"
-            )
-    numbers = table.numbers
-    for name in (*NUMBERS, GAP):
-        if name not in numbers:
-            continue
-        bad = bad_cells(numbers[name])
-        if bad is not None:
-            index, count, what = bad
-            raise DataError(
-                f"{table.at(index, name)}: is {what} ({count} such cells in this column);"
-                " correct it or leave out the pair"
-            )
-    is_broken = numbers["frame"] != np.floor(numbers["frame"])
-    _reject(table, "frame", is_broken, "is no whole number; number the frames 0, 1, 2, ...")
-    for name in ("leader_speed_mps", "follower_speed_mps"):
-        why = "is negative; speeds count along the lane and must be 0 or more"
-        _reject(table, name, numbers[name] < 0, why)
-    if LENGTH in numbers:
-        why = "is no vehicle length; give metres, or 0 where positions are of rear bumpers"
-        _reject(table, LENGTH, numbers[LENGTH] < 0, why)
-
-
-def _reject(table: TidyTable, name: str, wrong: Marks, why: str) -> None:
-    """Raises DataError if any cell of a column is wrong; names the first."""
-    at = np.flatnonzero(wrong)
-    if not len(at):
-        return
-    text = f"{table.at(at[0], name)}: {table.numbers[name][at[0]]:g} {why}"
-    if len(at) > 1:
-        text += f" ({len(at)} such cells)"
-    raise DataError(text)
-
-
-def _check_frames(table: TidyTable) -> tuple[Ints, Ints]:
-    """Checks that frames are consecutive and the time step is constant.
+def _check_frames(table: Table) -> tuple[Ints, Ints]:
+    """Check that frames are consecutive and the time step is constant.
 
     Returns:
         As `check`.
@@ -108,7 +78,7 @@ def _check_frames(table: TidyTable) -> tuple[Ints, Ints]:
     if len(twice):
         a, b = sorted((order[twice[0]], order[twice[0] + 1]))
         raise DataError(
-            f"{table.at(b)}: the same pair and frame as row {int(a) + table.first_row}"
+            f"{table.at(b)}: the same pair and frame as row {table.row(a)}"
             f" ({len(twice)} such rows); keep one of them"
         )
     jumps = np.flatnonzero(within & (step != 1))
@@ -130,12 +100,12 @@ def _check_frames(table: TidyTable) -> tuple[Ints, Ints]:
 
 
 def _sizes(order: Ints, starts: Ints) -> Ints:
-    """Returns how many frames each pair has."""
+    """Return how many frames each pair has."""
     return np.diff(np.append(starts, len(order)))
 
 
-def _check_time(table: TidyTable, order: Ints, starts: Ints, within: Marks) -> None:
-    """Checks that time advances by a constant step within a pair.
+def _check_time(table: Table, order: Ints, starts: Ints, within: Marks) -> None:
+    """Check that time advances by a constant step within a pair.
 
     Args:
         within: whether a row is of the same pair as the row before, for all but the first.
@@ -158,8 +128,8 @@ def _check_time(table: TidyTable, order: Ints, starts: Ints, within: Marks) -> N
         )
 
 
-def _check_pairs(table: TidyTable, order: Ints, starts: Ints) -> None:
-    """Raises DataError if what describes a pair as a whole changes within it."""
+def _check_pairs(table: Table, order: Ints, starts: Ints) -> None:
+    """Raise DataError if what describes a pair as a whole changes within it."""
     first = np.repeat(order[starts], _sizes(order, starts))
     described: dict[str, NDArray[Any]] = {}
     for name, labels in table.labels.items():
@@ -179,7 +149,9 @@ def _check_pairs(table: TidyTable, order: Ints, starts: Ints) -> None:
                 " follower behind one leader in one recording and lane: give each stretch its own"
                 " pair id"
             )
-    for name in table.truth_names:
+    for name in table.numbers:
+        if not name.startswith(TRUE):
+            continue
         unknown = np.isnan(table.numbers[name])
         at = np.flatnonzero(unknown[order] != unknown[first])
         if len(at):
@@ -187,14 +159,10 @@ def _check_pairs(table: TidyTable, order: Ints, starts: Ints) -> None:
                 f"{table.at(order[at[0]], name)}: the true parameter is known in a part of the pair"
                 " only; give it in every row"
             )
-    if LANE in table.numbers:
-        lane = table.numbers[LANE]
-        is_broken = ~np.isnan(lane) & ~(np.isfinite(lane) & (lane == np.floor(lane)))
-        _reject(table, LANE, is_broken, "is no lane number")
 
 
-def _check_motion(table: TidyTable, order: Ints, starts: Ints) -> None:
-    """Raises DataError if positions and speeds do not belong together."""
+def _check_motion(table: Table, order: Ints, starts: Ints) -> None:
+    """Raise DataError if positions and speeds do not belong together."""
     within = np.ones(len(order), dtype=bool)
     within[starts] = False
     time = table.numbers["time_s"][order]
@@ -216,7 +184,7 @@ def _check_motion(table: TidyTable, order: Ints, starts: Ints) -> None:
 
 
 def _likely_reason(ratio: float) -> str:
-    """Returns why positions and speeds do not belong together, from how much they differ."""
+    """Return why positions and speeds do not belong together, from how much they differ."""
     for factor, text in _FACTORS.items():
         if abs(ratio / factor - 1) < 0.05:
             return text
@@ -225,8 +193,8 @@ def _likely_reason(ratio: float) -> str:
     return "positions must be in m, speeds in m/s and times in s"
 
 
-def _check_gap(table: TidyTable) -> None:
-    """Raises DataError if a leader is not ahead of its follower."""
+def _check_gap(table: Table) -> None:
+    """Raise DataError if a leader is not ahead of its follower."""
     rear = table.numbers["leader_position_m"] - table.numbers["leader_length_m"]
     gap = rear - table.numbers["follower_position_m"]
     at = np.flatnonzero(~(gap > 0))
@@ -235,4 +203,93 @@ def _check_gap(table: TidyTable) -> None:
             f"{table.at(at[0])}: the leader is behind its follower, or overlaps it: the gap is"
             f" {gap[at[0]]:.2f} m ({len(at)} such rows); cut the pair there, or correct positions"
             " and leader_length_m"
+        )
+
+
+# --- a column of gaps in place of lengths, positions and accelerations ---------------------------
+
+
+def time_steps(time: Floats, starts: Ints) -> Floats:
+    """Return the mean time step of each pair, s.
+
+    Args:
+        time: of the rows in order, s.
+        starts: where each pair begins.
+    """
+    ends = np.append(starts[1:], len(time)) - 1
+    mean: Floats = (time[ends] - time[starts]) / (ends - starts)
+    return mean
+
+
+def with_positions(table: Table, order: Ints, starts: Ints) -> Table:
+    """Return a table that has every column, by its gaps.
+
+    An absent length is 0, so that the leader's position is that of its rear bumper; it follows from
+    the gap where both positions are there. An absent leader's position follows from the follower's,
+    or from the leader's speed. An absent follower's position follows from the gap. Absent
+    accelerations are differences of speeds.
+
+    Raises:
+        DataError: the gaps contradict the positions.
+    """
+    numbers = dict(table.numbers)
+    steps = time_steps(numbers["time_s"][order], starts)
+    gap = numbers[GAP]
+    has_both = {"leader_position_m", "follower_position_m"} <= numbers.keys()
+    if LENGTH not in numbers:
+        numbers[LENGTH] = np.zeros(len(table))
+        if has_both:
+            numbers[LENGTH] = _lengths(numbers, order, starts)
+    if "leader_position_m" not in numbers:
+        if "follower_position_m" in numbers:
+            rear = numbers["follower_position_m"] + gap
+        else:
+            rear = _by_pair(driven, numbers["leader_speed_mps"], order, starts, steps)
+        numbers["leader_position_m"] = rear + numbers[LENGTH]
+    rear = numbers["leader_position_m"] - numbers[LENGTH]
+    if "follower_position_m" not in numbers:
+        numbers["follower_position_m"] = rear - gap
+    for who in ("leader", "follower"):
+        name = f"{who}_acceleration_mps2"
+        if name not in numbers:
+            speed = numbers[f"{who}_speed_mps"]
+            numbers[name] = _by_pair(accelerations, speed, order, starts, steps)
+    complete = replace(table, numbers=numbers)
+    _check_agreement(complete)
+    return complete
+
+
+def _lengths(numbers: dict[str, Floats], order: Ints, starts: Ints) -> Floats:
+    """Return each pair's median of what its positions leave over beside the gap, `(N,)`."""
+    left = numbers["leader_position_m"] - numbers["follower_position_m"] - numbers[GAP]
+    result = np.empty_like(left)
+    for rows in np.split(order, starts[1:]):
+        result[rows] = np.median(left[rows])
+    return result
+
+
+def _by_pair(
+    function: Callable[[Floats, float], Floats],
+    values: Floats,
+    order: Ints,
+    starts: Ints,
+    steps: Floats,
+) -> Floats:
+    """Return what a function of values over time and a time step makes of each pair, `(N,)`."""
+    result = np.empty_like(values)
+    for rows, step in zip(np.split(order, starts[1:]), steps.tolist(), strict=True):
+        result[rows] = function(values[rows], step)
+    return result
+
+
+def _check_agreement(table: Table) -> None:
+    """Raise DataError where positions and lengths make another gap than the file says."""
+    numbers = table.numbers
+    between = numbers["leader_position_m"] - numbers[LENGTH] - numbers["follower_position_m"]
+    at = np.flatnonzero(np.abs(between - numbers[GAP]) > _AGREE_M)
+    if len(at):
+        raise DataError(
+            f"{table.at(at[0], GAP)}: is {numbers[GAP][at[0]]:.2f} m, but the positions and"
+            f" {LENGTH} make it {between[at[0]]:.2f} m ({len(at)} such rows); leave out the columns"
+            f" that are less exact: the positions, or {GAP}"
         )

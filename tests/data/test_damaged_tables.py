@@ -39,7 +39,7 @@ def not_utf8() -> pa.Array:
         ("pair_id", not_utf8(), "row 2, column pair_id: is no text in UTF-8"),
         ("pair_id", pa.array([{"a": 1}] * ROWS), "column pair_id: holds struct<a: int64>, not"),
         ("leader_id", pa.array([[1, 2]] * ROWS), "column leader_id: holds list<"),
-        ("lane", pa.array([float("inf")] * ROWS), "column lane .* inf is no lane number"),
+        ("lane", pa.array([float("inf")] * ROWS), "column lane .* the cell is infinite"),
     ],
 )
 def test_what_is_no_name_and_no_lane_is_refused(

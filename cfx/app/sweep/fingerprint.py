@@ -97,7 +97,7 @@ def _state_of_data(node: Any) -> list[list[Any]] | None:
     """
     if not isinstance(node, Mapping) or not node.get("path"):
         return None
-    from cfx.data.partitions import partitions  # imports pandas, a quarter of a second
+    from cfx.data.files import partitions
 
     named = node["path"]
     patterns = named if isinstance(named, list | tuple) else [named]

@@ -14,23 +14,38 @@ from pydantic import Field
 from cfx import PairSet, Settings
 from cfx.core.errors import DataError
 from cfx.data.base import Dataset, FileDatasetSettings, joined
-from cfx.data.files import FileStart, Floats, Ints, TextTable, read_columns
+from cfx.data.files import FileStart, Floats, Ints
+from cfx.data.table import Column, Layout, Table, read_table
 from cfx.data.tracks import Tracks, extract_pairs
-from cfx_recordings.tables import position, read_numbers, refuse
 
 _TRACKS, _TRACKS_META, _RECORDING_META = "_tracks.csv", "_tracksMeta.csv", "_recordingMeta.csv"
 
-_COLUMNS = (
-    "frame",
-    "id",
-    "x",
-    "width",
-    "xVelocity",
-    "xAcceleration",
-    "precedingId",
-    "laneId",
+
+def _count(name: str) -> Column:
+    return Column(name, whole=True, least=0, wrong="is no whole number from 0 on")
+
+
+_TRACK_COLUMNS = Layout(
+    "highD's tracks",
+    (
+        _count("frame"),
+        _count("id"),
+        Column("x", "m"),
+        Column("width", "m", above=0, wrong="is no vehicle length"),
+        Column("xVelocity", "m/s"),
+        Column("xAcceleration", "m/s2"),
+        _count("precedingId"),
+        _count("laneId"),
+    ),
 )
-"""Columns of the tracks that are read."""
+_VEHICLE_COLUMNS = Layout(
+    "highD's vehicles",
+    (Column("id"), Column("drivingDirection"), Column("class", is_name=True, may_be_empty=True)),
+)
+_RECORDING_COLUMNS = Layout(
+    "highD's recordings",
+    (Column("frameRate", "1/s", above=0, wrong="is no frame rate"),),
+)
 
 _LEFT, _RIGHT = 1, 2
 """Driving directions: the upper lanes lead to the left, the lower ones to the right."""
@@ -97,29 +112,30 @@ def _tracks(path: Path) -> Tracks:
     Raises:
         DataError: a file is missing or does not keep to the layout.
     """
-    numbers, table = read_numbers(path, [(name,) for name in _COLUMNS])
+    table = read_table(path, _TRACK_COLUMNS)
+    numbers = table.numbers
     vehicles = _vehicles(_beside(path, _TRACKS_META))
     row_of = np.searchsorted(vehicles.vehicle, numbers["id"])
     row_of[row_of == len(vehicles.vehicle)] = 0
     is_unknown = vehicles.vehicle[row_of] != numbers["id"]
     what = f"is no vehicle of {_beside(path, _TRACKS_META).name}; both must be of one recording"
-    refuse(table, "id", numbers["id"], is_unknown, what)
+    table.refuse("id", is_unknown, what)
     to_right = vehicles.direction[row_of] == _RIGHT
     sign = np.where(to_right, 1.0, -1.0)
     speed = sign * numbers["xVelocity"]
-    _check(table, numbers, speed)
+    _check(table, speed)
+    about = read_table(_beside(path, _RECORDING_META), _RECORDING_COLUMNS)
     order = np.lexsort((numbers["frame"], numbers["id"]))
-    whole = {name: numbers[name][order].astype(np.int64) for name in ("id", "frame", "laneId")}
     front = np.where(to_right, numbers["x"] + numbers["width"], -numbers["x"])
     return Tracks(
         source=str(path),
-        dt=1.0 / _frame_rate(_beside(path, _RECORDING_META)),
+        dt=1.0 / float(about.numbers["frameRate"][0]),
         recordings=(f"highd-{path.name.removesuffix(_TRACKS)}",),
         recording=np.zeros(len(order), dtype=np.int64),
-        vehicle=whole["id"],
-        frame=whole["frame"],
-        lane=whole["laneId"],
-        leader=numbers["precedingId"][order].astype(np.int64),
+        vehicle=table.whole("id")[order],
+        frame=table.whole("frame")[order],
+        lane=table.whole("laneId")[order],
+        leader=table.whole("precedingId")[order],
         position=front[order],
         speed=np.maximum(speed, 0.0)[order],
         acceleration=(sign * numbers["xAcceleration"])[order],
@@ -147,47 +163,33 @@ def _beside(path: Path, ending: str) -> Path:
 
 
 def _vehicles(path: Path) -> _Vehicles:
-    numbers, table = read_numbers(path, [("id",), ("drivingDirection",)])
-    _, labels = read_columns(table, {}, {"class": position(table, "class")})
-    direction = numbers["drivingDirection"]
+    table = read_table(path, _VEHICLE_COLUMNS)
+    direction = table.numbers["drivingDirection"]
     is_odd = (direction != _LEFT) & (direction != _RIGHT)
-    refuse(table, "drivingDirection", direction, is_odd, f"is neither {_LEFT} nor {_RIGHT}")
-    order = np.argsort(numbers["id"])
-    kinds = (*[name.lower() for name in labels["class"].names], "")
+    table.refuse("drivingDirection", is_odd, f"is neither {_LEFT} nor {_RIGHT}")
+    order = np.argsort(table.numbers["id"])
+    labels = table.labels["class"]
     return _Vehicles(
-        numbers["id"][order].astype(np.int64),
-        direction[order].astype(np.int64),
-        labels["class"].codes[order],
-        kinds,
+        table.whole("id")[order],
+        table.whole("drivingDirection")[order],
+        labels.codes[order],
+        (*[name.lower() for name in labels.names], ""),
     )
-
-
-def _frame_rate(path: Path) -> float:
-    """Returns frames per second."""
-    numbers, _ = read_numbers(path, [("frameRate",)])
-    rate = float(numbers["frameRate"][0])
-    if not rate > 0:
-        raise DataError(f"{path}, column frameRate: {rate:g} is no frame rate")
-    return rate
 
 
 _REVERSE_MPS = 0.5
 """Speeds against the driving direction up to this are noise of vehicles that stand."""
 
 
-def _check(table: TextTable, numbers: dict[str, Floats], speed: Floats) -> None:
+def _check(table: Table, speed: Floats) -> None:
     """Raises DataError for what no such recording can hold.
 
     Args:
         speed: along the driving direction, m/s.
     """
-    for name in ("frame", "id", "precedingId", "laneId"):
-        values = numbers[name]
-        is_odd = (values != np.floor(values)) | (values < 0)
-        refuse(table, name, values, is_odd, "is no whole number from 0 on")
     against = "is against the vehicle's drivingDirection; are both files of the same recording?"
-    refuse(table, "xVelocity", numbers["xVelocity"], speed < -_REVERSE_MPS, against)
-    refuse(table, "width", numbers["width"], numbers["width"] <= 0, "is no vehicle length")
-    key = numbers["id"] * (numbers["frame"].max() + 1) + numbers["frame"]
+    table.refuse("xVelocity", speed < -_REVERSE_MPS, against)
+    frame = table.numbers["frame"]
+    key = table.numbers["id"] * (frame.max() + 1) + frame
     if len(np.unique(key)) < len(key):
-        raise DataError(f"{table.path}: a vehicle has two rows at one frame; keep one of them")
+        raise DataError(f"{table.source}: a vehicle has two rows at one frame; keep one of them")

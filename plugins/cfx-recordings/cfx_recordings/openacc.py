@@ -7,7 +7,6 @@ Part C 125, 103047. European Commission, Joint Research Centre; CC BY 4.0.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar, NamedTuple, TypeVar
@@ -15,11 +14,11 @@ from typing import ClassVar, NamedTuple, TypeVar
 import numpy as np
 
 from cfx import PairSet, Settings
-from cfx.core.errors import DataError
-from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined, listed
-from cfx.data.files import FileStart, Floats, Ints, Labels, TextTable, beginning, read_columns, stem
+from cfx.core.errors import DataError, listed
+from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
+from cfx.data.files import FileStart, Floats, Ints, beginning, stem
 from cfx.data.series import Series, frames_at, pairs_of
-from cfx_recordings.tables import position, refuse
+from cfx.data.table import Column, Labels, Layout, Table, read_table
 
 _Column = TypeVar("_Column", Floats, Labels)
 
@@ -35,6 +34,18 @@ _HUMAN, _ACC = "human", "acc"
 
 _TYPE_OF_FLAG = {"0": _HUMAN, "1": _ACC}
 """What `ACC` above the table says of all followers; 2 is mixed, empty is not known."""
+
+
+_LAYOUT = Layout(
+    "OpenACC",
+    (
+        Column("Time", "s"),
+        Column(r"Speed\d+", "m/s", many=True, needed=False, may_be_empty=True),
+        Column(r"IVS\d+", "m", many=True, needed=False, may_be_empty=True),
+        Column(r"Driver\d+", is_name=True, many=True, needed=False, may_be_empty=True),
+    ),
+    above=_LINES,
+)
 
 
 class OpenaccDataset(Dataset):
@@ -112,36 +123,20 @@ def _read(path: Path) -> _File:
     for line in start.lines[:_LINES]:
         key, *values = [cell.strip() for cell in line.split(",")]
         about[key.lower()] = [value for value in values if value]
-    header = tuple(cell.strip() for cell in start.lines[_LINES].split(","))
-    table = TextTable(path, ",", header, len(header), above=_LINES)
-    numbers, labels = read_columns(
-        table,
-        {"Time": position(table, "Time"), **_places(header, "Speed", "IVS")},
-        _places(header, "Driver"),
-    )
-    time = numbers.pop("Time")
-    _check_time(table, time)
+    table = read_table(path, _LAYOUT)
+    _check_time(table)
     return _File(
         path,
         about,
-        frames_at(time, DT),
-        _by_place(numbers, "Speed"),
-        _by_place(numbers, "IVS"),
-        _by_place(labels, "Driver"),
+        frames_at(table.numbers["Time"], DT),
+        _by_place(table.numbers, "Speed"),
+        _by_place(table.numbers, "IVS"),
+        _by_place(table.labels, "Driver"),
     )
 
 
-def _places(header: Sequence[str], *kinds: str) -> dict[str, int]:
-    """Returns where the columns of these kinds are, such as Speed1, Speed2."""
-    found = {}
-    for at, name in enumerate(header):
-        match = re.fullmatch(r"([A-Za-z]+)(\d+)", name)
-        if match and match[1] in kinds:
-            found[name] = at
-    return found
-
-
 def _by_place(columns: Mapping[str, _Column], kind: str) -> dict[int, _Column]:
+    """Returns the columns of a kind, such as Speed1 and Speed2, by the vehicle's place."""
     found = {}
     for name, values in columns.items():
         if name.startswith(kind):
@@ -149,22 +144,14 @@ def _by_place(columns: Mapping[str, _Column], kind: str) -> dict[int, _Column]:
     return found
 
 
-def _check_time(table: TextTable, time: Floats) -> None:
+def _check_time(table: Table) -> None:
     """Raises DataError unless times advance, on a grid of 0.1 s."""
-    if not len(time):
-        raise DataError(f"{table.path}: has a header but no rows")
-    empty = np.flatnonzero(~np.isfinite(time))
-    if len(empty):
-        raise DataError(f"{table.path}, row {table.row(empty[0])}, column Time: the cell is empty")
-    back = np.flatnonzero(np.diff(time) <= 0)
-    if len(back):
-        raise DataError(
-            f"{table.path}, row {table.row(back[0] + 1)}, column Time: does not advance from the"
-            " row before"
-        )
+    time = table.numbers["Time"]
+    goes_back = np.append(False, np.diff(time) <= 0)
+    table.refuse("Time", goes_back, "does not advance from the row before")
     at = (time - time[0]) / DT
     between = f"s is between two frames of {DT:g} s; OpenACC's rows are {DT:g} s apart"
-    refuse(table, "Time", time, np.abs(at - np.rint(at)) > 0.25, between)
+    table.refuse("Time", np.abs(at - np.rint(at)) > 0.25, between)
 
 
 def _pairs(file: _File) -> PairSet:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -17,10 +17,10 @@ from pydantic import Field
 from cfx import PairSet, Settings
 from cfx.core.errors import DataError
 from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
-from cfx.data.files import FileStart, Floats, Ints, TextTable, stem
+from cfx.data.files import FileStart, Floats, Ints, stem
 from cfx.data.series import Series, frames_at, pairs_of
+from cfx.data.table import Column, Layout, Table, read_table
 from cfx.data.tracks import changes
-from cfx_recordings.tables import read_numbers, refuse
 
 DT = 0.1
 """Seconds between two rows of a vehicle."""
@@ -28,14 +28,27 @@ DT = 0.1
 AUTOMATED = 0
 """Number of Waymo's own vehicle in every segment."""
 
-_KEYS = ("segment_id", "local_veh_id", "follower_id", "leader_id")
 _TIME, _LENGTH = "local_time", "length"
-_MOTION = {
-    "position": ("filter_pos", "processed_position"),
-    "speed": ("filter_speed", "processed_speed"),
-    "acceleration": ("filter_accer", "processed_accer"),
-}
-"""Columns of motion: as the second and third version call them, and as the first."""
+
+
+def _motion(name: str, earlier: str, unit: str) -> Column:
+    return Column(name, unit, spellings=(earlier,), may_be_empty=True)
+
+
+_LAYOUT = Layout(
+    "the Waymo pairs",
+    (
+        Column("segment_id"),
+        Column("local_veh_id"),
+        Column("follower_id"),
+        Column("leader_id"),
+        Column(_TIME, "s"),
+        Column(_LENGTH, "m", above=0, wrong="is no vehicle length"),
+        _motion("filter_pos", "processed_position", "m"),
+        _motion("filter_speed", "processed_speed", "m/s"),
+        _motion("filter_accer", "processed_accer", "m/s2"),
+    ),
+)
 
 
 class WaymoPairsSettings(FileDatasetSettings):
@@ -72,32 +85,16 @@ class WaymoPairsDataset(Dataset):
         return self.contents().pairs
 
     def contents(self) -> Contents:
-        files = [_read(path) for path in self.settings.files()]
+        files = [read_table(path, _LAYOUT) for path in self.settings.files()]
         vehicles = 0
         for file in files:
             whole = np.stack([file.numbers["segment_id"], file.numbers["local_veh_id"]])
             vehicles += len(np.unique(whole, axis=1).T)
-        rows = sum(len(file.numbers[_TIME]) for file in files)
+        rows = sum(len(file) for file in files)
         return Contents(joined([_pairs(file) for file in files]), rows, vehicles)
 
 
-class _File(NamedTuple):
-    table: TextTable
-    numbers: dict[str, Floats]
-
-
-def _read(path: Path) -> _File:
-    whole = (*_KEYS, _TIME, _LENGTH)
-    wanted = [*[(name,) for name in whole], *_MOTION.values()]
-    may_lack = {spellings[0] for spellings in _MOTION.values()}
-    numbers, table = read_numbers(path, wanted, may_lack=may_lack)
-    for name, (spelling, _) in _MOTION.items():
-        numbers[name] = numbers.pop(spelling)
-    refuse(table, _LENGTH, numbers[_LENGTH], numbers[_LENGTH] <= 0, "is no vehicle length")
-    return _File(table, numbers)
-
-
-def _pairs(file: _File) -> PairSet:
+def _pairs(file: Table) -> PairSet:
     """Returns the pairs of a file, in the order of segment, follower and leader."""
     numbers = file.numbers
     keys = [numbers[name] for name in ("leader_id", "follower_id", "segment_id")]
@@ -108,12 +105,12 @@ def _pairs(file: _File) -> PairSet:
         one = _series(file, {name: values[rows] for name, values in numbers.items()})
         if one is not None:
             series.append(one)
-    return pairs_of(series, str(file.table.path))
+    return pairs_of(series, file.source)
 
 
-def _series(file: _File, rows: Mapping[str, Floats]) -> Series | None:
+def _series(file: Table, rows: Mapping[str, Floats]) -> Series | None:
     """Returns one pair's series; None where its vehicles have no time in common."""
-    segment = f"{stem(file.table.path)}-{rows['segment_id'][0]:g}"
+    segment = f"{stem(Path(file.source))}-{rows['segment_id'][0]:g}"
     follower, leader = int(rows["follower_id"][0]), int(rows["leader_id"][0])
     of_follower = np.flatnonzero(rows["local_veh_id"] == follower)
     of_leader = np.flatnonzero(rows["local_veh_id"] == leader)
@@ -132,9 +129,9 @@ def _series(file: _File, rows: Mapping[str, Floats]) -> Series | None:
     length = {}
     for who, at in (("follower", behind), ("leader", ahead)):
         length[who] = float(np.median(rows[_LENGTH][at]))
-        signals[f"{who}_position"] = rows["position"][at] + length[who] / 2
-        signals[f"{who}_speed"] = rows["speed"][at]
-        signals[f"{who}_acceleration"] = rows["acceleration"][at]
+        signals[f"{who}_position"] = rows["filter_pos"][at] + length[who] / 2
+        signals[f"{who}_speed"] = rows["filter_speed"][at]
+        signals[f"{who}_acceleration"] = rows["filter_accer"][at]
     return Series(
         name=f"{segment}-{follower}-{leader}",
         recording=segment,
@@ -149,11 +146,11 @@ def _series(file: _File, rows: Mapping[str, Floats]) -> Series | None:
     )
 
 
-def _require_once(file: _File, segment: str, frame: Ints, rows: Ints) -> None:
+def _require_once(file: Table, segment: str, frame: Ints, rows: Ints) -> None:
     """Raises DataError where a vehicle has two rows at one time."""
     if len(np.unique(frame[rows])) < len(rows):
         raise DataError(
-            f"{file.table.path}: a vehicle of {segment} has two rows of one pair at the same"
+            f"{file.source}: a vehicle of {segment} has two rows of one pair at the same"
             f" {_TIME}; keep one of them"
         )
 

@@ -233,7 +233,10 @@ def test_empty_cells_and_missing_times_cut_a_pair_and_are_counted(tmp_path: Path
     [
         (lambda text: text.replace("Time,", "Clock,"), "row 6: column Time is missing"),
         (lambda text: text.replace("IVS1", "Gap1"), "no two vehicles have Speed and IVS"),
-        (lambda text: text.replace("36000.5", "36000.1"), "row 12, column Time: does not advance"),
+        (
+            lambda text: text.replace("36000.5", "36000.1"),
+            "row 12, column Time: 36000.1 does not advance",
+        ),
         (lambda text: text.replace("36000.5", "36000.45"), "is between two frames of 0.1 s"),
         (lambda text: "\n".join(text.splitlines()[5:]), "five lines must stand above its table"),
     ],

@@ -1,0 +1,672 @@
+"""One checked table: columns as a layout declares them, whatever they are stored as.
+
+A reader is its layout and its meaning. The layout declares each column: its name and unit, other
+spellings, what its cells may hold, and what is wrong with a cell that holds something else.
+`read_table` finds the columns in a delimited text (gzipped or not) or a parquet file, reads these
+alone, and checks every cell. `table_of` does the same for a data frame.
+
+Rows are numbered as an editor shows them: the header is row 1 (blank lines are not counted).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from cfx.core.errors import DataError, listed, nearest
+from cfx.data.files import PARQUET, Floats, Ints, magic, read_head, unpacked_blocks
+
+if TYPE_CHECKING:
+    from numpy import bool_
+
+_BLOCK = 1 << 22
+"""Bytes that are parsed at once."""
+
+_UTF16 = (b"\xff\xfe", b"\xfe\xff")
+_UTF8_MARK = b"\xef\xbb\xbf"
+_OTHER_SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "vertical bars"}
+_ABSENT = ("", "nan", "na", "null", "none", "n/a", "#n/a")
+"""Cells that stand for no number, in small letters."""
+
+_PANDAS_INDEX = "__index_level_0__"
+"""A column that pandas adds to parquet files for the rows' index; it is not the user's."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a layout.
+
+    Attributes:
+        name: as the layout calls it; a regular expression where `many`.
+        unit: of its numbers, as the file has them; "" for names and counts.
+        is_name: whether it holds names, not numbers.
+        spellings: other names of the column.
+        needed: whether every file has it.
+        unless: name of a column beside which this one is not needed.
+        many: whether it stands for every column that its name matches; each keeps its own name.
+        may_be_empty: whether cells may be empty: they are NaN, or code -1.
+        whole: whether its numbers are whole.
+        least: smallest number that is possible.
+        above: every number is greater than this.
+        wrong: what is wrong with a number that is not whole or out of bounds, and what to do.
+    """
+
+    name: str
+    unit: str = ""
+    is_name: bool = False
+    spellings: tuple[str, ...] = ()
+    needed: bool = True
+    unless: str = ""
+    many: bool = False
+    may_be_empty: bool = False
+    whole: bool = False
+    least: float = -np.inf
+    above: float = -np.inf
+    wrong: str = ""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The columns of a kind of file.
+
+    Attributes:
+        name: what messages call it.
+        keys: what identifies a row in messages: a word, and the column that it stands for.
+        elsewhere: columns of other layouts, as `plain` writes them, and what to say of a file that
+            has them in place of its own.
+        remedy: what to do about an empty cell.
+        headerless: names of the columns of a text without a header, by their number.
+        above: lines of a text above its header that are no part of the table.
+        spaces: whether white space may separate columns of a text.
+        parquet: whether it may be stored as parquet too.
+        plain: turns a column's name into the form in which names are compared.
+    """
+
+    name: str
+    columns: tuple[Column, ...]
+    keys: Mapping[str, str] = field(default_factory=dict)
+    elsewhere: Mapping[str, str] = field(default_factory=dict)
+    remedy: str = "correct it or remove the row"
+    headerless: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
+    above: int = 0
+    spaces: bool = False
+    parquet: bool = False
+    plain: Callable[[str], str] = str
+
+    def found_in(self, source: str, names: Sequence[str]) -> dict[str, _Found]:
+        """Return the layout's columns among those of a file, by the names that they keep.
+
+        Raises:
+            DataError: a column is missing or stands twice.
+        """
+        at: dict[str, int] = {}
+        plain: dict[str, int] = {}
+        for index, name in enumerate(names):
+            at.setdefault(name, index)
+            plain.setdefault(self.plain(name), index)
+        found: dict[str, _Found] = {}
+        missing = []
+        for column in self.columns:
+            own = self._found(column, at, plain)
+            taken = {one.at for one in found.values()}
+            found |= {one.column.name: one for one in own if one.at not in taken}
+            if not own and column.needed and not (column.unless and column.unless in at):
+                missing.append(column)
+        for one in found.values():
+            name = names[one.at]
+            if names.count(name) > 1:
+                raise DataError(
+                    f"{source}: column {name} stands in the file more than once; remove one of them"
+                )
+        if missing:
+            raise DataError(self._missing(source, missing, names))
+        return found
+
+    def _found(
+        self, column: Column, at: Mapping[str, int], plain: Mapping[str, int]
+    ) -> list[_Found]:
+        """Return where a column is: once, or as often as its pattern matches."""
+        if column.many:
+            matching = [name for name in at if re.fullmatch(column.name, name)]
+            return [_Found(replace(column, name=name), at[name]) for name in matching]
+        for name in (column.name, *column.spellings):
+            if name in at:
+                return [_Found(column, at[name])]
+        for name in (column.name, *column.spellings):
+            if self.plain(name) in plain:
+                return [_Found(column, plain[self.plain(name)])]
+        return []
+
+    def _missing(self, source: str, missing: Sequence[Column], names: Sequence[str]) -> str:
+        """Return what to say of columns that are not there."""
+        first = missing[0]
+        called = " or ".join([first.name, *first.spellings])
+        own = {column.name for column in self.columns}
+        spare = [name for name in names if name not in own]
+        where = source
+        if self.above:
+            where += f", row {self.above + 1}"
+        text = f"{where}: column {called} is missing."
+        if len(names) > 1:
+            text += nearest(first.name, spare)
+        if len(missing) > 1:
+            text += f" So are {listed([column.name for column in missing[1:]], 5)}."
+        hints = dict.fromkeys(self.elsewhere.get(self.plain(name), "") for name in names)
+        text += "".join(f" {hint}" for hint in hints if hint)
+        return f"{text} Columns found: {listed(names, 30)}."
+
+
+class _Found(NamedTuple):
+    """A column of a layout, and its position in a file."""
+
+    column: Column
+    at: int
+
+
+class Labels(NamedTuple):
+    """A column of names: `codes` `(N,)` points into `names`; -1 is an empty cell."""
+
+    codes: Ints
+    names: list[str]
+
+    def at(self, row: int) -> str:
+        """Return the name in a row; "" for an empty cell."""
+        code = int(self.codes[row])
+        if code < 0:
+            return ""
+        return self.names[code]
+
+
+@dataclass(frozen=True)
+class Table:
+    """The columns of a file or a data frame, every cell of which fits the layout.
+
+    Attributes:
+        source: what messages call it.
+        numbers: columns of numbers `(N,)`, in the file's units.
+        labels: columns of names `(N,)`.
+        first_row: the number of the first row in messages.
+        ignored: names of the columns that are not part of the layout.
+    """
+
+    source: str
+    layout: Layout
+    numbers: Mapping[str, Floats]
+    labels: Mapping[str, Labels]
+    first_row: int
+    ignored: Sequence[str]
+
+    def __len__(self) -> int:
+        for values in self.numbers.values():
+            return len(values)
+        for labels in self.labels.values():
+            return len(labels.codes)
+        return 0
+
+    def row(self, index: int | np.integer[Any]) -> int:
+        """Return the number that an editor shows for the row `index` (from 0)."""
+        return int(index) + self.first_row
+
+    def at(self, index: int | np.integer[Any], column: str = "") -> str:
+        """Say where a row is: the source, the row, the column, and what identifies the row."""
+        text = f"{self.source}, row {self.row(index)}"
+        if column:
+            text += f", column {column}"
+        known = []
+        for word, key in self.layout.keys.items():
+            if key in self.numbers:
+                known.append(f"{word} {self.numbers[key][index]:g}")
+            elif self.labels[key].codes[index] >= 0:
+                known.append(f"{word} '{self.labels[key].at(int(index))}'")
+        if known:
+            text += f" ({', '.join(known)})"
+        return text
+
+    def refuse(self, column: str, wrong: NDArray[bool_], why: str) -> None:
+        """Raise DataError if any cell of a column of numbers is wrong; names the first.
+
+        Args:
+            column: its name.
+            wrong: marks the cells `(N,)`.
+            why: what is wrong with them, and what to do.
+        """
+        at = np.flatnonzero(wrong)
+        if not len(at):
+            return
+        text = f"{self.at(at[0], column)}: {self.numbers[column][at[0]]:g} {why}"
+        if len(at) > 1:
+            text += f" ({len(at)} such cells)"
+        raise DataError(text)
+
+    def whole(self, column: str) -> Ints:
+        """Return a column of whole numbers `(N,)`."""
+        return self.numbers[column].astype(np.int64)
+
+
+def read_table(path: Path, layout: Layout, given: Mapping[str, str] | None = None) -> Table:
+    """Read the columns of a layout from a text or a parquet file, and checks every cell.
+
+    Args:
+        given: a name for each column of names that a parquet file may lack: its cells all hold it.
+
+    Raises:
+        DataError: the file cannot be read, a column is missing, or a cell is wrong; the message
+            names file, row and column.
+    """
+    if magic(path) != PARQUET:
+        return _read_text(path, layout)
+    if not layout.parquet:
+        raise DataError(
+            f"{path}: is a parquet file; those of {layout.name} are text."
+            " Pairs in the tidy layout are read with data=tidy"
+        )
+    try:
+        file = pq.ParquetFile(path)
+        stored = file.schema_arrow.names
+        more = {name: value for name, value in (given or {}).items() if name not in stored}
+        found = layout.found_in(str(path), [*stored, *more])
+        columns = file.read(
+            columns=[stored[one.at] for one in found.values() if one.at < len(stored)]
+        )
+        for name, value in more.items():
+            columns = columns.append_column(name, pa.array([value] * len(columns)))
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+        raise DataError(
+            f"{path}: the parquet file is cut off or damaged ({_first_line(error)}); write it again"
+        ) from None
+    names = [*stored, *more]
+    by_name = {own: columns.column(names[one.at]) for own, one in found.items()}
+    return _checked(_Columns(str(path), layout, found, 1), by_name, names)
+
+
+def table_of(frame: pd.DataFrame, layout: Layout, source: str) -> Table:
+    """Return the columns of a layout from a data frame, every cell checked.
+
+    Args:
+        source: what messages call it; its rows are counted from 1.
+
+    Raises:
+        DataError: as `read_table`; or a column mixes numbers and text.
+    """
+    names = [str(name) for name in frame.columns]
+    found = layout.found_in(source, names)
+    wanted = frame.set_axis(names, axis=1)[[names[one.at] for one in found.values()]]
+    try:
+        columns = pa.Table.from_pandas(wanted, preserve_index=False)
+    except pa.ArrowException as error:
+        raise DataError(
+            f"{source}: a column mixes numbers and text ({_first_line(error)});"
+            " give each column one type"
+        ) from None
+    by_name = {own: columns.column(names[one.at]) for own, one in found.items()}
+    return _checked(_Columns(source, layout, found, 1), by_name, names)
+
+
+# --- cells ----------------------------------------------------------------------------------------
+
+
+class _Columns(NamedTuple):
+    """The columns of a layout that a source has."""
+
+    source: str
+    layout: Layout
+    found: Mapping[str, _Found]
+    first_row: int
+
+
+def _checked(here: _Columns, columns: Mapping[str, Any], names: Sequence[str]) -> Table:
+    """Return Arrow columns as a table of numbers and names.
+
+    Args:
+        columns: those of the layout, by its names.
+        names: of all columns of the source.
+
+    Raises:
+        DataError: a cell is wrong, or there is none.
+    """
+    numbers = {}
+    labels = {}
+    for name, one in here.found.items():
+        if one.column.is_name:
+            labels[name] = _labels(here, name, columns[name])
+        else:
+            numbers[name] = _floats(here, name, columns[name])
+    used = {one.at for one in here.found.values()}
+    ignored = []
+    for at, name in enumerate(names):
+        if at not in used and name != _PANDAS_INDEX:
+            ignored.append(name)
+    table = Table(here.source, here.layout, numbers, labels, here.first_row, ignored)
+    if not len(table):
+        raise DataError(f"{here.source}: has the right columns but no rows")
+    for name, own in labels.items():
+        if not here.found[name].column.may_be_empty:
+            _require_names(table, name, own)
+    for name, values in numbers.items():
+        _require_numbers(table, name, values, here.found[name].column)
+    return table
+
+
+def _require_names(table: Table, name: str, labels: Labels) -> None:
+    """Raise DataError for an empty cell of a column of names."""
+    empty = np.flatnonzero(labels.codes < 0)
+    if len(empty):
+        raise DataError(
+            f"{table.at(empty[0], name)}: the cell is empty ({len(empty)} such cells); give a name"
+        )
+
+
+def _require_numbers(table: Table, name: str, values: Floats, column: Column) -> None:
+    """Raise DataError for a cell that is no finite number, or not what its column declares."""
+    is_bad = ~np.isfinite(values)
+    if column.may_be_empty:
+        is_bad = np.isinf(values)
+    at = np.flatnonzero(is_bad)
+    if len(at):
+        what = "empty or NaN" if np.isnan(values[at[0]]) else "infinite"
+        raise DataError(
+            f"{table.at(at[0], name)}: the cell is {what} ({len(at)} such cells in this column);"
+            f" {table.layout.remedy}"
+        )
+    wrong = (values < column.least) | (values <= column.above)
+    if column.whole:
+        wrong |= (values != np.floor(values)) & ~np.isnan(values)
+    table.refuse(name, wrong, column.wrong)
+
+
+def _floats(here: _Columns, name: str, column: Any) -> Floats:
+    """Return an Arrow column as numbers `(N,)`.
+
+    "1,234" is read as 1234, and an empty cell as NaN.
+
+    Raises:
+        DataError: a cell is no number, or the column holds something else.
+    """
+    where = f"{here.source}, column {name}"
+    if pa.types.is_dictionary(column.type):
+        column = column.cast(column.type.value_type)
+    if not (pa.types.is_string(column.type) or pa.types.is_large_string(column.type)):
+        try:
+            return cast(Floats, column.cast(pa.float64()).to_numpy())
+        except (pa.ArrowException, ValueError):
+            raise DataError(
+                f"{where}: holds {column.type}, not numbers; write it as numbers"
+            ) from None
+    text = pc.replace_substring(pc.utf8_trim_whitespace(column), ",", "").to_pandas()
+    values: Floats = pd.to_numeric(text, errors="coerce").to_numpy(
+        dtype=np.float64, na_value=np.nan
+    )
+    absent = text.isna() | text.str.lower().isin(_ABSENT)
+    wrong = np.flatnonzero(np.isnan(values) & ~absent.to_numpy(dtype=bool))
+    if len(wrong):
+        row = int(wrong[0])
+        raise DataError(
+            f"{here.source}, row {row + here.first_row}, column {name}: '{column[row].as_py()}' is"
+            " not a number; correct it"
+        )
+    return values
+
+
+def _labels(here: _Columns, name: str, column: Any) -> Labels:
+    """Return an Arrow column as names, in the order in which they first appear.
+
+    Raises:
+        DataError: it holds something else, or bytes that are no UTF-8.
+    """
+    where = f"column {name}"
+    if pa.types.is_nested(column.type):
+        raise DataError(
+            f"{here.source}, {where}: holds {column.type}, not names; write a text or a number in"
+            " each row"
+        )
+    try:
+        column.validate(full=True)
+    except pa.ArrowException:
+        raise DataError(
+            f"{here.source}{_first_broken(column)}, {where}: is no text in UTF-8; write the file"
+            " again in UTF-8"
+        ) from None
+    if pa.types.is_floating(column.type):  # 11.0, as pandas writes 11 beside a missing id
+        with contextlib.suppress(pa.ArrowInvalid):
+            column = column.cast(pa.int64())
+    if not pa.types.is_dictionary(column.type):
+        column = pc.dictionary_encode(column.cast(pa.string()))
+    if isinstance(column, pa.ChunkedArray):
+        column = column.unify_dictionaries().combine_chunks()
+    if isinstance(column, pa.ChunkedArray):  # no chunk at all
+        return Labels(np.zeros(0, np.int64), [])
+    written: list[str | None] = []
+    for one in column.dictionary.to_pylist():
+        written.append(str(one).strip() or None)
+    merged, names = pd.factorize(np.array(written, dtype=object))  # an empty name has code -1
+    codes = pc.fill_null(column.indices, len(written)).to_numpy(zero_copy_only=False)
+    return Labels(np.append(merged, -1).astype(np.int64)[codes], list(names))
+
+
+def _first_broken(column: Any) -> str:
+    """Return ", row N" for the first cell that is no UTF-8; "" where no row is known."""
+    row = 1
+    for chunk in column.chunks:
+        if not (pa.types.is_string(chunk.type) or pa.types.is_large_string(chunk.type)):
+            return ""
+        for cell in chunk.cast(pa.large_binary(), safe=False):
+            try:
+                (cell.as_py() or b"").decode()
+            except UnicodeDecodeError:
+                return f", row {row}"
+            row += 1
+    return ""
+
+
+def _first_line(error: Exception) -> str:
+    lines = str(error).strip().splitlines()
+    if not lines:
+        return type(error).__name__
+    return lines[0]
+
+
+# --- delimited text -------------------------------------------------------------------------------
+
+
+class _Text(NamedTuple):
+    """A delimited text whose first lines have been looked at.
+
+    Attributes:
+        delimiter: "," or " ", the latter for any run of white space.
+        names: of the columns.
+        skipped: lines above the first row of data.
+    """
+
+    path: Path
+    delimiter: str
+    names: tuple[str, ...]
+    skipped: int
+
+
+def _read_text(path: Path, layout: Layout) -> Table:
+    text = _looked_at(path, layout)
+    where = str(path)
+    found = layout.found_in(where, text.names)
+    try:
+        columns = _parsed(text, found, pa.float64())
+    except pa.ArrowInvalid:
+        # Some cell is no plain number: read these columns as text and look closer.
+        columns = _parsed(text, found, pa.string())
+    by_name = {own: columns.column(f"c{one.at}") for own, one in found.items()}
+    here = _Columns(where, layout, found, text.skipped + 1)
+    return _checked(here, by_name, text.names)
+
+
+def _looked_at(path: Path, layout: Layout) -> _Text:
+    """Look at the beginning of a text.
+
+    Raises:
+        DataError: it is no text in UTF-8, its columns are separated by what the layout does not
+            allow, or they have no names.
+    """
+    head = read_head(path)
+    if head.startswith(_UTF16):
+        raise DataError(f"{path}: is in UTF-16; save it as UTF-8")
+    lines = _decoded(path, head).splitlines()[layout.above :]
+    first = next((line for line in lines if line.strip()), "")
+    if not first:
+        raise DataError(f"{path}: the file holds no rows")
+    exponents_removed = first.lower().replace("e+", "").replace("e-", "")
+    has_header = any(character.isalpha() for character in exponents_removed)
+    delimiter = " "
+    cells = first.split()
+    if "," in first:
+        delimiter = ","
+        cells = _comma_separated(first)
+    else:
+        for separator, plural in _OTHER_SEPARATORS.items():
+            if separator in first and not (separator == "\t" and not has_header):
+                raise DataError(
+                    f"{path}: the columns are separated by {plural}; write the file with commas"
+                )
+    if not has_header:
+        return _Text(path, delimiter, _names_without_header(path, layout, len(cells)), layout.above)
+    if delimiter == " " and len(cells) > 1 and not layout.spaces:
+        raise DataError(f"{path}: the columns are separated by spaces; write the file with commas")
+    return _Text(path, delimiter, tuple(cells), layout.above + 1)
+
+
+def _names_without_header(path: Path, layout: Layout, width: int) -> tuple[str, ...]:
+    """Return the names of a headerless text's columns; raises DataError if none are known."""
+    if width in layout.headerless:
+        return layout.headerless[width]
+    if layout.headerless:
+        widths = " or ".join(str(known) for known in layout.headerless)
+        raise DataError(
+            f"{path}: its first row has {width} columns; {layout.name}'s files without a header"
+            f" have {widths}"
+        )
+    needed = [column.name for column in layout.columns if column.needed and not column.many]
+    raise DataError(
+        f"{path}: the first row must hold the column names of {layout.name}: {listed(needed, 20)}"
+    )
+
+
+def _comma_separated(line: str) -> list[str]:
+    """Return the cells of one line of CSV."""
+    options = pa.csv.ReadOptions(autogenerate_column_names=True)
+    table = pa.csv.read_csv(io.BytesIO(line.encode() + b"\n"), read_options=options)
+    (row,) = table.to_pylist()
+    return [str(cell).strip() for cell in row.values()]
+
+
+def _decoded(path: Path, head: bytes) -> str:
+    """Return the beginning of a file as text; raises DataError if it is none."""
+    is_binary = any(byte < 32 and byte not in b"\t\n\r\f" for byte in head)
+    try:
+        text = head.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        # A character that the end of the block cuts in two is none of the file's faults.
+        if error.start < len(head) - 4:
+            is_binary = True
+        text = head.decode("utf-8-sig", errors="ignore")
+    if is_binary:
+        raise DataError(
+            f"{path}: is a binary file, not text; give a CSV or text file (gzip is fine),"
+            " or parquet for data=tidy"
+        )
+    return text
+
+
+def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any) -> Any:
+    """Return the columns found as one Arrow table with columns c0, c1, ...
+
+    Raises:
+        DataError: a row has another number of columns.
+        ArrowInvalid: a cell is not of `number_type`.
+    """
+    broken: list[Any] = []
+
+    def note(row: Any) -> str:
+        broken.append(row)
+        return "error"
+
+    types = {}
+    for one in found.values():
+        types[f"c{one.at}"] = number_type
+        if one.column.is_name:
+            types[f"c{one.at}"] = pa.dictionary(pa.int32(), pa.string())
+    read_options = pa.csv.ReadOptions(
+        # One thread: only then does pyarrow know the number of a broken row.
+        use_threads=False,
+        block_size=_BLOCK,
+        column_names=[f"c{at}" for at in range(len(text.names))],
+        skip_rows=text.skipped,
+    )
+    options = {
+        "read_options": read_options,
+        "parse_options": pa.csv.ParseOptions(invalid_row_handler=note),
+        "convert_options": pa.csv.ConvertOptions(column_types=types, include_columns=list(types)),
+    }
+    try:
+        with _Lines(text) as lines, pa.PythonFile(lines, mode="r") as file:
+            return pa.csv.open_csv(file, **options).read_all()
+    except pa.ArrowInvalid as error:
+        if broken:
+            row = broken[0]
+            raise DataError(
+                f"{text.path}, row {row.number}: {row.actual_columns} columns instead of"
+                f" {len(text.names)}; is the file cut off there, or does a cell hold a separator?"
+            ) from None
+        if number_type == pa.string():
+            raise DataError(f"{text.path}: cannot be read as a table ({error})") from None
+        raise
+
+
+class _Lines(io.RawIOBase):
+    """Feed pyarrow whole lines; white space that separates columns is turned into commas."""
+
+    def __init__(self, text: _Text) -> None:
+        super().__init__()
+        self._parts = self._whole_lines(text)
+        self._ready = b""
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        while not self._ready:
+            part = next(self._parts, None)
+            if part is None:
+                return 0
+            self._ready = part
+        size = min(len(buffer), len(self._ready))
+        buffer[:size] = self._ready[:size]
+        self._ready = self._ready[size:]
+        return size
+
+    @staticmethod
+    def _whole_lines(text: _Text) -> Iterator[bytes]:
+        """Yield parts of the file that end where a line does."""
+        rest = b""
+        mark = _UTF8_MARK
+        for block in unpacked_blocks(text.path):
+            lines, end, rest = (rest + block.removeprefix(mark)).rpartition(b"\n")
+            mark = b""
+            yield _with_commas(lines + end, text.delimiter)
+        yield _with_commas(rest, text.delimiter)
+
+
+def _with_commas(lines: bytes, delimiter: str) -> bytes:
+    """Return lines whose cells are separated by commas."""
+    if delimiter == ",":
+        return lines
+    return b"".join(b",".join(line.split()) + b"\n" for line in lines.splitlines())
