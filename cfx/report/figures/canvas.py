@@ -179,11 +179,12 @@ def logarithmic(axes: Axes) -> None:
     """Makes the vertical axis logarithmic, with plain numbers at 1, 2 and 5."""
     axes.set_yscale("log")
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.yaxis.set_major_formatter(FuncFormatter(_plain_tick))
+    axes.yaxis.set_major_formatter(FuncFormatter(plain_tick))
     axes.yaxis.set_minor_formatter(NullFormatter())
 
 
-def _plain_tick(value: float, _position: int) -> str:
+def plain_tick(value: float, _position: int) -> str:
+    """Return what stands beside a tick of plain numbers."""
     return f"{value:g}"
 
 

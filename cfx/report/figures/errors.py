@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -19,47 +18,6 @@ TIME_TITLE = "time since the test part began (s)"
 
 _LEAST = 0.9
 """Share of the pairs that a moment needs: with fewer, the errors would be other drivers'."""
-
-
-@dataclass(frozen=True)
-class ErrorPanel:
-    """RMSE over all pairs at each moment, a line per method.
-
-    Attributes:
-        title: which error, with its unit.
-        lines: by method.
-        transient_s: where the transient ends, s; the errors after it are the metrics `steady/...`.
-    """
-
-    title: str
-    lines: tuple[Line, ...]
-    transient_s: float
-
-    @property
-    def shows_transient(self) -> bool:
-        """Whether the lines go on after the transient."""
-        return any(line.time[-1:] > self.transient_s for line in self.lines)
-
-
-def error_panels(
-    trajectories: Sequence[PairTrajectory], methods: Sequence[str], transient_s: float
-) -> tuple[ErrorPanel, ...]:
-    """Chooses the panels of speed and gap.
-
-    Args:
-        trajectories: test parts of all pairs.
-        methods: those to show.
-        transient_s: as in `ErrorPanel`.
-    """
-    panels = []
-    for signal, unit in (("speed", "m/s"), ("gap", "m")):
-        lines = []
-        for method in methods:
-            seconds, error = errors_over_time(trajectories, method, signal)
-            lines.append(Line(method, seconds, error))
-        title = f"RMSE of {signal} over pairs ({unit})"
-        panels.append(ErrorPanel(title, tuple(lines), transient_s))
-    return tuple(panels)
 
 
 def errors_over_time(
@@ -89,22 +47,34 @@ def errors_over_time(
 
 
 @styled
-def draw_errors(panels: Sequence[ErrorPanel], methods: Sequence[str]) -> Figure:
-    """Draws RMSE of speed and of gap over all pairs at each moment since the test part began.
+def draw_errors(
+    trajectories: Sequence[PairTrajectory], methods: Sequence[str], transient_s: float
+) -> Figure:
+    """Draw RMSE of speed and of gap over all pairs at each moment since the test part began.
 
     All methods begin in the measured state. Constant parameters leave it for their own gap at once,
     so that a good part of what a policy gains may be gained in the first seconds: here it is seen.
+
+    Args:
+        trajectories: test parts of all pairs.
+        methods: those to show.
+        transient_s: where the transient ends, s; the errors after it are the metrics `steady/...`.
     """
     figure = canvas(3.9)
-    grid = figure.subplots(1, len(panels), squeeze=False)[0]
-    for axes, panel in zip(grid, panels, strict=True):
-        draw_lines(axes, panel.lines)
+    for axes, (signal, unit) in zip(
+        figure.subplots(1, 2), (("speed", "m/s"), ("gap", "m")), strict=True
+    ):
+        lines = []
+        for method in methods:
+            seconds, error = errors_over_time(trajectories, method, signal)
+            lines.append(Line(method, seconds, error))
+        draw_lines(axes, lines)
         axes.set_xlabel(TIME_TITLE)
-        axes.set_ylabel(panel.title)
+        axes.set_ylabel(f"RMSE of {signal} over pairs ({unit})")
         axes.set_ylim(bottom=0)
         axes.axhline(0, color=INK, linewidth=0.9)
-        if panel.shows_transient:
-            axes.axvline(panel.transient_s, color=EDGE, linewidth=0.9, linestyle=(0, (4, 2)))
+        if any(line.time[-1:] > transient_s for line in lines):
+            axes.axvline(transient_s, color=EDGE, linewidth=0.9, linestyle=(0, (4, 2)))
     method_legend(figure, methods)
     return figure
 
@@ -129,6 +99,4 @@ class ErrorOverTime(JobFigure):
         for method in results.methods:
             if method in simulated and method not in HIDDEN:
                 methods.append(method)
-        return draw_errors(
-            error_panels(results.trajectories, methods, results.transient_s), methods
-        )
+        return draw_errors(results.trajectories, methods, results.transient_s)

@@ -1,16 +1,23 @@
-"""Errors of forecasts against their horizon, and against the history that was read."""
+"""Errors of forecasts against their horizon and against the history that was read; samples."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
+import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from cfx.evaluation.distributions import (
+    LEVEL,
+    centre_errors,
+    sampled_methods,
+    summarize_distributions,
+)
 from cfx.evaluation.forecasts import errors_by, errors_by_history
 from cfx.report.figures.canvas import (
+    DASHES,
     Line,
     canvas,
     draw_lines,
@@ -21,106 +28,129 @@ from cfx.report.figures.canvas import (
 )
 from cfx.report.figures.figure import JobFigure
 from cfx.report.figures.results import Results
+from cfx.report.figures.values import Array
+from cfx.results.look import EDGE, colour_of
 
 HORIZON_TITLE = "horizon (s)"
 HISTORY_TITLE = "measured history (s)"
+PIT_BINS = 10
 
 _ERRORS = (("rmse_speed", "RMSE of speed (m/s)"), ("rmse_position", "RMSE of position (m)"))
 _PANELS = 3
 
 
-@dataclass(frozen=True)
-class ForecastPanel:
-    """Mean errors over drivers, a line per method.
-
-    Attributes:
-        title: which error, with its unit.
-        lines: by method; what `Line` calls time is what the errors stand against.
-        logarithmic: whether errors span so much that only ratios can be seen.
-    """
-
-    title: str
-    lines: tuple[Line, ...]
-    logarithmic: bool = False
-
-
-def horizon_panels(summary: pd.DataFrame, methods: Sequence[str]) -> tuple[ForecastPanel, ...]:
-    """Chooses a panel for speed and one for position.
+@styled
+def draw_by_horizon(summary: pd.DataFrame, methods: Sequence[str]) -> Figure:
+    """Draw errors of speed and of position against the horizon.
 
     Args:
         summary: as `Forecasts.summary`.
         methods: those to show.
     """
-    panels = []
-    for error, title in _ERRORS:
-        lines = _lines(summary, methods, "horizon_s", error)
-        panels.append(ForecastPanel(title, lines, logarithmic=True))
-    return tuple(panels)
+    figure = canvas(4.4)
+    for axes, (error, title) in zip(figure.subplots(1, len(_ERRORS)), _ERRORS, strict=True):
+        _draw_panel(axes, _lines(summary, methods, "horizon_s", error), title, HORIZON_TITLE)
+        logarithmic(axes)
+    method_legend(figure, methods)
+    return figure
 
 
-def history_panels(by_history: pd.DataFrame, methods: Sequence[str]) -> tuple[ForecastPanel, ...]:
-    """Chooses a panel for a short, a middle and a long horizon; none for a single span of history.
+@styled
+def draw_by_history(by_history: pd.DataFrame, methods: Sequence[str]) -> Figure | None:
+    """Draw a panel for a short, a middle and a long horizon; None for a single span of history.
 
     Args:
         by_history: as `errors_by_history` returns it.
         methods: those to show.
     """
     if by_history["span_s"].nunique() < 2:
-        return ()
+        return None
     horizons = sorted(by_history["horizon_s"].unique())
     chosen = sorted({horizons[0], horizons[len(horizons) // 2], horizons[-1]})[:_PANELS]
-    panels = []
-    for horizon in chosen:
+    figure = canvas(4.4)
+    grid = figure.subplots(1, len(chosen), squeeze=False)[0]
+    for axes, horizon in zip(grid, chosen, strict=True):
         rows = by_history[by_history["horizon_s"] == horizon]
         title = f"RMSE of speed after {horizon:g} s (m/s)"
-        panels.append(ForecastPanel(title, _lines(rows, methods, "span_s", "rmse_speed")))
-    return tuple(panels)
+        _draw_panel(axes, _lines(rows, methods, "span_s", "rmse_speed"), title, HISTORY_TITLE)
+        axes.set_ylim(bottom=0)
+    method_legend(figure, methods)
+    return figure
 
 
-def _lines(
-    table: pd.DataFrame, methods: Sequence[str], against: str, error: str
-) -> tuple[Line, ...]:
+def _lines(table: pd.DataFrame, methods: Sequence[str], against: str, error: str) -> list[Line]:
     lines = []
     for method in methods:
         rows = table[table["method"] == method].sort_values(against)
         seconds = rows[against].to_numpy(dtype=float)
         lines.append(Line(method, seconds, rows[error].to_numpy(dtype=float)))
-    return tuple(lines)
+    return lines
+
+
+def _draw_panel(axes: Axes, lines: Sequence[Line], title: str, against: str) -> None:
+    draw_lines(axes, lines)
+    mark_points(axes)
+    axes.set_xlabel(against)
+    axes.set_ylabel(title)
+
+
+def sampled_name(method: str) -> str:
+    """Return what a sampled method is called beside the policy's centre, which is `policy`."""
+    return "policy_sampled" if method == "policy" else method
+
+
+def pit_density(rows: pd.DataFrame) -> Array:
+    """Return the histogram of the PIT of one method, `(PIT_BINS,)`, in which drivers count alike.
+
+    Where reality lies among the sampled speeds, from 0 to 1; 1 everywhere if all is well.
+    """
+    found = []
+    for _, of_driver in rows.groupby("driver"):
+        counts, _ = np.histogram(of_driver["pit"], bins=PIT_BINS, range=(0.0, 1.0))
+        found.append(PIT_BINS * counts / max(1, counts.sum()))
+    return np.asarray(np.mean(found, axis=0))
 
 
 @styled
-def draw_forecasts(panels: Sequence[ForecastPanel], methods: Sequence[str], against: str) -> Figure:
-    """Draws mean errors over drivers, a panel for each error.
+def draw_distributions(table: pd.DataFrame, forecasts: pd.DataFrame) -> Figure:
+    """Draw CRPS and coverage against the horizon, and the PIT of the horizon nearest to 3 s.
 
     Args:
-        panels: the panels, side by side.
-        methods: of the legend.
-        against: title of the horizontal axes.
+        table: as `score_distributions` returns it.
+        forecasts: as `Forecasts.table`, of the same origins; the policy's centre is in the first
+            panel, with its absolute error.
     """
-    figure = canvas(4.4)
-    grid = figure.subplots(1, len(panels), squeeze=False)[0]
-    for axes, panel in zip(grid, panels, strict=True):
-        draw_panel(axes, panel, against)
-        if panel.logarithmic:
-            logarithmic(axes)
-        else:
-            axes.set_ylim(bottom=0)
-    method_legend(figure, methods)
+    figure = canvas(4.2)
+    crps, coverage, pit = figure.subplots(1, 3)
+    summary = summarize_distributions(table)
+    summary["method"] = summary["method"].astype(str).map(sampled_name)
+    sampled = sampled_methods(table)
+    names = [sampled_name(method) for method in sampled]
+    centre = centre_errors(forecasts).assign(method="policy")
+    crps_lines = _lines(summary, names, "horizon_s", "crps_speed")
+    crps_lines += _lines(centre, ["policy"], "horizon_s", "crps_speed")
+    _draw_panel(crps, crps_lines, "CRPS of speed (m/s)", HORIZON_TITLE)
+    logarithmic(crps)
+    title = f"share within the central {100 * LEVEL:.0f} %"
+    _draw_panel(coverage, _lines(summary, names, "horizon_s", "coverage"), title, HORIZON_TITLE)
+    coverage.axhline(LEVEL, color=EDGE, linewidth=1.0, zorder=1)
+    coverage.set_ylim(0.0, 1.0)
+    horizon = min(sorted(table["horizon_s"].unique()), key=lambda seconds: abs(seconds - 3.0))
+    here = table[table["horizon_s"] == horizon]
+    for method, name in zip(sampled, names, strict=True):
+        pit.stairs(
+            pit_density(here[here["method"] == method]),
+            [k / PIT_BINS for k in range(PIT_BINS + 1)],
+            color=colour_of(name),
+            linestyle=DASHES.get(name, "solid"),
+            linewidth=1.6,
+        )
+    pit.axhline(1.0, color=EDGE, linewidth=1.0, zorder=1)
+    pit.set_xlabel("share of samples below reality")
+    pit.set_ylabel(f"density, {horizon:g} s ahead")
+    pit.set_ylim(bottom=0)
+    method_legend(figure, [*names, "policy"])
     return figure
-
-
-def draw_panel(axes: Axes, panel: ForecastPanel, against: str) -> None:
-    """Draws the lines of one panel.
-
-    Args:
-        axes: to draw on.
-        panel: its lines and the title of its vertical axis.
-        against: title of the horizontal axis.
-    """
-    draw_lines(axes, panel.lines)
-    mark_points(axes)
-    axes.set_xlabel(against)
-    axes.set_ylabel(panel.title)
 
 
 class ForecastErrors(JobFigure):
@@ -142,8 +172,7 @@ class ForecastErrors(JobFigure):
         of_driver = errors_by(found.table, ["method", "horizon_s", "driver"])
         grouped = of_driver.groupby(["method", "horizon_s"], sort=False, observed=True)
         summary = grouped[[error for error, _ in _ERRORS]].mean().reset_index()
-        panels = horizon_panels(summary, found.methods)
-        return draw_forecasts(panels, found.methods, HORIZON_TITLE)
+        return draw_by_horizon(summary, found.methods)
 
 
 class ForecastsByHistory(JobFigure):
@@ -158,5 +187,25 @@ class ForecastsByHistory(JobFigure):
         found = results.forecasts
         if found is None:
             return None
-        panels = history_panels(errors_by_history(found.table), found.methods)
-        return draw_forecasts(panels, found.methods, HISTORY_TITLE) if panels else None
+        return draw_by_history(errors_by_history(found.table), found.methods)
+
+
+class Distributions(JobFigure):
+    """Sampled forecasts as distributions: CRPS, coverage, PIT."""
+
+    title = "CRPS, coverage and PIT of sampled forecasts"
+    caption = (
+        "The CRPS of speed is smallest, in the mean, for the distribution that reality is drawn"
+        " from. Coverage: the share of moments whose real speed lies in the central"
+        f" {100 * LEVEL:.0f} % of the sampled ones. The last panel has the share of sampled speeds"
+        " below the real one: flat if the spread is right, high at both ends if the paths are too"
+        " much alike. Means over drivers."
+    )
+    order = 112
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it where forecasts were sampled."""
+        found = results.forecasts
+        if found is None or found.distributions is None:
+            return None
+        return draw_distributions(found.distributions, found.table)

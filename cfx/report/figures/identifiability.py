@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -94,38 +94,21 @@ def slice_panels(table: pd.DataFrame, axes: Sequence[ParameterAxis]) -> tuple[Sl
     return tuple(panels)
 
 
-@dataclass(frozen=True)
-class Fit:
-    """Errors of one method on both parts of P pairs.
-
-    Attributes:
-        method: whose.
-        pair_ids: of the pairs.
-        train, test: `(P,)`, RMSE of speed, m/s, on the part that was calibrated on and on the test.
-    """
-
-    method: str
-    pair_ids: tuple[str, ...]
-    train: Array
-    test: Array
-
-
-def fits_of(table: pd.DataFrame) -> tuple[Fit, ...]:
-    """Returns the fit of each method, driver-specific parameters first.
+def fits_of(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return by method the pairs whose errors are known, driver-specific parameters first.
 
     Args:
-        table: columns pair_id, method, train_rmse_speed, test_rmse_speed.
+        table: columns pair_id, method, train_rmse_speed, test_rmse_speed (m/s): on the part that
+            was calibrated on and on the test part.
     """
-    found = []
+    errors = ["train_rmse_speed", "test_rmse_speed"]
+    found = {}
     for method in ("fixed", "population", "default"):
         rows = table[table["method"] == method]
-        train = rows["train_rmse_speed"].to_numpy(dtype=np.float64)
-        test = rows["test_rmse_speed"].to_numpy(dtype=np.float64)
-        known = np.isfinite(train) & np.isfinite(test)
-        if known.any():
-            ids = tuple(rows["pair_id"].astype(str)[known])
-            found.append(Fit(method, ids, train[known], test[known]))
-    return tuple(found)
+        known = rows[np.isfinite(rows[errors].astype(float)).all(axis=1)]
+        if len(known):
+            found[method] = known
+    return found
 
 
 @dataclass(frozen=True)
@@ -226,25 +209,28 @@ def draw_slices(panels: Sequence[SlicePanel]) -> Figure:
 
 
 @styled
-def draw_fits(fits: Sequence[Fit]) -> Figure:
-    """Draws each pair's error on the part that was calibrated on against that on the test part."""
+def draw_fits(fits: Mapping[str, pd.DataFrame]) -> Figure:
+    """Draw each pair's error on the part that was calibrated on against that on the test part."""
     figure = canvas(5.2, 6.4)
     axes = figure.subplots()
     highest = 0.0
-    for fit in fits:
-        highest = max(highest, float(np.quantile(np.concatenate([fit.train, fit.test]), 0.98)))
-        medians = f"median {np.median(fit.train):.2f} and {np.median(fit.test):.2f} m/s"
+    for method, rows in fits.items():
+        train = rows["train_rmse_speed"].to_numpy(dtype=float)
+        test = rows["test_rmse_speed"].to_numpy(dtype=float)
+        own, colour = method == "fixed", colour_of(method)
+        highest = max(highest, float(np.quantile(np.concatenate([train, test]), 0.98)))
+        medians = f"median {np.median(train):.2f} and {np.median(test):.2f} m/s"
         axes.plot(
-            fit.train,
-            fit.test,
+            train,
+            test,
             linestyle="none",
-            marker=_MARKERS[fit.method],
-            markersize=4.5 if fit.method == "fixed" else 5.5,
+            marker=_MARKERS[method],
+            markersize=4.5 if own else 5.5,
             alpha=0.65,
-            color=colour_of(fit.method),
-            markerfacecolor=colour_of(fit.method) if fit.method == "fixed" else "none",
-            label=f"{label(fit.method)}: {medians}",
-            zorder=3 if fit.method == "fixed" else 2,
+            color=colour,
+            markerfacecolor=colour if own else "none",
+            label=f"{label(method)}: {medians}",
+            zorder=3 if own else 2,
         )
     end = 1.15 * highest
     axes.plot([0, end], [0, end], color=EDGE, linewidth=1, zorder=1)
@@ -323,7 +309,7 @@ class FitTrainTest(JobFigure):
 
     def draw(self, results: Results) -> Figure | None:
         """Draws it where errors on both parts are known."""
-        found = () if results.fits is None else fits_of(results.fits)
+        found = {} if results.fits is None else fits_of(results.fits)
         return draw_fits(found) if found else None
 
 

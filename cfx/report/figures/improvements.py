@@ -130,6 +130,13 @@ def improvement_axis(
     return ImprovementAxis(low, high + margin, title, " ".join(parts))
 
 
+def vertical_improvements(axes: Axes, axis: ImprovementAxis) -> None:
+    """Make the vertical axis one of improvements."""
+    axes.set_ylim(axis.low, axis.high)
+    axes.set_ylabel(axis.title.replace(" over ", "\nover ") + " (%)")
+    percent_axis(axes)
+
+
 def improvement_bars(
     names: Sequence[str],
     pair_ids: Sequence[Sequence[str]],
@@ -190,7 +197,7 @@ def draw_improvements(bars: ImprovementBars, summary: Improvement) -> Figure:
     longest = max(map(len, ticks), default=0) if named else 0
     figure = canvas(4.3 + 0.075 * longest)
     axes = figure.subplots()
-    axes.set_ylim(bars.axis.low, bars.axis.high)
+    vertical_improvements(axes, bars.axis)
     _bars(axes, series, bars.axis.low)
     handles = _closer(series) + _statistics(axes, summary, bars.axis.low)
     # A few bars stand in the middle, and no broader than those of a larger job.
@@ -198,8 +205,6 @@ def draw_improvements(bars: ImprovementBars, summary: Improvement) -> Figure:
     middle, half = (count - 1) / 2, max(count, 8) / 2 + 0.3
     axes.set_xlim(middle - half, middle + half)
     axes.grid(visible=False, axis="x")
-    percent_axis(axes)
-    axes.set_ylabel(bars.axis.title.replace(" over ", "\nover ") + " (%)")
     if named:
         axes.set_xticks(np.arange(count), ticks, rotation=90, fontsize=8.5)
         axes.tick_params(axis="x", length=0)

@@ -14,8 +14,13 @@ from matplotlib.ticker import FuncFormatter
 
 from cfx.data.style.result import CLUSTERS
 from cfx.report.figures.calibration import spread_offsets
-from cfx.report.figures.canvas import canvas, hover, percent_axis, percent_tick, styled
-from cfx.report.figures.improvements import ImprovementAxis, ImprovementBars, improvement_axis
+from cfx.report.figures.canvas import canvas, hover, percent_tick, styled
+from cfx.report.figures.improvements import (
+    ImprovementAxis,
+    ImprovementBars,
+    improvement_axis,
+    vertical_improvements,
+)
 from cfx.report.figures.values import Array, finite
 from cfx.report.figures.words import (
     common_prefix,
@@ -52,36 +57,6 @@ class Statistics:
 
 
 @dataclass(frozen=True)
-class Overview:
-    """Statistics of several jobs over one baseline, and their common axis."""
-
-    baseline: str
-    rows: tuple[Statistics, ...]
-    axis: ImprovementAxis
-
-
-@dataclass(frozen=True)
-class ErrorDots:
-    """Errors of several jobs.
-
-    Attributes:
-        title: of the axis.
-        unit: of the errors.
-        jobs: J names.
-        values: by method `(J,)`; NaN where a job has no such method.
-        high: end of the axis.
-        note: a sentence on what lies beyond it, else "".
-    """
-
-    title: str
-    unit: str
-    jobs: tuple[str, ...]
-    values: Mapping[str, Array]
-    high: float
-    note: str
-
-
-@dataclass(frozen=True)
 class ClusterGroup:
     """The pairs of some jobs, by cluster.
 
@@ -98,34 +73,23 @@ class ClusterGroup:
     values: Array
 
 
-@dataclass(frozen=True)
-class ClusterBoxes:
-    """Improvements over one baseline by cluster, and their common axis."""
-
-    groups: tuple[ClusterGroup, ...]
-    axis: ImprovementAxis
-
-
-def overview(rows: Sequence[Statistics], baseline: str) -> Overview:
-    """Chooses the axis of several jobs' statistics."""
+def statistics_axis(rows: Sequence[Statistics], baseline: str) -> ImprovementAxis:
+    """Return the axis of several jobs' statistics."""
     values: list[float] = []
     for row in rows:
         values += finite([row.mean, row.low, row.high, row.trimmed_mean, row.median]).tolist()
     what = "means, medians and ends of intervals"
-    axis = improvement_axis(np.array(values), baseline=baseline, what=what)
-    return Overview(baseline, tuple(rows), axis)
+    return improvement_axis(np.array(values), baseline=baseline, what=what)
 
 
-def error_dots(
-    jobs: Sequence[str], values: Mapping[str, Array], *, unit: str, what: str
-) -> ErrorDots:
-    """Chooses the axis of several jobs' errors; a default far off the others does not stretch it.
+def error_limit(values: Mapping[str, Array], unit: str) -> tuple[float, str]:
+    """Return the end of an axis of several jobs' errors, and a sentence on what lies beyond it.
+
+    A default far off the others does not stretch the axis.
 
     Args:
-        jobs: J names.
-        values: by method `(J,)`.
+        values: by method `(J,)`; NaN where a job has no such method.
         unit: of the values.
-        what: what they are, in the axis' title.
     """
     near, far = [0.0], np.empty(0)
     for method, errors in values.items():
@@ -135,30 +99,18 @@ def error_dots(
             near += finite(errors).tolist()
     largest = max(*near, 1e-9)
     beyond = far[far > _WIDE * largest]
-    note = ""
-    if len(beyond):
-        high = _WIDE * largest
-        note = (
-            f"{plural(len(beyond), 'job')} with {label('default')} further off, up to"
-            f" {number(float(beyond.max()))} {unit}."
-        )
-    else:
-        high = 1.06 * max(largest, float(far.max(initial=0.0)))
-    return ErrorDots(f"{what} ({unit})", unit, tuple(jobs), dict(values), high, note)
-
-
-def cluster_boxes(groups: Sequence[ClusterGroup], baseline: str) -> ClusterBoxes:
-    """Chooses the axis of the improvements by cluster."""
-    every = np.concatenate([np.empty(0), *(group.values for group in groups)])
-    return ClusterBoxes(tuple(groups), improvement_axis(every, baseline=baseline))
+    if not len(beyond):
+        return 1.06 * max(largest, float(far.max(initial=0.0))), ""
+    jobs, most = plural(len(beyond), "job"), number(float(beyond.max()))
+    return _WIDE * largest, f"{jobs} with {label('default')} further off, up to {most} {unit}."
 
 
 @styled
-def draw_overview(chosen: Overview) -> Figure:
-    """Draws mean improvement with its 95 % interval, trimmed mean and median: a line per job."""
-    figure, axes, places = _by_job([row.job for row in chosen.rows])
-    colour = colour_of(chosen.baseline)
-    for row, place in zip(chosen.rows, places, strict=True):
+def draw_overview(rows: Sequence[Statistics], baseline: str, axis: ImprovementAxis) -> Figure:
+    """Draw mean improvement with its 95 % interval, trimmed mean and median: a line per job."""
+    figure, axes, places = _by_job([row.job for row in rows])
+    colour = colour_of(baseline)
+    for row, place in zip(rows, places, strict=True):
         reach = np.nan_to_num([[row.mean - row.low], [row.high - row.mean]])
         drawn = axes.errorbar(
             [row.mean], [place], xerr=reach, color=colour, marker="o", markersize=8, capsize=4
@@ -182,9 +134,9 @@ def draw_overview(chosen: Overview) -> Figure:
             )
             hover(mark, f"{row.job}: {name} {percent_or_undefined(value, 1)}")
     axes.axvline(0, color=INK, linewidth=0.9, zorder=1)
-    axes.set_xlim(chosen.axis.low, chosen.axis.high)
+    axes.set_xlim(axis.low, axis.high)
     axes.xaxis.set_major_formatter(FuncFormatter(percent_tick))
-    axes.set_xlabel(f"{chosen.axis.title} (%)")
+    axes.set_xlabel(f"{axis.title} (%)")
     handles = [_mark("o", colour, "mean and its 95 % interval")]
     handles += [_mark("D", "black", "trimmed mean"), _mark("|", "black", "median")]
     figure.legend(handles=handles, loc="outside upper center", ncols=3)
@@ -192,14 +144,23 @@ def draw_overview(chosen: Overview) -> Figure:
 
 
 @styled
-def draw_error_dots(chosen: ErrorDots) -> Figure:
-    """Draws the errors of each method: a line per job."""
-    figure, axes, places = _by_job(chosen.jobs)
+def draw_error_dots(
+    jobs: Sequence[str], values: Mapping[str, Array], *, unit: str, what: str
+) -> Figure:
+    """Draw the errors of each method: a line per job.
+
+    Args:
+        jobs: J names.
+        values: by method `(J,)`; NaN where a job has no such method.
+        unit: of the values.
+        what: what they are, in the axis' title.
+    """
+    figure, axes, places = _by_job(jobs)
     handles = []
-    for method, values in chosen.values.items():
+    for method, errors in values.items():
         marker = "D" if method == "policy" else "o"
         handles.append(_mark(marker, colour_of(method), label(method)))
-        for job, value, place in zip(chosen.jobs, values, places, strict=True):
+        for job, value, place in zip(jobs, errors, places, strict=True):
             (mark,) = axes.plot(
                 [value],
                 [place],
@@ -208,25 +169,25 @@ def draw_error_dots(chosen: ErrorDots) -> Figure:
                 markersize=8,
                 linestyle="none",
             )
-            hover(mark, f"{job}, {label(method)}: {value:.3f} {chosen.unit}")
-    axes.set_xlim(0, chosen.high)
-    axes.set_xlabel(chosen.title)
+            hover(mark, f"{job}, {label(method)}: {value:.3f} {unit}")
+    axes.set_xlim(0, error_limit(values, unit)[0])
+    axes.set_xlabel(f"{what} ({unit})")
     figure.legend(handles=handles, loc="outside upper center", ncols=min(5, len(handles)))
     return figure
 
 
 @styled
-def draw_clusters(chosen: ClusterBoxes) -> Figure:
-    """Draws the improvement by cluster: a box and its pairs for each group of jobs."""
+def draw_clusters(groups: Sequence[ClusterGroup], axis: ImprovementAxis) -> Figure:
+    """Draw the improvement by cluster: a box and its pairs for each group of jobs."""
     figure = canvas(4.4)
     axes = figure.subplots()
     present: set[str] = set()
-    for group in chosen.groups:
+    for group in groups:
         present |= set(group.clusters)
     order = [cluster for cluster in CLUSTERS if cluster in present]
-    width = 0.8 / max(len(chosen.groups), 1)
+    width = 0.8 / max(len(groups), 1)
     handles = []
-    for k, group in enumerate(chosen.groups):
+    for k, group in enumerate(groups):
         colour = JOB_COLOURS[k % len(JOB_COLOURS)]
         handles.append(Patch(color=colour, label=short(group.name, 60)))
         for place, cluster in enumerate(order):
@@ -234,7 +195,7 @@ def draw_clusters(chosen: ClusterBoxes) -> Figure:
             values = finite(group.values[inside])
             if not len(values):
                 continue
-            centre = place + (k - 0.5 * (len(chosen.groups) - 1)) * width
+            centre = place + (k - 0.5 * (len(groups) - 1)) * width
             _box(axes, values, centre, 0.8 * width, colour)
             offsets = 0.25 * width * spread_offsets(len(values))
             axes.plot(
@@ -252,7 +213,7 @@ def draw_clusters(chosen: ClusterBoxes) -> Figure:
     axes.set_xlim(-0.6, max(len(order), 1) - 0.4)
     axes.grid(visible=False, axis="x")
     axes.set_xlabel("cluster of driving style")
-    _improvement_axis(axes, chosen.axis)
+    vertical_improvements(axes, axis)
     figure.legend(handles=handles, loc="outside upper center", ncols=min(3, max(len(handles), 1)))
     return figure
 
@@ -329,7 +290,7 @@ def draw_every_pair(bars: ImprovementBars, pair_ids: Sequence[str]) -> Figure:
     axes.grid(visible=False, axis="x")
     of_what = f" of {short(prefix.rstrip('_-/:.'), 30)}" if prefix else ""
     axes.set_xlabel(f"{plural(len(pair_ids), 'pair')} of a leader and a follower{of_what}")
-    _improvement_axis(axes, bars.axis)
+    vertical_improvements(axes, bars.axis)
     figure.legend(handles=handles, loc="outside upper center", ncols=min(3, max(len(handles), 1)))
     return figure
 
@@ -343,12 +304,6 @@ def _by_job(jobs: Sequence[str]) -> tuple[Figure, Axes, Array]:
     axes.set_ylim(len(jobs) - 0.4, -0.6)
     axes.tick_params(axis="y", length=0)
     return figure, axes, places
-
-
-def _improvement_axis(axes: Axes, chosen: ImprovementAxis) -> None:
-    axes.set_ylim(chosen.low, chosen.high)
-    axes.set_ylabel(chosen.title.replace(" over ", "\nover ") + " (%)")
-    percent_axis(axes)
 
 
 def _mark(marker: str, colour: str, text: str) -> Line2D:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,83 +25,12 @@ _SHOWN_BEFORE = 10.0
 
 _MOST_POINTS = 400
 
-
-@dataclass(frozen=True)
-class VehicleLine:
-    """A vehicle's speed.
-
-    Attributes:
-        vehicle: 0 is the leader.
-        colour: from dark to light along the platoon.
-        time: `(T,)` s since the leader began to brake.
-        speed: `(T,)` m/s.
-        collision: time and speed at which its gap became negative; None if it never did.
-    """
-
-    vehicle: int
-    colour: str
-    time: Array
-    speed: Array
-    collision: tuple[float, float] | None
-
-    @property
-    def name(self) -> str:
-        """Which vehicle."""
-        return "leader" if self.vehicle == 0 else f"follower {self.vehicle}"
-
-
-@dataclass(frozen=True)
-class PlatoonPanel:
-    """The platoon of one method.
-
-    Attributes:
-        method: who drives all followers.
-        network: whose platoon it is: of several that with the slowest last follower.
-        title: the method.
-        verdicts: whether it is string stable, and by how much the last follower slows down.
-        lines: the leader first.
-    """
-
-    method: str
-    network: str
-    title: str
-    verdicts: tuple[str, ...]
-    lines: tuple[VehicleLine, ...]
-
-
-def platoon_panels(
-    table: pd.DataFrame, methods: Sequence[str], stable: Mapping[str, float]
-) -> tuple[PlatoonPanel, ...]:
-    """Chooses a panel per method.
-
-    Args:
-        table: as `Platoon.table`.
-        methods: those to show, in their order.
-        stable: by method the share of its platoons that are string stable; one that is not known
-            is left out of the verdicts.
-    """
-    panels = []
-    for method in methods:
-        of_method = table[table["method"] == method]
-        rows, network = worst_platoon(of_method)
-        verdicts = []
-        if method in stable:
-            verdicts.append(_stability(stable[method], int(of_method["network"].nunique())))
-        verdicts.append(f"last follower: {_slowing(rows)}")
-        panels.append(PlatoonPanel(method, network, label(method), tuple(verdicts), _lines(rows)))
-    return tuple(panels)
-
-
-def speed_range(panels: Sequence[PlatoonPanel]) -> tuple[float, float]:
-    """Returns the ends of the panels' common axis of speed, m/s."""
-    speeds = [np.empty(0)]
-    for panel in panels:
-        speeds += [line.speed for line in panel.lines]
-    values = finite(np.concatenate(speeds))
-    if not len(values):
-        return 0.0, 1.0
-    margin = 0.04 * max(float(np.ptp(values)), 1.0)
-    return float(values.min()) - margin, float(values.max()) + margin
+_COLLISION: dict[str, Any] = {
+    "marker": "X",
+    "color": COLLISION_COLOUR,
+    "markeredgecolor": "white",
+    "markersize": 9,
+}
 
 
 def worst_platoon(table: pd.DataFrame) -> tuple[pd.DataFrame, str]:
@@ -122,25 +51,6 @@ def braking_time(table: pd.DataFrame) -> float:
     speed = leader["speed"].to_numpy()
     first_slower = int(np.argmax(speed < speed[0]))
     return float(leader["time_s"].iloc[max(first_slower - 1, 0)])
-
-
-def _lines(rows: pd.DataFrame) -> tuple[VehicleLine, ...]:
-    begin = braking_time(rows)
-    shown = rows[rows["time_s"] >= begin - _SHOWN_BEFORE]
-    last = int(shown["vehicle"].max())
-    lines = []
-    for key, of_vehicle in shown.groupby("vehicle", sort=True):
-        vehicle = int(float(str(key)))
-        colour = COLOURS["real"] if vehicle == 0 else vehicle_colour(vehicle, last)
-        hit = of_vehicle[of_vehicle["gap"] < 0]
-        collision = None
-        if len(hit):
-            collision = (float(hit["time_s"].iloc[0]) - begin, float(hit["speed"].iloc[0]))
-        kept = of_vehicle.iloc[:: -(-len(of_vehicle) // _MOST_POINTS)]
-        time = kept["time_s"].to_numpy(dtype=float) - begin
-        speed = kept["speed"].to_numpy(dtype=float)
-        lines.append(VehicleLine(vehicle, colour, time, speed, collision))
-    return tuple(lines)
 
 
 def _stability(share: float, networks: int) -> str:
@@ -170,39 +80,66 @@ def _drop(rows: pd.DataFrame) -> float:
 
 
 @styled
-def draw_platoons(panels: Sequence[PlatoonPanel]) -> Figure:
-    """Draws speeds of the leader and its followers over time, a panel per method."""
-    figure = canvas(4.3, width=10.5 if len(panels) > 1 else 6.5)
-    grid = figure.subplots(1, len(panels), sharey=True, sharex=True, squeeze=False)[0]
-    for axes, panel in zip(grid, panels, strict=True):
-        _speeds(axes, panel)
-        axes.set_title("\n".join([panel.title, *panel.verdicts]), fontsize=_title_size(panels))
+def draw_platoons(
+    table: pd.DataFrame, methods: Sequence[str], stable: Mapping[str, float]
+) -> Figure:
+    """Draw speeds of the leader and its followers over time, a panel per method.
+
+    Args:
+        table: as `Platoon.table`.
+        methods: those to show, in their order.
+        stable: by method the share of its platoons that are string stable; one that is not known
+            is left out of the titles.
+    """
+    figure = canvas(4.3, width=10.5 if len(methods) > 1 else 6.5)
+    grid = figure.subplots(1, len(methods), sharey=True, sharex=True, squeeze=False)[0]
+    speeds = [np.empty(0)]
+    for axes, method in zip(grid, methods, strict=True):
+        of_method = table[table["method"] == method]
+        rows, _ = worst_platoon(of_method)
+        title = [label(method)]
+        if method in stable:
+            title.append(_stability(stable[method], int(of_method["network"].nunique())))
+        title.append(f"last follower: {_slowing(rows)}")
+        speeds += _draw_vehicles(axes, rows)
+        axes.set_title("\n".join(title), fontsize=9.5 if len(methods) < 4 else 7.5)
         axes.margins(x=0.01)
     figure.supxlabel(TIME_TITLE, fontsize=10.5)
     grid[0].set_ylabel("speed (m/s)")
-    grid[0].set_ylim(*speed_range(panels))
+    grid[0].set_ylim(*_speed_range(finite(np.concatenate(speeds))))
     figure.legend(handles=_handles(), loc="outside upper center", ncols=4, columnspacing=1.8)
     return figure
 
 
-def _title_size(panels: Sequence[PlatoonPanel]) -> float:
-    return 9.5 if len(panels) < 4 else 7.5
+def _draw_vehicles(axes: Axes, rows: pd.DataFrame) -> list[Array]:
+    """Draw the speeds of one platoon and where gaps became negative; return the speeds, m/s."""
+    begin = braking_time(rows)
+    recent = rows[rows["time_s"] >= begin - _SHOWN_BEFORE]
+    last = int(recent["vehicle"].max())
+    speeds = []
+    for key, of_vehicle in recent.groupby("vehicle", sort=True):
+        vehicle = int(float(str(key)))
+        colour, width, above = COLOURS["real"], 2.0, 3
+        if vehicle > 0:
+            colour, width, above = vehicle_colour(vehicle, last), 1.3, 2
+        kept = of_vehicle.iloc[:: -(-len(of_vehicle) // _MOST_POINTS)]
+        speed = kept["speed"].to_numpy(dtype=float)
+        time = kept["time_s"].to_numpy(dtype=float) - begin
+        axes.plot(time, speed, color=colour, linewidth=width, zorder=above)
+        speeds.append(speed)
+        hit = of_vehicle[of_vehicle["gap"] < 0]
+        if len(hit):
+            place = (float(hit["time_s"].iloc[0]) - begin, float(hit["speed"].iloc[0]))
+            axes.plot(*place, zorder=4, **_COLLISION)
+    return speeds
 
 
-def _speeds(axes: Axes, panel: PlatoonPanel) -> None:
-    for line in panel.lines:
-        leads = line.vehicle == 0
-        width, above = (2.0, 3) if leads else (1.3, 2)
-        axes.plot(line.time, line.speed, color=line.colour, linewidth=width, zorder=above)
-        if line.collision is not None:
-            axes.plot(
-                *line.collision,
-                marker="X",
-                color=COLLISION_COLOUR,
-                markeredgecolor="white",
-                markersize=9,
-                zorder=4,
-            )
+def _speed_range(values: Array) -> tuple[float, float]:
+    """Return the ends of the panels' common axis of speed, m/s."""
+    if not len(values):
+        return 0.0, 1.0
+    margin = 0.04 * max(float(np.ptp(values)), 1.0)
+    return float(values.min()) - margin, float(values.max()) + margin
 
 
 def _handles() -> list[Line2D]:
@@ -210,16 +147,7 @@ def _handles() -> list[Line2D]:
         Line2D([], [], color=COLOURS["real"], linewidth=2.0, label="leader"),
         Line2D([], [], color=vehicle_colour(1, 10), linewidth=1.6, label="first follower"),
         Line2D([], [], color=vehicle_colour(10, 10), linewidth=1.6, label="last follower"),
-        Line2D(
-            [],
-            [],
-            color=COLLISION_COLOUR,
-            marker="X",
-            linestyle="none",
-            markeredgecolor="white",
-            markersize=9,
-            label="collision",
-        ),
+        Line2D([], [], linestyle="none", label="collision", **_COLLISION),
     ]
 
 
@@ -245,4 +173,4 @@ class PlatoonSpeeds(JobFigure):
         methods = [method for method in results.methods if method in present]
         if not methods:
             return None
-        return draw_platoons(platoon_panels(results.platoon, methods, results.stable))
+        return draw_platoons(results.platoon, methods, results.stable)

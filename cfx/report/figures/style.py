@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
-from cfx.data.style.result import CLUSTERS
+from cfx.data.style.result import CLUSTERS, StyleResult
 from cfx.report.figures.canvas import canvas, styled
 from cfx.report.figures.figure import JobFigure
 from cfx.report.figures.results import Results
@@ -29,67 +27,8 @@ INDICATORS = {
 }
 
 
-@dataclass(frozen=True)
-class ClusterBars:
-    """The drivers of one cluster: their number in each bin, and in all."""
-
-    name: str
-    colour: str
-    counts: NDArray[np.int64]
-    drivers: int
-
-    @property
-    def label(self) -> str:
-        """What the legend says."""
-        return f"{self.name}: {self.drivers}"
-
-
-@dataclass(frozen=True)
-class StyleHistogram:
-    """Scores of all drivers.
-
-    Attributes:
-        edges: `(B + 1,)` of the bins.
-        clusters: stacked bars, from conservative to aggressive.
-        cuts: scores that separate the clusters, those that are finite.
-        title: of the score axis; it counts the drivers without a score.
-        highest: drivers in the fullest bin, at least 1.
-    """
-
-    edges: Array
-    clusters: tuple[ClusterBars, ...]
-    cuts: tuple[float, ...]
-    title: str
-    highest: int
-
-
-def style_histogram(
-    scores: Array, clusters: NDArray[np.integer], cuts: Sequence[float]
-) -> StyleHistogram:
-    """Chooses 8 to 24 equal bins over the scores, stacked by cluster.
-
-    Args:
-        scores: `(D,)`, of each driver; one that is not finite is left out and counted.
-        clusters: `(D,)`, 0, 1 or 2.
-        cuts: scores that separate the clusters.
-    """
-    known = finite(scores)
-    edges = _edges(known)
-    bars = []
-    for index, name in enumerate(CLUSTERS):
-        mine = finite(scores[clusters == index])
-        counts = np.histogram(mine, edges)[0]
-        bars.append(ClusterBars(name, CLUSTER_COLOURS[index], counts, len(mine)))
-    title = "style score (0 conservative, 1 aggressive)"
-    missing = len(scores) - len(known)
-    if missing:
-        title += f"; {plural(missing, 'driver')} without a score"
-    highest = max(1, int(np.histogram(known, edges)[0].max()))
-    kept = tuple(float(cut) for cut in finite(cuts))
-    return StyleHistogram(edges, tuple(bars), kept, title, highest)
-
-
-def _edges(scores: Array) -> Array:
+def score_bins(scores: Array) -> Array:
+    """Return the edges of 8 to 24 equal bins over finite scores."""
     if not len(scores):
         return np.linspace(0.0, 1.0, 9)
     low, high = float(scores.min()), float(scores.max())
@@ -100,43 +39,51 @@ def _edges(scores: Array) -> Array:
 
 
 @styled
-def draw_style(histogram: StyleHistogram, weights: Mapping[str, float]) -> Figure:
-    """Draws the scores with the cuts and the cluster sizes, and the entropy weights if known."""
+def draw_style(style: StyleResult) -> Figure:
+    """Draw the scores with the cuts and the cluster sizes, and the entropy weights if known."""
     figure = canvas(3.9)
-    if not weights:
-        _histogram(figure.subplots(), histogram)
+    if not style.weights:
+        _histogram(figure.subplots(), style)
         return figure
     left, right = figure.subplots(1, 2, width_ratios=(2.3, 1.0))
-    _histogram(left, histogram)
-    _weights(right, weights)
+    _histogram(left, style)
+    _weights(right, style.weights)
     return figure
 
 
-def _histogram(axes: Axes, histogram: StyleHistogram) -> None:
-    edges = histogram.edges
+def _histogram(axes: Axes, style: StyleResult) -> None:
+    scores = style.table["score"].to_numpy(dtype=float)
+    clusters = style.table["cluster"].astype(float).astype(int).to_numpy()
+    known = finite(scores)
+    edges = score_bins(known)
     bottom = np.zeros(len(edges) - 1)
-    for cluster in histogram.clusters:
+    for index, name in enumerate(CLUSTERS):
+        mine = finite(scores[clusters == index])
+        counts = np.histogram(mine, edges)[0]
         axes.bar(
             edges[:-1],
-            cluster.counts,
+            counts,
             width=np.diff(edges),
             align="edge",
             bottom=bottom,
-            color=cluster.colour,
+            color=CLUSTER_COLOURS[index],
             edgecolor="white",
             linewidth=0.8,
-            label=cluster.label,
+            label=f"{name}: {len(mine)}",
         )
-        bottom += cluster.counts
-    top = histogram.highest
+        bottom += counts
+    top = max(1, int(np.histogram(known, edges)[0].max()))
     axes.set_ylim(0, 1.22 * top)
-    for k, cut in enumerate(histogram.cuts):
+    for k, cut in enumerate(finite(style.cuts)):
         axes.axvline(cut, color=INK, linestyle=(0, (4, 2)), linewidth=1.2)
         side, text = ("right", f"{cut:.3f} ") if k == 0 else ("left", f" {cut:.3f}")
         axes.text(cut, 1.19 * top, text, ha=side, va="top", color=INK)
     axes.yaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     axes.grid(visible=False, axis="x")
-    axes.set_xlabel(histogram.title)
+    title = "style score (0 conservative, 1 aggressive)"
+    if len(scores) > len(known):
+        title += f"; {plural(len(scores) - len(known), 'driver')} without a score"
+    axes.set_xlabel(title)
     axes.set_ylabel("drivers")
     axes.legend(
         loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, handlelength=1.0, columnspacing=1.4
@@ -171,11 +118,4 @@ class StyleDistribution(JobFigure):
 
     def draw(self, results: Results) -> Figure | None:
         """Draws it where scores are known."""
-        if results.style is None:
-            return None
-        table = results.style.table
-        scores = table["score"].to_numpy(dtype=float)
-        clusters = table["cluster"].astype(float).astype(int).to_numpy()
-        return draw_style(
-            style_histogram(scores, clusters, results.style.cuts), results.style.weights
-        )
+        return None if results.style is None else draw_style(results.style)

@@ -6,6 +6,7 @@ import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -31,29 +32,6 @@ _ROOM = 1.5
 
 
 @dataclass(frozen=True)
-class Note:
-    """A remark inside a panel, at its upper end or at its lower end."""
-
-    text: str
-    method: str
-    above: bool
-
-
-@dataclass(frozen=True)
-class Collision:
-    """Where a simulated gap first becomes negative."""
-
-    method: str
-    time: float
-    gap: float
-
-    @property
-    def text(self) -> str:
-        """What stands beside the symbol."""
-        return f"{short_label(self.method)} collides"
-
-
-@dataclass(frozen=True)
 class Panel:
     """Lines on common axes.
 
@@ -61,8 +39,8 @@ class Panel:
         title: what is shown, with its unit.
         lines: those that are drawn, the hidden ones too.
         low, high: ends of the vertical axis; None where nothing is known of them.
-        notes: remarks.
-        collisions: of a gap.
+        notes: remarks on the default, each at the upper end (true) or the lower end of the panel.
+        collisions: method, time (s) and gap (m) where a simulated gap first becomes negative.
         bounds: of a parameter, if they are known.
         meaning: of a parameter, in words.
     """
@@ -71,8 +49,8 @@ class Panel:
     lines: tuple[Line, ...]
     low: float | None
     high: float | None
-    notes: tuple[Note, ...] = ()
-    collisions: tuple[Collision, ...] = ()
+    notes: tuple[tuple[str, bool], ...] = ()
+    collisions: tuple[tuple[str, float, float], ...] = ()
     bounds: tuple[float, float] | None = None
     meaning: str = ""
 
@@ -123,28 +101,6 @@ def pair_panels(
     )
 
 
-def method_panels(
-    trajectory: PairTrajectory, methods: Sequence[str], errors: Mapping[str, float]
-) -> tuple[Panel, ...]:
-    """Chooses a panel per method: its speed against the real driver's.
-
-    Args:
-        trajectory: the pair.
-        methods: those to show.
-        errors: by method, RMSE of speed, m/s.
-    """
-    panels = []
-    for method in methods:
-        lines = (
-            _line("real", trajectory.time, trajectory.real_speed),
-            _line(method, trajectory.time, trajectory.speed[method]),
-        )
-        low, high = _range(lines)
-        title = f"{label(method)}: RMSE of speed {errors[method]:.3f} m/s"
-        panels.append(Panel(title, lines, low, high))
-    return tuple(panels)
-
-
 def errors_text(what: str, unit: str, errors: Mapping[str, float]) -> str:
     """Returns a title such as "RMSE of speed (m/s): default 1.02, policy 0.31".
 
@@ -175,30 +131,29 @@ def _lines(
 
 
 def _signal_panel(
-    name: str, unit: str, lines: tuple[Line, ...], collisions: tuple[Collision, ...] = ()
+    name: str,
+    unit: str,
+    lines: tuple[Line, ...],
+    collisions: tuple[tuple[str, float, float], ...] = (),
 ) -> Panel:
     """Chooses the axis by the lines that matter; a note says how far a default lies off them."""
     low, high = _range(tuple(line for line in lines if line.method != "default"))
-    notes: list[Note] = []
+    notes: list[tuple[str, bool]] = []
     if low is not None and high is not None:
-        far = finite(np.concatenate([np.empty(0), *_of("default", lines)]))
+        defaults = [line.values for line in lines if line.method == "default"]
+        far = finite(np.concatenate([np.empty(0), *defaults]))
         height = max(high - low, 1.0)
         lowest, highest = low - _ROOM * height, high + _ROOM * height
         if len(far):
             least, most = float(far.min()), float(far.max())
             if most > highest:
-                notes.append(Note(f"default up to {number(most)} {unit} ↑", "default", above=True))
+                notes.append((f"default up to {number(most)} {unit} ↑", True))
             if least < lowest:
-                text = f"default down to {number(least)} {unit} ↓"
-                notes.append(Note(text, "default", above=False))
+                notes.append((f"default down to {number(least)} {unit} ↓", False))
             low, high = min(low, max(least, lowest)), max(high, min(most, highest))
         low, high = low - 0.06 * height, high + 0.06 * height
     title = unit_label(name, unit)
     return Panel(title, lines, low, high, tuple(notes), collisions)
-
-
-def _of(method: str, lines: Sequence[Line]) -> list[Array]:
-    return [line.values for line in lines if line.method == method]
 
 
 def _range(lines: Sequence[Line]) -> tuple[float | None, float | None]:
@@ -210,13 +165,13 @@ def _range(lines: Sequence[Line]) -> tuple[float | None, float | None]:
     return float(values.min()), float(values.max())
 
 
-def _collisions(lines: Sequence[Line]) -> tuple[Collision, ...]:
+def _collisions(lines: Sequence[Line]) -> tuple[tuple[str, float, float], ...]:
     found = []
     for line in lines:
         hit = np.flatnonzero(line.values < 0)
         if line.method != "real" and not line.hidden and len(hit):
             first = int(hit[0])
-            found.append(Collision(line.method, float(line.time[first]), float(line.values[first])))
+            found.append((line.method, float(line.time[first]), float(line.values[first])))
     return tuple(found)
 
 
@@ -237,13 +192,6 @@ def _parameter_panel(parameter: ParameterAxis, lines: tuple[Line, ...]) -> Panel
     low = max(centre - width / 2, min(bounds[0], lowest)) - margin
     high = min(centre + width / 2, max(bounds[1], highest)) + margin
     return Panel(title, lines, low, high, bounds=bounds, meaning=said)
-
-
-def bounds_text(panel: Panel) -> str:
-    """Returns a panel's title with the parameter's bounds, if they are known."""
-    if panel.bounds is None:
-        return panel.title
-    return f"{panel.title}, {number(panel.bounds[0])} to {number(panel.bounds[1])}"
 
 
 _LINE = 150
@@ -279,22 +227,26 @@ def draw_pairs(
 
 
 @styled
-def draw_speeds(pair_id: str, panels: Sequence[Panel], methods: Sequence[str]) -> Figure:
-    """Draws the simulated speed of each method against the real driver's, a panel per method.
+def draw_speeds(
+    trajectory: PairTrajectory, methods: Sequence[str], errors: Mapping[str, float]
+) -> Figure:
+    """Draw the simulated speed of each method against the real driver's, a panel per method.
 
     Args:
-        pair_id: which pair.
-        panels: of each method.
-        methods: for the legend.
+        trajectory: the pair.
+        methods: those to show.
+        errors: by method, RMSE of speed, m/s.
     """
-    figure = canvas(0.8 + 1.9 * len(panels))
-    grid = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
-    for axes, panel in zip(grid, panels, strict=True):
-        draw_lines(axes, panel.lines)
-        axes.set_title(panel.title, fontsize=9.5, color=INK)
+    figure = canvas(0.8 + 1.9 * len(methods))
+    grid = figure.subplots(len(methods), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, method in zip(grid, methods, strict=True):
+        simulated = {method: trajectory.speed[method]}
+        draw_lines(axes, _lines(trajectory.time, trajectory.real_speed, simulated, [method]))
+        title = f"{label(method)}: RMSE of speed {errors[method]:.3f} m/s"
+        axes.set_title(title, fontsize=9.5, color=INK)
         axes.set_ylabel("speed (m/s)")
     grid[-1].set_xlabel(TIME_TITLE)
-    title = f"pair {short(pair_id, 60)}, test part"
+    title = f"pair {short(trajectory.pair_id, 60)}, test part"
     method_legend(figure, ["real", *methods], title)
     return figure
 
@@ -370,14 +322,13 @@ def draw_panel(axes: Axes, panel: Panel) -> None:
         if panel.bounds is not None:
             _shade_outside(axes, panel.bounds, panel.low, panel.high)
     axes.set_ylabel(panel.title)
-    for note in panel.notes:
-        _write_note(axes, note)
-    for collision in panel.collisions:
-        colour = colour_of(collision.method)
-        place = (collision.time, collision.gap)
+    for text, above in panel.notes:
+        _write_note(axes, text, above=above)
+    for method, *place in panel.collisions:
+        colour = colour_of(method)
         axes.plot(*place, marker="X", markersize=9, color=colour, mec="white", zorder=6)
         axes.annotate(
-            collision.text,
+            f"{short_label(method)} collides",
             place,
             (6, 6),
             textcoords="offset points",
@@ -410,45 +361,43 @@ def _shade_outside(axes: Axes, bounds: tuple[float, float], low: float, high: fl
 
 def _titles_of_parameter(axes: Axes, panel: Panel, length: int) -> None:
     """Writes name, unit and bounds, and below them what the parameter means."""
+    title = panel.title
+    if panel.bounds is not None:
+        title += f", {number(panel.bounds[0])} to {number(panel.bounds[1])}"
     lines = textwrap.wrap(panel.meaning, length, max_lines=2, placeholder=" …")
     axes.set_title("\n".join(lines), fontsize=8, color=INK)
-    raised = 6 + 11 * len(lines)
-    axes.annotate(
-        bounds_text(panel),
-        (0, 1),
-        (0, raised),
-        xycoords="axes fraction",
-        textcoords="offset points",
-        fontsize=10.5,
-        color="black",
-    )
+    _above(axes, title, 6 + 11 * len(lines), fontsize=10.5)
 
 
 def _two_line_title(axes: Axes, strong: str, fine: str) -> None:
     axes.set_title(fine, fontsize=7.6, color=INK)  # several methods' errors beside each other
     if strong:
-        axes.annotate(
-            strong,
-            (0, 1),
-            (0, 20),
-            xycoords="axes fraction",
-            textcoords="offset points",
-            fontsize=11,
-            fontweight="bold",
-            color="black",
-        )
+        _above(axes, strong, 20, fontsize=11, fontweight="bold")
 
 
-def _write_note(axes: Axes, note: Note) -> None:
-    height, aligned = (0.97, "top") if note.above else (0.03, "bottom")
+def _above(axes: Axes, text: str, points: float, **font: Any) -> None:
+    """Write a line so many points above a panel."""
+    axes.annotate(
+        text,
+        (0, 1),
+        (0, points),
+        xycoords="axes fraction",
+        textcoords="offset points",
+        color="black",
+        **font,
+    )
+
+
+def _write_note(axes: Axes, text: str, *, above: bool) -> None:
+    height, aligned = (0.97, "top") if above else (0.03, "bottom")
     axes.text(
         0.985,
         height,
-        note.text,
+        text,
         transform=axes.transAxes,
         ha="right",
         va=aligned,
-        color=colour_of(note.method),
+        color=colour_of("default"),
         fontsize=9,
         bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5},
         zorder=5,
@@ -483,38 +432,6 @@ def drives(results: Results, pair_id: str | Sequence[str] | None = None, count: 
     return draw_pairs(titles, panels, results.methods, explained)
 
 
-def speeds(results: Results, pair_id: str | None = None) -> Figure:
-    """The simulated speed of each method against the real driver's: the paper's speed plots.
-
-    Args:
-        results: of a job.
-        pair_id: the pair to show; None for the one with the median improvement.
-
-    Raises:
-        ConfigError: the pair id is not in the results.
-    """
-    ((_, trajectory),) = _chosen(results, pair_id, 1)
-    errors = _errors(results, trajectory.pair_id, "rmse_speed")
-    panels = method_panels(trajectory, results.methods, errors)
-    return draw_speeds(trajectory.pair_id, panels, results.methods)
-
-
-def parameters(results: Results, pair_id: str | None = None) -> Figure:
-    """The parameters of each method over time.
-
-    Args:
-        results: of a job.
-        pair_id: the pair to show; None for the one with the median improvement.
-
-    Raises:
-        ConfigError: the pair id is not in the results.
-    """
-    ((_, trajectory),) = _chosen(results, pair_id, 1)
-    return draw_parameters(
-        pair_panels(trajectory, results.methods, results.parameters), results.methods
-    )
-
-
 class Drives(JobFigure):
     """Speed and gap of the best, the median and the worst pair."""
 
@@ -536,7 +453,11 @@ class Speeds(JobFigure):
 
     def draw(self, results: Results) -> Figure | None:
         """Draws it where trajectories are known."""
-        return speeds(results) if len(results.trajectories) else None
+        if not len(results.trajectories):
+            return None
+        ((_, trajectory),) = _chosen(results, None, 1)
+        errors = _errors(results, trajectory.pair_id, "rmse_speed")
+        return draw_speeds(trajectory, results.methods, errors)
 
 
 class ChosenParameters(JobFigure):
@@ -548,7 +469,11 @@ class ChosenParameters(JobFigure):
 
     def draw(self, results: Results) -> Figure | None:
         """Draws it where trajectories are known."""
-        return parameters(results) if len(results.trajectories) else None
+        if not len(results.trajectories):
+            return None
+        ((_, trajectory),) = _chosen(results, None, 1)
+        pair = pair_panels(trajectory, results.methods, results.parameters)
+        return draw_parameters(pair, results.methods)
 
 
 def _chosen(

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
 import pandas as pd
 
 from cfx.data.style.result import CLUSTERS
 from cfx.evaluation.statistics import Improvement
 from cfx.report.blocks import Block, Figure, Fold, Table, Text
 from cfx.report.figure_blocks import view
-from cfx.report.figures.jobs import ClusterGroup, cluster_boxes, draw_clusters
+from cfx.report.figures.improvements import improvement_axis
+from cfx.report.figures.jobs import ClusterGroup, draw_clusters
 from cfx.report.figures.words import explained, label
 from cfx.report.job import Job, Runs, any_baselines, with_baseline
 from cfx.report.names import SEPARATOR, differences
@@ -95,8 +97,9 @@ def per_cluster(series: Series, baselines: Sequence[str]) -> Figure:
             tables = [table for table in by_cluster.values() if column in table]
             if tables:
                 groups.append(_group(name, pd.concat(tables, ignore_index=True), column))
-        boxes = cluster_boxes(groups, baseline)
-        views[f"against {label(baseline)}"] = view(draw_clusters(boxes), boxes.axis.note)
+        every = np.concatenate([np.empty(0), *(group.values for group in groups)])
+        axis = improvement_axis(every, baseline=baseline)
+        views[f"against {label(baseline)}"] = view(draw_clusters(groups, axis), axis.note)
     return Figure(views, "Improvement by cluster of driving style")
 
 

@@ -12,7 +12,7 @@ from cfx.evaluation.metrics.base import MetricInfo
 from cfx.evaluation.result import METHODS
 from cfx.report.blocks import Block, Figure, Fold, Heading, Table, Text, View
 from cfx.report.figure_blocks import view
-from cfx.report.figures.jobs import draw_error_dots, error_dots
+from cfx.report.figures.jobs import draw_error_dots, error_limit
 from cfx.report.figures.words import FULL_TRAJECTORY, STEADY, TEST, explained, percent, short_label
 from cfx.report.job import Job, Runs, any_baselines, any_has_metric, without_baseline
 from cfx.report.metrics import metric_title
@@ -291,8 +291,9 @@ def absolute(jobs: Sequence[Job]) -> Figure:
                 values[method] = errors
         names = [job.name for job in jobs]
         what = f"RMSE of {signal}, mean over pairs"
-        dots = error_dots(names, values, unit=unit, what=what)
-        views[f"{signal}, {jobs[0].scope_label(scope)}"] = view(draw_error_dots(dots), dots.note)
+        drawn = draw_error_dots(names, values, unit=unit, what=what)
+        note = error_limit(values, unit)[1]
+        views[f"{signal}, {jobs[0].scope_label(scope)}"] = view(drawn, note)
     return Figure(views, "Errors of every job and method", chooser="RMSE of")
 
 

@@ -14,7 +14,7 @@ from cfx.evaluation.distributions import (
 )
 from cfx.report.blocks import Block, Table, Text, job_fold
 from cfx.report.figure_blocks import caption, figure_of
-from cfx.report.figures.distributions import sampled_name
+from cfx.report.figures.forecasts import sampled_name
 from cfx.report.job import Job, Runs
 from cfx.report.section import Section
 from cfx.report.tables import Cell, Column, Sheet, formatted, method_cell, methods_explained, number

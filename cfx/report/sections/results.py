@@ -10,8 +10,7 @@ import pandas as pd
 from cfx.evaluation.metrics.base import SCOPES
 from cfx.report.blocks import Block, Figure, Heading, Table, Text
 from cfx.report.figure_blocks import view
-from cfx.report.figures.jobs import Statistics, draw_overview
-from cfx.report.figures.jobs import overview as choose_overview
+from cfx.report.figures.jobs import Statistics, draw_overview, statistics_axis
 from cfx.report.figures.words import FULL_TRAJECTORY, MINUS, TEST, label
 from cfx.report.job import Job, Runs, any_baselines, with_baseline
 from cfx.report.section import Section
@@ -66,9 +65,9 @@ def overview(jobs: Sequence[Job]) -> Figure:
             for job in jobs:
                 if baseline in job.baselines(scope):
                     rows.append(_statistics(job, baseline, scope))
-            chosen = choose_overview(rows, baseline)
-            drawn = view(draw_overview(chosen), chosen.axis.note)
-            views[f"against {label(baseline)}{suffix}"] = drawn
+            axis = statistics_axis(rows, baseline)
+            drawn = draw_overview(rows, baseline, axis)
+            views[f"against {label(baseline)}{suffix}"] = view(drawn, axis.note)
     title = "Mean improvement of each job with its 95 % interval"
     return Figure(views, title)
 

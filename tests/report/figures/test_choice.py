@@ -8,12 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cfx.data.style.result import StyleResult
 from cfx.report.figures.calibration import correlations, parameter_spreads, spread_offsets
 from cfx.report.figures.improvements import WORST_WITHOUT_CUT, improvement_axis, improvement_bars
-from cfx.report.figures.jobs import error_dots
+from cfx.report.figures.jobs import error_limit
 from cfx.report.figures.pairs import evenly_spread, rank_pairs
 from cfx.report.figures.results import ParameterAxis
-from cfx.report.figures.style import style_histogram
+from cfx.report.figures.style import draw_style
 from cfx.report.figures.values import natural_order
 from cfx.report.figures.words import common_prefix, scope_label, short
 
@@ -63,19 +64,19 @@ def test_the_mean_stays_in_view_unless_it_dwarfs_the_bars() -> None:
 
 def test_a_default_far_off_does_not_stretch_the_errors() -> None:
     values = {"default": np.array([9.0, 0.4]), "policy": np.array([0.2, 0.3])}
-    dots = error_dots(["a", "b"], values, unit="m/s", what="RMSE")
-    assert dots.high == pytest.approx(1.6 * 0.3)
-    assert dots.note.startswith("1 job with default parameters further off, up to 9 m/s")
+    high, note = error_limit(values, "m/s")
+    assert high == pytest.approx(1.6 * 0.3)
+    assert note.startswith("1 job with default parameters further off, up to 9 m/s")
 
 
 @pytest.mark.parametrize("scores", [[], [0.5], [0.5, 0.5, np.nan], [0.1, 0.9]])
 def test_every_score_has_its_bin(scores: list[float]) -> None:
-    clusters = np.zeros(len(scores), dtype=int)
-    histogram = style_histogram(np.array(scores), clusters, (np.nan, 0.4))
-    counted = sum(int(cluster.counts.sum()) for cluster in histogram.clusters)
+    table = pd.DataFrame({"score": np.array(scores, dtype=float), "cluster": 0})
+    (axes,) = draw_style(StyleResult(table, {}, (float("nan"), 0.4))).axes
+    counted = sum(bar.get_height() for bar in axes.patches)
     assert counted == int(np.isfinite(scores).sum())
-    assert histogram.cuts == (0.4,)
-    assert ("without a score" in histogram.title) == bool(np.isnan(scores).any())
+    assert [text.get_text().strip() for text in axes.texts] == ["0.400"]
+    assert ("without a score" in axes.get_xlabel()) == bool(np.isnan(scores).any())
 
 
 def test_names() -> None:

@@ -81,9 +81,10 @@ def test_a_slice_without_a_finite_loss_is_left_out_or_infinite() -> None:
 
 
 def test_fits_have_the_pairs_that_are_defined_on_both_parts() -> None:
-    fixed, default = fits_of(FITS)
-    assert (fixed.method, fixed.pair_ids) == ("fixed", ("a",))
-    assert default.train.tolist() == [0.9, 0.8]
+    fits = fits_of(FITS)
+    assert list(fits) == ["fixed", "default"]
+    assert fits["fixed"]["pair_id"].tolist() == ["a"]
+    assert fits["default"]["train_rmse_speed"].tolist() == [0.9, 0.8]
 
 
 def test_labels_are_in_the_order_of_time_and_weighted_by_what_they_matter() -> None:
@@ -100,8 +101,8 @@ def test_what_was_chosen_is_drawn() -> None:
         lines = [line.get_ydata() for line in axes.lines]
         np.testing.assert_allclose(lines[len(panel.ratios)], panel.median)
     fits = fits_of(FITS)
-    for fit, line in zip(fits, draw_fits(fits).axes[0].lines, strict=False):
-        np.testing.assert_allclose(line.get_xdata(), fit.train)
+    for fit, line in zip(fits.values(), draw_fits(fits).axes[0].lines, strict=False):
+        np.testing.assert_allclose(line.get_xdata(), fit["train_rmse_speed"])
     (driver,) = labels_of(LABELS, PAIRS, AXES)
     assert len(draw_labels(driver, AXES).axes) == len(AXES) + 1
 

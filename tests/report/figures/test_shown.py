@@ -10,17 +10,23 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 
+from cfx.evaluation.distributions import centre_errors, summarize_distributions
 from cfx.evaluation.forecasts import errors_by_history
 from cfx.evaluation.result import Evaluation
+from cfx.learners.curves import over_networks
 from cfx.report.figures.calibration import correlations, draw_calibration, parameter_spreads
-from cfx.report.figures.distributions import distribution_view, draw_distributions
-from cfx.report.figures.errors import draw_errors, error_panels
-from cfx.report.figures.forecasts import draw_forecasts, history_panels, horizon_panels
+from cfx.report.figures.errors import draw_errors, errors_over_time
+from cfx.report.figures.forecasts import (
+    draw_by_history,
+    draw_by_horizon,
+    draw_distributions,
+    pit_density,
+)
 from cfx.report.figures.improvements import draw_improvements, improvement_bars
 from cfx.report.figures.jobs import draw_every_pair
-from cfx.report.figures.learning import draw_learning, learning_curves
+from cfx.report.figures.learning import draw_learning, loss_quartiles
 from cfx.report.figures.pairs import rank_pairs
-from cfx.report.figures.platoon import draw_platoons, platoon_panels, speed_range
+from cfx.report.figures.platoon import braking_time, draw_platoons, worst_platoon
 from cfx.report.figures.results import Results, parameter_axes
 from cfx.report.figures.traffic import draw_paths, draw_traffic, path_panels, traffic_panels
 from cfx.report.figures.trajectories import (
@@ -75,9 +81,9 @@ def test_a_pair_has_its_lines_limits_notes_and_collisions(far: float) -> None:
         for line in panel.lines:
             np.testing.assert_allclose(lines[colour_of(line.method)].get_ydata(), line.values)
         written = "\n".join(text.get_text() for text in axes.texts)
-        for note in panel.notes:
-            assert note.text in written
-    assert [one.method for one in panels.gap.collisions] == ["policy"]
+        for note, _ in panel.notes:
+            assert note in written
+    assert [method for method, *_ in panels.gap.collisions] == ["policy"]
     assert "policy collides" in "\n".join(text.get_text() for text in figure.axes[1].texts)
     assert bool(panels.gap.notes) == (far > 0)
 
@@ -120,71 +126,88 @@ def test_improvements_are_cut_off_at_one_place() -> None:
 
 def test_learning_curves_are_medians_and_quartiles() -> None:
     curves = make_results(pairs=9).curves
-    chosen = learning_curves(curves)
-    axes = draw_learning(chosen).axes[0]
-    assert chosen.logarithmic
+    axes = draw_learning(curves).axes[0]
     assert axes.get_yscale() == "log"
-    for k, curve in enumerate(chosen.curves):
-        np.testing.assert_allclose(axes.lines[k].get_ydata(), curve.median)
+    shown = loss_quartiles(curves)
+    assert list(shown) == ["train_loss", "validation_loss"]
+    for k, (column, quartiles) in enumerate(shown.items()):
+        median = over_networks(curves, column).median(axis=1)
+        np.testing.assert_allclose(quartiles[0.5], median)
+        np.testing.assert_allclose(axes.lines[k].get_ydata(), quartiles[0.5])
         outline = axes.collections[k].get_paths()[0].vertices
-        assert outline[:, 1].min() == pytest.approx(curve.low.min())
-        assert outline[:, 1].max() == pytest.approx(curve.high.max())
+        assert outline[:, 1].min() == pytest.approx(quartiles[0.25].min())
+        assert outline[:, 1].max() == pytest.approx(quartiles[0.75].max())
     half = curves["epoch"].median()
-    sampled = learning_curves(curves.assign(sampled_paths=2 * (curves["epoch"] >= half)))
+    sampled = curves.assign(sampled_paths=2 * (curves["epoch"] >= half))
     assert draw_learning(sampled).axes[0].lines[-1].get_xdata()[0] >= half
 
 
 def test_platoons_show_speeds_collisions_and_verdicts() -> None:
     platoon = make_platoon({"default": 1, "policy": 3})
-    panels = platoon_panels(platoon.table, platoon.methods, {"default": 1.0, "policy": 2 / 3})
-    figure = draw_platoons(panels)
-    for axes, panel in zip(figure.axes, panels, strict=True):
+    stable = {"default": 1.0, "policy": 2 / 3}
+    figure = draw_platoons(platoon.table, platoon.methods, stable)
+    verdicts = ("string stable", "2 of 3 platoons are string stable")
+    for axes, method, verdict in zip(figure.axes, platoon.methods, verdicts, strict=True):
+        rows, _ = worst_platoon(platoon.table[platoon.table["method"] == method])
         lines = [line for line in axes.lines if len(line.get_xdata()) > 1]
-        for line in panel.lines:
-            np.testing.assert_allclose(lines[line.vehicle].get_ydata(), line.speed)
-        hits = sum(line.collision is not None for line in panel.lines)
+        for (_, of_vehicle), line in zip(rows.groupby("vehicle"), lines, strict=True):
+            speeds = of_vehicle.set_index("time_s")["speed"]
+            shown = speeds.loc[line.get_xdata() + braking_time(rows)]
+            np.testing.assert_allclose(line.get_ydata(), shown)
+        hits = rows[rows["gap"] < 0]["vehicle"].nunique()
         assert len(axes.lines) - len(lines) == hits
-        for verdict in panel.verdicts:
-            assert verdict in axes.get_title(loc="left")
-    assert figure.axes[0].get_ylim() == pytest.approx(speed_range(panels))
+        title = axes.get_title(loc="left")
+        assert verdict in title
+        assert "last follower: " in title
+    low, high = figure.axes[0].get_ylim()
+    speeds = np.concatenate([line.get_ydata() for axes in figure.axes for line in axes.lines])
+    assert low < speeds.min() < speeds.max() < high
 
 
 def test_forecasts_have_a_line_per_method() -> None:
     forecasts = make_forecasts()
-    panels = horizon_panels(forecasts.summary, forecasts.methods)
-    panels += history_panels(errors_by_history(forecasts.table), forecasts.methods)
-    assert len(panels) == 5
-    figure = draw_forecasts(panels, forecasts.methods, "any")
-    for axes, panel in zip(figure.axes, panels, strict=True):
+    summary, methods = forecasts.summary, forecasts.methods
+    by_horizon = draw_by_horizon(summary, methods).axes
+    for axes, error in zip(by_horizon, ("rmse_speed", "rmse_position"), strict=True):
+        assert axes.get_yscale() == "log"
         lines = drawn_lines(axes)
-        assert len(panel.lines) == len(lines) == len(forecasts.methods)
-        for line in panel.lines:
-            np.testing.assert_allclose(lines[colour_of(line.method)].get_ydata(), line.values)
-        assert (axes.get_yscale() == "log") == panel.logarithmic
+        assert len(lines) == len(methods)
+        for method in methods:
+            rows = summary[summary["method"] == method].sort_values("horizon_s")
+            np.testing.assert_allclose(lines[colour_of(method)].get_ydata(), rows[error])
 
 
 def test_longer_histories_stand_to_the_right() -> None:
-    forecasts = make_forecasts()
-    (short, *_, long) = history_panels(errors_by_history(forecasts.table), ["policy"])
-    assert long.title.startswith("RMSE of speed after 10 s")
-    (line,) = short.lines
-    assert bool((np.diff(line.time) > 0).all())
-    assert bool((np.diff(line.values) < 0).all())
+    by_history = errors_by_history(make_forecasts().table)
+    figure = draw_by_history(by_history, ["policy"])
+    assert figure is not None
+    assert len(figure.axes) == 3
+    assert figure.axes[-1].get_ylabel().startswith("RMSE of speed after 10 s")
+    (line,) = figure.axes[0].lines
+    assert bool((np.diff(line.get_xdata()) > 0).all())
+    assert bool((np.diff(line.get_ydata()) < 0).all())
+    assert draw_by_history(by_history.assign(span_s=1.0), ["policy"]) is None
 
 
 def test_distributions_have_lines_and_histograms() -> None:
     forecasts = make_forecasts()
-    shown = distribution_view(make_distributions(forecasts), forecasts.table)
-    assert shown.methods == ("population_ar", "fixed_ar", "policy_sampled", "policy")
-    assert shown.horizon == 2.0
-    figure = draw_distributions(shown)
-    for axes, panel in zip(figure.axes, (shown.crps, shown.coverage), strict=False):
-        for line in panel.lines:
-            drawn = drawn_lines(axes)[colour_of(line.method)]
-            np.testing.assert_allclose(drawn.get_ydata(), line.values)
-    for histogram, patch in zip(shown.pit, figure.axes[2].patches, strict=True):
-        assert histogram.density.mean() == pytest.approx(1.0)
-        np.testing.assert_allclose(patch.get_data().values, histogram.density)
+    table = make_distributions(forecasts)
+    crps, coverage, pit = draw_distributions(table, forecasts.table).axes
+    summary = summarize_distributions(table)
+    shown = {"population_ar": "population_ar", "fixed_ar": "fixed_ar", "policy": "policy_sampled"}
+    for axes, column in ((crps, "crps_speed"), (coverage, "coverage")):
+        lines = drawn_lines(axes)
+        for method, name in shown.items():
+            rows = summary[summary["method"] == method].sort_values("horizon_s")
+            np.testing.assert_allclose(lines[colour_of(name)].get_ydata(), rows[column])
+    centre = centre_errors(forecasts.table)["crps_speed"]
+    np.testing.assert_allclose(drawn_lines(crps)[colour_of("policy")].get_ydata(), centre)
+    assert pit.get_ylabel() == "density, 2 s ahead"
+    here = table[table["horizon_s"] == 2.0]
+    for method, patch in zip(shown, pit.patches, strict=True):
+        density = pit_density(here[here["method"] == method])
+        assert density.mean() == pytest.approx(1.0)
+        np.testing.assert_allclose(patch.get_data().values, density)
 
 
 def test_traffic_has_lines_points_and_a_panel_of_paths_per_method() -> None:
@@ -210,12 +233,12 @@ def test_traffic_has_lines_points_and_a_panel_of_paths_per_method() -> None:
 
 def test_errors_over_time_show_where_the_transient_ends() -> None:
     evaluation = make_results(pairs=5, frames=80).evaluation
-    panels = error_panels(evaluation.trajectories, evaluation.methods, 5.0)
-    for axes, panel in zip(draw_errors(panels, evaluation.methods).axes, panels, strict=True):
-        for line in panel.lines:
-            drawn = drawn_lines(axes)[colour_of(line.method)]
-            np.testing.assert_allclose(drawn.get_ydata(), line.values)
-        assert panel.shows_transient
+    figure = draw_errors(evaluation.trajectories, evaluation.methods, 5.0)
+    for axes, signal in zip(figure.axes, ("speed", "gap"), strict=True):
+        lines = drawn_lines(axes)
+        for method in evaluation.methods:
+            _, error = errors_over_time(evaluation.trajectories, method, signal)
+            np.testing.assert_allclose(lines[colour_of(method)].get_ydata(), error)
         assert [5.0, 5.0] in [list(line.get_xdata()) for line in axes.lines]
 
 
