@@ -56,15 +56,13 @@ def draw_by_horizon(summary: pd.DataFrame, methods: Sequence[str]) -> Figure:
 
 
 @styled
-def draw_by_history(by_history: pd.DataFrame, methods: Sequence[str]) -> Figure | None:
-    """Draw a panel for a short, a middle and a long horizon; None for a single span of history.
+def draw_by_history(by_history: pd.DataFrame, methods: Sequence[str]) -> Figure:
+    """Draw a panel for a short, a middle and a long horizon.
 
     Args:
         by_history: as `errors_by_history` returns it.
         methods: those to show.
     """
-    if by_history["span_s"].nunique() < 2:
-        return None
     horizons = sorted(by_history["horizon_s"].unique())
     chosen = sorted({horizons[0], horizons[len(horizons) // 2], horizons[-1]})[:_PANELS]
     figure = canvas(4.4)
@@ -187,7 +185,10 @@ class ForecastsByHistory(JobFigure):
         found = results.forecasts
         if found is None:
             return None
-        return draw_by_history(errors_by_history(found.table), found.methods)
+        by_history = errors_by_history(found.table)
+        if by_history["span_s"].nunique() < 2:
+            return None
+        return draw_by_history(by_history, found.methods)
 
 
 class Distributions(JobFigure):

@@ -105,9 +105,9 @@ def fits_of(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
     found = {}
     for method in ("fixed", "population", "default"):
         rows = table[table["method"] == method]
-        known = rows[np.isfinite(rows[errors].astype(float)).all(axis=1)]
-        if len(known):
-            found[method] = known
+        known = np.isfinite(rows[errors].to_numpy(dtype=float)).all(axis=1)
+        if known.any():
+            found[method] = rows.loc[known]
     return found
 
 

@@ -324,8 +324,8 @@ def draw_panel(axes: Axes, panel: Panel) -> None:
     axes.set_ylabel(panel.title)
     for text, above in panel.notes:
         _write_note(axes, text, above=above)
-    for method, *place in panel.collisions:
-        colour = colour_of(method)
+    for method, time, gap in panel.collisions:
+        colour, place = colour_of(method), (time, gap)
         axes.plot(*place, marker="X", markersize=9, color=colour, mec="white", zorder=6)
         axes.annotate(
             f"{short_label(method)} collides",
