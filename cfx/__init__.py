@@ -50,6 +50,9 @@ if TYPE_CHECKING:
     from cfx.policies.base import Policy as Policy
     from cfx.policies.base import PolicyNetwork as PolicyNetwork
     from cfx.policies.base import PolicySettings as PolicySettings
+    from cfx.results.table import Column as Column
+    from cfx.results.table import Findings as Findings
+    from cfx.results.table import ResultTable as ResultTable
     from cfx.simulation.base import Stepper as Stepper
     from cfx.simulation.rollout import simulate as simulate
     from cfx.simulation.simulator import Simulator as Simulator
@@ -94,6 +97,9 @@ _HOMES = {
     "ProtocolResult": "cfx.evaluation.protocols.base",
     "Metric": "cfx.evaluation.metrics.base",
     "Trajectories": "cfx.evaluation.metrics.base",
+    "ResultTable": "cfx.results.table",
+    "Column": "cfx.results.table",
+    "Findings": "cfx.results.table",
     "Command": "cfx.core.command",
     "Parameter": "cfx.core.parameters",
     "ParameterSpace": "cfx.core.parameters",

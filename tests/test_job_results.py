@@ -12,10 +12,13 @@ import pytest
 from rich.console import Console
 
 from cfx.app.job.console import report
-from cfx.app.job.output import Output, write_further_tables
+from cfx.app.job.output import Output, write_tables
 from cfx.app.job.results import JobResult
+from cfx.data.pairs import PairSet
+from cfx.evaluation.protocols.base import ProtocolResult
 from cfx.evaluation.result import Evaluation
 from cfx.evaluation.statistics import Improvement
+from cfx.results.table import Findings
 from tests.made_up import GAINS, make_history, make_platoon, make_results, with_metric
 
 
@@ -36,13 +39,21 @@ def said(
     result = JobResult(evaluation.metrics(), evaluation.table, cast(Any, None), (), Path("folder"))
     report(
         result,
-        evaluation,
+        findings(evaluation),
+        (),
         Console(file=out, width=width),
         cast(Any, Untracked()),
         has_constant_baseline=has_constant_baseline,
         adapts=adapts,
     )
     return out.getvalue()
+
+
+def findings(evaluation: Evaluation) -> Findings:
+    """Returns an evaluation as if a job had found it."""
+    made = make_results(pairs=1, frames=5)
+    found = ProtocolResult(evaluation, cast(Any, None), made.curves, None)
+    return Findings(PairSet((), "made up"), made.style, found)
 
 
 def measured(hard_braking: dict[str, int], at_bounds: dict[str, float]) -> Evaluation:
@@ -152,9 +163,10 @@ def test_platoon_and_history_are_written_and_old_ones_go(tmp_path: Path, present
         evaluation = dataclasses.replace(
             evaluation, platoon=make_platoon({"policy": 1}), history=history
         )
-    written = write_further_tables(Output(tmp_path), evaluation)
-    assert written == ([tmp_path / name for name in names] if present else [])
-    assert sorted(path.name for path in tmp_path.iterdir()) == (sorted(names) if present else [])
+    written = write_tables(Output(tmp_path), findings(evaluation))
+    further = {one.about.file for one in written if not one.about.table.always}
+    assert further == {"pair_metrics.parquet", *(names if present else ())}
+    assert {path.name for path in tmp_path.iterdir()} == {one.about.file for one in written}
     if present:
         assert set(pd.read_parquet(tmp_path / "platoon.parquet")) == {
             "method",

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from cfx.contracts.suites import PolicyContract as PolicyContract
     from cfx.contracts.suites import ProtocolContract as ProtocolContract
     from cfx.contracts.suites import SimulatorContract as SimulatorContract
+    from cfx.contracts.suites import TableContract as TableContract
 
 _CHECKS = {
     "dataset": "cfx.contracts.datasets",
@@ -46,6 +47,7 @@ _CHECKS = {
     "learner": "cfx.contracts.learners",
     "protocol": "cfx.contracts.protocols",
     "metric": "cfx.contracts.metrics",
+    "table": "cfx.contracts.tables",
     "command": "cfx.contracts.commands",
 }
 """Where each kind's statements are."""

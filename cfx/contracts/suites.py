@@ -30,6 +30,7 @@ from cfx.contracts import (
     policies,
     protocols,
     simulators,
+    tables,
 )
 from cfx.contracts.contract import Check, Contract, NotApplicable
 from cfx.core.engine.base import Engine
@@ -39,6 +40,7 @@ from cfx.evaluation.protocols.base import Protocol
 from cfx.learners.base import Learner
 from cfx.models.base import DrivingModel
 from cfx.policies.base import Policy
+from cfx.results.table import ResultTable
 from cfx.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -226,6 +228,19 @@ class MetricContract:
     @_statements(metrics.CONTRACT)
     def test_contract(self, check: Check, metric: Metric) -> None:
         hold(check, metric)
+
+
+class TableContract:
+    """What every table of results must hold: each statement of `cfx.contracts.tables` is a test."""
+
+    @pytest.fixture
+    def table(self) -> ResultTable:
+        """Returns the table under test."""
+        raise _undefined(self, "table")
+
+    @_statements(tables.CONTRACT)
+    def test_contract(self, check: Check, table: ResultTable) -> None:
+        hold(check, table)
 
 
 class CommandContract:

@@ -54,8 +54,8 @@ class Kind:
         base: module and class that its components extend.
         smoke_check: module and function that tries a new component for some milliseconds; "" where
             its base class checks what it gives.
-        chosen: a job chooses one of this kind, by a config group; metrics are all measured, and
-            sub-commands are none of a job.
+        chosen: a job chooses one of this kind, by a config group; metrics are all measured, tables
+            are all written, and sub-commands are none of a job.
     """
 
     name: str
@@ -122,6 +122,7 @@ KINDS: dict[str, Kind] = {
             "cfx.contracts.smoke:smoke_check_metric",
             chosen=False,
         ),
+        Kind("table", "table", "cfx.tables", "cfx.results.table:ResultTable", chosen=False),
         Kind("command", "command", "cfx.commands", "cfx.core.command:Command", chosen=False),
     )
 }

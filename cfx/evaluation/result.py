@@ -172,6 +172,7 @@ class Evaluation:
         forecasts: from many moments of each trajectory; None if there were none.
         meanings: what the tuned parameters are, in words; empty if that is not known.
         traffic: of many vehicles that these methods drive; None if none was simulated.
+        tables: further tables of the protocol, by name (`cfx.results.table`).
     """
 
     about: pd.DataFrame
@@ -191,6 +192,7 @@ class Evaluation:
     forecasts: Forecasts | None = None
     meanings: tuple[str, ...] = ()
     traffic: Traffic | None = None
+    tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
 
     @cached_property
     def table(self) -> pd.DataFrame:

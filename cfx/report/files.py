@@ -4,41 +4,16 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
-
 from cfx.core.errors import DataError
 from cfx.core.job_folder import parse_json, parse_yaml
-from cfx.core.memory import in_units, total_memory
+from cfx.results.table import unreadable
 
 T = TypeVar("T")
 
-_CELL_BYTES = 8
-"""At the least."""
-
-TEXT_COLUMNS = frozenset(
-    {
-        "pair_id",
-        "recording",
-        "leader_id",
-        "road",
-        "follower_id",
-        "driver",
-        "method",
-        "network",
-        "base",
-        "amount",
-        "scope",
-        "metric",
-        "parameter",
-    }
-)
-_NAMES = TEXT_COLUMNS | {"cluster", "cluster_name"}
 _FOLDERS = re.compile(r"(?<![\w.~:/-])/(?:[^/\s'\",\]]+/)+")
 _OF_DATABASE = re.compile(r"(sqlite:///)/(?:[^/\s'\",\]]+/)+")
 _PASSWORD = re.compile(r"(://[^/@\s:]*):[^/@\s]+@")
@@ -62,74 +37,6 @@ def read_metrics(path: Path) -> dict[str, float]:
     except (TypeError, ValueError) as error:
         raise DataError(f"{path} is damaged: a metric is no number ({error})") from error
     return values
-
-
-def read_pairs(path: Path, columns: Iterable[str]) -> pd.DataFrame:
-    """Reads `pairs.csv`.
-
-    Raises:
-        DataError: the file cannot be read, or lacks a column or the policy.
-    """
-    table = read_table(path, columns)
-    if not {"policy", "fixed"} & set(table["method"]):
-        raise DataError(f"{path} is damaged: it has no row of the method 'policy' or 'fixed'")
-    return table
-
-
-def read_table(path: Path, columns: Iterable[str]) -> pd.DataFrame:
-    """Reads a table; all columns but names hold numbers.
-
-    Args:
-        path: of a CSV or Parquet file.
-        columns: those that it must have.
-
-    Raises:
-        DataError: the file cannot be read, or holds something else.
-    """
-    table = _load(path)
-    for column in columns:
-        if column not in table:
-            raise DataError(f"{path} is damaged: it has no column '{column}'")
-    for column in table.columns.astype(str):
-        if column in TEXT_COLUMNS:
-            table[column] = table[column].astype(str).astype(object)
-        elif column not in _NAMES:
-            try:
-                table[column] = table[column].astype(float)
-            except (TypeError, ValueError, ArithmeticError) as error:
-                raise DataError(
-                    f"{path} is damaged: column '{column}' holds something else than numbers"
-                    f" ({error})"
-                ) from error
-    return table
-
-
-def _load(path: Path) -> pd.DataFrame:
-    # Most of pyarrow's and pandas' errors are ValueErrors or OSErrors.
-    try:
-        _check_memory(path)
-        if path.suffix == ".parquet":
-            return pd.read_parquet(path)
-        # An id such as "NA" is an id, and "007" is no number.
-        header = pd.read_csv(path, nrows=0)
-        empty = {str(column): ["", "nan"] for column in header if column not in _NAMES}
-        types: Any = dict.fromkeys(TEXT_COLUMNS, str)
-        return pd.read_csv(path, dtype=types, keep_default_na=False, na_values=empty)
-    except (OSError, ValueError, ArithmeticError, pa.ArrowException) as error:
-        raise _unreadable(path, error) from error
-
-
-def _check_memory(path: Path) -> None:
-    """Checks that a table fits the memory: a short file may mean a long table."""
-    needed = float(path.stat().st_size)
-    if path.suffix == ".parquet":
-        found = pq.read_metadata(path)
-        needed = float(found.num_rows) * found.num_columns * _CELL_BYTES
-    if needed > total_memory():
-        raise DataError(
-            f"{path} holds a table of {in_units(needed)}, more than this machine's memory; no job"
-            " writes so much"
-        )
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -163,16 +70,7 @@ def _parsed(path: Path, parse: Callable[[str], Any]) -> Any:
     try:
         return parse(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise _unreadable(path, error) from error
-
-
-def _unreadable(path: Path, error: Exception) -> DataError:
-    reason = type(error).__name__
-    for line in str(error).splitlines():
-        if line.strip():
-            reason = line.strip()
-            break
-    return DataError(f"{path} cannot be read ({reason}); run the job again, or leave it out")
+        raise unreadable(path, error) from error
 
 
 def public(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -33,22 +33,7 @@ class Job:
         config: the resolved configuration.
         data: where the pairs came from, what was left out, what was measured (`data.json`).
         metrics: under their MLflow names; NaN where a metric is not defined.
-        pairs: a row per pair and method; SI units; `cluster` by name.
-        style: a row per driver; None if the job left none.
-        trajectories: the closed loops of the test part, a row per frame; SI units; None if the job
-            left none.
-        curves: the losses by network and epoch; None if the job left none.
-        platoon: `Platoon.table`; None if no platoon was simulated.
-        history: as `Evaluation.history`; None if that was not tried.
-        slices: the loss along each calibrated parameter; None if the job left none.
-        fits: errors of constant parameters on both parts of each trajectory; None if it left none.
-        labels: per-window calibrated parameters; None if the job left none.
-        values: every metric of every pair, method and part of the trajectories (columns pair_id,
-            driver, method, scope, metric, value); None if the job left none.
-        forecasts: as `Forecasts.table`; None if there were none.
-        distributions: scores of sampled forecasts; None if none were sampled.
-        traffic, traffic_growth, traffic_strips: as `roads`, `growth` and `strips` of `Traffic`;
-            None if none was simulated.
+        tables: what its installed tables hold, by name (`cfx.results.table`); `pairs` is there.
         overrides: what was typed; None if that is not known.
         experiment: the preset that was chosen, "" for none; None if that is not known.
         started: when it began; None if that is not known.
@@ -62,21 +47,7 @@ class Job:
     config: Mapping[str, Any]
     data: Mapping[str, Any]
     metrics: Mapping[str, float]
-    pairs: pd.DataFrame
-    style: pd.DataFrame | None
-    trajectories: pd.DataFrame | None
-    curves: pd.DataFrame | None
-    platoon: pd.DataFrame | None = None
-    history: pd.DataFrame | None = None
-    slices: pd.DataFrame | None = None
-    fits: pd.DataFrame | None = None
-    labels: pd.DataFrame | None = None
-    values: pd.DataFrame | None = None
-    forecasts: pd.DataFrame | None = None
-    distributions: pd.DataFrame | None = None
-    traffic: pd.DataFrame | None = None
-    traffic_growth: pd.DataFrame | None = None
-    traffic_strips: pd.DataFrame | None = None
+    tables: Mapping[str, pd.DataFrame]
     overrides: tuple[str, ...] | None = None
     experiment: str | None = None
     started: datetime | None = None
@@ -103,6 +74,11 @@ class Job:
         for key in path.split("."):
             value = value.get(key) if isinstance(value, Mapping) else None
         return value
+
+    @property
+    def pairs(self) -> pd.DataFrame:
+        """A row per pair and method; SI units; `cluster` by name."""
+        return self.tables["pairs"]
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -165,10 +141,10 @@ class Job:
     def _summaries(self) -> dict[tuple[str, str, str], float]:
         """Metrics by name, method and scope, summarised from the values of the pairs."""
         found: dict[tuple[str, str, str], float] = {}
-        if self.values is None:
+        if "pair_metrics" not in self.tables:
             return found
         kinds = {metric.name: metric.summary for metric in self.known_metrics}
-        for key, rows in self.values.groupby(["metric", "method", "scope"]):
+        for key, rows in self.tables["pair_metrics"].groupby(["metric", "method", "scope"]):
             name, method, scope = map(str, key)
             summary = rows["value"].dropna().agg(kinds.get(name, "mean"))
             found[name, method, scope] = float(summary)
@@ -240,14 +216,14 @@ class Job:
     @property
     def parameters(self) -> tuple[ParameterAxis, ...]:
         """The tuned parameters of the trajectories, with what is known of them."""
-        if self.trajectories is None:
+        if "trajectories" not in self.tables:
             return ()
         known = {}
         for one in self.data.get("parameters") or ():
             if isinstance(one, Mapping):
                 known[str(one.get("name"))] = one
         axes = []
-        for name in _parameter_names(self.trajectories, self._simulated):
+        for name in _parameter_names(self.tables["trajectories"], self._simulated):
             about = known.get(name, {})
             low, high = _number(about.get("low")), _number(about.get("high"))
             unit, meaning = str(about.get("unit", "")), str(about.get("meaning", ""))
@@ -261,11 +237,13 @@ class Job:
         from cfx.evaluation.traffic.result import Traffic
 
         forecasts = None
-        if self.forecasts is not None:
-            horizons = tuple(sorted(float(one) for one in self.forecasts["horizon_s"].unique()))
+        table = self.tables.get("forecasts")
+        if table is not None:
+            horizons = tuple(sorted(float(one) for one in table["horizon_s"].unique()))
             leader = str(self.setting("protocol.leader"))
-            forecasts = Forecasts(self.forecasts, horizons, leader, 0, self.distributions)
-        roads, growth, strips = self.traffic, self.traffic_growth, self.traffic_strips
+            forecasts = Forecasts(table, horizons, leader, 0, self.tables.get("distributions"))
+        roads = self.tables.get("traffic")
+        growth, strips = self.tables.get("traffic_growth"), self.tables.get("traffic_strips")
         traffic = None
         if roads is not None and growth is not None and strips is not None:
             real = self.metrics.get(key_of("traffic/wave_speed", RECORDED), math.nan)
@@ -283,15 +261,10 @@ class Job:
             trajectories=self.pair_trajectories,
             improvements={one: self._improvement(one) for one in self.baselines()},
             style=self._style_result,
-            curves=self.curves,
-            platoon=self.platoon,
+            tables=self.tables,
             stable=stable,
-            history=self.history,
             forecasts=forecasts,
             traffic=traffic,
-            slices=self.slices,
-            fits=self.fits,
-            labels=self.labels,
             transient_s=self.transient_s,
         )
 
@@ -305,15 +278,16 @@ class Job:
     @property
     def _style_result(self) -> StyleResult | None:
         """The scores; the weights of the indicators stand in no file."""
-        if self.style is None or not len(self.style):
+        table = self.tables.get("style")
+        if table is None or not len(table):
             return None
         percentiles = self.setting("style.percentiles")
         if not isinstance(percentiles, list):
             percentiles = [25.0, 75.0]
-        scores = self.style["score"].to_numpy(dtype=float)
+        scores = table["score"].to_numpy(dtype=float)
         known = scores[np.isfinite(scores)]
         low, high = np.percentile(known, percentiles) if len(known) else (math.nan, math.nan)
-        return StyleResult(self.style, {}, (float(low), float(high)))
+        return StyleResult(table, {}, (float(low), float(high)))
 
     @property
     def described_parameters(self) -> tuple[ParameterAxis, ...]:
@@ -328,17 +302,17 @@ class Job:
     @cached_property
     def pair_trajectories(self) -> tuple[PairTrajectory, ...]:
         """The test parts of all pairs; empty if the job left none."""
-        if self.trajectories is None:
+        if "trajectories" not in self.tables:
             return ()
         found = []
-        for pair_id, frames in self.trajectories.groupby("pair_id", sort=False):
+        for pair_id, frames in self.tables["trajectories"].groupby("pair_id", sort=False):
             found.append(self._trajectory(str(pair_id), frames))
         return tuple(found)
 
     @property
     def _simulated(self) -> list[str]:
         """The methods that the trajectories hold."""
-        table = self.trajectories
+        table = self.tables.get("trajectories")
         if table is None:
             return []
         return [method for method in self.methods if f"speed_{method}" in table]

@@ -25,6 +25,7 @@ SUITES = {
     "learner": cfx.contracts.LearnerContract,
     "protocol": cfx.contracts.ProtocolContract,
     "metric": cfx.contracts.MetricContract,
+    "table": cfx.contracts.TableContract,
     "command": cfx.contracts.CommandContract,
 }
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -12,19 +12,12 @@ from rich.table import Table
 
 from cfx.app.job.results import JobResult
 from cfx.calibration.flatness import NEAR, flat_for
-from cfx.evaluation.distributions import (
-    LEVEL,
-    centre_errors,
-    sampled_methods,
-    summarize_distributions,
-)
-from cfx.evaluation.forecasts import Forecasts
 from cfx.evaluation.headline import headline
-from cfx.evaluation.metrics.base import RECORDED, MetricInfo, key_of
+from cfx.evaluation.metrics.base import MetricInfo, key_of
 from cfx.evaluation.result import Evaluation
 from cfx.evaluation.statistics import Improvement
-from cfx.evaluation.traffic.result import Traffic
 from cfx.report.figures.words import few_drivers
+from cfx.results.table import Findings, WrittenTable
 from cfx.simulation.trajectory import TRANSIENT_S
 
 if TYPE_CHECKING:
@@ -36,7 +29,8 @@ _SCOPES = {"test": "test part", "full_trajectory": "full trajectories"}
 
 def report(
     result: JobResult,
-    evaluation: Evaluation,
+    findings: Findings,
+    tables: Iterable[WrittenTable],
     console: Console,
     tracker: Tracker,
     *,
@@ -48,13 +42,15 @@ def report(
 
     Args:
         result: of the job.
-        evaluation: what was measured.
+        findings: what was measured.
+        tables: those that the job has written.
         console: where it is printed.
         tracker: says how to open the job's run.
         has_constant_baseline: as `DrivingModel.has_constant_baseline`.
         adapts: as `Policy.adapts`.
         copied_to: URL of the folder's copy; None without.
     """
+    evaluation = findings.evaluation
     console.print(methods_table(evaluation, result.metrics))
     if evaluation.full_trajectory_improvements:
         console.print(methods_table(evaluation, result.metrics, "full_trajectory"))
@@ -73,12 +69,9 @@ def report(
             " with other jobs'."
         )
         console.print(text, soft_wrap=True)
-    if evaluation.forecasts is not None:
-        console.print(forecasts_table(evaluation.forecasts))
-        if evaluation.forecasts.distributions is not None:
-            console.print(distributions_table(evaluation.forecasts))
-    if evaluation.traffic is not None:
-        console.print(traffic_table(evaluation.traffic))
+    for table in tables:
+        for printed in table.about.console(findings, result.metrics):
+            console.print(printed)
     _print_safety(evaluation, result.metrics, console)
     _print_flat(evaluation, console)
     for scope, words in evaluation.outside.items():
@@ -116,91 +109,6 @@ def methods_table(
         cells = []
         for metric, value in zip(shown, values, strict=True):
             cells.append(_cell(metric, value))
-        table.add_row(method, *cells)
-    return table
-
-
-def forecasts_table(forecasts: Forecasts) -> Table:
-    """Returns the RMSE of speed of each method at each horizon: mean over drivers.
-
-    Errors of position and intervals are in `metrics.json` and in the report.
-    """
-    leader = "given"
-    if forecasts.leader != "given":
-        leader = f"predicted at {forecasts.leader.replace('_', ' ')}"
-    drivers = int(forecasts.summary["drivers"].max())
-    title = f"Forecasts of {drivers} drivers, leader {leader}: RMSE of speed (m/s) after"
-    table = Table(title=title, title_justify="left")
-    table.add_column("method")
-    for horizon in forecasts.horizons:
-        table.add_column(f"{horizon:g} s", justify="right")
-    by_method = forecasts.summary.set_index(["method", "horizon_s"])["rmse_speed"]
-    for method in forecasts.methods:
-        cells = []
-        for horizon in forecasts.horizons:
-            value = by_method.get((method, horizon))
-            cells.append("" if value is None else f"{value:.3f}")
-        table.add_row(method, *cells)
-    return table
-
-
-def distributions_table(forecasts: Forecasts) -> Table:
-    """Returns the CRPS of speed of each sampled method at each horizon, and its coverage below.
-
-    The policy's centre, a single path, has its absolute error instead, and no coverage.
-    """
-    assert forecasts.distributions is not None
-    share = f"{100 * LEVEL:.0f} %"
-    title = f"Sampled forecasts: CRPS of speed (m/s), coverage of {share}, after"
-    table = Table(title=title, title_justify="left")
-    table.add_column("method")
-    for horizon in forecasts.horizons:
-        table.add_column(f"{horizon:g} s", justify="right")
-    summary = summarize_distributions(forecasts.distributions).set_index(["method", "horizon_s"])
-    for method in sampled_methods(forecasts.distributions):
-        cells = []
-        for horizon in forecasts.horizons:
-            crps = summary["crps_speed"].get((method, horizon))
-            coverage = summary["coverage"].get((method, horizon))
-            if crps is None or coverage is None:
-                cells.append("")
-            else:
-                cells.append(f"{crps:.3f}\n{100 * coverage:.0f} %")
-        table.add_row(method, *cells)
-    centre = centre_errors(forecasts.table).set_index("horizon_s")["crps_speed"]
-    cells = []
-    for horizon in forecasts.horizons:
-        value = centre.get(horizon)
-        cells.append("" if value is None else f"{value:.3f}")
-    table.add_row("policy's centre", *cells)
-    return table
-
-
-_TRAFFIC = (
-    ("capacity", "capacity", ".0f"),
-    ("error", "flow_error", ".0f"),
-    ("std", "speed_std", ".2f"),
-    ("waves", "wave_speed", ".1f"),
-    ("last", "growth_last", ".2f"),
-    ("half", "growth_half", ".2f"),
-    ("hits", "collisions", ".0f"),
-)
-"""Columns of the table of traffic: heading, metric, format."""
-
-
-def traffic_table(traffic: Traffic) -> Table:
-    """Returns what traffic looks like for each method, and recorded; it fits 80 columns."""
-    title = "Traffic: rings in vehicles/h, m/s and km/h; platoons in m/s; collisions"
-    table = Table(title=title, title_justify="left")
-    table.add_column("method")
-    for heading, _, _ in _TRAFFIC:
-        table.add_column(heading, justify="right")
-    metrics = traffic.metrics()
-    for method in (*traffic.methods, RECORDED):
-        cells = []
-        for _, metric, form in _TRAFFIC:
-            value = metrics.get(f"traffic/{metric}/{method}", math.nan)
-            cells.append(f"{value:{form}}" if math.isfinite(value) else "")
         table.add_row(method, *cells)
     return table
 

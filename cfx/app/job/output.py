@@ -5,40 +5,26 @@ from __future__ import annotations
 import functools
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 import yaml
 
-from cfx.app.job.calibration_view import CalibrationView
 from cfx.core.errors import OutputError
 from cfx.core.files import atomic_write, remove_leftovers
 from cfx.data.pairs import PairSet
-from cfx.data.style.result import StyleResult
 from cfx.data.tidy import write_tidy
 from cfx.evaluation.protocols.base import ProtocolResult
-from cfx.evaluation.result import Evaluation
 from cfx.results.config import JobConfig
 from cfx.results.provenance import commit, version
+from cfx.results.table import Findings, WrittenTable, installed
 from cfx.simulation.trajectory import TRANSIENT_S
 
-TRACKED = (
-    "config.yaml",
-    "metrics.json",
-    "pairs.csv",
-    "pair_metrics.parquet",
-    "style.csv",
-    "data.json",
-    "trajectories.parquet",
-    "curves.parquet",
-)
-"""Files of a job's folder that MLflow keeps too, besides its figures and its policy."""
+TRACKED = ("config.yaml", "metrics.json", "data.json")
+"""Files of a job's folder that MLflow keeps too, besides its tables, figures and policy."""
 
 
 METRICS = "metrics.json"
@@ -156,104 +142,35 @@ def write_config(output: Output, config: JobConfig) -> None:
     output.text("config.yaml", yaml.safe_dump(values, sort_keys=False))
 
 
-def write_tables(
-    output: Output,
-    pairs: PairSet,
-    style: StyleResult,
-    protocol_result: ProtocolResult,
-    view: CalibrationView | None = None,
-) -> list[Path]:
-    """Writes the tables of the results.
+def write_tables(output: Output, findings: Findings) -> list[WrittenTable]:
+    """Writes the tables of the results; those that an earlier job left in the folder go.
 
     Returns:
-        The paths of the tables that only some protocols deliver.
+        Those that this job has.
 
     Raises:
         OutputError: a file cannot be written.
     """
-    evaluation = protocol_result.evaluation
-    curves = typed_curves(protocol_result.curves)
-    output.file("pairs.csv", lambda path: evaluation.table.to_csv(path, index=False))
-    values, trajectories = evaluation.values_tables, evaluation.trajectories_tables
-    output.file("pair_metrics.parquet", lambda path: write_parquet(values(), path))
-    output.file("trajectories.parquet", lambda path: write_parquet(trajectories(), path))
-    output.file("curves.parquet", lambda path: curves.to_parquet(path, index=False))
-    output.file("style.csv", lambda path: style.table.to_csv(path, index=False))
-    if protocol_result.labels is not None:
-        labels = protocol_result.labels.to_frame(pairs, evaluation.names)
-        output.file("labels.parquet", lambda path: labels.to_parquet(path, index=False))
-    if any(pair.truth for pair in pairs):
-        output.file("data.parquet", lambda path: write_tidy(pairs, path))
-    return write_further_tables(output, evaluation, view)
-
-
-def write_parquet(parts: Iterable[pd.DataFrame], path: Path) -> None:
-    """Writes a table, of which there may be more than fits into memory.
-
-    Args:
-        parts: its rows, some after the other; one part at least.
-        path: of the file.
-    """
-    with ExitStack() as opened:
-        writer: pq.ParquetWriter | None = None
-        for part in parts:
-            schema = None if writer is None else writer.schema
-            table = pa.Table.from_pandas(part, schema, preserve_index=False)
-            if writer is None:
-                writer = opened.enter_context(pq.ParquetWriter(path, table.schema))
-            writer.write_table(table)
-
-
-def write_further_tables(
-    output: Output, evaluation: Evaluation, view: CalibrationView | None = None
-) -> list[Path]:
-    """Writes the tables that only some protocols deliver; returns their paths.
-
-    Those that an earlier job left in the folder go.
-    """
-    platoon = None
-    if evaluation.platoon is not None:
-        platoon = evaluation.platoon.table
-    forecasts, distributions = None, None
-    if evaluation.forecasts is not None:
-        forecasts = evaluation.forecasts.table
-        distributions = evaluation.forecasts.distributions
-    tables = {
-        "platoon.parquet": platoon,
-        "history.parquet": evaluation.history,
-        "forecasts.parquet": forecasts,
-        "slices.parquet": None if view is None else view.slices,
-        "fits.parquet": None if view is None else view.fits,
-        "distributions.parquet": distributions,
-    } | _traffic_tables(evaluation)
-    paths = []
-    for name, table in tables.items():
-        path = output.folder / name
-        if table is None:
+    written = []
+    for about in installed():
+        path, parts = output.folder / about.file, about.parts(findings)
+        if parts is None:
             output.run(functools.partial(path.unlink, missing_ok=True))
-        else:
-            output.file(name, functools.partial(table.to_parquet, index=False))
-            paths.append(path)
-    return paths
-
-
-def _traffic_tables(evaluation: Evaluation) -> dict[str, pd.DataFrame | None]:
-    """Returns the tables of simulated traffic by file; None where none was simulated."""
-    traffic = evaluation.traffic
-    tables = {}
-    for name in ("roads", "growth", "strips", "paths"):
-        file = "traffic.parquet" if name == "roads" else f"traffic_{name}.parquet"
-        tables[file] = None if traffic is None else getattr(traffic, name)
-    return tables
+            continue
+        rows = None if about.table.large else pd.concat(list(parts))
+        kept = parts if rows is None else [rows]
+        output.file(about.file, functools.partial(about.write, parts=kept))
+        written.append(WrittenTable(about, rows))
+    if any(pair.truth for pair in findings.pairs):
+        output.file("data.parquet", lambda path: write_tidy(findings.pairs, path))
+    return written
 
 
 def write_figures(
     output: Output,
     config: JobConfig,
-    pairs: PairSet,
-    style: StyleResult,
-    protocol_result: ProtocolResult,
-    view: CalibrationView | None,
+    findings: Findings,
+    tables: Mapping[str, pd.DataFrame],
     *,
     adapts: bool,
 ) -> list[Path]:
@@ -262,10 +179,8 @@ def write_figures(
     Args:
         output: the job's folder.
         config: of the job.
-        pairs: of the job.
-        style: of its drivers.
-        protocol_result: what is drawn.
-        view: slices and fits of the calibration; None without.
+        findings: what is drawn.
+        tables: likewise, by name.
         adapts: as `Policy.adapts`.
 
     Raises:
@@ -276,18 +191,8 @@ def write_figures(
         from cfx.report.figures.results import Results
         from cfx.report.figures.write import write_figures as write_all_figures
 
-        evaluation = protocol_result.evaluation
-        labels = None
-        if view is not None and protocol_result.labels is not None:
-            labels = protocol_result.labels.to_frame(pairs, evaluation.names)
         results = Results.of(
-            evaluation,
-            adapts=adapts,
-            style=style,
-            curves=protocol_result.curves,
-            slices=None if view is None else view.slices,
-            fits=None if view is None else view.fits,
-            labels=labels,
+            findings.evaluation, adapts=adapts, style=findings.style, tables=tables
         )
 
         def write_all() -> None:
@@ -390,10 +295,3 @@ def write_metrics(output: Output, metrics: Mapping[str, float]) -> None:
         else:
             defined[name] = None
     output.json("metrics.json", defined)
-
-
-def typed_curves(curves: pd.DataFrame) -> pd.DataFrame:
-    """Returns learning curves with the same column types whether anything was learned or not."""
-    return curves.astype(
-        {"network": str, "epoch": "int64", "train_loss": float, "validation_loss": float}
-    )

@@ -12,7 +12,7 @@ import torch
 from rich.console import Console
 
 from cfx.app.job import output as files
-from cfx.app.job.calibration_view import CalibrationView, calibration_view
+from cfx.app.job.calibration_view import calibration_view
 from cfx.app.job.console import report
 from cfx.app.job.description import described
 from cfx.app.job.output import Output
@@ -37,6 +37,7 @@ from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolRes
 from cfx.learners.curves import best_losses
 from cfx.policies import checkpoint
 from cfx.results.config import JobConfig
+from cfx.results.table import Findings, WrittenTable
 
 if TYPE_CHECKING:
     from cfx.results.tracker import Tracker
@@ -106,14 +107,22 @@ def take_steps(
         if view is not None:
             evaluation = protocol_result.evaluation.with_slices(view.slices)
             protocol_result = replace(protocol_result, evaluation=evaluation)
-        result = _keep(config, parts, output, pairs, style, protocol_result, view, tracker)
+        findings = Findings(
+            pairs,
+            style,
+            protocol_result,
+            slices=None if view is None else view.slices,
+            fits=None if view is None else view.fits,
+        )
+        result, tables = _keep(config, parts, output, findings, tracker)
         if upload is not None:
             upload.finish()
             tracker.set_tags({"cfx.output_url": upload.url})
             log.info("The job's folder was copied to %s", upload.url)
     report(
         result,
-        protocol_result.evaluation,
+        findings,
+        tables,
         console,
         tracker,
         has_constant_baseline=parts.model.has_constant_baseline,
@@ -206,16 +215,10 @@ def _run_protocol(protocol: Protocol, context: ProtocolContext) -> ProtocolResul
 
 
 def _keep(
-    config: JobConfig,
-    parts: Parts,
-    output: Output,
-    pairs: PairSet,
-    style: StyleResult,
-    protocol_result: ProtocolResult,
-    view: CalibrationView | None,
-    tracker: Tracker,
-) -> JobResult:
+    config: JobConfig, parts: Parts, output: Output, findings: Findings, tracker: Tracker
+) -> tuple[JobResult, list[WrittenTable]]:
     """Writes everything into the folder, then into MLflow."""
+    pairs, protocol_result = findings.pairs, findings.protocol_result
     evaluation = protocol_result.evaluation
     of_training: dict[str, float] = {}
     if protocol_result.labels is not None:
@@ -224,21 +227,16 @@ def _keep(
     of_training |= protocol_result.calibration
     for name, share in flat_for(evaluation.table, evaluation.names).items():
         of_training[f"flat/{name}"] = share
-    metrics = evaluation.metrics() | of_training
 
     output.replace(config)
     policy_folder = output.folder / "policy"
-    further = files.write_tables(output, pairs, style, protocol_result, view)
+    tables = files.write_tables(output, findings)
+    for table in tables:
+        of_training |= table.about.metrics(findings)
+    metrics = evaluation.metrics() | of_training
     output.run(lambda: checkpoint.save(protocol_result.policy, policy_folder))
-    figures = files.write_figures(
-        output,
-        config,
-        pairs,
-        style,
-        protocol_result,
-        view,
-        adapts=parts.policy.adapts,
-    )
+    rows = {table.about.name: table.rows for table in tables if table.rows is not None}
+    figures = files.write_figures(output, config, findings, rows, adapts=parts.policy.adapts)
     demo = files.write_demo(output, config, pairs, protocol_result)
     files.write_provenance(
         output,
@@ -258,9 +256,12 @@ def _keep(
     tracker.log_curves(protocol_result.curves)
     tracker.log_figures(figures)
     tracker.log_policy(policy_folder, pairs)
-    tracked = [output.folder / name for name in files.TRACKED]
-    tracker.log_files(tracked + further + demo)
-    return JobResult(
+    tracked = [*files.TRACKED]
+    for table in tables:
+        if table.about.table.tracked:
+            tracked.append(table.about.file)
+    tracker.log_files([output.folder / name for name in tracked] + demo)
+    result = JobResult(
         metrics,
         evaluation.table,
         protocol_result.policy,
@@ -268,5 +269,6 @@ def _keep(
         output.folder,
         tracker.run_id,
         evaluation,
-        style,
+        findings.style,
     )
+    return result, tables

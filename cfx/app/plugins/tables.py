@@ -55,12 +55,7 @@ def show(kind: str, name: str) -> None:
     entry = registry.entry(kind, name)
     cls: Any = registry.get(kind, name)
     group = registry.kind_of(kind).group
-    chosen = f"Choose it with {group}={name}."
-    if entry.kind == "command":
-        chosen = f"Run it with cfx {name}; cfx {name} --help says what it takes."
-    elif not registry.kind_of(kind).chosen:
-        chosen = f"Every job measures it; with {group}={name} no others but those that a job needs."
-    print(f"{entry}\n{entry.location}\n{chosen}\n")
+    print(f"{entry}\n{entry.location}\n{_use(entry, cls)}\n")
     if cls.deprecated:
         print(f"Deprecated: {cls.deprecated}\n")
     print(f"{inspect.getdoc(cls) or '(its class has no docstring)'}\n")
@@ -68,10 +63,9 @@ def show(kind: str, name: str) -> None:
         print(f"{line}\n")
     if entry.kind == "objective":
         print(f"Unit: {cls.unit or 'none'}\n")
-    if entry.kind == "model":
-        put(_parameters(cls))
-    if entry.kind == "metric":
-        put(_metric(cls))
+    about = {"model": _parameters, "metric": _metric, "table": _columns}.get(entry.kind)
+    if about is not None:
+        put(about(cls))
     title = f"Settings (set with {group}.SETTING=VALUE)"
     settings = blank_table("setting", "default", "values", "meaning", title=title)
     settings.columns[0].no_wrap = True
@@ -82,6 +76,18 @@ def show(kind: str, name: str) -> None:
         put(settings)
     else:
         print("It has no settings.")
+
+
+def _use(entry: registry.Entry, cls: Any) -> str:
+    """Returns how a component comes into a job."""
+    name, group = entry.name, registry.kind_of(entry.kind).group
+    if entry.kind == "command":
+        return f"Run it with cfx {name}; cfx {name} --help says what it takes."
+    if entry.kind == "table":
+        return f"Every job that has rows of it writes {name}{cls.suffix}."
+    if entry.kind == "metric":
+        return f"Every job measures it; with {group}={name} no others but those that a job needs."
+    return f"Choose it with {group}={name}."
 
 
 def _reference(cls: type[Component]) -> Iterator[str]:
@@ -100,6 +106,15 @@ def _metric(cls: Any) -> Table:
     rows = blank_table("heading", "unit", "better", "over pairs", "scopes", "meaning")
     scopes = ", ".join(cls.scopes)
     rows.add_row(cls.heading, cls.unit, cls.direction, cls.summary, scopes, cls.meaning)
+    return rows
+
+
+def _columns(cls: Any) -> Table:
+    """Returns the columns of a table of results."""
+    rows = blank_table("column", "unit", "type", "meaning", title="Columns")
+    rows.columns[0].no_wrap = True
+    for column in cls.columns:
+        rows.add_row(column.name, column.unit, column.dtype, column.meaning)
     return rows
 
 

@@ -141,6 +141,7 @@ class History(JobFigure):
 
     def draw(self, results: Results) -> Figure | None:
         """Draws it where the history was varied."""
-        if results.history is None:
+        table = results.tables.get("history")
+        if table is None:
             return None
-        return draw_history(history_curves(results.history), amounts_of(results.history))
+        return draw_history(history_curves(table), amounts_of(table))

@@ -290,9 +290,10 @@ class Slices(JobFigure):
 
     def draw(self, results: Results) -> Figure | None:
         """Draws it where the loss was examined."""
-        if results.slices is None:
+        table = results.tables.get("slices")
+        if table is None:
             return None
-        panels = slice_panels(results.slices, results.parameters)
+        panels = slice_panels(table, results.parameters)
         return draw_slices(panels) if panels else None
 
 
@@ -309,7 +310,8 @@ class FitTrainTest(JobFigure):
 
     def draw(self, results: Results) -> Figure | None:
         """Draws it where errors on both parts are known."""
-        found = {} if results.fits is None else fits_of(results.fits)
+        table = results.tables.get("fits")
+        found = {} if table is None else fits_of(table)
         return draw_fits(found) if found else None
 
 
@@ -326,7 +328,8 @@ class LabelsOverTime(JobFigure):
 
     def draw(self, results: Results) -> Figure | None:
         """Draws it where windows were calibrated."""
-        if results.labels is None:
+        table = results.tables.get("labels")
+        if table is None:
             return None
-        drivers = labels_of(results.labels, results.pairs, results.parameters)
+        drivers = labels_of(table, results.pairs, results.parameters)
         return draw_labels(drivers[len(drivers) // 2], results.parameters) if drivers else None

@@ -124,6 +124,7 @@ class LearningCurve(JobFigure):
 
     def draw(self, results: Results) -> Figure | None:
         """Draws it where something was learned."""
-        if results.curves is None or not len(results.curves):
+        table = results.tables.get("curves")
+        if table is None or not len(table):
             return None
-        return draw_learning(results.curves)
+        return draw_learning(table)

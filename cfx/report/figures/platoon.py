@@ -167,10 +167,11 @@ class PlatoonSpeeds(JobFigure):
 
     def draw(self, results: Results) -> Figure | None:
         """Draws it where platoons were simulated."""
-        if results.platoon is None:
+        table = results.tables.get("platoon")
+        if table is None:
             return None
-        present = set(results.platoon["method"])
+        present = set(table["method"])
         methods = [method for method in results.methods if method in present]
         if not methods:
             return None
-        return draw_platoons(results.platoon, methods, results.stable)
+        return draw_platoons(table, methods, results.stable)

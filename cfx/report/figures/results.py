@@ -54,15 +54,11 @@ class Results:
         trajectories: test parts of all pairs; empty if none are known.
         improvements: of the policy by baseline; empty if it does not adapt.
         style: of the drivers; None if it is not known. Without weights these are not known.
-        curves: losses by network and epoch; None or empty if nothing was learned.
-        platoon: as `Platoon.table`; None if none was simulated.
+        tables: what the job has written, by name (`cfx.results.table`): of `curves`, `platoon`,
+            `history`, `slices`, `fits`, `labels` and those of plugins, what there is.
         stable: by method the share of its platoons that are string stable.
-        history: as `Evaluation.history`; None if that was not tried.
         forecasts: None if there were none.
         traffic: None if none was simulated.
-        slices: the loss along each calibrated parameter; None if that is not known.
-        fits: errors of constant parameters on both parts of each trajectory; None likewise.
-        labels: per-window calibrated parameters; None if there are none.
         transient_s: length of the transient at the beginning of the test part, s.
     """
 
@@ -72,15 +68,10 @@ class Results:
     trajectories: Sequence[PairTrajectory] = ()
     improvements: Mapping[str, Improvement] = field(default_factory=dict)
     style: StyleResult | None = None
-    curves: pd.DataFrame | None = None
-    platoon: pd.DataFrame | None = None
+    tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
     stable: Mapping[str, float] = field(default_factory=dict)
-    history: pd.DataFrame | None = None
     forecasts: Forecasts | None = None
     traffic: Traffic | None = None
-    slices: pd.DataFrame | None = None
-    fits: pd.DataFrame | None = None
-    labels: pd.DataFrame | None = None
     transient_s: float = TRANSIENT_S
 
     @classmethod
@@ -90,17 +81,15 @@ class Results:
         *,
         adapts: bool = True,
         style: StyleResult | None = None,
-        curves: pd.DataFrame | None = None,
-        slices: pd.DataFrame | None = None,
-        fits: pd.DataFrame | None = None,
-        labels: pd.DataFrame | None = None,
+        tables: Mapping[str, pd.DataFrame] | None = None,
     ) -> Results:
-        """Returns the results of an evaluation and what else a job has found.
+        """Returns the results of an evaluation and of the tables that a job has made.
 
         Args:
             evaluation: of the job.
             adapts: as `Policy.adapts`; if it does not, the policy is no method of its own.
-            style, curves, slices, fits, labels: as in the attributes.
+            style: as in the attributes.
+            tables: what the job has written, by name.
         """
         shown = evaluation if adapts else evaluation.constant_methods()
         stable: dict[str, float] = {}
@@ -114,13 +103,8 @@ class Results:
             trajectories=evaluation.trajectories,
             improvements=evaluation.improvements if adapts else {},
             style=style,
-            curves=curves,
-            platoon=None if evaluation.platoon is None else evaluation.platoon.table,
+            tables=tables or {},
             stable=stable,
-            history=evaluation.history,
             forecasts=evaluation.forecasts,
             traffic=evaluation.traffic,
-            slices=slices,
-            fits=fits,
-            labels=labels,
         )

@@ -53,9 +53,9 @@ def _beyond(jobs: Sequence[Job]) -> list[Block]:
         if figure is not None:
             found += [Text(caption(name)), figure]
     for job in jobs:
-        results = job.results
-        if results.labels is not None:
-            drivers = labels_of(results.labels, results.pairs, results.parameters)
+        results, labels = job.results, job.tables.get("labels")
+        if labels is not None:
+            drivers = labels_of(labels, results.pairs, results.parameters)
             if drivers:
                 views = {}
                 for driver in drivers:
@@ -68,9 +68,9 @@ def _beyond(jobs: Sequence[Job]) -> list[Block]:
 
 def slices_of(job: Job) -> tuple[SlicePanel, ...]:
     """Returns the loss along each tuned parameter of a job; () if it has kept none."""
-    if job.slices is None:
+    if "slices" not in job.tables:
         return ()
-    return slice_panels(job.slices, job.described_parameters)
+    return slice_panels(job.tables["slices"], job.described_parameters)
 
 
 def spreads_of(job: Job) -> tuple[ParameterSpread, ...]:

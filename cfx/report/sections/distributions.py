@@ -39,10 +39,11 @@ class DistributionsSection(Section):
         found: list[Block] = []
         methods: dict[str, None] = {}
         for job in runs.jobs:
-            if job.distributions is not None and job.forecasts is not None:
-                shown = _job_blocks(job, job.distributions, job.forecasts)
+            table = job.tables.get("distributions")
+            if table is not None and "forecasts" in job.tables:
+                shown = _job_blocks(job, table, job.tables["forecasts"])
                 found.append(job_fold(job.name, shown, first=not found))
-                methods |= dict.fromkeys(_shown(job.distributions))
+                methods |= dict.fromkeys(_shown(table))
         if not found:
             return []
         return [

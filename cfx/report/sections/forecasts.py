@@ -40,9 +40,10 @@ class ForecastsSection(Section):
         cards: list[Block] = []
         methods: dict[str, None] = {}
         for job in runs.jobs:
-            if job.forecasts is not None:
-                cards.append(Group(tuple(_job_blocks(job, job.forecasts)), "card"))
-                methods |= dict.fromkeys(forecast_methods(job.forecasts))
+            table = job.tables.get("forecasts")
+            if table is not None:
+                cards.append(Group(tuple(_job_blocks(job, table)), "card"))
+                methods |= dict.fromkeys(forecast_methods(table))
         if not cards:
             return []
         return [

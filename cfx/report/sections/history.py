@@ -23,7 +23,7 @@ class HistorySection(Section):
 
     def blocks(self, runs: Runs) -> list[Block]:
         """Return a plot for each job that varied the history, and a table."""
-        jobs = [job for job in runs.jobs if job.history is not None]
+        jobs = [job for job in runs.jobs if "history" in job.tables]
         if not jobs:
             return []
         groups = []
@@ -57,9 +57,9 @@ def histories(jobs: Sequence[Job]) -> Sheet:
     )
     rows: list[tuple[Cell, ...]] = []
     for job in jobs:
-        if job.history is None:
+        if "history" not in job.tables:
             continue
-        for curve in history_curves(job.history):
+        for curve in history_curves(job.tables["history"]):
             for k, amount in enumerate(curve.amounts):
                 rows.append(
                     (

@@ -30,12 +30,13 @@ class LearningSection(Section):
         """Return a plot for each job that learned something."""
         groups, without = [], []
         for job in runs.jobs:
-            if job.curves is None:
+            table = job.tables.get("curves")
+            if table is None:
                 continue
-            if not len(job.curves):
+            if not len(table):
                 without.append(job.name)
                 continue
-            networks = int(job.curves["network"].nunique())
+            networks = int(table["network"].nunique())
             heading = Heading(job.name, f"({plural(networks, 'network')})")
             figure = figure_of(_NAME, job)
             if figure is not None:

@@ -23,7 +23,7 @@ class StyleSection(Section):
         """Return a figure for each scoring of the drivers, with the jobs it holds for."""
         jobs: dict[str, list[Job]] = {}
         for job in runs.jobs:
-            if job.style is not None and len(job.style):
+            if len(job.tables.get("style", ())):
                 jobs.setdefault(_scoring(job), []).append(job)
         cards = []
         for together in jobs.values():
@@ -37,6 +37,5 @@ class StyleSection(Section):
 
 
 def _scoring(job: Job) -> str:
-    assert job.style is not None
-    table = job.style[["driver", "score", "cluster"]].to_csv()
+    table = job.tables["style"][["driver", "score", "cluster"]].to_csv()
     return hashlib.sha256(table.encode()).hexdigest()

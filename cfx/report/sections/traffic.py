@@ -82,9 +82,10 @@ class TrafficSection(Section):
         found: list[Block] = []
         methods: dict[str, None] = {}
         for job in runs.jobs:
-            if job.traffic is not None:
-                found.append(job_fold(job.name, _job_blocks(job, job.traffic), first=not found))
-                methods |= dict.fromkeys(traffic_methods(job.traffic))
+            table = job.tables.get("traffic")
+            if table is not None:
+                found.append(job_fold(job.name, _job_blocks(job, table), first=not found))
+                methods |= dict.fromkeys(traffic_methods(table))
         if not found:
             return []
         return [Text(_INTRODUCTION), Text(f"Methods: {methods_explained(methods)}"), *found]

@@ -37,7 +37,7 @@ class TrajectoriesSection(Section):
 
     def blocks(self, runs: Runs) -> list[Block]:
         """Return the chosen pairs of each job."""
-        jobs = [job for job in runs.jobs if job.trajectories is not None]
+        jobs = [job for job in runs.jobs if "trajectories" in job.tables]
         constant = calibrations(jobs)
         chosen = [_BOUNDS]
         if constant:

@@ -12,9 +12,9 @@ import pytest
 from rich.console import Console
 
 import cfx
-from cfx.app.job.console import forecasts_table
 from cfx.core.errors import CfxError
 from cfx.evaluation.forecasts import FORECAST_METHODS
+from cfx.results.tables import forecasts_table
 from tests.evaluation.protocols.test_across_drivers import QUICK
 
 FORECAST = [

@@ -12,7 +12,6 @@ import pytest
 from rich.console import Console
 
 import cfx
-from cfx.app.job.console import traffic_table
 from cfx.core.errors import CfxError
 from cfx.evaluation.traffic.result import (
     GROWTH_COLUMNS,
@@ -21,6 +20,7 @@ from cfx.evaluation.traffic.result import (
     STRIP_COLUMNS,
     TRAFFIC_METHODS,
 )
+from cfx.results.traffic_tables import traffic_table
 from tests.evaluation.protocols.test_across_drivers import QUICK
 
 TRAFFIC = [
@@ -85,7 +85,7 @@ def test_traffic_stands_in_every_table(result: cfx.JobResult) -> None:
     assert result.evaluation is not None
     assert result.evaluation.traffic is not None
     console = Console(file=io.StringIO(), width=80)
-    console.print(traffic_table(result.evaluation.traffic))
+    console.print(traffic_table(result.evaluation.traffic.methods, result.metrics))
     assert isinstance(console.file, io.StringIO)
     shown = console.file.getvalue()
     assert f"{capacity:.0f}" in shown

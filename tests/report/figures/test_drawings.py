@@ -40,7 +40,9 @@ def texts(figure: Figure) -> str:
 
 
 def all_of(made: MadeUp, *, adapts: bool = True) -> Results:
-    return Results.of(made.evaluation, adapts=adapts, style=made.style, curves=made.curves)
+    return Results.of(
+        made.evaluation, adapts=adapts, style=made.style, tables={"curves": made.curves}
+    )
 
 
 def drawn(name: str, results: Results) -> Figure:
@@ -50,7 +52,7 @@ def drawn(name: str, results: Results) -> Figure:
 
 
 def learned(curves: pd.DataFrame) -> Results:
-    return dataclasses.replace(all_of(make_results(pairs=1, frames=5)), curves=curves)
+    return dataclasses.replace(all_of(make_results(pairs=1, frames=5)), tables={"curves": curves})
 
 
 def with_improvement(results: MadeUp, gains: dict[int, float]) -> Evaluation:
@@ -217,7 +219,7 @@ def test_names_are_text_and_never_formulas(tmp_path: Path) -> None:
         values=results.evaluation.values.assign(pair_id=name),
         trajectories=(dataclasses.replace(results.evaluation.trajectories[0], pair_id=name),),
     )
-    odd = Results.of(evaluation, style=results.style, curves=results.curves)
+    odd = Results.of(evaluation, style=results.style, tables={"curves": results.curves})
     assert len(write_figures(tmp_path, odd)) == 8
 
 
@@ -300,7 +302,7 @@ def test_each_method_has_its_own_speed_plot() -> None:
 def test_a_panel_per_method_shows_the_worst_platoon() -> None:
     platoon = make_platoon({"default": 1, "policy": 3})
     evaluation = dataclasses.replace(make_results(pairs=1, frames=5).evaluation, platoon=platoon)
-    found = drawn("platoon", Results.of(evaluation))
+    found = drawn("platoon", Results.of(evaluation, tables={"platoon": platoon.table}))
     found.canvas.draw()
     default, policy = found.axes
     assert "string stable" in default.get_title(loc="left")
@@ -326,7 +328,7 @@ def test_history_is_drawn_from_least_to_most_with_its_intervals() -> None:
     )
     assert amounts_of(short) == ["0 s", "10 s", "80 %"]
     made = all_of(make_results(pairs=1, frames=5))
-    (axes,) = drawn("history", dataclasses.replace(made, history=history)).axes
+    (axes,) = drawn("history", dataclasses.replace(made, tables={"history": history})).axes
     own, population = axes.containers
     assert list(own.lines[0].get_ydata()) == pytest.approx([-0.1, 0.1, 0.2])
     assert list(population.lines[0].get_ydata()) == pytest.approx([0.05])
@@ -337,10 +339,10 @@ def test_history_is_drawn_from_least_to_most_with_its_intervals() -> None:
 def test_platoon_and_history_are_written_where_a_protocol_delivered_them(tmp_path: Path) -> None:
     results = make_results(pairs=3, frames=20)
     history = make_history(results.evaluation.trajectories, GAINS)
-    further = dataclasses.replace(
-        results.evaluation, platoon=make_platoon({"policy": 2}), history=history
-    )
-    every = Results.of(further, style=results.style, curves=results.curves)
+    platoon = make_platoon({"policy": 2})
+    further = dataclasses.replace(results.evaluation, platoon=platoon)
+    tables = {"curves": results.curves, "platoon": platoon.table, "history": history}
+    every = Results.of(further, style=results.style, tables=tables)
     names = {path.name for path in write_figures(tmp_path, every)}
     assert {"platoon.png", "history.png"} <= names
     assert len(names) == 10

@@ -47,7 +47,7 @@ def everything() -> Results:
         forecasts=forecasts,
         traffic=make_traffic(),
     )
-    results = Results.of(evaluation, style=made.style, curves=made.curves)
+    results = Results.of(evaluation, style=made.style, tables={"curves": made.curves})
     ids, axis = evaluation.table["pair_id"].unique(), results.parameters[0]
     slices = pd.DataFrame(
         [(ids[0], axis.name, place, place, 1 + place, 1.0) for place in (0.0, 0.5, 1.0)],
@@ -55,12 +55,16 @@ def everything() -> Results:
     )
     fits = pd.DataFrame({"pair_id": ids, "method": "fixed"})
     labels = pd.DataFrame({"pair_id": ids[0], "time_s": [0.0, 0.5], "sensitivity": [0.1, 0.2]})
-    return dataclasses.replace(
-        results,
-        slices=slices,
-        fits=fits.assign(train_rmse_speed=0.3, test_rmse_speed=0.4),
-        labels=labels.assign(**{f"parameter_{axis.name}": 1.0}),
-    )
+    assert evaluation.platoon is not None
+    assert evaluation.history is not None
+    tables = {
+        "platoon": evaluation.platoon.table,
+        "history": evaluation.history,
+        "slices": slices,
+        "fits": fits.assign(train_rmse_speed=0.3, test_rmse_speed=0.4),
+        "labels": labels.assign(**{f"parameter_{axis.name}": 1.0}),
+    }
+    return dataclasses.replace(results, tables={**results.tables, **tables})
 
 
 @pytest.mark.parametrize("one", JobFigure.installed(), ids=lambda one: one.name)

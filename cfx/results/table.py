@@ -1,0 +1,345 @@
+"""What a table of a job's results is, which are installed, and how they are written and read.
+
+A table is a class of its own: which columns it has, what its rows are made of, which metrics and
+which lines of the console summarise it. A distribution brings one by an entry point, whose name
+becomes that of its file:
+
+    [project.entry-points."cfx.tables"]
+    lane_changes = "my_package.tables:LaneChanges"
+
+Jobs write every installed table into their folder and into MLflow; `cfx.load` and reports read it
+back. A figure of reports takes it from `Results.tables`.
+"""
+
+from __future__ import annotations
+
+import logging
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, cast
+
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from cfx.core import registry
+from cfx.core.component import Component
+from cfx.core.errors import DataError, PluginError
+from cfx.core.memory import in_units, total_memory
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from cfx.data.pairs import PairSet
+    from cfx.data.style.result import StyleResult
+    from cfx.evaluation.protocols.base import ProtocolResult
+    from cfx.evaluation.result import Evaluation
+
+log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+_CELL_BYTES = 8
+"""At the least."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table.
+
+    Attributes:
+        name: its heading. In a name such as `speed_METHOD` the capitals stand for something: there
+            is a column for each, and none must be there.
+        unit: "" for texts, "1" for numbers without a unit.
+        meaning: what it says, in a few words.
+        dtype: how it is written; a table that is read back has floats for all numbers.
+        required: a file without it is damaged.
+    """
+
+    name: str
+    unit: str
+    meaning: str
+    dtype: Literal["text", "float", "int", "bool"] = "float"
+    required: bool = True
+
+    @property
+    def stands_for_several(self) -> bool:
+        """Whether there is a column for each of something."""
+        return any(part.isupper() and len(part) > 1 for part in self.name.split("_"))
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What a job has found, of which its tables are made.
+
+    Attributes:
+        pairs: of the job.
+        style: of its drivers.
+        protocol_result: what the protocol has delivered.
+        slices: the loss along each calibrated parameter; None if nothing was calibrated per driver.
+        fits: errors of constant parameters on both parts of each trajectory; None likewise.
+    """
+
+    pairs: PairSet
+    style: StyleResult
+    protocol_result: ProtocolResult
+    slices: pd.DataFrame | None = None
+    fits: pd.DataFrame | None = None
+
+    @property
+    def evaluation(self) -> Evaluation:
+        """What was measured."""
+        return self.protocol_result.evaluation
+
+
+class ResultTable(Component):
+    """Base of every table of results.
+
+    Life cycle: a job makes every installed table and calls `rows` once, before anything is drawn or
+    logged; then `metrics`, and at its end `console`. Those that a job has no rows of are not asked
+    any further.
+
+    Attributes:
+        meaning: what a row is, in a few words; the list of files in the documentation says it.
+        columns: of the table.
+        suffix: of its file, `.parquet` or `.csv`.
+        order: its place among the tables of a job; smaller numbers come first.
+        always: every job leaves it, whatever its protocol; a report says where it is missing.
+        tracked: MLflow keeps it too.
+        large: a job that writes it keeps it nowhere else: it may be more than fits into memory, and
+            figures do not see it.
+    """
+
+    kind = "table"
+    meaning: ClassVar[str]
+    columns: ClassVar[tuple[Column, ...]]
+    suffix: ClassVar[Literal[".parquet", ".csv"]] = ".parquet"
+    order: ClassVar[int] = 1000
+    always: ClassVar[bool] = False
+    tracked: ClassVar[bool] = True
+    large: ClassVar[bool] = False
+
+    @abstractmethod
+    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
+        """Returns the rows of the table, in one part or in several that follow one another.
+
+        A table that its protocol has delivered under its name is
+        `[findings.evaluation.tables.get(NAME)]`.
+
+        Returns:
+            Nothing, or None alone, where the job has found nothing of it.
+        """
+
+    def metrics(self, findings: Findings) -> Mapping[str, float]:
+        """Returns metrics for `metrics.json` and MLflow; NaN where one is not defined."""
+        return {}
+
+    def console(self, findings: Findings, metrics: Mapping[str, float]) -> Iterable[RenderableType]:
+        """Returns what the job prints about it at its end; it fits 80 columns.
+
+        Args:
+            findings: of the job.
+            metrics: all of the job.
+        """
+        return ()
+
+
+@dataclass(frozen=True)
+class InstalledTable:
+    """A table, and who brings it.
+
+    Attributes:
+        name: of its file without the suffix, and in `Results.tables`.
+        table: what it is.
+        distribution: who brings it.
+    """
+
+    name: str
+    table: ResultTable
+    distribution: str
+
+    @property
+    def file(self) -> str:
+        """The name of its file."""
+        return self.name + self.table.suffix
+
+    def parts(self, findings: Findings) -> Iterator[pd.DataFrame] | None:
+        """Returns its rows, some after the other; None where the job has none.
+
+        Raises:
+            PluginError: the rows lack a column that is declared.
+        """
+        rows = (part for part in self.table.rows(findings) if part is not None)
+        first = self._left_out_if_broken(lambda: self._checked(next(rows, None)), None)
+        return None if first is None else chain([first], rows)
+
+    def metrics(self, findings: Findings) -> Mapping[str, float]:
+        """Returns its metrics."""
+        return self._left_out_if_broken(lambda: self.table.metrics(findings), {})
+
+    def console(
+        self, findings: Findings, metrics: Mapping[str, float]
+    ) -> tuple[RenderableType, ...]:
+        """Returns what the job prints about it."""
+        return self._left_out_if_broken(lambda: tuple(self.table.console(findings, metrics)), ())
+
+    def write(self, path: Path, parts: Iterable[pd.DataFrame]) -> None:
+        """Writes its parts, one after the other.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        if self.table.suffix == ".csv":
+            pd.concat(list(parts)).to_csv(path, index=False)
+            return
+        with ExitStack() as opened:
+            writer: pq.ParquetWriter | None = None
+            for part in parts:
+                schema = None if writer is None else writer.schema
+                rows = pa.Table.from_pandas(part, schema, preserve_index=False)
+                if writer is None:
+                    writer = opened.enter_context(pq.ParquetWriter(path, rows.schema))
+                writer.write_table(rows)
+
+    def read(self, path: Path) -> pd.DataFrame:
+        """Reads it back: its texts as texts, all other columns as floats.
+
+        Raises:
+            DataError: the file cannot be read, or holds something else.
+        """
+        texts = [column.name for column in self.table.columns if column.dtype == "text"]
+        table = _load(path, texts)
+        for column in self.table.columns:
+            if column.required and not column.stands_for_several and column.name not in table:
+                raise DataError(f"{path} is damaged: it has no column '{column.name}'")
+        for name in table.columns.astype(str):
+            if name in texts:
+                table[name] = table[name].astype(str).astype(object)
+                continue
+            try:
+                table[name] = table[name].astype(float)
+            except (TypeError, ValueError, ArithmeticError) as error:
+                raise DataError(
+                    f"{path} is damaged: column '{name}' holds something else than numbers"
+                    f" ({error})"
+                ) from error
+        return table
+
+    def _checked(self, rows: pd.DataFrame | None) -> pd.DataFrame | None:
+        if rows is None:
+            return None
+        for column in self.table.columns:
+            if column.required and not column.stands_for_several and column.name not in rows:
+                raise PluginError(f"it declares the column '{column.name}', its rows have none")
+        return rows
+
+    def _left_out_if_broken(self, work: Callable[[], T], without: T) -> T:
+        """Returns what `work` gives; of another distribution's that fails, a warning and `without`.
+
+        The job has its results.
+        """
+        try:
+            return work()
+        except Exception as error:
+            if self.distribution == registry.OWN:
+                raise
+            log.warning(
+                "table %s of the distribution %s is left out: %s; repair or uninstall it",
+                self.name,
+                self.distribution,
+                registry.in_words(error),
+            )
+            return without
+
+
+@dataclass(frozen=True)
+class WrittenTable:
+    """A table that a job has written.
+
+    Attributes:
+        about: what it is.
+        rows: its rows; None if it is `large`.
+    """
+
+    about: InstalledTable
+    rows: pd.DataFrame | None
+
+
+def installed() -> tuple[InstalledTable, ...]:
+    """Returns all tables in their order.
+
+    One of another distribution that cannot be imported is left out with a warning.
+    """
+    found = []
+    for entry in registry.entries("table"):
+        if registry.rivals(entry):
+            continue
+        try:
+            table = cast(ResultTable, registry.create("table", {"name": entry.name}))
+        except PluginError as error:
+            if entry.distribution == registry.OWN:
+                raise
+            log.warning(
+                "table %s of the distribution %s is left out: %s",
+                entry.name,
+                entry.distribution,
+                error,
+            )
+            continue
+        found.append(InstalledTable(entry.name, table, entry.distribution))
+    return tuple(sorted(found, key=lambda one: (one.table.order, one.name)))
+
+
+def read_tables(folder: Path) -> dict[str, pd.DataFrame]:
+    """Reads the tables of a finished job's folder, by name; those that are not there are left out.
+
+    Raises:
+        DataError: a file cannot be read, or is not what a job writes.
+    """
+    found = {}
+    for one in installed():
+        if (folder / one.file).exists():
+            found[one.name] = one.read(folder / one.file)
+    return found
+
+
+def _load(path: Path, texts: list[str]) -> pd.DataFrame:
+    # Most of pyarrow's and pandas' errors are ValueErrors or OSErrors.
+    try:
+        _check_memory(path)
+        if path.suffix == ".parquet":
+            return pd.read_parquet(path)
+        # An id such as "NA" is an id, and "007" is no number.
+        header = pd.read_csv(path, nrows=0)
+        empty = {str(column): ["", "nan"] for column in header if str(column) not in texts}
+        types: Any = dict.fromkeys(texts, str)
+        return pd.read_csv(path, dtype=types, keep_default_na=False, na_values=empty)
+    except (OSError, ValueError, ArithmeticError, pa.ArrowException) as error:
+        raise unreadable(path, error) from error
+
+
+def _check_memory(path: Path) -> None:
+    """Checks that a table fits the memory: a short file may mean a long table."""
+    needed = float(path.stat().st_size)
+    if path.suffix == ".parquet":
+        found = pq.read_metadata(path)
+        needed = float(found.num_rows) * found.num_columns * _CELL_BYTES
+    if needed > total_memory():
+        raise DataError(
+            f"{path} holds a table of {in_units(needed)}, more than this machine's memory; no job"
+            " writes so much"
+        )
+
+
+def unreadable(path: Path, error: Exception) -> DataError:
+    """Returns the error that a file of a job cannot be read, with the first line of the reason."""
+    reason = type(error).__name__
+    for line in str(error).splitlines():
+        if line.strip():
+            reason = line.strip()
+            break
+    return DataError(f"{path} cannot be read ({reason}); run the job again, or leave it out")

@@ -1,0 +1,380 @@
+"""The tables of results that cfx's own protocols deliver."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import pandas as pd
+from rich.table import Table
+
+from cfx.results.table import Column, Findings, ResultTable
+
+if TYPE_CHECKING:
+    from cfx.evaluation.forecasts import Forecasts
+
+PAIR = Column("pair_id", "", "the pair of leader and follower", "text")
+DRIVER = Column("driver", "", "the follower of the pair", "text")
+METHOD = Column("method", "", "what chose the parameters", "text")
+TIME = Column("time_s", "s", "time since the start of the pair")
+
+
+class Pairs(ResultTable):
+    """A row per pair and method: the metrics of the test part and beyond, and the parameters."""
+
+    meaning = "a row per pair and method"
+    suffix = ".csv"
+    order = 10
+    always = True
+    columns = (
+        PAIR,
+        Column("recording", "", "the recording that the pair is of", "text", required=False),
+        Column("leader_id", "", "the leader, as the recording names it", "text", required=False),
+        Column("follower_id", "", "the follower, likewise", "text", required=False),
+        DRIVER,
+        Column("cluster", "", "the cluster of the driver's style, by name", "text"),
+        Column("style_score", "1", "the driver's style", required=False),
+        Column("fold", "1", "which fold tested the driver", "int", required=False),
+        METHOD,
+        Column("frames", "1", "frames that count", "int"),
+        Column("rmse_speed", "m/s", "RMSE of speed on the test part"),
+        Column("rmse_gap", "m", "RMSE of the gap on the test part"),
+        Column("collisions", "1", "1 if the gap became negative", "int"),
+        Column("METRIC", "as of the metric", "another metric of the test part"),
+        Column("improvement", "1", "improvement of the RMSE of speed over `fixed`"),
+        Column("improvement_over_METHOD", "1", "the same over another method"),
+        Column("steady_METRIC", "as of the metric", "a metric after the transient"),
+        Column("full_trajectory_METRIC", "as of the metric", "a metric of the full trajectory"),
+        Column("real_METRIC", "as of the metric", "a metric of the recorded driver"),
+        Column("parameter_NAME", "as of the parameter", "mean of a parameter over the frames"),
+        Column(
+            "flat_NAME",
+            "1",
+            "of the method `fixed`: on which share of the parameter's range the loss is within 5 %"
+            " of its best; 1: the recording does not determine it",
+        ),
+        Column("forecast_METRIC", "as of the metric", "an error of the pair's forecasts"),
+    )
+
+    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
+        return [findings.evaluation.table]
+
+
+class PairMetrics(ResultTable):
+    """Every metric of every pair, method and part of the trajectories."""
+
+    meaning = "a row per pair, method, scope and metric: what the tables are made from"
+    order = 20
+    large = True
+    columns = (
+        PAIR,
+        Column("driver", "", "the follower of the pair", "text", required=False),
+        Column("method", "", "what drove; `real` is the recorded driver", "text"),
+        Column("scope", "", "the part of the trajectory", "text"),
+        Column("metric", "", "the name of the metric", "text"),
+        Column("value", "as of the metric", "NaN where it is not defined"),
+    )
+
+    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
+        return findings.evaluation.values_tables()
+
+
+class Trajectories(ResultTable):
+    """What each method simulated on the test part, a row per frame.
+
+    A pair's first row is the last measured state before the simulation takes over.
+    """
+
+    meaning = "what each method simulated"
+    order = 30
+    always = True
+    large = True
+    columns = (
+        PAIR,
+        TIME,
+        Column("leader_speed", "m/s", "measured"),
+        Column("real_speed", "m/s", "measured, of the follower"),
+        Column("real_gap", "m", "measured"),
+        Column("speed_METHOD", "m/s", "simulated, of the follower"),
+        Column("gap_METHOD", "m", "simulated"),
+        Column("NAME_METHOD", "as of the parameter", "a tuned parameter that held at the frame"),
+    )
+
+    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
+        return findings.evaluation.trajectories_tables()
+
+
+class Curves(ResultTable):
+    """Learning curves; without rows where nothing was learned."""
+
+    meaning = (
+        "learning curves; of heads that draw also of how many sampled paths the CRPS is in an"
+        " epoch's training loss"
+    )
+    order = 40
+    always = True
+    columns = (
+        Column("network", "", "which of the networks", "text"),
+        Column("epoch", "1", "from 0", "int"),
+        Column("train_loss", "as of the loss", "mean over the training windows"),
+        Column("validation_loss", "as of the loss", "mean over the validation windows"),
+        Column("sampled_paths", "1", "paths per window in the CRPS", "int", required=False),
+    )
+
+    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
+        # The same types whether anything was learned or not.
+        curves = findings.protocol_result.curves
+        return [
+            curves.astype(
+                {"network": str, "epoch": "int64", "train_loss": float, "validation_loss": float}
+            )
+        ]
+
+
+class Style(ResultTable):
+    """Driving style, a row per driver."""
+
+    meaning = "driving style, a row per driver"
+    suffix = ".csv"
+    order = 50
+    always = True
+    columns = (
+        DRIVER,
+        Column("score", "1", "weighted sum of the indicators; large is aggressive"),
+        Column("cluster", "1", "0, 1 or 2: conservative, normal, aggressive", "int"),
+        Column("cluster_name", "", "the cluster by name", "text", required=False),
+        Column("mean_speed", "m/s", "an indicator", required=False),
+        Column("variance_speed", "m2/s2", "an indicator", required=False),
+        Column("mean_acceleration", "m/s2", "an indicator", required=False),
+        Column("variance_acceleration", "m2/s4", "an indicator", required=False),
+        Column("mean_space_headway", "m", "an indicator", required=False),
+        Column("mean_time_headway", "s", "an indicator", required=False),
+        Column("frames", "1", "frames of the driver", "int", required=False),
+        Column("standing_frames", "1", "frames in which the driver stands", "int", required=False),
+    )
+
+    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
+        return [findings.style.table]
+
+
+class Labels(ResultTable):
+    """Parameters that were calibrated window by window, for a learner that imitates them."""
+
+    meaning = "per-window calibrated parameters (labels), with their loss and sensitivity"
+    order = 60
+    tracked = False
+    columns = (
+        PAIR,
+        Column("window", "1", "number of the window, from 0", "int", required=False),
+        Column("time_s", "s", "start of the window, since the start of the pair"),
+        Column("parameter_NAME", "as of the parameter", "what was calibrated"),
+        Column("loss", "as of the objective", "the loss with these parameters"),
+        Column("sensitivity", "as of the objective", "by how much the choice changes the loss"),
+        Column("diverged", "1", "whether the simulation diverged", "bool", required=False),
+    )
+
+    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
+        labels = findings.protocol_result.labels
+        if labels is not None:
+            yield labels.to_frame(findings.pairs, findings.evaluation.names)
+
+
+class Platoon(ResultTable):
+    """Followers in a row behind a leader that brakes, a row per method, network and frame."""
+
+    meaning = "ten such followers in a row behind a leader that brakes"
+    order = 100
+    columns = (
+        METHOD,
+        Column("network", "", "which network or parameter set chooses the parameters", "text"),
+        Column("vehicle", "1", "0 is the leader", "int"),
+        Column("time_s", "s", "since the start"),
+        Column("speed", "m/s", "simulated"),
+        Column("gap", "m", "simulated; NaN for the leader"),
+    )
+
+    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
+        platoon = findings.evaluation.platoon
+        return [None if platoon is None else platoon.table]
+
+
+class History(ResultTable):
+    """What the policy gains from its burn-in, a row per pair, base and amount of history."""
+
+    meaning = "the improvement for different lengths of known history"
+    order = 110
+    columns = (
+        PAIR,
+        DRIVER,
+        Column("base", "", "what the policy's answers are offsets from", "text"),
+        Column("history_s", "s", "measured history before the test part that it has seen"),
+        Column("amount", "", "the same in words, `10 s` or `80 %`", "text"),
+        Column("rmse_speed", "m/s", "RMSE of speed on the test part"),
+        Column("rmse_gap", "m", "RMSE of the gap on the test part"),
+        Column("improvement", "1", "over the driver's own fixed parameters"),
+    )
+
+    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
+        return [findings.evaluation.history]
+
+
+class ForecastErrors(ResultTable):
+    """The error of every single forecast, a row per origin, method and horizon."""
+
+    meaning = "the error of every single forecast (`protocol=forecast`)"
+    order = 120
+    columns = (
+        PAIR,
+        DRIVER,
+        METHOD,
+        Column("history_s", "s", "measured history up to the origin"),
+        Column("horizon_s", "s", "time after the origin"),
+        Column("speed_error", "m/s", "simulated minus measured, at the horizon"),
+        Column("position_error", "m", "likewise"),
+        Column("ade", "m", "absolute error of position, mean over the way to the horizon"),
+    )
+
+    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
+        forecasts = findings.evaluation.forecasts
+        return [None if forecasts is None else forecasts.table]
+
+    def console(self, findings: Findings, metrics: Mapping[str, float]) -> Iterable[Table]:
+        assert findings.evaluation.forecasts is not None
+        return [forecasts_table(findings.evaluation.forecasts)]
+
+
+class Distributions(ResultTable):
+    """Scores of sampled forecasts, a row per origin, method and horizon."""
+
+    meaning = "scores of sampled forecasts, a row per origin (`protocol.samples`)"
+    order = 130
+    columns = (
+        PAIR,
+        DRIVER,
+        METHOD,
+        Column("horizon_s", "s", "time after the origin"),
+        Column("crps_speed", "m/s", "CRPS of speed at the horizon"),
+        Column("crps_gap", "m", "CRPS of the gap at the horizon"),
+        Column("energy_speed", "m/s", "energy score of the path of speeds, per point"),
+        Column("coverage", "1", "1 if the speed lies in the central 90 % of the sampled ones"),
+        Column("min_ade", "m", "absolute error of position, the best of six paths"),
+        Column("pit", "1", "share of sampled speeds below the one that happened"),
+        Column("likelihood_speed", "1", "of the whole path up to the horizon"),
+        Column("likelihood_gap", "1", "likewise"),
+        Column("likelihood_acceleration", "1", "likewise"),
+        Column("likelihood_jerk", "1", "likewise"),
+        Column("likelihood_time_to_collision", "1", "likewise"),
+    )
+
+    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
+        forecasts = findings.evaluation.forecasts
+        return [None if forecasts is None else forecasts.distributions]
+
+    def console(self, findings: Findings, metrics: Mapping[str, float]) -> Iterable[Table]:
+        assert findings.evaluation.forecasts is not None
+        return [distributions_table(findings.evaluation.forecasts)]
+
+
+class Slices(ResultTable):
+    """The loss along each calibrated parameter, the others held."""
+
+    meaning = (
+        "the loss when one calibrated parameter is moved from bound to bound and the others are"
+        " held"
+    )
+    order = 200
+    columns = (
+        PAIR,
+        Column("parameter", "", "which is moved", "text"),
+        Column("place", "1", "0 at the lower bound, 1 at the upper, as it is calibrated"),
+        Column("value", "as of the parameter", "the parameter there"),
+        Column("loss", "as of the objective", "the loss there, without the prior"),
+        Column("best_loss", "as of the objective", "the loss with the calibrated parameters"),
+    )
+
+    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
+        return [findings.slices]
+
+
+class Fits(ResultTable):
+    """Errors of constant parameters, a row per pair and method."""
+
+    meaning = (
+        "errors of constant parameters on the part that was calibrated on, and on the test part"
+    )
+    order = 210
+    columns = (
+        PAIR,
+        Column("driver", "", "the follower of the pair", "text", required=False),
+        METHOD,
+        Column("train_rmse_speed", "m/s", "on the part that was calibrated on"),
+        Column("test_rmse_speed", "m/s", "on the test part"),
+        Column("train_rmse_gap", "m", "on the part that was calibrated on", required=False),
+        Column("test_rmse_gap", "m", "on the test part", required=False),
+    )
+
+    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
+        return [findings.fits]
+
+
+def forecasts_table(forecasts: Forecasts) -> Table:
+    """Return the RMSE of speed of each method at each horizon: mean over drivers.
+
+    Errors of position and intervals are in `metrics.json` and in the report.
+    """
+    leader = "given"
+    if forecasts.leader != "given":
+        leader = f"predicted at {forecasts.leader.replace('_', ' ')}"
+    drivers = int(forecasts.summary["drivers"].max())
+    title = f"Forecasts of {drivers} drivers, leader {leader}: RMSE of speed (m/s) after"
+    table = _by_horizon(title, forecasts.horizons)
+    by_method = forecasts.summary.set_index(["method", "horizon_s"])["rmse_speed"]
+    for method in forecasts.methods:
+        errors = [by_method.get((method, horizon)) for horizon in forecasts.horizons]
+        table.add_row(method, *_cells(errors))
+    return table
+
+
+def distributions_table(forecasts: Forecasts) -> Table:
+    """Return the CRPS of speed of each sampled method at each horizon, and its coverage below.
+
+    The policy's centre, a single path, has its absolute error instead, and no coverage.
+    """
+    from cfx.evaluation.distributions import (
+        LEVEL,
+        centre_errors,
+        sampled_methods,
+        summarize_distributions,
+    )
+
+    assert forecasts.distributions is not None
+    share = f"{100 * LEVEL:.0f} %"
+    title = f"Sampled forecasts: CRPS of speed (m/s), coverage of {share}, after"
+    table = _by_horizon(title, forecasts.horizons)
+    summary = summarize_distributions(forecasts.distributions).set_index(["method", "horizon_s"])
+    for method in sampled_methods(forecasts.distributions):
+        cells = []
+        for horizon in forecasts.horizons:
+            crps = summary["crps_speed"].get((method, horizon))
+            coverage = summary["coverage"].get((method, horizon))
+            if crps is None or coverage is None:
+                cells.append("")
+            else:
+                cells.append(f"{crps:.3f}\n{100 * coverage:.0f} %")
+        table.add_row(method, *cells)
+    centre = centre_errors(forecasts.table).set_index("horizon_s")["crps_speed"]
+    errors = [centre.get(horizon) for horizon in forecasts.horizons]
+    table.add_row("policy's centre", *_cells(errors))
+    return table
+
+
+def _by_horizon(title: str, horizons: Sequence[float]) -> Table:
+    table = Table(title=title, title_justify="left")
+    table.add_column("method")
+    for horizon in horizons:
+        table.add_column(f"{horizon:g} s", justify="right")
+    return table
+
+
+def _cells(values: Iterable[float | None]) -> list[str]:
+    return ["" if value is None else f"{value:.3f}" for value in values]

@@ -1,0 +1,138 @@
+"""The tables of simulated traffic."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+
+import pandas as pd
+from rich.table import Table
+
+from cfx.results.table import Column, Findings, ResultTable
+
+METHOD = Column("method", "", "what drives", "text")
+
+
+class Roads(ResultTable):
+    """What was measured on each simulated road, a row per method and road.
+
+    Density, flow and speed are Edie's, of a whole ring, or of the stretch upstream of the
+    bottleneck.
+    """
+
+    meaning = "simulated roads (`protocol=traffic`)"
+    order = 140
+    columns = (
+        METHOD,
+        Column("road", "", "the kind of road", "text"),
+        Column(
+            "level",
+            "as of the road",
+            "vehicles/km of a ring, vehicles/h that enter an open road, m/s of a platoon's leader",
+        ),
+        Column("repetition", "1", "from 0", "int"),
+        Column("density", "vehicles/km", "Edie's"),
+        Column("flow", "vehicles/h", "Edie's"),
+        Column("speed", "m/s", "Edie's"),
+        Column("speed_std", "m/s", "of all vehicles' speeds over time"),
+        Column("wave_speed", "km/h", "of waves, from vehicle to vehicle"),
+        Column("ring_wave_speed", "km/h", "of waves, of the ring as a whole"),
+        Column("coherence", "1", "of the ring's waves"),
+        Column("discharge", "vehicles/h", "flow downstream of the bottleneck"),
+        Column("min_gap", "m", "the smallest gap"),
+        Column("collisions", "1", "vehicles whose gap was negative", "int"),
+        Column("outside", "1", "share of windows outside what the policy has learned from"),
+    )
+
+    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
+        traffic = findings.evaluation.traffic
+        return [None if traffic is None else traffic.roads]
+
+    def console(self, findings: Findings, metrics: Mapping[str, float]) -> Iterable[Table]:
+        assert findings.evaluation.traffic is not None
+        return [traffic_table(findings.evaluation.traffic.methods, metrics)]
+
+
+class Growth(ResultTable):
+    """How much the speeds in a platoon vary, a row per method, leader's speed and vehicle."""
+
+    meaning = "what grows along platoons (`protocol=traffic`)"
+    order = 150
+    columns = (
+        METHOD,
+        Column("leader_speed", "m/s", "of the platoon's leader"),
+        Column("vehicle", "1", "0 is the leader", "int"),
+        Column(
+            "speed_std",
+            "m/s",
+            "standard deviation of the vehicle's speed over time, the root of its mean square over"
+            " the repetitions",
+        ),
+    )
+
+    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
+        traffic = findings.evaluation.traffic
+        return [None if traffic is None else traffic.growth]
+
+
+class Strips(ResultTable):
+    """Flow and density of pairs of vehicles in strips of time."""
+
+    meaning = "flow and density of pairs of vehicles (`protocol=traffic`)"
+    order = 160
+    columns = (
+        Column("method", "", "what drives; `real` was recorded", "text"),
+        Column("density", "vehicles/km", "Edie's, of the strip"),
+        Column("flow", "vehicles/h", "Edie's, of the strip"),
+        Column("speed_std", "m/s", "standard deviation of the speeds in the strip"),
+    )
+
+    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
+        traffic = findings.evaluation.traffic
+        return [None if traffic is None else traffic.strips]
+
+
+class Paths(ResultTable):
+    """The vehicles of one ring per method."""
+
+    meaning = "the vehicles of one ring (`protocol=traffic`)"
+    order = 170
+    columns = (
+        METHOD,
+        Column("vehicle", "1", "number of the vehicle", "int"),
+        Column("time_s", "s", "since the start"),
+        Column("place", "m", "from 0 to the ring's circumference"),
+        Column("speed", "m/s", "simulated"),
+    )
+
+    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
+        traffic = findings.evaluation.traffic
+        return [None if traffic is None else traffic.paths]
+
+
+_SHOWN = (
+    ("capacity", "capacity", ".0f"),
+    ("error", "flow_error", ".0f"),
+    ("std", "speed_std", ".2f"),
+    ("waves", "wave_speed", ".1f"),
+    ("last", "growth_last", ".2f"),
+    ("half", "growth_half", ".2f"),
+    ("hits", "collisions", ".0f"),
+)
+"""Columns of the printed table: heading, metric, format."""
+
+
+def traffic_table(methods: Iterable[str], metrics: Mapping[str, float]) -> Table:
+    """Return what traffic looks like for each method, and recorded; it fits 80 columns."""
+    title = "Traffic: rings in vehicles/h, m/s and km/h; platoons in m/s; collisions"
+    table = Table(title=title, title_justify="left")
+    table.add_column("method")
+    for heading, _, _ in _SHOWN:
+        table.add_column(heading, justify="right")
+    for method in (*methods, "real"):
+        cells = []
+        for _, metric, form in _SHOWN:
+            value = metrics.get(f"traffic/{metric}/{method}", math.nan)
+            cells.append(f"{value:{form}}" if math.isfinite(value) else "")
+        table.add_row(method, *cells)
+    return table
