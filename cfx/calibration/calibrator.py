@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -30,7 +30,6 @@ from cfx.calibration.shards import (
     PooledShard,
     Solver,
     WindowShard,
-    solve_shard,
 )
 from cfx.calibration.windows import Windows, WindowSettings
 from cfx.core import scratch
@@ -332,10 +331,10 @@ class Calibrator:
         means = dict.fromkeys(self.reported, 0.0)
         for part in torch.split(torch.arange(len(pair), device=device), size):
             own = pair[part]
-            segments = self._segments(batch, own, last[own])
-            frames = segments.simulate(unit[part], gap=True)
+            losses = self._segments(batch, own, last[own])
+            frames = losses.simulated(losses.parameters(unit[part]), gap=True)
             for name, objective in self.reported.items():
-                loss = objective(frames, segments.counted[..., None])
+                loss = objective(frames, losses.segments.counted[..., None])
                 means[name] += float(loss.sum()) / len(pair)
             scratch.release()
         return means
@@ -409,29 +408,13 @@ class Calibrator:
             while wanted:
                 with self.cache.claim(work.sizes(wanted), enough) as claimed:
                     mine = {name: wanted.pop(name) for name in claimed}
-                    self._solve(work.groups(mine, task), shard, work, task)
+                    parts = work.parts(mine, task)
+                    shards = (shard(*part) for part in parts)
+                    solved = self.engine.map(CalibrationShard.solve, shards, task.advance)
+                    with closing(solved) as results:
+                        for number, entries in results:
+                            work.keep(parts[number][0], entries)
         return work.results()
-
-    def _solve(
-        self,
-        groups: list[_Group],
-        shard: Callable[[Tensor, Tensor], CalibrationShard],
-        work: _Work,
-        task: Task,
-    ) -> None:
-        """Has the engine solve groups of entries; each result is kept as soon as it is there."""
-        parts = []
-        for group in groups:
-            parts += group.parts
-
-        def shards() -> Iterator[CalibrationShard]:
-            for group in groups:
-                for part in group.parts:
-                    yield shard(torch.tensor(part), torch.tensor(group.entries))
-
-        with closing(self.engine.map(solve_shard, shards(), task.advance)) as results:
-            for number, entries in results:
-                work.keep(parts[number], entries)
 
     def _solver_for(self, steps: int) -> Solver:
         """Returns the solver of a group of problems, for any part of it.
@@ -461,13 +444,6 @@ class Calibrator:
 
     def _key(self, what: str, pair: str, **details: Any) -> str:
         return content_key({"what": what, "pair": pair, **self._scope, **details})
-
-
-class _Group(NamedTuple):
-    """Entries that belong together, and the parts that are solved one by one."""
-
-    entries: list[int]
-    parts: list[list[int]]
 
 
 class _Work:
@@ -505,13 +481,13 @@ class _Work:
             sizes[name] = self._size(indices)
         return sizes
 
-    def groups(self, shares: dict[str, list[int]], task: Task) -> list[_Group]:
-        """Returns what is left of claimed shares: entries that are solved together.
+    def parts(self, shares: dict[str, list[int]], task: Task) -> list[tuple[Tensor, Tensor]]:
+        """Returns what is left of claimed shares: entries to solve, with the group they belong to.
 
         Another process may have solved some before the claim. Shares are put together as an engine
         claims them that solves one group after the other, so that every engine has the same groups.
         """
-        groups = []
+        parts = []
         for names in first_fit(self.sizes(shares), _GROUP):
             indices: list[int] = []
             for name in names:
@@ -522,13 +498,13 @@ class _Work:
             left = self._missing(indices)
             task.advance(self.evaluations * (self._size(indices) - self._size(left)))
             for group in _runs(left, self._problems, _GROUP):
-                parts = list(_runs(group, self._problems, self._together))
-                groups.append(_Group(group, parts))
-        return groups
+                for part in _runs(group, self._problems, self._together):
+                    parts.append((torch.tensor(part), torch.tensor(group)))
+        return parts
 
-    def keep(self, group: list[int], entries: list[Arrays]) -> None:
+    def keep(self, part: Tensor, entries: list[Arrays]) -> None:
         """Keeps what was solved."""
-        for index, entry in zip(group, entries, strict=True):
+        for index, entry in zip(part.tolist(), entries, strict=True):
             self._cache.put(self._keys[index], entry)
             self._entries[index] = entry
 

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from cfx.calibration.objectives.base import FrameValues, Objective
+from cfx.calibration.prior import Prior
 from cfx.data.pairs import PairBatch
 from cfx.models.base import Leader
 from cfx.simulation.base import Stepper
 from cfx.simulation.kernel.keys import ComponentKey
 from cfx.simulation.trajectory import Segments, Start, common_shape
-
-_NOT_BATCHED = ("simulator", "objective")
-"""Fields of `SegmentLosses` that all its segments share."""
 
 
 @dataclass(frozen=True)
@@ -29,28 +26,14 @@ class SegmentLosses:
     Attributes:
         simulator: the model and its time step.
         objective: compares the simulated segment with the measured one.
-        leader_position, leader_speed, leader_acceleration: frames 0 to K - 1, `(K, P)`.
-        leader_length: `(P,)`, m.
-        start_position, start_speed, start_acceleration: measured follower at frame 0, `(P,)`.
-        leader_rear: position of the leader's rear bumper at frames 1 to K, `(K, P)`, m.
-        measured_speed: follower at frames 1 to K, `(K, P)`, m/s.
-        measured_gap: bumper to bumper at frames 1 to K, `(K, P)`, m.
-        counted: frames that count, `(K, P)`, 1 or 0.
+        segments: what was measured, K steps of P segments.
+        prior: added to the losses of candidates in unit space; None: none.
     """
 
     simulator: Stepper
     objective: Objective
-    leader_position: Tensor
-    leader_speed: Tensor
-    leader_acceleration: Tensor
-    leader_length: Tensor
-    start_position: Tensor
-    start_speed: Tensor
-    start_acceleration: Tensor
-    leader_rear: Tensor
-    measured_speed: Tensor
-    measured_gap: Tensor
-    counted: Tensor
+    segments: Segments
+    prior: Prior | None = None
 
     @classmethod
     def of_segments(
@@ -76,36 +59,35 @@ class SegmentLosses:
         now = (first + k).clamp(max=batch.mask.shape[1] - 1)
         after = (now + 1).clamp(max=batch.mask.shape[1] - 1)
         leader_rear = batch.leader_position[pair, after] - batch.leader_length[pair]
-        return cls(
-            simulator=simulator,
-            objective=objective,
+        segments = Segments(
             leader_position=batch.leader_position[pair, now],
             leader_speed=batch.leader_speed[pair, now],
             leader_acceleration=batch.leader_acceleration[pair, now],
-            leader_length=batch.leader_length[pair],
-            start_position=batch.follower_position[pair, first],
-            start_speed=batch.follower_speed[pair, first],
-            start_acceleration=batch.follower_acceleration[pair, first],
             leader_rear=leader_rear,
             measured_speed=batch.follower_speed[pair, after],
             measured_gap=leader_rear - batch.follower_position[pair, after],
             counted=(k < steps).to(batch.follower_speed.dtype),
+            leader_length=batch.leader_length[pair],
+            position=batch.follower_position[pair, first],
+            speed=batch.follower_speed[pair, first],
+            acceleration=batch.follower_acceleration[pair, first],
         )
+        return cls(simulator, objective, segments)
 
     @property
     def problems(self) -> int:
         """P."""
-        return len(self.leader_length)
+        return len(self.segments.leader_length)
 
     @property
     def device(self) -> torch.device:
         """Where the tensors lie."""
-        return self.leader_length.device
+        return self.segments.leader_length.device
 
     @property
     def steps(self) -> int:
         """K."""
-        return len(self.measured_speed)
+        return len(self.segments.measured_speed)
 
     @property
     def bytes_per_candidate(self) -> int:
@@ -122,14 +104,17 @@ class SegmentLosses:
             values = 6 * self.steps + 32
         else:
             values = 4 * self.steps + 32
-        return values * self.measured_speed.element_size()
+        of_prior = 0 if self.prior is None else self.prior.bytes_per_candidate
+        return values * self.segments.measured_speed.element_size() + of_prior
 
     @property
     def accumulates(self) -> bool:
         """Whether losses come from a compiled kernel, given enough work, without trajectories."""
         space = self.simulator.model.space
-        p = self._parameters(space.to_unit(space.defaults()).to(self.counted.device)[None, None])
-        return self.simulator.accumulates(p, self._terms, self._terms_key)
+        defaults = space.to_unit(space.defaults()).to(self.device)
+        return self.simulator.accumulates(
+            self.parameters(defaults[None, None]), self._terms, self._terms_key
+        )
 
     def for_work(self, candidates: int) -> SegmentLosses:
         """Returns the same losses, for a number of candidates of each problem in all calls."""
@@ -145,11 +130,9 @@ class SegmentLosses:
         return self._cut(problems)
 
     def _cut(self, which: slice | Tensor) -> SegmentLosses:
-        parts: dict[str, Any] = {}
-        for field in fields(self):
-            if field.name not in _NOT_BATCHED:
-                parts[field.name] = getattr(self, field.name)[..., which]
-        return replace(self, **parts)
+        segments = Segments(*(values[..., which] for values in self.segments))
+        prior = None if self.prior is None else self.prior.cut(which)
+        return replace(self, segments=segments, prior=prior)
 
     @torch.no_grad()
     def __call__(self, candidates: Tensor) -> Tensor:
@@ -157,35 +140,49 @@ class SegmentLosses:
         # Candidates that all problems share, an expanded view, are converted once.
         if candidates.stride(0) == 0:
             candidates = candidates[:1]
-        return self.with_parameters(self._parameters(candidates))
+        losses = self.with_parameters(self.parameters(candidates))
+        if self.prior is None:
+            return losses
+        return losses + self.prior.penalty(candidates)
 
     @torch.no_grad()
     def with_parameters(self, p: Mapping[str, Tensor]) -> Tensor:
-        """Returns losses `(P, q)`, in the objective's unit.
+        """Returns losses `(P, q)` without the prior, in the objective's unit.
 
         Args:
             p: one tensor per parameter, in SI units, `()` or broadcasting to `(P, q)`.
         """
-        sums = self.simulator.accumulate(self._segments(), p, self._terms, self._terms_key)
+        counted = self.segments.counted
+        sums = self.simulator.accumulate(self.segments, p, self._terms, self._terms_key)
         if sums is not None:
-            count = self.counted.sum(0).clamp(min=1)[:, None]
-            return self.objective.finish(sums, count)
-        frames = self._simulated(p, gap="gap" in self.objective.signals)
-        return self.objective(frames, self.counted[..., None])
+            return self.objective.finish(sums, counted.sum(0).clamp(min=1)[:, None])
+        frames = self.simulated(p, gap="gap" in self.objective.signals)
+        return self.objective(frames, counted[..., None])
 
-    def _segments(self) -> Segments:
-        return Segments(
-            leader_position=self.leader_position,
-            leader_speed=self.leader_speed,
-            leader_acceleration=self.leader_acceleration,
-            leader_rear=self.leader_rear,
-            measured_speed=self.measured_speed,
-            measured_gap=self.measured_gap,
-            counted=self.counted,
-            leader_length=self.leader_length,
-            position=self.start_position,
-            speed=self.start_speed,
-            acceleration=self.start_acceleration,
+    def simulated(self, p: Mapping[str, Tensor], *, gap: bool) -> FrameValues:
+        """Returns frames 1 to K: simulated signals `(K, P, q)` and measured ones `(K, P, 1)`.
+
+        Args:
+            p: as for `with_parameters`.
+            gap: compute the simulated gap; without, it is NaN.
+        """
+        s = self.segments
+        shape = common_shape([(self.problems, 1), *[value.shape for value in p.values()]])
+        start = [value[:, None].expand(shape) for value in (s.position, s.speed, s.acceleration)]
+        leader = (s.leader_position, s.leader_speed, s.leader_acceleration, s.leader_length)
+        follower = self.simulator.begin(Start(*start))
+        _, position, speed = self.simulator.advance(
+            follower, Leader(*(value[..., None] for value in leader)), p
+        )
+        simulated_gap = speed.new_tensor(torch.nan)
+        if gap:
+            simulated_gap = s.leader_rear[..., None] - position
+        return FrameValues(
+            speed=speed,
+            gap=simulated_gap,
+            measured_speed=s.measured_speed[..., None],
+            measured_gap=s.measured_gap[..., None],
+            dt=self.simulator.dt,
         )
 
     def _terms(
@@ -198,53 +195,14 @@ class SegmentLosses:
     def _terms_key(self) -> ComponentKey:
         return ComponentKey(type(self.objective), self.objective.settings.model_dump_json())
 
-    def simulate(self, candidates: Tensor, *, gap: bool) -> FrameValues:
-        """Returns frames 1 to K: simulated signals `(K, P, q)` and measured ones `(K, P, 1)`.
-
-        Args:
-            candidates: `(P, q, n)` in unit space.
-            gap: compute the simulated gap; without, it is NaN.
-        """
-        return self._simulated(self._parameters(candidates), gap=gap)
-
-    def _simulated(self, p: Mapping[str, Tensor], *, gap: bool) -> FrameValues:
-        """As `simulate`, of parameters by name."""
-        shape = common_shape([(self.problems, 1), *[value.shape for value in p.values()]])
-        follower = self.simulator.begin(self._start(shape))
-        _, position, speed = self.simulator.advance(follower, self._leader(), p)
-        simulated_gap = speed.new_tensor(torch.nan)
-        if gap:
-            simulated_gap = self.leader_rear[..., None] - position
-        return FrameValues(
-            speed=speed,
-            gap=simulated_gap,
-            measured_speed=self.measured_speed[..., None],
-            measured_gap=self.measured_gap[..., None],
-            dt=self.simulator.dt,
-        )
-
-    def _parameters(self, candidates: Tensor) -> dict[str, Tensor]:
+    def parameters(self, candidates: Tensor) -> dict[str, Tensor]:
+        """Returns candidates `(P, q, n)` in unit space as one tensor per parameter, SI units."""
         space = self.simulator.model.space
-        values = space.from_unit(candidates.to(self.measured_speed.dtype))
+        values = space.from_unit(candidates.to(self.segments.measured_speed.dtype))
         parameters = {}
         for name, value in space.unpack(values).items():
             parameters[name] = value.contiguous()
         return parameters
-
-    def _start(self, shape: torch.Size) -> Start:
-        return Start(
-            self.start_position[:, None].expand(shape),
-            self.start_speed[:, None].expand(shape),
-            self.start_acceleration[:, None].expand(shape),
-        )
-
-    def _leader(self) -> Leader:
-        return Leader(
-            self.leader_position[..., None],
-            self.leader_speed[..., None],
-            self.leader_acceleration[..., None],
-            self.leader_length[..., None],
-        )
 
 
 @dataclass(frozen=True)
@@ -315,11 +273,13 @@ class PooledLosses:
         members: the segments of each of K problems, bool `(K, D)`.
         memory: bound in bytes for what is simulated at once; candidates are simulated in blocks
             where all segments of all of them need more.
+        prior: added to the losses; None: none.
     """
 
     segments: SegmentLosses | FullTrajectories
     members: Tensor
     memory: int
+    prior: Prior | None = None
 
     @property
     def problems(self) -> int:
@@ -334,7 +294,8 @@ class PooledLosses:
     @property
     def bytes_per_candidate(self) -> int:
         """Memory of one candidate of one problem besides the blocks: the sum and the mean."""
-        return 2 * torch.float64.itemsize
+        of_prior = 0 if self.prior is None else self.prior.bytes_per_candidate
+        return 2 * torch.float64.itemsize + of_prior
 
     def for_work(self, candidates: int) -> PooledLosses:
         """Returns the same losses, for a number of candidates of each problem in all calls."""
@@ -344,7 +305,8 @@ class PooledLosses:
 
     def select(self, first: int, last: int) -> PooledLosses:
         """Returns problems `first` to `last - 1`."""
-        return replace(self, members=self.members[first:last])
+        prior = None if self.prior is None else self.prior.cut(slice(first, last))
+        return replace(self, members=self.members[first:last], prior=prior)
 
     @torch.no_grad()
     def __call__(self, candidates: Tensor) -> Tensor:
@@ -367,7 +329,10 @@ class PooledLosses:
                 part = segments.take(some[place])
                 every = torch.arange(len(place), device=place.device)
                 self._add(total, part, candidates[problem], problem, every)
-        return total / self.members.sum(1, keepdim=True)
+        losses = total / self.members.sum(1, keepdim=True)
+        if self.prior is None:
+            return losses
+        return losses + self.prior.penalty(candidates)
 
     def _add(
         self,

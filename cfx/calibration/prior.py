@@ -9,12 +9,11 @@ Shapes: P problems, q candidates of each, n tuned parameters.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-
-from cfx.calibration.losses import PooledLosses, SegmentLosses
 
 _WEIGHTS = {"weak": 0.01, "none": 0.0}
 """Weights of the priors. With the weak one, a parameter that is one unit of the squashed space away
@@ -31,65 +30,56 @@ def prior_weight(name: str) -> float:
 
 
 @dataclass(frozen=True)
-class LossesWithPrior:
-    """Losses plus a penalty on the distance from the model's default in the squashed space.
+class Prior:
+    """A penalty on the distance from a center in the squashed space, such as the model's default.
 
-        loss + weight * (loss of the default) * mean((logit u - logit u_default)^2)
+        loss + weight * (loss of the center) * mean((logit u - logit u_center)^2)
 
-    It is the logarithm of a normal prior on each logit, up to constants; the default's loss gives
+    It is the logarithm of a normal prior on each logit, up to constants; the center's loss gives
     it the objective's unit and makes it as strong for every driver.
 
     Attributes:
-        losses: what the recording says.
-        default: the model's default in unit space, `(n,)`.
+        center: what is likeliest, in the squashed space, `(n,)` or `(P, 1, n)`.
         weight: without unit.
-        scale: the loss of the default in each problem, `(P, 1)`, in the objective's unit.
+        scale: the loss there in each problem, `(P, 1)`, in the objective's unit.
     """
 
-    losses: SegmentLosses | PooledLosses
-    default: Tensor
+    center: Tensor
     weight: float
     scale: Tensor
 
     @classmethod
     def of(
-        cls, losses: SegmentLosses | PooledLosses, default: Tensor, weight: float
-    ) -> LossesWithPrior:
-        """Adds the prior to losses; `default` is in unit space, `(n,)`."""
-        everywhere = default[None, None, :].expand(losses.problems, 1, -1)
-        scale = losses(everywhere).nan_to_num(nan=0.0, posinf=0.0)
-        return cls(losses, default, weight, scale)
+        cls, losses: Callable[[Tensor], Tensor], unit: Tensor, center: Tensor, weight: float
+    ) -> Prior:
+        """Returns the prior of P problems.
 
-    @property
-    def problems(self) -> int:
-        """P."""
-        return self.losses.problems
+        Args:
+            losses: of candidates `(P, q, n)`, without a prior.
+            unit: what is likeliest, in unit space, `(P, 1, n)`.
+            center: the same in the squashed space, `(n,)` or `(P, 1, n)`.
+            weight: without unit.
+        """
+        return cls(center, weight, losses(unit).nan_to_num(nan=0.0, posinf=0.0))
 
     @property
     def bytes_per_candidate(self) -> int:
         """Memory that one candidate of one problem needs."""
-        return self.losses.bytes_per_candidate + 4 * self.default.nbytes
+        return 4 * torch.float64.itemsize * self.center.shape[-1]
 
-    def for_work(self, candidates: int) -> LossesWithPrior:
-        """Returns the same losses, for a number of candidates of each problem in all calls."""
-        return replace(self, losses=self.losses.for_work(candidates))
+    def cut(self, which: slice | Tensor) -> Prior:
+        """Returns the prior of some of the problems."""
+        center = self.center if self.center.dim() == 1 else self.center[which]
+        return replace(self, center=center, scale=self.scale[which])
 
-    def select(self, first: int, last: int) -> LossesWithPrior:
-        """Returns problems `first` to `last - 1`."""
-        return replace(self, losses=self.losses.select(first, last), scale=self.scale[first:last])
-
-    @torch.no_grad()
-    def __call__(self, candidates: Tensor) -> Tensor:
-        """Returns losses `(P, q)`, in the objective's unit, of candidates `(P, q, n)`."""
-        return self.losses(candidates) + self.weight * self.scale * self.distance(candidates)
-
-    def distance(self, candidates: Tensor) -> Tensor:
-        """Returns the mean square distance from the default, `(P, q)` or `(1, q)`."""
+    def penalty(self, candidates: Tensor) -> Tensor:
+        """Returns what is added to the losses of candidates `(P, q, n)`, `(P, q)`."""
         if candidates.stride(0) == 0:  # shared by all problems: an expanded view
             candidates = candidates[:1]
-        away = _logit(candidates) - _logit(self.default.to(candidates))
-        return away.square().mean(-1)
+        away = squashed(candidates) - self.center.to(candidates)
+        return self.weight * self.scale * away.square().mean(-1)
 
 
-def _logit(unit: Tensor) -> Tensor:
+def squashed(unit: Tensor) -> Tensor:
+    """Returns logits of parameters in unit space, finite also at the bounds."""
     return torch.logit(unit.clamp(_EDGE, 1.0 - _EDGE))

@@ -9,7 +9,7 @@ Shapes: P pairs of a shard, T frames of the longest, W windows, K groups, n tune
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -19,7 +19,7 @@ from cfx.calibration.cache import Arrays
 from cfx.calibration.losses import FullTrajectories, PooledLosses, SegmentLosses
 from cfx.calibration.objectives.base import Objective
 from cfx.calibration.optimizers.base import Optimizer, Solution
-from cfx.calibration.prior import LossesWithPrior
+from cfx.calibration.prior import Prior, squashed
 from cfx.core import registry
 from cfx.core.component import content_key, folder_hash
 from cfx.core.engine.base import Report, Unfit
@@ -80,29 +80,57 @@ class Solver:
             "seed": self.seed,
         }
 
-    def minimize_from_defaults(
-        self, losses: SegmentLosses | PooledLosses, report: Report
+    def minimize(
+        self,
+        losses: SegmentLosses | PooledLosses,
+        report: Report,
+        guesses: Tensor | None = None,
+        tolerance: float = 0.0,
     ) -> Arrays:
-        """Minimises from the model's defaults on, with the prior.
+        """Returns a row per problem; losses in it are without the prior.
 
-        The loss that is returned is without it.
+        Args:
+            losses: of the problems.
+            report: called with how many evaluations are done.
+            guesses: first guesses `(problems, g, n)` in unit space; None: the model's defaults, and
+                the search has the prior.
+            tolerance: losses this close are equal.
+
+        Raises:
+            PluginError: the optimizer breaks its contract.
         """
-        device = losses.device
-        default = self.space.to_unit(self.space.defaults(device=device))
-        guesses = default[None, None, :].expand(losses.problems, 1, -1)
-        if self.prior == 0:
-            return self.minimize(losses, guesses, report)
-        with_prior = LossesWithPrior.of(losses, default, self.prior)
-        found = self.minimize(with_prior, guesses, report)
-        best = self.space.to_unit(torch.as_tensor(found["parameters"], device=device))
-        settled = self._settled(with_prior, best.double())
+        searched = losses
+        if guesses is None:
+            default = self.space.to_unit(self.space.defaults(device=losses.device))
+            guesses = default[None, None, :].expand(losses.problems, 1, -1)
+            if self.prior > 0:
+                prior = Prior.of(losses, guesses, squashed(default), self.prior)
+                searched = replace(losses, prior=prior)
+        solution = self.optimizer.minimize(
+            searched.for_work(self.optimizer.evaluations()),
+            guesses,
+            seed=self.seed,
+            objective_bytes=searched.bytes_per_candidate,
+            memory=self.memory,
+            progress=report,
+            tolerance=tolerance,
+        )
+        self._check_losses(searched, solution)
+        parameters, loss = self.space.from_unit(solution.best), solution.loss
+        if searched.prior is not None:
+            best = self.space.to_unit(parameters).double()
+            settled = self._settled(searched, best, guesses[0, 0])
+            parameters, loss = self.space.from_unit(settled), losses(settled[:, None])[:, 0]
         return {
-            **found,
-            "parameters": self.space.from_unit(settled).cpu().numpy(),
-            "loss": losses(settled[:, None])[:, 0].cpu().numpy(),
+            "parameters": parameters.cpu().numpy(),
+            "loss": loss.cpu().numpy(),
+            "sensitivity": solution.sensitivity.cpu().numpy(),
+            "diverged": solution.diverged.cpu().numpy(),
         }
 
-    def _settled(self, losses: LossesWithPrior, best: Tensor) -> Tensor:
+    def _settled(
+        self, losses: SegmentLosses | PooledLosses, best: Tensor, default: Tensor
+    ) -> Tensor:
         """Moves what a search has found to where prior plus loss is lowest along each parameter.
 
         A search stops at what it has tried. Where a parameter hardly matters, the prior alone
@@ -112,53 +140,17 @@ class Solver:
         Args:
             losses: of the P problems, with the prior.
             best: `(P, n)` in unit space.
+            default: the model's, `(n,)` in unit space.
         """
         at_once = max(1, self.memory // (losses.bytes_per_candidate * len(_WAY)))
         worked = losses.for_work(self.optimizer.evaluations())
         parts = []
         for first in range(0, len(best), at_once):
             last = min(first + at_once, len(best))
-            parts.append(_towards_default(worked.select(first, last), best[first:last]))
+            parts.append(_towards(default, worked.select(first, last), best[first:last]))
         return torch.cat(parts)
 
-    def minimize(
-        self,
-        losses: SegmentLosses | PooledLosses | LossesWithPrior,
-        guesses: Tensor,
-        report: Report,
-        tolerance: float = 0.0,
-    ) -> Arrays:
-        """Returns a row per problem.
-
-        Args:
-            losses: of the problems.
-            guesses: first guesses `(problems, g, n)` in unit space.
-            report: called with how many evaluations are done.
-            tolerance: losses this close are equal.
-
-        Raises:
-            PluginError: the optimizer breaks its contract.
-        """
-        solution = self.optimizer.minimize(
-            losses.for_work(self.optimizer.evaluations()),
-            guesses,
-            seed=self.seed,
-            objective_bytes=losses.bytes_per_candidate,
-            memory=self.memory,
-            progress=report,
-            tolerance=tolerance,
-        )
-        self._check_losses(losses, solution)
-        return {
-            "parameters": self.space.from_unit(solution.best).cpu().numpy(),
-            "loss": solution.loss.cpu().numpy(),
-            "sensitivity": solution.sensitivity.cpu().numpy(),
-            "diverged": solution.diverged.cpu().numpy(),
-        }
-
-    def _check_losses(
-        self, losses: SegmentLosses | PooledLosses | LossesWithPrior, solution: Solution
-    ) -> None:
+    def _check_losses(self, losses: SegmentLosses | PooledLosses, solution: Solution) -> None:
         """Computes the losses of what a third party's optimizer returns once more.
 
         Raises:
@@ -201,11 +193,6 @@ class CalibrationShard:
             self.solver.simulator, self.solver.objective, self.batch, pair, first, steps
         )
 
-    def whole(self, last: Tensor) -> SegmentLosses:
-        """Returns the losses of each pair from frame 0 to a last one, `(P,)`."""
-        pair = torch.arange(len(self.batch), device=last.device)
-        return self.segments(pair, torch.zeros_like(last), last)
-
     @property
     def has_kernel(self) -> bool:
         """Whether losses come from a compiled kernel here."""
@@ -213,8 +200,36 @@ class CalibrationShard:
         return self.segments(pair, pair, pair + 1).accumulates
 
     def solve(self, report: Report) -> list[Arrays]:
-        """Returns an entry of the cache for each of what was asked for."""
+        """Returns an entry of the cache for each of what was asked for, wherever it is called.
+
+        Raises:
+            EngineError: here is other code than where the shard was cut.
+            Unfit: no kernel can be compiled here, as there: the compiler is missing, or the disk
+                full.
+        """
+        if content_key(self.solver.scope) != self.code:
+            raise EngineError(
+                "a worker has other code than this job (another version of cfx or of a plugin);"
+                " install the same on all workers, and start them again"
+            )
+        if self.compiled and not self.has_kernel:
+            raise Unfit(
+                "no kernel can be compiled there (no C++ compiler, or no place on the disk), so"
+                " that results would differ in their last bits"
+            )
+        losses, guesses, tolerance = self.problem()
+        return self.entries(self.solver.minimize(losses, report, guesses, tolerance))
+
+    def problem(self) -> tuple[SegmentLosses | PooledLosses, Tensor | None, float]:
+        """Returns what is minimised, with the guesses and the tolerance of `Solver.minimize`."""
         raise NotImplementedError
+
+    def entries(self, found: Arrays) -> list[Arrays]:
+        """Returns an entry of the cache for each of what was asked for: here for each problem."""
+        entries = []
+        for number in range(len(found["loss"])):
+            entries.append({name: values[number] for name, values in found.items()})
+        return entries
 
 
 @dataclass(frozen=True)
@@ -227,8 +242,9 @@ class DriverShard(CalibrationShard):
 
     last: Tensor
 
-    def solve(self, report: Report) -> list[Arrays]:
-        return _rows(self.solver.minimize_from_defaults(self.whole(self.last), report))
+    def problem(self) -> tuple[SegmentLosses | PooledLosses, Tensor | None, float]:
+        pair = torch.arange(len(self.batch), device=self.last.device)
+        return self.segments(pair, torch.zeros_like(self.last), self.last), None, 0.0
 
 
 @dataclass(frozen=True)
@@ -243,11 +259,10 @@ class PooledShard(CalibrationShard):
     last: Tensor
     members: Tensor
 
-    def solve(self, report: Report) -> list[Arrays]:
+    def problem(self) -> tuple[SegmentLosses | PooledLosses, Tensor | None, float]:
         simulator, objective = self.solver.simulator, self.solver.objective
         trajectories = FullTrajectories(simulator, objective, self.batch, self.last)
-        losses = PooledLosses(trajectories, self.members, self.solver.memory)
-        return _rows(self.solver.minimize_from_defaults(losses, report))
+        return PooledLosses(trajectories, self.members, self.solver.memory), None, 0.0
 
 
 @dataclass(frozen=True)
@@ -269,10 +284,12 @@ class WindowShard(CalibrationShard):
     guesses: Tensor
     tolerance: float
 
-    def solve(self, report: Report) -> list[Arrays]:
+    def problem(self) -> tuple[SegmentLosses | PooledLosses, Tensor | None, float]:
         steps = torch.full_like(self.first, self.length)
         losses = self.segments(self.pair, self.first, steps)
-        found = self.solver.minimize(losses, self.guesses[self.pair], report, self.tolerance)
+        return losses, self.guesses[self.pair], self.tolerance
+
+    def entries(self, found: Arrays) -> list[Arrays]:
         entries = []
         for last, count in zip(itertools.accumulate(self.counts), self.counts, strict=True):
             own = slice(last - count, last)
@@ -280,30 +297,10 @@ class WindowShard(CalibrationShard):
         return entries
 
 
-def solve_shard(shard: CalibrationShard, report: Report) -> list[Arrays]:
-    """Solves a shard, wherever it is.
-
-    Raises:
-        EngineError: here is other code than where the shard was cut.
-        Unfit: no kernel can be compiled here, as there: the compiler is missing, or the disk full.
-    """
-    if content_key(shard.solver.scope) != shard.code:
-        raise EngineError(
-            "a worker has other code than this job (another version of cfx or of a plugin); install"
-            " the same on all workers, and start them again"
-        )
-    if shard.compiled and not shard.has_kernel:
-        raise Unfit(
-            "no kernel can be compiled there (no C++ compiler, or no place on the disk), so that"
-            " results would differ in their last bits"
-        )
-    return shard.solve(report)
-
-
-def _towards_default(losses: LossesWithPrior, best: Tensor) -> Tensor:
+def _towards(default: Tensor, losses: SegmentLosses | PooledLosses, best: Tensor) -> Tensor:
     """Returns `(P, n)` in unit space: see `Solver._settled`."""
     way = torch.tensor(_WAY, dtype=best.dtype, device=best.device)
-    default, problem = losses.default.to(best), torch.arange(len(best), device=best.device)
+    default, problem = default.to(best), torch.arange(len(best), device=best.device)
     point = best
     for _ in range(_SETTLING_ROUNDS):
         before = point
@@ -315,11 +312,3 @@ def _towards_default(losses: LossesWithPrior, best: Tensor) -> Tensor:
         if torch.equal(point, before):
             break
     return point
-
-
-def _rows(found: Arrays) -> list[Arrays]:
-    """Returns an entry for each problem."""
-    entries = []
-    for number in range(len(found["loss"])):
-        entries.append({name: values[number] for name, values in found.items()})
-    return entries

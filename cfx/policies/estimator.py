@@ -17,15 +17,13 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
+from cfx.calibration.prior import squashed
 from cfx.calibration.settings import WindowSettings
 from cfx.core.errors import ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import History, Summary
 from cfx.simulation.step import advance_vehicle
-
-_EDGE = 0.005
-"""How close to a bound, in unit space, a parameter counts as being, so that its logit is finite."""
 
 _LARGEST = 6.0
 """Squashed parameters are kept within this, 0.25 % of a range from either bound."""
@@ -227,11 +225,6 @@ class EstimatorNetwork(PolicyNetwork):
         """Returns the mean acceleration over the window, `(*batch,)`, m/s2."""
         speed = history.follower_speed
         return (speed[..., -1] - speed[..., 0]) / (self.driven.dt * (speed.shape[-1] - 1))
-
-
-def squashed(unit: Tensor) -> Tensor:
-    """Returns logits of parameters in unit space, finite also at the bounds."""
-    return torch.logit(unit.clamp(_EDGE, 1.0 - _EDGE))
 
 
 def bounded(values: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ n tuned parameters; `*batch` any leading dimensions.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, ClassVar, cast
 
 import torch
@@ -16,12 +16,14 @@ from torch import Tensor
 from cfx.calibration.losses import SegmentLosses
 from cfx.calibration.objectives.base import Objective
 from cfx.calibration.optimizers.base import Optimizer
+from cfx.calibration.prior import Prior, squashed
 from cfx.core import registry
 from cfx.core.component import Settings
 from cfx.policies.base import ResidualSettings
-from cfx.policies.estimator import DrivenModel, EstimatorNetwork, EstimatorPolicy, squashed
+from cfx.policies.estimator import DrivenModel, EstimatorNetwork, EstimatorPolicy
 from cfx.policies.features import History
 from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.trajectory import Segments
 
 _SIGNALS = len(History._fields)
 
@@ -144,12 +146,11 @@ class RecalibrateNetwork(EstimatorNetwork):
     def _calibrated(self, frames: Tensor, known: Tensor, prior: Tensor) -> Tensor:
         """Calibrates D drivers; `(D, 5, T)`, `(D,)` and `(D, n)` to squashed `(D, n)`."""
         losses = self._losses(frames, known)
-        unit = prior.double().sigmoid()
-        scale = losses(unit[:, None]).nan_to_num(nan=0.0, posinf=0.0)
-        wanted = _WithPrior(losses, prior, self._weight * scale)
+        unit = prior.double().sigmoid()[:, None]
+        wanted = replace(losses, prior=Prior.of(losses, unit, prior[:, None], self._weight))
         solution = self._optimizer.minimize(
             wanted.for_work(self._optimizer.evaluations()),
-            unit[:, None],
+            unit,
             seed=_SEED,
             objective_bytes=losses.bytes_per_candidate,
             memory=_MEMORY_BYTES,
@@ -166,57 +167,20 @@ class RecalibrateNetwork(EstimatorNetwork):
         ahead = travelled + signals.gap
         steps = torch.arange(self._kept - 1, device=frames.device)[:, None]
         start = torch.zeros_like(ahead[:, 0])
-        return SegmentLosses(
-            simulator=self._stepper,
-            objective=self._objective,
+        segments = Segments(
             leader_position=ahead[:, :-1].T,
             leader_speed=signals.leader_speed[:, :-1].T,
             leader_acceleration=signals.leader_acceleration[:, :-1].T,
-            leader_length=start,
-            start_position=start,
-            start_speed=signals.follower_speed[:, 0],
-            start_acceleration=signals.follower_acceleration[:, 0],
             leader_rear=ahead[:, 1:].T,
             measured_speed=signals.follower_speed[:, 1:].T,
             measured_gap=signals.gap[:, 1:].T,
             counted=(steps < known - 1).to(frames.dtype),
+            leader_length=start,
+            position=start,
+            speed=signals.follower_speed[:, 0],
+            acceleration=signals.follower_acceleration[:, 0],
         )
-
-
-@dataclass(frozen=True)
-class _WithPrior:
-    """Losses plus a penalty on leaving each driver's prior in the squashed space.
-
-    Attributes:
-        losses: of D drivers.
-        prior: squashed, `(D, n)`.
-        weight: of the mean square distance, `(D, 1)`, in the objective's unit.
-    """
-
-    losses: SegmentLosses
-    prior: Tensor
-    weight: Tensor
-
-    @property
-    def problems(self) -> int:
-        """D."""
-        return self.losses.problems
-
-    def for_work(self, candidates: int) -> _WithPrior:
-        """Returns the same losses, for a number of candidates of each problem in all calls."""
-        return replace(self, losses=self.losses.for_work(candidates))
-
-    def select(self, first: int, last: int) -> _WithPrior:
-        """Returns problems `first` to `last - 1`."""
-        return _WithPrior(
-            self.losses.select(first, last), self.prior[first:last], self.weight[first:last]
-        )
-
-    @torch.no_grad()
-    def __call__(self, candidates: Tensor) -> Tensor:
-        """Returns losses `(D, q)`, in the objective's unit, of candidates `(D, q, n)`."""
-        away = squashed(candidates) - self.prior[:, None].to(candidates)
-        return self.losses(candidates) + self.weight * away.square().mean(-1)
+        return SegmentLosses(self._stepper, self._objective, segments)
 
 
 def _new_frames(last: Tensor, token: Tensor) -> Tensor:

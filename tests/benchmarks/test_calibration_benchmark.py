@@ -23,6 +23,7 @@ from cfx.calibration.optimizers.random import RandomSearch, sobol
 from cfx.core import registry, threads
 from cfx.models.base import DrivingModel
 from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.trajectory import Segments
 
 numba_loops = pytest.importorskip("tests.benchmarks.numba_loops", reason="numba is not installed")
 
@@ -48,21 +49,20 @@ def segments(model: DrivingModel, problems: int, steps: int) -> SegmentLosses:
     speed = 10.0 + 4.0 * swing * torch.sin(0.3 * at + 6.0 * phase)
     nothing = torch.zeros(problems, dtype=torch.float64)
     position = 25.0 + speed.cumsum(0) * DT
-    return SegmentLosses(
-        simulator=MemoryStepper(model, DT),
-        objective=SpeedRmse(),
+    segments = Segments(
         leader_position=position,
         leader_speed=speed,
         leader_acceleration=torch.diff(speed, dim=0, append=speed[-1:]) / DT,
         leader_length=nothing + 4.5,
-        start_position=nothing,
-        start_speed=speed[0],
-        start_acceleration=nothing,
+        position=nothing,
+        speed=speed[0],
+        acceleration=nothing,
         leader_rear=position - 4.5,
         measured_speed=speed,
         measured_gap=torch.full_like(speed, 20.0),
         counted=torch.ones_like(speed),
     )
+    return SegmentLosses(MemoryStepper(model, DT), SpeedRmse(), segments)
 
 
 def points_of(model: DrivingModel) -> Tensor:
@@ -84,12 +84,16 @@ def by_hand(losses: SegmentLosses, name: str) -> Callable[[], Tensor]:
     if name == "krauss":
         columns.append(columns[list(model.space.unpack(points[0])).index("b")])
     candidates = np.ascontiguousarray(np.stack(columns, axis=1))
-    frames = [losses.leader_position, losses.leader_speed, losses.leader_acceleration]
+    frames = [
+        losses.segments.leader_position,
+        losses.segments.leader_speed,
+        losses.segments.leader_acceleration,
+    ]
     arrays = [np.ascontiguousarray(one.numpy().T) for one in frames]
-    for value in (losses.leader_length, losses.start_position, losses.start_speed):
+    for value in (losses.segments.leader_length, losses.segments.position, losses.segments.speed):
         arrays.append(value.numpy())
-    arrays.append(losses.start_acceleration.numpy())
-    measured = np.ascontiguousarray(losses.measured_speed.numpy().T)
+    arrays.append(losses.segments.acceleration.numpy())
+    measured = np.ascontiguousarray(losses.segments.measured_speed.numpy().T)
     steps = np.full(losses.problems, losses.steps)
     loop = numba_loops.LOOPS[name]
 

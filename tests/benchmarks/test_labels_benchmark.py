@@ -29,7 +29,7 @@ from cfx.models.base import DrivingModel, Leader
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import MemoryStepper
-from cfx.simulation.trajectory import Start
+from cfx.simulation.trajectory import Segments, Start
 
 WINDOWS, STEPS, DT, LOOPED = 128, 5, 0.1, 4
 
@@ -60,16 +60,18 @@ def windows(model: DrivingModel) -> SegmentLosses:
     )
     observed = observed + 0.02 * torch.randn(observed.shape, generator=draw, dtype=torch.float64)
     rear = leader_position + leader_speed * DT - length
-    return SegmentLosses(
-        simulator,
-        SpeedRmse(),
-        *leader,
-        *start,
+    segments = Segments(
+        *leader[:3],
         leader_rear=rear,
         measured_speed=observed,
         measured_gap=rear - position,
         counted=torch.ones_like(observed),
+        leader_length=length,
+        position=start.position,
+        speed=start.speed,
+        acceleration=start.acceleration,
     )
+    return SegmentLosses(simulator, SpeedRmse(), segments)
 
 
 def plain_loop(objective: SegmentLosses, guess: Tensor, *, initial: int, iterations: int) -> float:

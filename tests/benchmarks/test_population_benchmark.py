@@ -20,6 +20,7 @@ from cfx.models.base import DrivingModel
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.trajectory import Segments
 
 DRIVES, FOLDS, STEPS, CANDIDATES, DT, MEMORY = 70, 5, 600, 512, 0.1, 1 << 30
 
@@ -32,21 +33,20 @@ def drives(model: DrivingModel) -> SegmentLosses:
     speed = 10.0 + 4.0 * swing * torch.sin(0.3 * time_s + 6.0 * phase)
     acceleration = torch.diff(speed, dim=0, append=speed[-1:]) / DT
     nothing = torch.zeros(DRIVES, dtype=torch.float64)
-    return SegmentLosses(
-        simulator=MemoryStepper(model, DT),
-        objective=SpeedRmse(),
+    segments = Segments(
         leader_position=25.0 + speed.cumsum(0) * DT,
         leader_speed=speed,
         leader_acceleration=acceleration,
         leader_length=nothing + 4.5,
-        start_position=nothing,
-        start_speed=speed[0],
-        start_acceleration=nothing,
+        position=nothing,
+        speed=speed[0],
+        acceleration=nothing,
         leader_rear=20.5 + speed.cumsum(0) * DT,
         measured_speed=speed,
         measured_gap=torch.full_like(speed, 20.0),
         counted=torch.ones_like(speed),
     )
+    return SegmentLosses(MemoryStepper(model, DT), SpeedRmse(), segments)
 
 
 @pytest.mark.timeout(600)

@@ -130,7 +130,7 @@ def test_a_segment_that_diverges_spoils_only_its_own_problems() -> None:
         torch.zeros_like(index),
         torch.full((2,), 150),
     )
-    segments.measured_speed[10, 1] = torch.nan
+    segments.segments.measured_speed[10, 1] = torch.nan
     same = torch.full((2, 3, 2), 0.5, dtype=torch.float64)
     members = torch.tensor([[True, False], [True, True]])
     losses = PooledLosses(segments, members, memory=1 << 30)(same)

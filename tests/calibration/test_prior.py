@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,7 @@ from cfx.calibration.optimizers.base import Optimizer
 from cfx.calibration.optimizers.botorch import BotorchOptimizer
 from cfx.calibration.optimizers.gradient import GradientSearch
 from cfx.calibration.optimizers.random import RandomSearch
-from cfx.calibration.prior import LossesWithPrior, prior_weight
+from cfx.calibration.prior import Prior, prior_weight, squashed
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.core.progress import Task
 from cfx.data.pairs import PairBatch
@@ -54,8 +55,8 @@ def losses() -> SegmentLosses:
 
 def test_the_default_costs_nothing_and_distance_costs_more() -> None:
     default = MODEL.space.to_unit(MODEL.space.defaults())
-    with_prior = LossesWithPrior.of(losses(), default, 0.01)
     near = default[None, None].expand(2, 1, -1)
+    with_prior = replace(losses(), prior=Prior.of(losses(), near, squashed(default), 0.01))
     far = torch.full_like(near, 0.9)
     plain = losses()
     torch.testing.assert_close(with_prior(near), plain(near))

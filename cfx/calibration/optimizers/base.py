@@ -34,6 +34,10 @@ TIE_RELATIVE, TIE_ABSOLUTE = 1e-6, 1e-9
 below anything that matters."""
 
 
+AT_ONCE = 4096
+"""Candidates of one problem in one call of the losses: intermediate values stay small however many
+an optimizer asks for."""
+
 _LOSSES_AT_ONCE = 1 << 19
 """Losses of one chunk on a CPU, at most: 4 MB, which are written and read again in its cache."""
 
@@ -210,10 +214,12 @@ class Optimizer(Component):
 
         starts = range(0, problems, chunk)
         try:
-            if self.in_threads and guesses.device.type == "cpu":
+            if self.in_threads and guesses.device.type == "cpu" and len(starts) > 1:
                 pieces = share(solve, starts, level="chunks")
             else:
-                pieces = [solve(first) for first in starts]
+                pieces = []
+                for first in starts:
+                    pieces.append(solve(first))
         finally:
             ended.set()  # one thread failed, or a signal came: nobody waits for the others
         best, loss, filling, diverged = (torch.cat(parts) for parts in zip(*pieces, strict=True))
@@ -313,7 +319,7 @@ def _in_unit_space(candidates: Tensor) -> bool:
 
 
 class _Guarded:
-    """Losses without NaN, which becomes infinity.
+    """Losses without NaN, which becomes infinity, of blocks of `AT_ONCE` candidates.
 
     Counts evaluations and refuses candidates outside the bounds, and all once the work has ended.
     """
@@ -354,11 +360,16 @@ class _Guarded:
                 f"{self._optimizer}: it asked for a candidate outside the bounds [0, 1] of unit"
                 " space"
             )
-        losses = self._objective(candidates).to(torch.float64)
-        self._progress(losses.numel())
-        if bool(losses.sum().isfinite()):
-            return losses
-        return losses.nan_to_num(nan=torch.inf, posinf=torch.inf, neginf=torch.inf)
+        found = [candidates.new_empty((self.problems, 0))]
+        for block in torch.split(candidates, AT_ONCE, dim=1):
+            if block.shape[1] == 0:
+                continue
+            losses = self._objective(block).to(torch.float64)
+            self._progress(losses.numel())
+            if not bool(losses.sum().isfinite()):
+                losses = losses.nan_to_num(nan=torch.inf, posinf=torch.inf, neginf=torch.inf)
+            found.append(losses)
+        return torch.cat(found, dim=1)
 
     def select(self, first: int, last: int) -> CandidateLosses:
         return _Guarded(

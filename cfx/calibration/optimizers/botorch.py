@@ -43,8 +43,8 @@ from linear_operator.utils.warnings import NumericalWarning
 from pydantic import Field
 from torch import Tensor
 
-from cfx.calibration.optimizers.base import CandidateLosses, Optimizer
-from cfx.calibration.optimizers.random import AT_ONCE, check_room, evaluate_in_blocks, sobol
+from cfx.calibration.optimizers.base import AT_ONCE, CandidateLosses, Optimizer
+from cfx.calibration.optimizers.random import check_room, sobol
 from cfx.core.component import Settings
 
 _NOISE = 1e-6
@@ -155,7 +155,7 @@ class BotorchOptimizer(Optimizer):
         check_room(settings.initial, g, key="initial")
         points = sobol(self.space_filling() - g, n, seed=seed, like=guesses)
         tried = torch.cat([guesses, points.expand(problems, -1, -1)], dim=1)
-        losses = evaluate_in_blocks(objective, tried)
+        losses = objective(tried)
         search = _Search(settings, tried, losses, guesses=g, seed=seed)
         for _ in range(settings.iterations):
             candidate = search.ask()

@@ -12,8 +12,8 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from cfx.calibration.optimizers.base import CandidateLosses, Optimizer, Tried
-from cfx.calibration.optimizers.random import AT_ONCE, check_room, evaluate_in_blocks, sobol
+from cfx.calibration.optimizers.base import AT_ONCE, CandidateLosses, Optimizer, Tried
+from cfx.calibration.optimizers.random import check_room, sobol
 from cfx.core.component import Settings
 
 _DIFFERENCE = 1e-6
@@ -110,8 +110,8 @@ class GradientSearch(Optimizer):
         stages, rest = _stages(settings.searches, settings.samples - settings.first, each_step)
         points = sobol(settings.first - g + rest, n, seed=seed, like=guesses)
         shared = points.expand(problems, -1, -1)
-        tried, losses = [guesses, shared], [evaluate_in_blocks(objective, guesses)]
-        losses.append(evaluate_in_blocks(objective, shared))
+        tried, losses = [guesses, shared], [objective(guesses)]
+        losses.append(objective(shared))
         search = _start(torch.cat(losses, dim=1), guesses, shared, settings.searches)
         for searches, rounds in stages:
             search = _best(search, searches)

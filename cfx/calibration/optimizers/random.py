@@ -14,13 +14,9 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from cfx.calibration.optimizers.base import CandidateLosses, Optimizer, Tried
+from cfx.calibration.optimizers.base import AT_ONCE, CandidateLosses, Optimizer, Tried
 from cfx.core.component import Settings
 from cfx.core.errors import ConfigError
-
-AT_ONCE = 4096
-"""Candidates of one problem in one call of the losses: intermediate values stay small whatever
-`samples` is."""
 
 
 class RandomSettings(Settings):
@@ -56,17 +52,8 @@ class RandomSearch(Optimizer):
         check_room(self.settings.samples, g, key="samples")
         points = sobol(self.settings.samples - g, n, seed=seed, like=guesses)
         blocks = (guesses, points.expand(problems, -1, -1))
-        losses = [evaluate_in_blocks(objective, block) for block in blocks]
+        losses = [objective(block) for block in blocks]
         return blocks, torch.cat(losses, dim=1)
-
-
-def evaluate_in_blocks(objective: CandidateLosses, candidates: Tensor) -> Tensor:
-    """Returns losses `(P, q)` of candidates `(P, q, n)`, asked for in blocks of `AT_ONCE`."""
-    losses = [candidates.new_empty(candidates.shape[:2])[:, :0]]
-    for block in torch.split(candidates, AT_ONCE, dim=1):
-        if block.shape[1]:
-            losses.append(objective(block))
-    return torch.cat(losses, dim=1)
 
 
 def check_room(evaluations: int, guesses: int, *, key: str) -> None:

@@ -205,7 +205,7 @@ class _ConstantParameters:
         # Whether a kernel pays is asked for all parts together.
         work = len(self.last) * windows * steps * bases
         losses = replace(losses, simulator=self.simulator.for_work(work))
-        p = self._by_name(unit.to(losses.counted.dtype), windows)
+        p = self._by_name(unit.to(losses.segments.counted.dtype), windows)
         objective = losses.with_parameters(p)
         gap = replace(losses, objective=GapRmse()).with_parameters(p)
         return torch.stack([objective, gap], -1).view(pairs, windows, bases, 2)
