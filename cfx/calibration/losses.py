@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -135,35 +135,36 @@ class SegmentLosses:
         return replace(self, segments=segments, prior=prior)
 
     @torch.no_grad()
-    def __call__(self, candidates: Tensor) -> Tensor:
-        """Returns losses `(P, q)`, in the objective's unit, of candidates `(P, q, n)`."""
-        # Candidates that all problems share, an expanded view, are converted once.
-        if candidates.stride(0) == 0:
-            candidates = candidates[:1]
-        losses = self.with_parameters(self.parameters(candidates))
-        if self.prior is None:
-            return losses
-        return losses + self.prior.penalty(candidates)
-
-    @torch.no_grad()
-    def with_parameters(self, p: Mapping[str, Tensor]) -> Tensor:
-        """Returns losses `(P, q)` without the prior, in the objective's unit.
+    def __call__(self, candidates: Tensor | Mapping[str, Tensor]) -> Tensor:
+        """Returns losses `(P, q)`, in the objective's unit.
 
         Args:
-            p: one tensor per parameter, in SI units, `()` or broadcasting to `(P, q)`.
+            candidates: `(P, q, n)` in unit space; or one tensor per parameter, in SI units, `()` or
+                broadcasting to `(P, q)`, to which the prior is not applied.
         """
+        if isinstance(candidates, Tensor):
+            # Candidates that all problems share, an expanded view, are converted once.
+            if candidates.stride(0) == 0:
+                candidates = candidates[:1]
+            p: Mapping[str, Tensor] = self.parameters(candidates)
+        else:
+            p = candidates
         counted = self.segments.counted
         sums = self.simulator.accumulate(self.segments, p, self._terms, self._terms_key)
         if sums is not None:
-            return self.objective.finish(sums, counted.sum(0).clamp(min=1)[:, None])
-        frames = self.simulated(p, gap="gap" in self.objective.signals)
-        return self.objective(frames, counted[..., None])
+            losses = self.objective.finish(sums, counted.sum(0).clamp(min=1)[:, None])
+        else:
+            frames = self.simulated(p, gap="gap" in self.objective.signals)
+            losses = self.objective(frames, counted[..., None])
+        if self.prior is None or not isinstance(candidates, Tensor):
+            return losses
+        return losses + self.prior.penalty(candidates)
 
     def simulated(self, p: Mapping[str, Tensor], *, gap: bool) -> FrameValues:
         """Returns frames 1 to K: simulated signals `(K, P, q)` and measured ones `(K, P, 1)`.
 
         Args:
-            p: as for `with_parameters`.
+            p: one tensor per parameter, in SI units, `()` or broadcasting to `(P, q)`.
             gap: compute the simulated gap; without, it is NaN.
         """
         s = self.segments
@@ -323,34 +324,21 @@ class PooledLosses:
         for some in torch.split(used, _SEGMENTS_AT_ONCE):
             problem, place = self.members[:, some].nonzero().unbind(1)
             if shared:
-                part = segments.take(some)
-                self._add(total, part, candidates[:1].expand(len(some), -1, -1), problem, place)
+                own, asked = segments.take(some), candidates[:1].expand(len(some), -1, -1)
             else:
-                part = segments.take(some[place])
-                every = torch.arange(len(place), device=place.device)
-                self._add(total, part, candidates[problem], problem, every)
+                own, asked = segments.take(some[place]), candidates[problem]
+                place = torch.arange(len(place), device=place.device)
+            for columns, block in self._blocks(own, total, asked):
+                columns.index_add_(0, problem, own(block).to(total)[place])
         losses = total / self.members.sum(1, keepdim=True)
         if self.prior is None:
             return losses
         return losses + self.prior.penalty(candidates)
 
-    def _add(
-        self,
-        total: Tensor,
-        segments: SegmentLosses,
-        candidates: Tensor,
-        problem: Tensor,
-        place: Tensor,
-    ) -> None:
-        """Simulates segments, a block of candidates after the other, and adds up their losses.
-
-        Args:
-            total: where they are added, `(K, q)`.
-            segments: S of them.
-            candidates: of each, `(S, q, n)`.
-            problem, place: the problem that each loss counts for, and the number of its segment
-                among those that are simulated, `(M,)`.
-        """
+    def _blocks(
+        self, segments: SegmentLosses, total: Tensor, candidates: Tensor
+    ) -> Iterator[tuple[Tensor, Tensor]]:
+        """Yields columns of `total` `(K, q)` with the candidates `(S, q, n)` that belong there."""
         bound = min(self.memory, _BYTES_AT_ONCE)
         if segments.accumulates:
             bound = min(self.memory, _SUMMED_AT_ONCE)
@@ -358,5 +346,4 @@ class PooledLosses:
         if block > _VECTOR:
             block -= block % _VECTOR
         columns = torch.split(total, block, dim=1)
-        for some, part in zip(columns, torch.split(candidates, block, dim=1), strict=True):
-            some.index_add_(0, problem, segments(part).to(total)[place])
+        yield from zip(columns, torch.split(candidates, block, dim=1), strict=True)

@@ -4,8 +4,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cfx.calibration.prior import squashed
 from cfx.models.krauss import Krauss
-from cfx.policies.heads.offset import NONE, coordinates, moved, shrunk
+from cfx.policies.heads.offset import NONE, moved, shrunk
 
 unit = st.floats(0.0, 1.0)
 
@@ -68,7 +69,7 @@ def test_more_shrinkage_brings_a_set_nearer_to_the_default(
 
 def test_a_base_at_its_bound_can_be_moved_and_has_finite_coordinates() -> None:
     base = torch.tensor([0.0, 1.0])
-    assert bool(coordinates(base).isfinite().all())
+    assert bool(squashed(base).isfinite().all())
     answer = torch.tensor([0.9, 0.1], requires_grad=True)
     result = moved(base, answer)
     assert float(result[0].detach()) > 0.02

@@ -202,15 +202,19 @@ class Optimizer(Component):
         guesses = guesses.double().clamp(0.0, 1.0)
         ended = Event()
 
-        def solve(first: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        def part(first: int) -> tuple[_Guarded, Tensor]:
             last = min(first + chunk, problems)
-            own_losses, origin = objective.select(first, last), registry.origin(self)
-            guarded = _Guarded(own_losses, progress, n, origin, ended)
-            own = guesses[first:last]
-            tried, losses = self.solve(guarded, own, seed=seed)
+            losses, origin = objective.select(first, last), registry.origin(self)
+            return _Guarded(losses, progress, n, origin, ended), guesses[first:last]
+
+        def reduced(own: Tensor, tried: Tried, losses: Tensor) -> tuple[Tensor, ...]:
             blocks = tried if isinstance(tried, tuple) else (tried,)
             self._check(blocks, losses, own)
             return _reduce(blocks, losses, own, self.space_filling(), tolerance)
+
+        def solve(first: int) -> tuple[Tensor, ...]:
+            losses, own = part(first)
+            return reduced(own, *self.solve(losses, own, seed=seed))
 
         starts = range(0, problems, chunk)
         try:
@@ -218,8 +222,8 @@ class Optimizer(Component):
                 pieces = share(solve, starts, level="chunks")
             else:
                 pieces = []
-                for first in starts:
-                    pieces.append(solve(first))
+                for losses, own in map(part, starts):
+                    pieces.append(reduced(own, *self.solve(losses, own, seed=seed)))
         finally:
             ended.set()  # one thread failed, or a signal came: nobody waits for the others
         best, loss, filling, diverged = (torch.cat(parts) for parts in zip(*pieces, strict=True))

@@ -159,7 +159,10 @@ class AcrossDrivers(Protocol):
         of_tested = pairs.select(tested.tolist(), "not tested")
         split[tested].check_test_parts(of_tested, context.windows, context.split)
         full = Split.none(pairs, context.windows)
-        found = self._calibrated(context, split, full, members)
+        calibrator, batch = context.calibrator, context.batch
+        fixed = calibrator.fixed(pairs, batch, split.frame)
+        population = calibrator.population(pairs, batch, full.frame, members)
+        found = self._calibrated(context, fixed, population, context.labels(full.windows, fixed))
         policy, training_result = self._learn(context, full, members, found)
         calibration = context.calibration_metrics("fixed", split.frame, found.fixed)
         calibration |= context.calibration_metrics(
@@ -184,12 +187,10 @@ class AcrossDrivers(Protocol):
         return assign_folds(pairs, s.folds, s.together, s.min_test_frames, seed=seed)
 
     def _calibrated(
-        self, context: ProtocolContext, split: Split, full: Split, members: Tensor
+        self, context: ProtocolContext, fixed: Tensor, population: Tensor, labels: Labels | None
     ) -> _Calibrated:
-        pairs, batch, s = context.pairs, context.batch, self.settings
-        fixed = context.calibrator.fixed(pairs, batch, split.frame)
-        population = context.calibrator.population(pairs, batch, full.frame, members)
-        labels = context.labels(full.windows, fixed)
+        """Returns what was calibrated, with what policies start from."""
+        s = self.settings
         start = population
         if s.base == "default":
             default = context.space.defaults(dtype=population.dtype, device=population.device)

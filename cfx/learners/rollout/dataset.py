@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cfx.calibration.prior import squashed
 from cfx.core import scratch
 from cfx.data.pairs import SIGNALS, PairBatch
 from cfx.learners.base import TrainingData
@@ -25,7 +26,7 @@ from cfx.policies.base import Policy
 from cfx.policies.driver_features import measure
 from cfx.policies.features import measured_history, tokens
 from cfx.policies.heads.base import ParameterHead
-from cfx.policies.heads.offset import OffsetHead, coordinates
+from cfx.policies.heads.offset import OffsetHead
 from cfx.policies.scaler import Scaler
 
 _FEW_DRIVERS = 5
@@ -224,10 +225,10 @@ class RolloutDataset:
         token_end = self.tokens.shape[-1]
         base_end = token_end + self.base.shape[-1]
         mean, scale = self.scaler.mean, self.scaler.scale
-        squashed = coordinates(base).expand(networks, -1)
+        center = squashed(base).expand(networks, -1)
         scaler = Scaler(
-            torch.cat([mean[:, :token_end], squashed, mean[:, base_end:]], -1),
-            torch.cat([scale[:, :token_end], torch.ones_like(squashed), scale[:, base_end:]], -1),
+            torch.cat([mean[:, :token_end], center, mean[:, base_end:]], -1),
+            torch.cat([scale[:, :token_end], torch.ones_like(center), scale[:, base_end:]], -1),
         )
         return replace(
             self,
@@ -278,7 +279,7 @@ class RolloutDataset:
         """
         pair, cold_start = self.pair.gather(1, batch.place), batch.cold_start[..., None]
         base = torch.where(cold_start, self.pooled[:, None], self.base[batch.row, batch.place])
-        features = coordinates(base)
+        features = squashed(base)
         count = self.driver_features.shape[-1]
         if count > 0:
             measured = self.driver_features[pair]
@@ -447,9 +448,9 @@ def _scaler(
     known = driver_features.isnan().logical_not().all(-1)
     means, scales = [], []
     for number, own in enumerate(pair):
-        squashed = coordinates(base[number])[:, None].expand(-1, windows, -1)
+        center = squashed(base[number])[:, None].expand(-1, windows, -1)
         windows_counted = counted[number]
-        of_base = Scaler.of(torch.cat([seen[own], squashed], -1)[None], windows_counted[None])
+        of_base = Scaler.of(torch.cat([seen[own], center], -1)[None], windows_counted[None])
         values = driver_features[own].nan_to_num()[:, None].expand(-1, windows, -1)
         is_known = windows_counted & known[own][:, None]
         of_driver = Scaler.of(values[None], is_known[None])

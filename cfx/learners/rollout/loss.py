@@ -206,8 +206,8 @@ class _ConstantParameters:
         work = len(self.last) * windows * steps * bases
         losses = replace(losses, simulator=self.simulator.for_work(work))
         p = self._by_name(unit.to(losses.segments.counted.dtype), windows)
-        objective = losses.with_parameters(p)
-        gap = replace(losses, objective=GapRmse()).with_parameters(p)
+        objective = losses(p)
+        gap = replace(losses, objective=GapRmse())(p)
         return torch.stack([objective, gap], -1).view(pairs, windows, bases, 2)
 
     def _by_name(self, unit: Tensor, windows: int) -> dict[str, Tensor]:

@@ -15,16 +15,13 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
+from cfx.calibration.prior import squashed
 from cfx.core.parameters import ParameterSpace
 from cfx.models.base import DrivingModel
 from cfx.policies.heads.base import ParameterHead
 
 NONE = 0.5
 """The answer that leaves the base as it is."""
-
-_EDGE = 0.005
-"""How close to a bound, in unit space, a base counts as being when an offset is added: at the bound
-itself no offset would move it."""
 
 _SMALLEST = 1e-6
 """Answers within this of 0 or 1 count as being that far away, so that their logits are finite."""
@@ -54,7 +51,7 @@ class OffsetHead(ParameterHead):
         return len(self.space)
 
     def condition(self, base: Tensor) -> Tensor:
-        return coordinates(base)
+        return squashed(base)
 
     def untrained_answer(self, fixed: Tensor) -> Tensor:
         return torch.full_like(fixed, NONE)
@@ -63,18 +60,6 @@ class OffsetHead(ParameterHead):
         if base is None:
             raise ValueError("the offset head needs each driver's base parameters")
         return moved(base, answer, self.adaptable)
-
-
-def coordinates(base: Tensor) -> Tensor:
-    """Returns the base in the squashed space.
-
-    Args:
-        base: `(*batch, n)` in unit space.
-
-    Returns:
-        Logits `(*batch, n)`, finite also at the bounds.
-    """
-    return torch.logit(base.clamp(_EDGE, 1.0 - _EDGE))
 
 
 def shrunk(space: ParameterSpace, parameters: Tensor, shrinkage: float) -> Tensor:
@@ -96,8 +81,8 @@ def shrunk(space: ParameterSpace, parameters: Tensor, shrinkage: float) -> Tenso
     if shrinkage == 0:
         return parameters
     default = space.defaults(dtype=parameters.dtype, device=parameters.device)
-    own = coordinates(space.to_unit(parameters))
-    target = coordinates(space.to_unit(default.expand_as(parameters)))
+    own = squashed(space.to_unit(parameters))
+    target = squashed(space.to_unit(default.expand_as(parameters)))
     return space.from_unit(torch.sigmoid(torch.lerp(own, target, shrinkage)))
 
 
@@ -112,7 +97,7 @@ def blended(base: Tensor, unit: Tensor, weight: Tensor) -> Tensor:
     Returns:
         `(*batch, n)` in unit space.
     """
-    mixed = torch.sigmoid(torch.lerp(coordinates(base), coordinates(unit), weight))
+    mixed = torch.sigmoid(torch.lerp(squashed(base), squashed(unit), weight))
     return torch.where(weight > 0, mixed, base)
 
 
@@ -146,5 +131,5 @@ def step_of(base: Tensor, offset: Tensor) -> Tensor:
     Returns:
         `(*batch, n)` in unit space.
     """
-    logit = coordinates(base)
+    logit = squashed(base)
     return torch.sigmoid(logit + offset) - torch.sigmoid(logit)

@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from cfx.calibration.prior import squashed
 from cfx.learners.rollout import dataset as dataset_module
 from cfx.learners.rollout.dataset import RolloutDataset, time_gaps
 from cfx.learners.rollout.loss import BaseErrors
 from cfx.policies.driver_features import measure
-from cfx.policies.heads.offset import coordinates
 from tests.learners.made import TRUE, batch_of, gru, placed, training_data
 
 
@@ -29,7 +29,7 @@ def test_networks_read_the_driver_features_of_each_of_their_drivers() -> None:
     torch.testing.assert_close(features[0, 2:, 2:], expected[dataset.pair[0, 2:]])
     usual = dataset.scaler.mean[:, -2:].expand(2, -1)
     torch.testing.assert_close(features[0, :2, 2:], usual)
-    torch.testing.assert_close(features[0, 1:, :2], coordinates(dataset.base)[0, 1:])
+    torch.testing.assert_close(features[0, 1:, :2], squashed(dataset.base)[0, 1:])
     trained_on = expected[dataset.pair[0, dataset.trains[0]]]
     known = trained_on[~trained_on.isnan().any(-1)]
     scaler, near = dataset.scaler, {"rtol": 1e-4, "atol": 1e-5}

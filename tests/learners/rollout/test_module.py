@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 
+from cfx.calibration.prior import squashed
 from cfx.learners.rollout import RolloutLearner, RolloutSettings
 from cfx.learners.rollout.inputs import RolloutBatch
 from cfx.learners.rollout.loop import burn_in, simulate
@@ -16,7 +17,6 @@ from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.policies.driver_features import measure
-from cfx.policies.heads.offset import coordinates
 from tests.learners.made import (
     QUICK,
     TRUE,
@@ -110,7 +110,7 @@ def test_a_bounded_burn_in_forgets_what_was_before() -> None:
             state = network.initial_state(1, 6)
             for window in range(max(0, first - 5), first):
                 token = dataset.tokens[:, window][dataset.pair]
-                state = step.observe(token, coordinates(dataset.base), state, everyone)
+                state = step.observe(token, squashed(dataset.base), state, everyone)
             torch.testing.assert_close(short[0, number], state[0, number])
     assert not bool(short[0, 5].any())
     assert not torch.allclose(short[0, 4], full[0, 4], atol=1e-6)
