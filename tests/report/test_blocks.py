@@ -72,6 +72,7 @@ class Broken(Further):
         raise ValueError("no luck")
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_further_section_needs_nothing_but_its_blocks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

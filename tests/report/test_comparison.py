@@ -74,6 +74,7 @@ def test_errors_of_all_jobs_stand_in_one_table_in_metres(sweep: Path) -> None:
     assert sum(span for _, span in sheet.groups) == len(sheet.columns)
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_jobs_with_and_without_a_baseline_stand_in_one_report(tmp_path: Path) -> None:
     """A shrunk set is a baseline of jobs that learn by rollout alone."""
     write_job(tmp_path / "rollout", model="krauss", methods=(*ACROSS, "shrunk"), seed=0)
@@ -168,6 +169,7 @@ def test_a_default_far_off_does_not_shrink_the_others(tmp_path: Path) -> None:
     assert "1 job with default parameters further off" in view.note
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_history_has_a_plot_and_a_table(sweep: Path) -> None:
     page = page_of(sweep)
     (table,) = (table for table in page.tables if "Burn-in" in table[0])
@@ -176,6 +178,7 @@ def test_history_has_a_plot_and_a_table(sweep: Path) -> None:
     assert labels.count("Improvement by the amount of burn-in") == 3
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_forecasts_have_plots_and_tables(tmp_path: Path) -> None:
     metrics = write_job(tmp_path / "job", pairs=4)
     forecasts = make_forecasts(drivers=4)
@@ -196,6 +199,7 @@ def test_forecasts_have_plots_and_tables(tmp_path: Path) -> None:
     assert cell.second == f"{low:.3f} to {high:.3f}"
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_sampled_forecasts_have_a_plot_and_a_table(tmp_path: Path) -> None:
     write_job(tmp_path / "job", pairs=4)
     forecasts = make_forecasts(drivers=4)
@@ -219,6 +223,7 @@ def test_sampled_forecasts_have_a_plot_and_a_table(tmp_path: Path) -> None:
     assert any("PIT" in words for words in page.having("aria-label"))
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_traffic_has_a_plot_and_a_table(tmp_path: Path) -> None:
     metrics = write_job(tmp_path / "job", pairs=4)
     traffic = make_traffic()

@@ -48,6 +48,7 @@ def rows_of(sheet: Sheet, first: str) -> list[dict[str, str]]:
     return found
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_metric_of_a_plugin_that_is_not_here_stands_in_the_report(tmp_path: Path) -> None:
     for name in ("a", "b"):
         write_job(tmp_path / name, model=name, pairs=4)
@@ -89,6 +90,7 @@ def test_a_metric_that_metrics_json_lacks_is_summarised_from_its_pairs(tmp_path:
     assert pd.isna(job.metric("comfort", "policy", "steady"))
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_metric_that_could_not_be_measured_is_told(tmp_path: Path) -> None:
     write_job(tmp_path / "job", pairs=3)
     path = tmp_path / "job" / "data.json"

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cfx.report.blocks import Figure, Fold, Table
+from cfx.report.blocks import Figure, Fold, Heading, Items, Table, Text
 from cfx.report.page import render
 from cfx.report.runs import read_runs
 from cfx.report.sections import clusters as clusters_section
@@ -278,6 +278,7 @@ def test_a_job_of_very_few_pairs_and_of_a_model_that_is_not_installed_has_a_page
     assert set(SECTIONS) <= set(page_of(tmp_path).having("id"))
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_job_of_an_older_version_has_a_page_that_says_what_is_missing(tmp_path: Path) -> None:
     write_job(tmp_path / "job", pairs=3)
     for name in ("trajectories.parquet", "curves.parquet", "style.csv"):
@@ -308,6 +309,7 @@ def test_what_is_gained_after_the_start_has_a_view_of_its_own(tmp_path: Path) ->
     assert "speed, test part after the first 5 s" in absolute(jobs).views
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_the_page_says_who_was_trained_on_whom(tmp_path: Path) -> None:
     write_job(
         tmp_path / "a",
@@ -331,6 +333,7 @@ def test_the_page_says_who_was_trained_on_whom(tmp_path: Path) -> None:
     assert "imitation" not in names[1]  # the learner of its configuration did nothing
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_unfinished_jobs_are_named_in_the_page(tmp_path: Path) -> None:
     write_job(tmp_path / "0", pairs=3)
     (tmp_path / "1" / ".hydra").mkdir(parents=True)
@@ -382,6 +385,7 @@ def test_a_calibration_is_none_of_the_policies_that_adapt(tmp_path: Path) -> Non
     assert "over driver-specific calibration" not in page.words.split("Trajectories")[-1]
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_calibrated_parameters_have_their_bounds_and_shares(tmp_path: Path) -> None:
     write_job(tmp_path / "job", methods=ACROSS)
     table = pd.read_csv(tmp_path / "job" / "pairs.csv")
@@ -407,14 +411,20 @@ def test_the_papers_figures_stand_beside_those_of_its_experiments(
     write_job(tmp_path / "pair", pairs=1, experiment="paper/pair")
     write_job(tmp_path / "pairs", pairs=5, experiment="paper/pairs")
     write_job(tmp_path / "own", pairs=5)
-    found = {one.heading: one for one in paper.comparisons(read_runs([str(tmp_path)]).jobs)}
-    assert len(found) == 2
-    pair = found["One pair: follower 11 behind leader 1"]
-    assert [cell.text for cell in pair.sheet.rows[0][1:]] == ["3.393", "1.033", "0.666", "+35.5 %"]
-    assert "this is another pair, follower 1000 and leader 990" in pair.verdicts[0]
-    pairs = found["A network for each pair"]
-    assert "the number of pairs (here 5 in a job; there 94 in all)" in pairs.explanation
-    assert "the search (here random; there Bayesian optimization)" in pairs.explanation
+    blocks = paper.PaperSection().blocks(read_runs([str(tmp_path)]))
+    assert [one.words for one in blocks if isinstance(one, Heading)] == [
+        "One pair: follower 11 behind leader 1",
+        "A network for each pair",
+    ]
+    pair, pairs = (one.sheet.rows for one in blocks if isinstance(one, Table))
+    texts = [cell.text for cell in pair[0]]
+    assert texts == ["paper", "11/1", "krauss", "3.393", "1.033", "0.666", "+35.5 %"]
+    assert pair[1][1].text == "1000/990"
+    assert [row[3].text for row in pairs[:2]] == ["below 0 %", "below 0 %"]
+    assert pairs[2][2].text == "5"
+    (said,) = (one.words for one in blocks[-1:] if isinstance(one, Text))
+    assert "the number of pairs (here 5; there 94 in all)" in said
+    assert "the search (here random; there Bayesian optimization)" in said
     _, metrics, page = clusters
     low, high = (
         metrics[f"w99 · {c}"]["rmse_improvement/population/mean"] or 0.0
@@ -422,9 +432,10 @@ def test_the_papers_figures_stand_beside_those_of_its_experiments(
     )
     does = "fares better" if high > low else "fares no better"
     assert (
-        f"w99: the policy {does} with aggressive than conservative drivers here;"
-        " better in the paper." in page.words
+        f"w99: the policy {does} with aggressive than with conservative here; better in the paper."
+        in page.words
     )
+    assert re.search(r"Above 0 % in [0-4] of 4 jobs here", page.words)
 
 
 def test_the_best_of_a_grid_search_is_chosen_by_the_validation_loss(tmp_path: Path) -> None:
@@ -435,9 +446,11 @@ def test_the_best_of_a_grid_search_is_chosen_by_the_validation_loss(tmp_path: Pa
         (folder / "metrics.json").write_text(
             json.dumps(metrics | {"validation_loss/best": loss}), encoding="utf-8"
         )
-    (grid,) = paper.comparisons(read_runs([str(tmp_path)]).jobs)
-    assert [row[1].text for row in grid.sheet.rows] == ["500", "500", "100"]
-    assert grid.verdicts == ("The smallest validation loss here: krauss · epochs=500.",)
+    blocks = paper.PaperSection().blocks(read_runs([str(tmp_path)]))
+    (sheet,) = (one.sheet for one in blocks if isinstance(one, Table))
+    assert [row[1].text for row in sheet.rows] == ["500", "500", "100"]
+    (items,) = (one.words for one in blocks if isinstance(one, Items))
+    assert items[0] == "The smallest of the last column here: krauss · epochs=500."
 
 
 def test_durations_are_said_as_one_says_them() -> None:

@@ -140,6 +140,7 @@ def test_folders_of_absolute_paths_are_left_out(text: str, kept: str) -> None:
     assert without_folders(text) == kept
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_the_page_names_no_folder_of_this_machine(sweep: Path) -> None:
     assert main(["report", str(sweep), "--output", str(sweep / "page.html")]) == 0
     text = (sweep / "page.html").read_text(encoding="utf-8")

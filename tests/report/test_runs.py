@@ -141,6 +141,7 @@ def test_a_damaged_file_is_named(tmp_path: Path, file: str, content: str, said: 
     assert str(tmp_path / "job" / file) in str(caught.value)
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_the_command_says_in_one_sentence_what_it_cannot_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -164,6 +165,7 @@ def test_the_command_says_in_one_sentence_what_it_cannot_do(
     assert list((tmp_path / "empty").iterdir()) == []
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_the_command_writes_beside_the_jobs_and_says_where(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

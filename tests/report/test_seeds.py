@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -17,9 +15,10 @@ from tests.report.folders import ACROSS, write_job
 SEEDS = (0, 1, 2)
 
 
-@pytest.fixture
-def runs(tmp_path: Path) -> Runs:
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
     """A policy and a calibration of two models, each with three seeds."""
+    tmp_path = tmp_path_factory.mktemp("seeds")
     for model in ("krauss", "w99"):
         for policy in ("gru", "fixed"):
             for seed in SEEDS:

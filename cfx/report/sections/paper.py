@@ -1,298 +1,171 @@
-"""The published numbers beside a job's, where the job ran one of the paper's experiments.
+"""Published numbers beside a job's, where the job ran one of a paper's experiments.
 
-Z. Yang, S. Masuda and M. Tatsubori (2021), Online Adaptation of Parameters using GRU-based Neural
-Network with BO for Accurate Driving Model.
+`published.json` has the paper's numbers, what a column shows of a job, and what differs between the
+paper's set-up and a job's: another paper is another such file.
 """
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from importlib import resources
+from typing import Any
 
-from cfx.data.style.result import CLUSTERS
 from cfx.report.blocks import Block, Heading, Items, Table, Text
-from cfx.report.figures.words import MINUS, percent
+from cfx.report.figures.words import percent_or_undefined, plural
 from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs
 from cfx.report.section import Section
-from cfx.report.tables import Cell, Column, Sheet, number, share, text
-
-PAPER_PAIRS = 94
-PAIR_11 = {"default": 3.393, "fixed": 1.033, "policy": 0.666}
-"""RMSE of speed, m/s: follower 11 behind leader 1, Krauss model."""
-
-_CITATION = (
-    "Yang, Masuda and Tatsubori (2021), Online Adaptation of Parameters using GRU-based Neural"
-    " Network with BO for Accurate Driving Model."
-)
-_NO_NUMBER = Cell("", number=True)
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """A published result beside the jobs'.
-
-    Attributes:
-        heading: what is compared.
-        sheet: the numbers.
-        verdicts: what follows from them, in sentences.
-        explanation: what differs between the paper's set-up and the jobs', in a sentence.
-    """
-
-    heading: str
-    sheet: Sheet
-    verdicts: tuple[str, ...]
-    explanation: str
+from cfx.report.tables import Cell, Column, Sheet, formatted, number, text
 
 
 class PaperSection(Section):
-    """The published numbers beside a job's, where the job ran one of the paper's experiments."""
+    """Published numbers beside a job's, where the job ran one of a paper's experiments."""
 
     title = "The paper's numbers beside these"
     entry = "The paper's numbers"
     order = 1100
 
     def blocks(self, runs: Runs) -> list[Block]:
-        """Return the comparisons; nothing if no job ran an experiment of the paper."""
+        """Return a comparison for each of the paper's experiments among the jobs."""
+        paper = published()
         found: list[Block] = []
-        for one in comparisons(runs.jobs):
-            found += [
-                Heading(one.heading),
-                Table(one.sheet, sortable=False),
-                Items(one.verdicts),
-                Text(one.explanation),
-            ]
-        return [Text(_CITATION), *found] if found else []
+        for experiment, about in paper["experiments"].items():
+            jobs = [job for job in runs.jobs if job.experiment == experiment]
+            if "ranked" in about:
+                jobs = _ranked(jobs, about["ranked"])
+            if jobs:
+                found += [
+                    Heading(about["heading"]),
+                    Table(comparison(about, jobs), sortable=False),
+                    Items(tuple(verdicts(about, jobs))),
+                    Text(differences(paper, about, jobs)),
+                ]
+        return [Text(paper["citation"]), *found] if found else []
 
 
-def comparisons(jobs: Sequence[Job]) -> list[Comparison]:
-    """Returns a comparison for each of the paper's experiments among the jobs' `experiment`."""
-    experiments = {"pair": _pair, "pairs": _pairs, "clusters": _clusters, "grid": _grid}
-    made = []
-    for experiment, compare in experiments.items():
-        chosen = [job for job in jobs if job.experiment == f"paper/{experiment}"]
-        if chosen:
-            made.append(compare(chosen))
-    return made
+def published() -> dict[str, Any]:
+    """Return what `published.json` holds."""
+    file = resources.files("cfx.report.sections") / "published.json"
+    found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    return found
 
 
-def _pair(jobs: Sequence[Job]) -> Comparison:
+def comparison(about: Mapping[str, Any], jobs: Sequence[Job]) -> Sheet:
+    """Return the paper's rows of an experiment, and a row per job."""
     columns = [Column("", number=False)]
-    published = [text("paper: pair 11/1, Krauss")]
-    for method, value in PAIR_11.items():
-        columns.append(Column(f"RMSE of speed, {method} (m/s)"))
-        published.append(number(value, f"{value:.3f}"))
-    columns.append(Column("Improvement over fixed", f"(fixed {MINUS} policy) / fixed."))
-    gain_there = (PAIR_11["fixed"] - PAIR_11["policy"]) / PAIR_11["fixed"]
-    rows = [(*published, share(gain_there))]
-    verdicts = []
+    for one in about["columns"]:
+        columns.append(Column(one["heading"], one.get("meaning", ""), number="form" in one))
+    named = [("paper", row) for row in about["published"]]
     for job in jobs:
-        cells = [text(f"here: {job.name}")]
-        for method in PAIR_11:
-            value = job.metric("rmse_speed", method)
-            cells.append(number(value, f"{value:.3f}"))
-        gain = job.improvement("mean")
-        rows.append((*cells, share(gain)))
-        there = f"in the paper it is closer by {100 * gain_there:.1f} %"
-        verdicts.append(f"{job.name}: {_which_pair(job)}; {_side(gain)}, {there}.")
-    return Comparison(
-        "One pair: follower 11 behind leader 1",
-        Sheet(tuple(columns), tuple(rows)),
-        tuple(verdicts),
-        _explanation(jobs, 1),
-    )
-
-
-def _which_pair(job: Job) -> str:
-    table = job.pairs.drop_duplicates("pair_id")
-    if len(table) == 1 and {"leader_id", "follower_id"} <= set(table.columns):
-        follower, leader = str(table["follower_id"].iloc[0]), str(table["leader_id"].iloc[0])
-        if (follower, leader) == ("11", "1"):
-            return "the pair has the paper's numbers, follower 11 and leader 1"
-        return f"this is another pair, follower {follower} and leader {leader}"
-    return f"these are means over {len(table)} pairs, not the paper's one"
-
-
-def _side(gain: float) -> str:
-    if not math.isfinite(gain):
-        return "the improvement is not defined"
-    closer = "closer" if gain > 0 else "not closer"
-    than = f"than driver-specific calibration ({percent(gain, 1)})"
-    return f"the policy is {closer} to the driver {than}"
-
-
-def _pairs(jobs: Sequence[Job]) -> Comparison:
-    columns = (
-        Column("", number=False),
-        Column("Driving model", number=False),
-        Column("Pairs"),
-        Column("Mean improvement", "Over driver-specific calibration."),
-        Column(
-            "Trimmed mean",
-            "Without the top and the bottom tenth, which the paper leaves out as outliers.",
-        ),
-    )
-    rows = []
-    for model in ("Krauss", "Wiedemann 99"):
-        count = number(PAPER_PAIRS, str(PAPER_PAIRS))
-        below = Cell("below 0 %", number=True)
-        rows.append((text("paper"), text(model), count, below, _NO_NUMBER))
-    verdicts = []
-    for job in jobs:
-        mean, trimmed = job.improvement("mean"), job.improvement("trimmed_mean")
-        count = _count(job)
-        about = (text(f"here: {job.name}"), text(job.component("model")), count)
-        rows.append((*about, share(mean), share(trimmed)))
-        if math.isfinite(mean):
-            verdicts.append(f"{job.name}: the average improvement is {_below(mean, trimmed)}.")
-    return Comparison(
-        "A network for each pair",
-        Sheet(columns, tuple(rows)),
-        tuple(verdicts),
-        _explanation(jobs, PAPER_PAIRS),
-    )
-
-
-def _below(mean: float, trimmed: float) -> str:
-    if mean < 0 and trimmed < 0:
-        return "below 0 %, as in the paper"
-    if mean < 0 or trimmed < 0:
-        return "below 0 % by one of the two means, and not by the other"
-    return "not below 0 %, unlike the paper's"
-
-
-def _clusters(jobs: Sequence[Job]) -> Comparison:
-    columns = (
-        Column("", number=False),
-        Column("Driving model", number=False),
-        Column("Cluster", number=False),
-        Column("Pairs"),
-        Column(
-            "Mean improvement over pooled calibration",
-            "One set of parameters, calibrated jointly on the training drivers: the paper's"
-            " baseline.",
-        ),
-        Column(
-            "Mean improvement over driver-specific calibration",
-            "A set calibrated on the driver's own first part: a harder baseline, which the paper"
-            " has not.",
-        ),
-    )
-    rows = []
-    for model, said in (("Krauss", "above 0 %"), ("Wiedemann 99", "above 0 %, up to +26 %")):
-        about = (text("paper"), text(model), text("each"), _NO_NUMBER)
-        rows.append((*about, Cell(said, number=True), _NO_NUMBER))
-    gains: dict[tuple[str, str], float] = {}
-    for job in jobs:
-        model, cluster = job.component("model"), str(job.setting("style.cluster") or "all")
-        gains[model, cluster] = job.improvement("mean", "population")
-        about = (text(f"here: {job.name}"), text(model), text(cluster), _count(job))
-        rows.append((*about, share(gains[model, cluster]), share(job.improvement("mean"))))
-    return Comparison(
-        "A network for each cluster, tested on unseen drivers",
-        Sheet(columns, tuple(rows)),
-        tuple(_cluster_verdicts(gains)),
-        _explanation(jobs, PAPER_PAIRS),
-    )
-
-
-def _cluster_verdicts(gains: Mapping[tuple[str, str], float]) -> list[str]:
-    known = {key: gain for key, gain in gains.items() if math.isfinite(gain)}
-    verdicts = []
-    if known:
-        above = sum(gain > 0 for gain in known.values())
-        there = "in all clusters in the paper"
-        verdicts.append(f"Above 0 % in {above} of {len(known)} jobs here; {there}.")
-    for model in dict.fromkeys(model for model, _ in known):
-        low, high = known.get((model, CLUSTERS[0])), known.get((model, CLUSTERS[2]))
-        if low is not None and high is not None:
-            verdicts.append(
-                f"{model}: the policy {_fares(high, low)} with aggressive than conservative drivers"
-                " here; better in the paper."
-            )
-    for cluster in dict.fromkeys(cluster for _, cluster in known):
-        krauss, w99 = known.get(("krauss", cluster)), known.get(("w99", cluster))
-        if krauss is not None and w99 is not None:
-            verdicts.append(
-                f"{cluster}: the policy {_fares(w99, krauss)} with Wiedemann 99 than with Krauss"
-                " here; better in the paper."
-            )
-    return verdicts
-
-
-def _fares(gain: float, other: float) -> str:
-    return "fares better" if gain > other else "fares no better"
-
-
-def _grid(jobs: Sequence[Job]) -> Comparison:
-    columns = (
-        Column("", number=False),
-        Column("Epochs"),
-        Column("Batch size"),
-        Column("Hidden size"),
-        Column(
-            "Best validation loss",
-            "Mean over the networks of each one's lowest. The training is chosen by it, never by"
-            " the test part.",
-        ),
-    )
-    published = (number(500, "500"), number(1, "1"), _NO_NUMBER, _NO_NUMBER)
-    rows: list[tuple[Cell, ...]] = [(text("paper: the best found"), *published)]
-    losses = {job.name: job.metrics.get("validation_loss/best", math.nan) for job in jobs}
-    ranked = sorted(jobs, key=lambda job: (not math.isfinite(losses[job.name]), losses[job.name]))
-    for job in ranked:
-        cells = [text(f"here: {job.name}")]
-        for path in ("learner.epochs", "learner.batch_size", "policy.hidden_size"):
-            setting = str(job.setting(path))
-            cells.append(Cell(setting, setting, number=True))
-        loss = losses[job.name]
-        rows.append((*cells, number(loss, f"{loss:.4g}")))
-    verdicts: tuple[str, ...] = ()
-    if math.isfinite(losses[ranked[0].name]):
-        verdicts = (f"The smallest validation loss here: {ranked[0].name}.",)
-    sheet = Sheet(columns, tuple(rows))
-    return Comparison("Grid search of the training", sheet, verdicts, _explanation(jobs, 1))
-
-
-def _count(job: Job) -> Cell:
-    count = job.pairs["pair_id"].nunique()
-    return number(count, str(count))
-
-
-def _explanation(jobs: Sequence[Job], pairs: int) -> str:
-    """Says what of the jobs' set-up is not the paper's; only what can be read off the jobs."""
-    sources, counts = set(), set()
-    optimizers, learners, epochs, batches = set(), set(), set(), set()
-    for job in jobs:
-        sources.add(without_folders(str(job.data.get("source", ""))))
-        counts.add(job.pairs["pair_id"].nunique())
-        optimizers.add(job.component("optimizer"))
-        learners.add(job.component("learner"))
-        epochs.add(str(job.setting("learner.epochs")))
-        batches.add(str(job.setting("learner.batch_size")))
-    sources -= {""}
-    parts = []
-    if sources:
-        there = "NGSIM I-80, 13 April 2005, 4:00 to 4:15 p.m."
-        parts.append(f"the recordings (here {', '.join(sorted(sources))}; there {there})")
-    if counts != {pairs} and pairs > 1:
-        here = " or ".join(map(str, sorted(counts)))
-        parts.append(f"the number of pairs (here {here} in a job; there {pairs} in all)")
-    if optimizers != {"botorch"}:
-        here = ", ".join(sorted(optimizers))
-        parts.append(f"the search (here {here}; there Bayesian optimization)")
-    if learners != {"imitation"}:
-        here = ", ".join(sorted(learners))
-        parts.append(
-            f"how the policy learns (here {here}; there from the windows' best parameters)"
+        named.append(
+            (f"here: {job.name}", [value_of(job, one["value"]) for one in about["columns"]])
         )
-    if epochs != {"500"} or batches != {"1"}:
-        here = f"{' or '.join(sorted(epochs))} epochs, batch size {' or '.join(sorted(batches))}"
-        parts.append(f"the training (here {here}; there 500, 1)")
-    parts.append(
-        "what the paper does not print, such as the parameters' bounds and the number of"
-        " evaluations of its search"
-    )
-    listed = "; ".join(parts)
-    return f"The numbers need not agree, because these things differ, or may: {listed}."
+    rows = []
+    for name, values in named:
+        cells = [text(name)]
+        for one, value in zip(about["columns"], values, strict=True):
+            cells.append(_cell(value, one.get("form", "")))
+        rows.append(tuple(cells))
+    return Sheet(tuple(columns), tuple(rows))
+
+
+def value_of(job: Job, path: str) -> Any:
+    """Return what a column shows of a job: a text or a number, NaN where it is not known.
+
+    Args:
+        job: of the report.
+        path: `source`, `pair`, `pairs`, `component/GROUP`, `setting/PATH`, `metric/KEY` or
+            `improvement/STATISTIC/BASELINE`.
+    """
+    kind, *rest = path.split("/")
+    readers: dict[str, Callable[..., Any]] = {
+        "component": job.component,
+        "setting": job.setting,
+        "metric": lambda *parts: job.metrics.get("/".join(parts), math.nan),
+        "improvement": job.improvement,
+        "source": lambda: without_folders(str(job.data.get("source", ""))),
+        "pairs": job.pairs["pair_id"].nunique,
+        "pair": lambda: _pair(job),
+    }
+    return readers[kind](*rest)
+
+
+def _pair(job: Job) -> str:
+    """Return the numbers of a single pair, or how many there are."""
+    table = job.pairs.drop_duplicates("pair_id")
+    if len(table) > 1 or not {"follower_id", "leader_id"} <= set(table.columns):
+        return plural(len(table), "pair")
+    return f"{table['follower_id'].iloc[0]}/{table['leader_id'].iloc[0]}"
+
+
+def verdicts(about: Mapping[str, Any], jobs: Sequence[Job]) -> list[str]:
+    """Return what the jobs say of the paper's claim, and the claim."""
+    said = []
+    if about["judged"]:
+        gains = {job.name: float(value_of(job, about["judged"])) for job in jobs}
+        for name, gain in gains.items():
+            said.append(f"{name}: mean improvement {percent_or_undefined(gain, 1)}.")
+        known = [gain for gain in gains.values() if math.isfinite(gain)]
+        if len(known) > 1:
+            above = sum(gain > 0 for gain in known)
+            said.append(f"Above 0 % in {above} of {len(known)} jobs here.")
+    if "ranked" in about and math.isfinite(value_of(jobs[0], about["ranked"])):
+        said.append(f"The smallest of the last column here: {jobs[0].name}.")
+    for better in about.get("better", ()):
+        said += _compared(better, about["judged"], jobs)
+    return [*said, about["claim"]]
+
+
+def _ranked(jobs: Sequence[Job], path: str) -> list[Job]:
+    """Return the jobs by a number, the smallest first, those where it is not known last."""
+
+    def place(job: Job) -> tuple[bool, float]:
+        value = value_of(job, path)
+        return not math.isfinite(value), value
+
+    return sorted(jobs, key=place)
+
+
+def _compared(better: Mapping[str, str], judged: str, jobs: Sequence[Job]) -> list[str]:
+    """Say whether the policy fares better with one value than with another, others being equal."""
+    gains: dict[str, dict[str, float]] = {}
+    for job in jobs:
+        gain = value_of(job, judged)
+        if math.isfinite(gain):
+            alike = gains.setdefault(str(value_of(job, better["same"])), {})
+            alike[str(value_of(job, better["value"]))] = gain
+    said = []
+    for same, found in gains.items():
+        if {better["with"], better["than"]} <= set(found):
+            more = "better" if found[better["with"]] > found[better["than"]] else "no better"
+            said.append(
+                f"{same}: the policy fares {more} with {better['with']} than with {better['than']}"
+                " here; better in the paper."
+            )
+    return said
+
+
+def differences(paper: Mapping[str, Any], about: Mapping[str, Any], jobs: Sequence[Job]) -> str:
+    """Say what of the jobs' set-up is not the paper's; only what can be read off the jobs."""
+    pairs = about["pairs"]
+    listed = list(paper["differences"])
+    if pairs > 1:
+        number_of = {"what": "the number of pairs", "value": "pairs", "there": f"{pairs} in all"}
+        listed.insert(1, {**number_of, "same": str(pairs)})
+    parts = []
+    for one in listed:
+        here = sorted({str(value_of(job, one["value"])) for job in jobs} - {""})
+        if here and here != [one["same"]]:
+            parts.append(f"{one['what']} (here {' or '.join(here)}; there {one['there']})")
+    told = "; ".join([*parts, paper["unknown"]])
+    return f"The numbers need not agree, because these things differ, or may: {told}."
+
+
+def _cell(value: Any, form: str) -> Cell:
+    if not form:
+        return text(value)
+    if isinstance(value, int | float):
+        return number(value, formatted(value, form))
+    return Cell("" if value is None else str(value), number=True)

@@ -135,6 +135,7 @@ class Broken(Further):
         raise ValueError("no luck")
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_third_partys_figure_needs_a_class_and_an_entry_point(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
