@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from cfx.report.job import Runs
+from cfx.report.job import Job, Runs
 from cfx.report.tables import Sheet
 
 
@@ -138,6 +138,21 @@ def cards(groups: Sequence[Group]) -> list[Block]:
     others = groups[MOST:]
     if others:
         found.append(Fold(f"{len(others)} more jobs", (Grid(tuple(others)),)))
+    return found
+
+
+def job_folds(runs: Runs, parts: Callable[[Job], Sequence[Block | None]]) -> list[Block]:
+    """Return a fold for each job that has something to show; the first is open.
+
+    Args:
+        runs: the jobs.
+        parts: takes a job and returns its blocks; None is left out.
+    """
+    found: list[Block] = []
+    for job in runs.jobs:
+        blocks = [block for block in parts(job) if block is not None]
+        if blocks:
+            found.append(job_fold(job.name, blocks, first=not found))
     return found
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from cfx.report.blocks import Figure, View
+from cfx.report.blocks import Block, Figure, View, job_folds
 from cfx.report.figures.figure import JobFigure, draw
-from cfx.report.job import Job
+from cfx.report.job import Job, Runs
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
@@ -17,6 +17,11 @@ def figure_of(name: str, job: Job) -> Figure | None:
     found = JobFigure.named(name)
     drawing = draw(found, job.results)
     return None if drawing is None else shown(drawing, found.part.title)
+
+
+def figure_folds(name: str, runs: Runs) -> list[Block]:
+    """Return the figure of that name of each job that has its data, in a fold; the first open."""
+    return job_folds(runs, lambda job: [figure_of(name, job)])
 
 
 def caption(name: str) -> str:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,107 +28,41 @@ _PLATOON = (
 )
 
 
-@dataclass(frozen=True)
-class _SafetyColumn:
-    """A column on safety: a metric over a part of the trajectories, and the baseline below it."""
+class _Measure(NamedTuple):
+    """A measure of safety over a part of the trajectories, and the baseline that stands below."""
 
     metric: str
     scope: str
     baseline: str
+    form: str
     heading: str
     meaning: str
-    form: str
-
-    @property
-    def platoon(self) -> bool:
-        """Whether it is of a platoon."""
-        return self.metric.startswith("platoon/")
 
 
 _SAFETY = (
-    _SafetyColumn(
-        "collisions",
-        TEST,
-        "fixed",
-        "Collisions",
-        "Pairs in which the simulated gap becomes negative, on the test part.",
-        ".0f",
-    ),
-    _SafetyColumn(
-        "collisions",
-        FULL_TRAJECTORY,
-        "population",
-        "full trajectory",
-        "The same over full trajectories.",
-        ".0f",
-    ),
-    _SafetyColumn(
-        "hard_braking",
-        TEST,
-        "fixed",
-        "Hard braking",
-        "Frames with an acceleration below \N{MINUS SIGN}8 m/s², test part.",
-        ".0f",
-    ),
-    _SafetyColumn(
-        "hard_braking",
-        FULL_TRAJECTORY,
-        "population",
-        "full trajectory",
-        "The same over full trajectories.",
-        ".0f",
-    ),
-    _SafetyColumn(
-        "jerk",
-        TEST,
-        "fixed",
-        "Jerk (m/s³)",
-        "Root mean square jerk on the test part, mean over the pairs.",
-        ".2f",
-    ),
-    _SafetyColumn(
-        "at_bounds",
-        TEST,
-        "fixed",
-        "At bounds",
-        "Share of the tuned parameters' values within 1 % of a bound.",
-        ".0%",
-    ),
-    _SafetyColumn(
-        "platoon/head_to_tail",
-        TEST,
-        "population",
-        "Amplification",
-        f"{_PLATOON} By how many times as much as the leader the last follower slows down, mean"
-        " over the networks; above 1 the platoon amplifies.",
-        ".2f",
-    ),
-    _SafetyColumn(
-        "platoon/string_stable",
-        TEST,
-        "population",
-        "Stable",
-        f"{_PLATOON} Share of the networks with a string stable platoon: no vehicle slows down more"
-        " than the vehicle ahead (by over 0.1 m/s).",
-        ".0%",
-    ),
-    _SafetyColumn(
-        "platoon/min_gap",
-        TEST,
-        "population",
-        "Least gap (m)",
-        f"{_PLATOON} The least gap of all.",
-        ".1f",
-    ),
-    _SafetyColumn(
-        "platoon/collisions",
-        TEST,
-        "population",
-        "Collisions",
-        f"{_PLATOON} Followers that collide, of all platoons.",
-        ".0f",
-    ),
+    ("collisions", TEST, "fixed", ".0f", "Collisions"),
+    ("collisions", FULL_TRAJECTORY, "population", ".0f", "full trajectory"),
+    ("hard_braking", TEST, "fixed", ".0f", "Hard braking"),
+    ("hard_braking", FULL_TRAJECTORY, "population", ".0f", "full trajectory"),
+    ("jerk", TEST, "fixed", ".2f", "Jerk (m/s³)"),
+    ("at_bounds", TEST, "fixed", ".0%", "At bounds"),
+    ("platoon/head_to_tail", TEST, "population", ".2f", "Amplification"),
+    ("platoon/string_stable", TEST, "population", ".0%", "Stable"),
+    ("platoon/min_gap", TEST, "population", ".1f", "Least gap (m)"),
+    ("platoon/collisions", TEST, "population", ".0f", "Collisions"),
 )
+_MEANINGS = {
+    "collisions": "Pairs in which the simulated gap becomes negative, on the test part.",
+    "hard_braking": "Frames with an acceleration below \N{MINUS SIGN}8 m/s², test part.",
+    "jerk": "Root mean square jerk on the test part, mean over the pairs.",
+    "at_bounds": "Share of the tuned parameters' values within 1 % of a bound.",
+    "platoon/head_to_tail": f"{_PLATOON} By how many times as much as the leader the last follower"
+    " slows down, mean over the networks; above 1 the platoon amplifies.",
+    "platoon/string_stable": f"{_PLATOON} Share of the networks with a string stable platoon: no"
+    " vehicle slows down more than the vehicle ahead (by over 0.1 m/s).",
+    "platoon/min_gap": f"{_PLATOON} The least gap of all.",
+    "platoon/collisions": f"{_PLATOON} Followers that collide, of all platoons.",
+}
 
 _ERRORS = (
     ("rmse_speed", TEST),
@@ -234,9 +169,10 @@ def closeness(jobs: Sequence[Job]) -> Sheet:
 def safety(jobs: Sequence[Job]) -> Sheet:
     """Returns a row per job: the policy's measures of safety, and below them a baseline's."""
     kept = []
-    for one in _SAFETY:
-        if any(job.has_metric(one.metric, job.judged, one.scope) for job in jobs):
-            kept.append(one)
+    for metric, scope, baseline, form, heading in _SAFETY:
+        if any(job.has_metric(metric, job.judged, scope) for job in jobs):
+            meaning = _MEANINGS[metric] if scope == TEST else "The same over full trajectories."
+            kept.append(_Measure(metric, scope, baseline, form, heading, meaning))
     columns = [Column("Job", number=False)]
     for one in kept:
         meaning = f"{one.meaning} Below it the same for {explained(one.baseline)}."
@@ -247,7 +183,7 @@ def safety(jobs: Sequence[Job]) -> Sheet:
         for one in kept:
             cells.append(_with_baseline(job, one.metric, one.scope, one.baseline, one.form))
         rows.append(tuple(cells))
-    platoon = len([one for one in kept if one.platoon])
+    platoon = len([one for one in kept if one.metric.startswith("platoon/")])
     groups = [("", 1)]
     for title, count in ((_RECORDED, len(kept) - platoon), (_IN_PLATOON, platoon)):
         if count:

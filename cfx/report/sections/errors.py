@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from cfx.report.blocks import Block, Text, job_fold
-from cfx.report.figure_blocks import caption, figure_of
+from cfx.report.blocks import Block, Text
+from cfx.report.figure_blocks import caption, figure_folds
 from cfx.report.job import Runs
 from cfx.report.section import Section
-
-_NAME = "error_over_time"
 
 
 class ErrorsSection(Section):
@@ -19,9 +17,5 @@ class ErrorsSection(Section):
 
     def blocks(self, runs: Runs) -> list[Block]:
         """Return a figure for each job that kept its trajectories."""
-        found: list[Block] = []
-        for job in runs.jobs:
-            figure = figure_of(_NAME, job)
-            if figure is not None:
-                found.append(job_fold(job.name, [figure], first=not found))
-        return [Text(caption(_NAME)), *found] if found else []
+        folds = figure_folds("error_over_time", runs)
+        return [Text(caption("error_over_time")), *folds] if folds else []

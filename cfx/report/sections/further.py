@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from cfx.core.registry import OWN
-from cfx.report.blocks import Block, Heading, Text, job_fold
-from cfx.report.figure_blocks import figure_of
+from cfx.report.blocks import Block, Heading, Text
+from cfx.report.figure_blocks import figure_folds
 from cfx.report.figures.figure import JobFigure
 from cfx.report.job import Runs
 from cfx.report.section import Section
@@ -26,11 +26,7 @@ class FurtherSection(Section):
         for one in JobFigure.installed():
             if one.distribution == OWN or one.name in shown:
                 continue
-            folds: list[Block] = []
-            for job in runs.jobs:
-                figure = figure_of(one.name, job)
-                if figure is not None:
-                    folds.append(job_fold(job.name, [figure], first=not folds))
+            folds = figure_folds(one.name, runs)
             if folds:
                 found += [Heading(one.part.title), Text(one.part.caption), *folds]
         return found

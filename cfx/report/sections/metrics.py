@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
 
-from cfx.report.blocks import Block, Table, Text, job_fold
+from cfx.report.blocks import Block, Table, Text, job_folds
 from cfx.report.figures.words import explained, short_label
 from cfx.report.job import Job, Runs
 from cfx.report.metrics import metric_title
@@ -29,18 +27,16 @@ class MetricsSection(Section):
 
     def blocks(self, runs: Runs) -> list[Block]:
         """Return a table for each job."""
-        found: list[Block] = [Text(_INTRODUCTION)]
-        for k, job in enumerate(runs.jobs):
-            parts: list[Block] = [Table(all_metrics(job), compact=True)]
-            for one in job.data.get("metrics_left_out") or ():
-                parts.append(Text(_left_out(one), "lacking"))
-            found.append(job_fold(job.name, parts, first=k == 0))
-        return found
+        return [Text(_INTRODUCTION), *job_folds(runs, _parts)]
 
 
-def _left_out(one: Mapping[str, Any]) -> str:
-    name, distribution = one.get("name"), one.get("distribution")
-    return f"{name} of {distribution} could not be measured: {one.get('reason')}"
+def _parts(job: Job) -> list[Block]:
+    parts: list[Block] = [Table(all_metrics(job), compact=True)]
+    for one in job.data.get("metrics_left_out") or ():
+        name, distribution = one.get("name"), one.get("distribution")
+        said = f"{name} of {distribution} could not be measured: {one.get('reason')}"
+        parts.append(Text(said, "lacking"))
+    return parts
 
 
 def all_metrics(job: Job) -> Sheet:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from cfx.report.blocks import Block, Fold, Heading, Table, Text, job_fold
-from cfx.report.figure_blocks import caption, figure_of
+from cfx.report.blocks import Block, Fold, Heading, Table, Text
+from cfx.report.figure_blocks import caption, figure_folds
 from cfx.report.figures.words import MINUS
 from cfx.report.job import Job, Runs
 from cfx.report.section import Section
@@ -54,11 +54,7 @@ class SafetySection(Section):
         for job in runs.jobs:
             for scope, words in job.outside.items():
                 found.append(Text(f"{job.name}, {job.scope_label(scope)}: {words}."))
-        folds: list[Block] = []
-        for job in runs.jobs:
-            figure = figure_of("platoon", job)
-            if figure is not None:
-                folds.append(job_fold(job.name, [figure], first=not folds))
+        folds = figure_folds("platoon", runs)
         if folds:
             found += [Heading("Ten followers in a row"), Text(caption("platoon")), *folds]
         return found
