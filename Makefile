@@ -75,7 +75,7 @@ dist: $(VENV)/.ready-test
 	$(BIN)/python -m twine check --strict dist/*
 	$(MAKE) VENV=.venv-dist .venv-dist/.torch
 	.venv-dist/bin/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt \
-	  dist/cfx_*.whl "cfx-driving[joblib,sumo] @ file://$$(echo $(CURDIR)/dist/cfx_driving-*.whl)"
+	  dist/cfx_*.whl "cfx-driving[joblib] @ file://$$(echo $(CURDIR)/dist/cfx_driving-*.whl)"
 	.ci/smoke .venv-dist/bin
 	rm -rf .venv-dist
 
@@ -83,8 +83,8 @@ conf: $(VENV)/.ready
 	$(BIN)/python -m cfx.app.nodes
 
 # The stamps are made again when what they were made from changes, so a second `make run` installs nothing.
-# What README's commands need comes from plugins/ too: the readers of published recordings, the benchmark.
-EVERYBODYS = plugins/cfx-recordings plugins/cfx-benchmark
+# What README's commands need comes from plugins/ too: the readers of published recordings, the benchmark, SUMO.
+EVERYBODYS = plugins/cfx-recordings plugins/cfx-benchmark plugins/cfx-sumo
 $(VENV)/.ready: pyproject.toml $(EVERYBODYS:%=%/pyproject.toml) constraints.txt $(VENV)/.torch
 	$(PIP) install --quiet --constraint constraints.txt $(addprefix --editable ,. $(EVERYBODYS))
 	touch $@

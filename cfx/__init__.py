@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from cfx.data.pairs import Pair as Pair
     from cfx.data.pairs import PairBatch as PairBatch
     from cfx.data.pairs import PairSet as PairSet
+    from cfx.evaluation.demo import Demo as Demo
     from cfx.evaluation.metrics.base import Metric as Metric
     from cfx.evaluation.metrics.base import Trajectories as Trajectories
     from cfx.evaluation.protocols.base import Protocol as Protocol
@@ -100,6 +101,7 @@ _HOMES = {
     "ResultTable": "cfx.results.table",
     "Column": "cfx.results.table",
     "Findings": "cfx.results.table",
+    "Demo": "cfx.evaluation.demo",
     "Command": "cfx.core.command",
     "Parameter": "cfx.core.parameters",
     "ParameterSpace": "cfx.core.parameters",
@@ -122,8 +124,6 @@ def __getattr__(name: str) -> Any:
         value = getattr(import_module(_HOMES[name]), name)
     elif name == "errors":
         value = import_module("cfx.core.errors")
-    elif name == "sumo":
-        value = import_module("cfx.sumo")
     elif name == "__version__":
         value = _version()
     else:

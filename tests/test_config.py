@@ -119,12 +119,12 @@ def test_every_file_in_conf_composes_and_its_components_can_be_created(
     values = values_of(f"{group}={name}")
     config = JobConfig.of(values)
     for key, kind in registry.GROUPS.items():
+        if getattr(config, key) is None:
+            continue  # a job needs no demonstration
         node = dict(getattr(config, key))
         for required in ("path", "run"):
             if required in node:
                 node[required] = "somewhere"
-        if node["name"] == "sumo_vtype" and node["parameters"] is None:
-            node["parameters"] = {"tau": {"low": 0.5, "high": 3.0, "default": 1.0}}
         assert registry.create(kind.name, node).kind == kind.name
 
 

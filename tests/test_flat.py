@@ -17,7 +17,7 @@ from cfx.app import cli
 from cfx.report.runs import read_runs
 from cfx.report.sections import calibration
 from cfx.report.tables import formatted
-from cfx.sumo.export import export
+from cfx_sumo.export import export
 
 JOB = [
     "debug=quick",

@@ -10,7 +10,7 @@ import pytest
 import cfx
 from cfx.data.tidy import write_tidy
 from cfx.simulation.synthetic import SyntheticDataset
-from cfx.sumo.scenarios import SCENARIOS
+from cfx_sumo.drive.scenarios import SCENARIOS
 from tests.conftest import ROOT
 from tests.printed import Reader, all_blocks
 

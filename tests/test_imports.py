@@ -24,7 +24,7 @@ FLOORS = (
     ("learners",),
     ("evaluation",),
     ("results",),
-    ("report", "sumo"),
+    ("report",),
     ("app", "contracts"),
 )
 """From the ground up; a room may use rooms on its own floor and below."""

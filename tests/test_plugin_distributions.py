@@ -97,7 +97,7 @@ def test_the_wheel_holds_the_package_its_licence_and_its_entry_points(
     source = {
         path.relative_to(plugin).as_posix()
         for path in (plugin / package).rglob("*")
-        if path.suffix in {".py", ".yaml"}
+        if path.is_file() and path.suffix != ".pyc"
     }
     assert source <= names
     assert {f"{package}/py.typed", f"{info}/licenses/LICENSE"} <= names

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from cfx.contracts.optimizers import Problems as Problems
     from cfx.contracts.suites import CommandContract as CommandContract
     from cfx.contracts.suites import DatasetContract as DatasetContract
+    from cfx.contracts.suites import DemoContract as DemoContract
     from cfx.contracts.suites import EngineContract as EngineContract
     from cfx.contracts.suites import LearnerContract as LearnerContract
     from cfx.contracts.suites import MetricContract as MetricContract
@@ -48,6 +49,7 @@ _CHECKS = {
     "protocol": "cfx.contracts.protocols",
     "metric": "cfx.contracts.metrics",
     "table": "cfx.contracts.tables",
+    "demo": "cfx.contracts.demos",
     "command": "cfx.contracts.commands",
 }
 """Where each kind's statements are."""

@@ -21,6 +21,7 @@ from cfx.calibration.optimizers.base import Optimizer
 from cfx.contracts import (
     commands,
     datasets,
+    demos,
     engines,
     learners,
     metrics,
@@ -35,6 +36,7 @@ from cfx.contracts import (
 from cfx.contracts.contract import Check, Contract, NotApplicable
 from cfx.core.engine.base import Engine
 from cfx.data.base import Dataset
+from cfx.evaluation.demo import Demo
 from cfx.evaluation.metrics.base import Metric
 from cfx.evaluation.protocols.base import Protocol
 from cfx.learners.base import Learner
@@ -241,6 +243,19 @@ class TableContract:
     @_statements(tables.CONTRACT)
     def test_contract(self, check: Check, table: ResultTable) -> None:
         hold(check, table)
+
+
+class DemoContract:
+    """What every demonstration must hold: each statement of `cfx.contracts.demos` is a test."""
+
+    @pytest.fixture
+    def demo(self) -> Demo:
+        """Returns the demonstration under test; it shows two simulated drivers."""
+        raise _undefined(self, "demo")
+
+    @_statements(demos.CONTRACT)
+    def test_contract(self, check: Check, demo: Demo) -> None:
+        hold(check, demo)
 
 
 class CommandContract:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class ConsoleHandler(logging.Handler):
-    """Prints cfx's and Hydra's own messages, and warnings of everybody.
+    """Prints messages of cfx, of packages named `cfx_...` and of Hydra, and warnings of everybody.
 
     Warnings and errors go to stderr, the rest to stdout. The streams are looked up at each message,
     so that a progress bar or a notebook that replaces them is respected.
@@ -24,7 +24,8 @@ class ConsoleHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         try:
-            ours = record.name.partition(".")[0] in {"cfx", "hydra", "hydra_plugins"}
+            package = record.name.partition(".")[0]
+            ours = package in {"cfx", "hydra", "hydra_plugins"} or package.startswith("cfx_")
             wanted = (
                 ours
                 or record.levelno >= logging.WARNING

@@ -123,13 +123,14 @@ KINDS: dict[str, Kind] = {
             chosen=False,
         ),
         Kind("table", "table", "cfx.tables", "cfx.results.table:ResultTable", chosen=False),
+        Kind("demo", "demo", "cfx.demos", "cfx.evaluation.demo:Demo"),
         Kind("command", "command", "cfx.commands", "cfx.core.command:Command", chosen=False),
     )
 }
 """All kinds, by name."""
 
 GROUPS: dict[str, Kind] = {kind.group: kind for kind in KINDS.values() if kind.chosen}
-"""Kinds by config group, of which a job chooses one component each."""
+"""Kinds by config group, of which a job chooses one component each; of demo perhaps none."""
 
 
 @dataclass(frozen=True)

@@ -97,24 +97,6 @@ class FigureSettings(Settings):
     )
 
 
-class DemoSettings(Settings):
-    """The demonstration in SUMO that follows a job."""
-
-    enabled: bool = Field(
-        False,
-        description="show the job's trajectories on a motorway in SUMO; into the folder `sumo` of"
-        " the job's",
-    )
-    osm: Path | None = Field(
-        None,
-        description="an OpenStreetMap extract of your own (.osm.xml), or a SUMO network"
-        " (.net.xml); null: a hand-made motorway",
-    )
-    pairs: int = Field(
-        6, ge=1, description="pairs at most, spread evenly from the best to the worst improvement"
-    )
-
-
 class JobConfig(Settings):
     """Everything that one job needs to know; `conf/config.yaml` says the same in YAML."""
 
@@ -154,7 +136,7 @@ class JobConfig(Settings):
     output: OutputSettings = Field(OutputSettings(), description="where results go")
     tracking: TrackingSettings = Field(TrackingSettings(), description="MLflow")
     figures: FigureSettings = Field(FigureSettings(), description="figures")
-    demo: DemoSettings = Field(DemoSettings(), description="demonstration in SUMO")
+    demo: Node | None = Field(None, description="the demonstration's node; null: there is none")
 
     @field_validator("device")
     @classmethod

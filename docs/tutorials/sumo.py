@@ -12,7 +12,8 @@ from pathlib import Path
 import libsumo
 
 import cfx
-from cfx.sumo.scenarios import SCENARIOS
+import cfx_sumo
+from cfx_sumo.drive.scenarios import SCENARIOS
 
 SMOKE = "CFX_SMOKE" in os.environ  # a test runs this file small
 END_S = 20 if SMOKE else 900
@@ -38,7 +39,7 @@ print(scenario)
 # obeyed, and SUMO's safe gap is kept; `speed_mode=0` drives what the model says and obeys none.
 
 # %%
-driver = cfx.sumo.Driver.load("cfx://i80-idm")
+driver = cfx_sumo.Driver.load("cfx://i80-idm")
 libsumo.start(["sumo", "-c", str(scenario), "--no-step-log", "true", "--no-warnings", "true"])
 speeds = []
 while libsumo.simulation.getTime() < END_S:
@@ -76,7 +77,7 @@ result = cfx.run(
 )
 
 # %%
-from cfx.sumo.export import export  # noqa: E402 - the last step of the tutorial
+from cfx_sumo.export import export  # noqa: E402 - the last step of the tutorial
 
 for line in export(result.folder):
     print(line)

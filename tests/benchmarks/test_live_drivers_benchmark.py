@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 from cfx.policies import checkpoint
-from cfx.simulation.sumo.network import network
-from tests.sumo.policies import adaptive
+from cfx_sumo.simulation.network import network
+from tests.agents import adaptive
 
 pytest.importorskip("traci", reason="needs the extra sumo")
 
@@ -26,7 +26,7 @@ SCRIPT = """
 import json, sys
 sys.modules["pyarrow"] = None
 from pathlib import Path
-from cfx.sumo.drive import run_scenario
+from cfx_sumo.drive.run import run_scenario
 driven = run_scenario(Path("motorway.sumocfg"), {"calm": "krauss", "hasty": "w99"}, end=float(sys.argv[1]))
 share = sum(tally.driven for tally in driven.tallies.values()) / sum(tally.steps for tally in
 driven.tallies.values())

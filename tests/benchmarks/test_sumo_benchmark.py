@@ -93,7 +93,7 @@ def alone(request: str) -> list[float]:
 
 @pytest.mark.benchmark(group="sumo")
 def test_pair_runs_in_sumo(benchmark: Any) -> None:
-    from cfx.simulation.sumo.stepper import SumoStepper
+    from cfx_sumo.simulation.stepper import SumoStepper
 
     case, cores = Case(), len(os.sched_getaffinity(0))
     simulator = SumoStepper(case.model, DT)

@@ -26,6 +26,7 @@ SUITES = {
     "protocol": cfx.contracts.ProtocolContract,
     "metric": cfx.contracts.MetricContract,
     "table": cfx.contracts.TableContract,
+    "demo": cfx.contracts.DemoContract,
     "command": cfx.contracts.CommandContract,
 }
 

@@ -23,11 +23,11 @@ from cfx.evaluation.platoon import (
 from cfx.evaluation.result import Platoon
 from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
 from cfx.models.krauss import Krauss
-from cfx.models.sumo_vtype import SumoVType
 from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
+from cfx_sumo.vtype import SumoVType
+from tests.agents import adaptive as live
 from tests.evaluation.test_closed_loop import adaptive, constant
-from tests.sumo.policies import adaptive as live
 
 
 class Linear(DrivingModel):

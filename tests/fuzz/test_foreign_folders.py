@@ -23,8 +23,8 @@ from cfx.evaluation.protocols.transfer import Transfer, TransferSettings
 from cfx.policies import checkpoint
 from cfx.report.page import render
 from cfx.report.runs import read_runs
-from cfx.sumo.driver import Driver
-from cfx.sumo.export import export
+from cfx_sumo.export import export
+from cfx_sumo.live.driver import Driver
 from tests.broken_plugins import QUICK
 from tests.fuzz.test_fuzz import EXAMPLES, JUNK, damaged, fuzz, leaves, put, said
 

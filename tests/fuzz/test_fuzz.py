@@ -30,8 +30,8 @@ from cfx.data.tidy import TidyDataset, write_tidy
 from cfx.policies import checkpoint
 from cfx.results.config import JobConfig
 from cfx.results.tracker import MlflowTracker
+from tests.agents import adaptive
 from tests.drives import straight_pairs
-from tests.sumo.policies import adaptive
 
 EXAMPLES = int(os.environ.get("CFX_FUZZ_EXAMPLES", "40"))
 

@@ -16,11 +16,11 @@ from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
 from cfx.models.residual import RESIDUAL, WithResidual
-from cfx.models.sumo_vtype import SumoVType
 from cfx.models.w99 import W99
 from cfx.simulation.kernel.run import model_key
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.trajectory import Start
+from cfx_sumo.vtype import SumoVType
 
 DT = 0.1
 

@@ -10,8 +10,8 @@ from cfx.data.pairs import PairBatch
 from cfx.models.krauss import Krauss
 from cfx.policies.context import DriverContext
 from cfx.policies.features import measured_history
+from tests.agents import adaptive
 from tests.drives import wavy_pairs
-from tests.sumo.policies import adaptive
 
 NODE = {"name": "krauss"}
 TRUE = torch.tensor([[1.5, 0.1], [2.5, 0.4], [2.0, 0.0]], dtype=torch.float64)

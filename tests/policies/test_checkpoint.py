@@ -16,8 +16,8 @@ from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
 from cfx.policies.context import ContextRule, DriverContext
 from cfx.policies.features import measured_history
+from tests.agents import adaptive
 from tests.drives import wavy_pairs
-from tests.sumo.policies import adaptive
 
 NODE = {"name": "krauss"}
 

@@ -26,8 +26,8 @@ from cfx.policies.context import DriverContext
 from cfx.policies.driver_features import DRIVER_FEATURES, LEAST, MOVING, measure
 from cfx.policies.features import History, measured_history
 from cfx.policies.gru import GruPolicy
+from tests.agents import adaptive
 from tests.drives import straight_pairs, wavy_pairs
-from tests.sumo.policies import adaptive
 
 ALL = tuple(DRIVER_FEATURES)
 PARAMETERS = torch.tensor([[1.0, 0.1], [1.8, 0.5], [3.0, 0.4]]).double()

@@ -24,7 +24,6 @@ from cfx.evaluation.forecast_paths import Origins, simulate_from_origins
 from cfx.models.base import DrivingModel
 from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
-from cfx.models.sumo_vtype import SumoVType
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
 from cfx.policies.base import Policy
@@ -38,6 +37,7 @@ from cfx.policies.recalibrate import RecalibratePolicy
 from cfx.policies.scaler import Scaler
 from cfx.policies.ukf import UkfPolicy, unscented_update
 from cfx.simulation.rollout import MemoryStepper
+from cfx_sumo.vtype import SumoVType
 from tests.drives import wavy_pairs
 
 WINDOWS = WindowSettings()

@@ -23,7 +23,7 @@ from cfx.policies.agent import Agent, AgentState
 from cfx.policies.features import History
 from cfx.policies.heads.stochastic import PARAMETER_TIME, SCALE, StochasticHead
 from cfx.policies.valid_range import ValidRange
-from tests.sumo.policies import adaptive
+from tests.agents import adaptive
 
 WINDOW_S = 0.5
 HEAD = StochasticHead.for_model(Krauss())

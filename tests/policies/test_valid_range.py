@@ -11,7 +11,7 @@ from cfx.policies import valid_range
 from cfx.policies.context import DriverContext
 from cfx.policies.features import History
 from cfx.policies.valid_range import FADED, ValidRange, share_in_words, stacked, weight_of_answer
-from tests.sumo.policies import adaptive
+from tests.agents import adaptive
 
 
 def learned(count: int = 4000) -> torch.Tensor:

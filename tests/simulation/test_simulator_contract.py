@@ -15,12 +15,11 @@ from cfx.contracts import SimulatorContract
 from cfx.core import registry
 from cfx.core.errors import ConfigError, PluginError
 from cfx.models.krauss import Krauss
-from cfx.models.sumo_vtype import SumoVType
 from cfx.results.config import JobConfig
 from cfx.simulation.memory import MemorySimulator
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.simulator import Simulator
-from cfx.simulation.sumo.simulator import SumoSimulator
+from cfx_sumo.vtype import SumoVType
 
 QUICK = [
     "model=krauss",
@@ -60,18 +59,6 @@ class TestMemory(SimulatorContract):
     @pytest.fixture
     def simulator(self) -> Simulator:
         return MemorySimulator()
-
-
-@pytest.fixture(scope="module")
-def sumo() -> Simulator:
-    """Returns one for all statements: a SUMO process takes a second to start."""
-    return SumoSimulator(workers=1)
-
-
-class TestSumo(SimulatorContract):
-    @pytest.fixture
-    def simulator(self, sumo: Simulator) -> Simulator:
-        return sumo
 
 
 def values_of(*overrides: str) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-import cfx.sumo
+import cfx_sumo
 from cfx.core.errors import DataError, ParameterError, SumoError
 from cfx.data.pairs import PairBatch
 from cfx.data.style.entropy import measure_style
@@ -32,14 +32,14 @@ from cfx.policies.heads.offset import shrunk
 from cfx.policies.scaler import Scaler
 from cfx.policies.valid_range import ValidRange
 from cfx.simulation.rollout import MemoryStepper
-from cfx.sumo.demo import simulate_in_sumo
-from cfx.sumo.demo_request import PolicyKnowledge
-from cfx.sumo.driver import Driver, needed_deceleration
-from cfx.sumo.fleet import Fleet
-from cfx.sumo.motorway import read_motorway
-from cfx.sumo.surroundings import Seen
+from cfx_sumo.demo.demo import simulate_in_sumo
+from cfx_sumo.demo.motorway import read_motorway
+from cfx_sumo.demo.request import PolicyKnowledge
+from cfx_sumo.live.driver import Driver, needed_deceleration
+from cfx_sumo.live.fleet import Fleet
+from cfx_sumo.live.surroundings import Seen
+from tests.agents import adaptive
 from tests.drives import wavy_pairs
-from tests.sumo.policies import adaptive
 
 pytest.importorskip("traci", reason="needs the extra sumo")
 
@@ -519,10 +519,10 @@ def test_a_fleet_drives_each_type_by_its_own_and_finds_who_comes(
 
 
 def test_the_package_gives_the_driver_and_imports_no_sumo() -> None:
-    assert cfx.sumo.Driver is Driver, "also after a plain `import cfx`"
-    assert cfx.sumo.Fleet is Fleet
+    assert cfx_sumo.Driver is Driver, "also after a plain `import cfx`"
+    assert cfx_sumo.Fleet is Fleet
     with pytest.raises(AttributeError, match="no attribute 'Rider'"):
-        _ = cfx.sumo.Rider
+        _ = cfx_sumo.Rider
 
 
 def _baseline(policy: Agent, component: Any, pairs: int) -> Agent:

@@ -14,7 +14,7 @@ from tests.policies.test_estimators import ESTIMATORS, agent_of
 
 pytest.importorskip("traci", reason="needs the extra sumo")
 
-from cfx.sumo.driver import Driver
+from cfx_sumo.live.driver import Driver
 from tests.sumo.test_driver import Car, Road
 
 

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from cfx.app.job.results import JobResult
 from cfx.calibration.flatness import NEAR, flat_for
+from cfx.evaluation.demo import PAGE
 from cfx.evaluation.headline import headline
 from cfx.evaluation.metrics.base import MetricInfo, key_of
 from cfx.evaluation.result import Evaluation
@@ -83,9 +84,8 @@ def report(
     console.print(f"Results: {result.folder}", soft_wrap=True, highlight=False)
     if copied_to is not None:
         console.print(f"Copied to: {copied_to}", soft_wrap=True, highlight=False)
-    animation = result.folder / "sumo" / "demo.html"
-    if animation.is_file():
-        console.print(f"Animation, for any browser: {animation}", soft_wrap=True, highlight=False)
+    for page in sorted(result.folder.glob(f"*/{PAGE}")):
+        console.print(f"Demonstration, for any browser: {page}", soft_wrap=True, highlight=False)
     for line in tracker.how_to_open():
         console.print(line, soft_wrap=True, highlight=False)
 

@@ -17,6 +17,7 @@ from cfx.core.errors import OutputError
 from cfx.core.files import atomic_write, remove_leftovers
 from cfx.data.pairs import PairSet
 from cfx.data.tidy import write_tidy
+from cfx.evaluation.demo import Demo
 from cfx.evaluation.protocols.base import ProtocolResult
 from cfx.results.config import JobConfig
 from cfx.results.provenance import commit, version
@@ -204,32 +205,29 @@ def write_figures(
 
 
 def write_demo(
-    output: Output, config: JobConfig, pairs: PairSet, protocol_result: ProtocolResult
+    output: Output,
+    demo: Demo,
+    pairs: PairSet,
+    protocol_result: ProtocolResult,
+    config: JobConfig,
 ) -> list[Path]:
-    """Writes the demonstration in SUMO, if the configuration wants it; returns its paths.
+    """Writes the demonstration into a folder of its name; returns its paths.
 
     The policy must have been saved before.
 
     Raises:
-        OutputError: a file cannot be written.
+        CfxError: it cannot be shown, or a file cannot be written.
     """
+    assert config.demo is not None
+    folder = output.folder / config.demo["name"]
+    policy, evaluation = protocol_result.policy, protocol_result.evaluation
     paths: list[Path] = []
-    if config.demo.enabled:
-        from cfx.sumo import demo
 
-        def write_all() -> None:
-            paths.extend(
-                demo.write_demo(
-                    output.folder / "sumo",
-                    output.folder / "policy",
-                    pairs,
-                    protocol_result.policy,
-                    protocol_result.evaluation,
-                    config,
-                )
-            )
+    def write_all() -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        paths.extend(demo.write(folder, pairs, policy, evaluation, config.protocol))
 
-        output.run(write_all)
+    output.run(write_all)
     return paths
 
 

@@ -15,6 +15,7 @@ from cfx.core.engine.base import Engine
 from cfx.core.errors import ConfigError
 from cfx.core.storage import is_url
 from cfx.data.base import Dataset
+from cfx.evaluation.demo import Demo
 from cfx.evaluation.metrics.installed import MetricSet
 from cfx.evaluation.protocols.base import Protocol
 from cfx.learners.base import Learner
@@ -45,6 +46,7 @@ class Parts:
     protocol: Protocol
     metrics: MetricSet
     engine: Engine
+    demo: Demo | None = None
 
     @classmethod
     def of(cls, config: JobConfig, protocol: Protocol) -> Parts:
@@ -66,6 +68,9 @@ class Parts:
             learner.require_gradients(model, simulator.differentiable)
         if "policy" not in protocol.determines():  # else the policy has been trained already
             learner.require_no_driver_features(policy)
+        demo = None
+        if config.demo is not None:
+            demo = cast(Demo, registry.create("demo", config.demo))
         return cls(
             dataset=cast(Dataset, registry.create("dataset", config.data)),
             model=model,
@@ -77,6 +82,7 @@ class Parts:
             protocol=protocol,
             metrics=MetricSet.of(config.metrics),
             engine=cast(Engine, registry.create("engine", config.engine)),
+            demo=demo,
         )
 
 

@@ -86,10 +86,8 @@ def take_steps(
         if config.data != data:  # the protocol has determined other data
             loaded = load_pairs(parts.dataset)
         pairs, style = _select_pairs(loaded, config)
-        if config.demo.enabled:
-            from cfx.sumo.demo import check_demo
-
-            check_demo(config.demo, pairs)
+        if parts.demo is not None:
+            parts.demo.check(pairs)
         tracker.set_tags(
             {
                 "dataset.fingerprint": pairs.fingerprint,
@@ -237,7 +235,9 @@ def _keep(
     output.run(lambda: checkpoint.save(protocol_result.policy, policy_folder))
     rows = {table.about.name: table.rows for table in tables if table.rows is not None}
     figures = files.write_figures(output, config, findings, rows, adapts=parts.policy.adapts)
-    demo = files.write_demo(output, config, pairs, protocol_result)
+    shown: list[Path] = []
+    if parts.demo is not None:
+        shown = files.write_demo(output, parts.demo, pairs, protocol_result, config)
     files.write_provenance(
         output,
         pairs,
@@ -260,7 +260,7 @@ def _keep(
     for table in tables:
         if table.about.table.tracked:
             tracked.append(table.about.file)
-    tracker.log_files([output.folder / name for name in tracked] + demo)
+    tracker.log_files([output.folder / name for name in tracked] + shown)
     result = JobResult(
         metrics,
         evaluation.table,

@@ -1,0 +1,1 @@
+"""The demonstration that follows a job: its trajectories on a motorway in SUMO."""

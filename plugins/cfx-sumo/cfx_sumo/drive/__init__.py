@@ -1,0 +1,1 @@
+"""`cfx drive`: whole scenarios in which policies drive."""

@@ -1,0 +1,129 @@
+"""`cfx drive`: a SUMO scenario in which policies drive."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from cfx import Command
+
+
+class DriveCommand(Command):
+    """Runs a SUMO scenario in which policies drive the vehicles of some vTypes."""
+
+    summary = "run a SUMO scenario in which policies drive the vehicles of some types"
+
+    def parser(self) -> argparse.ArgumentParser:
+        parser = argparse.ArgumentParser(
+            "cfx drive",
+            description="Runs a SUMO scenario in which policies drive the vehicles of some vTypes.",
+            epilog="What follows -- goes to SUMO as it is:"
+            " cfx drive city.sumocfg --drivers calm=RUN -- --step-length 0.1",
+        )
+        parser.add_argument(
+            "scenario",
+            nargs="?",
+            default="ring",
+            help="SUMO's configuration (.sumocfg), or a scenario that comes with cfx: ring"
+            " (default), motorway, stress",
+        )
+        parser.add_argument(
+            "--drivers",
+            nargs="+",
+            default=["car=cfx://i80-idm"],
+            metavar="TYPE=RUN",
+            help="a vType, and who drives it: a job, a ready-made policy (cfx policies lists them),"
+            " or RUN#NETWORK for one of its networks; default: car=cfx://i80-idm",
+        )
+        parser.add_argument("--gui", action="store_true", help="show SUMO's window")
+        parser.add_argument(
+            "--end",
+            type=float,
+            metavar="SECONDS",
+            help="of simulated time; default: the scenario's",
+        )
+        parser.add_argument(
+            "--seed",
+            type=int,
+            help="SUMO's, and that of stochastic policies; default: the scenario's, and 0",
+        )
+        parser.add_argument(
+            "--output",
+            metavar="FILE",
+            help="CSV: where each driven vehicle is at each step, and its parameters",
+        )
+        parser.add_argument(
+            "--look-ahead",
+            type=float,
+            default=200.0,
+            metavar="METRES",
+            help="farther is no leader; default: 200",
+        )
+        parser.add_argument(
+            "--speed-mode",
+            type=int,
+            default=31,
+            help="SUMO's bit set; 31 (default): SUMO's own checks bound each speed; 0: none, exact",
+        )
+        return parser
+
+    def parse(self, arguments: Sequence[str]) -> argparse.Namespace:
+        """Reads what stands before `--`; what follows it is SUMO's."""
+        given = list(arguments)
+        cut = len(given)
+        if "--" in given:
+            cut = given.index("--")
+        options = self.parser().parse_args(given[:cut])
+        options.sumo_options = given[cut + 1 :]
+        return options
+
+    def run(self, options: argparse.Namespace) -> int:
+        _drive(options)
+        return 0
+
+
+def _drive(options: argparse.Namespace) -> None:
+    """Runs the scenario in this process and prints what happened.
+
+    Raises:
+        CfxError: whatever `cfx_sumo.drive.run.run_scenario` raises.
+    """
+    from cfx_sumo.installed import require_sumo
+
+    require_sumo()
+    # libsumo does not get on with pyarrow, and pandas loads it where it finds it: this process does
+    # without.
+    # None is Python's own way to say that a module is not there.
+    sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]
+    from cfx.core.console import console_logging
+    from cfx_sumo.drive.run import parse_drivers, report, run_scenario
+    from cfx_sumo.drive.scenarios import SCENARIOS
+
+    output = None
+    if options.output:
+        output = Path(options.output).expanduser()
+    with console_logging():
+        runs = parse_drivers(options.drivers)
+        if options.scenario == "stress":
+            from cfx_sumo.drive.stress import report_stress, run_stress
+
+            result = run_stress(runs, seed=options.seed or 0, speed_mode=options.speed_mode)
+            report_stress(result, output)
+            return
+        scenario = options.scenario
+        if scenario not in SCENARIOS:
+            scenario = Path(scenario).expanduser()
+        run = run_scenario(
+            scenario,
+            runs,
+            end=options.end,
+            seed=options.seed,
+            output=output,
+            look_ahead=options.look_ahead,
+            speed_mode=options.speed_mode,
+            gui=options.gui,
+            options=options.sumo_options,
+        )
+        report(run)

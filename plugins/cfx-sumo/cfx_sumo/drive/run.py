@@ -1,0 +1,709 @@
+"""`cfx drive`: runs a user's SUMO scenario with live drivers for some of its vTypes.
+
+SUMO runs in this process (libsumo), so nothing here may load pyarrow, with which it does not get
+on.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+import numpy as np
+
+from cfx.core.errors import ConfigError, DataError, OutputError, SumoError, nearest
+from cfx.core.files import atomic_write
+from cfx.core.progress import Task
+from cfx_sumo.drive.histogram import Histogram
+from cfx_sumo.drive.scenarios import SCENARIOS
+from cfx_sumo.installed import require_sumo
+from cfx_sumo.live.driver import OBEYS_ALL
+from cfx_sumo.live.fleet import Fleet
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+Actor = Callable[[Any], None]
+"""Acts on a simulation before each of its steps."""
+
+_QUANTILES = (0.05, 0.5, 0.95)
+"""Quantiles by which live traffic is compared with the recording."""
+
+
+_LISTED = 10
+"""Collisions that the report lists."""
+
+
+@dataclass
+class Tally:
+    """What the vehicles of one vType did.
+
+    Attributes:
+        vehicles: ids of all that were on the road.
+        steps: vehicle steps.
+        driven: those of them that the model drove; in the others no vehicle was ahead.
+        metres: the distance that all covered together.
+        lane_changes: on the same edge.
+        hard_brakings: times that a vehicle began to brake harder than its vType's `decel`.
+        hardest_braking: the largest deceleration of any, m/s2.
+        braking: decelerations of all steps, m/s2; 0 where a vehicle did not brake.
+        speeds: of all steps, m/s.
+        accelerations: of all steps, m/s2.
+        time_gaps: of the steps that the model drove faster than walking, s.
+        collisions: of those that SUMO reported, the ones with contact (`Collision.contact`).
+        below_min_gap: the others: the gap was below minGap, and nobody was touched.
+        teleports: vehicles that SUMO reported; a vehicle may teleport more than once.
+    """
+
+    vehicles: set[str] = field(default_factory=set)
+    steps: int = 0
+    driven: int = 0
+    metres: float = 0.0
+    lane_changes: int = 0
+    hard_brakings: int = 0
+    hardest_braking: float = 0.0
+    braking: Histogram = field(default_factory=lambda: Histogram(0.0, 20.0, 0.02))
+    speeds: Histogram = field(default_factory=lambda: Histogram(0.0, 70.0, 0.1))
+    accelerations: Histogram = field(default_factory=lambda: Histogram(-15.0, 8.0, 0.02))
+    time_gaps: Histogram = field(default_factory=lambda: Histogram(0.0, 30.0, 0.05))
+    collisions: int = 0
+    below_min_gap: int = 0
+    teleports: int = 0
+
+
+@dataclass
+class Collision:
+    """What SUMO reports as a collision of two vehicles, however many steps it lasts.
+
+    SUMO reports a gap below the follower's `minGap` as well (`collision.mingap-factor`).
+
+    Attributes:
+        time: s, of the first step.
+        kind: the driven vType of the collider; of the victim, where no policy drives the collider.
+        collider, victim: their ids.
+        lane: of the collider.
+        position: of the collider's front on it, m.
+        gap: the smallest, from bumper to bumper, m; None: not known, as where paths cross.
+    """
+
+    time: float
+    kind: str
+    collider: str
+    victim: str
+    lane: str
+    position: float
+    gap: float | None
+
+    @property
+    def contact(self) -> bool:
+        """Whether they touched; also where the gap is not known."""
+        return self.gap is None or self.gap <= 0.0
+
+    def __str__(self) -> str:
+        """Returns who, where and when on one line."""
+        what = "contact"
+        if not self.contact:
+            what = "below minGap"
+        gap = "gap not known"
+        if self.gap is not None:
+            gap = f"gap {self.gap:.2f} m"
+        return (
+            f"{self.time:.2f} s: {self.collider} behind {self.victim} on {self.lane} at"
+            f" {self.position:.1f} m: {what}, {gap}"
+        )
+
+
+@dataclass(frozen=True)
+class ScenarioRun:
+    """What `run_scenario` reports.
+
+    Attributes:
+        tallies: for each vType that was driven.
+        steps: of the simulation.
+        dt: its time step, s.
+        seconds: how long it took.
+        others: most vehicles of other types at one time.
+        most: most vehicles of the driven types at one time.
+        limited: for each vType, the share of the steps that the model drove at a limit of
+            acceleration.
+        outside: for each vType, how much was driven outside what its policy has learned, in words;
+            "" where nothing was.
+        recorded: for each vType, quantiles of the recording that its policy learned from, by
+            signal (`Agent.recorded`).
+        collisions: that SUMO reported of driven vehicles, in their order.
+    """
+
+    tallies: Mapping[str, Tally]
+    steps: int
+    dt: float
+    seconds: float
+    others: int
+    most: int
+    limited: Mapping[str, float] = field(default_factory=dict)
+    outside: Mapping[str, str] = field(default_factory=dict)
+    recorded: Mapping[str, Mapping[str, Sequence[float]]] = field(default_factory=dict)
+    collisions: Sequence[Collision] = ()
+
+    @property
+    def real_time(self) -> float:
+        """Simulated seconds per second."""
+        if self.seconds <= 0:
+            return float("inf")
+        return self.steps * self.dt / self.seconds
+
+
+def run_scenario(
+    scenario: Path | str,
+    runs: Mapping[str, str | Path],
+    *,
+    end: float | None = None,
+    seed: int | None = None,
+    output: Path | None = None,
+    look_ahead: float = 200.0,
+    speed_mode: int = OBEYS_ALL,
+    gui: bool = False,
+    options: Sequence[str] = (),
+) -> ScenarioRun:
+    """Runs a scenario in libsumo, or in SUMO's window, until it is over.
+
+    It is over when no vehicle is on the road or still to come, at the end that the scenario gives,
+    or at `end`. A vehicle that arrives, teleports, collides or changes lanes ends nothing: it is
+    counted, and goes on with what SUMO makes of it (one that teleported begins anew).
+
+    Args:
+        scenario: SUMO's configuration (`.sumocfg`), or the name of a scenario that comes with cfx
+            (`cfx_sumo.drive.scenarios`).
+        runs: vType -> a job's output folder, the id of its MLflow run, or a ready-made policy
+            (`cfx://NAME`).
+        end: s of simulated time.
+        seed: SUMO's, and that of stochastic policies; None for the scenario's, and 0.
+        output: a CSV file with a row for each driven vehicle and step.
+        look_ahead: as in `Driver`.
+        speed_mode: as in `Driver`.
+        gui: show SUMO's window, slowly enough to watch.
+        options: more of SUMO's own options.
+
+    Raises:
+        SumoError: SUMO is missing, refuses the scenario or stops; a vType is not in it or never on
+            the road; the steps differ.
+        DataError: a run has no policy that drives unseen drivers, or the scenario is not there.
+        OutputError: the output cannot be written.
+    """
+    require_sumo()
+    with ExitStack() as stack:
+        path, actor = _prepared(scenario, end, stack)
+        fleet = Fleet.load(runs, look_ahead=look_ahead, speed_mode=speed_mode, seed=seed or 0)
+        connection = stack.enter_context(started(path, _command(path, seed, gui, options), gui))
+        rows = _Rows.opened(stack, output, fleet) if output is not None else None
+        try:
+            return _Run(connection, fleet, path, rows, actor, _name(scenario)).go(end)
+        except OSError as error:
+            raise OutputError(
+                f"{output} cannot be written ({error.strerror or error}); name another --output"
+            ) from error
+
+
+def _name(scenario: Path | str) -> str:
+    """Returns how messages call a scenario."""
+    return Path(scenario).name
+
+
+def _prepared(
+    scenario: Path | str, end: float | None, stack: ExitStack
+) -> tuple[Path, Actor | None]:
+    """Returns SUMO's configuration, and what acts on the simulation besides the drivers."""
+    shipped = SCENARIOS.get(str(scenario))
+    path = Path(scenario)
+    if shipped is not None and not path.exists():
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cfx-")))
+        actor = None
+        if shipped.make_actor is not None:
+            actor = shipped.make_actor()
+        return shipped.write(folder, end), actor
+    if not path.is_file():
+        raise DataError(
+            f"{path} is not there; name SUMO's configuration of the scenario (.sumocfg), or a"
+            f" scenario that comes with cfx: {', '.join((*SCENARIOS, 'stress'))}"
+        )
+    return path, None
+
+
+@contextmanager
+def started(scenario: Path, command: Sequence[str], gui: bool) -> Iterator[Any]:
+    """Starts SUMO for a block; gives its connection.
+
+    Args:
+        scenario: for messages.
+        command: SUMO's command line.
+        gui: whether it is that of SUMO's window.
+
+    Raises:
+        SumoError: SUMO refuses the scenario, or stops in the block.
+    """
+    sumo = _traci() if gui else _libsumo()
+    try:
+        sumo.start(list(command))
+    except Exception as error:
+        if not _is_sumos(error):
+            raise
+        raise SumoError(f"SUMO refuses {scenario}: {_reason(error)}") from error
+    try:
+        yield sumo
+    except Exception as error:
+        if not _is_sumos(error):
+            raise
+        raise SumoError(f"SUMO stopped {scenario}: {_reason(error)}") from error
+    finally:
+        _close(sumo)
+
+
+def _libsumo() -> Any:
+    # No word about pyarrow, which is not loaded here.
+    os.environ.setdefault("LIBSUMO_AS_TRACI", "quiet")
+    import libsumo
+
+    return libsumo
+
+
+def _traci() -> Any:
+    import traci  # type: ignore[import-untyped]  # SUMO brings no types
+
+    return traci
+
+
+def _close(sumo: Any) -> None:
+    try:
+        sumo.close()
+    except Exception as error:  # SUMO has gone already; why was said
+        if not _is_sumos(error):
+            raise
+
+
+def _is_sumos(error: Exception) -> bool:
+    """Says whether an error is SUMO's word; libsumo's and traci's are classes of the same names."""
+    return type(error).__name__ in {"TraCIException", "FatalTraCIError"}
+
+
+def _gui_program() -> str:
+    try:
+        import sumo  # of the wheel eclipse-sumo, which the extra leaves out for its size
+
+        program = shutil.which("sumo-gui", path=str(Path(sumo.__file__).parent / "bin"))
+    except ImportError:
+        program = shutil.which("sumo-gui")
+    if program is None:
+        raise SumoError("--gui needs SUMO's window, sumo-gui: pip install eclipse-sumo")
+    return program
+
+
+def _command(scenario: Path, seed: int | None, gui: bool, options: Sequence[str]) -> list[str]:
+    """Returns SUMO's command line; the user's own options come last and win."""
+    command = ["sumo", "-c", str(scenario)]
+    if gui:
+        command[0] = _gui_program()
+        command += ["--start", "--quit-on-end", "--delay", "100"]
+    for name in ("--no-step-log", "--duration-log.disable", "--no-warnings"):
+        if name not in options:
+            command += [name, "true"]
+    if seed is not None:
+        command += ["--seed", str(seed)]
+    return command + list(options)
+
+
+def _reason(error: Exception) -> str:
+    """Returns SUMO's words on one line; some of them it prints on stderr alone."""
+    said = " ".join(str(error).split()).rstrip(".")
+    if said in {"", "Process Error", "Connection closed by SUMO"}:
+        return "its own message stands above"
+    return said
+
+
+class _Run:
+    """One run of a scenario."""
+
+    def __init__(
+        self,
+        sumo: Any,
+        fleet: Fleet,
+        scenario: Path,
+        rows: _Rows | None,
+        actor: Actor | None = None,
+        title: str = "",
+    ) -> None:
+        self._sumo = sumo
+        self._actor = actor
+        self._name = title or scenario.name
+        self._fleet = fleet
+        self._scenario = scenario
+        self._rows = rows
+        self._tallies = {name: Tally() for name in fleet.drivers}
+        self._type_of: dict[str, str] = {}
+        self._lanes: dict[str, tuple[str, int]] = {}
+        self._braking: set[str] = set()
+        self._collisions: list[Collision] = []
+        self._touching: dict[tuple[str, str], Collision] = {}
+        self._decel: dict[str, float] = {}
+        self._steps = 0
+        self._others = 0
+        self._most = 0
+        for name in self._checked():
+            self._decel[name] = float(sumo.vehicletype.getDecel(name))
+
+    def _checked(self) -> Sequence[str]:
+        """Returns the vTypes, all of which are in the scenario."""
+        known = self._sumo.vehicletype.getIDList()
+        for name in self._fleet.drivers:
+            if name not in known:
+                own = [one for one in known if not one.startswith("DEFAULT_")]
+                raise SumoError(
+                    f"{self._scenario} has no vType '{name}'.{nearest(name, own)} It has:"
+                    f" {', '.join(own) or 'none of its own'}. (A vTypeDistribution has members:"
+                    " name them. A vType must stand ahead of the first vehicle.)"
+                )
+        return list(self._fleet.drivers)
+
+    def go(self, end: float | None) -> ScenarioRun:
+        """Runs the scenario to its end."""
+        simulation = self._sumo.simulation
+        dt = simulation.getDeltaT()
+        last = self._last(end)
+        total = 0
+        if last < math.inf:
+            total = max(0, round((last - simulation.getTime()) / dt))
+        began = time.perf_counter()
+        with Task(f"Driving {self._name}", total) as task:
+            while simulation.getMinExpectedNumber() > 0 and simulation.getTime() < last - 1e-9:
+                if self._actor is not None:
+                    self._actor(self._sumo)
+                self._sumo.simulationStep()
+                self._note_collisions(dt)  # ahead of the drivers, who forget whoever has gone
+                self._fleet.step(self._sumo)
+                self._after_step(dt)
+                task.advance()
+        seconds = time.perf_counter() - began
+        for name, tally in self._tallies.items():
+            if not tally.vehicles:
+                raise SumoError(
+                    f"no vehicle of vType '{name}' was ever on the road in {self._scenario}"
+                    f" ({self._steps * dt:g} s); give it a flow, or a later --end"
+                )
+        for collision in self._collisions:
+            if collision.contact:
+                self._tallies[collision.kind].collisions += 1
+            else:
+                self._tallies[collision.kind].below_min_gap += 1
+        limited, outside, recorded = {}, {}, {}
+        for name, driver in self._fleet.drivers.items():
+            limited[name] = driver.counts.limited / max(1, driver.counts.steps)
+            outside[name] = driver.outside_in_words()
+            recorded[name] = driver.policy.recorded
+        return ScenarioRun(
+            self._tallies,
+            self._steps,
+            dt,
+            seconds,
+            self._others,
+            self._most,
+            limited,
+            outside,
+            recorded,
+            self._collisions,
+        )
+
+    def _last(self, end: float | None) -> float:
+        """Returns the simulated time at which the run ends at the latest, s."""
+        last = math.inf
+        if end is not None:
+            last = end
+        given = self._sumo.simulation.getEndTime()
+        if given >= 0:
+            last = min(last, given)
+        return last
+
+    def _after_step(self, dt: float) -> None:
+        """Notes what the last step did, and writes it down."""
+        self._steps += 1
+        vehicles = self._fleet.vehicles
+        self._type_of |= vehicles
+        for name, kind in vehicles.items():
+            self._count(name, kind, dt)
+        self._count_motions()
+        self._count_teleports()
+        if self._rows is not None:
+            self._rows.write(self._sumo, self._fleet)
+        self._others = max(self._others, self._sumo.vehicle.getIDCount() - len(vehicles))
+        self._most = max(self._most, len(vehicles))
+
+    def _count(self, name: str, kind: str, dt: float) -> None:
+        """Notes what the last step did to a vehicle of the fleet."""
+        vehicle, tally = self._sumo.vehicle, self._tallies[kind]
+        tally.vehicles.add(name)
+        tally.steps += 1
+        tally.metres += vehicle.getSpeed(name) * dt
+        if self._fleet.drivers[kind].drives(name):
+            tally.driven += 1
+        lane = vehicle.getRoadID(name), vehicle.getLaneIndex(name)
+        before = self._lanes.get(name, lane)
+        if before[0] == lane[0] and before[1] != lane[1]:
+            tally.lane_changes += 1
+        self._lanes[name] = lane
+        acceleration = vehicle.getAcceleration(name)
+        tally.hardest_braking = max(tally.hardest_braking, -acceleration)
+        if acceleration >= -self._decel[kind] - 1e-6:
+            self._braking.discard(name)
+        elif name not in self._braking:
+            self._braking.add(name)
+            tally.hard_brakings += 1
+
+    def _count_motions(self) -> None:
+        """Notes speeds, accelerations and time gaps of all vehicles of the fleet."""
+        vehicle = self._sumo.vehicle
+        motions: dict[str, list[tuple[float, float]]] = {name: [] for name in self._tallies}
+        for name, kind in self._fleet.vehicles.items():
+            motions[kind].append((vehicle.getSpeed(name), vehicle.getAcceleration(name)))
+        for kind, pairs in motions.items():
+            if not pairs:
+                continue
+            values = np.array(pairs)
+            tally = self._tallies[kind]
+            tally.speeds.add(values[:, 0])
+            tally.accelerations.add(values[:, 1])
+            tally.braking.add((-values[:, 1]).clip(min=0.0))
+        for kind, driver in self._fleet.drivers.items():
+            names = [name for name, its in self._fleet.vehicles.items() if its == kind]
+            self._tallies[kind].time_gaps.add(driver.time_gaps(names).numpy())
+
+    def _note_collisions(self, dt: float) -> None:
+        """Notes the collisions that SUMO reports after a step; one that goes on is one."""
+        now = self._sumo.simulation.getTime()
+        touching = {}
+        for found in self._sumo.simulation.getCollisions():
+            kind = self._type_of.get(found.collider) or self._type_of.get(found.victim)
+            if kind is None:
+                continue
+            key = found.collider, found.victim
+            known, before = self._touching.get(key), self._gap_before(*key)
+            if known is None:
+                gap = self._gap(found, before, dt)
+                known = Collision(now, kind, *key, found.lane, found.pos, gap)
+                self._collisions.append(known)
+            elif known.gap is not None and before is not None:
+                # SUMO goes on to report the speeds of the first step.
+                known.gap = min(known.gap, before)
+            touching[key] = known
+        self._touching = touching
+
+    def _gap_before(self, collider: str, victim: str) -> float | None:
+        """Returns the gap of a driven vehicle one step ago; None behind another vehicle."""
+        if collider not in self._fleet.vehicles:
+            return None
+        return self._fleet.driver(collider).gap_to(collider, victim)
+
+    def _gap(self, found: Any, before: float | None, dt: float) -> float | None:
+        """Returns the gap as a collision begins, bumper to bumper, m.
+
+        SUMO may have taken the vehicles off the road by now. So it is the gap of the step before,
+        and what their speeds have made of it; for a vehicle that has just changed lanes, or that no
+        policy drives, the places of both on the lane.
+        """
+        if found.type != "collision":
+            return None  # their paths crossed
+        if before is not None:
+            return float(before + (found.victimSpeed - found.colliderSpeed) * dt)
+        vehicle = self._sumo.vehicle
+        if found.victim not in vehicle.getIDList() or vehicle.getLaneID(found.victim) != found.lane:
+            return None
+        back = vehicle.getLanePosition(found.victim) - vehicle.getLength(found.victim)
+        return float(back - found.pos)
+
+    def _count_teleports(self) -> None:
+        for name in self._sumo.simulation.getStartingTeleportIDList():
+            if name in self._type_of:
+                self._tallies[self._type_of[name]].teleports += 1
+
+
+class _Rows:
+    """The output: a row for each vehicle of the fleet and step, SI units."""
+
+    _COLUMNS = (
+        "time_s",
+        "vehicle",
+        "type",
+        "edge",
+        "lane",
+        "position_m",
+        "x_m",
+        "y_m",
+        "speed_mps",
+        "acceleration_mps2",
+    )
+
+    def __init__(self, file: TextIO, parameters: Sequence[str]) -> None:
+        self._writer = csv.writer(file)
+        self._parameters = list(parameters)
+        self._writer.writerow([*self._COLUMNS, *(f"parameter_{name}" for name in parameters)])
+
+    @classmethod
+    def opened(cls, stack: ExitStack, path: Path, fleet: Fleet) -> _Rows:
+        """Opens the file, which takes its name when the run has ended well."""
+        if path.is_dir():
+            raise OutputError(f"{path} is a folder; name a file in --output")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            partial = stack.enter_context(atomic_write(path))
+            file = stack.enter_context(partial.open("w", newline="", encoding="utf-8"))
+        except OSError as error:
+            raise OutputError(
+                f"{path} cannot be written ({error.strerror}); name another --output"
+            ) from error
+        names: dict[str, None] = {}
+        for driver in fleet.drivers.values():
+            names |= dict.fromkeys(driver.policy.space.names)
+        return cls(file, list(names))
+
+    def write(self, sumo: Any, fleet: Fleet) -> None:
+        """Writes where the fleet's vehicles are, and the parameters with which they drive on."""
+        for name, kind in fleet.vehicles.items():
+            self._writer.writerow(self._row(sumo, name, kind, fleet.drivers[kind].parameters(name)))
+
+    def _row(self, sumo: Any, name: str, kind: str, parameters: Mapping[str, float]) -> list[str]:
+        vehicle = sumo.vehicle
+        lane = [vehicle.getRoadID(name), str(vehicle.getLaneIndex(name))]
+        x, y = vehicle.getPosition(name)
+        speed, acceleration = vehicle.getSpeed(name), vehicle.getAcceleration(name)
+        row = [f"{sumo.simulation.getTime():.10g}", name, kind, *lane]
+        for value in (vehicle.getLanePosition(name), x, y, speed, acceleration):
+            row.append(f"{value:.6g}")
+        for parameter in self._parameters:
+            value = parameters.get(parameter)
+            row.append("" if value is None else f"{value:.6g}")
+        return row
+
+
+def parse_drivers(given: Sequence[str]) -> dict[str, str]:
+    """Reads `TYPE=RUN` arguments.
+
+    Raises:
+        ConfigError: one is not of this form, or names a vType twice.
+    """
+    runs: dict[str, str] = {}
+    for one in given:
+        name, equals, run = one.partition("=")
+        if not (name and equals and run):
+            raise ConfigError(
+                f"--drivers {one}: write TYPE=RUN, a vType of the scenario and a job's output"
+                " folder"
+            )
+        if name in runs:
+            raise ConfigError(f"--drivers: vType '{name}' stands twice")
+        runs[name] = run
+    return runs
+
+
+def report(run: ScenarioRun) -> None:
+    """Prints what happened: tables, and one line about speed."""
+    from cfx.core.console import put
+
+    put(_what_happened(run))
+    put(_braking(run))
+    put(_beside_the_recording(run))
+    for collision in run.collisions[:_LISTED]:
+        print(collision)
+    if len(run.collisions) > _LISTED:
+        print(f"... and {len(run.collisions) - _LISTED} more collisions")
+    if any(not collision.contact for collision in run.collisions):
+        print(
+            "SUMO takes a gap below minGap for a collision, and teleports the vehicle unless the"
+            " scenario says otherwise; -- --collision.mingap-factor 0 leaves contact alone"
+        )
+    for name, words in run.outside.items():
+        if words:
+            print(f"{name}: {words}; there it fades towards its base parameters")
+    print(
+        f"{run.steps} steps of {run.dt:g} s in {run.seconds:.1f} s, {run.real_time:.1f} times real"
+        f" time; at most {run.most} of these vehicles at once, {run.others} others"
+    )
+
+
+def _what_happened(run: ScenarioRun) -> Table:
+    table = _table(
+        "vType",
+        "vehicles",
+        "model drove",
+        "mean speed [m/s]",
+        "lane changes",
+        "collisions",
+        "below minGap",
+        "teleports",
+    )
+    for name, tally in run.tallies.items():
+        table.add_row(
+            name,
+            str(len(tally.vehicles)),
+            f"{tally.driven / tally.steps:.0%}",
+            f"{tally.metres / (tally.steps * run.dt):.2f}",
+            str(tally.lane_changes),
+            str(tally.collisions),
+            str(tally.below_min_gap),
+            str(tally.teleports),
+        )
+    return table
+
+
+def _braking(run: ScenarioRun) -> Table:
+    """Returns how hard vehicles braked, m/s2."""
+    table = _table(
+        "braking [m/s2]",
+        "95 % of steps below",
+        "99.9 % below",
+        "hardest",
+        "times above decel",
+        "steps at limits",
+    )
+    for name, tally in run.tallies.items():
+        table.add_row(
+            name,
+            f"{tally.braking.quantile(0.95):.2f}",
+            f"{tally.braking.quantile(0.999):.2f}",
+            f"{tally.hardest_braking:.2f}",
+            str(tally.hard_brakings),
+            f"{run.limited.get(name, 0.0):.1%}",
+        )
+    return table
+
+
+def _beside_the_recording(run: ScenarioRun) -> Table:
+    """Returns quantiles of the live vehicles beside those of what their policy learned from."""
+    table = _table("5 %, median, 95 %", "speed [m/s]", "acceleration [m/s2]", "time gap [s]")
+    for name, tally in run.tallies.items():
+        live = []
+        for histogram in (tally.speeds, tally.accelerations, tally.time_gaps):
+            live.append(_listed([histogram.quantile(share) for share in _QUANTILES]))
+        table.add_row(name, *live)
+        recorded = run.recorded.get(name) or {}
+        if recorded:
+            signals = ("speed", "acceleration", "time_gap")
+            table.add_row("its recording", *(_listed(recorded[signal]) for signal in signals))
+    return table
+
+
+def _table(*columns: str) -> Table:
+    from cfx.core.console import blank_table
+
+    table = blank_table(*columns)
+    for column in table.columns[1:]:
+        column.justify = "right"
+    return table
+
+
+def _listed(values: Sequence[float]) -> str:
+    return ", ".join(f"{value:.2f}" for value in values)

@@ -1,0 +1,440 @@
+"""Situations that go wrong if anything does: `cfx drive stress`.
+
+Thousands of single events run at once in SUMO, each on a road of its own: cut-ins, leaders who
+brake as hard as a car can, vehicles that stand on the lane. Then come a dropped lane and a red
+light. Every event can be survived by braking at 9 m/s2 at most; a vehicle of the vType `car` should
+survive it with less.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cfx.core.errors import SumoError
+from cfx.core.files import write_json
+from cfx.core.progress import Task
+from cfx_sumo.drive.run import started
+from cfx_sumo.drive.scenarios import ASSETS, CAR, STEP_S
+from cfx_sumo.installed import require_sumo
+from cfx_sumo.live.driver import OBEYS_ALL
+from cfx_sumo.live.fleet import Fleet
+
+_KIND = "car"
+"""The vType that policies drive."""
+
+_LENGTH_M = 4.5
+_ROAD_M, _APART_M, _LANE_MPS = 6000.0, 12.0, 40.0
+_BEGIN_M = 1500.0  # where cars stand at first, with room behind and ahead
+_SETTLE_S, _LASTS_S = 8.0, 30.0  # before an event, and after it
+
+_HARDEST = 9.0
+"""m/s2: how leaders brake."""
+
+_BEARABLE = 6.0
+"""m/s2: what a cut-in needs at least if the driver reacts within a step; 9 can be braked."""
+
+
+class Event(NamedTuple):
+    """One event on a road of its own; SI units.
+
+    Attributes:
+        speed: the car's at first.
+        ahead: gap to its leader at first, m.
+        leader_speed: the leader's, until the event.
+        slower: by which share of the car's speed the vehicle is slower that cuts in; None: nobody
+            cuts in.
+        margin: what its gap has beyond what braking at `_BEARABLE` needs, m.
+        headway: at which the leader begins to brake, s; None: it goes on.
+    """
+
+    speed: float
+    ahead: float
+    leader_speed: float
+    slower: float | None = None
+    margin: float = 0.0
+    headway: float | None = None
+
+
+@dataclass
+class EventResult:
+    """What happened in all events of a kind.
+
+    Attributes:
+        kind: of the events.
+        number: of events that took place: the vehicle that cut in or braked was the next ahead.
+        headway: smallest, median and largest time headway as the events began, s; None where an
+            event has no such moment.
+        collisions: driven vehicles that hit something.
+        hardest_braking: of any driven vehicle, m/s2.
+        hardest_acceleration: of any driven vehicle, m/s2.
+        smallest_gap: to the vehicle ahead, m, bumper to bumper.
+        braked_hard: driven vehicles that braked harder than 4.5 m/s2.
+    """
+
+    kind: str
+    number: int
+    headway: tuple[float, float, float] | None = None
+    collisions: int = 0
+    hardest_braking: float = 0.0
+    hardest_acceleration: float = 0.0
+    smallest_gap: float = float("inf")
+    braked_hard: int = 0
+
+
+@dataclass(frozen=True)
+class StressResult:
+    """What `run_stress` found, a result for each kind of event."""
+
+    events: tuple[EventResult, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns plain data."""
+        return {"events": [asdict(one) for one in self.events]}
+
+
+def run_stress(
+    runs: Mapping[str, str | Path],
+    *,
+    seed: int = 0,
+    cut_ins: int = 1000,
+    speed_mode: int = OBEYS_ALL,
+) -> StressResult:
+    """Drives all events with the policy of the vType `car`.
+
+    Args:
+        runs: `car` -> a job's output folder, the id of its MLflow run, or `cfx://NAME`.
+        seed: of the events.
+        cut_ins: how many; of the other kinds a fifth as many.
+        speed_mode: as in `Driver`.
+
+    Raises:
+        SumoError: SUMO is missing, or another vType than `car` is given.
+        DataError: a run has no policy that drives unseen drivers.
+    """
+    require_sumo()
+    if set(runs) != {_KIND}:
+        raise SumoError(f"the stress scenario drives vType '{_KIND}' alone: --drivers {_KIND}=RUN")
+    rng = np.random.default_rng(seed)
+    few = max(1, cut_ins // 5)
+    kinds = {
+        "cut-ins": [_cut_in(rng) for _ in range(cut_ins)],
+        "leaders braking at 9 m/s2": [_braking_leader(rng) for _ in range(few)],
+        "standing vehicles": [_standing_vehicle(rng) for _ in range(few)],
+    }
+    found = []
+    with Task("Driving stress", len(kinds) + 2) as task:
+        for kind, events in kinds.items():
+            found.append(_run_events(kind, events, _fleet(runs, speed_mode)))
+            task.advance()
+        for kind, routes, end in _TOWN:
+            found.append(_run_town(kind, routes, end, _fleet(runs, speed_mode)))
+            task.advance()
+    return StressResult(tuple(found))
+
+
+def report_stress(result: StressResult, output: Path | None = None) -> None:
+    """Prints a table of the events, and writes it as JSON where `output` is given."""
+    from cfx.core.console import blank_table, put
+
+    table = blank_table(
+        "event",
+        "number",
+        "headway at first [s]",
+        "collisions",
+        "hardest braking [m/s2]",
+        "above 4.5 m/s2",
+        "hardest acceleration [m/s2]",
+        "smallest gap [m]",
+    )
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for one in result.events:
+        table.add_row(
+            one.kind,
+            str(one.number),
+            _range(one.headway),
+            str(one.collisions),
+            f"{one.hardest_braking:.2f}",
+            str(one.braked_hard),
+            f"{one.hardest_acceleration:.2f}",
+            f"{one.smallest_gap:.2f}",
+        )
+    put(table)
+    if output is not None:
+        write_json(output, result.to_json())
+
+
+def _range(headway: tuple[float, float, float] | None) -> str:
+    if headway is None:
+        return ""
+    return f"{headway[0]:.2f} to {headway[2]:.2f}"
+
+
+def _fleet(runs: Mapping[str, str | Path], speed_mode: int) -> Fleet:
+    return Fleet.load(runs, speed_mode=speed_mode)
+
+
+def _cut_in(rng: np.random.Generator) -> Event:
+    """Returns a cut-in that braking at `_BEARABLE` survives."""
+    speed = float(rng.uniform(5.0, 33.0))
+    slower, margin = float(rng.uniform(0.0, 0.3)), float(rng.uniform(0.0, 12.0))
+    return Event(speed, 4.0 + 1.5 * speed, speed, slower=slower, margin=margin)
+
+
+def _braking_leader(rng: np.random.Generator) -> Event:
+    speed = float(rng.uniform(5.0, 33.0))
+    return Event(speed, 4.0 + 1.5 * speed, speed, headway=float(rng.uniform(1.0, 2.5)))
+
+
+def _standing_vehicle(rng: np.random.Generator) -> Event:
+    speed = float(rng.uniform(5.0, 33.0))
+    return Event(speed, 150.0 + _SETTLE_S * speed, 0.0)
+
+
+def _run_events(kind: str, events: list[Event], fleet: Fleet) -> EventResult:
+    """Runs events side by side, each on a road of its own."""
+    network, routes = _roads(len(events)), _placed(events)
+    events_at = round(_SETTLE_S / STEP_S)
+    steps = events_at + round(_LASTS_S / STEP_S)
+    result = EventResult(kind, len(events))
+
+    def act(sumo: Any, step: int) -> None:
+        if step == 0:
+            _take_hold(sumo, events)
+        if step == events_at:
+            headways = _happen(sumo, events)
+            if headways is not None:
+                result.number = len(headways)
+                result.headway = _spread(headways)
+
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cfx-")))
+        configuration = _written(folder, network, routes)
+        sumo = stack.enter_context(started(configuration, _command(configuration), gui=False))
+        _drive(sumo, fleet, steps, result, act)
+    return result
+
+
+def _spread(values: list[float]) -> tuple[float, float, float] | None:
+    if not values:
+        return None
+    return (float(np.min(values)), float(np.median(values)), float(np.max(values)))
+
+
+def _take_hold(sumo: Any, events: list[Event]) -> None:
+    """Lets the vehicles that no policy drives keep their speeds and lanes."""
+    vehicle = sumo.vehicle
+    for name in vehicle.getIDList():
+        vehicle.setLaneChangeMode(name, 0)
+        kind, _, number = name.partition(".")
+        if kind != _KIND:
+            vehicle.setSpeedMode(name, 0)
+            vehicle.setSpeed(name, events[int(number)].leader_speed)
+
+
+def _happen(sumo: Any, events: list[Event]) -> list[float] | None:
+    """Lets vehicles cut in and leaders brake.
+
+    A policy has driven for `_SETTLE_S` by now, at a gap and a speed that are its own. So what
+    happens is laid out from where the car is at this moment.
+
+    Returns:
+        Time headway, s, of each event in which the vehicle that acts is the next ahead of the car;
+        None where nobody acts.
+    """
+    vehicle = sumo.vehicle
+    acting: dict[int, str] = {}
+    for number, event in enumerate(events):
+        car, leader, cutter = f"{_KIND}.{number}", f"leader.{number}", f"cutter.{number}"
+        position, speed = vehicle.getLanePosition(car), vehicle.getSpeed(car)
+        if event.slower is not None:
+            cutter_speed = min((1.0 - event.slower) * speed, event.leader_speed)
+            closing = speed - cutter_speed
+            gap = 1.0 + closing * STEP_S + closing**2 / (2.0 * _BEARABLE) + event.margin
+            front = position + gap + _LENGTH_M
+            # The leader goes on ahead of whoever cuts in, and never slower.
+            room = front + _LENGTH_M + 2.0 + event.leader_speed
+            if vehicle.getLanePosition(leader) < room:
+                vehicle.moveTo(leader, f"road{number}_0", room)
+            vehicle.moveTo(cutter, f"road{number}_0", front)
+            vehicle.setPreviousSpeed(cutter, cutter_speed)
+            vehicle.setSpeed(cutter, cutter_speed)
+            acting[number] = cutter
+        elif event.headway is not None:
+            # The leader takes the car's speed: then braking as hard as it does is enough.
+            front = position + 2.0 + event.headway * speed + _LENGTH_M
+            vehicle.moveTo(leader, f"road{number}_0", front)
+            vehicle.setPreviousSpeed(leader, speed)
+            vehicle.slowDown(leader, 0.0, speed / _HARDEST)
+            acting[number] = leader
+    return _headways(vehicle, acting) if acting else None
+
+
+def _headways(vehicle: Any, acting: Mapping[int, str]) -> list[float]:
+    """Returns headways of the cars whose next vehicle ahead is the one that acts."""
+    headways = []
+    for number, name in acting.items():
+        car = f"{_KIND}.{number}"
+        ahead = vehicle.getLeader(car, 200.0)
+        if ahead and ahead[0] == name:
+            gap = ahead[1] + vehicle.getMinGap(car)
+            headways.append(gap / max(vehicle.getSpeed(car), STEP_S))
+    return headways
+
+
+def _drive(
+    sumo: Any,
+    fleet: Fleet,
+    steps: int,
+    result: EventResult,
+    act: Callable[[Any, int], None] | None = None,
+) -> None:
+    """Runs a simulation and notes what the driven vehicles do."""
+    vehicle, hard = sumo.vehicle, set()
+    collided: set[str] = set()
+    for step in range(steps):
+        sumo.simulationStep()
+        if act is not None:
+            act(sumo, step)
+        fleet.step(sumo)
+        collided |= set(sumo.simulation.getCollidingVehiclesIDList())
+        for name in fleet.vehicles:
+            acceleration = vehicle.getAcceleration(name)
+            result.hardest_braking = max(result.hardest_braking, -acceleration)
+            result.hardest_acceleration = max(result.hardest_acceleration, acceleration)
+            if acceleration < -4.5 - 1e-6:
+                hard.add(name)
+            leader = vehicle.getLeader(name, 50.0)
+            if leader and leader[0]:
+                gap = leader[1] + vehicle.getMinGap(name)
+                result.smallest_gap = min(result.smallest_gap, gap)
+                if gap < 0:
+                    collided.add(name)
+    result.braked_hard = len(hard)
+    result.collisions = len({name for name in collided if name.startswith(_KIND)})
+
+
+def _command(configuration: Path) -> list[str]:
+    command = ["sumo", "-c", str(configuration), "--collision.action", "warn"]
+    # Contact is a collision; SUMO's own rule takes a gap below minGap for one.
+    command += ["--collision.mingap-factor", "0"]
+    for name in ("--no-step-log", "--duration-log.disable", "--no-warnings"):
+        command += [name, "true"]
+    return command
+
+
+def _written(folder: Path, network: str | Path, routes: str) -> Path:
+    """Writes a scenario; the network is a text, or a file that is there already."""
+    if isinstance(network, str):
+        text, network = network, folder / "stress.net.xml"
+        network.write_text(text, encoding="utf-8")
+    (folder / "stress.rou.xml").write_text(routes, encoding="utf-8")
+    configuration = folder / "stress.sumocfg"
+    configuration.write_text(
+        f'<configuration><input><net-file value="{network}"/>'
+        f'<route-files value="{folder / "stress.rou.xml"}"/></input>'
+        f'<time><step-length value="{STEP_S:g}"/></time>'
+        '<processing><time-to-teleport value="-1"/></processing></configuration>',
+        encoding="utf-8",
+    )
+    return configuration
+
+
+def _roads(number: int) -> str:
+    """Returns a network of parallel roads with two lanes each."""
+    box = f"0,0,{_ROAD_M},{_APART_M * number}"
+    lines = [
+        '<net version="1.20">',
+        f'<location netOffset="0,0" convBoundary="{box}" origBoundary="0,0,1,1"'
+        ' projParameter="!"/>',
+    ]
+    ends = []
+    for i in range(number):
+        y = _APART_M * i
+        lanes = []
+        for lane in range(2):
+            at = y + 3.2 * lane
+            lanes.append(
+                f'<lane id="road{i}_{lane}" index="{lane}" speed="{_LANE_MPS}" length="{_ROAD_M}"'
+                f' shape="0,{at} {_ROAD_M},{at}"/>'
+            )
+        lines.append(
+            f'<edge id="road{i}" from="from{i}" to="to{i}" priority="1">{"".join(lanes)}</edge>'
+        )
+        ends.append(
+            f'<junction id="from{i}" type="dead_end" x="0" y="{y}" incLanes="" intLanes=""'
+            f' shape="0,{y}"/>'
+        )
+        ends.append(
+            f'<junction id="to{i}" type="dead_end" x="{_ROAD_M}" y="{y}"'
+            f' incLanes="road{i}_0 road{i}_1" intLanes="" shape="{_ROAD_M},{y}"/>'
+        )
+    return "\n".join([*lines, *ends, "</net>"])
+
+
+def _placed(events: list[Event]) -> str:
+    """Returns the routes and vehicles of events."""
+    lines = [
+        "<routes>",
+        CAR,
+        f'<vType id="other" length="{_LENGTH_M}" maxSpeed="60" speedDev="0"/>',
+    ]
+    for number, event in enumerate(events):
+        lines.append(f'<route id="route{number}" edges="road{number}"/>')
+        lines.append(_vehicle(_KIND, _KIND, number, 0, event.speed, _BEGIN_M))
+        at = _BEGIN_M + event.ahead + _LENGTH_M
+        lines.append(_vehicle("leader", "other", number, 0, event.leader_speed, at))
+        if event.slower is not None:
+            lines.append(_vehicle("cutter", "other", number, 1, event.leader_speed, _BEGIN_M))
+    lines.append("</routes>")
+    return "\n".join(lines)
+
+
+def _vehicle(role: str, kind: str, number: int, lane: int, speed: float, at: float) -> str:
+    return (
+        f'<vehicle id="{role}.{number}" type="{kind}" route="route{number}" depart="0"'
+        f' departLane="{lane}" departPos="{at!r}" departSpeed="{speed!r}"'
+        ' insertionChecks="none"/>'
+    )
+
+
+_TOWN = (
+    (
+        "a lane drop",
+        '<route id="r" edges="wide narrow"/><flow id="car" type="car" route="r" begin="0" end="500"'
+        ' vehsPerHour="2600" departLane="random" departSpeed="desired" departPos="base"/>',
+        600.0,
+    ),
+    (
+        "a red light",
+        '<route id="r" edges="before after"/><flow id="car" type="car" route="r" begin="0"'
+        ' end="500" vehsPerHour="700" departSpeed="desired"/>',
+        600.0,
+    ),
+)
+"""Kind, demand and duration, s, of the events in `assets/town.net.xml`."""
+
+
+def _run_town(kind: str, routes: str, end: float, fleet: Fleet) -> EventResult:
+    """Runs one of the scenarios with a flow of cars; an event is a car."""
+    result = EventResult(kind, 0)
+    seen: set[str] = set()
+
+    def act(sumo: Any, step: int) -> None:  # noqa: ARG001 - the signature of an act
+        seen.update(sumo.simulation.getDepartedIDList())
+
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cfx-")))
+        text = f"<routes>{CAR}{routes}</routes>"
+        configuration = _written(folder, ASSETS / "town.net.xml", text)
+        sumo = stack.enter_context(started(configuration, _command(configuration), gui=False))
+        _drive(sumo, fleet, round(end / STEP_S), result, act)
+    result.number = len(seen)
+    return result

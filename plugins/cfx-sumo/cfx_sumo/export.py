@@ -1,0 +1,218 @@
+"""`cfx export --to sumo`: a job's driver-specific parameters as vTypes that SUMO loads."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from cfx import DrivingModel
+from cfx.calibration.flatness import COLUMN
+from cfx.core.errors import ConfigError, DataError
+from cfx.core.files import write_output
+from cfx.core.job_folder import examine, parse_yaml
+from cfx.core.registry import create
+from cfx.models.vtype import InSumo, VType
+from cfx.results.store import folder_of
+
+NAME = "drivers.add.xml"
+
+ALL_DRIVERS = "drivers"
+"""The vTypeDistribution of all drivers."""
+
+_WITHOUT_LAG = {"variant": "sumo", "leader_deceleration": None}
+"""Settings with which krauss is SUMO's KraussOrig1, once its t_i is 0."""
+
+
+def export(run: str | Path, output: str | Path | None = None) -> list[str]:
+    """Writes a vTypeDistribution for each cluster, with a vType for each pair's parameters.
+
+    The parameters are those of the method `fixed`: calibrated to the driver, constant. The
+    distribution `drivers` holds them all. Each vType is one driver's whole set, so that a vehicle
+    drawn from it has parameters that belong together, as correlated as they are among drivers.
+
+    Args:
+        run: a job's output folder, or the id of its MLflow run.
+        output: the file; None for `drivers.add.xml` in that folder, or here for an MLflow run.
+
+    Raises:
+        DataError: there is no finished job, or it has no driver-specific parameters.
+        ConfigError: SUMO has no model that drives as the job's.
+        OutputError: the file cannot be written.
+
+    Returns:
+        Sentences for the user.
+    """
+    folder, home = _folder(run)
+    node, table = _read(folder)
+    kind, notes = vtypes(node, table)
+    notes += _undetermined(table)
+    path = Path(output).expanduser() if output else home / NAME
+    write_output(path, _xml(table, kind, notes), "the list of vTypes")
+    first = quoteattr(str(table["cluster"].iloc[0]))
+    counts = []
+    for name, count in table.groupby("cluster", sort=False).size().items():
+        counts.append(f"{name} {count}")
+    return [
+        f"vTypes of SUMO's {kind.car_follow_model}, in one vTypeDistribution for each cluster:"
+        f" {', '.join(counts)}; all together in '{ALL_DRIVERS}'",
+        *[f"Note: {note}" for note in notes],
+        f"Use it: sumo --additional-files {path.absolute()}; then in a flow or vehicle:"
+        f' type="{ALL_DRIVERS}", or type={first}',
+    ]
+
+
+def vtypes(node: Mapping[str, Any], table: pd.DataFrame) -> tuple[VType, list[str]]:
+    """Returns what SUMO calls the drivers of a table, and what a reader of the result must know.
+
+    Args:
+        node: the driving model's config node.
+        table: a row for each driver, with a column `parameter_NAME` for each tuned parameter.
+
+    Raises:
+        ConfigError: SUMO has no model that drives as this one.
+        DataError: the table has other parameters than the model.
+    """
+    model = cast(DrivingModel, create("model", node))
+    columns = [f"parameter_{name}" for name in model.space.names]
+    missing = [column for column in columns if column not in table]
+    if missing:
+        raise DataError(
+            f"pairs.csv has no column {missing[0]}, which model={node['name']} here needs; run the"
+            " job again"
+        )
+    p: dict[str, Tensor] = model.space.unpack(torch.tensor(table[columns].to_numpy(dtype=float)))
+    notes: list[str] = []
+    if node["name"] == "krauss":
+        model, notes = _krauss(node, p)
+    if not isinstance(model, InSumo):
+        raise ConfigError(
+            f"SUMO has no car-following model that drives as model={node['name']}; export jobs with"
+            " model=idm, krauss, w99, krauss_sumo, idm_sumo or sumo_vtype"
+        )
+    return model.sumo_vtype(p), notes
+
+
+def _krauss(node: Mapping[str, Any], p: Mapping[str, Tensor]) -> tuple[DrivingModel, list[str]]:
+    """Returns krauss as SUMO has it; what is lost stands in the notes."""
+    notes = []
+    if bool((p["t_i"] > 0).any()):
+        notes.append(
+            "SUMO's KraussOrig1 has no brake build-up time t_i; tau is t_r, with which the gap at"
+            " constant speed is the same, and braking begins a little later"
+        )
+    if node.get("leader_deceleration") is not None:
+        notes.append(
+            "SUMO's KraussOrig1 expects of the leader the follower's own decel, not"
+            " leader_deceleration"
+        )
+    parameters = dict(node.get("parameters") or {})
+    parameters["t_i"] = {"default": 0.0, "tuned": False}
+    without_lag = {**node, **_WITHOUT_LAG, "parameters": parameters}
+    return cast(DrivingModel, create("model", without_lag)), notes
+
+
+def _folder(run: str | Path) -> tuple[Path, Path]:
+    """Returns the folder of a job, and where its export goes unless told otherwise."""
+    folder = folder_of(run)
+    if Path(run).expanduser().is_dir():
+        return folder, folder
+    return folder, Path()
+
+
+def _read(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
+    """Reads the model's node, and the rows of `fixed`, calmest cluster first."""
+    examine(folder)
+    try:
+        node = parse_yaml((folder / "config.yaml").read_text(encoding="utf-8"))["model"]
+        if not isinstance(node, dict):
+            raise ValueError("config.yaml: model is no mapping")
+        table = pd.read_csv(folder / "pairs.csv", dtype={"pair_id": str})
+        fixed = table[table["method"] == "fixed"]
+        values = fixed.filter(like="parameter_").to_numpy(dtype=float)
+        fixed = fixed[np.isfinite(values).all(axis=1)]
+        fixed = fixed.sort_values("style_score", kind="stable").reset_index(drop=True)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(
+            f"{folder} holds no finished job ({error}); give the output folder that a job printed"
+        ) from error
+    if fixed.empty:
+        raise DataError(
+            f"{folder}/pairs.csv holds no driver-specific parameters (method `fixed`); give a job"
+            " that calibrated some"
+        )
+    return node, fixed
+
+
+def _undetermined(table: pd.DataFrame) -> list[str]:
+    """Returns a note on the parameters that some recordings do not determine, if there are any."""
+    counts = Counter(name for row in table.index for name in _flat(table, row))
+    if not counts:
+        return []
+    listed = ", ".join(f"{name} of {count}" for name, count in counts.items())
+    return [
+        f"some recordings do not determine {listed} of the {len(table)} drivers, so that these"
+        " values say nothing of them; each such vType names them in its parameter 'flat'"
+    ]
+
+
+def _flat(table: pd.DataFrame, row: Any) -> list[str]:
+    """Returns the parameters whose loss is flat for the driver of a row, by cfx's names."""
+    columns = [str(name) for name in table if str(name).startswith(COLUMN)]
+    return [name.removeprefix(COLUMN) for name in columns if table[name][row] == 1]
+
+
+def _xml(table: pd.DataFrame, kind: VType, notes: list[str]) -> str:
+    columns: dict[str, list[str]] = {}
+    for name, value in {"sigma": "0", **kind.attributes}.items():
+        columns[name] = _texts(value, len(table))
+    lines = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        "<!-- Constant parameters of recorded drivers, each calibrated by cfx.",
+    ]
+    for note in notes:
+        lines.append(f"     {note}.")
+    lines += ["-->", "<additional>"]
+    names = []
+    for cluster, rows in table.groupby("cluster", sort=False):
+        lines.append(f"    <vTypeDistribution id={quoteattr(str(cluster))}>")
+        for place, row in enumerate(rows.index):
+            attributes = {name: values[row] for name, values in columns.items()}
+            names.append(f"{cluster}_{place}")
+            about = {"pair": rows["pair_id"][row]}
+            flat = _flat(table, row)
+            if flat:
+                about["flat"] = " ".join(flat)
+            lines += _vtype(names[-1], kind, attributes, about)
+        lines.append("    </vTypeDistribution>")
+    lines.append(f'    <vTypeDistribution id="{ALL_DRIVERS}" vTypes={quoteattr(" ".join(names))}/>')
+    return "\n".join([*lines, "</additional>", ""])
+
+
+def _vtype(
+    name: str, kind: VType, attributes: Mapping[str, str], about: Mapping[str, str]
+) -> list[str]:
+    further = []
+    for key, said in about.items():
+        further.append(f"            <param key={quoteattr(key)} value={quoteattr(said)}/>")
+    given = " ".join(f"{key}={quoteattr(value)}" for key, value in attributes.items())
+    return [
+        f"        <vType id={quoteattr(name)} carFollowModel={quoteattr(kind.car_follow_model)}"
+        f' speedDev="0" {given}>',
+        *further,
+        "        </vType>",
+    ]
+
+
+def _texts(value: Tensor | str, count: int) -> list[str]:
+    """Returns an attribute of each of `count` vehicles."""
+    if isinstance(value, str):
+        return [value] * count
+    return [repr(float(one)) for one in value.expand(count)]

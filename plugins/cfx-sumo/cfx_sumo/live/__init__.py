@@ -1,0 +1,1 @@
+"""Live drivers: policies that drive vehicles of a running SUMO simulation."""

@@ -1,0 +1,110 @@
+"""Several kinds of drivers in one scenario: a policy for each vType."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from cfx.core.errors import DataError
+from cfx.policies.placement import ALL
+from cfx_sumo.live.driver import OBEYS_ALL, Driver
+from cfx_sumo.live.surroundings import Connection
+
+
+class Fleet:
+    """Drives all vehicles of some vTypes, each type by its own driver.
+
+        fleet = Fleet.load({"calm": "outputs/conservative", "hasty": "outputs/aggressive"})
+        connection.simulationStep()
+        fleet.step(connection)
+
+    The fleet finds vehicles that come and go. A vehicle belongs to the vType with which it is first
+    seen; a vType that SUMO made of it for this one vehicle (`calm@vehicle`) counts as `calm`. Types
+    that share a driver are one batch.
+    """
+
+    def __init__(self, drivers: Mapping[str, Driver]) -> None:
+        """Takes a driver for each vType.
+
+        Raises:
+            DataError: there is none, or their time steps differ.
+        """
+        if not drivers:
+            raise DataError("a fleet needs a driver for at least one vType")
+        steps = {name: driver.policy.dt for name, driver in drivers.items()}
+        if max(steps.values()) - min(steps.values()) > 1e-6:
+            listed = ", ".join(f"{name} {dt:g} s" for name, dt in steps.items())
+            raise DataError(
+                f"the policies were trained at different time steps ({listed}); a simulation has"
+                " one"
+            )
+        self.drivers = dict(drivers)
+        self._type_of: dict[str, str] = {}
+
+    @classmethod
+    def load(
+        cls,
+        runs: Mapping[str, str | Path],
+        *,
+        network: str = ALL,
+        look_ahead: float = 200.0,
+        speed_mode: int = OBEYS_ALL,
+        seed: int = 0,
+    ) -> Fleet:
+        """Reads the policy of a run for each vType; types with the same run share a driver.
+
+        A run may be followed by `#` and the name of one of its networks, which drives then. Each
+        driver has a seed of its own. The other arguments are those of `Driver.load`.
+        """
+        loaded: dict[str | Path, Driver] = {}
+        for run in dict.fromkeys(runs.values()):
+            folder, chosen = _network_of(run, network)
+            loaded[run] = Driver.load(
+                folder,
+                network=chosen,
+                look_ahead=look_ahead,
+                speed_mode=speed_mode,
+                seed=seed + len(loaded),
+            )
+        return cls({name: loaded[run] for name, run in runs.items()})
+
+    @property
+    def vehicles(self) -> dict[str, str]:
+        """The vType of each vehicle of the fleet that was on the road at the last step."""
+        return {vehicle: name for vehicle, name in self._type_of.items() if name in self.drivers}
+
+    def step(self, connection: Connection) -> None:
+        """Sets the speeds of the fleet's vehicles in the next `simulationStep`.
+
+        Call it after each.
+
+        Raises:
+            SumoError: the simulation's step is not the policies'.
+        """
+        types: dict[str, str] = {}
+        for vehicle in connection.vehicle.getIDList():
+            known = self._type_of.get(vehicle)
+            if known is None:
+                known = connection.vehicle.getTypeID(vehicle).partition("@")[0]
+            types[vehicle] = known
+        self._type_of = types
+        drivers = {id(driver): driver for driver in self.drivers.values()}
+        vehicles: dict[int, list[str]] = {key: [] for key in drivers}
+        for vehicle, name in types.items():
+            if name in self.drivers:
+                vehicles[id(self.drivers[name])].append(vehicle)
+        for key, driver in drivers.items():
+            driver.step(connection, vehicles[key])
+
+    def driver(self, vehicle: str) -> Driver:
+        """Returns the driver of a vehicle of the fleet."""
+        return self.drivers[self._type_of[vehicle]]
+
+
+def _network_of(run: str | Path, network: str) -> tuple[str | Path, str]:
+    """Splits `RUN#NETWORK`; a folder of such a name is taken as it is."""
+    text = str(run)
+    if "#" not in text or Path(text).exists():
+        return run, network
+    folder, _, chosen = text.rpartition("#")
+    return folder, chosen

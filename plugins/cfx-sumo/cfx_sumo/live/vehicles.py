@@ -1,0 +1,86 @@
+"""What a live driver knows of vehicles, as one table of tensors.
+
+Shapes: C vehicles, L frames of a token, n tuned parameters, m width of the model's memory, s width
+of the networks' state, k driver features, q numbers that a stochastic head keeps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from cfx import DrivingModel
+from cfx.policies.agent import Agent
+from cfx.policies.features import History
+
+
+@dataclass(frozen=True)
+class VehicleTable:
+    """A row per vehicle; double precision where nothing else is said.
+
+    Attributes:
+        history: `(C, 5, L)`, the signals of `History`.
+        parameters: `(C, n)`, SI units.
+        memory: `(C, m)`, of the model.
+        state: `(C, s)`, of the networks, in their precision.
+        latent: `(C, q)`, what a stochastic head keeps of its random numbers.
+        network: `(C,)` int64, which of the agent's networks drives.
+        base: `(C, n)`, SI units, the base parameters; NaN where the agent needs none.
+        driver_features: `(C, k)`; NaN for unseen drivers.
+        steps: `(C,)` int64, since the vehicle's first window.
+        time: `(C,)` s, of the last frame; NaN before the first.
+        driven: `(C,)` bool; the others are watched.
+        score: `(C,)`, how far outside what was learned each was when its window began.
+        beyond: `(C, 2 f)` bool, which signals alone were unusual then.
+    """
+
+    history: Tensor
+    parameters: Tensor
+    memory: Tensor
+    state: Tensor
+    latent: Tensor
+    network: Tensor
+    base: Tensor
+    driver_features: Tensor
+    steps: Tensor
+    time: Tensor
+    driven: Tensor
+    score: Tensor
+    beyond: Tensor
+
+    @classmethod
+    def empty(cls, agent: Agent, model: DrivingModel, count: int) -> VehicleTable:
+        """Returns rows for `count` vehicles."""
+        begun = agent.begin(torch.zeros(1, dtype=torch.int64))
+        state = begun.state
+        length, parameters = agent.windows.length, len(agent.space)
+        features = len(agent.core.driver_features)
+        return cls(
+            history=_unknown(count, len(History._fields), length),
+            parameters=_unknown(count, parameters),
+            memory=torch.zeros((count, model.memory_size), dtype=torch.float64),
+            state=state.new_zeros((count, state.shape[-1])),
+            latent=begun.latent.new_zeros((count, begun.latent.shape[-1])),
+            network=torch.zeros(count, dtype=torch.int64),
+            base=_unknown(count, parameters),
+            driver_features=_unknown(count, features),
+            steps=torch.zeros(count, dtype=torch.int64),
+            time=_unknown(count),
+            driven=torch.zeros(count, dtype=torch.bool),
+            score=torch.zeros(count, dtype=torch.float64),
+            beyond=torch.zeros((count, begun.beyond.shape[-1]), dtype=torch.bool),
+        )
+
+    def with_rows(self, more: VehicleTable) -> VehicleTable:
+        """Returns these rows and then the others."""
+        columns = {}
+        for column in fields(self):
+            both = [getattr(self, column.name), getattr(more, column.name)]
+            columns[column.name] = torch.cat(both)
+        return VehicleTable(**columns)
+
+
+def _unknown(*shape: int) -> Tensor:
+    return torch.full(shape, torch.nan, dtype=torch.float64)

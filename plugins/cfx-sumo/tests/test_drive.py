@@ -1,0 +1,292 @@
+from __future__ import annotations
+
+import csv
+import json
+import logging
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cfx.app.cli import main
+from cfx.core.errors import ConfigError
+from cfx.core.extras import install_line
+from cfx.policies.checkpoint import save
+from cfx_sumo.demo.motorway import SHIPPED
+from cfx_sumo.drive.run import Collision, ScenarioRun, Tally, parse_drivers, report
+from tests.agents import adaptive
+
+pytest.importorskip("traci", reason="needs the extra sumo")
+
+DEMAND = """<routes>
+  <vType id="calm" minGap="1"/> <vType id="hasty"/> <vType id="other"/> <vType id="ghost"/>
+  <route id="whole" edges="1001 1002 1003"/> <route id="ramp" edges="1004 1002 1003"/>
+  <flow id="c" type="calm" route="whole" begin="0" end="20" vehsPerHour="3000"
+      departLane="random" departSpeed="12"/>
+  <flow id="h" type="hasty" route="whole" begin="0" end="20" vehsPerHour="3000"
+      departLane="random" departSpeed="12"/>
+  <flow id="o" type="other" route="whole" begin="0" end="20" vehsPerHour="900"
+      departLane="random" departSpeed="9"/>
+  <flow id="r" type="calm" route="ramp" begin="0" end="20" vehsPerHour="600"/>
+</routes>"""
+
+CONFIGURATION = """<configuration><input><net-file value="{net}"/>
+  <route-files value="{demand}"/></input>
+<time><end value="30"/><step-length value="{step}"/></time></configuration>"""
+
+
+@pytest.fixture(scope="module")
+def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("scenario")
+    demand = folder / "demand.rou.xml"
+    demand.write_text(DEMAND)
+    (folder / "lost.rou.xml").write_text(DEMAND.replace("1001 1002 1003", "1001 1002 9999"))
+    for name, values in {
+        "motorway": {"demand": demand, "step": 0.1},
+        "slow": {"demand": demand, "step": 0.5},
+        "lost": {"demand": folder / "lost.rou.xml", "step": 0.1},
+    }.items():
+        (folder / f"{name}.sumocfg").write_text(CONFIGURATION.format(net=SHIPPED, **values))
+    (folder / "torn.sumocfg").write_text("<configuration><input><net-file")
+    for name, model in (("calm", "krauss"), ("hasty", "w99")):
+        save(adaptive({"name": model}), folder / name / "policy")
+    return folder
+
+
+def python(script: str, folder: Path) -> Any:
+    """Runs a script in a process of its own; returns the JSON of its last line."""
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=200,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_the_command_drives_a_scenario_and_says_what_happened(scenario: Path) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "cfx",
+        "drive",
+        "motorway.sumocfg",
+        "--drivers",
+        "calm=calm",
+        "hasty=hasty",
+        "--seed",
+        "7",
+    ]
+    done = subprocess.run(
+        [*command, "--output", "out/drives.csv", "--", "--collision.action", "warn"],
+        cwd=scenario,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    table = {
+        line.split()[0]: line.split()
+        for line in reversed(done.stdout.splitlines())
+        if line.strip().startswith(("calm", "hasty"))
+    }
+    assert int(table["calm"][1]) > 15
+    assert int(table["hasty"][1]) > 12
+    assert "300 steps of 0.1 s in" in done.stdout
+    assert "times real time" in done.stdout
+    with (scenario / "out" / "drives.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["type"] for row in rows} == {"calm", "hasty"}
+    assert len({row["vehicle"] for row in rows if row["type"] == "calm"}) == int(table["calm"][1])
+    driven = [row for row in rows if row["parameter_cc1"]]
+    assert {row["type"] for row in driven} == {"hasty"}
+    assert all(0.1 <= float(row["parameter_cc1"]) <= 6 for row in driven)
+    assert len({row["parameter_cc1"] for row in driven}) > 100, "parameters change while they drive"
+    assert any(row["type"] == "calm" and row["parameter_t_r"] for row in rows)
+    assert not [row for row in rows if row["type"] == "calm" and row["parameter_cc1"]]
+
+
+def test_what_cannot_be_driven_is_one_sentence_and_leaves_no_file(scenario: Path) -> None:
+    said = python(
+        """
+        import sys
+        sys.modules["pyarrow"] = None
+        import json
+        from pathlib import Path
+        from cfx.core.errors import CfxError
+        from cfx_sumo.drive.run import run_scenario
+        said = []
+        for name, kinds in (("motorway", ["clam"]), ("motorway", ["calm", "ghost"]),
+                            ("slow", ["calm"]), ("lost", ["calm"]),
+                            ("torn", ["calm"])):
+            try:
+                runs = {kind: "calm" for kind in kinds}
+                run_scenario(Path(name + ".sumocfg"), runs, output=Path("never.csv"), end=2.0)
+            except CfxError as error:
+                said.append(str(error))
+        # And the process still drives afterwards.
+        driven = run_scenario(Path("motorway.sumocfg"), {"calm": "calm"}, end=2.0)
+        print(json.dumps([said, driven.steps, "pyarrow.lib" in sys.modules]))
+        """,
+        scenario,
+    )
+    (unknown, never, step, edge, torn), steps, pyarrow = said
+    assert "has no vType 'clam'. Did you mean 'calm'? It has: calm, ghost, hasty, other" in unknown
+    assert never.startswith(
+        "no vehicle of vType 'ghost' was ever on the road in motorway.sumocfg (2 s)"
+    )
+    assert (
+        "steps by 0.5 s, the policy of calm was trained at 0.1 s; start SUMO with --step-length 0.1"
+        in step
+    )
+    assert edge.startswith(
+        "SUMO refuses lost.sumocfg: The edge '9999' within the route 'whole' is not known"
+    )
+    assert torn.startswith("SUMO refuses torn.sumocfg: ")
+    assert not any("\n" in one for one in said[0])
+    assert steps == 20
+    assert not pyarrow, "libsumo does not get on with it"
+    assert not list(scenario.glob("*never*"))
+
+
+def test_mistakes_are_reported_before_sumo_starts(
+    scenario: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(scenario)
+    monkeypatch.setitem(
+        sys.modules, "pyarrow", sys.modules.get("pyarrow")
+    )  # the command does without it, later tests do not
+    with pytest.raises(ConfigError, match=r"--drivers calm: write TYPE=RUN"):
+        parse_drivers(["calm"])
+    with pytest.raises(ConfigError, match="'calm' stands twice"):
+        parse_drivers(["calm=a", "calm=b"])
+    assert parse_drivers(["a=b=c"]) == {"a": "b=c"}
+    handlers = list(logging.getLogger("cfx").handlers)
+    assert main(["drive", "nowhere.sumocfg", "--drivers", "calm=calm"]) == 2
+    assert "nowhere.sumocfg is not there" in capsys.readouterr().err
+    with monkeypatch.context() as without:
+        without.setattr("importlib.metadata.version", _not_found)
+        assert main(["drive", "motorway.sumocfg", "--drivers", "calm=calm"]) == 2
+    assert install_line("cfx-sumo") in capsys.readouterr().err
+    assert logging.getLogger("cfx").handlers == handlers, "nothing is left behind"
+
+
+def _not_found(name: str) -> str:
+    from importlib.metadata import PackageNotFoundError
+
+    raise PackageNotFoundError(name)
+
+
+def test_a_vehicle_that_collides_teleports_or_changes_lanes_is_counted_and_ends_nothing(
+    scenario: Path,
+) -> None:
+    """One drives into a car that stands, one is told to change lanes."""
+    counts = python(
+        """
+        import sys
+        sys.modules["pyarrow"] = None
+        import json, os
+        os.environ["LIBSUMO_AS_TRACI"] = "quiet"
+        import libsumo
+        from pathlib import Path
+        from cfx_sumo.drive.run import _Run
+        from cfx_sumo.live.driver import Driver
+        from cfx_sumo.live.fleet import Fleet
+        Path("crash.rou.xml").write_text('''<routes><vType id="calm"/>
+          <route id="m" edges="1001 1002 1003"/>
+          <vehicle id="wall" type="DEFAULT_VEHTYPE" route="m" depart="0" departPos="200"
+            departSpeed="0" departLane="2">
+            <stop lane="1001_2" endPos="201" duration="100"/></vehicle>
+          <vehicle id="blind" type="calm" route="m" depart="0" departPos="150" departSpeed="25"
+            departLane="2"
+            insertionChecks="none"/>
+          <vehicle id="mover" type="calm" route="m" depart="0" departPos="100"
+            departSpeed="10" departLane="4"/></routes>''')
+        from cfx_sumo.demo.motorway import SHIPPED
+        files = ["-n", str(SHIPPED), "-r", "crash.rou.xml"]
+        options = ["--step-length", "0.1", "--no-step-log", "--collision.action", "teleport"]
+        libsumo.start(["sumo", *files, *options])
+        fleet = Fleet({"calm": Driver.load("calm")})
+        run = _Run(libsumo, fleet, Path("crash"), None)
+        step = fleet.step
+        def careless(connection):
+            step(connection)
+            present = connection.vehicle.getIDList()
+            if "blind" in present and connection.simulation.getTime() < 5:
+                connection.vehicle.setSpeed("blind", 25)
+                connection.vehicle.setSpeedMode("blind", 0)
+                connection.vehicle.setLaneChangeMode("blind", 0)
+            if connection.simulation.getTime() == 1.0:
+                connection.vehicle.changeLane("mover", 5, 10)
+        fleet.step = careless
+        driven = run.go(12.0)
+        tally = driven.tallies["calm"]
+        counts = [tally.collisions + tally.below_min_gap, tally.teleports, tally.lane_changes, driven.steps]
+        print(json.dumps([sorted(tally.vehicles), *counts]))
+        """,
+        scenario,
+    )
+    vehicles, collided, teleports, lane_changes, steps = counts
+    assert vehicles == ["blind", "mover"]
+    assert collided == 1, "once, with contact or below minGap"
+    assert teleports == 1
+    assert lane_changes >= 1
+    assert steps == 120
+
+
+def test_the_table_says_it_all(capsys: pytest.CaptureFixture[str]) -> None:
+    tally = Tally(
+        {"a", "b"},
+        steps=200,
+        driven=150,
+        metres=240.0,
+        lane_changes=3,
+        hard_brakings=2,
+        hardest_braking=6.25,
+        collisions=1,
+        below_min_gap=8,
+        teleports=4,
+    )
+    tally.braking.add([0.0] * 189 + [0.49] * 10 + [4.99])
+    tally.speeds.add([10.05] * 20 + [12.05] * 160 + [14.05] * 20)
+    recorded = dict.fromkeys(("speed", "acceleration", "time_gap"), (1.0, 2.0, 3.0))
+    run = ScenarioRun(
+        {"calm": tally},
+        steps=100,
+        dt=0.1,
+        seconds=2.0,
+        others=5,
+        most=2,
+        limited={"calm": 0.25},
+        outside={"calm": "3 % of steps outside what the policy has learned (speed above 18 m/s)"},
+        recorded={"calm": recorded},
+        collisions=[
+            Collision(3.1, "calm", "a", "b", "road_0", 51.26, -0.2),
+            Collision(4.0, "calm", "b", "x", "road_0", 80.0, 2.391),
+        ],
+    )
+    report(run)
+    out = capsys.readouterr().out
+    rows = [line.split() for line in out.splitlines() if "calm" in line]
+    assert rows[0] == ["calm", "2", "75%", "12.00", "3", "1", "8", "4"]
+    assert rows[1] == ["calm", "0.49", "4.99", "6.25", "2", "25.0%"]
+    assert rows[2] == ["calm", "10.05,", "12.05,", "14.05", *["nan,", "nan,", "nan"] * 2]
+    assert rows[3][0] == "calm:"
+    assert "3.10 s: a behind b on road_0 at 51.3 m: contact, gap -0.20 m" in out
+    assert "4.00 s: b behind x on road_0 at 80.0 m: below minGap, gap 2.39 m" in out
+    assert "calm: 3 % of steps outside what the policy has learned (speed above 18 m/s)" in out
+    assert next(line.split() for line in out.splitlines() if "its recording" in line)[2:5] == [
+        "1.00,",
+        "2.00,",
+        "3.00",
+    ]
+    assert (
+        "100 steps of 0.1 s in 2.0 s, 5.0 times real time; at most 2 of these vehicles at once, 5"
+        " others" in out
+    )

@@ -1,0 +1,201 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pandas as pd
+import pytest
+import yaml
+
+from cfx.app.cli import main
+from cfx.core.errors import ConfigError, DataError, OutputError
+from cfx.core.registry import create
+from cfx.models.base import DrivingModel
+from cfx_sumo.demo.motorway import SHIPPED
+from cfx_sumo.export import export
+
+CLUSTERS = ("conservative", "normal", "normal", "aggressive")
+
+
+def job(folder: Path, node: dict[str, Any], shift: float = 0.1) -> Path:
+    """Writes what a finished job leaves: four pairs with parameters between the bounds."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "config.yaml").write_text(yaml.safe_dump({"model": node}))
+    model = create("model", node)
+    assert isinstance(model, DrivingModel)
+    low, high = (bound.tolist() for bound in model.space.bounds())
+    rows = []
+    for k, cluster in enumerate(CLUSTERS):
+        for method in ("default", "fixed", "policy"):
+            share = shift * (k + 1) if method == "fixed" else 0.9
+            values = {
+                f"parameter_{n}": a + share * (b - a)
+                for n, a, b in zip(model.space.names, low, high, strict=True)
+            }
+            rows.append(
+                {
+                    "pair_id": f"p<{k}>",
+                    "cluster": cluster,
+                    "style_score": 0.2 * k,
+                    "method": method,
+                    **values,
+                }
+            )
+    pd.DataFrame(rows[::-1]).to_csv(folder / "pairs.csv", index=False)
+    return folder
+
+
+def types(path: Path) -> dict[str, dict[str, dict[str, str]]]:
+    root = ElementTree.parse(path).getroot()  # noqa: S314 - we have just written it
+    return {
+        one.get("id", ""): {kind.get("id", ""): dict(kind.attrib) for kind in one.iter("vType")}
+        for one in root.iter("vTypeDistribution")
+    }
+
+
+def test_each_cluster_is_a_distribution_of_its_drivers_own_fixed_parameters(tmp_path: Path) -> None:
+    folder = job(tmp_path / "w99", {"name": "w99"})
+    lines = export(folder)
+    assert lines[0].endswith("conservative 1, normal 2, aggressive 1; all together in 'drivers'")
+    found = types(folder / "drivers.add.xml")
+    assert {cluster: len(kinds) for cluster, kinds in found.items()} == {
+        "conservative": 1,
+        "normal": 2,
+        "aggressive": 1,
+        "drivers": 0,
+    }
+    table = (
+        pd.read_csv(folder / "pairs.csv")
+        .query("method == 'fixed'")
+        .sort_values("style_score")
+        .reset_index()
+    )
+    for row, kind in enumerate(one for kinds in found.values() for one in kinds.values()):
+        assert kind["carFollowModel"] == "W99"
+        assert float(kind["cc1"]) == table["parameter_cc1"][row]
+        assert float(kind["minGap"]) == table["parameter_cc0"][row]
+    text = (folder / "drivers.add.xml").read_text()
+    assert 'key="pair" value="p&lt;0&gt;"' in text
+
+
+def test_krauss_loses_its_brake_build_up_time_and_says_so(tmp_path: Path) -> None:
+    folder = job(tmp_path / "krauss", {"name": "krauss"})
+    lines = export(folder, tmp_path / "here.add.xml")
+    assert any(
+        line.startswith("Note: SUMO's KraussOrig1 has no brake build-up time t_i; tau is t_r")
+        for line in lines
+    )
+    fixed = pd.read_csv(folder / "pairs.csv").query("method == 'fixed' and cluster == 'aggressive'")
+    (kind,) = types(tmp_path / "here.add.xml")["aggressive"].values()
+    assert (kind["carFollowModel"], float(kind["tau"])) == (
+        "KraussOrig1",
+        fixed["parameter_t_r"].item(),
+    )
+    assert not (folder / "drivers.add.xml").exists()
+    same = job(
+        tmp_path / "without",
+        {
+            "name": "krauss",
+            "variant": "sumo",
+            "parameters": {"t_i": {"default": 0.0, "tuned": False}},
+        },
+    )
+    assert len(export(same)) == 2
+
+
+def test_sumo_loads_it_as_it_is_and_one_vehicle_of_each_type_drives(tmp_path: Path) -> None:
+    pytest.importorskip("traci", reason="needs the extra sumo")
+    nodes: list[dict[str, Any]] = [
+        {"name": name} for name in ("krauss", "w99", "krauss_sumo", "idm_sumo", "idm")
+    ]
+    for number, node in enumerate(nodes):
+        folder = job(tmp_path / str(number), node)
+        export(folder)
+        every = [kind for kinds in types(folder / "drivers.add.xml").values() for kind in kinds]
+        vehicles = [
+            f'<vehicle id="{kind}" type="{kind}" route="m" depart="{i}"/>'
+            for i, kind in enumerate(every)
+        ]
+        vehicles.append('<vehicle id="any" type="normal" route="m" depart="9"/>')
+        vehicles.append('<vehicle id="anybody" type="drivers" route="m" depart="12"/>')
+        (folder / "demand.rou.xml").write_text(
+            f'<routes><route id="m" edges="1001"/>{"".join(vehicles)}</routes>'
+        )
+    script = """
+import json, os, sys
+os.environ["LIBSUMO_AS_TRACI"] = "quiet"
+import libsumo as sumo
+answers = []
+for k in range(5):
+    files = ["-n", sys.argv[1], "-a", f"{k}/drivers.add.xml", "-r", f"{k}/demand.rou.xml"]
+    sumo.start(["sumo", *files, "--no-step-log", "--step-length", "0.1"])
+    seen = {}
+    while sumo.simulation.getMinExpectedNumber():
+        sumo.simulationStep()
+        for one in sumo.vehicle.getIDList():
+            fastest = seen.get(one, ["", 0])[1]
+            speed = sumo.vehicle.getSpeed(one)
+            seen[one] = [sumo.vehicle.getTypeID(one), max(speed, fastest)]
+    sumo.close()
+    answers.append(seen)
+print(json.dumps(answers))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(SHIPPED)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=100,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Warning" not in done.stderr, done.stderr
+    for seen in json.loads(done.stdout):
+        assert {name for name, (kind, _) in seen.items() if name == kind} == {
+            "conservative_0",
+            "normal_0",
+            "normal_1",
+            "aggressive_0",
+        }
+        assert seen["any"][0] in {"normal_0", "normal_1"}
+        assert all(fastest > 5 for _, fastest in seen.values())
+
+
+def test_what_cannot_be_exported_is_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(
+        ConfigError,
+        match="SUMO has no car-following model that drives as model=w74; export jobs with model=",
+    ):
+        export(job(tmp_path / "w74", {"name": "w74"}))
+    with pytest.raises(ConfigError, match="variant=sumo only"):
+        export(job(tmp_path / "vissim", {"name": "w99", "variant": "vissim"}))
+    assert main(["export", str(tmp_path), "--to", "sumo"]) == 2
+    assert "holds no finished job" in capsys.readouterr().err
+    folder = job(tmp_path / "job", {"name": "w99"})
+    with pytest.raises(OutputError, match="name another --output"):
+        export(folder, folder / "config.yaml" / "x.add.xml")
+    table = pd.read_csv(folder / "pairs.csv")
+    table[table["method"] == "policy"].to_csv(folder / "pairs.csv", index=False)
+    with pytest.raises(DataError, match="no driver-specific parameters"):
+        export(folder)
+    table.drop(columns="parameter_cc3").to_csv(folder / "pairs.csv", index=False)
+    with pytest.raises(DataError, match="no column parameter_cc3"):
+        export(folder)
+    assert not list(tmp_path.rglob("*.add.xml"))
+
+
+def test_the_command_says_how_to_use_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = job(tmp_path / "job", {"name": "w99"})
+    assert (
+        main(["export", str(folder), "--to", "sumo", "--output", str(tmp_path / "x.add.xml")]) == 0
+    )
+    assert (
+        f"sumo --additional-files {tmp_path / 'x.add.xml'}; then in a flow or vehicle:"
+        ' type="drivers", or type="conservative"' in capsys.readouterr().out
+    )
