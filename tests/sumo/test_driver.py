@@ -32,9 +32,8 @@ from cfx.policies.heads.offset import shrunk
 from cfx.policies.scaler import Scaler
 from cfx.policies.valid_range import ValidRange
 from cfx.simulation.rollout import MemoryStepper
-from cfx_sumo.demo.demo import simulate_in_sumo
 from cfx_sumo.demo.motorway import read_motorway
-from cfx_sumo.demo.request import PolicyKnowledge
+from cfx_sumo.demo.simulated import FinishedJob, PolicyKnowledge, simulate_in_sumo
 from cfx_sumo.live.driver import Driver, needed_deceleration
 from cfx_sumo.live.fleet import Fleet
 from cfx_sumo.live.surroundings import Seen
@@ -602,15 +601,8 @@ def test_in_sumo_a_policy_drives_as_in_memory(
     }
     evaluation = evaluate(pairs, batch, first, loops, model.space, style_of(pairs), seed=0)
     knowledge = PolicyKnowledge("fixed", history)
-    shown = simulate_in_sumo(
-        tmp_path / "policy",
-        pairs,
-        policy,
-        evaluation,
-        read_motorway(None, tmp_path),
-        4,
-        knowledge=knowledge,
-    )
+    job = FinishedJob(pairs, policy, evaluation, tmp_path / "policy", knowledge)
+    shown = simulate_in_sumo(job, read_motorway(None, tmp_path), 4)
     assert {one.pair.pair_id: one.first for one in shown} == {
         f"p{i}": int(first[i]) for i in range(4)
     }

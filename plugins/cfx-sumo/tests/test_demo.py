@@ -13,11 +13,10 @@ from cfx.contracts import DemoContract
 from cfx.core.errors import ConfigError, DataError, SumoError
 from cfx.policies.checkpoint import save
 from cfx_sumo.demo import motorway
-from cfx_sumo.demo.channel import Message
 from cfx_sumo.demo.demo import SumoDemo
 from cfx_sumo.demo.motorway import SHIPPED, find_netconvert, read_motorway
-from cfx_sumo.demo.replay import FOLLOWERS
-from cfx_sumo.demo.request import ask
+from cfx_sumo.demo.replay import FOLLOWERS, ReplayRequest
+from cfx_sumo.demo.simulated import ask
 from tests.agents import adaptive
 from tests.browser import Browser
 from tests.drives import straight_pairs
@@ -236,7 +235,7 @@ def test_what_sumo_refuses_is_one_sentence() -> None:
             match=r"^SUMO lost a vehicle or refuses one \(The edge 'nowhere' within the route 'from0'",
         ) as error:
             ask(
-                Message(
+                ReplayRequest(
                     header | {"policy": folder},
                     {"0/leader": np.add(signals, [[30], [0], [0]]), "0/follower": signals},
                 )

@@ -18,7 +18,7 @@ from cfx.report.scripts import embedded_json, inline_scripts, security_policy
 from cfx.results.look import COLOURS
 from cfx_sumo.demo.motorway import Motorway
 from cfx_sumo.demo.replay import CAR_LENGTH, FOLLOWERS
-from cfx_sumo.demo.shown import Array, Shown
+from cfx_sumo.demo.simulated import Array, SimulatedPair
 
 _ASSETS = resources.files("cfx_sumo") / "assets"
 
@@ -26,7 +26,7 @@ _ASSETS = resources.files("cfx_sumo") / "assets"
 def write_page(
     path: Path,
     road: Motorway,
-    shown: Sequence[Shown],
+    simulated: Sequence[SimulatedPair],
     evaluation: Evaluation,
     policy: Agent,
     source: str,
@@ -36,7 +36,7 @@ def write_page(
     Args:
         path: the file; what was there is replaced once the new page is complete.
         road: where the pairs were.
-        shown: the pairs.
+        simulated: the pairs.
         evaluation: of these pairs, as they were simulated in SUMO.
         policy: what chose the parameters.
         source: where the recordings come from.
@@ -44,7 +44,7 @@ def write_page(
     Raises:
         OSError: the page cannot be written.
     """
-    page = render(road, shown, evaluation, policy, source)
+    page = render(road, simulated, evaluation, policy, source)
     with atomic_write(path) as partial:
         partial.write_text(page, encoding="utf-8")
     return path
@@ -52,7 +52,7 @@ def write_page(
 
 def render(
     road: Motorway,
-    shown: Sequence[Shown],
+    simulated: Sequence[SimulatedPair],
     evaluation: Evaluation,
     policy: Agent,
     source: str,
@@ -65,7 +65,7 @@ def render(
     )
     scripts = inline_scripts([_asset("demo.js")])
     rows: list[Any] = []
-    for one in shown:
+    for one in simulated:
         rows += one.table.to_dict("records")
     plots = _plots(evaluation)
     vehicles = ("leader", *FOLLOWERS)
@@ -75,8 +75,8 @@ def render(
         style=_asset("demo.css"),
         colours={kind: COLOURS[kind] for kind in vehicles},
         labels={kind: LABELS[kind] for kind in vehicles},
-        content=embedded_json(_content(road, shown, plots)),
-        shown=shown,
+        content=embedded_json(_content(road, simulated, plots)),
+        simulated=simulated,
         plots=plots,
         rows=rows,
         model=policy.model_node["name"],
@@ -84,7 +84,7 @@ def render(
         windows=policy.windows,
         dt=policy.dt,
         source=Path(source).name,
-        count=len(shown),
+        count=len(simulated),
     )
 
 
@@ -92,14 +92,16 @@ def _asset(name: str) -> str:
     return (_ASSETS / name).read_text(encoding="utf-8")
 
 
-def _content(road: Motorway, shown: Sequence[Shown], plots: Sequence[_Plot]) -> dict[str, Any]:
+def _content(
+    road: Motorway, simulated: Sequence[SimulatedPair], plots: Sequence[_Plot]
+) -> dict[str, Any]:
     """Returns what the script draws.
 
     Positions are centimetres from a corner of the road, so that they are short integers.
     """
     corner = np.concatenate([lane.shape for lane in road.lanes]).min(axis=0)
     pairs = []
-    for one, plot in zip(shown, plots, strict=True):
+    for one, plot in zip(simulated, plots, strict=True):
         pairs.append(_pair(one, corner) | {"axes": plot.axes})
     lanes = []
     for lane in road.lanes:
@@ -115,7 +117,7 @@ def _content(road: Motorway, shown: Sequence[Shown], plots: Sequence[_Plot]) -> 
     }
 
 
-def _pair(one: Shown, corner: Array) -> dict[str, Any]:
+def _pair(one: SimulatedPair, corner: Array) -> dict[str, Any]:
     speed, gap, place = {}, {}, {}
     for kind in FOLLOWERS:
         speed[kind] = _rounded(100 * one.speed[kind])

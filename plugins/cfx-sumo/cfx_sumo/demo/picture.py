@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Patch
 from matplotlib.transforms import Affine2D
-from numpy.typing import NDArray
 
 from cfx.evaluation.result import Evaluation
 from cfx.report.figures.canvas import canvas, styled
@@ -21,9 +20,7 @@ from cfx.report.figures.write import write_figure
 from cfx.results.look import COLOURS, INK
 from cfx_sumo.demo.motorway import Motorway
 from cfx_sumo.demo.replay import CAR_LENGTH, FOLLOWERS
-from cfx_sumo.demo.shown import Shown
-
-Array = NDArray[np.float64]
+from cfx_sumo.demo.simulated import Array, SimulatedPair
 
 _ASPHALT, _PAINT, _GRASS = "#6b7178", "#f4f4f4", "#e9eee4"
 _CAR_WIDTH = 1.9  # m
@@ -31,29 +28,29 @@ _MOMENTS = 3
 
 
 def write_pictures(
-    folder: Path, road: Motorway, shown: Sequence[Shown], evaluation: Evaluation
+    folder: Path, road: Motorway, simulated: Sequence[SimulatedPair], evaluation: Evaluation
 ) -> list[Path]:
     """Writes `demo.png` and `demo_drives.png`.
 
     Args:
         folder: where to.
         road: where the pairs were.
-        shown: the pairs, from the best to the worst improvement; the one in the middle is the
+        simulated: the pairs, from the best to the worst improvement; the one in the middle is the
             picture's.
         evaluation: of these pairs, as they were simulated in SUMO.
 
     Raises:
         OutputError: a file cannot be written.
     """
-    middle = shown[len(shown) // 2]
-    together = [one for one in shown if one.scene == middle.scene]
+    middle = simulated[len(simulated) // 2]
+    together = [one for one in simulated if one.scene == middle.scene]
     picture = write_figure(snapshots(road, middle, together), folder / "demo.png")
-    trajectories = drives(Results.of(evaluation), [one.pair.pair_id for one in shown])
+    trajectories = drives(Results.of(evaluation), [one.pair.pair_id for one in simulated])
     return [picture, write_figure(trajectories, folder / "demo_drives.png")]
 
 
 @styled
-def snapshots(road: Motorway, main: Shown, together: Sequence[Shown]) -> Figure:
+def snapshots(road: Motorway, main: SimulatedPair, together: Sequence[SimulatedPair]) -> Figure:
     """The road from above, driving upwards, at three moments.
 
     Each follower has a lane, behind its own copy of the leader.
@@ -95,7 +92,7 @@ def snapshots(road: Motorway, main: Shown, together: Sequence[Shown]) -> Figure:
     return figure
 
 
-def _reach(one: Shown, frame: int) -> float:
+def _reach(one: SimulatedPair, frame: int) -> float:
     """Returns how far the last follower is behind the leader, m, front to front."""
     return max(float(one.gap[kind][frame]) for kind in FOLLOWERS) + one.pair.leader_length
 
@@ -112,7 +109,9 @@ class _View:
         self.heading = heading
 
     @classmethod
-    def of(cls, one: Shown, together: Sequence[Shown], frame: int, width: float) -> _View:
+    def of(
+        cls, one: SimulatedPair, together: Sequence[SimulatedPair], frame: int, width: float
+    ) -> _View:
         """Looks at all lanes that are used, and along them at one pair."""
         vehicles = np.stack([one.place[kind][frame] for kind in FOLLOWERS])
         leader = vehicles[:, 0].mean(axis=0)
@@ -154,7 +153,7 @@ def _aside(line: Array, distance: float) -> Array:
     return np.asarray(line + distance * left / length)
 
 
-def _draw_pair(axes: Axes, one: Shown, frame: int, view: _View, *, named: bool) -> None:
+def _draw_pair(axes: Axes, one: SimulatedPair, frame: int, view: _View, *, named: bool) -> None:
     if frame >= len(one.pair):
         return
     for kind in FOLLOWERS:

@@ -1,21 +1,7 @@
 """Recorded leaders in SUMO with a real follower and live drivers behind each.
 
-`python -m cfx_sumo.demo.replay` runs it. It is a process of its own, because libsumo does not get
-on with pyarrow, which jobs load. It answers one request from standard input and ends.
-`cfx_sumo.demo.request` asks.
-
-Request: header `dt`, `net`, `edges`, `tracks` (as in `Motorway`), `policy` (a folder), and `pairs`,
-each with its `scene`, `length` (of the leader, m), `first` (frame at which the drivers take over),
-`network`, `base` (parameters that offsets start from, or null), `driver_features` (of the driver,
-or null), `renew` (frame at which the policy's memory begins), and for each of `FOLLOWERS` its
-`track` and `places` (edge and position on it of leader and follower at frame 0); arrays `I/leader`
-and `I/follower` `(3, T)` of pair I: position, speed, acceleration. Pairs of one scene are on the
-road together.
-
-Answer: for pair I and each F of `FOLLOWERS` the arrays `I/F/motion` `(T, 2)` (speed, gap to the
-leader ahead) and `I/F/place` `(T, 2, 3)` (x, y and heading in degrees of leader and follower);
-`I/parameters` `(T, n)` of the policy, NaN where it does not drive; or a header with `error`. SI
-units.
+`cfx_sumo.demo.simulated` has a SUMO process call `replay`: a process of its own, because libsumo
+does not get on with pyarrow, which jobs load. This module imports neither torch nor SUMO.
 """
 
 from __future__ import annotations
@@ -25,12 +11,12 @@ import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from cfx.core.errors import CfxError
-from cfx_sumo.demo.channel import Array, Message, receive, send
+from cfx.core.errors import SumoError
+from cfx_sumo.simulation.worker import Array, printed_errors, printed_here
 
 FOLLOWERS = ("real", "policy", "default")
 """What drives behind a copy of the same leader: the recording, the job's policy, the model's
@@ -49,6 +35,23 @@ _OPTIONS = (
     *("--duration-log.disable", "true"),
     *("--no-warnings", "true"),
 )
+
+
+class ReplayRequest(NamedTuple):
+    """What is simulated; SI units. Pairs of one scene are on the road together.
+
+    Attributes:
+        header: `dt`, `net`, `edges`, `tracks` (as in `Motorway`), `policy` (a folder), and `pairs`,
+            each with its `scene`, `length` (of the leader, m), `first` (frame at which the drivers
+            take over), `network`, `base` (parameters that offsets start from, or None),
+            `driver_features` (of the driver, or None), `renew` (frame at which the policy's memory
+            begins), and for each of `FOLLOWERS` its `track` and `places` (edge and position on it
+            of leader and follower at frame 0).
+        arrays: `I/leader` and `I/follower` `(3, T)` of pair I: position, speed, acceleration.
+    """
+
+    header: dict[str, Any]
+    arrays: dict[str, Array]
 
 
 class Recorded:
@@ -122,12 +125,31 @@ class Road:
             self.follower.aim(sumo, frame)
 
 
-def replay(request: Message) -> dict[str, Array]:
-    """Simulates all scenes, one after another, and returns the answer's arrays.
+def replay(request: ReplayRequest) -> dict[str, Array]:
+    """Simulates all scenes, one after another, in a process that is SUMO's.
+
+    Returns:
+        For pair I and each F of `FOLLOWERS` the arrays `I/F/motion` `(T, 2)` (speed, gap to the
+        leader ahead) and `I/F/place` `(T, 2, 3)` (x, y and heading in degrees of leader and
+        follower); `I/parameters` `(T, n)` of the policy, NaN where it does not drive.
 
     Raises:
         CfxError: the policy cannot drive, or SUMO lost a vehicle.
     """
+    # pandas loads pyarrow where it finds it; None is Python's own way to say that it is not there.
+    sys.modules["pyarrow"] = None  # type: ignore[assignment]
+    os.environ["LIBSUMO_AS_TRACI"] = "quiet"
+    try:
+        return _replay(request)
+    except Exception as error:  # libsumo's errors have no common base
+        if not type(error).__module__.startswith("libsumo"):
+            raise
+        lost = f"SUMO lost a vehicle or refuses one ({error})"
+        said = ": ".join([lost, *printed_errors(printed_here())])
+        raise SumoError(" ".join(said.split())) from None
+
+
+def _replay(request: ReplayRequest) -> dict[str, Array]:
     import libsumo
 
     header, arrays = request
@@ -264,33 +286,3 @@ def _routes(header: Mapping[str, Any], roads: Sequence[Road]) -> str:
             )
     lines.append("</routes>")
     return "\n".join(lines)
-
-
-def _failure(error: Exception) -> dict[str, str]:
-    """Returns the header of an answer that says what failed; `bug` names an unexpected error."""
-    if type(error).__module__.partition(".")[0] in {"libsumo", "traci"}:
-        return {"error": f"SUMO lost a vehicle or refuses one ({error})", "bug": ""}
-    if isinstance(error, CfxError):
-        return {"error": str(error), "bug": ""}
-    return {"error": str(error), "bug": type(error).__name__}
-
-
-def main() -> None:
-    """Answers one request."""
-    answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # SUMO prints; the answer must stay clean
-    request = receive(sys.stdin.buffer)
-    if request is None:
-        return
-    try:
-        found = replay(request)
-    except Exception as error:  # whatever it is, the job reports it
-        send(answers, _failure(error))
-    else:
-        send(answers, {}, found)
-
-
-if __name__ == "__main__":
-    # pandas loads pyarrow where it finds it; None is Python's own way to say that it is not there.
-    sys.modules["pyarrow"] = None  # type: ignore[assignment]
-    main()

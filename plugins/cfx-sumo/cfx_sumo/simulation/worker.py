@@ -239,9 +239,18 @@ def _in_words(error: str, log: str) -> str:
             f"SUMO lost a vehicle ({first}): it left the {ROAD / 1000:.0f} km of its road; look for"
             " positions far out in the data, and for bounds of parameters that mean nothing"
         )
-    said = [first]
+    return f"SUMO refuses the vehicles: {': '.join([first, *printed_errors(log)])}"
+
+
+def printed_errors(log: str) -> list[str]:
+    """Returns the errors among the lines that SUMO has printed, each once."""
+    found: dict[str, None] = {}
     for line in log.splitlines():
-        text = line.removeprefix("Error:").strip().rstrip(".")
-        if line.startswith("Error:") and text not in said[1:]:
-            said.append(text)
-    return f"SUMO refuses the vehicles: {': '.join(said)}"
+        if line.startswith("Error:"):
+            found[line.removeprefix("Error:").strip().rstrip(".")] = None
+    return list(found)
+
+
+def printed_here() -> str:
+    """Returns what SUMO has printed in this process since its last request came."""
+    return _ROADS[0].printed()
