@@ -180,12 +180,13 @@ def ask(request: ReplayRequest) -> dict[str, Array]:
         folder = Path(name)
         pool = worker_pool(1, begin, folder, folder=folder)
         try:
-            return pool.submit(replay, request).result()
+            answer: dict[str, Array] = pool.submit(replay, request).result()
         except BrokenProcessPool as error:
             reason = str(error).partition("\n")[0]
             raise SumoError(f"the SUMO process ended by itself ({reason})") from error
         finally:
             pool.shutdown(wait=True, kill_workers=True)
+    return answer
 
 
 def _request(
