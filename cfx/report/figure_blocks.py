@@ -16,7 +16,7 @@ def figure_of(name: str, job: Job) -> Figure | None:
     """Returns the figure of that name as the job has written it; None if the job lacks its data."""
     found = JobFigure.named(name)
     drawing = draw(found, job.results)
-    return None if drawing is None else shown(drawing, found.part.title)
+    return None if drawing is None else single_view(drawing, found.part.title)
 
 
 def figure_folds(name: str, runs: Runs) -> list[Block]:
@@ -29,7 +29,7 @@ def caption(name: str) -> str:
     return JobFigure.named(name).part.caption
 
 
-def shown(drawing: Drawing, label: str) -> Figure:
+def single_view(drawing: Drawing, label: str) -> Figure:
     """Returns a drawing as a figure of the page with one view."""
     return Figure({"": view(drawing)}, label)
 

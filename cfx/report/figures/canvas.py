@@ -109,7 +109,7 @@ class Line:
 
 
 @contextmanager
-def look() -> Iterator[None]:
+def figure_style() -> Iterator[None]:
     """Draws in this look, without warnings of names and values; the reader's settings come back."""
     with (
         mpl.rc_context(_STYLE),  # type: ignore[arg-type]  # the stubs want literal keys
@@ -137,7 +137,7 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
 
     @functools.wraps(draw)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> Figure:
-        with look():
+        with figure_style():
             return draw(*args, **kwargs)
 
     return wrapped

@@ -44,10 +44,10 @@ class JobFigure(Part):
 
 def draw(one: Installed[JobFigure], results: Results) -> Figure | None:
     """Return a figure in the common look; None where there is nothing to show, or it fails."""
-    from cfx.report.figures.canvas import look
+    from cfx.report.figures.canvas import figure_style
 
     def attempt(figure: JobFigure) -> Figure | None:
-        with look():
+        with figure_style():
             return figure.draw(results)
 
     return one.attempt(attempt)

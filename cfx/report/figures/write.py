@@ -18,7 +18,7 @@ from matplotlib.lines import Line2D
 
 from cfx.core.errors import OutputError
 from cfx.core.files import atomic_write
-from cfx.report.figures.canvas import DPI, WIDTH, hover_text, look
+from cfx.report.figures.canvas import DPI, WIDTH, figure_style, hover_text
 from cfx.report.figures.figure import JobFigure, draw
 from cfx.report.figures.results import Results
 
@@ -75,7 +75,7 @@ def write_figure(figure: Figure, path: Path) -> Path:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_write(path) as unfinished, look():
+        with atomic_write(path) as unfinished, figure_style():
             form = path.suffix.removeprefix(".")
             figure.savefig(unfinished, format=form, dpi=DPI, metadata=_METADATA[form])
     except OSError as error:
@@ -95,7 +95,7 @@ def inline_svg(figure: Figure) -> str:
     """
     hovers = _prepare(figure)
     stream = io.StringIO()
-    with look(), mpl.rc_context({"svg.fonttype": "none", "path.simplify_threshold": 0.3}):
+    with figure_style(), mpl.rc_context({"svg.fonttype": "none", "path.simplify_threshold": 0.3}):
         # `savefig` would draw twice, once for the layout alone.
         paper = FigureCanvasSVG(figure)
         paper.print_svg(stream, metadata=_METADATA["svg"])  # type: ignore[no-untyped-call]

@@ -37,11 +37,10 @@ class CalibrationSection(Section):
         found: list[Block] = []
         for k, jobs in enumerate(together.values()):
             spreads = spreads_of(jobs[0])
-            figure = figure_of("calibration", jobs[0])
-            parts: list[Block] = [] if figure is None else [figure]
-            panels = slices_of(jobs[0])
-            parts += [Table(sheet(spreads, panels), explain=k == 0), *_beyond(jobs)]
-            found.append(job_fold(job_names(jobs), parts, first=k == 0))
+            table = Table(sheet(spreads, slices_of(jobs[0])), explain=k == 0)
+            parts = [figure_of("calibration", jobs[0]), table, *_beyond(jobs)]
+            shown = [part for part in parts if part is not None]
+            found.append(job_fold(job_names(jobs), shown, first=k == 0))
         return [Text(caption("calibration")), *found] if found else []
 
 
@@ -52,17 +51,15 @@ def _beyond(jobs: Sequence[Job]) -> list[Block]:
         figure = figure_of(name, jobs[0])
         if figure is not None:
             found += [Text(caption(name)), figure]
-    for job in jobs:
-        results, labels = job.results, job.tables.get("labels")
-        if labels is not None:
-            drivers = labels_of(labels, results.pairs, results.parameters)
-            if drivers:
-                views = {}
-                for driver in drivers:
-                    views[short(driver.pair_id)] = view(draw_labels(driver, results.parameters))
-                title = "Per-window calibrated parameters over time, and how much they mattered"
-                found += [Text(caption("labels_over_time")), Figure(views, title, "Pair")]
-                break
+    kept = [job for job in jobs if "labels" in job.tables]
+    for job in kept:
+        results = job.results
+        views = {}
+        for driver in labels_of(job.tables["labels"], results.pairs, results.parameters):
+            views[short(driver.pair_id)] = view(draw_labels(driver, results.parameters))
+        if views:
+            title = "Per-window calibrated parameters over time, and how much they mattered"
+            return [*found, Text(caption("labels_over_time")), Figure(views, title, "Pair")]
     return found
 
 

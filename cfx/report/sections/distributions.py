@@ -12,14 +12,13 @@ from cfx.evaluation.distributions import (
     sampled_methods,
     summarize_distributions,
 )
-from cfx.report.blocks import Block, Table, Text, job_fold
+from cfx.report.blocks import Block, Table, Text, job_folds
 from cfx.report.figure_blocks import caption, figure_of
 from cfx.report.figures.forecasts import sampled_name
 from cfx.report.job import Job, Runs
 from cfx.report.section import Section
 from cfx.report.tables import Cell, Column, Sheet, formatted, method_cell, methods_explained, number
 
-_NAME = "distributions"
 _INTRODUCTION = (
     "From every moment of the test trajectories several paths were sampled. The CRPS of a single"
     " path is its absolute error, so the policy's centre, where nothing is drawn, can stand beside"
@@ -36,27 +35,24 @@ class DistributionsSection(Section):
 
     def blocks(self, runs: Runs) -> list[Block]:
         """Return plots and a table for each job with sampled forecasts."""
-        found: list[Block] = []
-        methods: dict[str, None] = {}
+        methods: list[str] = []
         for job in runs.jobs:
-            table = job.tables.get("distributions")
-            if table is not None and "forecasts" in job.tables:
-                shown = _job_blocks(job, table, job.tables["forecasts"])
-                found.append(job_fold(job.name, shown, first=not found))
-                methods |= dict.fromkeys(_shown(table))
-        if not found:
+            if {"distributions", "forecasts"} <= set(job.tables):
+                methods += _names(job.tables["distributions"])
+        if not methods:
             return []
         return [
-            Text(_INTRODUCTION + caption(_NAME)),
+            Text(_INTRODUCTION + caption("distributions")),
             Text(f"Methods: {methods_explained(methods)}"),
-            *found,
+            *job_folds(runs, _parts),
         ]
 
 
-def _job_blocks(job: Job, table: pd.DataFrame, forecasts: pd.DataFrame) -> list[Block]:
-    figure = figure_of(_NAME, job)
-    parts: list[Block] = [] if figure is None else [figure]
-    return [*parts, Table(crps_sheet(table, forecasts))]
+def _parts(job: Job) -> list[Block | None]:
+    if not {"distributions", "forecasts"} <= set(job.tables):
+        return []
+    sheet = crps_sheet(job.tables["distributions"], job.tables["forecasts"])
+    return [figure_of("distributions", job), Table(sheet)]
 
 
 def crps_sheet(table: pd.DataFrame, forecasts: pd.DataFrame) -> Sheet:
@@ -73,7 +69,7 @@ def crps_sheet(table: pd.DataFrame, forecasts: pd.DataFrame) -> Sheet:
         meaning = f"CRPS of speed {horizon:g} s after the origin, m/s; below it the coverage."
         columns.append(Column(f"CRPS, {horizon:g} s (m/s)", meaning))
     rows: list[tuple[Cell, ...]] = []
-    for method, name in zip(sampled_methods(table), _shown(table), strict=False):
+    for method, name in zip(sampled_methods(table), _names(table), strict=False):
         cells = [method_cell(name)]
         for horizon in horizons:
             crps = summary["crps_speed"].get((method, horizon), math.nan)
@@ -88,7 +84,7 @@ def crps_sheet(table: pd.DataFrame, forecasts: pd.DataFrame) -> Sheet:
     return Sheet(tuple(columns), tuple(rows))
 
 
-def _shown(table: pd.DataFrame) -> tuple[str, ...]:
+def _names(table: pd.DataFrame) -> tuple[str, ...]:
     """Returns what the methods are called beside the policy's centre, which stands last."""
     names = []
     for method in sampled_methods(table):

@@ -11,8 +11,6 @@ from cfx.report.job import Job, Runs
 from cfx.report.section import Section
 from cfx.report.tables import Cell, Column, Sheet, interval, number, share, text
 
-_NAME = "history"
-
 
 class HistorySection(Section):
     """How much burn-in the policy needs."""
@@ -28,10 +26,10 @@ class HistorySection(Section):
             return []
         groups = []
         for job in jobs:
-            figure = figure_of(_NAME, job)
+            figure = figure_of("history", job)
             if figure is not None:
                 groups.append(Group((Heading(job.name), figure), "card"))
-        return [Text(caption(_NAME)), *cards(groups), Table(histories(jobs))]
+        return [Text(caption("history")), *cards(groups), Table(histories(jobs))]
 
 
 def histories(jobs: Sequence[Job]) -> Sheet:
@@ -57,18 +55,10 @@ def histories(jobs: Sequence[Job]) -> Sheet:
     )
     rows: list[tuple[Cell, ...]] = []
     for job in jobs:
-        if "history" not in job.tables:
-            continue
         for curve in history_curves(job.tables["history"]):
+            named = (text(job.name), text(curve.label))
             for k, amount in enumerate(curve.amounts):
-                rows.append(
-                    (
-                        text(job.name),
-                        text(curve.label),
-                        text(amount),
-                        share(float(curve.mean[k])),
-                        interval(float(curve.low[k]), float(curve.high[k])),
-                        number(curve.pairs[k], str(curve.pairs[k])),
-                    )
-                )
+                mean, low, high = (float(one[k]) for one in (curve.mean, curve.low, curve.high))
+                pairs = number(curve.pairs[k], str(curve.pairs[k]))
+                rows.append((*named, text(amount), share(mean), interval(low, high), pairs))
     return Sheet(columns, tuple(rows))

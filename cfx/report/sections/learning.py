@@ -42,8 +42,7 @@ class LearningSection(Section):
             if figure is not None:
                 groups.append(Group((heading, figure), "card"))
         found: list[Block] = [Text(caption(_NAME)), *cards(groups)]
-        if len(without) > MOST:
-            found.append(Text(f"Nothing was learned in {len(without)} jobs.", "fine"))
-        elif without:
-            found.append(Text(f"Nothing was learned in {', '.join(without)}.", "fine"))
+        if without:
+            named = ", ".join(without) if len(without) <= MOST else f"{len(without)} jobs"
+            found.append(Text(f"Nothing was learned in {named}.", "fine"))
         return [*found, *missing_file(runs, "curves.parquet", "the learning curves")]

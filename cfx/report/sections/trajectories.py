@@ -10,10 +10,10 @@ from cfx.report.blocks import (
     Group,
     Heading,
     Text,
-    job_fold,
+    job_folds,
     missing_file,
 )
-from cfx.report.figure_blocks import shown
+from cfx.report.figure_blocks import single_view
 from cfx.report.figures.pairs import RankedPair, rank_pairs
 from cfx.report.figures.trajectories import draw_pair
 from cfx.report.figures.words import percent_or_undefined, short_label
@@ -44,16 +44,19 @@ class TrajectoriesSection(Section):
             chosen.insert(0, _CONSTANT)
         if len(constant) < len(jobs):
             chosen.insert(0, _ADAPTING)
-        found: list[Block] = [Text(" ".join(chosen))]
-        for k, job in enumerate(jobs):
-            groups = []
-            for pair in chosen_pairs(job):
-                heading = Heading(_title(job, pair), _errors(job, pair))
-                parts = (heading, pair_of(job, pair.pair_id))
-                groups.append(Group(parts))
-            found.append(job_fold(job.name, groups, first=k == 0))
         what = "speed, gap and parameters over time"
-        return [*found, *missing_file(runs, "trajectories.parquet", what)]
+        lacking = missing_file(runs, "trajectories.parquet", what)
+        return [Text(" ".join(chosen)), *job_folds(runs, _pairs), *lacking]
+
+
+def _pairs(job: Job) -> list[Block]:
+    if "trajectories" not in job.tables:
+        return []
+    groups: list[Block] = []
+    for pair in chosen_pairs(job):
+        heading = Heading(_title(job, pair), _errors(job, pair))
+        groups.append(Group((heading, pair_of(job, pair.pair_id))))
+    return groups
 
 
 def chosen_pairs(job: Job) -> tuple[RankedPair, ...]:
@@ -70,7 +73,7 @@ def chosen_pairs(job: Job) -> tuple[RankedPair, ...]:
 def pair_of(job: Job, pair_id: str) -> Figure:
     """Speed, gap and each tuned parameter of one pair of a job."""
     title = f"Speed, gap and parameters of pair {pair_id}"
-    return shown(draw_pair(job.results, pair_id), title)
+    return single_view(draw_pair(job.results, pair_id), title)
 
 
 def _title(job: Job, pair: RankedPair) -> str:
