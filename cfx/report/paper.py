@@ -14,8 +14,8 @@ from cfx.calibration.flatness import NEAR
 from cfx.core.files import write_output
 from cfx.report.figures.words import short_label
 from cfx.report.files import without_folders
-from cfx.report.grouped import Row, any_adapts, baselines_of, methods_of, rows_of
 from cfx.report.job import Job, Runs
+from cfx.report.names import Row, any_adapts, baselines_of, methods_of, rows_of
 from cfx.report.sections.calibration import sheet, slices_of, spreads_of
 
 FORMS = {"latex": ".tex", "csv": ".csv"}

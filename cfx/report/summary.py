@@ -9,8 +9,8 @@ import numpy as np
 
 from cfx.evaluation.headline import Comparison, contradiction
 from cfx.report.figures.words import TEST, explained, few_drivers, percent, plural, short_label
-from cfx.report.grouped import Row, rows_over_seeds
 from cfx.report.job import Job, calibrations, with_baseline, without_baseline
+from cfx.report.names import Row, rows_over_seeds
 
 _MOST = 3
 """Up to so many jobs have a sentence each."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cfx.report.grouped import rows_over_seeds
 from cfx.report.job import Runs
+from cfx.report.names import rows_over_seeds
 from cfx.report.runs import read_runs
 from cfx.report.sections.seeds import SeedsSection, over_seeds
 from cfx.report.summary import summary

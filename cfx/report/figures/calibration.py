@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -11,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from cfx.report.figures.canvas import canvas, styled
+from cfx.report.figures.canvas import canvas, draw_points, styled
 from cfx.report.figures.figure import JobFigure
 from cfx.report.figures.results import ParameterAxis, Results
 from cfx.report.figures.values import Array
@@ -132,36 +133,16 @@ def _values(axes: Axes, spreads: Sequence[ParameterSpread]) -> None:
         axes.vlines((0, 1), row - 0.42, row + 0.42, color=EDGE, linewidth=1)
         places = spread.places(spread.values)
         named = {method: label(method) if row == 0 else "" for method in ("fixed", "default")}
-        axes.plot(
-            places,
-            row + _WIDTH * spread_offsets(len(places)),
-            linestyle="none",
-            marker="o",
-            markersize=3.2,
-            alpha=0.55,
-            color=colour_of("fixed"),
-            markeredgewidth=0,
-            label=named["fixed"],
-        )
+        aside = row + _WIDTH * spread_offsets(len(places))
+        dots: dict[str, Any] = {"alpha": 0.55, "markeredgewidth": 0, "label": named["fixed"]}
+        draw_points(axes, places, aside, "o", colour_of("fixed"), 3.2, **dots)
         pooled = spread.places(spread.pooled)
-        axes.plot(
-            pooled,
-            np.full(len(pooled), row),
-            linestyle="none",
-            marker="D",
-            markersize=6,
-            color=colour_of("population"),
-            label=label("population") if row == 0 and len(pooled) else "",
-        )
-        axes.plot(
-            spread.places(np.array([spread.default])),
-            [row],
-            linestyle="none",
-            marker="|",
-            markersize=17,
-            markeredgewidth=2.2,
-            color=colour_of("default"),
-            label=named["default"],
+        said = label("population") if row == 0 and len(pooled) else ""
+        rows_of_it = np.full(len(pooled), row)
+        draw_points(axes, pooled, rows_of_it, "D", colour_of("population"), 6, label=said)
+        default, bar = spread.places(np.array([spread.default])), {"markeredgewidth": 2.2}
+        draw_points(
+            axes, default, [row], "|", colour_of("default"), 17, label=named["default"], **bar
         )
         _ends(axes, spread, row)
     names = [unit_label(spread.axis.name, spread.axis.unit) for spread in spreads]

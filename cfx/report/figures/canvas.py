@@ -16,6 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from numpy.typing import ArrayLike
 
 from cfx.report.figures.values import Array
 from cfx.report.figures.words import label, percent
@@ -166,6 +167,15 @@ def draw_lines(axes: Axes, lines: Sequence[Line]) -> None:
         )
         hover(drawn, label(method))
     axes.margins(x=0.01)
+
+
+def draw_points(
+    axes: Axes, x: ArrayLike, y: ArrayLike, marker: str, colour: str, size: float, **more: Any
+) -> Line2D:
+    """Draw points without a line between them; `more` as of `Line2D`."""
+    style = {"marker": marker, "color": colour, "markersize": size, "linestyle": "none", **more}
+    (drawn,) = axes.plot(x, y, **style)
+    return drawn
 
 
 def mark_points(axes: Axes) -> None:

@@ -10,7 +10,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from cfx.calibration.flatness import NEAR, flat_shares
-from cfx.report.figures.canvas import canvas, styled
+from cfx.report.figures.canvas import canvas, draw_points, styled
 from cfx.report.figures.figure import JobFigure
 from cfx.report.figures.results import ParameterAxis, Results
 from cfx.report.figures.trajectories import TIME_TITLE
@@ -220,18 +220,9 @@ def draw_fits(fits: Mapping[str, pd.DataFrame]) -> Figure:
         own, colour = method == "fixed", colour_of(method)
         highest = max(highest, float(np.quantile(np.concatenate([train, test]), 0.98)))
         medians = f"median {np.median(train):.2f} and {np.median(test):.2f} m/s"
-        axes.plot(
-            train,
-            test,
-            linestyle="none",
-            marker=_MARKERS[method],
-            markersize=4.5 if own else 5.5,
-            alpha=0.65,
-            color=colour,
-            markerfacecolor=colour if own else "none",
-            label=f"{label(method)}: {medians}",
-            zorder=3 if own else 2,
-        )
+        size, above, filled = (4.5, 3, colour) if own else (5.5, 2, "none")
+        drawn = draw_points(axes, train, test, _MARKERS[method], colour, size, alpha=0.65)
+        drawn.set(label=f"{label(method)}: {medians}", zorder=above, markerfacecolor=filled)
     end = 1.15 * highest
     axes.plot([0, end], [0, end], color=EDGE, linewidth=1, zorder=1)
     axes.set_xlim(0, end)

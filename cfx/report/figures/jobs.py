@@ -14,7 +14,7 @@ from matplotlib.ticker import FuncFormatter
 
 from cfx.data.style.result import CLUSTERS
 from cfx.report.figures.calibration import spread_offsets
-from cfx.report.figures.canvas import canvas, hover, percent_tick, styled
+from cfx.report.figures.canvas import canvas, draw_points, hover, percent_tick, styled
 from cfx.report.figures.improvements import (
     ImprovementAxis,
     ImprovementBars,
@@ -122,16 +122,8 @@ def draw_overview(rows: Sequence[Statistics], baseline: str, axis: ImprovementAx
             ("trimmed mean", row.trimmed_mean, "D"),
             ("median", row.median, "|"),
         ):
-            (mark,) = axes.plot(
-                [value],
-                [place],
-                color="black",
-                marker=marker,
-                markersize=8 if marker == "D" else 13,
-                markerfacecolor="none",
-                markeredgewidth=1.3,
-                linestyle="none",
-            )
+            mark = draw_points(axes, [value], [place], marker, "black", 8 if marker == "D" else 13)
+            mark.set(markerfacecolor="none", markeredgewidth=1.3)
             hover(mark, f"{row.job}: {name} {percent_or_undefined(value, 1)}")
     axes.axvline(0, color=INK, linewidth=0.9, zorder=1)
     axes.set_xlim(axis.low, axis.high)
@@ -161,14 +153,7 @@ def draw_error_dots(
         marker = "D" if method == "policy" else "o"
         handles.append(_mark(marker, colour_of(method), label(method)))
         for job, value, place in zip(jobs, errors, places, strict=True):
-            (mark,) = axes.plot(
-                [value],
-                [place],
-                color=colour_of(method),
-                marker=marker,
-                markersize=8,
-                linestyle="none",
-            )
+            mark = draw_points(axes, [value], [place], marker, colour_of(method), 8)
             hover(mark, f"{job}, {label(method)}: {value:.3f} {unit}")
     axes.set_xlim(0, error_limit(values, unit)[0])
     axes.set_xlabel(f"{what} ({unit})")
@@ -198,16 +183,8 @@ def draw_clusters(groups: Sequence[ClusterGroup], axis: ImprovementAxis) -> Figu
             centre = place + (k - 0.5 * (len(groups) - 1)) * width
             _box(axes, values, centre, 0.8 * width, colour)
             offsets = 0.25 * width * spread_offsets(len(values))
-            axes.plot(
-                centre + offsets,
-                values,
-                color=colour,
-                marker="o",
-                markersize=3.5,
-                alpha=0.6,
-                markeredgewidth=0,
-                linestyle="none",
-            )
+            pairs = draw_points(axes, centre + offsets, values, "o", colour, 3.5, alpha=0.6)
+            pairs.set(markeredgewidth=0)
     axes.axhline(0, color=INK, linewidth=0.9, zorder=1)
     axes.set_xticks(range(len(order)), order)
     axes.set_xlim(-0.6, max(len(order), 1) - 0.4)
@@ -264,26 +241,11 @@ def draw_every_pair(bars: ImprovementBars, pair_ids: Sequence[str]) -> Figure:
                 hover(bar, f"pair {pair}, {series.name}: {percent_or_undefined(float(value), 1)}")
             handles.append(Patch(color=colour, label=named_as))
         else:
-            (dots,) = axes.plot(
-                places,
-                series.shown,
-                marker=marker,
-                color=colour,
-                markersize=4.5,
-                linestyle="none",
-            )
-            hover(dots, series.name)
+            hover(draw_points(axes, places, series.shown, marker, colour, 4.5), series.name)
             handles.append(_mark(marker, colour, named_as))
-        axes.plot(
-            places[series.clipped],
-            series.shown[series.clipped],
-            marker="v",
-            color=colour,
-            markeredgecolor="black",
-            markersize=8,
-            linestyle="none",
-            clip_on=False,
-        )
+        cut = series.clipped
+        arrows = draw_points(axes, places[cut], series.shown[cut], "v", colour, 8, clip_on=False)
+        arrows.set(markeredgecolor="black")
     axes.axhline(0, color=INK, linewidth=0.9)
     axes.set_xlim(-0.7, max(len(pair_ids), 8) - 0.3)
     axes.set_xticks(range(len(ticks)), ticks, rotation=90, fontsize=8.5)

@@ -19,9 +19,8 @@ from cfx.evaluation.result import PairTrajectory
 from cfx.report.figures.canvas import HIDDEN, Line, canvas, draw_lines, method_legend, styled
 from cfx.report.figures.figure import JobFigure
 from cfx.report.figures.improvements import improvement_title
-from cfx.report.figures.pairs import RankedPair, rank_pairs
 from cfx.report.figures.results import ParameterAxis, Results
-from cfx.report.figures.values import Array, finite, without_infinity
+from cfx.report.figures.values import Array, RankedPair, finite, rank_pairs, without_infinity
 from cfx.report.figures.words import label, number, percent, short, short_label, unit_label
 from cfx.results.look import BAND, EDGE, INK, colour_of
 

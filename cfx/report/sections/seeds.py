@@ -10,8 +10,8 @@ import numpy as np
 from cfx.report.blocks import Block, Table, Text
 from cfx.report.figures.values import finite
 from cfx.report.figures.words import explained, percent, short_label
-from cfx.report.grouped import Row, baselines_of, methods_of, rows_over_seeds
 from cfx.report.job import Job, Runs
+from cfx.report.names import Row, baselines_of, methods_of, rows_over_seeds
 from cfx.report.section import Section
 from cfx.report.tables import Cell, Column, Sheet, number, tested, text
 

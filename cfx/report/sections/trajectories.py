@@ -14,8 +14,8 @@ from cfx.report.blocks import (
     missing_file,
 )
 from cfx.report.figure_blocks import single_view
-from cfx.report.figures.pairs import RankedPair, rank_pairs
 from cfx.report.figures.trajectories import draw_pair
+from cfx.report.figures.values import RankedPair, rank_pairs
 from cfx.report.figures.words import percent_or_undefined, short_label
 from cfx.report.job import Job, Runs, calibrations
 from cfx.report.section import Section

@@ -12,10 +12,9 @@ from cfx.data.style.result import StyleResult
 from cfx.report.figures.calibration import correlations, parameter_spreads, spread_offsets
 from cfx.report.figures.improvements import WORST_WITHOUT_CUT, improvement_axis, improvement_bars
 from cfx.report.figures.jobs import error_limit
-from cfx.report.figures.pairs import evenly_spread, rank_pairs
 from cfx.report.figures.results import ParameterAxis
 from cfx.report.figures.style import draw_style
-from cfx.report.figures.values import natural_order
+from cfx.report.figures.values import evenly_spread, natural_order, rank_pairs
 from cfx.report.figures.words import common_prefix, scope_label, short
 
 GAIN = st.floats(-50, 1) | st.sampled_from([np.nan, -np.inf])

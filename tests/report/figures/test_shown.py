@@ -25,7 +25,6 @@ from cfx.report.figures.forecasts import (
 from cfx.report.figures.improvements import draw_improvements, improvement_bars
 from cfx.report.figures.jobs import draw_every_pair
 from cfx.report.figures.learning import draw_learning, loss_quartiles
-from cfx.report.figures.pairs import rank_pairs
 from cfx.report.figures.platoon import braking_time, draw_platoons, worst_platoon
 from cfx.report.figures.results import Results, parameter_axes
 from cfx.report.figures.traffic import draw_paths, draw_traffic, path_panels, traffic_panels
@@ -37,6 +36,7 @@ from cfx.report.figures.trajectories import (
     drives,
     pair_panels,
 )
+from cfx.report.figures.values import rank_pairs
 from cfx.report.figures.words import label
 from cfx.report.runs import read_runs
 from cfx.report.sections.trajectories import chosen_pairs
