@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from cfx.core.parameters import Parameter, ParameterSpace
-from cfx.data.style.result import CLUSTERS, StyleResult
+from cfx.data.style import CLUSTERS, StyleResult
 from cfx.evaluation.distributions import DISTRIBUTION_COLUMNS
 from cfx.evaluation.forecasts import FORECAST_COLUMNS, FORECAST_METHODS, Forecasts
 from cfx.evaluation.metrics.base import MetricInfo

@@ -17,11 +17,10 @@ import torch
 import cfx
 from cfx.core import scratch
 from cfx.core.errors import OutputError
-from cfx.data import tidy
+from cfx.data import style, tidy
 from cfx.data.base import joined, scaled
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.resample import resampled
-from cfx.data.style import entropy
 from cfx.data.tidy import read_tidy, write_tidy
 from cfx.evaluation import result, shards, trajectories
 from cfx.simulation.synthetic import SyntheticDataset
@@ -151,7 +150,7 @@ def test_a_job_in_files_and_in_parts_has_the_same_results(
     monkeypatch.setattr(scratch, "LARGE", 1)
     for module in (shards, trajectories):
         monkeypatch.setattr(module, "PAIRS_AT_ONCE", 4)
-    for module, name in ((result, "_PAIRS_AT_ONCE"), (entropy, "_PAIRS_AT_ONCE")):
+    for module, name in ((result, "_PAIRS_AT_ONCE"), (style, "_PAIRS_AT_ONCE")):
         monkeypatch.setattr(module, name, 4)
     monkeypatch.setattr(result, "_ROWS_AT_ONCE", 100)
     before = maps()

@@ -22,8 +22,7 @@ from cfx.calibration.windows import WindowSettings
 from cfx.contracts.contract import NotApplicable, contract_of
 from cfx.core.progress import Task
 from cfx.data.pairs import Pair, PairBatch, PairSet
-from cfx.data.style.entropy import measure_style
-from cfx.data.style.settings import StyleSettings
+from cfx.data.style import StyleSettings, measure_style
 from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.evaluation.result import METHODS, PairTrajectory
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult

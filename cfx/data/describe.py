@@ -21,7 +21,7 @@ from cfx.data.base import Contents, Dataset
 from cfx.data.files import Floats, beginning, partitions
 from cfx.data.pairs import Dropped, Pair, PairSet
 from cfx.data.resample import frames_in_steps
-from cfx.data.style.entropy import STANDING_MPS
+from cfx.data.style import STANDING_MPS
 
 log = logging.getLogger(__name__)
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from cfx.core import registry
 from cfx.core.parameters import ParameterSpace
 from cfx.data.pairs import PairBatch, PairSet
-from cfx.data.style.result import CLUSTERS, StyleResult
+from cfx.data.style import CLUSTERS, StyleResult
 from cfx.evaluation.closed_loop import ClosedLoop
 from cfx.evaluation.metrics.base import RECORDED, MetricInfo, Trajectories
 from cfx.evaluation.metrics.errors import RmseGap, RmseSpeed

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from cfx.data.style.result import StyleResult
+from cfx.data.style import StyleResult
 from cfx.evaluation.headline import improvement_key
 from cfx.evaluation.metrics.base import RECORDED, MetricInfo, key_of
 from cfx.evaluation.result import METHODS, PairTrajectory

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cfx.core.files import write_output
-from cfx.data.style.result import CLUSTERS
+from cfx.data.style import CLUSTERS
 from cfx.report.job import Runs, calibrations
 from cfx.report.scripts import inline_scripts, security_policy
 from cfx.report.section import Section

@@ -16,7 +16,7 @@ from cfx.calibration.settings import CalibrationSettings, WindowSettings
 from cfx.core.component import Settings, validate
 from cfx.core.errors import ConfigError, without_passwords
 from cfx.core.storage import is_url
-from cfx.data.style.settings import StyleSettings
+from cfx.data.style import StyleSettings
 
 Node = dict[str, Any]
 """A component's node, `{name: ..., settings...}`: `cfx.core.registry.create` validates it against

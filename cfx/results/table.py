@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from cfx.data.pairs import PairSet
-    from cfx.data.style.result import StyleResult
+    from cfx.data.style import StyleResult
     from cfx.evaluation.protocols.base import ProtocolResult
     from cfx.evaluation.result import Evaluation
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from cfx.calibration.windows import WindowSettings
 from cfx.data.pairs import PairBatch
-from cfx.data.style.result import StyleResult
+from cfx.data.style import StyleResult
 from cfx.evaluation.closed_loop import ClosedLoop, simulate_closed_loop
 from cfx.evaluation.evaluate import evaluate
 from cfx.models.base import DrivingModel, Leader

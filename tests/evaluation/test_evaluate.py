@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from cfx.data.pairs import PairBatch
-from cfx.data.style.result import StyleResult
+from cfx.data.style import StyleResult
 from cfx.evaluation.closed_loop import ClosedLoop
 from cfx.evaluation.evaluate import evaluate
 from cfx.models.krauss import Krauss

@@ -13,7 +13,7 @@ import pandas as pd
 import yaml
 
 from cfx.core.parameters import ParameterSpace
-from cfx.data.style.result import CLUSTERS
+from cfx.data.style import CLUSTERS
 from cfx.evaluation.result import Evaluation
 from cfx.evaluation.statistics import Improvement, improvement_statistics
 from cfx.evaluation.tables import values_of

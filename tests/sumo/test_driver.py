@@ -13,9 +13,7 @@ from torch import Tensor
 import cfx_sumo
 from cfx.core.errors import DataError, ParameterError, SumoError
 from cfx.data.pairs import PairBatch
-from cfx.data.style.entropy import measure_style
-from cfx.data.style.result import StyleResult
-from cfx.data.style.settings import StyleSettings
+from cfx.data.style import StyleResult, StyleSettings, measure_style
 from cfx.evaluation.closed_loop import simulate_closed_loop
 from cfx.evaluation.evaluate import evaluate
 from cfx.models.krauss import Krauss

@@ -9,7 +9,7 @@ import pandas as pd
 
 from cfx.core.errors import DataError
 from cfx.core.job_folder import examine
-from cfx.data.style.result import StyleResult
+from cfx.data.style import StyleResult
 from cfx.evaluation.headline import headline
 from cfx.evaluation.result import Evaluation
 from cfx.policies import checkpoint

@@ -31,8 +31,7 @@ from cfx.core.progress import Task
 from cfx.core.threads import limit_cores, set_threads
 from cfx.data.base import load_pairs
 from cfx.data.pairs import PairBatch, PairSet
-from cfx.data.style.entropy import measure_style, select_cluster
-from cfx.data.style.result import StyleResult
+from cfx.data.style import StyleResult, measure_style, select_cluster
 from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.learners.curves import best_losses
 from cfx.policies import checkpoint

@@ -23,7 +23,7 @@ from cfx.core.engine.base import Engine
 from cfx.core.errors import PluginError
 from cfx.core.parameters import ParameterSpace
 from cfx.data.pairs import PairBatch, PairSet
-from cfx.data.style.result import StyleResult
+from cfx.data.style import StyleResult
 from cfx.evaluation.metrics.installed import MetricSet
 from cfx.evaluation.result import Evaluation
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingResult

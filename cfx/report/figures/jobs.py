@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter
 
-from cfx.data.style.result import CLUSTERS
+from cfx.data.style import CLUSTERS
 from cfx.report.figures.calibration import spread_offsets
 from cfx.report.figures.canvas import canvas, draw_points, hover, percent_tick, styled
 from cfx.report.figures.improvements import (

@@ -11,7 +11,7 @@ import pandas as pd
 from cfx.simulation.trajectory import TRANSIENT_S
 
 if TYPE_CHECKING:
-    from cfx.data.style.result import StyleResult
+    from cfx.data.style import StyleResult
     from cfx.evaluation.forecasts import Forecasts
     from cfx.evaluation.result import Evaluation, PairTrajectory
     from cfx.evaluation.statistics import Improvement

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from cfx.data.style.result import CLUSTERS, StyleResult
+from cfx.data.style import CLUSTERS, StyleResult
 from cfx.report.figures.canvas import canvas, styled
 from cfx.report.figures.figure import JobFigure
 from cfx.report.figures.results import Results

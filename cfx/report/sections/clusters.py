@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 
-from cfx.data.style.result import CLUSTERS
+from cfx.data.style import CLUSTERS
 from cfx.evaluation.statistics import Improvement
 from cfx.report.blocks import Block, Figure, Fold, Table, Text
 from cfx.report.figure_blocks import view

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cfx.data.style.result import StyleResult
+from cfx.data.style import StyleResult
 from cfx.report.figures.calibration import correlations, parameter_spreads, spread_offsets
 from cfx.report.figures.improvements import WORST_WITHOUT_CUT, improvement_axis, improvement_bars
 from cfx.report.figures.jobs import error_limit

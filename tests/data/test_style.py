@@ -15,8 +15,9 @@ from scipy.stats import entropy
 from cfx.core.component import validate
 from cfx.core.errors import ConfigError, DataError
 from cfx.data.pairs import Pair, PairSet
-from cfx.data.style.entropy import (
+from cfx.data.style import (
     INDICATORS,
+    StyleSettings,
     entropies,
     entropy_weights,
     indicators,
@@ -24,7 +25,6 @@ from cfx.data.style.entropy import (
     normalise,
     select_cluster,
 )
-from cfx.data.style.settings import StyleSettings
 from cfx.data.tidy import TidyDataset
 
 # Whole numbers keep columns either constant or clearly spread: rounding itself is tested apart.

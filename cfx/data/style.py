@@ -14,18 +14,21 @@ leading minus sign, with which they would all be negative, is left out.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Literal, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, NamedTuple, Self
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
 from cfx.core import scratch
+from cfx.core.component import Settings
 from cfx.core.errors import DataError
 from cfx.data.pairs import Pair, PairSet
-from cfx.data.style.result import CLUSTERS, StyleResult
-from cfx.data.style.settings import StyleSettings
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Floats = NDArray[np.float64]
 
@@ -50,12 +53,57 @@ INDICATORS = (
     Indicator("mean_time_headway", -1),
 )
 
+CLUSTERS = ("conservative", "normal", "aggressive")
+"""Names of the clusters 0, 1, 2: the bottom quarter, the middle half, the top quarter of scores."""
+
 STANDING_MPS = 0.5
 """Below this speed a vehicle stands: its time headway, headway over speed, says nothing."""
 
 
+class StyleSettings(Settings):
+    """How driving style is measured, and which drivers a job uses."""
+
+    cluster: Literal["all", "conservative", "normal", "aggressive"] = Field(
+        "all", description="drivers that the job uses"
+    )
+    direction: Literal["signed", "printed"] = Field(
+        "signed",
+        description="signed: headways count against aggressiveness; printed: the rule as the paper"
+        " prints it",
+    )
+    percentiles: tuple[float, float] = Field(
+        (25.0, 75.0), description="cuts between the three clusters, percent of the drivers"
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        low, high = self.percentiles
+        if not 0 < low < high < 100:
+            raise ValueError(
+                f"style.percentiles=[{low:g}, {high:g}] must rise and lie between 0 and 100"
+            )
+        return self
+
+
+@dataclass(frozen=True)
+class StyleResult:
+    """Driving style of every driver.
+
+    Attributes:
+        table: a row per driver: driver, score, cluster (0, 1, 2), cluster_name, and the six raw
+            indicators `mean_speed`, `variance_speed`, `mean_acceleration`, `variance_acceleration`,
+            `mean_space_headway`, `mean_time_headway` (SI units).
+        weights: entropy weight of each indicator; they are not negative and sum to 1.
+        cuts: the two scores that separate the clusters.
+    """
+
+    table: pd.DataFrame
+    weights: Mapping[str, float]
+    cuts: tuple[float, float]
+
+
 def measure_style(pairs: PairSet, settings: StyleSettings) -> StyleResult:
-    """Scores every driver (`Pair.driver`) and sorts the drivers into three clusters.
+    """Score every driver (`Pair.driver`) and sorts the drivers into three clusters.
 
     The frames of all pairs of a driver count together. Scores lie in [0, 1]; the more aggressive,
     the higher. A driver whose score is below the lower percentile is conservative, above the upper
@@ -87,7 +135,7 @@ def measure_style(pairs: PairSet, settings: StyleSettings) -> StyleResult:
 
 
 def select_cluster(pairs: PairSet, style: StyleResult, cluster: str) -> PairSet:
-    """Keeps the pairs of the drivers of one cluster and counts the others; `all` keeps every pair.
+    """Keep the pairs of the drivers of one cluster and counts the others; `all` keeps every pair.
 
     Raises:
         DataError: no driver is in this cluster.
@@ -108,19 +156,21 @@ def select_cluster(pairs: PairSet, style: StyleResult, cluster: str) -> PairSet:
 
 
 def indicators(pairs: PairSet) -> pd.DataFrame:
-    """Returns a row per driver with the six indicators, in SI units.
+    """Return a row per driver with the six indicators, in SI units.
 
     The space headway is front bumper to front bumper, `x_l - x_s`, as NGSIM's Space_Headway. The
     time headway is that over the follower's speed, averaged over the frames with a speed of 0.5 m/s
     or more; for a driver who is never that fast, it is the mean space headway over 0.5 m/s.
     Variances are those of the population (divided by the number of frames).
     """
+    import pandas as pd
+
     parts = [_indicators(some) for some in _by_driver(pairs)]
     return pd.concat(parts, ignore_index=True)
 
 
 def _by_driver(pairs: PairSet) -> Iterator[list[Pair]]:
-    """Yields the pairs of some drivers, then of some others: frames of all need much memory."""
+    """Yield the pairs of some drivers, then of some others: frames of all need much memory."""
     of_driver: dict[str, list[int]] = {}
     for index, pair in enumerate(pairs.pairs):
         of_driver.setdefault(pair.driver, []).append(index)
@@ -136,7 +186,9 @@ def _by_driver(pairs: PairSet) -> Iterator[list[Pair]]:
 
 
 def _indicators(pairs: Sequence[Pair]) -> pd.DataFrame:
-    """Returns the indicators of drivers all of whose pairs are given."""
+    """Return the indicators of drivers all of whose pairs are given."""
+    import pandas as pd
+
     sizes = [len(pair) for pair in pairs]
     code, drivers = pd.factorize(np.array([pair.driver for pair in pairs], dtype=object))
     code = np.repeat(code, sizes)
@@ -173,7 +225,7 @@ def _indicators(pairs: Sequence[Pair]) -> pd.DataFrame:
 
 
 def normalise(raw: Floats, direction: Literal["signed", "printed"] = "signed") -> Floats:
-    """Maps each column of `raw` `(m, n)` to [0, 1], 1 being the most aggressive.
+    """Map each column of `raw` `(m, n)` to [0, 1], 1 being the most aggressive.
 
     A constant column becomes 0.
 
@@ -195,7 +247,7 @@ def normalise(raw: Floats, direction: Literal["signed", "printed"] = "signed") -
 
 
 def entropies(normalised: Floats) -> Floats:
-    """Returns the entropy of each column of `(m, n)`, in [0, 1]: 1 is evenly spread.
+    """Return the entropy of each column of `(m, n)`, in [0, 1]: 1 is evenly spread.
 
     ent_j = -(1 / ln m) sum_i p_ij ln p_ij with p_ij = e_ij / sum_i e_ij and 0 ln 0 = 0. A column of
     zeros (a constant indicator) and a single driver carry no information: 1.
@@ -211,7 +263,7 @@ def entropies(normalised: Floats) -> Floats:
 
 
 def entropy_weights(normalised: Floats) -> Floats:
-    """Returns the weight of each column `(n,)`: not negative, sum 1; 0 for a constant column.
+    """Return the weight of each column `(n,)`: not negative, sum 1; 0 for a constant column.
 
     w_j = (1 - ent_j) / (n - sum_j ent_j). If no indicator varies, as with a single driver, all
     weigh the same.

@@ -1,1 +1,0 @@
-"""Driving style: entropy weights, scores, clusters."""
