@@ -208,14 +208,13 @@ class Dataset(Component):
         self._check(pairs)
         if not len(pairs):
             raise DataError(f"{pairs.source}: no leader-follower pair found{_why(pairs.dropped)}")
-        if self.settings.recording is not None:
-            pairs = _select_recording(pairs, self.settings.recording)
+        pairs = _select_label(pairs, "recording", self.settings.recording)
         if self.settings.lanes is not None:
             pairs = _select_lanes(pairs, self.settings.lanes)
         if self.settings.pair_ids is not None:
             pairs = _select_ids(pairs, self.settings.pair_ids)
         for name in ("driver_type", "leader_driver_type"):
-            pairs = _select_type(pairs, name, getattr(self.settings, name))
+            pairs = _select_label(pairs, name, getattr(self.settings, name))
         if self.settings.time_step is not None:
             pairs = resampled(pairs, self.settings.time_step)
             if not len(pairs):
@@ -334,17 +333,6 @@ def _why(dropped: Sequence[Dropped]) -> str:
     return f" (left out: {'; '.join(reasons)})"
 
 
-def _select_recording(pairs: PairSet, recording: str) -> PairSet:
-    known = list(dict.fromkeys(pair.recording for pair in pairs))
-    if recording not in known:
-        raise DataError(
-            f"data.recording={recording}: {pairs.source} has no such recording."
-            f"{nearest(recording, known)} Known: {listed(known)}."
-        )
-    kept = [pair.recording == recording for pair in pairs]
-    return pairs.select(kept, f"other recordings than '{recording}'")
-
-
 def _select_lanes(pairs: PairSet, lanes: Sequence[int]) -> PairSet:
     known = sorted({pair.lane for pair in pairs if pair.lane is not None})
     if not known:
@@ -377,12 +365,16 @@ def _select_ids(pairs: PairSet, wanted: Sequence[str]) -> PairSet:
     return pairs.select([name in wanted for name in known], "other pairs than data.pair_ids")
 
 
-def _select_type(pairs: PairSet, name: str, wanted: str | None) -> PairSet:
-    """Keeps the pairs whose follower or leader is of a type; all where None is wanted."""
+def _select_label(pairs: PairSet, name: str, wanted: str | None) -> PairSet:
+    """Keep the pairs with a label; all where None is wanted.
+
+    Args:
+        name: recording, driver_type or leader_driver_type.
+    """
     if wanted is None:
         return pairs
-    types = [getattr(pair, name) for pair in pairs]
-    known = sorted(set(types) - {""})
+    labels = [getattr(pair, name) for pair in pairs]
+    known = [label for label in dict.fromkeys(labels) if label]
     if not known:
         raise DataError(
             f"data.{name}={wanted}: {pairs.source} does not say what drives its vehicles; leave"
@@ -390,10 +382,10 @@ def _select_type(pairs: PairSet, name: str, wanted: str | None) -> PairSet:
         )
     if wanted not in known:
         raise DataError(
-            f"data.{name}={wanted}: {pairs.source} has no such type.{nearest(wanted, known)}"
-            f" Known: {listed(known)}."
+            f"data.{name}={wanted}: {pairs.source} has no such {name.rpartition('_')[2]}."
+            f"{nearest(wanted, known)} Known: {listed(known)}."
         )
-    return pairs.select([one == wanted for one in types], f"another {name} than '{wanted}'")
+    return pairs.select([one == wanted for one in labels], f"another {name} than '{wanted}'")
 
 
 def _select_long(pairs: PairSet, min_frames: int) -> PairSet:
