@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
@@ -13,7 +10,6 @@ from cfx.report.figures.canvas import canvas, percent_axis, styled
 from cfx.report.figures.figure import JobFigure
 from cfx.report.figures.improvements import improvement_title
 from cfx.report.figures.results import Results
-from cfx.report.figures.values import Array
 from cfx.results.look import COLOURS, INK
 
 BASES = {"own": "fixed", "population": "population"}
@@ -23,43 +19,29 @@ BASE_LABELS = {
     "own": "offsets from driver-specific calibration",
     "population": "offsets from pooled calibration",
 }
-AMOUNT_TITLE = "burn-in: measured history before the test part"
-SUBTITLE = "mean over pairs and its 95 % interval"
 
 
-@dataclass(frozen=True)
-class HistoryCurve:
-    """Improvements by amount of burn-in, with one base.
-
-    Attributes:
-        base: key of the base.
-        label: what the base is.
-        colour: of the line.
-        amounts: A of them, in words.
-        mean, low, high: `(A,)`, fractions; mean over pairs and its 95 % interval.
-        pairs: `(A,)`, pairs with a defined improvement.
-    """
-
-    base: str
-    label: str
-    colour: str
-    amounts: tuple[str, ...]
-    mean: Array
-    low: Array
-    high: Array
-    pairs: tuple[int, ...]
-
-
-def history_curves(history: pd.DataFrame) -> tuple[HistoryCurve, ...]:
-    """Chooses a curve per base; the improvement is over driver-specific calibration.
+def history_curves(history: pd.DataFrame) -> pd.DataFrame:
+    """Return the improvement over driver-specific calibration by base and amount of burn-in.
 
     Args:
         history: as `Evaluation.history`.
+
+    Returns:
+        A row per base and amount, each in its order: `base`, `amount`, `mean`, `low` and `high`
+        (fractions; mean over pairs and its 95 % interval), `pairs` with a defined improvement.
     """
-    curves = []
+    from cfx.evaluation.statistics import mean_interval  # imports scipy
+
+    rows = []
     for base in sorted(history["base"].unique(), key=_place_of_base):
-        curves.append(_curve(history[history["base"] == base], str(base), amounts_of(history)))
-    return tuple(curves)
+        for amount in amounts_of(history):
+            chosen = history[(history["base"] == base) & (history["amount"] == amount)]
+            if len(chosen):
+                gains = chosen["improvement"].astype(float).tolist()
+                interval = mean_interval(gains, chosen["driver"].astype(str).tolist(), seed=0)
+                rows.append((str(base), amount, *interval, int(np.isfinite(gains).sum())))
+    return pd.DataFrame(rows, columns=["base", "amount", "mean", "low", "high", "pairs"])
 
 
 def amounts_of(history: pd.DataFrame) -> list[str]:
@@ -76,55 +58,40 @@ def _place_of_base(base: str) -> tuple[int, str]:
     return (known.index(base) if base in known else len(known), base)
 
 
-def _curve(history: pd.DataFrame, base: str, order: list[str]) -> HistoryCurve:
-    from cfx.evaluation.statistics import mean_interval  # imports scipy
-
-    amounts, pairs, intervals = [], [], []
-    for amount in order:
-        chosen = history[history["amount"] == amount]
-        if len(chosen):
-            gains = chosen["improvement"].astype(float).tolist()
-            drivers = chosen["driver"].astype(str).tolist()
-            amounts.append(amount)
-            pairs.append(int(np.isfinite(gains).sum()))
-            intervals.append(mean_interval(gains, drivers, seed=0))
-    mean, low, high = np.array(intervals, dtype=float).T
-    label = BASE_LABELS.get(base, base)
-    colour = COLOURS.get(BASES.get(base, ""), INK)
-    return HistoryCurve(base, label, colour, tuple(amounts), mean, low, high, tuple(pairs))
-
-
 @styled
-def draw_history(curves: Sequence[HistoryCurve], amounts: Sequence[str]) -> Figure:
-    """Draws the mean improvement and its 95 % interval against the amount of burn-in.
+def draw_history(history: pd.DataFrame) -> Figure:
+    """Draw the mean improvement and its 95 % interval against the amount of burn-in.
 
     Args:
-        curves: one for each base.
-        amounts: all of them, in their order.
+        history: as `Evaluation.history`.
     """
     figure = canvas(3.9)
     axes = figure.subplots()
-    for k, curve in enumerate(curves):
-        aside = 0.06 * (k - 0.5 * (len(curves) - 1))
-        places = np.array([amounts.index(amount) for amount in curve.amounts]) + aside
-        interval = np.nan_to_num(np.stack([curve.mean - curve.low, curve.high - curve.mean]))
+    amounts, curves = amounts_of(history), history_curves(history)
+    bases = curves["base"].unique()
+    for k, base in enumerate(bases):
+        curve = curves[curves["base"] == base]
+        aside = 0.06 * (k - 0.5 * (len(bases) - 1))
+        places = np.array([amounts.index(amount) for amount in curve["amount"]]) + aside
+        mean, low, high = (curve[name].to_numpy(dtype=float) for name in ("mean", "low", "high"))
         axes.errorbar(
             places,
-            curve.mean,
-            interval,
-            color=curve.colour,
+            mean,
+            np.nan_to_num(np.stack([mean - low, high - mean])),
+            color=COLOURS.get(BASES.get(base, ""), INK),
             marker="o",
             linewidth=1.8,
             capsize=4,
-            label=curve.label,
+            label=BASE_LABELS.get(base, base),
         )
     axes.axhline(0, color=INK, linewidth=0.9)
     axes.set_xticks(range(len(amounts)), amounts)
     axes.set_xlim(-0.4, len(amounts) - 0.6)
-    axes.set_xlabel(AMOUNT_TITLE)
+    axes.set_xlabel("burn-in: measured history before the test part")
     axes.set_ylabel(improvement_title("fixed").replace(" over ", "\nover ") + " (%)")
     percent_axis(axes)
-    figure.legend(loc="outside upper center", ncols=2, title=SUBTITLE, title_fontsize=10.5)
+    title = "mean over pairs and its 95 % interval"
+    figure.legend(loc="outside upper center", ncols=2, title=title, title_fontsize=10.5)
     return figure
 
 
@@ -144,4 +111,4 @@ class History(JobFigure):
         table = results.tables.get("history")
         if table is None:
             return None
-        return draw_history(history_curves(table), amounts_of(table))
+        return draw_history(table)

@@ -111,67 +111,37 @@ def fits_of(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
     return found
 
 
-@dataclass(frozen=True)
-class DriverLabels:
-    """Per-window calibrated parameters of one pair; W windows, n parameters.
-
-    Attributes:
-        pair_id: which pair.
-        time: `(W,)` s, from the start of the pair.
-        values: by parameter, `(W,)`, SI units.
-        weight: `(W,)`, 0 to 1: how much the choice mattered in the window, as a share of the 90 %
-            quantile over all windows; 0 is arbitrary.
-        sensitivity: `(W,)`, in the objective's unit.
-        fixed: by parameter, the driver-specific one.
-    """
-
-    pair_id: str
-    time: Array
-    values: dict[str, Array]
-    weight: Array
-    sensitivity: Array
-    fixed: dict[str, float]
-
-
 def labels_of(
     labels: pd.DataFrame, pairs: pd.DataFrame, axes: Sequence[ParameterAxis]
-) -> tuple[DriverLabels, ...]:
-    """Returns the labels of some pairs, spread evenly over those that have driver-specific ones.
+) -> dict[str, pd.DataFrame]:
+    """Return the labels of some pairs, spread evenly over those that have driver-specific ones.
 
     Args:
         labels: as `Labels.to_frame` returns it.
         pairs: a row per pair and method with columns `pair_id`, `method`, `parameter_NAME`.
         axes: the tuned parameters.
+
+    Returns:
+        By pair its rows of `labels` by time, with `weight`, 0 to 1: how much the choice mattered in
+        the window, as a share of the 90 % quantile over all windows (0 is arbitrary), and
+        `fixed_NAME`, the driver-specific parameters.
     """
     names = [axis.name for axis in axes if f"parameter_{axis.name}" in labels]
     if labels.empty or not names:
-        return ()
+        return {}
     own = pairs[pairs["method"] == "fixed"].drop_duplicates("pair_id").set_index("pair_id")
-    known = [one for one in own.index.astype(str) if one in set(labels["pair_id"].astype(str))]
+    ids = labels["pair_id"].astype(str)
+    known = [one for one in own.index.astype(str) if one in set(ids)]
     if not known:
-        return ()
+        return {}
     scale = float(np.quantile(labels["sensitivity"].to_numpy(dtype=float), 0.9)) or 1.0
     places = np.linspace(0, len(known) - 1, min(len(known), MOST_DRIVERS)).round().astype(int)
-    found = []
-    for place in dict.fromkeys(places.tolist()):
-        rows = labels[labels["pair_id"].astype(str) == known[place]].sort_values("time_s")
-        sensitivity = rows["sensitivity"].to_numpy(dtype=np.float64)
-        values = {}
-        fixed = {}
-        for name in names:
-            values[name] = rows[f"parameter_{name}"].to_numpy(dtype=np.float64)
-            fixed[name] = float(own.loc[known[place], f"parameter_{name}"])
-        found.append(
-            DriverLabels(
-                known[place],
-                rows["time_s"].to_numpy(dtype=np.float64),
-                values,
-                np.clip(sensitivity / scale, 0, 1),
-                sensitivity,
-                fixed,
-            )
-        )
-    return tuple(found)
+    found = {}
+    for pair_id in (known[place] for place in places):
+        rows = labels[ids == pair_id].sort_values("time_s")
+        fixed = {f"fixed_{name}": float(own.loc[pair_id, f"parameter_{name}"]) for name in names}
+        found[pair_id] = rows.assign(weight=(rows["sensitivity"] / scale).clip(0, 1), **fixed)
+    return found
 
 
 _ACROSS = 5
@@ -235,31 +205,39 @@ def draw_fits(fits: Mapping[str, pd.DataFrame]) -> Figure:
 
 
 @styled
-def draw_labels(driver: DriverLabels, axes: Sequence[ParameterAxis]) -> Figure:
-    """Draws one pair's per-window parameters; pale ones did not matter in their window."""
-    shown = [axis for axis in axes if axis.name in driver.values]
+def draw_labels(pair_id: str, labels: pd.DataFrame, axes: Sequence[ParameterAxis]) -> Figure:
+    """Draw one pair's per-window parameters; pale ones did not matter in their window.
+
+    Args:
+        pair_id: which pair.
+        labels: as `labels_of` returns it for the pair.
+        axes: the tuned parameters.
+    """
+    shown = [axis for axis in axes if f"fixed_{axis.name}" in labels]
     figure = canvas(1.0 + 1.15 * (len(shown) + 1))
     grid = figure.subplots(len(shown) + 1, 1, sharex=True)
+    times = labels["time_s"].to_numpy(dtype=float)
     for place, axis in zip(grid, shown, strict=False):
         place.scatter(
-            driver.time,
-            driver.values[axis.name],
+            times,
+            labels[f"parameter_{axis.name}"].to_numpy(dtype=float),
             s=11,
             color=colour_of("policy"),
-            alpha=np.maximum(driver.weight, 0.08),
+            alpha=np.maximum(labels["weight"].to_numpy(dtype=float), 0.08),
             linewidths=0,
         )
-        place.axhline(driver.fixed[axis.name], color=colour_of("fixed"), linewidth=1.6)
+        fixed = float(labels[f"fixed_{axis.name}"].iloc[0])
+        place.axhline(fixed, color=colour_of("fixed"), linewidth=1.6)
         place.set_ylabel(unit_label(axis.name, axis.unit).replace(" ", "\n"), fontsize=9)
         if axis.low is not None and axis.high is not None:
             room = 0.06 * (axis.high - axis.low)
             place.set_ylim(axis.low - room, axis.high + room)
-    grid[-1].plot(driver.time, driver.sensitivity, color=INK, linewidth=1.2)
+    grid[-1].plot(times, labels["sensitivity"].to_numpy(dtype=float), color=INK, linewidth=1.2)
     grid[-1].set_ylabel("sensi-\ntivity", fontsize=9)
     grid[-1].set_ylim(bottom=0)
     grid[-1].set_xlabel(TIME_TITLE)
     figure.suptitle(
-        f"{short(driver.pair_id)}: per-window calibrated parameters; the paler, the less the choice"
+        f"{short(pair_id)}: per-window calibrated parameters; the paler, the less the choice"
         " mattered; line: driver-specific",
         fontsize=10.5,
         color=INK,
@@ -323,4 +301,7 @@ class LabelsOverTime(JobFigure):
         if table is None:
             return None
         drivers = labels_of(table, results.pairs, results.parameters)
-        return draw_labels(drivers[len(drivers) // 2], results.parameters) if drivers else None
+        if not drivers:
+            return None
+        pair_id = list(drivers)[len(drivers) // 2]
+        return draw_labels(pair_id, drivers[pair_id], results.parameters)

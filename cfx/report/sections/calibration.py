@@ -55,8 +55,9 @@ def _beyond(jobs: Sequence[Job]) -> list[Block]:
     for job in kept:
         results = job.results
         views = {}
-        for driver in labels_of(job.tables["labels"], results.pairs, results.parameters):
-            views[short(driver.pair_id)] = view(draw_labels(driver, results.parameters))
+        drivers = labels_of(job.tables["labels"], results.pairs, results.parameters)
+        for pair_id, labels in drivers.items():
+            views[short(pair_id)] = view(draw_labels(pair_id, labels, results.parameters))
         if views:
             title = "Per-window calibrated parameters over time, and how much they mattered"
             return [*found, Text(caption("labels_over_time")), Figure(views, title, "Pair")]

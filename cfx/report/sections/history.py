@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from cfx.report.blocks import Block, Group, Heading, Table, Text, cards
 from cfx.report.figure_blocks import caption, figure_of
-from cfx.report.figures.history import history_curves
+from cfx.report.figures.history import BASE_LABELS, history_curves
 from cfx.report.job import Job, Runs
 from cfx.report.section import Section
 from cfx.report.tables import Cell, Column, Sheet, interval, number, share, text
@@ -55,10 +55,9 @@ def histories(jobs: Sequence[Job]) -> Sheet:
     )
     rows: list[tuple[Cell, ...]] = []
     for job in jobs:
-        for curve in history_curves(job.tables["history"]):
-            named = (text(job.name), text(curve.label))
-            for k, amount in enumerate(curve.amounts):
-                mean, low, high = (float(one[k]) for one in (curve.mean, curve.low, curve.high))
-                pairs = number(curve.pairs[k], str(curve.pairs[k]))
-                rows.append((*named, text(amount), share(mean), interval(low, high), pairs))
+        for one in history_curves(job.tables["history"]).to_dict("records"):
+            base = BASE_LABELS.get(one["base"], one["base"])
+            named = (text(job.name), text(base), text(one["amount"]))
+            pairs = number(one["pairs"], str(one["pairs"]))
+            rows.append((*named, share(one["mean"]), interval(one["low"], one["high"]), pairs))
     return Sheet(columns, tuple(rows))

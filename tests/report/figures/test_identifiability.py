@@ -88,11 +88,13 @@ def test_fits_have_the_pairs_that_are_defined_on_both_parts() -> None:
 
 
 def test_labels_are_in_the_order_of_time_and_weighted_by_what_they_matter() -> None:
-    (driver,) = labels_of(LABELS, PAIRS, AXES)
-    assert driver.time.tolist() == [0.0, 0.5, 1.0, 1.5]
-    np.testing.assert_allclose(driver.weight, [0.0, 0.5, 1.0, 1.0])
-    assert driver.fixed == {"T": 1.15, "s0": 2.0}
-    assert labels_of(LABELS, PAIRS.iloc[:0], AXES) == ()
+    ((pair_id, rows),) = labels_of(LABELS, PAIRS, AXES).items()
+    assert pair_id == "a"
+    assert rows["time_s"].tolist() == [0.0, 0.5, 1.0, 1.5]
+    np.testing.assert_allclose(rows["weight"], [0.0, 0.5, 1.0, 1.0])
+    assert rows["fixed_T"].unique().tolist() == [1.15]
+    assert rows["fixed_s0"].unique().tolist() == [2.0]
+    assert labels_of(LABELS, PAIRS.iloc[:0], AXES) == {}
 
 
 def test_what_was_chosen_is_drawn() -> None:
@@ -103,8 +105,10 @@ def test_what_was_chosen_is_drawn() -> None:
     fits = fits_of(FITS)
     for fit, line in zip(fits.values(), draw_fits(fits).axes[0].lines, strict=False):
         np.testing.assert_allclose(line.get_xdata(), fit["train_rmse_speed"])
-    (driver,) = labels_of(LABELS, PAIRS, AXES)
-    assert len(draw_labels(driver, AXES).axes) == len(AXES) + 1
+    ((pair_id, rows),) = labels_of(LABELS, PAIRS, AXES).items()
+    drawn = draw_labels(pair_id, rows, AXES).axes
+    assert len(drawn) == len(AXES) + 1
+    assert drawn[0].lines[0].get_ydata()[0] == 1.15
 
 
 def test_a_report_shows_them(tmp_path: Path) -> None:
