@@ -16,11 +16,16 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cfx_sumo.live.driver import Driver as Driver
+    from cfx_sumo.live.driver import DriverOptions as DriverOptions
     from cfx_sumo.live.fleet import Fleet as Fleet
 
-_HOMES = {"Driver": "cfx_sumo.live.driver", "Fleet": "cfx_sumo.live.fleet"}
+_HOMES = {
+    "Driver": "cfx_sumo.live.driver",
+    "DriverOptions": "cfx_sumo.live.driver",
+    "Fleet": "cfx_sumo.live.fleet",
+}
 
-__all__ = ["Driver", "Fleet"]
+__all__ = ["Driver", "DriverOptions", "Fleet"]
 
 
 def __getattr__(name: str) -> Any:

@@ -6,8 +6,7 @@ import pytest
 
 from cfx import Command
 from cfx.contracts import CommandContract
-from cfx_sumo.drive.command import DriveCommand
-from cfx_sumo.export_command import ExportCommand
+from cfx_sumo.commands import DriveCommand, ExportCommand
 
 
 class TestCommands(CommandContract):

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cfx_sumo.drive.histogram import Histogram
+from cfx_sumo.drive.run import Histogram
 
 pytest.importorskip("traci", reason="needs the extra sumo")
 

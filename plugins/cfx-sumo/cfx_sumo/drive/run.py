@@ -16,17 +16,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO, Unpack
 
 import numpy as np
 
 from cfx.core.errors import ConfigError, DataError, OutputError, SumoError, nearest
 from cfx.core.files import atomic_write
 from cfx.core.progress import Task
-from cfx_sumo.drive.histogram import Histogram
 from cfx_sumo.drive.scenarios import SCENARIOS
 from cfx_sumo.installed import require_sumo
-from cfx_sumo.live.driver import OBEYS_ALL
+from cfx_sumo.live.driver import DriverOptions
 from cfx_sumo.live.fleet import Fleet
 
 if TYPE_CHECKING:
@@ -41,6 +40,34 @@ _QUANTILES = (0.05, 0.5, 0.95)
 
 _LISTED = 10
 """Collisions that the report lists."""
+
+
+class Histogram:
+    """Counts values in bins of equal width; those beyond the ends count in the last bins.
+
+    Args:
+        low, high: ends.
+        width: of a bin, which is also how exactly quantiles are known.
+    """
+
+    def __init__(self, low: float, high: float, width: float) -> None:
+        self.low, self.width = low, width
+        self.counts = np.zeros(round((high - low) / width), dtype=np.int64)
+
+    def add(self, values: Sequence[float] | np.ndarray) -> None:
+        """Counts values; those that are not finite are left out."""
+        array = np.asarray(values, dtype=np.float64)
+        array = array[np.isfinite(array)]
+        places = ((array - self.low) / self.width).astype(np.int64)
+        np.add.at(self.counts, places.clip(0, len(self.counts) - 1), 1)
+
+    def quantile(self, share: float) -> float:
+        """Returns the value below which this share lies, to half a bin; NaN if there is none."""
+        total = int(self.counts.sum())
+        if total == 0:
+            return float("nan")
+        place = int(np.searchsorted(self.counts.cumsum(), share * total))
+        return self.low + (place + 0.5) * self.width
 
 
 @dataclass
@@ -166,12 +193,10 @@ def run_scenario(
     runs: Mapping[str, str | Path],
     *,
     end: float | None = None,
-    seed: int | None = None,
     output: Path | None = None,
-    look_ahead: float = 200.0,
-    speed_mode: int = OBEYS_ALL,
     gui: bool = False,
-    options: Sequence[str] = (),
+    sumo_options: Sequence[str] = (),
+    **options: Unpack[DriverOptions],
 ) -> ScenarioRun:
     """Runs a scenario in libsumo, or in SUMO's window, until it is over.
 
@@ -185,12 +210,10 @@ def run_scenario(
         runs: vType -> a job's output folder, the id of its MLflow run, or a ready-made policy
             (`cfx://NAME`).
         end: s of simulated time.
-        seed: SUMO's, and that of stochastic policies; None for the scenario's, and 0.
         output: a CSV file with a row for each driven vehicle and step.
-        look_ahead: as in `Driver`.
-        speed_mode: as in `Driver`.
         gui: show SUMO's window, slowly enough to watch.
-        options: more of SUMO's own options.
+        sumo_options: more of SUMO's own options.
+        options: as in `DriverOptions`; the seed is also SUMO's, without one it is the scenario's.
 
     Raises:
         SumoError: SUMO is missing, refuses the scenario or stops; a vType is not in it or never on
@@ -201,8 +224,12 @@ def run_scenario(
     require_sumo()
     with ExitStack() as stack:
         path, actor = _prepared(scenario, end, stack)
-        fleet = Fleet.load(runs, look_ahead=look_ahead, speed_mode=speed_mode, seed=seed or 0)
-        connection = stack.enter_context(started(path, _command(path, seed, gui, options), gui))
+        seed = options.get("seed")
+        options["seed"] = seed or 0
+        fleet = Fleet.load(runs, **options)
+        connection = stack.enter_context(
+            started(path, command_line(path, seed, gui, sumo_options), gui)
+        )
         rows = _Rows.opened(stack, output, fleet) if output is not None else None
         try:
             return _Run(connection, fleet, path, rows, actor, _name(scenario)).go(end)
@@ -305,7 +332,9 @@ def _gui_program() -> str:
     return program
 
 
-def _command(scenario: Path, seed: int | None, gui: bool, options: Sequence[str]) -> list[str]:
+def command_line(
+    scenario: Path, seed: int | None = None, gui: bool = False, options: Sequence[str] = ()
+) -> list[str]:
     """Returns SUMO's command line; the user's own options come last and win."""
     command = ["sumo", "-c", str(scenario)]
     if gui:

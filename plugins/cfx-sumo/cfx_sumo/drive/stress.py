@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,17 +19,19 @@ import numpy as np
 from cfx.core.errors import SumoError
 from cfx.core.files import write_json
 from cfx.core.progress import Task
-from cfx_sumo.drive.run import started
-from cfx_sumo.drive.scenarios import ASSETS, CAR, STEP_S
+from cfx_sumo.drive.run import command_line, started
+from cfx_sumo.drive.scenarios import ASSETS, CAR, STEP_S, Scenario
 from cfx_sumo.installed import require_sumo
 from cfx_sumo.live.driver import OBEYS_ALL
 from cfx_sumo.live.fleet import Fleet
+from cfx_sumo.simulation.network import network
 
 _KIND = "car"
 """The vType that policies drive."""
 
 _LENGTH_M = 4.5
 _ROAD_M, _APART_M, _LANE_MPS = 6000.0, 12.0, 40.0
+_ENDLESS_S = 1e5  # every event ends after a number of steps
 _BEGIN_M = 1500.0  # where cars stand at first, with room behind and ahead
 _SETTLE_S, _LASTS_S = 8.0, 30.0  # before an event, and after it
 
@@ -200,7 +201,7 @@ def _standing_vehicle(rng: np.random.Generator) -> Event:
 
 def _run_events(kind: str, events: list[Event], fleet: Fleet) -> EventResult:
     """Runs events side by side, each on a road of its own."""
-    network, routes = _roads(len(events)), _placed(events)
+    roads = network(len(events), 2, length=_ROAD_M, speed=_LANE_MPS, apart=_APART_M)
     events_at = round(_SETTLE_S / STEP_S)
     steps = events_at + round(_LASTS_S / STEP_S)
     result = EventResult(kind, len(events))
@@ -214,11 +215,10 @@ def _run_events(kind: str, events: list[Event], fleet: Fleet) -> EventResult:
                 result.number = len(headways)
                 result.headway = _spread(headways)
 
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cfx-")))
-        configuration = _written(folder, network, routes)
-        sumo = stack.enter_context(started(configuration, _command(configuration), gui=False))
-        _drive(sumo, fleet, steps, result, act)
+    with tempfile.TemporaryDirectory(prefix="cfx-") as folder:
+        net = Path(folder, "stress.net.xml")
+        net.write_text(roads, encoding="utf-8")
+        _drive(Scenario(kind, _placed(events), net, _ENDLESS_S), fleet, steps, result, act)
     return result
 
 
@@ -290,19 +290,31 @@ def _headways(vehicle: Any, acting: Mapping[int, str]) -> list[float]:
 
 
 def _drive(
+    scenario: Scenario,
+    fleet: Fleet,
+    steps: int,
+    result: EventResult,
+    act: Callable[[Any, int], None],
+) -> None:
+    """Runs a scenario; `act` is given each step, and notes what the driven vehicles do."""
+    with tempfile.TemporaryDirectory(prefix="cfx-") as folder:
+        configuration = scenario.write(Path(folder))
+        with started(configuration, command_line(configuration), gui=False) as sumo:
+            _take_steps(sumo, fleet, steps, result, act)
+
+
+def _take_steps(
     sumo: Any,
     fleet: Fleet,
     steps: int,
     result: EventResult,
-    act: Callable[[Any, int], None] | None = None,
+    act: Callable[[Any, int], None],
 ) -> None:
-    """Runs a simulation and notes what the driven vehicles do."""
     vehicle, hard = sumo.vehicle, set()
     collided: set[str] = set()
     for step in range(steps):
         sumo.simulationStep()
-        if act is not None:
-            act(sumo, step)
+        act(sumo, step)
         fleet.step(sumo)
         collided |= set(sumo.simulation.getCollidingVehiclesIDList())
         for name in fleet.vehicles:
@@ -319,64 +331,6 @@ def _drive(
                     collided.add(name)
     result.braked_hard = len(hard)
     result.collisions = len({name for name in collided if name.startswith(_KIND)})
-
-
-def _command(configuration: Path) -> list[str]:
-    command = ["sumo", "-c", str(configuration), "--collision.action", "warn"]
-    # Contact is a collision; SUMO's own rule takes a gap below minGap for one.
-    command += ["--collision.mingap-factor", "0"]
-    for name in ("--no-step-log", "--duration-log.disable", "--no-warnings"):
-        command += [name, "true"]
-    return command
-
-
-def _written(folder: Path, network: str | Path, routes: str) -> Path:
-    """Writes a scenario; the network is a text, or a file that is there already."""
-    if isinstance(network, str):
-        text, network = network, folder / "stress.net.xml"
-        network.write_text(text, encoding="utf-8")
-    (folder / "stress.rou.xml").write_text(routes, encoding="utf-8")
-    configuration = folder / "stress.sumocfg"
-    configuration.write_text(
-        f'<configuration><input><net-file value="{network}"/>'
-        f'<route-files value="{folder / "stress.rou.xml"}"/></input>'
-        f'<time><step-length value="{STEP_S:g}"/></time>'
-        '<processing><time-to-teleport value="-1"/></processing></configuration>',
-        encoding="utf-8",
-    )
-    return configuration
-
-
-def _roads(number: int) -> str:
-    """Returns a network of parallel roads with two lanes each."""
-    box = f"0,0,{_ROAD_M},{_APART_M * number}"
-    lines = [
-        '<net version="1.20">',
-        f'<location netOffset="0,0" convBoundary="{box}" origBoundary="0,0,1,1"'
-        ' projParameter="!"/>',
-    ]
-    ends = []
-    for i in range(number):
-        y = _APART_M * i
-        lanes = []
-        for lane in range(2):
-            at = y + 3.2 * lane
-            lanes.append(
-                f'<lane id="road{i}_{lane}" index="{lane}" speed="{_LANE_MPS}" length="{_ROAD_M}"'
-                f' shape="0,{at} {_ROAD_M},{at}"/>'
-            )
-        lines.append(
-            f'<edge id="road{i}" from="from{i}" to="to{i}" priority="1">{"".join(lanes)}</edge>'
-        )
-        ends.append(
-            f'<junction id="from{i}" type="dead_end" x="0" y="{y}" incLanes="" intLanes=""'
-            f' shape="0,{y}"/>'
-        )
-        ends.append(
-            f'<junction id="to{i}" type="dead_end" x="{_ROAD_M}" y="{y}"'
-            f' incLanes="road{i}_0 road{i}_1" intLanes="" shape="{_ROAD_M},{y}"/>'
-        )
-    return "\n".join([*lines, *ends, "</net>"])
 
 
 def _placed(events: list[Event]) -> str:
@@ -430,11 +384,8 @@ def _run_town(kind: str, routes: str, end: float, fleet: Fleet) -> EventResult:
     def act(sumo: Any, step: int) -> None:  # noqa: ARG001 - the signature of an act
         seen.update(sumo.simulation.getDepartedIDList())
 
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cfx-")))
-        text = f"<routes>{CAR}{routes}</routes>"
-        configuration = _written(folder, ASSETS / "town.net.xml", text)
-        sumo = stack.enter_context(started(configuration, _command(configuration), gui=False))
-        _drive(sumo, fleet, round(end / STEP_S), result, act)
+    text = f"<routes>{CAR}{routes}</routes>"
+    town = Scenario(kind, text, ASSETS / "town.net.xml", _ENDLESS_S)
+    _drive(town, fleet, round(end / STEP_S), result, act)
     result.number = len(seen)
     return result

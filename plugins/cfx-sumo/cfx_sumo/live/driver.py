@@ -16,7 +16,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import TypedDict, Unpack, cast
 
 import torch
 from torch import Tensor
@@ -58,6 +58,21 @@ _NEAR_M = 0.2
 
 OBEYS_ALL = 31
 """Speed mode with all of SUMO's checks: lights, stops, yielding, its safe gap."""
+
+
+class DriverOptions(TypedDict, total=False):
+    """How vehicles are driven, whoever drives them.
+
+    Attributes:
+        look_ahead: m; a vehicle farther ahead (bumper to bumper) is no leader.
+        speed_mode: SUMO's bit set of `vehicle.setSpeedMode` while a vehicle is driven: 31 obeys
+            lights, stops and junctions and keeps SUMO's safe gap; 0 does none of it.
+        seed: of what a stochastic policy leaves to chance; None: nothing is drawn.
+    """
+
+    look_ahead: float
+    speed_mode: int
+    seed: int | None
 
 
 @dataclass
@@ -216,9 +231,7 @@ class Driver:
         *,
         network: str | None = ALL,
         model: str | None = None,
-        look_ahead: float = 200.0,
-        speed_mode: int = OBEYS_ALL,
-        seed: int | None = 0,
+        **options: Unpack[DriverOptions],
     ) -> Driver:
         """Reads a job's policy.
 
@@ -227,10 +240,7 @@ class Driver:
             network: which of the policy's networks drives: `all`, which drives any driver's
                 vehicle, or the id of a pair, to drive like its driver.
             model: refuse a policy of another driving model than this.
-            look_ahead: m; a vehicle farther ahead is no leader.
-            speed_mode: SUMO's bit set of `vehicle.setSpeedMode` while a vehicle is driven: 31 obeys
-                lights, stops and junctions and keeps SUMO's safe gap; 0 does none of it.
-            seed: of what a stochastic policy leaves to chance; None: nothing is drawn.
+            options: as in `DriverOptions`.
 
         Raises:
             DataError: there is no such policy, it has no such network, or it is one of another
@@ -243,14 +253,7 @@ class Driver:
                 f"{run} was trained for model={name}, not for model={model}; name a run with"
                 f" model={model}"
             )
-        return cls(
-            policy,
-            network=network,
-            look_ahead=look_ahead,
-            speed_mode=speed_mode,
-            source=str(run),
-            seed=seed,
-        )
+        return cls(policy, network=network, source=str(run), **options)
 
     @classmethod
     def constant(
@@ -259,8 +262,7 @@ class Driver:
         parameters: Mapping[str, float] | None = None,
         *,
         dt: float = 0.1,
-        look_ahead: float = 200.0,
-        speed_mode: int = OBEYS_ALL,
+        **options: Unpack[DriverOptions],
     ) -> Driver:
         """Makes a driver with constant parameters: what a policy is compared with.
 
@@ -268,9 +270,7 @@ class Driver:
             model: the driving model.
             parameters: name -> value, SI units; the others at their defaults.
             dt: time step of the simulation, s.
-            look_ahead: m; a vehicle farther ahead is no leader.
-            speed_mode: SUMO's bit set of `vehicle.setSpeedMode` while a vehicle is driven: 31 obeys
-                lights, stops and junctions and keeps SUMO's safe gap; 0 does none of it.
+            options: as in `DriverOptions`.
 
         Raises:
             ParameterError: the model has no such parameter.
@@ -293,13 +293,7 @@ class Driver:
             dt=dt,
             names=(ALL,),
         )
-        return cls(
-            policy,
-            look_ahead=look_ahead,
-            speed_mode=speed_mode,
-            model=model,
-            source="the constant driver",
-        )
+        return cls(policy, model=model, source="the constant driver", **options)
 
     @property
     def vehicles(self) -> tuple[str, ...]:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Unpack
 
 from cfx.core.errors import DataError
 from cfx.policies.placement import ALL
-from cfx_sumo.live.driver import OBEYS_ALL, Driver
+from cfx_sumo.live.driver import Driver, DriverOptions
 from cfx_sumo.live.surroundings import Connection
 
 
@@ -47,25 +48,21 @@ class Fleet:
         runs: Mapping[str, str | Path],
         *,
         network: str = ALL,
-        look_ahead: float = 200.0,
-        speed_mode: int = OBEYS_ALL,
-        seed: int = 0,
+        **options: Unpack[DriverOptions],
     ) -> Fleet:
         """Reads the policy of a run for each vType; types with the same run share a driver.
 
         A run may be followed by `#` and the name of one of its networks, which drives then. Each
-        driver has a seed of its own. The other arguments are those of `Driver.load`.
+        driver has a seed of its own, from `seed` on. The other arguments are those of
+        `Driver.load`.
         """
+        seed = options.get("seed", 0)
         loaded: dict[str | Path, Driver] = {}
         for run in dict.fromkeys(runs.values()):
             folder, chosen = _network_of(run, network)
-            loaded[run] = Driver.load(
-                folder,
-                network=chosen,
-                look_ahead=look_ahead,
-                speed_mode=speed_mode,
-                seed=seed + len(loaded),
-            )
+            own = options.copy()
+            own["seed"] = None if seed is None else seed + len(loaded)
+            loaded[run] = Driver.load(folder, network=chosen, **own)
         return cls({name: loaded[run] for name, run in runs.items()})
 
     @property

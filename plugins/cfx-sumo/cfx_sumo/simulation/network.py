@@ -19,46 +19,51 @@ LANE_SPEED = 130.0
 LEADER, FOLLOWER, LANE = "leader{}", "follower{}", "road{}_0"
 """Names of the vehicles and the lane of road i."""
 
-_APART = 10.0  # m between two roads
-
 Attributes = Mapping[str, float | str]
 
 
-def network(roads: int) -> str:
-    """Returns a network file (`.net.xml`) of parallel roads."""
-    box = f"0,0,{ROAD},{_APART * roads}"
+def network(
+    roads: int,
+    lanes: int = 1,
+    *,
+    length: float = ROAD,
+    speed: float = LANE_SPEED,
+    apart: float = 10.0,
+) -> str:
+    """Returns a network file (`.net.xml`) of parallel roads.
+
+    Args:
+        roads: how many; road i has the edge `roadI`.
+        lanes: of each, 3.2 m wide.
+        length: of each, m.
+        speed: their limit, m/s.
+        apart: from one road's first lane to the next one's, m.
+    """
+    box = f"0,0,{length},{apart * roads}"
     lines = [
         '<net version="1.20">',
         f'<location netOffset="0,0" convBoundary="{box}" origBoundary="0,0,1,1"'
         ' projParameter="!"/>',
     ]
     for i in range(roads):
-        lines += _edge(i)
+        lines.append(f'<edge id="road{i}" from="from{i}" to="to{i}" priority="1">')
+        for lane in range(lanes):
+            at = apart * i + 3.2 * lane
+            lines.append(
+                f'<lane id="road{i}_{lane}" index="{lane}" speed="{speed}" length="{length}"'
+                f' shape="0,{at} {length},{at}"/>'
+            )
+        lines.append("</edge>")
     for i in range(roads):
-        lines += _ends(i)
+        y = apart * i
+        arriving = " ".join(f"road{i}_{lane}" for lane in range(lanes))
+        end = f'type="dead_end" y="{y}" intLanes=""'
+        lines.append(f'<junction id="from{i}" {end} x="0" incLanes="" shape="0,{y}"/>')
+        lines.append(
+            f'<junction id="to{i}" {end} x="{length}" incLanes="{arriving}" shape="{length},{y}"/>'
+        )
     lines.append("</net>")
     return "\n".join(lines)
-
-
-def _edge(i: int) -> list[str]:
-    y = _APART * i
-    return [
-        f'<edge id="road{i}" from="from{i}" to="to{i}" priority="1">'
-        f'<lane id="{LANE.format(i)}" index="0"',
-        f' speed="{LANE_SPEED}" length="{ROAD}" shape="0,{y} {ROAD},{y}"/></edge>',
-    ]
-
-
-def _ends(i: int) -> list[str]:
-    """Returns the junctions at which road i begins and ends."""
-    y = _APART * i
-    return [
-        f'<junction id="from{i}" type="dead_end" x="0" y="{y}" incLanes="" intLanes=""'
-        f' shape="0,{y}"/>',
-        f'<junction id="to{i}" type="dead_end" x="{ROAD}" y="{y}"'
-        f' incLanes="{LANE.format(i)}" intLanes=""',
-        f' shape="{ROAD},{y}"/>',
-    ]
 
 
 class Placed:
