@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -64,7 +65,9 @@ def run(install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     """Returns the application with a job that does what its seed says, in an empty folder."""
     install("jobs-stub", {}, {"jobs_stub.py": JOB})
     monkeypatch.chdir(tmp_path)
-    return lambda *arguments: application.start(arguments, target="jobs_stub:run_job")
+    return lambda *arguments: application.start(
+        arguments, run_job=import_module("jobs_stub").run_job
+    )
 
 
 def outputs(folder: Path) -> list[Path]:
@@ -260,8 +263,8 @@ def test_a_multirun_in_worker_processes_composes_a_plugin_and_reports_failures(
 ) -> None:
     install("mine-data", {"cfx.datasets": {"mine": "mine_data:Mine"}}, {"mine_data.py": PLUGIN})
     script = (
-        "import sys; from cfx.app.application import start;"
-        " sys.exit(start(sys.argv[1:], target='jobs_stub:run_job'))"
+        "import sys; from cfx.app.application import start; from jobs_stub import run_job;"
+        " sys.exit(start(sys.argv[1:], run_job=run_job))"
     )
     arguments = [
         "-m",
@@ -370,9 +373,9 @@ def test_cfx_run_runs_the_same_job_into_a_fresh_folder(
     monkeypatch.setattr(
         HydraConfig.instance(), "cfg", None
     )  # as in a process where Hydra never ran
-    first = application.run(["model=w99", "seed=7"], target="jobs_stub:run_job")
+    first = application.run(["model=w99", "seed=7"], run_job=import_module("jobs_stub").run_job)
     again = application.run(
-        ["model=w99", f"hydra.run.dir={first.folder}"], target="jobs_stub:run_job"
+        ["model=w99", f"hydra.run.dir={first.folder}"], run_job=import_module("jobs_stub").run_job
     )
     assert first.config.model["name"] == "w99"  # type: ignore[attr-defined]  # the stub's result
     assert first.folder.is_relative_to(tmp_path)
@@ -397,7 +400,7 @@ def test_cfx_run_raises_what_the_command_line_would_print(
 ) -> None:
     (tmp_path / "file").write_text("here already")
     with pytest.raises(error, match=message):
-        application.run(overrides, target="jobs_stub:run_job")
+        application.run(overrides, run_job=import_module("jobs_stub").run_job)
     assert cfx.run is application.run
 
 

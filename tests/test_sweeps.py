@@ -12,6 +12,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +78,9 @@ def run(install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     install("sweep-stub", {}, {"sweep_stub.py": JOB})
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-    return lambda *arguments: application.start(arguments, target="sweep_stub:run_job")
+    return lambda *arguments: application.start(
+        arguments, run_job=import_module("sweep_stub").run_job
+    )
 
 
 def ran() -> list[str]:
@@ -394,8 +397,8 @@ def test_every_launcher_ends_what_was_broken_off(
     launcher: str, install: Any, run: Run, processes: list[Any]
 ) -> None:
     script = (
-        "import sys; from cfx.app.application import start;"
-        " sys.exit(start(sys.argv[1:], target='sweep_stub:run_job'))"
+        "import sys; from cfx.app.application import start; from sweep_stub import run_job;"
+        " sys.exit(start(sys.argv[1:], run_job=run_job))"
     )
     command = ["-c", script, "-m", f"seed=range({JOBS})", *LAUNCHERS[launcher]]
     wait = Path(f"wait-{JOBS - 2}")
@@ -427,8 +430,8 @@ def test_a_killed_sweep_of_worker_processes_is_made_up_for(
     run: Run, install, processes: list[Any], killed: str
 ) -> None:
     script = (
-        "import sys; from cfx.app.application import start;"
-        " sys.exit(start(sys.argv[1:], target='sweep_stub:run_job'))"
+        "import sys; from cfx.app.application import start; from sweep_stub import run_job;"
+        " sys.exit(start(sys.argv[1:], run_job=run_job))"
     )
     command = [
         "-c",

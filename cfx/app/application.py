@@ -16,11 +16,10 @@ import sys
 import time
 import traceback
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeGuard, cast
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -47,14 +46,15 @@ from cfx.core.memory import is_out_of_memory
 from cfx.core.plugin_errors import blame
 from cfx.core.signals import raise_if_terminated, signal_behind, terminable
 from cfx.core.storage import is_url
+from cfx.results.config import JobConfig
 
 if TYPE_CHECKING:
     from cfx.app.job import JobResult
 
 log = logging.getLogger(__name__)
 
-JOB = "cfx.app.job:run_job"
-"""`run_job(config: JobConfig, folder: Path) -> JobResult`; imported when a job starts."""
+RunJob = Callable[["JobConfig", Path], "JobResult"]
+"""What runs a job; `cfx.app.job.run.run_job` unless a caller gives another."""
 
 INTERRUPTED, TERMINATED = 130, 143
 """Exit codes after Ctrl-C and after SIGTERM."""
@@ -64,15 +64,15 @@ class JobFunction:
     """The function that Hydra calls for each job; it is pickled into worker processes.
 
     Attributes:
-        target: module and function that runs a job, as `JOB`.
+        run_job: runs a job; None: cfx's own.
         multirun: this start of a multirun.
         process: the process that started it.
         show_traceback: users' mistakes too are shown with their traceback.
         status: how the job ended that ran last.
     """
 
-    def __init__(self, target: str, multirun: str, show_traceback: bool) -> None:
-        self.target = target
+    def __init__(self, run_job: RunJob | None, multirun: str, show_traceback: bool) -> None:
+        self.run_job = run_job
         self.multirun = multirun
         self.process = os.getpid()
         self.show_traceback = show_traceback
@@ -141,7 +141,8 @@ class JobFunction:
                     status = replace(blank, seconds=earlier.seconds, before=True)
                     return _metric(metrics_of(folder)), status
                 (folder / STATUS).unlink(missing_ok=True)  # what it says is no longer so
-            result = _call(self.target, values, folder)
+            with _blaming():
+                result = (self.run_job or _own_job())(JobConfig.of(values), folder)
         except (Exception, SystemExit) as error:
             status = self._failed(error, blank)
             return float("nan"), replace(status, seconds=time.monotonic() - began)
@@ -164,12 +165,12 @@ class JobFunction:
         return replace(blank, code=1, message=message, detail=detail)
 
 
-def start(arguments: Sequence[str], *, target: str = JOB) -> int:
+def start(arguments: Sequence[str], *, run_job: RunJob | None = None) -> int:
     """Runs the Hydra application and returns its exit code; prints each message once."""
     _refuse_passwords(arguments)
     _refuse_interpolated_folder()
     _refuse_urls_as_folders(arguments)
-    job = JobFunction(target, uuid.uuid4().hex, wants_traceback(arguments))
+    job = JobFunction(run_job, uuid.uuid4().hex, wants_traceback(arguments))
     SweepFolder.take()
     code = _run_hydra(job, arguments)
     sweep = SweepFolder.take()
@@ -257,7 +258,7 @@ def _call_hydra(job: JobFunction, arguments: Sequence[str]) -> None:
         application(job)()
 
 
-def run(overrides: Sequence[str] = (), *, target: str = JOB) -> JobResult:
+def run(overrides: Sequence[str] = (), *, run_job: RunJob | None = None) -> JobResult:
     """Runs the job that `python -m cfx OVERRIDES` runs.
 
     It runs in this process, and writes into a new output folder.
@@ -279,8 +280,8 @@ def run(overrides: Sequence[str] = (), *, target: str = JOB) -> JobResult:
         if is_user_error(error) and not isinstance(error, CfxError):
             raise ConfigError(explain(error, overrides)) from None
         raise
-    with _log_file(folder / "cfx.log"):
-        return cast("JobResult", _call(target, values, folder))
+    with _log_file(folder / "cfx.log"), _blaming():
+        return (run_job or _own_job())(JobConfig.of(values), folder)
 
 
 def wants_traceback(arguments: Sequence[str]) -> bool:
@@ -294,14 +295,21 @@ def wants_traceback(arguments: Sequence[str]) -> bool:
     return False
 
 
-def _call(target: str, values: Any, folder: Path) -> Any:
-    from cfx.results.config import JobConfig
+def _own_job() -> RunJob:
+    from cfx.app.job.run import run_job
 
-    job_config = JobConfig.of(values)
-    module, _, function = target.partition(":")
-    run_it = getattr(import_module(module), function)
+    return run_job
+
+
+@contextlib.contextmanager
+def _blaming() -> Iterator[None]:
+    """Attributes what a plugin raises in the block to its distribution.
+
+    Raises:
+        CfxError: with the plugin's distribution, or because memory ran out.
+    """
     try:
-        return run_it(job_config, folder)
+        yield
     except CfxError:
         raise
     except (Exception, SystemExit) as error:  # a plugin may raise anything

@@ -22,8 +22,6 @@ from torch import Tensor
 from cfx.calibration.cache import Arrays, Cache, first_fit
 from cfx.calibration.losses import SegmentLosses
 from cfx.calibration.objectives.base import Objective
-from cfx.calibration.objectives.rmse import SpeedRmse
-from cfx.calibration.optimizers.base import Optimizer
 from cfx.calibration.shards import (
     CalibrationShard,
     DriverShard,
@@ -39,7 +37,6 @@ from cfx.core.engine.local import LocalEngine
 from cfx.core.parameters import ParameterSpace
 from cfx.core.progress import Task
 from cfx.data.pairs import Pair, PairBatch, PairSet
-from cfx.simulation.base import Stepper
 
 _GROUP = 1024
 """Problems solved together: enough to fill the batch, few enough that an interruption loses
@@ -125,44 +122,26 @@ class Calibrator:
     """Calibrates one model with one optimizer.
 
     Args:
-        simulator: the model and its time step.
-        optimizer: solves the problems.
-        objective: what is minimised; RMSE of speed unless given.
-        seed: the same seed gives the same parameters.
+        solver: model, optimizer, objective and prior.
         cache: where results are kept.
-        memory: bound for one chunk, bytes.
         progress: makes a progress display, given a description and a total.
         reported: objectives by name whose losses `losses` reports beside the minimised one.
-        prior: weight of the prior on driver-specific and pooled parameters
-            (`cfx.calibration.prior`); 0: none. Labels have none: ties go to the driver's own set.
         engine: solves the problems, shard by shard; this machine's cores unless given.
     """
 
     def __init__(
         self,
-        simulator: Stepper,
-        optimizer: Optimizer,
+        solver: Solver,
         *,
-        seed: int,
         cache: Cache,
-        memory: int,
-        progress: Callable[[str, int], Task],
-        objective: Objective | None = None,
+        progress: Callable[[str, int], Task] = Task,
         reported: Mapping[str, Objective] | None = None,
-        prior: float = 0.0,
         engine: Engine | None = None,
     ) -> None:
-        self.simulator = simulator
-        self.optimizer = optimizer
-        self.objective: Objective = SpeedRmse()
-        if objective is not None:
-            self.objective = objective
-        self.seed = seed
+        self.solver = solver
         self.cache = cache
-        self.memory = memory
         self.progress = progress
         self.reported = reported or {}
-        self.prior = prior
         self.engine: Engine = LocalEngine()
         if engine is not None:
             self.engine = engine
@@ -170,12 +149,12 @@ class Calibrator:
     @property
     def space(self) -> ParameterSpace:
         """The model's parameter space."""
-        return self.simulator.model.space
+        return self.solver.space
 
     def tie_tolerance(self, settings: WindowSettings) -> float:
         """Returns which losses of a window count as equal, in the objective's unit."""
         if settings.tie_tolerance is None:
-            return self.objective.tie_tolerance
+            return self.solver.objective.tie_tolerance
         return settings.tie_tolerance
 
     def fixed(self, pairs: PairSet, batch: PairBatch, last: Tensor) -> Tensor:
@@ -342,7 +321,9 @@ class Calibrator:
     def _segments(self, batch: PairBatch, pair: Tensor, last: Tensor) -> SegmentLosses:
         """Returns the losses of pairs `(S,)` from their frame 0 to a last one `(S,)`."""
         first = torch.zeros_like(pair)
-        return SegmentLosses.of_segments(self.simulator, self.objective, batch, pair, first, last)
+        return SegmentLosses.of_segments(
+            self.solver.simulator, self.solver.objective, batch, pair, first, last
+        )
 
     def _where_it_is_fast(self, batch: PairBatch) -> PairBatch:
         """Returns the pairs on the CPU if losses come from a compiled kernel there.
@@ -367,9 +348,9 @@ class Calibrator:
 
     @property
     def _prior_key(self) -> dict[str, float]:
-        if self.prior == 0:
+        if self.solver.prior == 0:
             return {}
-        return {"prior": self.prior}
+        return {"prior": self.solver.prior}
 
     def _cached(
         self,
@@ -393,16 +374,18 @@ class Calibrator:
         """
         together = _GROUP
         enough: float = _GROUP
-        if self.optimizer.in_parts or (self.optimizer.in_threads and self.engine.distributes):
+        if self.solver.optimizer.in_parts or (
+            self.solver.optimizer.in_threads and self.engine.distributes
+        ):
             together = min(part, _GROUP)
         if self.engine.distributes:
             enough = math.inf
-        work = _Work(self.cache, keys, problems, self.optimizer.evaluations(), together)
+        work = _Work(self.cache, keys, problems, self.solver.optimizer.evaluations(), together)
         wanted = work.shares(self._key(what, "", **scope))
-        optimizer = type(self.optimizer).__name__
-        objective = type(self.objective).__name__
-        if self.objective.unit:
-            objective = f"{objective} in {self.objective.unit}"
+        optimizer = type(self.solver.optimizer).__name__
+        objective = type(self.solver.objective).__name__
+        if self.solver.objective.unit:
+            objective = f"{objective} in {self.solver.objective.unit}"
         title = f"{what} ({optimizer}, {objective}, {work.missing_problems} problems)"
         with self.progress(title, work.missing_problems * work.evaluations) as task:
             while wanted:
@@ -424,15 +407,8 @@ class Calibrator:
         Args:
             steps: of all problems of the group, for one candidate.
         """
-        simulator = self.simulator.for_work(steps * self.optimizer.evaluations())
+        simulator = self.solver.simulator.for_work(steps * self.solver.optimizer.evaluations())
         return replace(self.solver, simulator=simulator)
-
-    @cached_property
-    def solver(self) -> Solver:
-        """What all problems have in common."""
-        return Solver(
-            self.simulator, self.optimizer, self.objective, self.seed, self.memory, self.prior
-        )
 
     @cached_property
     def _scope(self) -> dict[str, Any]:

@@ -61,7 +61,7 @@ def slices(
     for column in range(count):
         moved[:, column, :, column] = places
     candidates = torch.cat([best[:, None], moved.reshape(pairs, count * PLACES, count)], dim=1)
-    losses = losses_of(calibrator, calibrator.objective, batch, last, candidates)
+    losses = losses_of(calibrator, calibrator.solver.objective, batch, last, candidates)
     values = torch.diagonal(space.from_unit(moved), dim1=1, dim2=3)  # (P, G, n)
     per_pair = count * PLACES
     return pd.DataFrame(
@@ -104,10 +104,10 @@ def losses_of(
     for own in torch.split(torch.arange(len(batch), device=candidates.device), _PAIRS_AT_ONCE):
         first, end = torch.zeros_like(own), last.to(own.device)[own]
         segments = SegmentLosses.of_segments(
-            calibrator.simulator, objective, batch, own, first, end
+            calibrator.solver.simulator, objective, batch, own, first, end
         )
         per_pair = segments.bytes_per_candidate * candidates.shape[1]
-        size = max(1, calibrator.memory // max(1, per_pair))
+        size = max(1, calibrator.solver.memory // max(1, per_pair))
         for some in torch.split(torch.arange(len(own), device=own.device), size):
             parts.append(segments.take(some)(candidates[own[some]]))
         scratch.release()

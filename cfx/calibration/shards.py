@@ -9,7 +9,7 @@ Shapes: P pairs of a shard, T frames of the longest, W windows, K groups, n tune
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -18,6 +18,7 @@ from torch import Tensor
 from cfx.calibration.cache import Arrays
 from cfx.calibration.losses import FullTrajectories, PooledLosses, SegmentLosses
 from cfx.calibration.objectives.base import Objective
+from cfx.calibration.objectives.rmse import SpeedRmse
 from cfx.calibration.optimizers.base import Optimizer, Solution
 from cfx.calibration.prior import Prior, squashed
 from cfx.core import registry
@@ -46,17 +47,18 @@ class Solver:
     Attributes:
         simulator: the model and its time step.
         optimizer: solves the problems.
-        objective: what is minimised.
         seed: the same seed gives the same parameters.
+        objective: what is minimised.
         memory: bound for one chunk, bytes.
-        prior: weight of the prior (`cfx.calibration.prior`); 0: none.
+        prior: weight of the prior on driver-specific and pooled parameters
+            (`cfx.calibration.prior`); 0: none. Labels have none: ties go to the driver's own set.
     """
 
     simulator: Stepper
     optimizer: Optimizer
-    objective: Objective
     seed: int
-    memory: int
+    objective: Objective = field(default_factory=SpeedRmse)
+    memory: int = 1 << 30
     prior: float = 0.0
 
     @property

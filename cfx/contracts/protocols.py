@@ -18,9 +18,9 @@ import torch
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.optimizers.random import RandomSearch
+from cfx.calibration.shards import Solver
 from cfx.calibration.windows import WindowSettings
 from cfx.contracts.contract import NotApplicable, contract_of
-from cfx.core.progress import Task
 from cfx.data.pairs import Pair, PairBatch, PairSet
 from cfx.data.style import StyleSettings, measure_style
 from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
@@ -59,22 +59,16 @@ def context(
         pairs=pairs,
         batch=batch,
         style=measure_style(pairs, StyleSettings()),
-        simulator=simulator,
         model_node={"name": "krauss"},
         policy_node={"name": "gru"},
         calibrator=Calibrator(
-            simulator,
-            RandomSearch(samples=512),
-            seed=seed,
+            Solver(simulator, RandomSearch(samples=512), seed=seed, memory=1 << 28),
             cache=Cache(None),
-            memory=1 << 28,
-            progress=Task,
         ),
         policy=policy or GruPolicy(hidden_size=4),
         learner=learner or ImitationLearner(epochs=3, learning_rate=0.02),
         windows=WindowSettings(),
         split=0.8,
-        seed=seed,
     )
 
 

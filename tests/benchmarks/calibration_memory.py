@@ -18,9 +18,9 @@ import torch
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.optimizers.random import RandomSearch
+from cfx.calibration.shards import Solver
 from cfx.calibration.windows import Split, Windows, WindowSettings
 from cfx.core import registry
-from cfx.core.progress import Task
 from cfx.core.threads import limit_cores
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.tidy import TidyDataset
@@ -50,12 +50,8 @@ def drivers(copies: int) -> PairSet:
 def calibrate(what: str, model: DrivingModel, pairs: PairSet, batch: PairBatch) -> None:
     """Runs one calibration, without a cache."""
     tool = Calibrator(
-        MemoryStepper(model, batch.dt),
-        RandomSearch(),
-        seed=0,
+        Solver(MemoryStepper(model, batch.dt), RandomSearch(), seed=0, memory=1 << 30),
         cache=Cache(None),
-        memory=1 << 30,
-        progress=Task,
     )
     settings = WindowSettings()
     split = Split.of(pairs, settings, 0.8)

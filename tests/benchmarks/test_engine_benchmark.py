@@ -14,11 +14,11 @@ import torch
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.optimizers.random import RandomSearch
+from cfx.calibration.shards import Solver
 from cfx.calibration.windows import Windows, WindowSettings
 from cfx.core import threads
 from cfx.core.engine.base import Engine
 from cfx.core.engine.local import LocalEngine
-from cfx.core.progress import Task
 from cfx.data.pairs import PairBatch
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import MemoryStepper
@@ -66,12 +66,8 @@ def test_efficiency_of_two_workers(benchmark, engine: Engine) -> None:
 
     def seconds(where: Engine) -> float:
         calibrator = Calibrator(
-            MemoryStepper(model, 0.1),
-            RandomSearch(samples=8192),
-            seed=0,
+            Solver(MemoryStepper(model, 0.1), RandomSearch(samples=8192), seed=0, memory=1 << 28),
             cache=Cache(None),
-            memory=1 << 28,
-            progress=Task,
             engine=where,
         )
         began = time.perf_counter()

@@ -25,6 +25,7 @@ from pathlib import Path
 import torch
 from cfx.calibration import calibrator as module
 from cfx.calibration.cache import Cache
+from cfx.calibration.shards import Solver
 from cfx.models.krauss import Krauss
 from cfx.calibration.optimizers.random import RandomSearch
 from cfx.data.pairs import PairBatch
@@ -50,8 +51,8 @@ class Advanced(Task):
 truth = torch.linspace(1, 3, {PAIRS}, dtype=torch.float64)[:, None].repeat(1, 2) * 0.4
 pairs = wavy_pairs(Krauss(), truth)
 tool = module.Calibrator(
-    MemoryStepper(Krauss(), 0.1), Logged(samples=16), seed=0, cache=Cache(here / "cache"),
-    memory=1 << 28, progress=Advanced
+    Solver(MemoryStepper(Krauss(), 0.1), Logged(samples=16), seed=0),
+    cache=Cache(here / "cache"), progress=Advanced
 )
 (here / f"ready-{{os.getpid()}}").touch()
 while not (here / "go").exists():

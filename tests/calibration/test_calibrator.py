@@ -22,12 +22,11 @@ from cfx.calibration.optimizers.base import CandidateLosses, Optimizer
 from cfx.calibration.optimizers.botorch import BotorchOptimizer
 from cfx.calibration.optimizers.gradient import GradientSearch
 from cfx.calibration.optimizers.random import RandomSearch
-from cfx.calibration.shards import CalibrationShard
+from cfx.calibration.shards import CalibrationShard, Solver
 from cfx.calibration.windows import Windows, WindowSettings
 from cfx.core import threads
 from cfx.core.engine.base import Engine, Report
 from cfx.core.errors import OutputError
-from cfx.core.progress import Task
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.models.base import DrivingModel
 from cfx.models.krauss import Krauss
@@ -68,10 +67,14 @@ def calibrator(
     optimizer: RandomSearch,
     folder: Path | None = None,
     model: DrivingModel | None = None,
-    **changes: object,
+    **changes: Any,
 ) -> Calibrator:
-    arguments = {"seed": 0, "cache": Cache(folder), "memory": 1 << 28, "progress": Task} | changes
-    return Calibrator(MemoryStepper(model or Krauss(), 0.1), optimizer, **arguments)  # type: ignore[arg-type]  # the test's own mix
+    of_solver: dict[str, Any] = {"seed": 0, "memory": 1 << 28}
+    for name in ("seed", "memory", "objective", "prior"):
+        if name in changes:
+            of_solver[name] = changes.pop(name)
+    solver = Solver(MemoryStepper(model or Krauss(), 0.1), optimizer, **of_solver)
+    return Calibrator(solver, cache=Cache(folder), **changes)
 
 
 def everything(tool: Calibrator, pairs: PairSet) -> tuple[Tensor, Tensor]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,7 +12,7 @@ from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.identifiability import PLACES, slices, training_errors
 from cfx.calibration.optimizers.random import RandomSearch
-from cfx.core.progress import Task
+from cfx.calibration.shards import Solver
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.models.krauss import Krauss
 from cfx.simulation.rollout import MemoryStepper
@@ -27,9 +29,7 @@ def pairs() -> PairSet:
 @pytest.fixture
 def calibrator() -> Calibrator:
     stepper = MemoryStepper(Krauss(), 0.1)
-    return Calibrator(
-        stepper, RandomSearch(), seed=0, cache=Cache(None), memory=1 << 28, progress=Task
-    )
+    return Calibrator(Solver(stepper, RandomSearch(), seed=0, memory=1 << 28), cache=Cache(None))
 
 
 def test_a_slice_is_lowest_at_the_true_parameters(calibrator: Calibrator, pairs: PairSet) -> None:
@@ -76,6 +76,6 @@ def test_chunks_change_nothing(calibrator: Calibrator, pairs: PairSet) -> None:
     best = TRUE * 1.1
     ids = [pair.pair_id for pair in pairs]
     whole = slices(calibrator, batch, batch.lengths - 1, best, ids)
-    calibrator.memory = 1
+    calibrator.solver = replace(calibrator.solver, memory=1)
     parts = slices(calibrator, batch, batch.lengths - 1, best, ids)
     np.testing.assert_allclose(parts["loss"], whole["loss"], rtol=1e-12)

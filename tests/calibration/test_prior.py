@@ -19,8 +19,8 @@ from cfx.calibration.optimizers.botorch import BotorchOptimizer
 from cfx.calibration.optimizers.gradient import GradientSearch
 from cfx.calibration.optimizers.random import RandomSearch
 from cfx.calibration.prior import Prior, prior_weight, squashed
+from cfx.calibration.shards import Solver
 from cfx.core.parameters import Parameter, ParameterSpace
-from cfx.core.progress import Task
 from cfx.data.pairs import PairBatch
 from cfx.models.base import Follower, Leader
 from cfx.models.idm import IDM
@@ -35,13 +35,14 @@ BATCH = PairBatch.of(PAIRS)
 
 def found(prior: float, folder: Path | None = None) -> torch.Tensor:
     calibrator = Calibrator(
-        MemoryStepper(MODEL, 0.1),
-        GradientSearch(samples=2048),
-        seed=0,
+        Solver(
+            MemoryStepper(MODEL, 0.1),
+            GradientSearch(samples=2048),
+            seed=0,
+            memory=1 << 28,
+            prior=prior,
+        ),
         cache=Cache(folder),
-        memory=1 << 28,
-        progress=Task,
-        prior=prior,
     )
     return calibrator.fixed(PAIRS, BATCH, BATCH.lengths - 1)
 
@@ -102,13 +103,10 @@ class Indifferent(IDM):
 def test_what_does_not_matter_returns_to_its_default(optimizer: Optimizer) -> None:
     model = Indifferent()
     calibrator = Calibrator(
-        MemoryStepper(model, 0.1),
-        optimizer,
-        seed=0,
+        Solver(
+            MemoryStepper(model, 0.1), optimizer, seed=0, memory=1 << 28, prior=prior_weight("weak")
+        ),
         cache=Cache(None),
-        memory=1 << 28,
-        progress=Task,
-        prior=prior_weight("weak"),
     )
     last = BATCH.lengths - 1
     own = calibrator.fixed(PAIRS, BATCH, last)

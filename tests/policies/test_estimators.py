@@ -14,10 +14,10 @@ from torch import Tensor
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.optimizers.gradient import GradientSearch
+from cfx.calibration.shards import Solver
 from cfx.calibration.windows import WindowSettings
 from cfx.contracts import PolicyContract
 from cfx.core.errors import ConfigError
-from cfx.core.progress import Task
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
 from cfx.evaluation.closed_loop import simulate_closed_loop
 from cfx.evaluation.forecast_paths import Origins, simulate_from_origins
@@ -200,12 +200,8 @@ def test_recalibration_is_the_calibration_of_the_latest_history() -> None:
         cut.append(type(pair)(**{**vars(pair), **signals}))
     latest = PairSet(tuple(cut), "the latest history")
     calibrator = Calibrator(
-        MemoryStepper(Krauss(), 0.1),
-        GradientSearch(samples=512),
-        seed=0,
+        Solver(MemoryStepper(Krauss(), 0.1), GradientSearch(samples=512), seed=0, memory=1 << 28),
         cache=Cache(None),
-        memory=1 << 28,
-        progress=Task,
     )
     found = calibrator.fixed(latest, PairBatch.of(latest), torch.full((3,), kept - 1))
     torch.testing.assert_close(loop.parameters[:, -1], found, atol=1e-3, rtol=1e-3)

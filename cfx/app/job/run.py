@@ -1,12 +1,9 @@
-"""A job from its start: what it is, its pairs, then `cfx.app.job.steps`.
-
-PyTorch, Lightning and MLflow take seconds to import. So a job first says what it does and reads its
-recordings, which needs none of them: a wrong path or column is answered at once.
-"""
+"""One job, from its recordings to its results."""
 
 from __future__ import annotations
 
 import logging
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -34,17 +31,53 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
     Raises:
         CfxError: the user's mistake, in one sentence; nothing half-written is left.
     """
+    chosen = (config.model, config.policy, config.learner, config.protocol, config.data)
     log.info(
         "Model %s, policy %s, learner %s, protocol %s, data %s: starting",
-        *[node.get("name") for node in _chosen(config)],
+        *[node.get("name") for node in chosen],
     )
     # An engine that is not installed is named at once too; it connects to nothing yet.
     registry.create("engine", config.engine)
     pairs = load_pairs(cast("Dataset", registry.create("dataset", config.data)))
-    from cfx.app.job.steps import take_steps
 
-    return take_steps(config, folder, pairs, console)
+    # These take seconds to import: a wrong path or column has been answered by now.
+    from rich.console import Console
 
+    from cfx.app.job import steps
+    from cfx.app.job.console import report
+    from cfx.app.job.output import Output
+    from cfx.app.job.upload import Upload
+    from cfx.results.tracker import Tracker
 
-def _chosen(config: JobConfig) -> list[dict[str, object]]:
-    return [config.model, config.policy, config.learner, config.protocol, config.data]
+    data = config.data
+    config, parts = steps.prepare(config)
+    output = Output.make(folder)
+    output.begin(config)
+    upload = Upload.of(config.output.url, folder)
+    with Tracker.open(config, folder) as tracker:
+        if config.data != data:  # the protocol has determined other data
+            pairs = load_pairs(parts.dataset)
+        pairs, style = steps.select_pairs(pairs, config)
+        if parts.demo is not None:
+            parts.demo.check(pairs)
+        tracker.set_tags(steps.tags_of(pairs))
+        context = steps.compose(config, parts, pairs, style)
+        with closing(context.simulator), closing(parts.engine):
+            # It splits the pairs, calibrates, has the learner train, and evaluates.
+            result = parts.protocol.run(context)
+            findings = steps.found(parts, context, result)
+        job_result, tables = steps.keep(config, parts, output, findings, tracker)
+        if upload is not None:
+            upload.finish()
+            tracker.set_tags({"cfx.output_url": upload.url})
+    report(
+        job_result,
+        findings,
+        tables,
+        console or Console(),
+        tracker,
+        has_constant_baseline=parts.model.has_constant_baseline,
+        adapts=parts.policy.adapts,
+        copied_to=None if upload is None else upload.url,
+    )
+    return job_result

@@ -1,38 +1,33 @@
-"""The steps of one job, once its pairs are there."""
+"""The steps of one job, in the order in which `run_job` calls them."""
 
 from __future__ import annotations
 
 import logging
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
-from rich.console import Console
 
 from cfx.app.job import output as files
 from cfx.app.job.calibration_view import calibration_view
-from cfx.app.job.console import report
 from cfx.app.job.description import described
 from cfx.app.job.output import Output
 from cfx.app.job.parts import Parts, choose_device, complete, make_protocol, reported_objectives
 from cfx.app.job.results import JobResult
-from cfx.app.job.upload import Upload
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.flatness import flat_for
 from cfx.calibration.prior import prior_weight
 from cfx.calibration.settings import WindowSettings
+from cfx.calibration.shards import Solver
 from cfx.core import registry
 from cfx.core.errors import PluginError
 from cfx.core.memory import require_memory
-from cfx.core.progress import Task
 from cfx.core.threads import limit_cores, set_threads
-from cfx.data.base import load_pairs
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.style import StyleResult, measure_style, select_cluster
-from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
+from cfx.evaluation.protocols.base import ProtocolContext, ProtocolResult
 from cfx.learners.curves import best_losses
 from cfx.policies import checkpoint
 from cfx.results.config import JobConfig
@@ -47,89 +42,31 @@ _WINDOW_S = 0.5
 """Length of a window in the paper, and with default settings at NGSIM's time step of 0.1 s."""
 
 
-def take_steps(
-    config: JobConfig,
-    folder: Path,
-    loaded: PairSet,
-    console: Console | None = None,
-) -> JobResult:
-    """Runs one job and writes its results into `folder`.
+def tags_of(pairs: PairSet) -> dict[str, str]:
+    """Returns what MLflow's run says of the pairs."""
+    return {
+        "dataset.fingerprint": pairs.fingerprint,
+        "dataset.source": pairs.source,
+        "dataset.pairs": str(len(pairs)),
+    }
 
-    Args:
-        config: the validated configuration.
-        folder: the job's output folder; made if it is not there.
-        loaded: the pairs of the configuration's dataset.
-        console: where the table goes; stdout unless given.
+
+def prepare(config: JobConfig) -> tuple[JobConfig, Parts]:
+    """Makes the components, and completes the configuration by what the protocol determines.
 
     Raises:
-        CfxError: the user's mistake, in one sentence; nothing half-written is left.
+        CfxError: a setting is wrong, or what a component needs is not there.
     """
-    from cfx.results.tracker import Tracker
-
-    console = console or Console()
-    data = config.data
-    device = choose_device(config.device)
+    choose_device(config.device)  # one that is not there is named before any work begins
     limit_cores(config.cores)
     if config.threads is not None:
         set_threads(config.threads)
     protocol = make_protocol(config)
     config = complete(config, protocol)
-    parts = Parts.of(config, protocol)
-    output = Output.make(folder)
-    output.begin(config)
-    upload = None
-    if config.output.url is not None:
-        upload = Upload(config.output.url, folder)
-        upload.begin()
-    with Tracker.open(config, folder) as tracker:
-        if config.data != data:  # the protocol has determined other data
-            loaded = load_pairs(parts.dataset)
-        pairs, style = _select_pairs(loaded, config)
-        if parts.demo is not None:
-            parts.demo.check(pairs)
-        tracker.set_tags(
-            {
-                "dataset.fingerprint": pairs.fingerprint,
-                "dataset.source": pairs.source,
-                "dataset.pairs": str(len(pairs)),
-            }
-        )
-        context = _context(config, parts, pairs, style, device)
-        with closing(context.simulator), closing(parts.engine):
-            protocol_result = _run_protocol(parts.protocol, context)
-            if not parts.policy.adapts:
-                shown = protocol_result.evaluation.constant_methods()
-                protocol_result = replace(protocol_result, evaluation=shown)
-            view = calibration_view(context, protocol_result.evaluation)
-        if view is not None:
-            evaluation = protocol_result.evaluation.with_slices(view.slices)
-            protocol_result = replace(protocol_result, evaluation=evaluation)
-        findings = Findings(
-            pairs,
-            style,
-            protocol_result,
-            slices=None if view is None else view.slices,
-            fits=None if view is None else view.fits,
-        )
-        result, tables = _keep(config, parts, output, findings, tracker)
-        if upload is not None:
-            upload.finish()
-            tracker.set_tags({"cfx.output_url": upload.url})
-            log.info("The job's folder was copied to %s", upload.url)
-    report(
-        result,
-        findings,
-        tables,
-        console,
-        tracker,
-        has_constant_baseline=parts.model.has_constant_baseline,
-        adapts=parts.policy.adapts,
-        copied_to=None if upload is None else upload.url,
-    )
-    return result
+    return config, Parts.of(config, protocol)
 
 
-def _select_pairs(pairs: PairSet, config: JobConfig) -> tuple[PairSet, StyleResult]:
+def select_pairs(pairs: PairSet, config: JobConfig) -> tuple[PairSet, StyleResult]:
     """Returns the pairs of the wanted driving style."""
     style = measure_style(pairs, config.style)
     pairs = select_cluster(pairs, style, config.style.cluster)
@@ -154,14 +91,12 @@ def _check_window(length: int, dt: float) -> None:
         )
 
 
-def _context(
-    config: JobConfig, parts: Parts, pairs: PairSet, style: StyleResult, device: torch.device
-) -> ProtocolContext:
+def compose(config: JobConfig, parts: Parts, pairs: PairSet, style: StyleResult) -> ProtocolContext:
     """Returns what the protocol works with."""
     bound = parts.simulator.settings.memory_mb * 2**20
     require_memory(bound, f"simulator.memory_mb={parts.simulator.settings.memory_mb}")
+    device = choose_device(config.device)
     batch = PairBatch.of(pairs, dtype=getattr(torch, config.dtype), device=device)
-    stepper = parts.simulator.stepper(parts.model, batch.dt)
     cache_folder: Path | str | None = None
     workspace = None
     if config.cache.enabled:
@@ -171,23 +106,24 @@ def _context(
         if isinstance(cache_folder, Path):
             cache_folder = cache_folder.expanduser()
             workspace = cache_folder / "training"
-    calibrator = Calibrator(
-        stepper,
+    solver = Solver(
+        parts.simulator.stepper(parts.model, batch.dt),
         parts.optimizer,
-        seed=config.seed,
-        cache=Cache(cache_folder),
-        memory=bound,
-        progress=Task,
+        config.seed,
         objective=parts.objective,
-        reported=reported_objectives(config, parts.objective),
+        memory=bound,
         prior=prior_weight(config.calibration.prior),
+    )
+    calibrator = Calibrator(
+        solver,
+        cache=Cache(cache_folder),
+        reported=reported_objectives(config, parts.objective),
         engine=parts.engine,
     )
     return ProtocolContext(
         pairs=pairs,
         batch=batch,
         style=style,
-        simulator=stepper,
         model_node=config.model,
         policy_node=config.policy,
         calibrator=calibrator,
@@ -195,23 +131,33 @@ def _context(
         learner=parts.learner,
         windows=config.windows,
         split=config.split,
-        seed=config.seed,
         workspace=workspace,
         metrics=parts.metrics,
     )
 
 
-def _run_protocol(protocol: Protocol, context: ProtocolContext) -> ProtocolResult:
-    result: object = protocol.run(context)
+def found(parts: Parts, context: ProtocolContext, result: object) -> Findings:
+    """Returns what a protocol has delivered, with a view of the calibration.
+
+    Raises:
+        PluginError: it is no `ProtocolResult`.
+    """
     if not isinstance(result, ProtocolResult):
         raise PluginError(
-            f"{registry.origin(protocol)}: run must return a cfx.ProtocolResult,"
+            f"{registry.origin(parts.protocol)}: run must return a cfx.ProtocolResult,"
             f" but returned a {type(result).__name__}"
         )
-    return result
+    evaluation = result.evaluation
+    if not parts.policy.adapts:
+        evaluation = evaluation.constant_methods()
+    view = calibration_view(context, evaluation)
+    if view is None:
+        return Findings(context.pairs, context.style, replace(result, evaluation=evaluation))
+    result = replace(result, evaluation=evaluation.with_slices(view.slices))
+    return Findings(context.pairs, context.style, result, slices=view.slices, fits=view.fits)
 
 
-def _keep(
+def keep(
     config: JobConfig, parts: Parts, output: Output, findings: Findings, tracker: Tracker
 ) -> tuple[JobResult, list[WrittenTable]]:
     """Writes everything into the folder, then into MLflow."""

@@ -37,6 +37,19 @@ class Upload:
         self._folder = folder
         self._remote = RemoteFolder(self.url)
 
+    @classmethod
+    def of(cls, url: str | None, folder: Path) -> Upload | None:
+        """Returns the copy that has begun; None without a URL.
+
+        Raises:
+            CfxError: nobody knows such URLs, or the store cannot be read or written.
+        """
+        if url is None:
+            return None
+        upload = cls(url, folder)
+        upload.begin()
+        return upload
+
     def begin(self) -> None:
         """Copies the configuration, so that a store that cannot be written is known at once.
 
@@ -62,6 +75,7 @@ class Upload:
         """
         try:
             self._copy()
+            log.info("The job's folder was copied to %s", self.url)
         except OSError as error:
             raise OutputError(
                 f"the job's results lie in {self._folder}, but cannot be copied to"

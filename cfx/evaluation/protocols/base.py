@@ -50,12 +50,10 @@ class ProtocolContext:
     Attributes:
         pairs, batch: the trajectories, as objects and as tensors on the job's device.
         style: score and cluster of each driver.
-        simulator: the driving model and its time step.
         model_node, policy_node: config nodes, kept with the trained policy.
         calibrator, policy, learner: the components.
         windows: how trajectories are cut.
         split: share of each pair's windows for training.
-        seed: for everything random.
         metrics: what is measured; None: cfx's own metrics.
         workspace: a folder where interrupted training finds what it needs to go on; None: training
             begins again.
@@ -64,7 +62,6 @@ class ProtocolContext:
     pairs: PairSet
     batch: PairBatch
     style: StyleResult
-    simulator: Stepper
     model_node: Mapping[str, Any]
     policy_node: Mapping[str, Any]
     calibrator: Calibrator
@@ -72,9 +69,18 @@ class ProtocolContext:
     learner: Learner
     windows: WindowSettings
     split: float
-    seed: int
     workspace: Path | None = None
     metrics: MetricSet | None = None
+
+    @property
+    def simulator(self) -> Stepper:
+        """The driving model and its time step."""
+        return self.calibrator.solver.simulator
+
+    @property
+    def seed(self) -> int:
+        """For everything random."""
+        return self.calibrator.solver.seed
 
     @property
     def space(self) -> ParameterSpace:
@@ -84,7 +90,7 @@ class ProtocolContext:
     @property
     def objective(self) -> Objective:
         """What calibration minimises and closed-loop training back-propagates."""
-        return self.calibrator.objective
+        return self.calibrator.solver.objective
 
     @property
     def engine(self) -> Engine:

@@ -15,6 +15,7 @@ from torch import Tensor
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.optimizers.random import RandomSearch
+from cfx.calibration.shards import Solver
 from cfx.calibration.windows import Windows, WindowSettings
 from cfx.core.engine.base import Engine
 from cfx.core.engine.local import LocalEngine
@@ -49,11 +50,8 @@ def calibrated(engine: Engine, folder: Path | None) -> Tensor:
     truth[:, 1] += torch.linspace(0, 0.5, PAIRS, dtype=torch.float64)
     pairs = wavy_pairs(model, truth, frames=5 * WINDOWS + 10)
     calibrator = Calibrator(
-        MemoryStepper(model, 0.1),
-        RandomSearch(samples=SAMPLES),
-        seed=0,
+        Solver(MemoryStepper(model, 0.1), RandomSearch(samples=SAMPLES), seed=0, memory=1 << 28),
         cache=Cache(folder),
-        memory=1 << 28,
         progress=Counted,
         engine=engine,
     )

@@ -17,9 +17,9 @@ import cfx
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.optimizers.random import RandomSearch
+from cfx.calibration.shards import Solver
 from cfx.calibration.windows import Split, WindowSettings
 from cfx.core.errors import DataError
-from cfx.core.progress import Task
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
 from cfx.data.tidy import write_tidy
 from cfx.evaluation.protocols.across_drivers import AcrossDrivers
@@ -131,12 +131,8 @@ def test_too_few_drivers_are_refused() -> None:
 
 def calibrator(memory: int = 1 << 28, samples: int = 256) -> Calibrator:
     return Calibrator(
-        MemoryStepper(Krauss(), 0.1),
-        RandomSearch(samples=samples),
-        seed=0,
+        Solver(MemoryStepper(Krauss(), 0.1), RandomSearch(samples=samples), seed=0, memory=memory),
         cache=Cache(None),
-        memory=memory,
-        progress=Task,
     )
 
 
