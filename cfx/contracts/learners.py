@@ -27,7 +27,7 @@ from cfx.policies.core import AgentCore, features_read
 from cfx.policies.ensemble import Ensemble
 from cfx.policies.features import measured_history
 from cfx.policies.gru import GruPolicy
-from cfx.policies.heads import HEADS, head_name
+from cfx.policies.heads import head_class, head_name
 from cfx.policies.heads.base import ParameterHead
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.synthetic import SyntheticDataset
@@ -308,8 +308,7 @@ def _rmse(result: TrainingResult, data: TrainingData) -> float:
 
 def _head(result: TrainingResult, data: TrainingData) -> ParameterHead:
     name = result.head or head_name(has_base=result.base is not None)
-    assert name in HEADS, f"there is no head '{name}'; write one of {', '.join(HEADS)}"
-    return HEADS[name].for_model(data.simulator.model)
+    return head_class(name).for_model(data.simulator.model)
 
 
 def _agent(result: TrainingResult, data: TrainingData) -> Agent:

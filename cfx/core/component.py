@@ -94,6 +94,14 @@ class Component(ABC):
             settings = validate(self.schema, options, where=group)
         self.settings = settings
 
+    @classmethod
+    def complaint(cls) -> str:
+        """Returns what is wrong with what a class declares; "" if nothing is.
+
+        It is the end of a sentence that begins with the component. Base classes of kinds say it.
+        """
+        return ""
+
     def identity(self) -> dict[str, Any]:
         """Returns what results of this component depend on: its class, its settings and its code.
 

@@ -49,21 +49,29 @@ class Kind:
 
     Attributes:
         name: as in `cfx.get(kind, name)`.
-        group: its config group, the folder in `conf/` and the key in configs.
-        entry_points: its entry-point group.
         base: module and class that its components extend.
-        smoke_check: module and function that tries a new component for some milliseconds; "" where
-            its base class checks what it gives.
+        group: its config group, the folder in `conf/` and the key in configs; by default its name.
+        has_smoke_check: `cfx.contracts.smoke` tries a new component for some milliseconds; base
+            classes of the other kinds check what a component gives.
         chosen: a job chooses one of this kind, by a config group; metrics are all measured, tables
             are all written, and sub-commands are none of a job.
     """
 
     name: str
-    group: str
-    entry_points: str
     base: str
-    smoke_check: str = ""
+    group: str = ""
+    has_smoke_check: bool = False
     chosen: bool = True
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "group", self.group or self.name)
+
+    @property
+    def entry_points(self) -> str:
+        """Its entry-point group, the plural of its name: `cfx.models`."""
+        if self.name.endswith("y"):
+            return f"cfx.{self.name[:-1]}ies"
+        return f"cfx.{self.name}s"
 
     def call(self, component: str) -> str:
         """Returns what a user writes to ask for a component."""
@@ -75,56 +83,24 @@ class Kind:
 KINDS: dict[str, Kind] = {
     kind.name: kind
     for kind in (
-        Kind("dataset", "data", "cfx.datasets", "cfx.data.base:Dataset"),
-        Kind(
-            "model",
-            "model",
-            "cfx.models",
-            "cfx.models.base:DrivingModel",
-            "cfx.contracts.smoke:smoke_check_model",
-        ),
-        Kind(
-            "policy",
-            "policy",
-            "cfx.policies",
-            "cfx.policies.base:Policy",
-            "cfx.contracts.smoke:smoke_check_policy",
-        ),
-        Kind(
-            "optimizer",
-            "optimizer",
-            "cfx.optimizers",
-            "cfx.calibration.optimizers.base:Optimizer",
-            "cfx.contracts.smoke:smoke_check_optimizer",
-        ),
-        Kind(
-            "simulator",
-            "simulator",
-            "cfx.simulators",
-            "cfx.simulation.simulator:Simulator",
-            "cfx.contracts.smoke:smoke_check_simulator",
-        ),
-        Kind(
-            "objective",
-            "objective",
-            "cfx.objectives",
-            "cfx.calibration.objectives.base:Objective",
-            "cfx.contracts.smoke:smoke_check_objective",
-        ),
-        Kind("engine", "engine", "cfx.engines", "cfx.core.engine.base:Engine"),
-        Kind("learner", "learner", "cfx.learners", "cfx.learners.base:Learner"),
-        Kind("protocol", "protocol", "cfx.protocols", "cfx.evaluation.protocols.base:Protocol"),
+        Kind("dataset", "cfx.data.base:Dataset", group="data"),
+        Kind("model", "cfx.models.base:DrivingModel", has_smoke_check=True),
+        Kind("policy", "cfx.policies.base:Policy", has_smoke_check=True),
+        Kind("optimizer", "cfx.calibration.optimizers.base:Optimizer", has_smoke_check=True),
+        Kind("simulator", "cfx.simulation.simulator:Simulator", has_smoke_check=True),
+        Kind("objective", "cfx.calibration.objectives.base:Objective", has_smoke_check=True),
+        Kind("engine", "cfx.core.engine.base:Engine"),
+        Kind("learner", "cfx.learners.base:Learner"),
+        Kind("protocol", "cfx.evaluation.protocols.base:Protocol"),
         Kind(
             "metric",
-            "metrics",
-            "cfx.metrics",
             "cfx.evaluation.metrics.base:Metric",
-            "cfx.contracts.smoke:smoke_check_metric",
+            group="metrics",
+            has_smoke_check=True,
             chosen=False,
         ),
-        Kind("table", "table", "cfx.tables", "cfx.results.table:ResultTable", chosen=False),
-        Kind("demo", "demo", "cfx.demos", "cfx.evaluation.demo:Demo"),
-        Kind("command", "command", "cfx.commands", "cfx.core.command:Command", chosen=False),
+        Kind("table", "cfx.results.table:ResultTable", chosen=False),
+        Kind("command", "cfx.core.command:Command", chosen=False),
     )
 }
 """All kinds, by name."""
@@ -375,10 +351,10 @@ def _smoke_check(found: Entry, component: Component, settings: BaseModel) -> Non
     """
     kind = KINDS[found.kind]
     key = (found, settings.model_dump_json())
-    if not kind.smoke_check or key in _smoke_checked:
+    if not kind.has_smoke_check or key in _smoke_checked:
         return
     try:
-        _resolve(kind.smoke_check)(component)
+        _resolve(f"cfx.contracts.smoke:smoke_check_{kind.name}")(component)
     except PluginError as broken:
         raise PluginError(f"{found} breaks its contract: {broken}{_remedy(found)}") from broken
     except Exception as error:  # a plugin may raise anything
@@ -532,29 +508,13 @@ def _check(found: Entry, cls: Any) -> None:
             f"{found}: its settings must not have a field 'name',"
             " which chooses the component itself"
         )
-    if found.kind == "model":
-        _check_model(found, cls)
     if found.kind in {"model", "simulator"} and not issubclass(schema, base.schema):
         raise PluginError(
             f"{found}: its schema must extend {base.schema.__module__}.{base.schema.__name__}"
         )
-    if found.kind == "metric":
-        wrong = _resolve("cfx.evaluation.metrics.base:declared_wrongly")(cls)
-        if wrong:
-            raise PluginError(f"{found} {wrong}")
-
-
-def _check_model(found: Entry, cls: Any) -> None:
-    from cfx.core.parameters import ParameterSpace
-
-    space = getattr(cls, "parameters", None)
-    if not isinstance(space, ParameterSpace):
-        raise PluginError(
-            f"{found}: its attribute 'parameters' must be a cfx.ParameterSpace,"
-            f" not {type(space).__name__}"
-        )
-    if not space.tuned and not space.open:
-        raise PluginError(f"{found}: at least one of its parameters must be tuned")
+    complaint = cls.complaint()
+    if complaint:
+        raise PluginError(f"{found}{complaint}")
 
 
 def _resolve(target: str) -> Any:

@@ -101,7 +101,7 @@ class TrainingResult:
         curves: columns network, epoch, train_loss, validation_loss (NaN where not measured).
         base: parameters that answers refer to for drivers without a base of their own, `(N, n)`, SI
             units; None where the head needs none.
-        head: what makes parameters of answers (`cfx.policies.heads.HEADS`); None: `offset` where
+        head: what makes parameters of answers (`cfx.policies.heads`); None: `offset` where
             there is a base, otherwise `direct`.
         valid_range: the situations that each network learned from; None: those of its training
             parts (`cfx.learners.situations`).

@@ -24,7 +24,7 @@ from cfx.learners.grid import Grid
 from cfx.learners.imitation_data import ImitationDataset, ImitationSettings
 from cfx.learners.situations import learned_range
 from cfx.policies.base import Policy
-from cfx.policies.heads import HEADS
+from cfx.policies.heads import head_class
 
 log = logging.getLogger(__name__)
 
@@ -55,7 +55,7 @@ class ImitationLearner(Learner):
         """
         self.require_no_driver_features(policy)
         s, device = self.settings, training_data.device
-        head = HEADS[s.head].for_model(training_data.simulator.model, device)
+        head = head_class(s.head).for_model(training_data.simulator.model, device)
         space, names = head.space, training_data.names
         dataset = ImitationDataset.of(policy, training_data, s, head)
         generator = torch.Generator().manual_seed(training_data.seed)

@@ -6,10 +6,10 @@ token, c features of conditioning, n tuned parameters.
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
-from pydantic import Field
+from pydantic import AfterValidator, Field
 from torch import Tensor, nn
 
 from cfx.core.component import Settings
@@ -18,6 +18,7 @@ from cfx.learners.base import TrainingData
 from cfx.learners.grid import Grid
 from cfx.policies.base import Policy
 from cfx.policies.features import measured_history, tokens
+from cfx.policies.heads import trained_head
 from cfx.policies.heads.base import ParameterHead
 from cfx.policies.scaler import Scaler
 from cfx.simulation.rollout import Compile
@@ -26,7 +27,7 @@ from cfx.simulation.rollout import Compile
 class ImitationSettings(Settings):
     """Settings of `imitation`."""
 
-    head: Literal["direct", "offset"] = Field(
+    head: Annotated[str, AfterValidator(trained_head("imitation"))] = Field(
         "direct",
         description="what networks answer: direct: the parameters themselves (paper); offset:"
         " offsets from each driver's base parameters",

@@ -124,6 +124,18 @@ class DrivingModel(Component):
         self._adaptation_bounds = self.settings.adaptation_bounds or {}
         self.space.for_adaptation(self._adaptation_bounds)  # says now what is wrong with them
 
+    @classmethod
+    def complaint(cls) -> str:
+        space = getattr(cls, "parameters", None)
+        if not isinstance(space, ParameterSpace):
+            return (
+                ": its attribute 'parameters' must be a cfx.ParameterSpace,"
+                f" not {type(space).__name__}"
+            )
+        if not space.tuned and not space.open:
+            return ": at least one of its parameters must be tuned"
+        return ""
+
     def refuse_unused(self) -> None:
         """Refuses to tune what the model does not use with its settings.
 

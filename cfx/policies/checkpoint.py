@@ -26,7 +26,7 @@ from cfx.policies.agent import Agent
 from cfx.policies.base import Policy
 from cfx.policies.context import ContextRule
 from cfx.policies.core import AgentCore, features_read, network_with_weights
-from cfx.policies.heads import HEADS
+from cfx.policies.heads import head_class, head_names
 from cfx.policies.heads.base import ParameterHead
 from cfx.policies.scaler import Scaler
 from cfx.policies.valid_range import SIGNALS, ValidRange
@@ -249,9 +249,9 @@ def _read(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
 
 
 def _head(folder: Path, description: _Description, model: DrivingModel) -> ParameterHead:
-    if description.head not in HEADS:
+    if description.head not in head_names():
         raise DataError(
             f"{folder}/{_DESCRIPTION}: this version of cfx has no head '{description.head}'; it has"
-            f" {', '.join(HEADS)}"
+            f" {', '.join(head_names())}"
         )
-    return HEADS[description.head].for_model(model)
+    return head_class(description.head).for_model(model)

@@ -26,7 +26,6 @@ from cfx.evaluation.headline import RESULT, headline
 from cfx.evaluation.result import Evaluation
 from cfx.learners.curves import over_networks
 from cfx.results import provenance
-from cfx.results.look import JOB_COLOURS
 from cfx.results.store import Store, open_store, tracking_uri, translate_errors
 
 if TYPE_CHECKING:
@@ -46,9 +45,6 @@ _EXAMPLE_FRAMES = 50
 
 _ROWS_AT_ONCE = 20_000
 """Rows of a table that are text at once, while it is written."""
-
-_COLOUR = "mlflow.runColor"
-"""The tag with a run's colour in MLflow's tables and charts."""
 
 _SERVED = Path(__file__).with_name("served_policy.py")
 
@@ -337,7 +333,6 @@ class MlflowTracker(Tracker):
         self._log_artifacts(sorted(folder.iterdir()), "policy")
         with (
             translate_errors("log the policy as a model"),
-            _requirements_as_they_are(),
             tempfile.TemporaryDirectory() as temporary,
         ):
             import mlflow
@@ -441,27 +436,6 @@ def _run_name(config: JobConfig, names: Mapping[str, str]) -> str:
     return "-".join([*parts, names["optimizer"], names["data"]])
 
 
-@contextmanager
-def _requirements_as_they_are() -> Iterator[None]:
-    """Keeps MLflow from comparing a model's requirements with what is installed.
-
-    They name the versions that are installed. MLflow reads the file lists of all distributions for
-    that, half a second, to print a warning.
-    """
-    from mlflow.utils import environment
-
-    name = "warn_dependency_requirement_mismatches"
-    before = getattr(environment, name, None)
-    if before is None:
-        yield
-        return
-    setattr(environment, name, lambda _requirements: None)
-    try:
-        yield
-    finally:
-        setattr(environment, name, before)
-
-
 def _dataset_name(name: str, source: str) -> str:
     """Returns what MLflow calls the recordings: the dataset's name and the file's."""
     if source.startswith(name):
@@ -560,8 +534,7 @@ def _begin(store: Store, name: str, parameters: Mapping[str, str], tags: Mapping
             client.delete_tag(run.info.run_id, "cfx.failure")
     else:
         # With its tags from the start: whoever finds it after a kill knows whose it was.
-        whose = {_COLOUR: _next_colour(store)}
-        whose |= {tag.key: tag.value for tag in _tags(tags)}
+        whose = {tag.key: tag.value for tag in _tags(tags)}
         run, known = client.create_run(store.experiment_id, run_name=name, tags=whose), {}
     run_id = str(run.info.run_id)
     try:
@@ -576,19 +549,6 @@ def _begin(store: Store, name: str, parameters: Mapping[str, str], tags: Mapping
         client.set_terminated(run_id, "FAILED")
         raise
     return run_id
-
-
-def _next_colour(store: Store) -> str:
-    """Returns the colour of jobs that the newest runs have least; MLflow's own often coincide."""
-    jobs = "tags.`cfx.sweep_parent` IS NULL"
-    newest = ["attributes.start_time DESC"]
-    runs = store.client.search_runs(
-        [store.experiment_id], jobs, order_by=newest, max_results=len(JOB_COLOURS)
-    )
-    ages: dict[str, int] = {}
-    for age, run in enumerate(runs):
-        ages.setdefault(run.data.tags.get(_COLOUR, ""), age)
-    return max(JOB_COLOURS, key=lambda colour: ages.get(colour, len(runs)))
 
 
 def _replace_earlier(store: Store, run_id: str, tags: Mapping[str, str]) -> None:

@@ -23,7 +23,7 @@ from cfx.policies.agent import Agent
 from cfx.policies.base import Policy
 from cfx.policies.core import AgentCore
 from cfx.policies.gru import GruPolicy
-from cfx.policies.heads import HEADS, head_name
+from cfx.policies.heads import head_class, head_name
 from cfx.simulation.rollout import MemoryStepper
 from tests.drives import wavy_pairs
 
@@ -76,7 +76,7 @@ def training_data(
 def ready(result: TrainingResult, data: TrainingData, policy: Policy) -> Agent:
     """Returns trained networks as an agent."""
     name = result.head or head_name(has_base=result.base is not None)
-    head = HEADS[name].for_model(data.simulator.model)
+    head = head_class(name).for_model(data.simulator.model)
     return Agent(
         core=AgentCore(policy, result.network, result.scaler, head),
         model_node={},
@@ -126,7 +126,7 @@ def placed(
 ) -> RolloutDataset:
     """Returns the training data placed on networks."""
     generator = torch.Generator().manual_seed(seed)
-    made = HEADS[head].for_model(data.simulator.model)
+    made = head_class(head).for_model(data.simulator.model)
     return RolloutDataset.of(data, policy, share, generator, head=made)
 
 

@@ -56,7 +56,11 @@ def test_a_loaded_agent_chooses_what_the_saved_one_chose(tmp_path: Path, head: s
     ("key", "value", "message"),
     [
         ("format", 2, "has format 2; this version of cfx reads format 3"),
-        ("head", "mixture", "this version of cfx has no head 'mixture'; it has direct, offset"),
+        (
+            "head",
+            "mixture",
+            "this version of cfx has no head 'mixture'; it has direct, direct_residual, offset",
+        ),
         ("head", "offset", "the weights read 25 features, the policy's settings give 27"),
     ],
 )

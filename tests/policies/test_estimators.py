@@ -30,7 +30,7 @@ from cfx.policies.base import Policy
 from cfx.policies.core import AgentCore
 from cfx.policies.estimator import EstimatorPolicy
 from cfx.policies.features import token_width
-from cfx.policies.heads import HEADS
+from cfx.policies.heads import head_class
 from cfx.policies.heads.direct import DirectHead
 from cfx.policies.particle_filter import ParticleFilterPolicy, reweighted
 from cfx.policies.recalibrate import RecalibratePolicy
@@ -248,7 +248,7 @@ def test_with_a_residual_a_forecast_starts_with_the_drivers_acceleration(residua
     batch, _, _ = krauss_drivers()
     model = IDM()
     agent = agent_of(UkfPolicy(), model, model.space.defaults()[None])
-    head = HEADS["direct_residual" if residual else "direct"].for_model(model)
+    head = head_class("direct_residual" if residual else "direct").for_model(model)
     agent = replace(agent, core=AgentCore(agent.policy, agent.network, agent.scaler, head))
     origins = Origins(torch.tensor([0, 1, 2]), torch.tensor([100, 120, 150]))
     paths = simulate_from_origins(
@@ -272,7 +272,7 @@ def test_an_estimator_is_saved_and_loaded(name: str, tmp_path: Path) -> None:
     batch, _, _ = krauss_drivers(150)
     policy = ESTIMATORS[name]
     agent = agent_of(policy, Krauss(), torch.tensor([[1.5, 0.15]]).double())
-    head = HEADS["direct_residual"].for_model(Krauss())
+    head = head_class("direct_residual").for_model(Krauss())
     agent = replace(
         agent,
         core=AgentCore(agent.policy, agent.network, agent.scaler, head),

@@ -5,16 +5,20 @@ from __future__ import annotations
 import pytest
 import torch
 
+from cfx.core.component import validate
+from cfx.core.errors import ConfigError, PluginError
+from cfx.learners.imitation_data import ImitationSettings
+from cfx.learners.rollout.settings import RolloutSettings
 from cfx.models.w99 import W99
-from cfx.policies.heads import HEADS
+from cfx.policies.heads import head_class, head_names
 from cfx.policies.heads.base import ParameterHead
 
 MODEL = W99()
 
 
-@pytest.fixture(params=sorted(HEADS))
+@pytest.fixture(params=head_names())
 def head(request: pytest.FixtureRequest) -> ParameterHead:
-    return HEADS[request.param].for_model(MODEL)
+    return head_class(request.param).for_model(MODEL)
 
 
 def random(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -22,7 +26,7 @@ def random(*shape: int, seed: int = 0) -> torch.Tensor:
 
 
 def test_it_goes_by_the_name_that_it_is_saved_under(head: ParameterHead) -> None:
-    assert HEADS[head.name] is type(head)
+    assert head_class(head.name) is type(head)
 
 
 def test_no_answer_leaves_the_bounds(head: ParameterHead) -> None:
@@ -72,3 +76,16 @@ def test_single_precision_agrees_with_double(head: ParameterHead) -> None:
     assert single.dtype == torch.float32
     double = head.unit_parameters(answer, base)
     torch.testing.assert_close(single.double(), double, rtol=0, atol=1e-5)
+
+
+def test_a_learner_takes_the_heads_that_it_trains() -> None:
+    assert ImitationSettings(head="offset").head == "offset"
+    with pytest.raises(ConfigError, match="head='residual': should be one of direct, offset"):
+        validate(ImitationSettings, {"head": "residual"}, where="learner")
+    with pytest.raises(ConfigError, match="should be one of offset, residual, stochastic"):
+        validate(RolloutSettings, {"head": "direct"}, where="learner")
+
+
+def test_a_head_that_is_not_there() -> None:
+    with pytest.raises(PluginError, match="no head 'mixture'; write one of direct, "):
+        head_class("mixture")

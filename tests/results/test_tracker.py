@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import operator
 import os
 import subprocess
 import sys
@@ -32,7 +31,6 @@ from cfx.policies.heads.direct import DirectHead
 from cfx.policies.scaler import Scaler
 from cfx.results import provenance
 from cfx.results.config import JobConfig
-from cfx.results.look import JOB_COLOURS
 from cfx.results.store import download_run, quiet, translate_errors
 from cfx.results.tracker import CURVE_POINTS, MlflowTracker, Tracker, sweep_link
 from tests.drives import wavy_pairs
@@ -341,18 +339,6 @@ def test_a_sweep_has_the_status_of_its_jobs(uri: str, client: Any) -> None:
         "#/experiments/1/runs?searchFilter=tags.%60cfx.sweep%60%20%3D%20%27s%27&orderByKey=metrics."
     )
     assert one.how_to_open() == ()  # the sweep's own link comes once, at its end
-
-
-def test_neighbours_have_different_colours(uri: str, client: Any) -> None:
-    """Charts and tables tell the jobs of a sweep apart, also where one is run again."""
-    colours = []
-    for seed in range(len(JOB_COLOURS) + 2):
-        tags = {"cfx.folder": str(seed)}
-        with begin(uri, sweep="s", parameters={"seed": str(seed)}, tags=tags) as run:
-            pass
-        colours.append(client.get_run(run.run_id).data.tags["mlflow.runColor"])
-    assert set(colours) == set(JOB_COLOURS)
-    assert all(map(operator.ne, colours, colours[1:]))
 
 
 def test_long_values_and_odd_keys_are_kept(uri: str, client: Any) -> None:

@@ -113,6 +113,28 @@ class Metric(Component):
     headline: ClassVar[bool] = True
     order: ClassVar[int] = 100
 
+    @classmethod
+    def complaint(cls) -> str:
+        for name in ("unit", "direction", "heading", "meaning", "summary"):
+            if not isinstance(getattr(cls, name, None), str):
+                return f" must say its `{name}`, a text"
+        for name in ("heading", "meaning"):
+            if not getattr(cls, name).strip():
+                return f" must say its `{name}`: tables explain their columns with it"
+        allowed: Sequence[tuple[str, Sequence[str]]] = (
+            ("direction", DIRECTIONS),
+            ("summary", SUMMARIES),
+        )
+        for name, choices in allowed:
+            if getattr(cls, name) not in choices:
+                return f" says {name}={getattr(cls, name)!r}; choose one of {', '.join(choices)}"
+        unknown = [scope for scope in cls.scopes if scope not in SCOPES]
+        if unknown or not cls.scopes:
+            return f" says scopes={cls.scopes!r}; choose some of {', '.join(SCOPES)}"
+        if cls.schema.model_fields:
+            return " must have no settings, so that its name means the same number in every job"
+        return ""
+
     @abstractmethod
     def compute(self, trajectories: Trajectories) -> Tensor:
         """Measures P trajectories: pure, batched, over the frames that count.
@@ -166,29 +188,3 @@ def column_of(metric: str, scope: str = "test") -> str:
     if scope == "test":
         return metric
     return f"{scope}_{metric}"
-
-
-def declared_wrongly(cls: type[Metric]) -> str:
-    """Returns what is wrong with the declarations of a metric's class; "" if nothing is.
-
-    It is the end of a sentence whose subject is the metric.
-    """
-    for name in ("unit", "direction", "heading", "meaning", "summary"):
-        if not isinstance(getattr(cls, name, None), str):
-            return f"must say its `{name}`, a text"
-    for name in ("heading", "meaning"):
-        if not getattr(cls, name).strip():
-            return f"must say its `{name}`: tables explain their columns with it"
-    allowed: Sequence[tuple[str, Sequence[str]]] = (
-        ("direction", DIRECTIONS),
-        ("summary", SUMMARIES),
-    )
-    for name, choices in allowed:
-        if getattr(cls, name) not in choices:
-            return f"says {name}={getattr(cls, name)!r}; choose one of {', '.join(choices)}"
-    unknown = [scope for scope in cls.scopes if scope not in SCOPES]
-    if unknown or not cls.scopes:
-        return f"says scopes={cls.scopes!r}; choose some of {', '.join(SCOPES)}"
-    if cls.schema.model_fields:
-        return "must have no settings, so that its name means the same number in every job"
-    return ""

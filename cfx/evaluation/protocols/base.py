@@ -33,7 +33,7 @@ from cfx.policies.base import ConstantNetwork, Policy
 from cfx.policies.core import AgentCore, features_read
 from cfx.policies.features import token_width
 from cfx.policies.fixed import FixedPolicy
-from cfx.policies.heads import HEADS, head_name
+from cfx.policies.heads import head_class, head_name, head_names
 from cfx.policies.heads.base import ParameterHead
 from cfx.policies.heads.stochastic import SCALE, StochasticHead
 from cfx.policies.scaler import Scaler
@@ -236,13 +236,13 @@ class ProtocolContext:
         """Returns the head that the learner trained its networks for."""
         has_base = training_result.base is not None
         name = training_result.head or head_name(has_base=has_base)
-        if name not in HEADS:
+        if name not in head_names():
             raise PluginError(
                 f"{registry.origin(self.learner)} breaks its contract: there is no head '{name}';"
-                f" write one of {', '.join(HEADS)}"
+                f" write one of {', '.join(head_names())}"
             )
         model = self.simulator.model
-        head = HEADS[name].for_model(model, training_result.scaler.mean.device)
+        head = head_class(name).for_model(model, training_result.scaler.mean.device)
         if policy.trainable and head.model_space != model.adaptation_space:
             log.info(
                 "model.adaptation_bounds changes nothing here: this policy answers parameters,"

@@ -43,7 +43,7 @@ from cfx.learners.rollout.shard import (
 from cfx.learners.situations import learned_range
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.ensemble import Ensemble
-from cfx.policies.heads import HEADS
+from cfx.policies.heads import head_class
 from cfx.policies.heads.base import ParameterHead
 from cfx.policies.scaler import Scaler
 
@@ -102,7 +102,7 @@ class RolloutLearner(Learner):
                 "The policy does not see the gap; policy.inputs=situation gives smaller errors"
             )
         generator = torch.Generator().manual_seed(training_data.seed)
-        head = HEADS[s.head].for_model(simulator.model)
+        head = head_class(s.head).for_model(simulator.model)
         dataset = RolloutDataset.of(
             training_data, policy, s.validation, generator, s.ensemble_size, head
         )
@@ -173,7 +173,7 @@ class RolloutLearner(Learner):
         curves: pd.DataFrame,
     ) -> TrainingResult:
         """Returns the networks with the situations that they have learned from."""
-        head = HEADS[self.settings.head].for_model(training_data.simulator.model)
+        head = head_class(self.settings.head).for_model(training_data.simulator.model)
         found = _training_result(network, dataset, training_data, curves, head)
         has_cold_starts = training_data.base is not None and self.settings.cold_start_fraction > 0
         augment = None

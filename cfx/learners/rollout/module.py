@@ -33,7 +33,7 @@ from cfx.learners.rollout.window import (
 )
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.core import AgentCore
-from cfx.policies.heads import HEADS
+from cfx.policies.heads import head_class
 from cfx.simulation.rollout import can_compile
 
 _WORTH_COMPILING = 5_000
@@ -119,7 +119,7 @@ class RolloutModule(BatchedModule):
         device = dataset.base.device
         model, dt = training_data.simulator.model, training_data.simulator.dt
         windows = training_data.windows
-        head = HEADS[settings.head].for_model(model, device)
+        head = head_class(settings.head).for_model(model, device)
         model = head.driven_model(model)
         core = AgentCore(policy, network, dataset.scaler, head)
         self.temperature = torch.tensor(settings.temperature, device=device)

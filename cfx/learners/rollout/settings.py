@@ -6,18 +6,19 @@ set of parameters holds (`windows.stride`).
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from cfx.core.component import Settings
+from cfx.policies.heads import trained_head
 from cfx.simulation.rollout import Compile
 
 
 class HeadSettings(Settings):
     """What networks answer."""
 
-    head: Literal["offset", "residual", "stochastic"] = Field(
+    head: Annotated[str, AfterValidator(trained_head("rollout"))] = Field(
         "offset",
         description="offset: offsets from each driver's base parameters; residual: also how the"
         " model takes over from the acceleration at the start, so that the policy starts with"

@@ -25,7 +25,7 @@ from cfx.learners.rollout.shard import (
     for_experts,
     untrained,
 )
-from cfx.policies.heads import HEADS
+from cfx.policies.heads import head_class
 from cfx.policies.heads.offset import OffsetHead
 
 log = logging.getLogger(__name__)
@@ -43,7 +43,7 @@ def train(shard: TrainingShard, report: Report) -> TrainedShard:
     """
     progress = _Epochs(report, epochs(shard.settings))
     dataset, training_data, s = shard.dataset, shard.training_data, shard.settings
-    head = HEADS[s.head].for_model(training_data.simulator.model)
+    head = head_class(s.head).for_model(training_data.simulator.model)
     network = untrained(shard.policy, dataset, head)
     network.load_state_dict(shard.weights)
     if shard.checkpoint is not None and not _has_place(shard.checkpoint):

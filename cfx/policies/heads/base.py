@@ -21,10 +21,12 @@ class ParameterHead(ABC):
     """Base of every parameter head.
 
     A head is a pure function of tensors, elementwise over leading dimensions: training and
-    evaluation use the same. A saved policy names its head; `cfx.policies.heads.HEADS` lists them.
+    evaluation use the same. A saved policy names its head; an entry point of
+    the group `cfx.heads` makes it known by that name.
 
     Attributes:
-        name: in saved policies.
+        name: in saved policies, and of its entry point.
+        learners: names of the learners that train it, as `learner.head=NAME` asks for.
         needs_base: whether parameters depend on each driver's base parameters.
         noise_width: how many random numbers a window of a driver takes, k; 0: nothing is drawn.
         latent_width: how many of a driver's random numbers are kept from window to window, q.
@@ -32,6 +34,7 @@ class ParameterHead(ABC):
     """
 
     name: ClassVar[str]
+    learners: ClassVar[tuple[str, ...]] = ()
     needs_base: ClassVar[bool] = False
     noise_width: int = 0
     latent_width: int = 0

@@ -15,6 +15,7 @@ class DirectHead(ParameterHead):
     """Answers are parameters in unit space, within the bounds of calibration."""
 
     name: ClassVar[str] = "direct"
+    learners: ClassVar[tuple[str, ...]] = ("imitation",)
 
     @classmethod
     def for_model(cls, model: DrivingModel, device: torch.device | str | None = None) -> Self:

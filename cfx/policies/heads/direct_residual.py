@@ -26,6 +26,7 @@ class DirectResidualHead(DirectHead):
     """Answers are parameters in unit space; the residual is the same for all."""
 
     name: ClassVar[str] = "direct_residual"
+    learners: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def for_model(cls, model: DrivingModel, device: torch.device | str | None = None) -> Self:

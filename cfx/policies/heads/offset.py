@@ -36,6 +36,7 @@ class OffsetHead(ParameterHead):
     """Answers are offsets from each driver's base, within the model's adaptation bounds."""
 
     name: ClassVar[str] = "offset"
+    learners: ClassVar[tuple[str, ...]] = ("imitation", "rollout")
     needs_base: ClassVar[bool] = True
 
     def __init__(self, space: ParameterSpace, device: torch.device | str | None = None) -> None:

@@ -29,6 +29,7 @@ class ResidualHead(OffsetHead):
     """Answers are offsets from each driver's base, and from the defaults of the residual."""
 
     name: ClassVar[str] = "residual"
+    learners: ClassVar[tuple[str, ...]] = ("rollout",)
 
     @classmethod
     def for_model(cls, model: DrivingModel, device: torch.device | str | None = None) -> Self:

@@ -80,6 +80,7 @@ class StochasticHead(ResidualHead):
     """
 
     name: ClassVar[str] = "stochastic"
+    learners: ClassVar[tuple[str, ...]] = ("rollout",)
 
     def __init__(self, space: ParameterSpace, device: torch.device | str | None = None) -> None:
         super().__init__(space, device)
