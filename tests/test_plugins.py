@@ -396,8 +396,8 @@ GENERATED = [
     pytest.param("engine", marks=pytest.mark.slow),
     pytest.param("learner", marks=pytest.mark.slow),
     pytest.param("protocol", marks=pytest.mark.slow),
-    pytest.param("table"),
-    pytest.param("command"),
+    pytest.param("table", marks=pytest.mark.slow),
+    pytest.param("command", marks=pytest.mark.slow),
 ]
 
 

@@ -146,6 +146,7 @@ def test_it_answers_a_braking_leader_after_the_reaction_time(
     assert int(differs.nonzero()[0]) == 100 + frames
 
 
+@pytest.mark.slow
 def test_compiled_steps_carry_the_memory_as_eager_ones_do() -> None:
     leader = leader_of(0.1, 53)
     taus = torch.linspace(0.3, 2.0, 7, dtype=torch.float64)[:, None]

@@ -47,6 +47,7 @@ def test_the_motorway_has_waves_and_lane_changes(tmp_path: Path) -> None:
     assert row[5] == "0"  # collisions
 
 
+@pytest.mark.slow
 def test_stress_finds_no_collision_and_no_step_outside_the_limits(tmp_path: Path) -> None:
     """A few events of each kind; the cards hold those of a thousand."""
     script = """

@@ -44,7 +44,7 @@ class TestBotorchOptimizerWithScreening(OptimizerContract):
         )
 
 
-@pytest.mark.parametrize("function", [distance, bowl])
+@pytest.mark.parametrize("function", [distance, pytest.param(bowl, marks=pytest.mark.slow)])
 def test_forty_evaluations_beat_four_thousand_random_ones(function: Function) -> None:
     optima = torch.rand(20, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     guesses = torch.full((20, 1, 2), 0.5, dtype=torch.float64)

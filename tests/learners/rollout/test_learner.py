@@ -240,6 +240,7 @@ def test_w99_learns_through_smoothed_regimes_and_drives_exactly() -> None:
     assert data.simulator.model.temperature == 0
 
 
+@pytest.mark.slow
 def test_compiled_training_is_eager_training() -> None:
     policy, data = gru(), training_data(networks=1)
     curves = []
