@@ -19,7 +19,7 @@ from cfx.calibration.calibrator import Labels
 from cfx.calibration.windows import Split, Windows, WindowSettings
 from cfx.contracts.contract import contract_of
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
-from cfx.evaluation.closed_loop import simulate_closed_loop
+from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.models.krauss import Krauss
 from cfx.policies.agent import Agent
@@ -297,9 +297,8 @@ def _answers(result: TrainingResult, data: TrainingData) -> Tensor:
 def _rmse(result: TrainingResult, data: TrainingData) -> float:
     """Returns the RMSE of speed in closed loop over the training parts, m/s."""
     first = torch.zeros(PAIRS, dtype=torch.int64)
-    loop = simulate_closed_loop(
-        data.simulator, _agent(result, data), data.batch, first, data.network
-    )
+    followers = Followers(data.batch, data.network)
+    loop = simulate_closed_loop(data.simulator, _agent(result, data), followers, first)
     frames = torch.arange(loop.speed.shape[1])
     counted = (frames > 0) & (frames <= data.split.frame[:, None])
     error = (loop.speed - data.batch.follower_speed[:, : loop.speed.shape[1]])[counted]

@@ -9,6 +9,7 @@ Shapes: P pairs, K simulated frames, L frames of a token, T = L + K columns, n t
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -23,6 +24,24 @@ from cfx.policies.context import DriverContext
 from cfx.policies.features import History
 from cfx.simulation.base import Stepper
 from cfx.simulation.trajectory import Start
+
+
+@dataclass(frozen=True)
+class Followers:
+    """P recorded followers and what an agent knows of each.
+
+    Attributes:
+        batch: P pairs, complete.
+        network: `(P,)`, which of the agent's networks drives each pair.
+        base: `(P, n)` in SI units, the drivers' base parameters; None: the agent's own base.
+        history: seconds of measured history before a simulation that the agent observes, and in
+            which driver features are measured; None: all there is.
+    """
+
+    batch: PairBatch
+    network: Tensor
+    base: Tensor | None = None
+    history: float | None = None
 
 
 class ClosedLoop(NamedTuple):
@@ -56,13 +75,9 @@ class ClosedLoop(NamedTuple):
 def simulate_closed_loop(
     simulator: Stepper,
     agent: Agent,
-    batch: PairBatch,
+    followers: Followers,
     first: Tensor,
-    network: Tensor,
     *,
-    base: Tensor | None = None,
-    history: float | None = None,
-    steps: int | None = None,
     state: AgentState | None = None,
     generator: torch.Generator | None = None,
 ) -> ClosedLoop:
@@ -71,25 +86,20 @@ def simulate_closed_loop(
     Args:
         simulator: the model and its time step.
         agent: chooses the parameters of each window.
-        batch: P pairs, complete.
+        followers: P pairs, simulated to the end of the longest, and what the agent knows of them.
         first: `(P,)`, the frame of the last measured state.
-        network: `(P,)`, which of the agent's networks drives each pair.
-        base: `(P, n)` in SI units, the drivers' base parameters; None: the agent's own base.
-        history: seconds of measured history before `first` that the agent observes, and in which
-            driver features are measured; None: all there is.
-        steps: K, how many steps are simulated at most; None: to the end of the longest pair.
         state: of the agent after what it has observed up to `first`; None: it observes that here.
         generator: draws, on the CPU, what a stochastic agent leaves to chance; None: nothing is
             drawn.
     """
     simulator = agent.stepper(simulator)
     if state is None:
-        state = burnt_in(agent, batch, first, network, base, history, simulator.dt)
-    track = _Track(batch, first, agent.windows.length, steps)
+        state = burnt_in(agent, followers, first, simulator.dt)
+    track = _Track(followers.batch, first, agent.windows.length)
     position, speed, acceleration = track.now()
     follower = simulator.begin(Start(position, speed, acceleration))
     width = len(agent.model_space)
-    parameters = track.speed.new_empty((len(batch), track.steps + 1, width))
+    parameters = track.speed.new_empty((len(first), track.steps + 1, width))
     outside = torch.zeros(parameters.shape[:2], dtype=torch.bool, device=parameters.device)
     beyond = torch.zeros(state.beyond.shape[1], dtype=torch.float64, device=parameters.device)
     _, _, counted = track.result()
@@ -112,27 +122,19 @@ def simulate_closed_loop(
     return ClosedLoop(speed, gap, parameters, counted, at_limit, outside, beyond)
 
 
-def burnt_in(
-    agent: Agent,
-    batch: PairBatch,
-    first: Tensor,
-    network: Tensor,
-    base: Tensor | None,
-    history: float | None,
-    dt: float,
-) -> AgentState:
+def burnt_in(agent: Agent, followers: Followers, first: Tensor, dt: float) -> AgentState:
     """Returns an agent's state after what it has observed of P pairs up to a frame.
 
     Args:
-        agent, batch, first, network, base, history: as for `simulate_closed_loop`.
+        agent, followers, first: as for `simulate_closed_loop`.
         dt: time step, s.
     """
     since = None
-    if history is not None:
-        since = (first - round(history / dt)).clamp(min=0)
-    features = agent.driver_features_of(batch, first, since)
-    state = agent.begin(network, DriverContext(base, features))
-    return agent.burn_in(batch, first, state, since)
+    if followers.history is not None:
+        since = (first - round(followers.history / dt)).clamp(min=0)
+    features = agent.driver_features_of(followers.batch, first, since)
+    state = agent.begin(followers.network, DriverContext(followers.base, features))
+    return agent.burn_in(followers.batch, first, state, since)
 
 
 class _Track:
@@ -143,12 +145,8 @@ class _Track:
         speed: of the followers, `(P, T)`; NaN where nothing was simulated yet.
     """
 
-    def __init__(
-        self, batch: PairBatch, first: Tensor, length: int, steps: int | None = None
-    ) -> None:
+    def __init__(self, batch: PairBatch, first: Tensor, length: int) -> None:
         self.steps = int((batch.lengths - 1 - first).max())
-        if steps is not None:
-            self.steps = min(self.steps, steps)
         self._length = length
         self._now = length - 1
         self._lengths = batch.lengths

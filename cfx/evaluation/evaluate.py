@@ -6,6 +6,7 @@ Shapes: P pairs, K + 1 frames, n tuned parameters.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -21,8 +22,7 @@ from cfx.evaluation.closed_loop import ClosedLoop
 from cfx.evaluation.metrics.base import RECORDED, MetricInfo, Trajectories
 from cfx.evaluation.metrics.errors import RmseGap, RmseSpeed
 from cfx.evaluation.metrics.installed import LeftOut, MeasuredMetric, MetricSet, leave_out
-from cfx.evaluation.outside import outside_in_words
-from cfx.evaluation.result import METHODS, Array, Evaluation, Platoon
+from cfx.evaluation.result import METHODS, Array, Evaluation
 from cfx.evaluation.statistics import Improvement, improvement_statistics
 from cfx.evaluation.tables import long_table, values_of
 from cfx.evaluation.trajectories import (
@@ -33,57 +33,63 @@ from cfx.evaluation.trajectories import (
     simulated_pairs,
     trajectories_of,
 )
-from cfx.policies.agent import Agent
 from cfx.simulation.trajectory import TRANSIENT_S
 
 Measured = dict[tuple[str, str, str], NDArray[np.float64]]
 """By metric, scope and method the value of each pair, `(P,)`."""
 
 
+@dataclass(frozen=True)
+class ComparedPairs:
+    """P pairs on which methods are compared.
+
+    Attributes:
+        pairs, batch: the recording, as objects and as tensors.
+        first: `(P,)`, the frame of the last measured state.
+        style: score and cluster of each driver.
+        fold: `(P,)`, in which fold each pair was tested; None if there was one.
+    """
+
+    pairs: PairSet
+    batch: PairBatch
+    first: Tensor
+    style: StyleResult
+    fold: Tensor | None = None
+
+
 def evaluate(
-    pairs: PairSet,
-    batch: PairBatch,
-    first: Tensor,
-    loops: Mapping[str, ClosedLoop],
+    tested: ComparedPairs,
+    scopes: Mapping[str, Mapping[str, ClosedLoop]],
     space: ParameterSpace,
-    style: StyleResult,
     *,
     seed: int,
-    adaptation_space: ParameterSpace | None = None,
-    fold: Tensor | None = None,
-    full_trajectory: Mapping[str, ClosedLoop] | None = None,
-    platoon: Platoon | None = None,
-    history: pd.DataFrame | None = None,
+    policy_space: ParameterSpace | None = None,
     metrics: MetricSet | None = None,
-    agent: Agent | None = None,
 ) -> Evaluation:
     """Measures closed loops against the recording.
 
     Args:
-        pairs: P pairs.
-        batch: the same as tensors.
-        first: `(P,)`, the frame of the last measured state.
-        loops: the closed loops of each method of `METHODS`, on the same frames; `fixed` and
-            `policy` are among them.
+        tested: P pairs.
+        scopes: the closed loops of each method of `METHODS`. `test`: from `first` on; `fixed` and
+            `policy` are among them. `full_trajectory`, if there: from frame 0 on, of methods that
+            nothing of these drivers went into.
         space: the model's parameters, in the bounds of constant ones.
-        adaptation_space: the same in the bounds of `policy`; None: the same bounds.
-        style: score and cluster of each driver.
         seed: of the bootstrap.
-        fold: `(P,)`, in which fold each pair was tested; None if there was one.
-        full_trajectory: closed loops from frame 0 on, of methods that nothing of these drivers went
-            into; None if there are none.
-        platoon, history: further results, handed on; see `Evaluation`.
+        policy_space: the parameters in the bounds of `policy`; None: the same bounds.
         metrics: what is measured; None: cfx's own metrics.
-        agent: what drove as `policy`; None: nothing is said of where it is valid.
+
+    Returns:
+        The comparison, without `platoon`, `history` and `outside`.
     """
-    loops = {method: loops[method] for method in METHODS if method in loops}
-    policy_space = space
-    if adaptation_space is not None:
-        policy_space = adaptation_space
+    pairs, batch, first = tested.pairs, tested.batch, tested.first
+    loops = {method: scopes["test"][method] for method in METHODS if method in scopes["test"]}
+    full_trajectory = scopes.get("full_trajectory", {})
+    if policy_space is None:
+        policy_space = space
     spaces = dict.fromkeys(METHODS, space) | {"policy": policy_space}
     measures = _Measures(metrics or MetricSet.own())
     for rows in parts_of(len(pairs)):
-        whole = _rows(full_trajectory or {}, rows)
+        whole = _rows(full_trajectory, rows)
         measures.add(_scopes(batch[rows], first[rows], _rows(loops, rows), whole, spaces))
     measured, infos, left_out = measures.found()
     drivers = [pair.driver for pair in pairs]
@@ -92,7 +98,7 @@ def evaluate(
     for scope in ("test", "steady", "full_trajectory"):
         improvements[scope] = _improvements(values, scope, drivers, seed)
     return Evaluation(
-        about=_about(pairs, style, fold, measures, space.names),
+        about=_about(tested, measures, space.names),
         values=values,
         measured=infos,
         improvements=improvements["test"],
@@ -103,27 +109,8 @@ def evaluate(
         meanings=tuple(parameter.meaning for parameter in space.tuned),
         bounds=policy_space.bounds().numpy(),
         full_trajectory_improvements=improvements["full_trajectory"],
-        platoon=platoon,
-        history=history,
         left_out=left_out,
-        outside=_outside(agent, loops, full_trajectory or {}),
     )
-
-
-def _outside(
-    agent: Agent | None, test: Mapping[str, ClosedLoop], full: Mapping[str, ClosedLoop]
-) -> dict[str, str]:
-    """Returns `Evaluation.outside`."""
-    found: dict[str, str] = {}
-    if agent is None:
-        return found
-    for scope, loops in (("test", test), ("full_trajectory", full)):
-        words = ""
-        if "policy" in loops:
-            words = outside_in_words(agent, loops["policy"])
-        if words:
-            found[scope] = words
-    return found
 
 
 def closed_loop_errors(batch: PairBatch, first: Tensor, loop: ClosedLoop) -> tuple[Array, Array]:
@@ -273,21 +260,16 @@ def _improvements(
     return found
 
 
-def _about(
-    pairs: PairSet,
-    style: StyleResult,
-    fold: Tensor | None,
-    measures: _Measures,
-    names: Sequence[str],
-) -> pd.DataFrame:
+def _about(tested: ComparedPairs, measures: _Measures, names: Sequence[str]) -> pd.DataFrame:
     """Returns `Evaluation.about`."""
-    by_driver = style.table.set_index("driver")
+    pairs = tested.pairs
+    by_driver = tested.style.table.set_index("driver")
     methods = list(measures.parameters)
     drivers = [pair.driver for pair in pairs]
     clusters = by_driver["cluster"].loc[drivers].map(dict(enumerate(CLUSTERS)))
     folds = np.zeros(len(pairs), dtype=np.int64)
-    if fold is not None:
-        folds = fold.numpy()
+    if tested.fold is not None:
+        folds = tested.fold.numpy()
     of_pair = {
         "pair_id": [pair.pair_id for pair in pairs],
         "recording": [pair.recording for pair in pairs],

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
-from cfx.evaluation.closed_loop import simulate_closed_loop
+from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.policies.agent import Agent, AgentState
 from cfx.policies.context import DriverContext
 from cfx.policies.features import measured_history
@@ -145,13 +145,10 @@ def _extrapolated(speed: Tensor, acceleration: Tensor, steps: int, dt: float) ->
 def simulate_from_origins(
     simulator: Stepper,
     agent: Agent,
-    batch: PairBatch,
+    followers: Followers,
     origins: Origins,
     steps: int,
-    network: Tensor,
     *,
-    base: Tensor | None = None,
-    history: float | None = None,
     leader: LeaderFuture = "given",
 ) -> Paths:
     """Simulates followers from origins on, with an agent in the loop.
@@ -162,25 +159,14 @@ def simulate_from_origins(
     Args:
         simulator: the model and its time step.
         agent: chooses the parameters of each window; of any kind.
-        batch: P pairs, complete.
+        followers: P pairs, and what the agent knows of them; it observes their history before each
+            origin.
         origins: Q of them.
         steps: K, at least 1.
-        network: `(P,)`, which of the agent's networks drives each pair.
-        base: `(P, n)` in SI units, the drivers' base parameters; None: the agent's own base.
-        history: s of measured history before an origin that the agent observes; None: all there is.
         leader: what is known of the leader after the origin.
     """
     sampled = sample_from_origins(
-        simulator,
-        agent,
-        batch,
-        origins,
-        steps,
-        network,
-        (None,),
-        base=base,
-        history=history,
-        leader=leader,
+        simulator, agent, followers, origins, steps, (None,), leader=leader
     )
     return Paths(sampled.speed[0], sampled.travelled[0])
 
@@ -188,14 +174,11 @@ def simulate_from_origins(
 def sample_from_origins(
     simulator: Stepper,
     agent: Agent,
-    batch: PairBatch,
+    followers: Followers,
     origins: Origins,
     steps: int,
-    network: Tensor,
     generators: Sequence[torch.Generator | None],
     *,
-    base: Tensor | None = None,
-    history: float | None = None,
     leader: LeaderFuture = "given",
 ) -> Paths:
     """Samples paths of followers from origins on; see `simulate_from_origins`.
@@ -203,39 +186,32 @@ def sample_from_origins(
     What was measured is observed once for all paths. One path of all origins is one batch.
 
     Args:
-        simulator, agent, batch, origins, steps, network: as there.
+        simulator, agent, followers, origins, steps: as there.
         generators: S of them, on the CPU, one for each path; None: what a stochastic agent does if
             nothing is drawn.
-        base, history, leader: as there.
+        leader: as there.
 
     Returns:
         Paths `(S, Q, K + 1)`.
     """
     speeds, travelled = [], []
+    batch, base = followers.batch, followers.base
     for chunk in _chunks(agent, batch, origins):
         state = None
-        if history is None and not agent.core.driver_features:
-            state = _observed(agent, batch, chunk, network, base)
+        if followers.history is None and not agent.core.driver_features:
+            state = _observed(agent, followers, chunk)
         part = _with_future(batch[chunk.pair], chunk.frame, steps, leader)
         own_base = None
         if base is not None:
             own_base = base[chunk.pair]
+        known = Followers(part, followers.network[chunk.pair], own_base, followers.history)
         index = chunk.frame[:, None] + torch.arange(steps + 1, device=chunk.frame.device)
         index = index.clamp(max=part.mask.shape[1] - 1)
         leader_position = part.leader_position.gather(1, index)
         speed, moved = [], []
         for generator in generators:
             loop = simulate_closed_loop(
-                simulator,
-                agent,
-                part,
-                chunk.frame,
-                network[chunk.pair],
-                base=own_base,
-                history=history,
-                steps=steps,
-                state=state,
-                generator=generator,
+                simulator, agent, known, chunk.frame, state=state, generator=generator
             )
             position = leader_position - loop.gap
             speed.append(loop.speed)
@@ -246,9 +222,7 @@ def sample_from_origins(
 
 
 @torch.no_grad()
-def _observed(
-    agent: Agent, batch: PairBatch, origins: Origins, network: Tensor, base: Tensor | None
-) -> AgentState:
+def _observed(agent: Agent, followers: Followers, origins: Origins) -> AgentState:
     """Returns the agent's state at origins, each pair being observed once.
 
     What was observed up to an origin is the beginning of what is observed up to the next one. Not
@@ -256,13 +230,12 @@ def _observed(
 
     Args:
         agent: observes.
-        batch: P pairs.
+        followers: P pairs.
         origins: Q of them.
-        network, base: as for `simulate_from_origins`.
     """
     pairs, row = torch.unique(origins.pair, return_inverse=True)
-    at_origins = _begun(agent, network, base, origins.pair)
-    state = _begun(agent, network, base, pairs)
+    at_origins = _begun(agent, followers, origins.pair)
+    state = _begun(agent, followers, pairs)
     stride = agent.windows.stride
     last = torch.zeros_like(pairs).scatter_reduce(0, row, origins.frame, "amax")
     windows = origins.frame.add(stride - 1).div(stride, rounding_mode="floor")
@@ -271,17 +244,17 @@ def _observed(
         places = (at_origins.network[due], at_origins.place[due])
         at_origins.state[places] = state.state[state.network[row[due]], state.place[row[due]]]
         frame = torch.full_like(last, window * stride)
-        history = measured_history(batch, pairs, frame, agent.windows.length)
+        history = measured_history(followers.batch, pairs, frame, agent.windows.length)
         state = agent.observe(history, state, frame < last)
     return at_origins
 
 
-def _begun(agent: Agent, network: Tensor, base: Tensor | None, pairs: Tensor) -> AgentState:
+def _begun(agent: Agent, followers: Followers, pairs: Tensor) -> AgentState:
     """Returns the state of drivers of some pairs before their first window."""
     own = None
-    if base is not None:
-        own = base[pairs]
-    return agent.begin(network[pairs], DriverContext(own))
+    if followers.base is not None:
+        own = followers.base[pairs]
+    return agent.begin(followers.network[pairs], DriverContext(own))
 
 
 def _chunks(agent: Agent, batch: PairBatch, origins: Origins) -> Iterator[Origins]:

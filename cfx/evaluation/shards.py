@@ -15,8 +15,7 @@ from torch import Tensor
 from cfx.core import scratch
 from cfx.core.engine.base import Engine, Report
 from cfx.core.memory import give_back
-from cfx.data.pairs import PairBatch
-from cfx.evaluation.closed_loop import ClosedLoop, simulate_closed_loop
+from cfx.evaluation.closed_loop import ClosedLoop, Followers, simulate_closed_loop
 from cfx.policies.agent import Agent
 from cfx.simulation.base import Stepper
 
@@ -34,25 +33,14 @@ class ClosedLoopShard:
 
     simulator: Stepper
     agent: Agent
-    batch: PairBatch
+    followers: Followers
     first: Tensor
-    network: Tensor
-    base: Tensor | None
-    history: float | None
 
 
 def simulate_shard(shard: ClosedLoopShard, report: Report) -> ClosedLoop:
     """Simulates the pairs of a shard, wherever it is."""
-    found = simulate_closed_loop(
-        shard.simulator,
-        shard.agent,
-        shard.batch,
-        shard.first,
-        shard.network,
-        base=shard.base,
-        history=shard.history,
-    )
-    report(len(shard.batch))
+    found = simulate_closed_loop(shard.simulator, shard.agent, shard.followers, shard.first)
+    report(len(shard.first))
     return found
 
 
@@ -60,12 +48,8 @@ def simulate_in_shards(
     engine: Engine,
     simulator: Stepper,
     agent: Agent,
-    batch: PairBatch,
+    followers: Followers,
     first: Tensor,
-    network: Tensor,
-    *,
-    base: Tensor | None = None,
-    history: float | None = None,
 ) -> ClosedLoop:
     """Simulates P pairs as `simulate_closed_loop` does, in shards where there are many.
 
@@ -73,11 +57,12 @@ def simulate_in_shards(
 
     Args:
         engine: where shards are simulated; few pairs are simulated here.
-        simulator, agent, batch, first, network, base, history: as for `simulate_closed_loop`.
+        simulator, agent, followers, first: as for `simulate_closed_loop`.
     """
     # Whom it has learned from is a long list, and drives nothing.
     agent = replace(agent, learned_from={})
-    whole = ClosedLoopShard(simulator, agent, batch, first, network, base, history)
+    whole = ClosedLoopShard(simulator, agent, followers, first)
+    batch = followers.batch
     if len(batch) <= PAIRS_AT_ONCE:
         return simulate_shard(whole, _nothing)
     joined = _Joined(len(batch), 1 + int((batch.lengths - 1 - first).max()))
@@ -94,23 +79,17 @@ def _nothing(_pairs: int) -> None:
 
 def _cut(whole: ClosedLoopShard) -> Iterator[ClosedLoopShard]:
     """Yields shards that hold copies of their own rows: pickled, a slice is all that it is of."""
-    every = torch.arange(len(whole.batch), device=whole.first.device)
+    followers = whole.followers
+    every = torch.arange(len(whole.first), device=whole.first.device)
     for part in torch.split(every, PAIRS_AT_ONCE):
-        agent, network, base = whole.agent, whole.network[part], None
+        agent, network, base = whole.agent, followers.network[part], None
         if len(agent.names) > len(part):
             used, network = torch.unique(network, return_inverse=True)
             agent = agent.only(used)
-        if whole.base is not None:
-            base = whole.base[part]
-        yield ClosedLoopShard(
-            whole.simulator,
-            agent,
-            whole.batch[part].trimmed(),
-            whole.first[part],
-            network,
-            base,
-            whole.history,
-        )
+        if followers.base is not None:
+            base = followers.base[part]
+        some = Followers(followers.batch[part].trimmed(), network, base, followers.history)
+        yield ClosedLoopShard(whole.simulator, agent, some, whole.first[part])
 
 
 class _Joined:

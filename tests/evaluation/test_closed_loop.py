@@ -11,8 +11,8 @@ from torch import Tensor
 from cfx.calibration.windows import WindowSettings
 from cfx.data.pairs import PairBatch
 from cfx.data.style import StyleResult
-from cfx.evaluation.closed_loop import ClosedLoop, simulate_closed_loop
-from cfx.evaluation.evaluate import evaluate
+from cfx.evaluation.closed_loop import ClosedLoop, Followers, simulate_closed_loop
+from cfx.evaluation.evaluate import ComparedPairs, evaluate
 from cfx.models.base import DrivingModel, Leader
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
@@ -73,9 +73,8 @@ def test_true_parameters_drive_exactly_like_the_driver(model: DrivingModel) -> N
     loop = simulate_closed_loop(
         MemoryStepper(model, 0.1),
         constant(model, true),
-        batch,
+        Followers(batch, torch.arange(3)),
         torch.tensor([200, 215, 100]),
-        torch.arange(3),
     )
     for i, first in enumerate((200, 215, 100)):
         counted = int(loop.counted[i].sum())
@@ -92,7 +91,10 @@ def test_constant_parameters_are_the_plain_rollout() -> None:
     )
     first = torch.tensor([150, 150])
     loop = simulate_closed_loop(
-        MemoryStepper(model, 0.1), constant(model, parameters), batch, first, torch.arange(2)
+        MemoryStepper(model, 0.1),
+        constant(model, parameters),
+        Followers(batch, torch.arange(2)),
+        first,
     )
     leader = Leader(
         batch.leader_position[:, 150:],
@@ -119,7 +121,7 @@ def closed_loop_of(batch: PairBatch, model: DrivingModel, first: Tensor) -> Clos
         15,
     )
     return simulate_closed_loop(
-        MemoryStepper(model, 0.1), policy, batch, first, torch.arange(len(batch))
+        MemoryStepper(model, 0.1), policy, Followers(batch, torch.arange(len(batch))), first
     )
 
 
@@ -166,10 +168,16 @@ def test_a_pair_drives_the_same_whatever_drives_beside_it() -> None:
     batch = PairBatch.of(wavy_pairs(model, true))
     policy = adaptive(model, GruPolicy(start="middle", inputs=SPEEDS), 3, 10)
     together = simulate_closed_loop(
-        MemoryStepper(model, 0.1), policy, batch, torch.tensor([150, 200, 100]), torch.arange(3)
+        MemoryStepper(model, 0.1),
+        policy,
+        Followers(batch, torch.arange(3)),
+        torch.tensor([150, 200, 100]),
     )
     alone = simulate_closed_loop(
-        MemoryStepper(model, 0.1), policy, batch[1:2], torch.tensor([200]), torch.tensor([1])
+        MemoryStepper(model, 0.1),
+        policy,
+        Followers(batch[1:2], torch.tensor([1])),
+        torch.tensor([200]),
     )
     steps = alone.speed.shape[1]
     torch.testing.assert_close(together.speed[1:2, :steps], alone.speed, atol=1e-5, rtol=1e-5)
@@ -182,10 +190,16 @@ def test_several_drivers_share_one_network() -> None:
     )
     shared = adaptive(model, GruPolicy(start="middle", inputs=SPEEDS), 1, 10)
     both = simulate_closed_loop(
-        MemoryStepper(model, 0.1), shared, batch, torch.tensor([150, 150]), torch.tensor([0, 0])
+        MemoryStepper(model, 0.1),
+        shared,
+        Followers(batch, torch.tensor([0, 0])),
+        torch.tensor([150, 150]),
     )
     second = simulate_closed_loop(
-        MemoryStepper(model, 0.1), shared, batch[1:2], torch.tensor([150]), torch.tensor([0])
+        MemoryStepper(model, 0.1),
+        shared,
+        Followers(batch[1:2], torch.tensor([0])),
+        torch.tensor([150]),
     )
     torch.testing.assert_close(both.parameters[1:2], second.parameters, atol=1e-5, rtol=1e-5)
 
@@ -201,19 +215,17 @@ def test_the_table_says_what_the_loops_did() -> None:
         "default": simulate_closed_loop(
             simulator,
             constant(model, model.space.defaults().expand(2, 2)),
-            batch,
+            Followers(batch, torch.arange(2)),
             first,
-            torch.arange(2),
         ),
         "fixed": simulate_closed_loop(
             simulator,
             constant(model, torch.tensor([[4.0, 0.1], [4.0, 0.1]]).double()),
-            batch,
+            Followers(batch, torch.arange(2)),
             first,
-            torch.arange(2),
         ),
         "policy": simulate_closed_loop(
-            simulator, constant(model, true), batch, first, torch.arange(2)
+            simulator, constant(model, true), Followers(batch, torch.arange(2)), first
         ),
     }
     style = StyleResult(
@@ -221,7 +233,9 @@ def test_the_table_says_what_the_loops_did() -> None:
         {},
         (0.3, 0.7),
     )
-    result = evaluate(pairs, batch, first, loops, model.space, style, seed=0)
+    result = evaluate(
+        ComparedPairs(pairs, batch, first, style), {"test": loops}, model.space, seed=0
+    )
     table = result.table.set_index(["pair_id", "method"])
     assert table.loc[("p0", "policy"), "rmse_speed"] == pytest.approx(0, abs=1e-9)
     assert table.loc[("p1", "policy"), "improvement"] == pytest.approx(1)
@@ -245,21 +259,17 @@ def test_a_collision_is_counted() -> None:
     loop = simulate_closed_loop(
         MemoryStepper(model, 0.1),
         constant(model, torch.tensor([[1.5, 0.1]]).double()),
-        batch,
+        Followers(batch, torch.arange(1)),
         first,
-        torch.arange(1),
     )
     crashed = loop._replace(gap=torch.where(torch.arange(loop.gap.shape[1]) == 7, -0.1, loop.gap))
     style = StyleResult(
         pd.DataFrame({"driver": ["test/0"], "score": [0.2], "cluster": [0]}), {}, (0.3, 0.7)
     )
     result = evaluate(
-        pairs,
-        batch,
-        first,
-        {"default": loop, "fixed": loop, "policy": crashed},
+        ComparedPairs(pairs, batch, first, style),
+        {"test": {"default": loop, "fixed": loop, "policy": crashed}},
         model.space,
-        style,
         seed=0,
     )
     assert result.metrics()["collisions/policy"] == 1

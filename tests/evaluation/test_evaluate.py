@@ -12,7 +12,7 @@ import torch
 from cfx.data.pairs import PairBatch
 from cfx.data.style import StyleResult
 from cfx.evaluation.closed_loop import ClosedLoop
-from cfx.evaluation.evaluate import evaluate
+from cfx.evaluation.evaluate import ComparedPairs, evaluate
 from cfx.models.krauss import Krauss
 from tests.drives import straight_pairs
 from tests.made_up import GAINS, make_history, make_results
@@ -40,14 +40,10 @@ def test_the_table_and_the_metrics_tell_what_was_driven() -> None:
     )
     loops = {"default": calm, "fixed": calm, "policy": hard}
     found = evaluate(
-        pairs,
-        batch,
-        first,
-        loops,
+        ComparedPairs(pairs, batch, first, style),
+        {"test": loops, "full_trajectory": {"default": calm, "policy": hard}},
         model.space,
-        style,
         seed=0,
-        full_trajectory={"default": calm, "policy": hard},
     )
     table = found.table.set_index(["pair_id", "method"])
     assert table["hard_braking"].to_dict() == {("p0", "policy"): 1} | dict.fromkeys(
@@ -69,14 +65,11 @@ def test_the_table_and_the_metrics_tell_what_was_driven() -> None:
         {model.space.names[0]: (-5.0, 5.0)}
     )  # then the policy's value is none of its bounds
     within = evaluate(
-        pairs,
-        batch,
-        first,
-        {**loops, "fixed": hard},
+        ComparedPairs(pairs, batch, first, style),
+        {"test": {**loops, "fixed": hard}},
         model.space,
-        style,
         seed=0,
-        adaptation_space=adaptation_space,
+        policy_space=adaptation_space,
     ).metrics()
     assert (within["at_bounds/policy"], within["at_bounds/fixed"]) == (0, 0.5)
 
@@ -122,7 +115,9 @@ def test_what_comes_after_the_start_is_measured_on_its_own() -> None:
         (0.3, 0.7),
     )
     loops = {"fixed": loop(0.5), "policy": loop(0.2)}
-    found = evaluate(pairs, batch, first, loops, Krauss().space, style, seed=0)
+    found = evaluate(
+        ComparedPairs(pairs, batch, first, style), {"test": loops}, Krauss().space, seed=0
+    )
     table = found.table.set_index(["pair_id", "method"])["steady_rmse_speed"]
     assert table["p0"].to_dict() == pytest.approx({"fixed": 0.5, "policy": 0.2})
     assert table["p1"].isna().all()
@@ -134,12 +129,9 @@ def test_what_comes_after_the_start_is_measured_on_its_own() -> None:
         method: ClosedLoop(*(values[1:] for values in one[:4])) for method, one in loops.items()
     }
     short = evaluate(
-        pairs.select([False, True], "long"),
-        batch[1:],
-        first[1:],
-        alone,
+        ComparedPairs(pairs.select([False, True], "long"), batch[1:], first[1:], style),
+        {"test": alone},
         Krauss().space,
-        style,
         seed=0,
     )
     assert not [name for name in short.metrics() if name.startswith("steady")]

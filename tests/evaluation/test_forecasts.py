@@ -12,7 +12,7 @@ from torch import Tensor
 
 from cfx.data.pairs import PairBatch
 from cfx.evaluation import forecast_paths
-from cfx.evaluation.closed_loop import simulate_closed_loop
+from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.evaluation.forecast_paths import (
     LeaderFuture,
     Origins,
@@ -53,7 +53,11 @@ def test_a_driver_with_the_true_parameters_is_forecast_exactly(batch: PairBatch)
     true = MODEL.space.defaults() + torch.tensor([[0.0, 0.0], [0.8, 0.2], [1.5, 0.1]]).double()
     origins = Origins.every(20, torch.tensor([40, 50, 60]), torch.tensor([269, 269, 269]))
     paths = simulate_from_origins(
-        MemoryStepper(MODEL, 0.1), constant(MODEL, true), batch, origins, STEPS, torch.arange(3)
+        MemoryStepper(MODEL, 0.1),
+        constant(MODEL, true),
+        Followers(batch, torch.arange(3)),
+        origins,
+        STEPS,
     )
     measured, recorded = measured_paths(batch, origins, STEPS)
     assert bool(recorded.all())
@@ -70,19 +74,17 @@ def test_each_origin_is_a_closed_loop_of_its_own(
     agent, stepper = policy(), MemoryStepper(MODEL, 0.1)
     origins = Origins(torch.tensor([0, 2, 2]), torch.tensor([33, 100, 250]))
     network = torch.tensor([2, 0, 1])
-    paths = simulate_from_origins(stepper, agent, batch, origins, STEPS, network)
+    paths = simulate_from_origins(stepper, agent, Followers(batch, network), origins, STEPS)
     for k, (pair, frame) in enumerate(
         zip(origins.pair.tolist(), origins.frame.tolist(), strict=True)
     ):
         alone = simulate_closed_loop(
             stepper,
             agent,
-            batch[pair : pair + 1],
+            Followers(batch[pair : pair + 1], network[pair : pair + 1]),
             torch.tensor([frame]),
-            network[pair : pair + 1],
-            steps=STEPS,
         )
-        torch.testing.assert_close(paths.speed[k], alone.speed[0])
+        torch.testing.assert_close(paths.speed[k], alone.speed[0, : STEPS + 1])
 
 
 @pytest.mark.parametrize("leader", ["given", "constant_speed", "constant_acceleration"])
@@ -106,10 +108,9 @@ def test_nothing_is_read_that_is_not_known_at_the_origin(
                 simulate_from_origins(
                     MemoryStepper(MODEL, 0.1),
                     agent,
-                    one,
+                    Followers(one, torch.arange(3)),
                     origins,
                     STEPS,
-                    torch.arange(3),
                     leader=leader,
                 )
             )
@@ -126,11 +127,10 @@ def test_a_leader_at_constant_speed_is_predicted_exactly_at_constant_speed() -> 
         paths = simulate_from_origins(
             MemoryStepper(MODEL, 0.1),
             agent,
-            batch,
+            Followers(batch, torch.arange(2)),
             origins,
             STEPS,
-            torch.arange(2),
-            leader=leader,  # type: ignore[arg-type]  # one of its three
+            leader=leader,
         )
         found.append(paths.travelled)
     torch.testing.assert_close(found[0], found[1])

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.data.pairs import PairBatch
-from cfx.evaluation.closed_loop import simulate_closed_loop
+from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.evaluation.platoon import (
     LENGTH,
     VEHICLES,
@@ -135,7 +135,10 @@ def test_each_vehicle_drives_as_it_would_alone_behind_the_one_before() -> None:
             0.1,
         )
         alone = simulate_closed_loop(
-            MemoryStepper(model, 0.1), policy, batch, torch.zeros(2).long(), torch.arange(2)
+            MemoryStepper(model, 0.1),
+            policy,
+            Followers(batch, torch.arange(2)),
+            torch.zeros(2).long(),
         )
         torch.testing.assert_close(alone.speed, own, atol=1e-5, rtol=0)
         torch.testing.assert_close(alone.gap, gap[vehicle - 1], atol=1e-4, rtol=0)

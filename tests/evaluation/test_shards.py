@@ -12,7 +12,7 @@ from torch import Tensor
 from cfx.core.engine.local import LocalEngine
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.evaluation import shards
-from cfx.evaluation.closed_loop import simulate_closed_loop
+from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.evaluation.shards import simulate_in_shards
 from cfx.models.krauss import Krauss
 from cfx.policies.gru import GruPolicy
@@ -40,7 +40,7 @@ def test_shards_give_what_the_whole_gives(monkeypatch: pytest.MonkeyPatch) -> No
     agent = adaptive(model, GruPolicy(hidden_size=4), len(pairs), 30)
     first = torch.tensor([30, 20, 50, 10, 30])
     network = torch.arange(len(pairs))
-    arguments = (MemoryStepper(model, 0.1), agent, batch, first, network)
+    arguments = (MemoryStepper(model, 0.1), agent, Followers(batch, network), first)
     whole = simulate_closed_loop(*arguments)
     parts = simulate_in_shards(LocalEngine(), *arguments)
     assert torch.equal(parts.counted, whole.counted)
@@ -67,12 +67,12 @@ def test_a_shard_holds_nothing_of_the_others(monkeypatch: pytest.MonkeyPatch) ->
     agent = adaptive(model, GruPolicy(hidden_size=4), len(pairs), 30)
     agent = replace(agent, learned_from={"content": "driver"})
     first, network = torch.full((5,), 10), torch.arange(5)
-    simulate_in_shards(engine, MemoryStepper(model, 0.1), agent, batch, first, network)
-    assert [len(one.batch) for one in engine.shards] == [2, 2, 1]
+    simulate_in_shards(engine, MemoryStepper(model, 0.1), agent, Followers(batch, network), first)
+    assert [len(one.followers.batch) for one in engine.shards] == [2, 2, 1]
     row = batch.leader_speed[0].nbytes
     for one in engine.shards:
-        rows = len(one.batch)
-        assert one.batch.leader_speed.untyped_storage().nbytes() == rows * row
+        rows = len(one.followers.batch)
+        assert one.followers.batch.leader_speed.untyped_storage().nbytes() == rows * row
         assert one.first.untyped_storage().nbytes() == rows * one.first.itemsize
         assert len(one.agent.names) == len(one.agent.scaler.mean) == rows
         assert not one.agent.learned_from
@@ -86,7 +86,12 @@ def test_few_pairs_are_one_call_with_the_same_bits() -> None:
     model, pairs = Krauss(), pairs_of_several_lengths()
     batch = PairBatch.of(pairs)
     agent = adaptive(model, GruPolicy(hidden_size=4), len(pairs), 30)
-    arguments = (MemoryStepper(model, 0.1), agent, batch, torch.full((5,), 10), torch.arange(5))
+    arguments = (
+        MemoryStepper(model, 0.1),
+        agent,
+        Followers(batch, torch.arange(5)),
+        torch.full((5,), 10),
+    )
     parts = simulate_in_shards(LocalEngine(), *arguments)
     assert torch.equal(parts.speed, simulate_closed_loop(*arguments).speed)
 

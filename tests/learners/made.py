@@ -12,7 +12,7 @@ import torch
 
 from cfx.calibration.windows import Split, WindowSettings
 from cfx.data.pairs import PairBatch
-from cfx.evaluation.closed_loop import ClosedLoop, simulate_closed_loop
+from cfx.evaluation.closed_loop import ClosedLoop, Followers, simulate_closed_loop
 from cfx.learners.base import TrainingData, TrainingResult
 from cfx.learners.rollout import RolloutLearner, RolloutSettings
 from cfx.learners.rollout.dataset import RolloutDataset
@@ -101,7 +101,11 @@ def loop(
     agent = ready(result, data, policy)
     generator = None if seed is None else torch.Generator().manual_seed(seed)
     return simulate_closed_loop(
-        data.simulator, agent, data.batch, frames, data.network, base=base, generator=generator
+        data.simulator,
+        agent,
+        Followers(data.batch, data.network, base=base),
+        frames,
+        generator=generator,
     )
 
 

@@ -19,7 +19,7 @@ from cfx.calibration.windows import WindowSettings
 from cfx.contracts import PolicyContract
 from cfx.core.errors import ConfigError
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
-from cfx.evaluation.closed_loop import simulate_closed_loop
+from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.evaluation.forecast_paths import Origins, simulate_from_origins
 from cfx.models.base import DrivingModel
 from cfx.models.idm import IDM
@@ -140,7 +140,10 @@ def test_estimates_converge_to_the_true_parameters(name: str) -> None:
     prior = torch.tensor([[1.5, 0.15]], dtype=torch.float64)
     agent = agent_of(ESTIMATORS[name], Krauss(), prior)
     loop = simulate_closed_loop(
-        MemoryStepper(Krauss(), 0.1), agent, batch, torch.full((3,), 250), torch.zeros(3).long()
+        MemoryStepper(Krauss(), 0.1),
+        agent,
+        Followers(batch, torch.zeros(3).long()),
+        torch.full((3,), 250),
     )
     found = loop.parameters[:, -1, 0]
     torch.testing.assert_close(found, true[:, 0], atol=0.05, rtol=0.0)
@@ -151,7 +154,10 @@ def test_what_the_policy_itself_drives_changes_no_estimate(name: str) -> None:
     batch, _, _ = krauss_drivers()
     agent = agent_of(ESTIMATORS[name], Krauss(), torch.tensor([[1.5, 0.15]]).double())
     loop = simulate_closed_loop(
-        MemoryStepper(Krauss(), 0.1), agent, batch, torch.full((3,), 200), torch.zeros(3).long()
+        MemoryStepper(Krauss(), 0.1),
+        agent,
+        Followers(batch, torch.zeros(3).long()),
+        torch.full((3,), 200),
     )
     assert torch.equal(loop.parameters, loop.parameters[:, :1].expand_as(loop.parameters))
 
@@ -162,7 +168,10 @@ def test_without_history_a_driver_has_the_pooled_parameters(name: str) -> None:
     prior = torch.tensor([[1.2, 0.3]], dtype=torch.float64)
     agent = agent_of(ESTIMATORS[name], Krauss(), prior)
     loop = simulate_closed_loop(
-        MemoryStepper(Krauss(), 0.1), agent, batch, torch.zeros(3).long(), torch.zeros(3).long()
+        MemoryStepper(Krauss(), 0.1),
+        agent,
+        Followers(batch, torch.zeros(3).long()),
+        torch.zeros(3).long(),
     )
     wide = 0.0
     if name == "particle_filter":
@@ -176,12 +185,12 @@ def test_origins_that_share_their_observation_are_as_each_alone(name: str) -> No
     agent = agent_of(ESTIMATORS[name], Krauss(), torch.tensor([[1.5, 0.15]]).double())
     stepper, network = MemoryStepper(Krauss(), 0.1), torch.zeros(3).long()
     origins = Origins(torch.tensor([0, 0, 2]), torch.tensor([40, 90, 65]))
-    paths = simulate_from_origins(stepper, agent, batch, origins, 30, network)
+    paths = simulate_from_origins(stepper, agent, Followers(batch, network), origins, 30)
     for k, (pair, frame) in enumerate(zip(origins.pair, origins.frame, strict=True)):
         alone = simulate_closed_loop(
-            stepper, agent, batch[pair[None]], frame[None], network[:1], steps=30
+            stepper, agent, Followers(batch[pair[None]], network[:1]), frame[None]
         )
-        torch.testing.assert_close(paths.speed[k], alone.speed[0], atol=2e-3, rtol=0)
+        torch.testing.assert_close(paths.speed[k], alone.speed[0, :31], atol=2e-3, rtol=0)
 
 
 def test_recalibration_is_the_calibration_of_the_latest_history() -> None:
@@ -192,7 +201,10 @@ def test_recalibration_is_the_calibration_of_the_latest_history() -> None:
     default = Krauss().space.defaults()
     agent = agent_of(policy, Krauss(), default[None])
     loop = simulate_closed_loop(
-        MemoryStepper(Krauss(), 0.1), agent, batch, torch.full((3,), until), torch.zeros(3).long()
+        MemoryStepper(Krauss(), 0.1),
+        agent,
+        Followers(batch, torch.zeros(3).long()),
+        torch.full((3,), until),
     )
     cut = []
     for pair in pairs:
@@ -212,7 +224,10 @@ def test_any_optimizer_recalibrates() -> None:
     policy = RecalibratePolicy(prior=0.0, optimizer={"name": "random", "samples": 2048})
     agent = agent_of(policy, Krauss(), torch.tensor([[1.5, 0.15]]).double())
     loop = simulate_closed_loop(
-        MemoryStepper(Krauss(), 0.1), agent, batch, torch.full((3,), 250), torch.zeros(3).long()
+        MemoryStepper(Krauss(), 0.1),
+        agent,
+        Followers(batch, torch.zeros(3).long()),
+        torch.full((3,), 250),
     )
     torch.testing.assert_close(loop.parameters[:, -1, 0], true[:, 0], atol=0.1, rtol=0.0)
 
@@ -222,7 +237,10 @@ def test_a_strong_prior_keeps_the_pooled_parameters() -> None:
     prior = torch.tensor([[1.5, 0.15]], dtype=torch.float64)
     agent = agent_of(RecalibratePolicy(prior=1e4), Krauss(), prior)
     loop = simulate_closed_loop(
-        MemoryStepper(Krauss(), 0.1), agent, batch, torch.full((3,), 250), torch.zeros(3).long()
+        MemoryStepper(Krauss(), 0.1),
+        agent,
+        Followers(batch, torch.zeros(3).long()),
+        torch.full((3,), 250),
     )
     torch.testing.assert_close(loop.parameters[:, -1], prior.expand(3, -1), atol=1e-3, rtol=0)
 
@@ -237,7 +255,10 @@ def test_extreme_driving_leaves_estimates_within_their_bounds() -> None:
     for policy in ESTIMATORS.values():
         agent = agent_of(policy, IDM(), IDM().space.defaults()[None])
         loop = simulate_closed_loop(
-            MemoryStepper(IDM(), 0.1), agent, wrong, torch.full((3,), 150), torch.zeros(3).long()
+            MemoryStepper(IDM(), 0.1),
+            agent,
+            Followers(wrong, torch.zeros(3).long()),
+            torch.full((3,), 150),
         )
         assert bool(((loop.parameters >= low) & (loop.parameters <= high)).all())
 
@@ -252,7 +273,7 @@ def test_with_a_residual_a_forecast_starts_with_the_drivers_acceleration(residua
     agent = replace(agent, core=AgentCore(agent.policy, agent.network, agent.scaler, head))
     origins = Origins(torch.tensor([0, 1, 2]), torch.tensor([100, 120, 150]))
     paths = simulate_from_origins(
-        MemoryStepper(model, 0.1), agent, batch, origins, 1, torch.zeros(3).long()
+        MemoryStepper(model, 0.1), agent, Followers(batch, torch.zeros(3).long()), origins, 1
     )
     first = (paths.speed[:, 1] - paths.speed[:, 0]) / 0.1
     driver = batch.follower_acceleration[origins.pair, origins.frame].clamp(-9.0, 2.6)
@@ -282,7 +303,10 @@ def test_an_estimator_is_saved_and_loaded(name: str, tmp_path: Path) -> None:
     speeds = []
     for one in (agent, checkpoint.load(tmp_path)):
         loop = simulate_closed_loop(
-            MemoryStepper(Krauss(), 0.1), one, batch, torch.full((3,), 100), torch.zeros(3).long()
+            MemoryStepper(Krauss(), 0.1),
+            one,
+            Followers(batch, torch.zeros(3).long()),
+            torch.full((3,), 100),
         )
         speeds.append(loop.speed)
     assert torch.equal(*speeds)

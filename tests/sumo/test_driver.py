@@ -14,8 +14,8 @@ import cfx_sumo
 from cfx.core.errors import DataError, ParameterError, SumoError
 from cfx.data.pairs import PairBatch
 from cfx.data.style import StyleResult, StyleSettings, measure_style
-from cfx.evaluation.closed_loop import simulate_closed_loop
-from cfx.evaluation.evaluate import evaluate
+from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
+from cfx.evaluation.evaluate import ComparedPairs, evaluate
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.policies import checkpoint
@@ -588,16 +588,18 @@ def test_in_sumo_a_policy_drives_as_in_memory(
     simulator, base = MemoryStepper(model, 0.1), model.space.defaults().expand(4, -1)
     loops = {
         "policy": simulate_closed_loop(
-            simulator, policy, batch, first, own, base=base, history=history
+            simulator, policy, Followers(batch, own, base=base, history=history), first
         ),
         "default": simulate_closed_loop(
-            simulator, _baseline(policy, DefaultPolicy(), 4), batch, first, own
+            simulator, _baseline(policy, DefaultPolicy(), 4), Followers(batch, own), first
         ),
         "fixed": simulate_closed_loop(
-            simulator, _baseline(policy, FixedPolicy(), 4), batch, first, own
+            simulator, _baseline(policy, FixedPolicy(), 4), Followers(batch, own), first
         ),
     }
-    evaluation = evaluate(pairs, batch, first, loops, model.space, style_of(pairs), seed=0)
+    evaluation = evaluate(
+        ComparedPairs(pairs, batch, first, style_of(pairs)), {"test": loops}, model.space, seed=0
+    )
     knowledge = PolicyKnowledge("fixed", history)
     job = FinishedJob(pairs, policy, evaluation, tmp_path / "policy", knowledge)
     shown = simulate_in_sumo(job, read_motorway(None, tmp_path), 4)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from cfx.core.component import Settings
 from cfx.core.errors import ConfigError, DataError
+from cfx.evaluation.closed_loop import Followers
 from cfx.evaluation.distributions import Recorded, score_distributions
 from cfx.evaluation.forecast_paths import (
     LeaderFuture,
@@ -274,13 +275,10 @@ class Forecast(FoldsOrFinished):
         return sample_from_origins(
             test.context.simulator,
             agent,
-            test.batch,
+            Followers(test.batch, network, base, test.policy.context_rule.history_s),
             origins,
             steps,
-            network,
             generators,
-            base=base,
-            history=test.policy.context_rule.history_s,
             leader=self.settings.leader,
         )
 

@@ -6,7 +6,7 @@ Shapes: Q test pairs, N networks, n tuned parameters.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 
 from cfx.data.pairs import PairBatch, PairSet
-from cfx.evaluation.closed_loop import ClosedLoop
-from cfx.evaluation.evaluate import closed_loop_errors, evaluate
+from cfx.evaluation.closed_loop import ClosedLoop, Followers
+from cfx.evaluation.evaluate import ComparedPairs, closed_loop_errors, evaluate
+from cfx.evaluation.outside import outside_of_scopes
 from cfx.evaluation.platoon import measure_platoons
 from cfx.evaluation.protocols.base import ProtocolContext
 from cfx.evaluation.result import Evaluation, Platoon
@@ -73,21 +74,20 @@ class HeldOut:
         history = None
         if self.policy.base is not None and histories:
             history = self.history(histories, loops["fixed"])
-        return evaluate(
-            self.pairs,
-            self.batch,
-            self.first,
-            loops,
+        scopes = {"test": loops, "full_trajectory": self._full_trajectory(methods)}
+        evaluation = evaluate(
+            ComparedPairs(self.pairs, self.batch, self.first, context.style, fold),
+            scopes,
             context.space,
-            context.style,
-            adaptation_space=self.policy.model_space,
+            policy_space=self.policy.model_space,
             seed=context.seed,
-            fold=fold,
-            full_trajectory=self._full_trajectory(methods),
             metrics=context.metrics,
-            agent=self.policy,
+        )
+        return replace(
+            evaluation,
             platoon=self._platoons(methods),
             history=history,
+            outside=outside_of_scopes(self.policy, scopes),
         )
 
     def methods_without_history(self) -> dict[str, Agent]:
@@ -112,11 +112,8 @@ class HeldOut:
                 context.engine,
                 context.simulator,
                 agent,
-                self.batch,
+                Followers(self.batch, self.network, base, rule.history_s),
                 self.first,
-                self.network,
-                base=base,
-                history=rule.history_s,
             )
         loops["fixed"] = self._constant(self.fixed)
         if self.base is not None and self.policy.base is not None and rule.shrinkage > 0:
@@ -127,22 +124,19 @@ class HeldOut:
         """Simulates the test part with constant parameters of each driver, `(Q, n)`."""
         agent = self.context.constant(FixedPolicy(), parameters)
         each = torch.arange(len(self.first), device=self.first.device)
+        followers = Followers(self.batch, each)
         return simulate_in_shards(
-            self.context.engine, self.context.simulator, agent, self.batch, self.first, each
+            self.context.engine, self.context.simulator, agent, followers, self.first
         )
 
     def _full_trajectory(self, methods: Mapping[str, Agent]) -> dict[str, ClosedLoop]:
         """Simulates the test trajectories from their first frame on."""
         begin = torch.zeros_like(self.first)
+        followers = Followers(self.batch, self.network)
         loops = {}
         for name, agent in methods.items():
             loops[name] = simulate_in_shards(
-                self.context.engine,
-                self.context.simulator,
-                agent,
-                self.batch,
-                begin,
-                self.network,
+                self.context.engine, self.context.simulator, agent, followers, begin
             )
         return loops
 
@@ -184,11 +178,8 @@ class HeldOut:
             context.engine,
             context.simulator,
             self.policy,
-            self.batch,
+            Followers(self.batch, self.network, base, amount),
             self.first,
-            self.network,
-            base=base,
-            history=amount,
         )
         speed, gap = closed_loop_errors(self.batch, self.first, loop)
         observed = self.first.cpu().numpy() * context.simulator.dt

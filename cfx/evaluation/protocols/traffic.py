@@ -14,7 +14,7 @@ from torch import Tensor
 from cfx.core.component import Settings
 from cfx.core.errors import ConfigError
 from cfx.core.memory import require_memory
-from cfx.evaluation.closed_loop import burnt_in
+from cfx.evaluation.closed_loop import Followers, burnt_in
 from cfx.evaluation.protocols.base import ProtocolContext, ProtocolResult
 from cfx.evaluation.protocols.finished import FoldsOrFinished, FoldsOrFinishedSettings
 from cfx.evaluation.protocols.held_out import HeldOut
@@ -329,8 +329,8 @@ def _observed(test: HeldOut, agent: Agent, network: Tensor) -> AgentState:
     part, as when it drives there.
     """
     base = test.unseen_base if test.base is None else test.base
-    history = agent.context_rule.history_s
-    state = burnt_in(agent, test.batch, test.first, network, base, history, agent.dt)
+    followers = Followers(test.batch, network, base, agent.context_rule.history_s)
+    state = burnt_in(agent, followers, test.first, agent.dt)
     pairs = torch.arange(len(test.batch), device=test.first.device)
     now = measured_history(test.batch, pairs, test.first, agent.windows.length)
     _, state = agent.act(now, state)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import ClassVar, Literal
 
 import torch
@@ -10,8 +11,9 @@ from torch import Tensor
 
 from cfx.calibration.windows import Split
 from cfx.core.component import Settings
-from cfx.evaluation.closed_loop import ClosedLoop
-from cfx.evaluation.evaluate import evaluate
+from cfx.evaluation.closed_loop import ClosedLoop, Followers
+from cfx.evaluation.evaluate import ComparedPairs, evaluate
+from cfx.evaluation.outside import outside_of_scopes
 from cfx.evaluation.platoon import measure_platoons
 from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.evaluation.result import Platoon
@@ -75,18 +77,19 @@ class WithinDriver(Protocol):
             training_result = context.untrained(context.policy, fixed)
         policy = context.ready(context.policy, training_result, names)
         first = split.frame.to(batch.lengths.device)
+        scopes = {"test": _test_part(context, policy, network, first, fixed)}
         evaluation = evaluate(
-            pairs,
-            batch,
-            first,
-            _test_part(context, policy, network, first, fixed),
+            ComparedPairs(pairs, batch, first, context.style),
+            scopes,
             context.space,
-            context.style,
-            adaptation_space=policy.model_space,
+            policy_space=policy.model_space,
             seed=context.seed,
-            platoon=self._platoons(context, policy, fixed),
             metrics=context.metrics,
-            agent=policy,
+        )
+        evaluation = replace(
+            evaluation,
+            platoon=self._platoons(context, policy, fixed),
+            outside=outside_of_scopes(policy, scopes),
         )
         return ProtocolResult(
             evaluation,
@@ -129,9 +132,10 @@ def _test_part(
     default = context.constant(DefaultPolicy(), fixed)
     constant = context.constant(FixedPolicy(), fixed)
     each = torch.arange(len(first), device=first.device)
-    together = (context.engine, context.simulator)
-    return {
-        "default": simulate_in_shards(*together, default, context.batch, first, each),
-        "fixed": simulate_in_shards(*together, constant, context.batch, first, each),
-        "policy": simulate_in_shards(*together, policy, context.batch, first, network, base=fixed),
-    }
+    alone = Followers(context.batch, each)
+    learned = Followers(context.batch, network, base=fixed)
+    methods = {"default": (default, alone), "fixed": (constant, alone), "policy": (policy, learned)}
+    loops = {}
+    for name, (agent, followers) in methods.items():
+        loops[name] = simulate_in_shards(context.engine, context.simulator, agent, followers, first)
+    return loops

@@ -15,6 +15,7 @@ import cfx
 from cfx.contracts import ProtocolContract
 from cfx.core.errors import CfxError, DataError
 from cfx.data.pairs import PairBatch
+from cfx.evaluation.closed_loop import Followers
 from cfx.evaluation.forecast_paths import Origins, simulate_from_origins
 from cfx.evaluation.protocols.base import Protocol
 from cfx.evaluation.protocols.forecast import Forecast
@@ -107,11 +108,9 @@ def test_the_finished_policy_forecasts_from_every_moment(drawn: Path, tmp_path: 
     paths = simulate_from_origins(
         MemoryStepper(cfx.get("model", "krauss")(), 0.1),
         agent,
-        batch,
+        Followers(batch, torch.zeros(3, dtype=torch.int64), history=0.0),
         origins,
         20,
-        torch.zeros(3, dtype=torch.int64),
-        history=0.0,
     )
     happened = batch.follower_speed[origins.pair, origins.frame + 20]
     np.testing.assert_allclose(

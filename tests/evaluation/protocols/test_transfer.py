@@ -16,7 +16,7 @@ from cfx.contracts import ProtocolContract
 from cfx.core.errors import CfxError, DataError, TrackingError
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.tidy import TidyDataset, frame_of, write_tidy
-from cfx.evaluation.closed_loop import simulate_closed_loop
+from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.evaluation.protocols.base import Protocol
 from cfx.evaluation.protocols.transfer import Transfer
 from cfx.policies import checkpoint
@@ -102,7 +102,10 @@ def test_it_drives_with_the_network_of_all_from_the_populations_parameters(
     number = torch.full((3,), policy.names.index(ALL))
     model = cfx.get("model", "krauss")()
     loop = simulate_closed_loop(
-        MemoryStepper(model, 0.1), policy, batch, torch.zeros(3, dtype=torch.int64), number
+        MemoryStepper(model, 0.1),
+        policy,
+        Followers(batch, number),
+        torch.zeros(3, dtype=torch.int64),
     )
     error = loop.speed - batch.follower_speed[:, : loop.speed.shape[1]]
     rows = result.pairs[result.pairs.method == "policy"]
