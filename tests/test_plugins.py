@@ -440,7 +440,10 @@ def test_a_new_package_installs_and_its_tests_pass(kind: str, tmp_path: Path, ca
     assert "declares no version" not in said
     expected = "" if kind == "table" else f"name: novel_{kind}"
     if kind == "command":
-        expected = "cfx novel_command The command novel_command for cfx (from cfx-novel-command)"
+        expected = (
+            "cfx novel_command how much each of some jobs improves on constant parameters"
+            " (from cfx-novel-command)"
+        )
     assert expected in said
 
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 import importlib.util
 import logging
 import re
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -169,15 +170,20 @@ def register() -> None:
 
 
 def listed_commands() -> str:
-    """Returns a line for each sub-command, as `--help` prints them; imports cfx's own alone."""
+    """Returns a line for each sub-command, as `--help` prints them; nothing where nobody asks.
+
+    Hydra fills in its help of every job; a third party's command is imported for it here alone.
+    """
+    if not {"--help", "-h"}.intersection(sys.argv):
+        return ""
     lines = []
     for name in registry.names("command"):
         try:
-            found = registry.entry("command", name)
-            about = f"{found.summary} (from {found.distribution})".strip()
-            if found.distribution == registry.OWN:
-                about = cast("type[Command]", registry.get("command", name)).summary
-        except PluginError as error:  # two distributions bring it
+            about = cast("type[Command]", registry.get("command", name)).summary
+            distribution = registry.entry("command", name).distribution
+            if distribution != registry.OWN:
+                about = f"{about} (from {distribution})".strip()
+        except PluginError as error:  # it cannot be imported, or two distributions bring it
             about = str(error)
         lines.append(f"  cfx {name:<12} {about}")
     return "\n".join(lines).replace("$", "$$")  # Hydra fills in what follows a $

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 from typing import Any
 
@@ -109,7 +110,10 @@ class Telling(WithinDriver):
 
 class Drawing(WithinDriver):
     def run(self, context: ProtocolContext) -> ProtocolResult:
-        return super().run(replace(context, seed=int(torch.randint(0, 1000, ()))))
+        calibrator = copy(context.calibrator)
+        seed = int(torch.randint(0, 1000, ()))
+        calibrator.solver = replace(calibrator.solver, seed=seed)
+        return super().run(replace(context, calibrator=calibrator))
 
 
 class Eager(WithinDriver):
