@@ -100,6 +100,7 @@ KINDS: dict[str, Kind] = {
             chosen=False,
         ),
         Kind("table", "cfx.results.table:ResultTable", chosen=False),
+        Kind("demo", "cfx.evaluation.demo:Demo"),
         Kind("command", "cfx.core.command:Command", chosen=False),
     )
 }
