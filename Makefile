@@ -83,8 +83,8 @@ conf: $(VENV)/.ready
 	$(BIN)/python -m cfx.app.nodes
 
 # The stamps are made again when what they were made from changes, so a second `make run` installs nothing.
-# What README's commands need comes from plugins/ too: the readers of published recordings, the benchmark, SUMO.
-EVERYBODYS = plugins/cfx-recordings plugins/cfx-benchmark plugins/cfx-sumo
+# What README's commands need comes from plugins/ too: the readers of published recordings, the benchmark, SUMO, traffic.
+EVERYBODYS = plugins/cfx-recordings plugins/cfx-benchmark plugins/cfx-sumo plugins/cfx-traffic
 $(VENV)/.ready: pyproject.toml $(EVERYBODYS:%=%/pyproject.toml) constraints.txt $(VENV)/.torch
 	$(PIP) install --quiet --constraint constraints.txt $(addprefix --editable ,. $(EVERYBODYS))
 	touch $@

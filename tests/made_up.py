@@ -17,7 +17,6 @@ from cfx.evaluation.metrics.base import MetricInfo
 from cfx.evaluation.result import Evaluation, PairTrajectory, Platoon
 from cfx.evaluation.statistics import Improvement
 from cfx.evaluation.tables import VALUE_COLUMNS
-from cfx.evaluation.traffic.result import ROAD_COLUMNS, Traffic
 
 TWO = ParameterSpace.of(
     Parameter("t_r", "s", 0.1, 10.0, 1.5, "reaction time"),
@@ -212,42 +211,6 @@ def make_distributions(forecasts: Forecasts, seed: int = 0) -> pd.DataFrame:
         parts.append(part[list(DISTRIBUTION_COLUMNS)])
     centre = parts[0].assign(method="fixed", coverage=np.nan, pit=np.nan)
     return pd.concat([*parts, centre], ignore_index=True)
-
-
-def make_traffic(methods: tuple[str, ...] = ("population", "fixed_ar", "policy")) -> Traffic:
-    """Traffic of made-up vehicles: each method's flows and variations are of another size."""
-    rng = np.random.default_rng(0)
-    roads, growth, strips, paths = [], [], [], []
-    for k, method in enumerate(("real", *methods)):
-        size = 1.0 - 0.1 * k
-        density = rng.uniform(20.0, 110.0, 400)
-        flow = size * 25.0 * density * (1.0 - density / 150.0)
-        columns = {"density": density, "flow": flow, "speed_std": size * 0.9}
-        strips.append(pd.DataFrame({"method": method, **columns}))
-        if method == "real":
-            continue
-        for density_of_ring in (30.0, 60.0, 90.0):
-            ring_flow = size * 25.0 * density_of_ring * (1.0 - density_of_ring / 150.0)
-            row = dict.fromkeys(ROAD_COLUMNS, 1.0) | {"flow": ring_flow, "wave_speed": -15.0 * size}
-            level = {"level": density_of_ring, "density": density_of_ring}
-            roads.append(row | level | {"method": method, "road": "ring", "collisions": 0})
-        free = dict.fromkeys(ROAD_COLUMNS, np.nan) | {"discharge": 1500.0 * size, "collisions": k}
-        roads.append(free | {"method": method, "road": "open", "level": 1800.0})
-        vehicle = np.arange(9)
-        along = {"leader_speed": 8.0, "vehicle": vehicle, "speed_std": size * np.sqrt(vehicle)}
-        growth.append(pd.DataFrame({"method": method, **along}))
-        time = np.tile(np.arange(50.0), 4)
-        place = np.mod(10.0 * time + 100.0 * np.repeat(np.arange(4.0), 50), 400.0)
-        points = {"vehicle": np.repeat(np.arange(4), 50), "time_s": time, "place": place}
-        paths.append(pd.DataFrame({"method": method, **points, "speed": 10.0 * size}))
-    return Traffic(
-        pd.DataFrame(roads, columns=list(ROAD_COLUMNS)),
-        pd.concat(growth, ignore_index=True),
-        pd.concat(strips, ignore_index=True),
-        pd.concat(paths, ignore_index=True),
-        -14.0,
-        5,
-    )
 
 
 GAINS = {

@@ -11,15 +11,22 @@ import yaml
 
 import cfx
 from cfx.app import cli, hydra_source, nodes
+from tests.conftest import ROOT
 
 FOLDER = nodes.conf_dir() / "experiment"
-NAMES = sorted(str(path.relative_to(FOLDER).with_suffix("")) for path in FOLDER.rglob("*.yaml"))
+FOLDERS = [FOLDER, *sorted(ROOT.glob("plugins/*/cfx_*/conf/experiment"))]
+FILES = {
+    str(path.relative_to(folder).with_suffix("")): path
+    for folder in FOLDERS
+    for path in folder.rglob("*.yaml")
+}
+NAMES = sorted(FILES)
 SMALL = ["optimizer=random", "optimizer.samples=32", "figures.enabled=false", "learner.epochs=2"]
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_experiment_says_its_question_command_and_duration(name: str) -> None:
-    text = (FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
+    text = FILES[name].read_text(encoding="utf-8")
     assert text.startswith("# @package _global_\n# Question: ")
     assert f"\n# Command:  python -m cfx experiment={name} " in text
     assert "\n# Duration: " in text

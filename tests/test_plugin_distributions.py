@@ -16,6 +16,8 @@ import pytest
 
 import cfx
 from cfx.core import registry
+from cfx.report.figures.figure import JobFigure
+from cfx.report.section import Section
 
 ROOT = Path(__file__).resolve().parent.parent
 PLUGINS = sorted(path.parent for path in (ROOT / "plugins").glob("*/pyproject.toml"))
@@ -26,12 +28,24 @@ REPORTS = {
     "cfx.report.figures.canvas",
     "cfx.report.figures.figure",
     "cfx.report.figures.results",
+    "cfx.report.figures.values",
     "cfx.report.figures.words",
     "cfx.report.job",
+    "cfx.report.runs",
     "cfx.report.section",
     "cfx.report.tables",
+    "cfx.results.look",
 }
-PUBLIC_MODULES = {"cfx", "cfx.core.errors", *READERS, *REPORTS} | {
+PROTOCOLS = {
+    "cfx.core.memory",
+    "cfx.evaluation.closed_loop",
+    "cfx.evaluation.protocols.finished",
+    "cfx.evaluation.protocols.held_out",
+    "cfx.evaluation.protocols.noise",
+    "cfx.models.speed_limit",
+    "cfx.policies.features",
+}
+PUBLIC_MODULES = {"cfx", "cfx.core.errors", *READERS, *REPORTS, *PROTOCOLS} | {
     kind.base.partition(":")[0] for kind in registry.KINDS.values()
 }
 """What a plugin may import from, and `cfx.contracts`; docs/plugins.md says so."""
@@ -117,9 +131,14 @@ def test_what_it_announces_is_installed_here_and_loads(plugin: Path) -> None:
     points = project(plugin)["entry-points"]
     assert isinstance(points, dict)
     points.pop(registry.API_GROUP, None)  # the version of the plugin API, which is no component
-    assert set(points) <= set(groups)
+    parts = {part.group: part for part in (JobFigure, Section)}
+    assert set(points) <= {*groups, *parts}
     for group, announced in points.items():
         for name, target in announced.items():
+            if group in parts:
+                installed = {one.name: one.distribution for one in parts[group].installed()}
+                assert installed[name] == plugin.name, "install again: make test"
+                continue
             found = registry.entry(groups[group], name)
             assert (found.distribution, found.target) == (plugin.name, target), (
                 "install again: make test"

@@ -23,6 +23,8 @@ EXTRAS: dict[tuple[str, str], str] = {
     ("data", "sumo_fcd"): "cfx-sumo",
     ("data", "waymo_pairs"): "cfx-recordings",
     ("command", "benchmark"): "cfx-benchmark",
+    ("experiment", "traffic"): "cfx-traffic",
+    ("protocol", "traffic"): "cfx-traffic",
     ("command", "drive"): "cfx-sumo",
     ("command", "export"): "cfx-sumo",
     ("demo", "sumo"): "cfx-sumo",

@@ -20,7 +20,6 @@ from cfx.evaluation.metrics.base import MetricInfo
 from cfx.evaluation.metrics.installed import LeftOut
 from cfx.evaluation.statistics import Improvement
 from cfx.evaluation.tables import in_text, summaries, values_of, wide_table
-from cfx.evaluation.traffic.result import Traffic
 
 Array = NDArray[np.float64]
 
@@ -140,7 +139,6 @@ class Evaluation:
         `history/BASE/AMOUNT/rmse_improvement`: see `history`; AMOUNT is `80pct` for "80 %" and
             `10s` for "10 s".
         `forecast/...`: see `Forecasts`.
-        `traffic/...`: see `Traffic`.
 
     Attributes:
         about: a row per pair and method: pair_id, recording, leader_id, follower_id, driver,
@@ -171,7 +169,6 @@ class Evaluation:
             it has learned from, in words by scope; empty if it did not.
         forecasts: from many moments of each trajectory; None if there were none.
         meanings: what the tuned parameters are, in words; empty if that is not known.
-        traffic: of many vehicles that these methods drive; None if none was simulated.
         tables: further tables of the protocol, by name (`cfx.results.table`).
     """
 
@@ -191,7 +188,6 @@ class Evaluation:
     outside: Mapping[str, str] = field(default_factory=dict)
     forecasts: Forecasts | None = None
     meanings: tuple[str, ...] = ()
-    traffic: Traffic | None = None
     tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
 
     @cached_property
@@ -266,8 +262,6 @@ class Evaluation:
                 values[f"history/{base}/{name}/rmse_improvement"] = float(gains.mean())
         if self.forecasts is not None:
             values |= self.forecasts.metrics()
-        if self.traffic is not None:
-            values |= self.traffic.metrics()
         return values
 
     def values_tables(self) -> Iterator[pd.DataFrame]:

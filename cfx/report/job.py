@@ -15,7 +15,7 @@ import pandas as pd
 
 from cfx.data.style import StyleResult
 from cfx.evaluation.headline import improvement_key
-from cfx.evaluation.metrics.base import RECORDED, MetricInfo, key_of
+from cfx.evaluation.metrics.base import MetricInfo, key_of
 from cfx.evaluation.result import METHODS, PairTrajectory
 from cfx.evaluation.statistics import STATISTICS, Improvement
 from cfx.report.figures.results import ParameterAxis, Results
@@ -234,7 +234,6 @@ class Job:
     def results(self) -> Results:
         """What the job's figures are drawn from."""
         from cfx.evaluation.forecasts import Forecasts
-        from cfx.evaluation.traffic.result import Traffic
 
         forecasts = None
         table = self.tables.get("forecasts")
@@ -242,18 +241,6 @@ class Job:
             horizons = tuple(sorted(float(one) for one in table["horizon_s"].unique()))
             leader = str(self.setting("protocol.leader"))
             forecasts = Forecasts(table, horizons, leader, 0, self.tables.get("distributions"))
-        roads = self.tables.get("traffic")
-        growth, strips = self.tables.get("traffic_growth"), self.tables.get("traffic_strips")
-        traffic = None
-        if roads is not None and growth is not None and strips is not None:
-            real = self.metrics.get(key_of("traffic/wave_speed", RECORDED), math.nan)
-            # Paths stay in the job's folder: as a picture they would be most of a page.
-            traffic = Traffic(roads, growth, strips, pd.DataFrame(), real, 0)
-        stable = {}
-        for method in self.methods:
-            key = key_of("platoon/string_stable", method)
-            if key in self.metrics:
-                stable[method] = self.metrics[key]
         return Results(
             pairs=self.pairs,
             methods=self.meaningful_methods,
@@ -262,9 +249,8 @@ class Job:
             improvements={one: self._improvement(one) for one in self.baselines()},
             style=self._style_result,
             tables=self.tables,
-            stable=stable,
+            metrics=self.metrics,
             forecasts=forecasts,
-            traffic=traffic,
             transient_s=self.transient_s,
         )
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
-from cfx.report.figures.words import MINUS
 from cfx.report.job import Job
 from cfx.report.page import render
 from cfx.report.runs import read_runs
@@ -17,11 +15,10 @@ from cfx.report.sections.comparison import absolute, closeness, safety
 from cfx.report.sections.distributions import crps_sheet
 from cfx.report.sections.forecasts import errors
 from cfx.report.sections.safety import safety_of_methods
-from cfx.report.sections.traffic import traffic_sheet
 from cfx.report.summary import summary
 from cfx.report.tables import Sheet
 from tests.browser import Browser
-from tests.made_up import make_distributions, make_forecasts, make_traffic
+from tests.made_up import make_distributions, make_forecasts
 from tests.report.folders import ACROSS, write_job
 from tests.report.test_page import page_of
 
@@ -224,31 +221,6 @@ def test_sampled_forecasts_have_a_plot_and_a_table(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("blank_figures")
-def test_traffic_has_a_plot_and_a_table(tmp_path: Path) -> None:
-    metrics = write_job(tmp_path / "job", pairs=4)
-    traffic = make_traffic()
-    for name in ("roads", "growth", "strips"):
-        file = "traffic.parquet" if name == "roads" else f"traffic_{name}.parquet"
-        getattr(traffic, name).to_parquet(tmp_path / "job" / file, index=False)
-    found = {**metrics, **traffic.metrics()}
-    (tmp_path / "job" / "metrics.json").write_text(
-        json.dumps({key: value if math.isfinite(value) else None for key, value in found.items()})
-    )
-    page = page_of(tmp_path)
-    assert "traffic" in page.having("id")
-    (job,) = read_runs([str(tmp_path)]).jobs
-    sheet = traffic_sheet(job, traffic.roads)
-    assert [row[0].text for row in sheet.rows] == [
-        "pooled",
-        "driver-specific + noise",
-        "policy",
-        "real",
-    ]
-    pooled, *_, real = sheet.rows
-    assert pooled[1].text == f"{found['traffic/capacity/population']:.0f}"
-    assert real[4].text == f"{MINUS}14.0"
-
-
 def test_the_comparison_fits_a_laptop_and_sorts(
     sweep: Path, tmp_path: Path, browser: Browser
 ) -> None:

@@ -172,6 +172,7 @@ def write_figures(
     config: JobConfig,
     findings: Findings,
     tables: Mapping[str, pd.DataFrame],
+    metrics: Mapping[str, float],
     *,
     adapts: bool,
 ) -> list[Path]:
@@ -182,6 +183,7 @@ def write_figures(
         config: of the job.
         findings: what is drawn.
         tables: likewise, by name.
+        metrics: of the job.
         adapts: as `Policy.adapts`.
 
     Raises:
@@ -193,7 +195,11 @@ def write_figures(
         from cfx.report.figures.write import write_figures as write_all_figures
 
         results = Results.of(
-            findings.evaluation, adapts=adapts, style=findings.style, tables=tables
+            findings.evaluation,
+            adapts=adapts,
+            style=findings.style,
+            tables=tables,
+            metrics=metrics,
         )
 
         def write_all() -> None:

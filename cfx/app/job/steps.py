@@ -179,7 +179,9 @@ def keep(
     metrics = evaluation.metrics() | of_training
     output.run(lambda: checkpoint.save(protocol_result.policy, policy_folder))
     rows = {table.about.name: table.rows for table in tables if table.rows is not None}
-    figures = files.write_figures(output, config, findings, rows, adapts=parts.policy.adapts)
+    figures = files.write_figures(
+        output, config, findings, rows, metrics, adapts=parts.policy.adapts
+    )
     shown: list[Path] = []
     if parts.demo is not None:
         shown = files.write_demo(output, parts.demo, pairs, protocol_result, config)

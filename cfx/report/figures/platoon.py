@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from cfx.evaluation.metrics.base import key_of
 from cfx.report.figures.canvas import canvas, styled
 from cfx.report.figures.figure import JobFigure
 from cfx.report.figures.results import Results
@@ -174,4 +175,9 @@ class PlatoonSpeeds(JobFigure):
         methods = [method for method in results.methods if method in present]
         if not methods:
             return None
-        return draw_platoons(table, methods, results.stable)
+        stable = {}
+        for method in methods:
+            share = results.metrics.get(key_of("platoon/string_stable", method))
+            if share is not None:
+                stable[method] = share
+        return draw_platoons(table, methods, stable)

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from cfx.evaluation.forecasts import Forecasts
     from cfx.evaluation.result import Evaluation, PairTrajectory
     from cfx.evaluation.statistics import Improvement
-    from cfx.evaluation.traffic.result import Traffic
 
 
 @dataclass(frozen=True)
@@ -56,9 +55,8 @@ class Results:
         style: of the drivers; None if it is not known. Without weights these are not known.
         tables: what the job has written, by name (`cfx.results.table`): of `curves`, `platoon`,
             `history`, `slices`, `fits`, `labels` and those of plugins, what there is.
-        stable: by method the share of its platoons that are string stable.
+        metrics: of the job, under their names in `metrics.json`.
         forecasts: None if there were none.
-        traffic: None if none was simulated.
         transient_s: length of the transient at the beginning of the test part, s.
     """
 
@@ -69,9 +67,8 @@ class Results:
     improvements: Mapping[str, Improvement] = field(default_factory=dict)
     style: StyleResult | None = None
     tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
-    stable: Mapping[str, float] = field(default_factory=dict)
+    metrics: Mapping[str, float] = field(default_factory=dict)
     forecasts: Forecasts | None = None
-    traffic: Traffic | None = None
     transient_s: float = TRANSIENT_S
 
     @classmethod
@@ -82,6 +79,7 @@ class Results:
         adapts: bool = True,
         style: StyleResult | None = None,
         tables: Mapping[str, pd.DataFrame] | None = None,
+        metrics: Mapping[str, float] | None = None,
     ) -> Results:
         """Returns the results of an evaluation and of the tables that a job has made.
 
@@ -90,12 +88,9 @@ class Results:
             adapts: as `Policy.adapts`; if it does not, the policy is no method of its own.
             style: as in the attributes.
             tables: what the job has written, by name.
+            metrics: as in the attributes; None: those of the evaluation alone.
         """
         shown = evaluation if adapts else evaluation.constant_methods()
-        stable: dict[str, float] = {}
-        if evaluation.platoon is not None:
-            shares = evaluation.platoon.measures.groupby("method")["string_stable"].mean()
-            stable = {method: float(shares[method]) for method in evaluation.platoon.methods}
         return cls(
             pairs=shown.table,
             methods=shown.methods,
@@ -104,7 +99,6 @@ class Results:
             improvements=evaluation.improvements if adapts else {},
             style=style,
             tables=tables or {},
-            stable=stable,
+            metrics=evaluation.metrics() if metrics is None else metrics,
             forecasts=evaluation.forecasts,
-            traffic=evaluation.traffic,
         )

@@ -1,4 +1,4 @@
-"""Forecasts and traffic by a finished job's policy: nothing is trained, and nothing is new."""
+"""Forecasts by a finished job's policy: nothing is trained, and nothing is new."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from cfx.evaluation.closed_loop import Followers
 from cfx.evaluation.forecast_paths import Origins, simulate_from_origins
 from cfx.evaluation.protocols.base import Protocol
 from cfx.evaluation.protocols.forecast import Forecast
-from cfx.evaluation.protocols.traffic import TrafficProtocol
 from cfx.policies import checkpoint
 from cfx.simulation.rollout import MemoryStepper
 from tests.evaluation.protocols.test_transfer import HERE, ROLLOUT, elsewhere, trained
@@ -29,19 +28,6 @@ FORECAST = [
     "protocol=forecast",
     "protocol.horizons=[0.5,2]",
     "protocol.histories=[]",
-]
-TRAFFIC = [
-    *HERE,
-    "protocol=traffic",
-    "protocol.histories=[]",
-    "protocol.densities=[30]",
-    "protocol.vehicles=5",
-    "protocol.repetitions=1",
-    "protocol.demands=[]",
-    "protocol.leader_speeds=[8]",
-    "protocol.platoon=3",
-    "protocol.duration=40",
-    "protocol.settle=10",
 ]
 
 
@@ -58,31 +44,10 @@ def forecast(drawn: Path) -> Forecast:
     return Forecast(run=drawn, horizons=(0.5, 1.0), histories=())
 
 
-@pytest.fixture(scope="module")
-def traffic(drawn: Path) -> TrafficProtocol:
-    return TrafficProtocol(
-        run=drawn,
-        histories=(),
-        densities=(30.0,),
-        vehicles=5,
-        demands=(900.0,),
-        leader_speeds=(8.0,),
-        platoon=3,
-        duration=10.0,
-        settle=5.0,
-    )
-
-
 class TestForecast(ProtocolContract):
     @pytest.fixture
     def protocol(self, forecast: Forecast) -> Protocol:
         return forecast
-
-
-class TestTraffic(ProtocolContract):
-    @pytest.fixture
-    def protocol(self, traffic: TrafficProtocol) -> Protocol:
-        return traffic
 
 
 def job(base: list[str], run: Path, folder: Path, *overrides: str) -> cfx.JobResult:
@@ -118,13 +83,6 @@ def test_the_finished_policy_forecasts_from_every_moment(drawn: Path, tmp_path: 
     )
     scored = pd.read_parquet(result.folder / "distributions.parquet")
     assert {"policy", "population_ar", "fixed_ar"} <= set(scored["method"])
-
-
-def test_the_finished_policy_is_set_on_roads(drawn: Path, tmp_path: Path) -> None:
-    result = job(TRAFFIC, drawn, tmp_path / "job")
-    roads = pd.read_parquet(result.folder / "traffic.parquet")
-    assert {"population", "fixed", "policy", "policy_sampled"} <= set(roads["method"])
-    assert result.metrics["traffic/capacity/policy"] > 0
 
 
 def test_who_was_learned_from_is_refused_and_who_is_too_short_is_left_out(

@@ -8,24 +8,12 @@ from cfx.contracts import ProtocolContract
 from cfx.evaluation.protocols.across_drivers import AcrossDrivers
 from cfx.evaluation.protocols.base import Protocol
 from cfx.evaluation.protocols.forecast import Forecast
-from cfx.evaluation.protocols.traffic import TrafficProtocol
 from cfx.evaluation.protocols.within_driver import WithinDriver
 
 # Kept for all tests, which then share a run.
 WITHIN = {networks: WithinDriver(networks=networks) for networks in ("pair", "all")}
 ACROSS = AcrossDrivers(folds=3)
 FORECAST = Forecast(folds=3, horizons=(0.5, 1.0), histories=())
-TRAFFIC = TrafficProtocol(
-    folds=3,
-    histories=(),
-    densities=(30.0,),
-    vehicles=5,
-    demands=(900.0,),
-    leader_speeds=(8.0,),
-    platoon=3,
-    duration=10.0,
-    settle=5.0,
-)
 
 
 class TestWithinDriver(ProtocolContract):
@@ -45,10 +33,3 @@ class TestForecast(ProtocolContract):
     @pytest.fixture
     def protocol(self) -> Protocol:
         return FORECAST
-
-
-@pytest.mark.slow  # as TestForecast
-class TestTraffic(ProtocolContract):
-    @pytest.fixture
-    def protocol(self) -> Protocol:
-        return TRAFFIC

@@ -29,7 +29,6 @@ from tests.made_up import (
     make_history,
     make_platoon,
     make_results,
-    make_traffic,
 )
 from tests.report.folders import write_job
 
@@ -45,7 +44,6 @@ def everything() -> Results:
         platoon=make_platoon({"policy": 2}),
         history=make_history(made.evaluation.trajectories, GAINS),
         forecasts=forecasts,
-        traffic=make_traffic(),
     )
     results = Results.of(evaluation, style=made.style, tables={"curves": made.curves})
     ids, axis = evaluation.table["pair_id"].unique(), results.parameters[0]

@@ -27,7 +27,6 @@ from cfx.report.figures.jobs import draw_every_pair
 from cfx.report.figures.learning import draw_learning, loss_quartiles
 from cfx.report.figures.platoon import braking_time, draw_platoons, worst_platoon
 from cfx.report.figures.results import Results, parameter_axes
-from cfx.report.figures.traffic import draw_paths, draw_traffic, path_panels, traffic_panels
 from cfx.report.figures.trajectories import (
     PairPanels,
     draw_pair,
@@ -37,7 +36,6 @@ from cfx.report.figures.trajectories import (
     pair_panels,
 )
 from cfx.report.figures.values import rank_pairs
-from cfx.report.figures.words import label
 from cfx.report.runs import read_runs
 from cfx.report.sections.trajectories import chosen_pairs
 from cfx.results.look import colour_of
@@ -46,7 +44,6 @@ from tests.made_up import (
     make_forecasts,
     make_platoon,
     make_results,
-    make_traffic,
 )
 from tests.report.folders import write_job
 
@@ -206,27 +203,6 @@ def test_distributions_have_lines_and_histograms() -> None:
         density = pit_density(here[here["method"] == method])
         assert density.mean() == pytest.approx(1.0)
         np.testing.assert_allclose(patch.get_data().values, density)
-
-
-def test_traffic_has_lines_points_and_a_panel_of_paths_per_method() -> None:
-    traffic = make_traffic()
-    tables = (traffic.roads, traffic.growth, traffic.strips, traffic.real_wave_speed)
-    panels = traffic_panels(*tables, traffic.methods)
-    figure = draw_traffic(panels, traffic.methods)
-    assert len(panels) == 4
-    for axes, panel in zip(figure.axes, panels, strict=True):
-        for line in panel.lines:
-            if len(line.time) > 2:
-                drawn = drawn_lines(axes)[colour_of(line.method)]
-                np.testing.assert_allclose(drawn.get_ydata(), line.values)
-    points = np.asarray(figure.axes[0].collections[0].get_offsets())
-    np.testing.assert_allclose(points[:, 0], panels[0].cloud[0])
-    without = traffic_panels(traffic.roads, traffic.growth.iloc[:0], *tables[2:], traffic.methods)
-    assert len(without) == 3
-    paths = draw_paths(path_panels(traffic.paths, traffic.methods))
-    assert [axes.get_title(loc="left") for axes in paths.axes[:3]] == [
-        label(method) for method in traffic.methods
-    ]
 
 
 def test_errors_over_time_show_where_the_transient_ends() -> None:

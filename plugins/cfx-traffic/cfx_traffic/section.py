@@ -7,13 +7,13 @@ import math
 import pandas as pd
 
 from cfx.evaluation.metrics.base import RECORDED, key_of
-from cfx.evaluation.traffic.result import traffic_methods
 from cfx.report.blocks import Block, Table, Text, job_fold
 from cfx.report.figure_blocks import figure_of
 from cfx.report.figures.words import MINUS
 from cfx.report.job import Job, Runs
 from cfx.report.section import Section
 from cfx.report.tables import Cell, Column, Sheet, formatted, method_cell, methods_explained, number
+from cfx_traffic.summary import traffic_methods
 
 _INTRODUCTION = (
     "Each vehicle of a road is a recorded driver, drawn with replacement; all methods have the same"
@@ -103,7 +103,7 @@ def traffic_sheet(job: Job, roads: pd.DataFrame) -> Sheet:
 
     Args:
         job: of the report.
-        roads: as `Traffic.roads`.
+        roads: the table `Roads`.
     """
     columns = [Column("Driven by", number=False)]
     columns += [Column(heading, meaning) for heading, _, _, meaning in _COLUMNS]

@@ -6,9 +6,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.evaluation.traffic.edie import region
-from cfx.evaluation.traffic.measure import Settled
-from cfx.evaluation.traffic.roads import (
+import cfx
+from cfx.models.base import DrivingModel
+from cfx.models.idm import IDM
+from cfx.models.krauss import Krauss
+from cfx.models.w99 import W99
+from cfx_classics.optimal_velocity import optimal_velocity
+from cfx_classics.ovm import OVM
+from cfx_traffic.edie import region
+from cfx_traffic.measure import Settled
+from cfx_traffic.roads import (
     Bottleneck,
     Driven,
     Lanes,
@@ -18,13 +25,6 @@ from cfx.evaluation.traffic.roads import (
     ring_roads,
     simulate_roads,
 )
-from cfx.models.base import DrivingModel
-from cfx.models.idm import IDM
-from cfx.models.krauss import Krauss
-from cfx.models.w99 import W99
-from cfx.policies.gru import GruPolicy
-from cfx_classics.optimal_velocity import optimal_velocity
-from cfx_classics.ovm import OVM
 from tests.evaluation.test_closed_loop import adaptive, constant
 from tests.evaluation.test_platoon import STABLE, UNSTABLE, Linear
 
@@ -156,7 +156,7 @@ def test_roads_that_are_simulated_together_do_not_meet() -> None:
 def test_recurrent_policies_drive_each_vehicle_as_the_driver_that_it_is() -> None:
     """The same drivers at other places of the state's grid drive the same."""
     model = Krauss()
-    agent = adaptive(model, GruPolicy(hidden_size=4), networks=3, features=30)
+    agent = adaptive(model, cfx.get("policy", "gru")(hidden_size=4), networks=3, features=30)
     with torch.no_grad():
         for weights in agent.network.parameters():
             weights.add_(torch.randn(weights.shape, generator=drawn()))

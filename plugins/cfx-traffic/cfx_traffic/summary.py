@@ -1,11 +1,9 @@
-"""What simulated traffic delivers: tables and metrics."""
+"""What the tables of simulated traffic amount to: methods, means and metrics."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import pandas as pd
@@ -29,42 +27,6 @@ TRAFFIC_METHODS = (
 `policy_sampled`: the same, with all that a stochastic policy leaves to chance.
 """
 
-ROAD_COLUMNS = (
-    "method",
-    "road",
-    "level",
-    "repetition",
-    "density",
-    "flow",
-    "speed",
-    "speed_std",
-    "wave_speed",
-    "ring_wave_speed",
-    "coherence",
-    "discharge",
-    "min_gap",
-    "collisions",
-    "outside",
-)
-"""Columns of the table of roads, which a job writes as `traffic.parquet`. level: vehicles/km of a
-ring, vehicles/h that enter an open road, m/s of a platoon's leader. density (vehicles/km), flow
-(vehicles/h), speed (m/s): Edie's, of a whole ring, or of the stretch upstream of the bottleneck.
-speed_std: of all vehicles' speeds over time, m/s. wave_speed (km/h): from vehicle
-to vehicle; ring_wave_speed (km/h) and coherence: of the ring as a whole. discharge: flow downstream
-of the bottleneck, vehicles/h. min_gap: m. collisions: vehicles whose gap was negative. outside:
-share of windows outside what the policy has learned from."""
-
-GROWTH_COLUMNS = ("method", "leader_speed", "vehicle", "speed_std")
-"""Columns of `traffic_growth.parquet`: the standard deviation of each vehicle's speed over time,
-m/s, the root of its mean square over the repetitions; vehicle 0 is the platoon's leader."""
-
-STRIP_COLUMNS = ("method", "density", "flow", "speed_std")
-"""Columns of `traffic_strips.parquet`: see `cfx.evaluation.traffic.edie`; `real` are recorded."""
-
-PATH_COLUMNS = ("method", "vehicle", "time_s", "place", "speed")
-"""Columns of `traffic_paths.parquet`: the vehicles of one ring; place in m, from 0 to its
-circumference."""
-
 BIN_PER_KM = 10.0
 """Width of the bins of density in which flows are compared, vehicles/km."""
 
@@ -72,12 +34,12 @@ _LEAST_STRIPS = 10
 """Strips that a bin must have to count."""
 
 
-@dataclass(frozen=True)
-class Traffic:
-    """Traffic of sampled drivers, beside the recording.
+def traffic_metrics(
+    roads: pd.DataFrame, growth: pd.DataFrame, strips: pd.DataFrame, real_wave_speed: float
+) -> dict[str, float]:
+    """Return the metrics of simulated traffic, beside the recording, under their MLflow names.
 
-    Metrics (`metrics`), under their names in metrics.json and MLflow, METHOD as in
-    `TRAFFIC_METHODS`:
+    METHOD is as in `TRAFFIC_METHODS`:
         `traffic/capacity/METHOD`: the largest mean flow of a ring over all densities, vehicles/h.
         `traffic/flow_error/METHOD`: RMS difference to the recording of the mean flow in bins of
             local density, vehicles/h, over the bins that both have.
@@ -95,47 +57,24 @@ class Traffic:
         `traffic/collisions/METHOD`: vehicles on all roads whose gap was negative.
         `traffic/outside/METHOD`: share of windows outside what the policy has learned from.
 
-    Attributes:
-        roads: a row per method and road; columns `ROAD_COLUMNS`.
-        growth: a row per method, leader's speed and vehicle; columns `GROWTH_COLUMNS`.
-        strips: flow and density of pairs; columns `STRIP_COLUMNS`.
-        paths: the vehicles of one ring per method; columns `PATH_COLUMNS`.
+    Args:
+        roads, growth, strips: the tables `Roads`, `Growth` and `Strips`.
         real_wave_speed: of the recording, km/h (`PairWaves.speed`).
-        real_waves: pairs of the recording that have one.
     """
-
-    roads: pd.DataFrame
-    growth: pd.DataFrame
-    strips: pd.DataFrame
-    paths: pd.DataFrame
-    real_wave_speed: float
-    real_waves: int
-
-    @property
-    def methods(self) -> tuple[str, ...]:
-        """What drove, in the order of `TRAFFIC_METHODS`."""
-        return traffic_methods(self.roads)
-
-    @cached_property
-    def bins(self) -> pd.DataFrame:
-        """Mean flow and variation in bins of density; see `binned`."""
-        return binned(self.strips)
-
-    def metrics(self) -> dict[str, float]:
-        """Returns the metrics under their MLflow names."""
-        found: dict[str, float] = {}
-        errors = flow_errors(self.bins)
-        variations = common_variation(self.bins)
-        for method in self.methods:
-            rows = self.roads[self.roads["method"] == method]
-            values = _of_roads(rows) | _of_growth(self.growth[self.growth["method"] == method])
-            values["flow_error"] = errors.get(method, math.nan)
-            values["speed_std"] = variations.get(method, math.nan)
-            for name, value in values.items():
-                found[f"traffic/{name}/{method}"] = value
-        found[f"traffic/wave_speed/{RECORDED}"] = self.real_wave_speed
-        found[f"traffic/speed_std/{RECORDED}"] = variations.get(RECORDED, math.nan)
-        return found
+    found: dict[str, float] = {}
+    bins = binned(strips)
+    errors = flow_errors(bins)
+    variations = common_variation(bins)
+    for method in traffic_methods(roads):
+        rows = roads[roads["method"] == method]
+        values = _of_roads(rows) | _of_growth(growth[growth["method"] == method])
+        values["flow_error"] = errors.get(method, math.nan)
+        values["speed_std"] = variations.get(method, math.nan)
+        for name, value in values.items():
+            found[f"traffic/{name}/{method}"] = value
+    found[f"traffic/wave_speed/{RECORDED}"] = real_wave_speed
+    found[f"traffic/speed_std/{RECORDED}"] = variations.get(RECORDED, math.nan)
+    return found
 
 
 def traffic_methods(roads: pd.DataFrame) -> tuple[str, ...]:
@@ -151,7 +90,7 @@ def binned(strips: pd.DataFrame) -> pd.DataFrame:
     The mean flow is Edie's of all strips of a bin together: their ways over their areas.
 
     Args:
-        strips: columns `STRIP_COLUMNS`.
+        strips: the table `Strips`.
 
     Returns:
         A row per method and bin: method, density (the middle), flow, speed_std, strips.

@@ -8,7 +8,9 @@ from collections.abc import Iterable, Mapping
 import pandas as pd
 from rich.table import Table
 
-from cfx.results.table import Column, Findings, ResultTable
+from cfx import Column, Findings, ResultTable
+from cfx.evaluation.metrics.base import RECORDED
+from cfx_traffic.summary import traffic_methods, traffic_metrics
 
 METHOD = Column("method", "", "what drives", "text")
 
@@ -45,12 +47,20 @@ class Roads(ResultTable):
     )
 
     def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        traffic = findings.evaluation.traffic
-        return [None if traffic is None else traffic.roads]
+        return [findings.evaluation.tables.get("traffic")]
+
+    def metrics(self, findings: Findings) -> Mapping[str, float]:
+        tables = findings.evaluation.tables
+        speed = findings.protocol_result.notes["traffic"]["recorded_wave_speed_kmh"]
+        return traffic_metrics(
+            tables["traffic"],
+            tables["traffic_growth"],
+            tables["traffic_strips"],
+            math.nan if speed is None else speed,
+        )
 
     def console(self, findings: Findings, metrics: Mapping[str, float]) -> Iterable[Table]:
-        assert findings.evaluation.traffic is not None
-        return [traffic_table(findings.evaluation.traffic.methods, metrics)]
+        return [traffic_table(traffic_methods(findings.evaluation.tables["traffic"]), metrics)]
 
 
 class Growth(ResultTable):
@@ -71,8 +81,7 @@ class Growth(ResultTable):
     )
 
     def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        traffic = findings.evaluation.traffic
-        return [None if traffic is None else traffic.growth]
+        return [findings.evaluation.tables.get("traffic_growth")]
 
 
 class Strips(ResultTable):
@@ -88,8 +97,7 @@ class Strips(ResultTable):
     )
 
     def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        traffic = findings.evaluation.traffic
-        return [None if traffic is None else traffic.strips]
+        return [findings.evaluation.tables.get("traffic_strips")]
 
 
 class Paths(ResultTable):
@@ -106,9 +114,17 @@ class Paths(ResultTable):
     )
 
     def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        traffic = findings.evaluation.traffic
-        return [None if traffic is None else traffic.paths]
+        return [findings.evaluation.tables.get("traffic_paths")]
 
+
+def _names(table: type[ResultTable]) -> tuple[str, ...]:
+    return tuple(column.name for column in table.columns)
+
+
+ROAD_COLUMNS = _names(Roads)
+GROWTH_COLUMNS = _names(Growth)
+STRIP_COLUMNS = _names(Strips)
+PATH_COLUMNS = _names(Paths)
 
 _SHOWN = (
     ("capacity", "capacity", ".0f"),
@@ -129,7 +145,7 @@ def traffic_table(methods: Iterable[str], metrics: Mapping[str, float]) -> Table
     table.add_column("method")
     for heading, _, _ in _SHOWN:
         table.add_column(heading, justify="right")
-    for method in (*methods, "real"):
+    for method in (*methods, RECORDED):
         cells = []
         for _, metric, form in _SHOWN:
             value = metrics.get(f"traffic/{metric}/{method}", math.nan)

@@ -17,13 +17,13 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from cfx import Start
 from cfx.core.threads import one_thread
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.speed_limit import LIMIT, WithSpeedLimit
 from cfx.policies.agent import Agent, AgentState
 from cfx.policies.features import History
 from cfx.simulation.rollout import MemoryStepper
-from cfx.simulation.trajectory import Start
 
 RoadKind = Literal["ring", "open", "platoon"]
 

@@ -11,14 +11,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cfx.evaluation.traffic.edie import STRIP_S, region, strips_of
-from cfx.evaluation.traffic.result import (
-    STRIP_COLUMNS,
-    binned,
-    common_variation,
-    flow_errors,
-)
-from cfx.evaluation.traffic.waves import pair_waves, ring_waves
+from cfx_traffic.edie import STRIP_S, region, strips_of
+from cfx_traffic.summary import binned, common_variation, flow_errors
+from cfx_traffic.tables import STRIP_COLUMNS
+from cfx_traffic.waves import pair_waves, ring_waves
 
 DT = 0.5
 

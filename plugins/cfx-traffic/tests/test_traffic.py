@@ -13,14 +13,14 @@ from rich.console import Console
 
 import cfx
 from cfx.core.errors import CfxError
-from cfx.evaluation.traffic.result import (
+from cfx_traffic.summary import TRAFFIC_METHODS
+from cfx_traffic.tables import (
     GROWTH_COLUMNS,
     PATH_COLUMNS,
     ROAD_COLUMNS,
     STRIP_COLUMNS,
-    TRAFFIC_METHODS,
+    traffic_table,
 )
-from cfx.results.traffic_tables import traffic_table
 from tests.evaluation.protocols.test_across_drivers import QUICK
 
 TRAFFIC = [
@@ -83,9 +83,8 @@ def test_traffic_stands_in_every_table(result: cfx.JobResult) -> None:
     capacity = rings.groupby("level")["flow"].mean().max()
     assert result.metrics["traffic/capacity/fixed"] == pytest.approx(capacity)
     assert result.evaluation is not None
-    assert result.evaluation.traffic is not None
     console = Console(file=io.StringIO(), width=80)
-    console.print(traffic_table(result.evaluation.traffic.methods, result.metrics))
+    console.print(traffic_table(CONSTANT, result.metrics))
     assert isinstance(console.file, io.StringIO)
     shown = console.file.getvalue()
     assert f"{capacity:.0f}" in shown

@@ -1,4 +1,4 @@
-"""From simulated roads to the tables of `Traffic`.
+"""From simulated roads to the tables of `cfx_traffic.tables`.
 
 Shapes: D vehicles of all roads, P recorded pairs, W stored frames.
 """
@@ -13,18 +13,12 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from cfx.data.pairs import PairBatch
+from cfx import PairBatch
 from cfx.evaluation.metrics.base import RECORDED
-from cfx.evaluation.traffic.edie import PER_HOUR, PER_KM, Strips, region, strips_of
-from cfx.evaluation.traffic.result import (
-    GROWTH_COLUMNS,
-    PATH_COLUMNS,
-    ROAD_COLUMNS,
-    STRIP_COLUMNS,
-    Traffic,
-)
-from cfx.evaluation.traffic.roads import Driven, Lanes, Road
-from cfx.evaluation.traffic.waves import PairWaves, pair_waves, ring_waves
+from cfx_traffic.edie import PER_HOUR, PER_KM, Strips, region, strips_of
+from cfx_traffic.roads import Driven, Lanes, Road
+from cfx_traffic.tables import GROWTH_COLUMNS, PATH_COLUMNS, ROAD_COLUMNS, STRIP_COLUMNS
+from cfx_traffic.waves import PairWaves, pair_waves, ring_waves
 
 KMH = 3.6
 
@@ -71,9 +65,23 @@ class Settled(NamedTuple):
         )  # fmt: skip
 
 
+class Measured(NamedTuple):
+    """What was measured of simulated traffic and of the recording.
+
+    Attributes:
+        tables: by their names in a job's folder (`cfx_traffic.tables`).
+        real_wave_speed: of the recording, km/h (`PairWaves.speed`).
+        real_waves: pairs of the recording that have one.
+    """
+
+    tables: dict[str, pd.DataFrame]
+    real_wave_speed: float
+    real_waves: int
+
+
 def traffic_of(
     driven: Mapping[str, Driven], lanes: Lanes, settle: float, batch: PairBatch
-) -> Traffic:
+) -> Measured:
     """Measures simulated traffic and the recording.
 
     Args:
@@ -94,14 +102,15 @@ def traffic_of(
             paths.append(_paths(method, shown, settled.of_road(shown)))
     strips.append(_strips_table(RECORDED, recorded_strips(batch)))
     waves = recorded_waves(batch)
-    return Traffic(
-        roads=pd.DataFrame(roads, columns=list(ROAD_COLUMNS)),
-        growth=pd.concat(growth, ignore_index=True),
-        strips=pd.concat(strips, ignore_index=True),
-        paths=pd.concat([pd.DataFrame(columns=list(PATH_COLUMNS)), *paths], ignore_index=True),
-        real_wave_speed=KMH * waves.speed,
-        real_waves=waves.measured,
-    )
+    tables = {
+        "traffic": pd.DataFrame(roads, columns=list(ROAD_COLUMNS)),
+        "traffic_growth": pd.concat(growth, ignore_index=True),
+        "traffic_strips": pd.concat(strips, ignore_index=True),
+        "traffic_paths": pd.concat(
+            [pd.DataFrame(columns=list(PATH_COLUMNS)), *paths], ignore_index=True
+        ),
+    }
+    return Measured(tables, KMH * waves.speed, waves.measured)
 
 
 def recorded_strips(batch: PairBatch) -> Strips:
@@ -180,7 +189,7 @@ def _of_bottleneck(settled: Settled, lanes: Lanes) -> dict[str, object]:
 
 
 def _growth(method: str, lanes: Lanes, settled: Settled) -> pd.DataFrame:
-    """Returns the rows of `Traffic.growth` of one method."""
+    """Returns the rows of `Growth` of one method."""
     parts = []
     for road in lanes.roads:
         if road.kind != "platoon":
@@ -207,7 +216,7 @@ def _ring_strips(lanes: Lanes, settled: Settled) -> Strips:
 
 
 def _strips_table(method: str, strips: Strips) -> pd.DataFrame:
-    """Returns rows of `Traffic.strips`; of very many every so manieth."""
+    """Returns rows of `Strips`; of very many every so manieth."""
     every = max(1, -(-len(strips.density) // _MOST_STRIPS))
     columns = {name: _array(getattr(strips, name)[::every]) for name in STRIP_COLUMNS[1:]}
     return pd.DataFrame({"method": method, **columns})[list(STRIP_COLUMNS)]
@@ -220,7 +229,7 @@ def _shown_ring(lanes: Lanes) -> Road | None:
 
 
 def _paths(method: str, road: Road, settled: Settled) -> pd.DataFrame:
-    """Returns rows of `Traffic.paths` of one method."""
+    """Returns rows of `Paths` of one method."""
     every = max(1, round(PATH_STEP_S / settled.interval))
     position, speed = _array(settled.position[:, ::every]), _array(settled.speed[:, ::every])
     vehicle, frame = np.indices(position.shape).reshape(2, -1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,13 +11,13 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from cfx.evaluation.metrics.base import RECORDED
-from cfx.evaluation.traffic.result import binned, mean_growth, ring_means
 from cfx.report.figures.canvas import Line, canvas, draw_lines, mark_points, method_legend, styled
 from cfx.report.figures.figure import JobFigure
 from cfx.report.figures.results import Results
 from cfx.report.figures.values import Array
 from cfx.report.figures.words import label
 from cfx.results.look import BAND, EDGE
+from cfx_traffic.summary import binned, mean_growth, ring_means, traffic_methods
 
 DENSITY_TITLE = "density (vehicles/km)"
 FLOW_TITLE = "flow (vehicles/h)"
@@ -81,7 +82,7 @@ def traffic_panels(
     """Chooses flow, variation, waves and growth, in this order; without platoons no growth.
 
     Args:
-        roads, growth, strips: as in `Traffic`.
+        roads, growth, strips: the tables `Roads`, `Growth` and `Strips`.
         real_wave_speed: of the recording, km/h; NaN if it is not known.
         methods: those to show.
     """
@@ -125,7 +126,7 @@ def path_panels(paths: pd.DataFrame, methods: Sequence[str]) -> tuple[PathPanel,
     """Chooses the paths of one ring for each method.
 
     Args:
-        paths: as `Traffic.paths`.
+        paths: the table `Paths`.
         methods: those to show.
     """
     panels = []
@@ -260,13 +261,13 @@ class TrafficFigure(JobFigure):
 
     def draw(self, results: Results) -> Figure | None:
         """Draws it where traffic was simulated."""
-        found = results.traffic
-        if found is None:
+        roads = results.tables.get("traffic")
+        growth, strips = results.tables.get("traffic_growth"), results.tables.get("traffic_strips")
+        if roads is None or growth is None or strips is None:
             return None
-        panels = traffic_panels(
-            found.roads, found.growth, found.strips, found.real_wave_speed, found.methods
-        )
-        return draw_traffic(panels, found.methods)
+        real = results.metrics.get(f"traffic/wave_speed/{RECORDED}", math.nan)
+        methods = traffic_methods(roads)
+        return draw_traffic(traffic_panels(roads, growth, strips, real, methods), methods)
 
 
 class TrafficPaths(JobFigure):
@@ -278,7 +279,7 @@ class TrafficPaths(JobFigure):
 
     def draw(self, results: Results) -> Figure | None:
         """Draws it where paths were kept."""
-        found = results.traffic
-        if found is None or not len(found.paths):
+        paths, roads = results.tables.get("traffic_paths"), results.tables.get("traffic")
+        if paths is None or roads is None or not len(paths):
             return None
-        return draw_paths(path_panels(found.paths, found.methods))
+        return draw_paths(path_panels(paths, traffic_methods(roads)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Annotated, Any, ClassVar, NamedTuple
@@ -11,7 +12,7 @@ import torch
 from pydantic import AfterValidator, Field, model_validator
 from torch import Tensor
 
-from cfx.core.component import Settings
+from cfx import Settings
 from cfx.core.errors import ConfigError
 from cfx.core.memory import require_memory
 from cfx.evaluation.closed_loop import Followers, burnt_in
@@ -19,9 +20,13 @@ from cfx.evaluation.protocols.base import ProtocolContext, ProtocolResult
 from cfx.evaluation.protocols.finished import FoldsOrFinished, FoldsOrFinishedSettings
 from cfx.evaluation.protocols.held_out import HeldOut
 from cfx.evaluation.protocols.noise import can_drive, residual_noise
-from cfx.evaluation.traffic.measure import UPSTREAM_M, traffic_of
-from cfx.evaluation.traffic.result import Traffic
-from cfx.evaluation.traffic.roads import (
+from cfx.policies.agent import Agent, AgentState
+from cfx.policies.features import measured_history
+from cfx.policies.fixed import FixedPolicy
+from cfx.policies.placement import ALL
+from cfx.simulation.rollout import MemoryStepper
+from cfx_traffic.measure import UPSTREAM_M, Measured, traffic_of
+from cfx_traffic.roads import (
     Bottleneck,
     Driven,
     Lanes,
@@ -31,11 +36,6 @@ from cfx.evaluation.traffic.roads import (
     ring_roads,
     simulate_roads,
 )
-from cfx.policies.agent import Agent, AgentState
-from cfx.policies.features import measured_history
-from cfx.policies.fixed import FixedPolicy
-from cfx.policies.placement import ALL
-from cfx.simulation.rollout import MemoryStepper
 
 log = logging.getLogger(__name__)
 
@@ -133,7 +133,7 @@ class TrafficProtocol(FoldsOrFinished):
 
     Folds, calibration, training and the test part are those of `across_drivers`; with `run` they
     are those of `transfer`, and nothing is trained. Beyond it, test drivers are set on roads, all
-    at once (`cfx.evaluation.traffic.roads`): on ring roads of each density, on open roads with a
+    at once (`cfx_traffic.roads`): on ring roads of each density, on open roads with a
     bottleneck at each demand, and in platoons behind leaders that keep their speed. Each vehicle is
     a test driver, drawn with replacement; every method has the same drivers at the same places:
 
@@ -165,8 +165,9 @@ class TrafficProtocol(FoldsOrFinished):
         evaluation = test.evaluation(self.settings.histories, fold=trained.fold)
         traffic = self._traffic(test, lanes)
         notes = {**trained.notes, "traffic": self._described(lanes, traffic)}
+        tables = {**evaluation.tables, **traffic.tables}
         return ProtocolResult(
-            replace(evaluation, traffic=traffic),
+            replace(evaluation, tables=tables),
             test.policy,
             trained.curves,
             trained.labels,
@@ -232,7 +233,7 @@ class TrafficProtocol(FoldsOrFinished):
                 f" {s.entry_speed * 3600.0 / spacing:.0f}"
             )
 
-    def _traffic(self, test: HeldOut, lanes: Lanes) -> Traffic:
+    def _traffic(self, test: HeldOut, lanes: Lanes) -> Measured:
         """Lets all kinds of drivers drive on all roads, and measures."""
         s, context = self.settings, test.context
         generator = torch.Generator().manual_seed(context.seed * _DRAWN + 2)
@@ -274,8 +275,9 @@ class TrafficProtocol(FoldsOrFinished):
                 kinds["policy_sampled"] = _Kind(test.policy, state, draws=True)
         return kinds
 
-    def _described(self, lanes: Lanes, traffic: Traffic) -> dict[str, Any]:
+    def _described(self, lanes: Lanes, traffic: Measured) -> dict[str, Any]:
         """Returns what `data.json` says of the traffic."""
+        speed = traffic.real_wave_speed
         return {
             "vehicles": len(lanes),
             "roads": len(lanes.roads),
@@ -284,6 +286,7 @@ class TrafficProtocol(FoldsOrFinished):
             "settle_s": self.settings.settle,
             "upstream_m": UPSTREAM_M,
             "recorded_pairs_with_waves": traffic.real_waves,
+            "recorded_wave_speed_kmh": speed if math.isfinite(speed) else None,
         }
 
 

@@ -1,0 +1,85 @@
+"""The protocol and its tables hold their contracts; a finished job's policy drives too."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from cfx import Protocol, ResultTable
+from cfx.contracts import ProtocolContract, TableContract
+from cfx_traffic.protocol import TrafficProtocol
+from cfx_traffic.tables import Growth, Paths, Roads, Strips
+from tests.evaluation.protocols.test_finished import drawn, job
+from tests.evaluation.protocols.test_transfer import HERE
+
+__all__ = ["drawn"]  # pytest finds it here
+
+FINISHED = [
+    *HERE,
+    "protocol=traffic",
+    "protocol.histories=[]",
+    "protocol.densities=[30]",
+    "protocol.vehicles=5",
+    "protocol.repetitions=1",
+    "protocol.demands=[]",
+    "protocol.leader_speeds=[8]",
+    "protocol.platoon=3",
+    "protocol.duration=40",
+    "protocol.settle=10",
+]
+
+TRAFFIC = TrafficProtocol(
+    folds=3,
+    histories=(),
+    densities=(30.0,),
+    vehicles=5,
+    demands=(900.0,),
+    leader_speeds=(8.0,),
+    platoon=3,
+    duration=10.0,
+    settle=5.0,
+)
+
+
+@pytest.fixture(scope="module")
+def traffic(drawn: Path) -> TrafficProtocol:
+    return TrafficProtocol(
+        run=drawn,
+        histories=(),
+        densities=(30.0,),
+        vehicles=5,
+        demands=(900.0,),
+        leader_speeds=(8.0,),
+        platoon=3,
+        duration=10.0,
+        settle=5.0,
+    )
+
+
+@pytest.mark.slow  # calibration and training are those of across_drivers
+class TestTraffic(ProtocolContract):
+    @pytest.fixture
+    def protocol(self) -> Protocol:
+        return TRAFFIC
+
+
+class TestFinished(ProtocolContract):
+    @pytest.fixture
+    def protocol(self, traffic: TrafficProtocol) -> Protocol:
+        return traffic
+
+
+class TestTables(TableContract):
+    @pytest.fixture(params=[Roads, Growth, Strips, Paths], ids=lambda table: table.__name__)
+    def table(self, request: pytest.FixtureRequest) -> ResultTable:
+        found: ResultTable = request.param()
+        return found
+
+
+def test_the_finished_policy_is_set_on_roads(drawn: Path, tmp_path: Path) -> None:
+    result = job(FINISHED, drawn, tmp_path / "job")
+    roads = pd.read_parquet(result.folder / "traffic.parquet")
+    assert {"population", "fixed", "policy", "policy_sampled"} <= set(roads["method"])
+    assert result.metrics["traffic/capacity/policy"] > 0
