@@ -297,7 +297,7 @@ def test_a_table_that_fits_no_memory_is_refused(
         for _ in range(40):
             writer.write_table(one)
     assert (folder / "trajectories.parquet").stat().st_size < 2**20
-    monkeypatch.setattr("cfx.report.files.total_memory", lambda: 2.0**28)
+    monkeypatch.setattr("cfx.results.table.total_memory", lambda: 2.0**28)
     with pytest.raises(CfxError, match=r"holds a table of 336 MB, more than this machine's memory"):
         report(folder)
 
