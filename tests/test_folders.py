@@ -14,6 +14,7 @@ from cfx.app import cli
 from cfx.app.job import steps
 from cfx.core.errors import CfxError
 from cfx.core.files import atomic_write, remove_leftovers
+from cfx.evaluation.protocols.within_driver import WithinDriver
 from tests.broken_plugins import QUICK
 
 
@@ -32,7 +33,7 @@ def test_a_job_that_fails_leaves_an_earlier_jobs_folder_as_it_was(
         raise CfxError("the protocol failed")
 
     with monkeypatch.context() as broken:
-        broken.setattr(steps, "_run_protocol", fail)
+        broken.setattr(WithinDriver, "run", fail)
         assert job(folder, "seed=2") == 2
     for name, content in before.items():
         assert (folder / name).read_bytes() == content

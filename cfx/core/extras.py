@@ -23,13 +23,12 @@ EXTRAS: dict[tuple[str, str], str] = {
     ("data", "sumo_fcd"): "cfx-sumo",
     ("data", "waymo_pairs"): "cfx-recordings",
     ("command", "benchmark"): "cfx-benchmark",
-    ("experiment", "traffic"): "cfx-traffic",
-    ("protocol", "traffic"): "cfx-traffic",
     ("command", "drive"): "cfx-sumo",
     ("command", "export"): "cfx-sumo",
     ("demo", "sumo"): "cfx-sumo",
     ("engine", "dask"): "cfx-dask",
     ("experiment", "sumo_demo"): "cfx-sumo",
+    ("experiment", "traffic"): "cfx-traffic",
     ("hydra/launcher", "dask"): "cfx-dask",
     ("hydra/launcher", "joblib"): f"{OWN}[joblib]",
     ("hydra/launcher", "submitit_local"): f"{OWN}[submitit]",
@@ -47,7 +46,12 @@ EXTRAS: dict[tuple[str, str], str] = {
     ("optimizer", "cma"): "cfx-cma",
     ("optimizer", "differential_evolution"): "cfx-scipy",
     ("policy", "tcn"): "cfx-tcn",
+    ("protocol", "traffic"): "cfx-traffic",
     ("simulator", "sumo"): "cfx-sumo",
+    ("table", "traffic"): "cfx-traffic",
+    ("table", "traffic_growth"): "cfx-traffic",
+    ("table", "traffic_paths"): "cfx-traffic",
+    ("table", "traffic_strips"): "cfx-traffic",
 }
 """Options that come with another distribution or an extra, by group and name."""
 
