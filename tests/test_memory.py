@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from cfx.app import cli
-from cfx.app.job import steps
 from cfx.core.errors import ConfigError
 from cfx.core.memory import in_units, is_out_of_memory, require_memory
+from cfx.evaluation.protocols.within_driver import WithinDriver
 from cfx.policies.gru import GruPolicy
 from cfx.simulation.synthetic import SyntheticDataset
 from tests.broken_plugins import QUICK
@@ -59,7 +59,7 @@ def test_memory_that_runs_out_is_one_sentence(
         raise error
 
     assert is_out_of_memory(error)
-    monkeypatch.setattr(steps, "_run_protocol", fail)
+    monkeypatch.setattr(WithinDriver, "run", fail)
     assert cli.main([*QUICK, f"hydra.run.dir={tmp_path / 'job'}"]) == 2
     err = capsys.readouterr().err
     assert err.startswith("memory ran out (")

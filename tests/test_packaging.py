@@ -17,6 +17,7 @@ from packaging.utils import canonicalize_name
 import cfx
 from cfx.app import nodes
 from cfx.core import registry
+from cfx.policies.heads import head_names
 from cfx.report.figures.figure import JobFigure
 from cfx.report.section import Section
 
@@ -51,6 +52,7 @@ def test_entry_points_of_pyproject_are_the_installed_ones() -> None:
     for base in (JobFigure, Section):
         own = {one.name for one in base.installed() if one.distribution == nodes.DISTRIBUTION}
         assert own == {name for name, _ in declared.pop(base.group)}
+    assert {name for name, _ in declared.pop("cfx.heads")} <= set(head_names())
     assert not declared, "an entry-point group of no kind"
     (script,) = metadata.entry_points(group="console_scripts", name="cfx")
     assert script.value == PYPROJECT["project"]["scripts"]["cfx"]

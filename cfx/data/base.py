@@ -20,6 +20,7 @@ from cfx.core.files import absolute
 from cfx.core.memory import give_back
 from cfx.core.storage import is_url, local_copies
 from cfx.data.files import FileStart
+from cfx.data.kinematics import Check, check_kinematics
 from cfx.data.pairs import SIGNALS, Dropped, Pair, PairSet
 from cfx.data.resample import resampled
 from cfx.data.tracks import summed
@@ -54,6 +55,12 @@ FilePaths = Annotated[Path | str | tuple[Path | str, ...], BeforeValidator(_file
 class DatasetSettings(Settings):
     """What every dataset lets its user select."""
 
+    check: Check = Field(
+        "refuse",
+        description="pairs whose positions, speeds, accelerations and gaps contradict one another,"
+        " as with a wrong unit or time step: refuse: the job ends; report: a warning; off: nobody"
+        " looks",
+    )
     min_frames: int = Field(
         700, ge=2, description="shortest pair that is kept, frames; the paper keeps 700"
     )
@@ -200,7 +207,7 @@ class Dataset(Component):
 
         Raises:
             DataError: as `read`; or the recording, a pair id or a type of driver is unknown, the
-                source has no lanes, or too few pairs remain.
+                source has no lanes, too few pairs remain, or some contradict themselves.
             PluginError: `read` gives anything but pairs of finite numbers.
         """
         pairs = self.read()
@@ -223,6 +230,7 @@ class Dataset(Component):
                     " two such steps; give a shorter one"
                 )
         selected = _select_first(_select_long(pairs, self.settings.min_frames), self.settings)
+        check_kinematics(selected, self.settings.check)
         return scaled(selected, self.settings.scale)
 
     def _check(self, pairs: Any) -> None:

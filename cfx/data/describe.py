@@ -19,6 +19,7 @@ from cfx.core.errors import DataError, PluginError, listed
 from cfx.core.registry import Entry
 from cfx.data.base import Contents, Dataset
 from cfx.data.files import Floats, beginning, partitions
+from cfx.data.kinematics import in_words
 from cfx.data.pairs import Dropped, Pair, PairSet
 from cfx.data.resample import frames_in_steps
 from cfx.data.style import STANDING_MPS
@@ -323,6 +324,9 @@ def _suspicions(pairs: PairSet) -> Iterator[str]:
             f"{without} pairs have leaders of length 0: their gaps are bumper to bumper if"
             " leader positions are those of rear bumpers, and too long by a vehicle if not"
         )
+    words = in_words(pairs)
+    if words:
+        yield f"{words}; a job that uses them is refused (data.check)"
     for what, wrong in _CHECKS.items():
         yield from _counted(pairs, what, wrong)
 

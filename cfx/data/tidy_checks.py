@@ -5,7 +5,6 @@ What single cells may hold is declared in `cfx.data.tidy.LAYOUT`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -20,26 +19,12 @@ from cfx.data.table import Table
 
 Marks = NDArray[np.bool_]
 
-_FACTORS = {
-    1 / 0.3048: "the positions look like feet; multiply them by 0.3048",
-    0.3048: "the speeds look like feet per second; multiply them by 0.3048",
-    1 / 3.6: "the speeds look like km/h; divide them by 3.6",
-    0.44704: "the speeds look like miles per hour; multiply them by 0.44704",
-    1000.0: "the positions look like millimetres or the speeds like km/s; write m and m/s",
-    100.0: "the positions look like centimetres; divide them by 100",
-    0.001: "the times look like milliseconds, or the positions like kilometres; write s and m",
-}
-"""Distance over speed times time, if one of them has another unit than it should."""
-
 GAP, LENGTH, LANE = "gap_m", "leader_length_m", "lane"
 TRUE = "true_"
 """What the columns of true parameters begin with."""
 
 _AGREE_M = 0.5
 """How far a gap may be from that between the positions; beyond it one of them is wrong."""
-
-_TOO_LITTLE_M = 10.0
-"""Distance below which positions and speeds cannot be compared."""
 
 
 def check(table: Table) -> tuple[Table, Ints, Ints]:
@@ -56,7 +41,6 @@ def check(table: Table) -> tuple[Table, Ints, Ints]:
     _check_pairs(table, order, starts)
     if GAP in table.numbers:
         table = with_positions(table, order, starts)
-    _check_motion(table, order, starts)
     _check_gap(table)
     return table, order, starts
 
@@ -159,38 +143,6 @@ def _check_pairs(table: Table, order: Ints, starts: Ints) -> None:
                 f"{table.at(order[at[0]], name)}: the true parameter is known in a part of the pair"
                 " only; give it in every row"
             )
-
-
-def _check_motion(table: Table, order: Ints, starts: Ints) -> None:
-    """Raise DataError if positions and speeds do not belong together."""
-    within = np.ones(len(order), dtype=bool)
-    within[starts] = False
-    time = table.numbers["time_s"][order]
-    for who in ("leader", "follower"):
-        position = table.numbers[f"{who}_position_m"][order]
-        speed = table.numbers[f"{who}_speed_mps"][order]
-        moved = float(np.diff(position)[within[1:]].sum())
-        expected = float((0.5 * (speed[1:] + speed[:-1]) * np.diff(time))[within[1:]].sum())
-        if expected < _TOO_LITTLE_M and abs(moved) < _TOO_LITTLE_M:
-            continue
-        ratio = math.inf
-        if expected > 0:
-            ratio = moved / expected
-        if not 0.8 < ratio < 1.25:
-            raise DataError(
-                f"{table.source}, columns {who}_position_m and {who}_speed_mps: the distance driven"
-                f" is {ratio:.3g} times speed times time: {_likely_reason(ratio)}"
-            )
-
-
-def _likely_reason(ratio: float) -> str:
-    """Return why positions and speeds do not belong together, from how much they differ."""
-    for factor, text in _FACTORS.items():
-        if abs(ratio / factor - 1) < 0.05:
-            return text
-    if ratio < 0:
-        return "positions must grow along the lane"
-    return "positions must be in m, speeds in m/s and times in s"
 
 
 def _check_gap(table: Table) -> None:

@@ -1,0 +1,160 @@
+"""Pairs whose signals contradict one another are named with the likely reason, and refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cfx.core.errors import DataError
+from cfx.data.base import Dataset
+from cfx.data.describe import describe
+from cfx.data.kinematics import check_kinematics, contradiction, contradictions, in_words
+from cfx.data.ngsim import NgsimDataset
+from cfx.data.pairs import Pair, PairSet
+from cfx.data.series import driven
+from cfx.data.tidy import TidyDataset, frame_of
+from cfx.models.krauss import Krauss
+from tests.conftest import ROOT
+from tests.drives import wavy_pairs
+
+TRUE = torch.tensor([[1.0, 0.1], [2.0, 0.4], [3.0, 0.8], [1.5, 0.2]], dtype=torch.float64)
+PAIRS = wavy_pairs(Krauss(), TRUE, frames=300)
+SPEEDS = ("leader_speed", "follower_speed")
+ACCELERATIONS = ("leader_acceleration", "follower_acceleration")
+POSITIONS = ("leader_position", "follower_position")
+FOOT, MILE_PER_HOUR = 0.3048, 0.44704
+
+
+def times(factor: float, *signals: str, pair: Pair = PAIRS[0]) -> Pair:
+    return replace(pair, **{name: getattr(pair, name) * factor for name in signals})
+
+
+def by_gap(pair: Pair, speed: float, gap: float) -> Pair:
+    """Returns what a file of gaps and speeds gives, each with a factor."""
+    leader, follower = pair.leader_speed * speed, pair.follower_speed * speed
+    rear = driven(leader, pair.dt)
+    return replace(
+        pair,
+        leader_length=0.0,
+        leader_position=rear,
+        follower_position=rear - pair.gap * gap,
+        leader_speed=leader,
+        follower_speed=follower,
+        leader_acceleration=np.gradient(leader, pair.dt),
+        follower_acceleration=np.gradient(follower, pair.dt),
+    )
+
+
+@pytest.mark.parametrize(
+    ("pair", "said"),
+    [
+        (times(3.6, *SPEEDS), ["0.278 times speed times time", "km/h"]),
+        (times(1 / FOOT, *SPEEDS), ["feet per second"]),
+        (times(1 / MILE_PER_HOUR, *SPEEDS), ["miles per hour"]),
+        (times(3.6, "follower_speed"), ["follower_position and follower_speed", "km/h"]),
+        (times(1 / FOOT, *POSITIONS), ["3.28 times", "the positions look like feet"]),
+        (times(100, *POSITIONS), ["centimetres"]),
+        (times(1000, *POSITIONS), ["millimetres"]),
+        (times(1 / 1.7, *POSITIONS), ["0.588 times", "positions must be in m"]),
+        (times(-1, *POSITIONS), ["positions must grow"]),
+        (times(-1, *ACCELERATIONS), ["their sign is turned"]),
+        (times(2, *ACCELERATIONS), ["they are 2 times what the speeds say"]),
+        (times(0.1, *ACCELERATIONS), ["they are 0.1 times what the speeds say"]),
+        (times(1 / 9.80665, "follower_acceleration"), ["follower_acceleration", "multiples of g"]),
+        (times(1 / FOOT, *ACCELERATIONS), ["ft/s2"]),
+        (replace(PAIRS[0], dt=PAIRS[0].dt * 2), ["the time step looks like 0.1 s, not 0.2 s"]),
+        (replace(PAIRS[0], dt=PAIRS[0].dt * 25 / 30), ["the time step looks like 0.1 s"]),
+        (by_gap(PAIRS[1], 1 / MILE_PER_HOUR, 1.0), ["gap and speeds", "miles per hour"]),
+        (by_gap(PAIRS[1], 3.6, 1.0), ["gap and speeds", "km/h"]),
+        (by_gap(PAIRS[1], 1.0, 1 / FOOT), ["the gaps look like feet"]),
+    ],
+)
+def test_a_contradiction_is_named_with_its_likely_reason(pair: Pair, said: list[str]) -> None:
+    found = contradiction(pair)
+    assert found is not None
+    for words in said:
+        assert words in found, found
+
+
+@given(
+    number=st.integers(0, len(PAIRS) - 1),
+    signal=st.sampled_from([*SPEEDS, *ACCELERATIONS, *POSITIONS]),
+    factor=st.sampled_from([3.6, 1 / MILE_PER_HOUR, 1 / FOOT, -1.0, 2.0, 0.1, 9.80665]),
+)
+@settings(deadline=None, max_examples=40)
+def test_one_wrong_column_of_one_pair_is_found_and_no_other_pair(
+    number: int, signal: str, factor: float
+) -> None:
+    wrong = list(PAIRS)
+    wrong[number] = times(factor, signal, pair=wrong[number])
+    found = dict(contradictions(PairSet(tuple(wrong), "made up")))
+    assert list(found) == [wrong[number].pair_id]
+    assert signal in found[wrong[number].pair_id]
+
+
+def test_a_stationary_pair_says_nothing_and_is_let_through() -> None:
+    still = replace(
+        times(0.0, *SPEEDS, *ACCELERATIONS),
+        leader_position=np.full(300, 20.0),
+        follower_position=np.zeros(300),
+    )
+    assert contradiction(still) is None
+
+
+def test_a_job_is_refused_warned_or_left_alone(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    frame = frame_of(PAIRS)
+    chosen = frame["pair_id"] == PAIRS[2].pair_id
+    frame.loc[chosen, "follower_speed_mps"] *= 3.6
+    path = tmp_path / "pairs.csv"
+    frame.to_csv(path, index=False)
+
+    def dataset(**more: object) -> Dataset:
+        return TidyDataset(path=path, min_frames=100, **more)
+
+    with pytest.raises(DataError) as error:
+        dataset().load()
+    for words in (str(path), "one of 4 pairs", f"'{PAIRS[2].pair_id}'", "km/h", "data.check"):
+        assert words in str(error.value)
+    assert "km/h" in describe(path)
+    assert len(dataset(check="off").load()) == 4
+    assert not caplog.records
+    assert len(dataset(check="report").load()) == 4
+    assert "km/h" in caplog.text
+    # Pairs that a job does not use do not stop it.
+    assert len(dataset(pair_ids=[PAIRS[0].pair_id]).load()) == 1
+
+
+def test_every_dataset_is_checked(tmp_path: Path) -> None:
+    class Theirs(Dataset):
+        def read(self) -> PairSet:
+            return PairSet((times(-1, *ACCELERATIONS),), "a plugin's")
+
+    with pytest.raises(DataError, match=r"a plugin's: one of 1 pairs.*sign is turned"):
+        Theirs(min_frames=2).load()
+
+
+def test_only_some_pairs_are_named_and_all_counted() -> None:
+    wrong = PairSet(tuple(times(3.6, *SPEEDS, pair=pair) for pair in PAIRS), "made up")
+    words = in_words(wrong)
+    assert "4 of 4 pairs contradict themselves" in words
+    assert "(and 1 more)" in words
+    with pytest.raises(DataError):
+        check_kinematics(wrong, "refuse")
+
+
+SHARED = ROOT.parent / "shared" / "data"
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="the real recordings are not here")
+@pytest.mark.parametrize("path", sorted(SHARED.glob("*.[pc]*")), ids=lambda path: path.name)
+def test_real_recordings_are_let_through(path: Path) -> None:
+    kind = TidyDataset if path.suffix == ".parquet" else NgsimDataset
+    assert not list(contradictions(kind(path=path, min_frames=20, check="off").load()))
