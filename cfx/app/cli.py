@@ -62,6 +62,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(arguments: Sequence[str]) -> int:
     """Runs a sub-command or the Hydra application; returns the exit code."""
+    if list(arguments) == ["--version"]:
+        import cfx
+
+        print(f"cfx {cfx.__version__}")
+        return 0
     if arguments and re.match(r"\w[^=]*$", arguments[0]):
         return _command(*arguments)
     return _hydra(arguments)

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import importlib.util
 import logging
-import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -43,21 +42,6 @@ log = logging.getLogger(__name__)
 
 _MADE_BY_HYDRA = {"hydra/config.yaml", "hydra/launcher/basic.yaml", "hydra/sweeper/basic.yaml"}
 """Options that Hydra has in code; a file of the same name on the search path replaces them."""
-
-_PLAIN = re.compile(r"[\w./+-]+", re.ASCII)
-"""Values that Hydra's grammar takes as they are."""
-
-
-def path_override(key: str, path: Path) -> str:
-    """Returns the override that gives a setting a path, quoted where its signs ask for it."""
-    text = str(path)
-    if _PLAIN.fullmatch(text):
-        return f"{key}={text}"
-    # Backslashes count as such in a quoted value only before a quote.
-    escaped = re.sub(r"(\\*)'", r"\1\1\\'", text)
-    ending = re.search(r"\\*$", escaped)
-    assert ending is not None
-    return f"{key}='{escaped}{ending[0]}'"
 
 
 class ComponentSource(ConfigSource):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from cfx.app import hydra_source
 from cfx.core import registry
-from cfx.core.errors import CfxError, nearest
+from cfx.core.errors import CfxError, listed, nearest
 from cfx.core.extras import advice
 
 
@@ -120,10 +121,28 @@ def _unknown_key(key: str, overrides: Sequence[str]) -> str:
         if parent:
             advice = advice.replace("'", f"'{parent}.", 1)
             known = f"Known keys of {parent}"
-        return f"{given}: there is no key '{key}'.{advice} {known}: {', '.join(names)}."
+        elsewhere = _options_with(parent, last, str(siblings.get("name", "")))
+        return (
+            f"{given}: there is no key '{key}'.{elsewhere or advice} {known}: {', '.join(names)}."
+        )
     everything: Any = OmegaConf.to_container(config, resolve=False)
     paths = _keys(everything)
     return f"{given}: there is no key '{key}'.{nearest(key, paths)} cfx --cfg job prints every key."
+
+
+def _options_with(group: str, setting: str, chosen: str) -> str:
+    """Returns which other options of a group have a setting; "" if none has."""
+    if group not in registry.GROUPS:
+        return ""
+    kind, found = registry.GROUPS[group].name, []
+    for name in registry.names(kind):
+        with contextlib.suppress(CfxError):  # a plugin that cannot be imported has none
+            component = registry.get(kind, name)
+            if setting in component.schema.model_fields:
+                found.append(f"{group}={name}")
+    if not found:
+        return ""
+    return f" {group}={chosen} has none; choose {listed(found, 5)} too."
 
 
 def _keys(values: Mapping[Any, Any], prefix: str = "") -> Iterator[str]:

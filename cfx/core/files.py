@@ -131,3 +131,19 @@ def write_json(path: Path, values: Mapping[str, Any]) -> None:
     """
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
+
+
+_PLAIN = re.compile(r"[\w./+-]+", re.ASCII)
+"""Values that Hydra's grammar takes as they are."""
+
+
+def path_override(key: str, path: Path) -> str:
+    """Returns the override that gives a setting a path, quoted where its signs ask for it."""
+    text = str(path)
+    if _PLAIN.fullmatch(text):
+        return f"{key}={text}"
+    # Backslashes count as such in a quoted value only before a quote.
+    escaped = re.sub(r"(\\*)'", r"\1\1\\'", text)
+    ending = re.search(r"\\*$", escaped)
+    assert ending is not None
+    return f"{key}='{escaped}{ending[0]}'"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+import shlex
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -16,6 +17,7 @@ from rich.table import Table
 
 from cfx.core import registry
 from cfx.core.errors import DataError, PluginError, listed
+from cfx.core.files import path_override
 from cfx.core.registry import Entry
 from cfx.data.base import Contents, Dataset
 from cfx.data.files import Floats, beginning, partitions
@@ -76,7 +78,11 @@ def describe(path: Path) -> str:
         pieces += ["", "Why pairs end:", *_counts(contents.pairs.ends)]
     pieces += ["", *_problems(contents)]
     options, kept = _advice(_lengths(contents.pairs), dataset.settings.min_frames)
-    pieces += ["", f"Use it: data={name} data.path={path}{options}", *kept]
+    pieces += [
+        "",
+        f"Use it: data={name} {shlex.quote(path_override('data.path', path))}{options}",
+        *kept,
+    ]
     return _text(pieces)
 
 
@@ -113,7 +119,7 @@ def _describe_partitions(folder: Path, cls: type[Dataset]) -> str:
             table,
             "",
             "A recording alone: python -m cfx data describe FILE",
-            f"Use it: data=tidy data.path={folder}{options}",
+            f"Use it: data=tidy {shlex.quote(path_override('data.path', folder))}{options}",
             *kept,
             "One recording of it: data.recording=NAME",
         ]
@@ -322,7 +328,8 @@ def _suspicions(pairs: PairSet) -> Iterator[str]:
     if without:
         yield (
             f"{without} pairs have leaders of length 0: their gaps are bumper to bumper if"
-            " leader positions are those of rear bumpers, and too long by a vehicle if not"
+            " a column gap_m was given or leader positions are those of rear bumpers, and too long"
+            " by a vehicle if not"
         )
     words = in_words(pairs)
     if words:

@@ -152,6 +152,7 @@ class Layout:
 
     def _missing(self, source: str, missing: Sequence[Column], names: Sequence[str]) -> str:
         """Return what to say of columns that are not there."""
+        missing = sorted(missing, key=lambda column: bool(column.unless))
         first = missing[0]
         called = " or ".join([first.name, *first.spellings])
         own = {column.name for column in self.columns}
@@ -162,8 +163,12 @@ class Layout:
         text = f"{where}: column {called} is missing."
         if len(names) > 1:
             text += nearest(first.name, spare)
-        if len(missing) > 1:
-            text += f" So are {listed([column.name for column in missing[1:]], 5)}."
+        also = [column.name for column in missing[1:] if not column.unless]
+        if also:
+            text += f" So {'is' if len(also) == 1 else 'are'} {listed(also, 5)}."
+        for unless in dict.fromkeys(column.unless for column in missing if column.unless):
+            spared = [column.name for column in missing if column.unless == unless]
+            text += f" {listed(spared, 10)}: missing too, but not needed beside a column {unless}."
         hints = dict.fromkeys(self.elsewhere.get(self.plain(name), "") for name in names)
         text += "".join(f" {hint}" for hint in hints if hint)
         return f"{text} Columns found: {listed(names, 30)}."
@@ -586,8 +591,11 @@ def _decoded(path: Path, head: bytes) -> str:
     return text
 
 
-def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any) -> Any:
+def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any, spare: int = 0) -> Any:
     """Return the columns found as one Arrow table with columns c0, c1, ...
+
+    Args:
+        spare: columns without a name behind the others: 1 where rows end in a comma.
 
     Raises:
         DataError: a row has another number of columns.
@@ -608,7 +616,7 @@ def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any) -> Any:
         # One thread: only then does pyarrow know the number of a broken row.
         use_threads=False,
         block_size=_BLOCK,
-        column_names=[f"c{at}" for at in range(len(text.names))],
+        column_names=[f"c{at}" for at in range(len(text.names) + spare)],
         skip_rows=text.skipped,
     )
     options = {
@@ -622,6 +630,9 @@ def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any) -> Any:
     except pa.ArrowInvalid as error:
         if broken:
             row = broken[0]
+            more = row.actual_columns - len(text.names)
+            if spare == 0 and more == 1 and str(row.text).rstrip().endswith(","):
+                return _parsed(text, found, number_type, spare=1)
             raise DataError(
                 f"{text.path}, row {row.number}: {row.actual_columns} columns instead of"
                 f" {len(text.names)}; is the file cut off there, or does a cell hold a separator?"

@@ -372,7 +372,9 @@ class MlflowTracker(Tracker):
         if self._sweep is not None:
             return ()  # the sweep says it once, at its end
         address, first = _address(self.store.uri)
-        return (*first, f"MLflow: {address}/{self.link}")
+        if first:
+            return (f"{first[0]}, then {address}/{self.link}",)
+        return (f"MLflow: {address}/{self.link}",)
 
     def _log_metrics(self, points: Sequence[tuple[str, float, int]]) -> None:
         from mlflow.entities import Metric

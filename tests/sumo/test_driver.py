@@ -209,6 +209,24 @@ def test_without_a_leader_sumo_drives_and_a_new_leader_begins_anew() -> None:
     assert car.mode == 0
 
 
+def test_a_leader_that_traci_makes_up_is_none() -> None:
+    road = platoon(1)
+    driver = Driver(adaptive({"name": "krauss"}), look_ahead=100, speed_mode=0)
+    road.cars["v0"].gap = -1.8e308
+    driver.step(road, "v0")
+    assert not driver.drives("v0")
+    road.advance()
+    road.cars["v0"].gap = 20.0
+    driver.step(road, "v0")
+    assert driver.drives("v0")
+
+
+@pytest.mark.parametrize("look_ahead", [-5.0, 0.0, float("nan")])
+def test_a_distance_that_is_none_is_refused(look_ahead: float) -> None:
+    with pytest.raises(DataError, match="give a distance above 0 m"):
+        Driver(adaptive({"name": "krauss"}), look_ahead=look_ahead)
+
+
 def test_a_change_of_leader_begins_nothing_and_a_missed_step_begins_anew() -> None:
     road = platoon(1)
     road.cars["other"] = Car(speed=3.0)

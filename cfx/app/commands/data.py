@@ -55,6 +55,7 @@ def _fetch(options: argparse.Namespace) -> None:
     import shlex
 
     from cfx.core.console import console_logging
+    from cfx.core.files import path_override
     from cfx.data.fetch import URL, fetch_ngsim_i80
 
     with console_logging():
@@ -65,4 +66,4 @@ def _fetch(options: argparse.Namespace) -> None:
             force=options.force,
         )
     print(f"Look at it: python -m cfx data describe {shlex.quote(str(path))}")
-    print(f"Use it: python -m cfx data=ngsim data.path={shlex.quote(str(path))}")
+    print(f"Use it: python -m cfx data=ngsim {shlex.quote(path_override('data.path', path))}")

@@ -81,13 +81,15 @@ def report(
     for one in evaluation.left_out:
         text = f"Not measured: {one.name} of the distribution {one.distribution} ({one.reason})."
         console.print(text, soft_wrap=True, highlight=False)
-    console.print(f"Results: {result.folder}", soft_wrap=True, highlight=False)
+    console.print(f"Results: {result.folder}", soft_wrap=True, highlight=False, markup=False)
     if copied_to is not None:
-        console.print(f"Copied to: {copied_to}", soft_wrap=True, highlight=False)
+        console.print(f"Copied to: {copied_to}", soft_wrap=True, highlight=False, markup=False)
     for page in sorted(result.folder.glob(f"*/{PAGE}")):
-        console.print(f"Demonstration, for any browser: {page}", soft_wrap=True, highlight=False)
+        console.print(
+            f"Demonstration, for any browser: {page}", soft_wrap=True, highlight=False, markup=False
+        )
     for line in tracker.how_to_open():
-        console.print(line, soft_wrap=True, highlight=False)
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
 def methods_table(

@@ -14,10 +14,9 @@ from typing import Any
 
 import torch
 
-from cfx.app.hydra_source import path_override
 from cfx.app.publish.recipes import RECIPES, SHARED_OVERRIDES
 from cfx.core.errors import ConfigError, DataError, nearest
-from cfx.core.files import atomic_write, write_json
+from cfx.core.files import atomic_write, path_override, write_json
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
 from cfx.policies.ready import FOLDER

@@ -42,8 +42,8 @@ class SumoFcdSettings(FileDatasetSettings):
     length: float = Field(
         5.0, gt=0, description="m: of vehicles whose length nothing in the file gives"
     )
-    lengths: dict[str, float] = Field(
-        {}, description="m: of vehicles by their vType, for instance {truck: 12.0}"
+    lengths: dict[str, float] | None = Field(
+        None, description="m: of vehicles by their vType, for instance {truck: 12.0}"
     )
 
 
@@ -208,7 +208,8 @@ def _tracks(parsed: _Parsed, settings: SumoFcdSettings) -> Tracks:
         gap = np.where(leader == NOBODY, np.nan, numbers["leaderGap"][order])
     else:
         leader = columns.next_in_lane()
-    length = np.array([settings.lengths.get(str(name), settings.length) for name in types])
+    lengths_of = settings.lengths or {}
+    length = np.array([lengths_of.get(str(name), settings.length) for name in types])
     lengths = length[kind[order]]
     position, number_of_lane = columns.position, columns.lane
     if gap is not None:

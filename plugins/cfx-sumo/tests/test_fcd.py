@@ -138,3 +138,9 @@ def test_leaders_are_those_that_sumo_names(of_sumo: Path, tmp_path: Path) -> Non
             np.testing.assert_allclose(pair.gap, other, atol=1e-4)
             matched += 1
     assert matched > len(by_name) / 2
+
+
+def test_lengths_are_taken_as_the_docs_write_them(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["data=sumo_fcd", "data.path=fcd.xml", "data.lengths={truck: 12.0}", "--cfg", "job"]
+    assert main(words) == 0
+    assert "lengths:\n    truck: 12.0\n" in capsys.readouterr().out

@@ -293,11 +293,18 @@ def started(scenario: Path, command: Sequence[str], gui: bool) -> Iterator[Any]:
         _close(sumo)
 
 
-def _libsumo() -> Any:
-    # No word about pyarrow, which is not loaded here.
-    os.environ.setdefault("LIBSUMO_AS_TRACI", "quiet")
-    import libsumo
+_QUIET = "LIBSUMO_AS_TRACI"
 
+
+def _libsumo() -> Any:
+    before = os.environ.get(_QUIET)
+    # No word about pyarrow, which is not loaded here.
+    os.environ.setdefault(_QUIET, "quiet")
+    try:
+        import libsumo
+    finally:
+        if before is None:
+            del os.environ[_QUIET]
     return libsumo
 
 

@@ -184,9 +184,13 @@ class Driver:
             seed: of what a stochastic policy leaves to chance; None: nothing is drawn.
 
         Raises:
-            DataError: the policy has no such network; or its driving model has equations in SUMO
-                only, or may brake harder than a vehicle can.
+            DataError: `look_ahead` is no distance; the policy has no such network; or its driving
+                model has equations in SUMO only, or may brake harder than a vehicle can.
         """
+        if not look_ahead > 0:
+            raise DataError(
+                f"look_ahead={look_ahead:g}: give a distance above 0 m within which a leader counts"
+            )
         self.policy = policy
         self.look_ahead = look_ahead
         self.speed_mode = speed_mode

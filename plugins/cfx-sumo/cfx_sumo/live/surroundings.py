@@ -68,6 +68,10 @@ def look(
     return following, leaders, Seen(*table.unbind(1)), alone
 
 
+_FARTHEST = 1e6
+"""m: no gap is larger."""
+
+
 def leader_of(connection: Connection, name: str, look_ahead: float) -> tuple[str, float] | None:
     """Returns the vehicle ahead and the gap from bumper to bumper, m.
 
@@ -87,7 +91,8 @@ def leader_of(connection: Connection, name: str, look_ahead: float) -> tuple[str
             f"vehicle '{name}' cannot be driven ({error}); step only vehicles of"
             " connection.vehicle.getIDList()"
         ) from error
-    if not leader or not leader[0]:
+    # At some junctions TraCI answers a leader at -1.8e308 m, which is none.
+    if not leader or not leader[0] or abs(leader[1]) > _FARTHEST:
         return None
     gap = leader[1] + connection.vehicle.getMinGap(name)  # SUMO's own gap leaves minGap out
     if gap > look_ahead:
