@@ -262,6 +262,17 @@ def test_other_time_steps_are_said_and_can_be_brought_to_the_usual_one(
     assert times.diff().dropna().round(6).unique().tolist() == [0.1]
 
 
+def test_a_coarse_time_step_is_warned_of_with_the_remedy(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    coarse = ["data.dt=0.5", "data.frames=120", "data.min_frames=50", "policy=fixed"]
+    run(*coarse)
+    assert any("parameters calibrated in such steps are biased" in one for one in caplog.messages)
+    caplog.clear()
+    run(*coarse, "data.time_step=0.1", "data.min_frames=200")
+    assert not any("biased" in message for message in caplog.messages)
+
+
 def test_a_style_cluster_is_selected() -> None:
     result = run("style.cluster=normal", "data.pairs=8")
     assert set(result.pairs.cluster) == {"normal"}
