@@ -57,7 +57,8 @@ class SumoFcdDataset(Dataset):
 
     Pairs are cut by `cfx.data.tracks.extract_pairs`. Another lane of the same edge is a lane
     change; another edge is none. Where SUMO wrote no `acceleration` it is the change of speed over
-    the last step, as SUMO defines it. `driver_type` is the vType.
+    the last step, as SUMO defines it. `driver_type` is the vType; of a vehicle whose type SUMO made
+    its own (`truck@t.0` after `setTau`), the type that it had before.
 
     SUMO writes two decimals unless `--precision` says more: speeds are then rounded to 0.01 m/s,
     and accelerations that follow from them in steps of 0.1 s to 0.1 m/s2.
@@ -198,7 +199,11 @@ def _tracks(parsed: _Parsed, settings: SumoFcdSettings) -> Tracks:
     order = np.lexsort((frame, vehicle))
     has_leaders = not bool(np.isnan(numbers["leaderGap"]).all())
     lanes, lane = np.unique(np.array(parsed.texts["lane"]), return_inverse=True)
-    types, kind = np.unique(np.array(parsed.texts["type"]), return_inverse=True)
+    own = [
+        kind.removesuffix(f"@{name}")
+        for name, kind in zip(parsed.texts["id"], parsed.texts["type"], strict=True)
+    ]
+    types, kind = np.unique(np.array(own), return_inverse=True)
     columns = _Columns(vehicle[order], frame[order], lane[order], numbers["pos"][order])
     gap: Floats | None = None
     if has_leaders:

@@ -144,3 +144,19 @@ def test_lengths_are_taken_as_the_docs_write_them(capsys: pytest.CaptureFixture[
     words = ["data=sumo_fcd", "data.path=fcd.xml", "data.lengths={truck: 12.0}", "--cfg", "job"]
     assert main(words) == 0
     assert "lengths:\n    truck: 12.0\n" in capsys.readouterr().out
+
+
+def test_types_of_one_vehicle_are_the_type_they_came_from(of_sumo: Path) -> None:
+    own = RUN.replace("fcd.xml", "own.xml").replace(
+        "    libsumo.simulationStep()\n",
+        "    libsumo.simulationStep()\n    if libsumo.simulation.getTime() == 1:\n"
+        '        libsumo.vehicle.setTau("t.0", 1.4)\n',
+    )
+    subprocess.run([sys.executable, "-c", own], cwd=of_sumo.parent, check=True, capture_output=True)
+    path = of_sumo.with_name("own.xml")
+    assert 'type="truck@t.0"' in path.read_text(), "SUMO gives the vehicle a type of its own"
+    lengths = {"car": 4.3, "truck": 12.0}
+    pairs = SumoFcdDataset(path=path, min_frames=50, lengths=lengths).load()
+    behind = [pair for pair in pairs if pair.leader_id == "t.0"]
+    assert behind, "somebody follows it"
+    assert {(pair.leader_driver_type, pair.leader_length) for pair in behind} == {("truck", 12.0)}
