@@ -39,10 +39,22 @@ def machine() -> dict[str, str]:
     """Returns what the last bits of floating-point numbers depend on."""
     return {
         "architecture": platform.machine(),
+        "processor": _processor(),
         "capability": torch.backends.cpu.get_cpu_capability(),
         "torch": torch.__version__.partition("+")[0],
         "numpy": np.__version__,
     }
+
+
+def _processor() -> str:
+    """Returns family, model and stepping of the processor, where Linux tells them."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").split("\n\n")[0].splitlines()
+    except OSError:
+        return platform.processor()
+    known = dict(line.split(":", 1) for line in lines if ":" in line)
+    named = {key.strip(): value.strip() for key, value in known.items()}
+    return " ".join(named.get(key, "") for key in ("cpu family", "model", "stepping")).strip()
 
 
 def record(folder: Path) -> Record:
