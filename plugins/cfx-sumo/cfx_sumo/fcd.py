@@ -140,8 +140,6 @@ class _Parsed:
                 numbers.append(self._number(attributes, key))
             for key, texts in self.texts.items():
                 texts.append(attributes.get(key, ""))
-            # A vehicle of which TraCI changed something has a type of its own, such as truck@t.0.
-            self.texts["type"][-1] = self.texts["type"][-1].partition("@")[0]
         elif self.step < 0 and name != "fcd-export":
             raise DataError(
                 f"{self.path}: is XML of <{name}>, not SUMO's FCD output (<fcd-export>)"

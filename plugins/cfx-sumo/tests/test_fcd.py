@@ -37,14 +37,6 @@ def test_gives_gaps_and_speeds_back(tmp_path: Path, leaders: bool) -> None:
         assert pair.driver_type == "car"
 
 
-def test_a_type_that_traci_made_is_the_one_it_was_made_of(tmp_path: Path) -> None:
-    path = write_fcd(tmp_path / "fcd.xml", made_pairs(), leaders=False, length=7.0)
-    path.write_text(path.read_text().replace('type="car"', 'type="car@f.3"'))
-    pairs = SumoFcdDataset(path=path, min_frames=2, max_gap=None, lengths={"car": 7.0}).load()
-    assert {pair.leader_length for pair in pairs} == {7.0}
-    assert {pair.driver_type for pair in pairs} == {"car"}
-
-
 def test_is_recognised_packed_or_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plain = write_fcd(tmp_path / "fcd.xml", made_pairs())
     packed = tmp_path / "fcd.xml.gz"
