@@ -140,9 +140,9 @@ def test_no_import_comes_back_to_where_it_began() -> None:
     "code",
     [
         "import cfx, cfx.core.errors, cfx.core.component, cfx.core.parameters, cfx.data.pairs, cfx.core.registry, cfx.app.cli",
-        "import cfx.app.application, cfx.app.nodes",
+        "import cfx.app.application, cfx.app.nodes, sys; assert 'numpy' not in sys.modules",
         "from cfx.app.cli import main; main(['plugins'])",
-        "from cfx.app.cli import main; main(['--help'])",
+        "from cfx.app.cli import main; main(['--help']); import sys; assert 'numpy' not in sys.modules",
         "from cfx.app.cli import main; main(['--cfg', 'job', 'model=w99', 'data=ngsim'])",
         "from cfx.app.cli import main; main(['modle=w99'])",
     ],

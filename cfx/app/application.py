@@ -46,10 +46,10 @@ from cfx.core.memory import is_out_of_memory
 from cfx.core.plugin_errors import blame
 from cfx.core.signals import raise_if_terminated, signal_behind, terminable
 from cfx.core.storage import is_url
-from cfx.results.config import JobConfig
 
 if TYPE_CHECKING:
     from cfx.app.job import JobResult
+    from cfx.results.config import JobConfig
 
 log = logging.getLogger(__name__)
 
@@ -142,7 +142,7 @@ class JobFunction:
                     return _metric(metrics_of(folder)), status
                 (folder / STATUS).unlink(missing_ok=True)  # what it says is no longer so
             with _blaming():
-                result = (self.run_job or _own_job())(JobConfig.of(values), folder)
+                result = (self.run_job or _own_job())(_job_config(values), folder)
         except (Exception, SystemExit) as error:
             status = self._failed(error, blank)
             return float("nan"), replace(status, seconds=time.monotonic() - began)
@@ -281,7 +281,7 @@ def run(overrides: Sequence[str] = (), *, run_job: RunJob | None = None) -> JobR
             raise ConfigError(explain(error, overrides)) from None
         raise
     with _log_file(folder / "cfx.log"), _blaming():
-        return (run_job or _own_job())(JobConfig.of(values), folder)
+        return (run_job or _own_job())(_job_config(values), folder)
 
 
 def wants_traceback(arguments: Sequence[str]) -> bool:
@@ -293,6 +293,13 @@ def wants_traceback(arguments: Sequence[str]) -> bool:
         if argument.startswith("hydra.verbose=") and not argument.lower().endswith("=false"):
             return True
     return False
+
+
+# What these import takes a tenth of a second and more, which `--help` does not wait for.
+def _job_config(values: Mapping[str, Any]) -> JobConfig:
+    from cfx.results.config import JobConfig
+
+    return JobConfig.of(values)
 
 
 def _own_job() -> RunJob:
