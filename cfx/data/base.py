@@ -19,10 +19,11 @@ from cfx.core.errors import DataError, PluginError, listed, nearest
 from cfx.core.files import absolute
 from cfx.core.memory import give_back
 from cfx.core.storage import is_url, local_copies
-from cfx.data.files import FileStart
+from cfx.data.files import FileStart, recording_of, stem
 from cfx.data.kinematics import Check, check_kinematics
 from cfx.data.pairs import SIGNALS, Dropped, Pair, PairSet
 from cfx.data.resample import resampled
+from cfx.data.sites import SiteNames, VehiclePattern, with_sites, with_vehicles
 from cfx.data.tracks import summed
 
 log = logging.getLogger(__name__)
@@ -72,6 +73,17 @@ class DatasetSettings(Settings):
         " null: as recorded",
     )
     recording: str | None = Field(None, description="keep this recording alone; null: all")
+    site: SiteNames = Field(
+        None,
+        description="the road or area of the recordings: one name for all, or names by patterns of"
+        " recordings or files, such as {i80-*: I-80}; null: what the source says, or else, where"
+        " several files are read, the file's name",
+    )
+    vehicle: VehiclePattern | None = Field(
+        None,
+        description="a regular expression whose group finds, in a follower's id, the name that its"
+        " vehicle keeps over recordings, such as '^[0-9]+-(.+)$'; null: what the source says",
+    )
     lanes: list[int] | None = Field(None, description="keep pairs in these lanes alone; null: all")
     pair_ids: list[str] | None = Field(
         None, description="keep these pairs alone, by their ids; null: all"
@@ -215,6 +227,8 @@ class Dataset(Component):
         self._check(pairs)
         if not len(pairs):
             raise DataError(f"{pairs.source}: no leader-follower pair found{_why(pairs.dropped)}")
+        pairs = with_sites(pairs, self.settings.site)
+        pairs = with_vehicles(pairs, self.settings.vehicle)
         pairs = _select_label(pairs, "recording", self.settings.recording)
         if self.settings.lanes is not None:
             pairs = _select_lanes(pairs, self.settings.lanes)
@@ -270,9 +284,9 @@ def scaled(pairs: PairSet, factor: float) -> PairSet:
 def joined(files: Iterable[PairSet]) -> PairSet:
     """Returns the pairs of several files as one set, in their order.
 
-    What was left out for the same reason is counted together. Where there are many pairs, their
-    signals are moved into temporary files (`cfx.core.scratch`), so that memory holds those of one
-    file.
+    Of several files each is a site of its own name, unless it says otherwise. What was left out for
+    the same reason is counted together. Where there are many pairs, their signals are moved into
+    temporary files (`cfx.core.scratch`), so that memory holds those of one file.
 
     Args:
         files: read one after the other.
@@ -285,6 +299,7 @@ def joined(files: Iterable[PairSet]) -> PairSet:
     parts = _compact(files)
     if len(parts) == 1:
         return parts[0]
+    parts = [_at_site(part) for part in parts]
     _require_different(parts)
     pairs: list[Pair] = []
     dropped: list[Dropped] = []
@@ -295,6 +310,15 @@ def joined(files: Iterable[PairSet]) -> PairSet:
         ends += part.ends
     sources = listed([part.source for part in parts], 3)
     return PairSet(tuple(pairs), f"{len(parts)} files ({sources})", summed(dropped), summed(ends))
+
+
+def _at_site(part: PairSet) -> PairSet:
+    """Returns the pairs of a file; its name stands in for a site that is not known."""
+    file = Path(part.source)
+    if recording_of(file) is not None or all(pair.site for pair in part.pairs):
+        return part
+    named = tuple(replace(pair, site=pair.site or stem(file)) for pair in part.pairs)
+    return replace(part, pairs=named)
 
 
 def _compact(files: Iterable[PairSet]) -> list[PairSet]:

@@ -58,6 +58,9 @@ class Pair:
         driver_type: what drives the follower, as the source labels it: "human", "acc", "automated",
             "truck", a vType; "" where it has no labels.
         leader_driver_type: what drives the leader.
+        site: the road or area that the recording was made at; several recordings may share one.
+        vehicle: the follower's name over all recordings, "" where ids mean something within one
+            recording alone.
         truth: true parameters over time, name -> `(T,)`, known only for synthetic pairs.
         truth_model: name of the model these parameters belong to.
     """
@@ -80,6 +83,8 @@ class Pair:
     truth_model: str = ""
     driver_type: str = ""
     leader_driver_type: str = ""
+    site: str = ""
+    vehicle: str = ""
 
     def __post_init__(self) -> None:
         shapes = {name: getattr(self, name).shape for name in SIGNALS}
@@ -95,7 +100,13 @@ class Pair:
 
     @property
     def driver(self) -> str:
-        """The follower, unique across recordings."""
+        """Who drives the follower, unique across recordings.
+
+        A vehicle that keeps its name over recordings is one driver with adaptive cruise control and
+        another one without.
+        """
+        if self.vehicle:
+            return f"{self.vehicle} ({self.driver_type})" if self.driver_type else self.vehicle
         return f"{self.recording}/{self.follower_id}"
 
     @property

@@ -28,6 +28,7 @@ class Series:
         gap: bumper to bumper, m; None: both positions are given.
         leader_length: m; 0 where positions are rear bumpers' or unknown.
         labels: where any of these changes, the pair is cut; for instance who drives.
+        site, vehicle: as of pairs.
         driver_types: what the values of `labels["driver_type"]` stand for; a single one without it.
     """
 
@@ -43,6 +44,8 @@ class Series:
     labels: Mapping[str, Ints] = field(default_factory=dict)
     driver_types: Sequence[str] = ("",)
     leader_driver_type: str = ""
+    site: str = ""
+    vehicle: str = ""
 
 
 def pairs_of(
@@ -148,6 +151,8 @@ def _pair(one: Series, run: slice, seen: dict[str, int]) -> Pair:
         lane=lane,
         driver_type=one.driver_types[kind],
         leader_driver_type=one.leader_driver_type,
+        site=one.site,
+        vehicle=one.vehicle,
         **signals,
     )
 

@@ -13,6 +13,8 @@ One row per pair and frame, SI units, a constant time step within a pair, no gap
 | `leader_length_m` | m | net gap = leader position - leader length - follower position |
 | `gap_m` | m | optional, the net gap: lengths, positions and accelerations may then be left out |
 | `driver_type`, `leader_driver_type` | | optional labels such as human or acc, one for each pair |
+| `site` | | optional: the road or area of a recording; several recordings may share one |
+| `vehicle` | | optional: the follower's name over all recordings, where it has one |
 | `lane` | | optional, one value for each pair |
 | `true_model`, `true_NAME` | | optional: a synthetic driver's model and its parameters over time |
 
@@ -68,7 +70,8 @@ SIGNAL_COLUMNS = {
 """A pair's signals, and the columns that they are written in."""
 
 TRUE_MODEL = "true_model"
-DRIVER_TYPES = ("driver_type", "leader_driver_type")
+OPTIONAL_LABELS = ("driver_type", "leader_driver_type", "site", "vehicle")
+"""Columns of names that some files have, called as the attributes of pairs."""
 
 _NGSIM = "This looks like an NGSIM file: use data=ngsim."
 _REVERSING = "is negative; speeds count along the lane and must be 0 or more"
@@ -96,7 +99,7 @@ LAYOUT = Layout(
         Column(LANE, needed=False, may_be_empty=True, whole=True, wrong="is no lane number"),
         *[
             Column(name, is_name=True, needed=False, may_be_empty=True)
-            for name in (TRUE_MODEL, *DRIVER_TYPES)
+            for name in (TRUE_MODEL, *OPTIONAL_LABELS)
         ],
         Column(f"{TRUE}.+", many=True, needed=False, may_be_empty=True),
     ),
@@ -208,6 +211,8 @@ def _build(table: Table, order: Ints, starts: Ints) -> list[Pair]:
             truth_model=label.get(TRUE_MODEL, ""),
             driver_type=label.get("driver_type", ""),
             leader_driver_type=label.get("leader_driver_type", ""),
+            site=label.get("site", ""),
+            vehicle=label.get("vehicle", ""),
         )
         pairs.append(pair)
     return pairs
@@ -231,7 +236,7 @@ def _simplest(step: float) -> float:
     return step
 
 
-_ATTRIBUTES = {TRUE_MODEL: "truth_model"} | {name: name for name in DRIVER_TYPES}
+_ATTRIBUTES = {TRUE_MODEL: "truth_model"} | {name: name for name in OPTIONAL_LABELS}
 """Optional columns of labels, and the attributes of pairs that they hold."""
 
 _PAIRS_AT_ONCE = 1024

@@ -54,6 +54,7 @@ class TrainingData:
             n)`, SI units, while those in `fixed` serve unseen drivers; None where there are no
             unseen drivers. Only learners of offsets read them.
         drivers: whose pair each is; None if each is another driver's.
+        sites: where each pair was recorded; None if all were recorded at one site.
         workspace: a folder for what training needs to go on after an interruption; None: nothing is
             kept.
         objective: what training that simulates in closed loop minimises; calibration has minimised
@@ -73,6 +74,7 @@ class TrainingData:
     seed: int
     base: Tensor | None = None
     drivers: tuple[str, ...] | None = None
+    sites: tuple[str, ...] | None = None
     workspace: Path | None = None
     objective: Objective = field(default_factory=SpeedRmse)
     engine: Engine = field(default_factory=LocalEngine)

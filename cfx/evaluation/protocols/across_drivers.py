@@ -30,14 +30,18 @@ log = logging.getLogger(__name__)
 class AcrossDriversSettings(Settings):
     """Settings of `across_drivers`."""
 
-    folds: int = Field(
-        5, ge=2, description="parts that the drivers are divided into; each is tested once"
+    folds: int | None = Field(
+        5,
+        ge=2,
+        description="parts that the drivers are divided into; each is tested once; null: as many as"
+        " there are drivers (sites, ...), so that one is left out at a time",
     )
     together: Together = Field(
         "driver",
         description="what a fold keeps together: driver: all pairs of one follower; platoon: also"
-        " all who follow each other; recording: all drivers of a recording, so that no network"
-        " learned from the recordings it is tested on",
+        " all who follow each other; vehicle: all drives of a car (data.vehicle), with adaptive"
+        " cruise control and without; recording, site: all drivers of a recording or of a site"
+        " (data.site), so that no network learned from the road it is tested on",
     )
     min_test_frames: int | None = Field(
         None,
@@ -152,8 +156,8 @@ class AcrossDrivers(Protocol):
         """Calibrates and trains, and returns what is to be tested."""
         pairs = context.pairs
         fold = self.folds(pairs, seed=context.seed)
-        notes = describe_folds(pairs, fold, apart=self.settings.together == "recording")
-        members = learned_from(fold, self.settings.folds)
+        notes = describe_folds(pairs, fold, apart=self.settings.together in {"recording", "site"})
+        members = learned_from(fold, int(fold.max()) + 1)
         split = Split.of(pairs, context.windows, context.split)
         tested = fold >= 0
         of_tested = pairs.select(tested.tolist(), "not tested")
@@ -206,7 +210,7 @@ class AcrossDrivers(Protocol):
     ) -> tuple[Agent, TrainingResult]:
         """Trains a network for each row of `members`, `(K + 1, P)`, on full trajectories."""
         s = self.settings
-        names = (*(f"fold {number}" for number in range(s.folds)), ALL)
+        names = (*(f"fold {number}" for number in range(len(members) - 1)), ALL)
         if not context.policy.trainable:
             training_result = context.untrained(context.policy, found.start)
             policy = context.ready(context.policy, training_result, names)
@@ -299,6 +303,7 @@ def _training_data(
         objective=context.objective,
         base=base,
         drivers=tuple(context.pairs[number].driver for number in index.tolist()),
+        sites=tuple(context.pairs[number].site for number in index.tolist()),
         workspace=context.workspace,
         engine=context.engine,
     )

@@ -20,17 +20,17 @@ from scipy.sparse.csgraph import connected_components
 from sklearn.model_selection import GroupKFold
 from torch import Tensor
 
-from cfx.core.errors import DataError
+from cfx.core.errors import DataError, listed
 from cfx.data.pairs import Pair, PairSet
 
 log = logging.getLogger(__name__)
 
-Together = Literal["driver", "platoon", "recording"]
+Together = Literal["driver", "platoon", "vehicle", "recording", "site"]
 """What a fold keeps together."""
 
 
 def assign_folds(
-    pairs: PairSet, folds: int, together: Together, min_frames: int | None, *, seed: int
+    pairs: PairSet, folds: int | None, together: Together, min_frames: int | None, *, seed: int
 ) -> Tensor:
     """Returns the fold of each pair, `(P,)` int64.
 
@@ -38,13 +38,15 @@ def assign_folds(
 
     Args:
         pairs: P pairs.
-        folds: K.
+        folds: K; None: as many as there are drivers (platoons, ...), one of which is left out
+            at a time.
         together: what a fold keeps together.
         min_frames: frames that a tested pair has at least; None: all are tested.
         seed: of the shuffle.
 
     Raises:
-        DataError: there are fewer drivers (platoons, recordings) than folds.
+        DataError: there are fewer drivers (platoons, ...) than folds, or one driver would be
+            tested by a network that learned from them elsewhere.
     """
     groups = _GROUPS[together](pairs)
     tested = []
@@ -53,8 +55,10 @@ def assign_folds(
             tested.append(number)
     groups_tested = [groups[number] for number in tested]
     found = len(set(groups_tested))
-    if found < folds:
+    if found < (folds or 2):
         raise DataError(_too_few(pairs, folds, together, min_frames, found))
+    if folds is None:
+        folds = found
     splitter = GroupKFold(folds, shuffle=True, random_state=seed)
     fold_of_group: dict[Any, int] = {}
     parts = splitter.split(np.zeros(len(tested)), groups=groups_tested)
@@ -70,7 +74,27 @@ def assign_folds(
             assigned.append(-2 - fold_of_group[group])
         else:
             assigned.append(-1)
+    _require_drivers_apart(pairs, assigned, together)
     return torch.tensor(assigned)
+
+
+def _require_drivers_apart(pairs: PairSet, fold: Sequence[int], together: Together) -> None:
+    """Raises DataError if a driver is tested in one fold and learned from for it.
+
+    Args:
+        fold: of each pair.
+        together: what a fold keeps together.
+    """
+    first: dict[str, tuple[int, Pair]] = {}
+    for number, pair in zip(fold, pairs, strict=True):
+        place = number if number >= -1 else -2 - number
+        other, elsewhere = first.setdefault(pair.driver, (place, pair))
+        if other != place:
+            raise DataError(
+                f"protocol.together={together}: '{pair.driver}' drives in {elsewhere.recording} and"
+                f" in {pair.recording}, of which one is learned from when the other is tested;"
+                " write protocol.together=vehicle, or give both one site (data.site)"
+            )
 
 
 def learned_from(fold: Tensor, folds: int) -> Tensor:
@@ -81,12 +105,19 @@ def learned_from(fold: Tensor, folds: int) -> Tensor:
 
 
 def _too_few(
-    pairs: PairSet, folds: int, together: Together, min_frames: int | None, found: int
+    pairs: PairSet, folds: int | None, together: Together, min_frames: int | None, found: int
 ) -> str:
     what = together if found == 1 else f"{together}s"
     if min_frames:
         what += f" with {min_frames} frames or more"
-    more = "recordings" if together == "recording" else "pairs"
+    if together == "site" and found == 1:
+        what += " (name those of its recordings with data.site)"
+    more = f"{together}s" if together in {"recording", "site", "vehicle"} else "pairs"
+    if folds is None:
+        return (
+            f"protocol.together={together}: {pairs.source} has only {found} {what} here, and one is"
+            f" left out at a time; use more {more}"
+        )
     return (
         f"protocol.folds={folds}: {pairs.source} has only {found} {what} here; lower protocol.folds"
         f" (2 at least) or use more {more}"
@@ -101,10 +132,18 @@ def _recordings(pairs: PairSet) -> list[str]:
     return [pair.recording for pair in pairs]
 
 
+def _vehicles(pairs: PairSet) -> list[str]:
+    return [pair.vehicle or pair.driver for pair in pairs]
+
+
+def _sites(pairs: PairSet) -> list[str]:
+    return [pair.site for pair in pairs]
+
+
 def _platoons(pairs: PairSet) -> list[int]:
     """Numbers the platoon of each pair: vehicles that follow one another, also through others."""
     leaders = [_leader(pair) for pair in pairs]
-    followers = _drivers(pairs)
+    followers = [_follower(pair) for pair in pairs]
     vehicles = sorted({*leaders, *followers})
     number = {vehicle: index for index, vehicle in enumerate(vehicles)}
     rows = [number[leader] for leader in leaders]
@@ -118,13 +157,19 @@ def _platoons(pairs: PairSet) -> list[int]:
 _GROUPS: Mapping[str, Callable[[PairSet], Sequence[Any]]] = {
     "driver": _drivers,
     "platoon": _platoons,
+    "vehicle": _vehicles,
     "recording": _recordings,
+    "site": _sites,
 }
 """What each pair's fold is chosen for: `protocol.together`."""
 
 
 def _leader(pair: Pair) -> str:
     return f"{pair.recording}/{pair.leader_id}"
+
+
+def _follower(pair: Pair) -> str:
+    return f"{pair.recording}/{pair.follower_id}"
 
 
 def describe_folds(pairs: PairSet, fold: Tensor, *, apart: bool) -> dict[str, Any]:
@@ -143,7 +188,7 @@ def describe_folds(pairs: PairSet, fold: Tensor, *, apart: bool) -> dict[str, An
     for pair, place in zip(pairs, places, strict=True):
         if place >= 0:
             fold_of_driver[pair.driver] = place
-    behind_trained, leaders = _on_both_sides(pairs, places, fold_of_driver)
+    behind_trained, leaders = _on_both_sides(pairs, places)
     folds = max(places) + 1
     tested = sum(place >= 0 for place in places)
     recordings = _recordings_per_fold(pairs, places, folds)
@@ -161,7 +206,7 @@ def describe_folds(pairs: PairSet, fold: Tensor, *, apart: bool) -> dict[str, An
     if apart:
         for number, names in enumerate(recordings):
             text = "Fold %d is tested on %s and learns nothing from there"
-            log.info(text, number, ", ".join(names))
+            log.info(text, number, listed(names, 3))
     in_folds = list(fold_of_driver.values())
     return {
         "folds": folds,
@@ -174,20 +219,21 @@ def describe_folds(pairs: PairSet, fold: Tensor, *, apart: bool) -> dict[str, An
     }
 
 
-def _on_both_sides(
-    pairs: PairSet, places: Sequence[int], fold_of_driver: Mapping[str, int]
-) -> tuple[int, set[str]]:
+def _on_both_sides(pairs: PairSet, places: Sequence[int]) -> tuple[int, set[str]]:
     """Returns how many test pairs follow a training driver, and the test drivers who lead one."""
+    fold_of_follower: dict[str, int] = {}
     not_learned_in: dict[str, int] = {}
     for pair, place in zip(pairs, places, strict=True):
-        not_learned_in[pair.driver] = place if place >= 0 else -2 - place
+        if place >= 0:
+            fold_of_follower[_follower(pair)] = place
+        not_learned_in[_follower(pair)] = place if place >= 0 else -2 - place
     behind_trained = 0
     leaders = set()
     for pair, place in zip(pairs, places, strict=True):
         leader = _leader(pair)
         if place >= 0 and leader in not_learned_in and not_learned_in[leader] != place:
             behind_trained += 1
-        leads_in = fold_of_driver.get(leader)
+        leads_in = fold_of_follower.get(leader)
         if leads_in is not None and place not in {leads_in, -2 - leads_in}:
             leaders.add(leader)
     return behind_trained, leaders

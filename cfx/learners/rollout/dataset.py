@@ -8,7 +8,7 @@ features, c = n + k features of conditioning.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -76,6 +76,8 @@ class RolloutDataset:
         driver_features: from each driver's whole training part, `(U, k)`; NaN where too little was
             measured.
         time_gap: each driver's usual one, `(U,)`, s.
+        chance: how likely each place is sampled, in relation to the others of its network, `(N,
+            B)`; None: all places alike.
         scaler: normalises tokens and conditioning, f + c features; alike for all members of an
             ensemble.
         ensemble_size: networks of an ensemble, which stand behind one another.
@@ -96,6 +98,7 @@ class RolloutDataset:
     driver_features: Tensor
     time_gap: Tensor
     scaler: Scaler
+    chance: Tensor | None = None
     ensemble_size: int = 1
     networks: slice | None = None
     total: int = 0
@@ -109,6 +112,7 @@ class RolloutDataset:
         generator: torch.Generator,
         ensemble_size: int = 1,
         head: ParameterHead | None = None,
+        balance: float = 0.0,
     ) -> RolloutDataset:
         """Places training data.
 
@@ -120,6 +124,7 @@ class RolloutDataset:
             generator: chooses these drivers, for each member of an ensemble anew.
             ensemble_size: networks of an ensemble.
             head: says which parameters bases have; None: those of the driving model.
+            balance: how evenly sites and drivers are sampled, from 0 to 1; see `chances`.
         """
         if head is None:
             head = OffsetHead.for_model(training_data.simulator.model)
@@ -165,6 +170,7 @@ class RolloutDataset:
             tokens=seen,
             driver_features=driver_features,
             time_gap=_usual_time_gaps(batch, frame),
+            chance=_chance(training_data, pair, present, balance),
             scaler=Scaler(
                 scaler.mean.repeat_interleave(ensemble_size, 0),
                 scaler.scale.repeat_interleave(ensemble_size, 0),
@@ -192,6 +198,7 @@ class RolloutDataset:
             tokens=self.tokens[rows],
             driver_features=self.driver_features[rows],
             time_gap=self.time_gap[rows],
+            chance=None if self.chance is None else self.chance[networks],
             scaler=Scaler(self.scaler.mean[networks], self.scaler.scale[networks]),
             networks=networks,
             total=len(self.pair),
@@ -242,9 +249,13 @@ class RolloutDataset:
 
         All drivers in order, unless there are more than `most`: then as many of those that are
         trained on. Drivers kept for validation are among them where all are taken; their
-        trajectories have no weight.
+        trajectories have no weight. With `chance` drivers are drawn, each as often as it falls to
+        them.
         """
         networks, drivers = self.pair.shape
+        if self.chance is not None:
+            count = drivers if most is None else min(most, drivers)
+            return self._draw(torch.where(self.trains, self.chance, 0.0), count, generator)
         if most is None or drivers <= most:
             return torch.arange(drivers, device=self.pair.device).expand(networks, drivers)
         return self._sample(self.trains, most, generator)
@@ -271,6 +282,20 @@ class RolloutDataset:
         lots = self.lots(tuple(wanted.shape[1:]), generator)
         return torch.where(wanted, lots, -1.0).topk(count, dim=1).indices.sort(1).values
 
+    def _draw(self, chance: Tensor, count: int, generator: torch.Generator) -> Tensor:
+        """Draws `count` places of each network with replacement, `(N, count)`, in order.
+
+        Args:
+            chance: of each place, `(N, B)`.
+            count: how many.
+            generator: on the CPU.
+        """
+        upto = chance.cumsum(1)
+        lots = self.lots((count,), generator) * upto[:, -1:]
+        places = torch.searchsorted(upto, lots, right=True)
+        last = (chance > 0).long().cumsum(1).argmax(1, keepdim=True)
+        return places.minimum(last).sort(1).values
+
     def condition(self, batch: RolloutBatch) -> Conditioning:
         """Returns what is known of the drivers of these trajectories.
 
@@ -287,6 +312,61 @@ class RolloutDataset:
             known = torch.where(cold_start | measured.isnan(), usual, measured)
             features = torch.cat([features, known], -1)
         return Conditioning(pair, base, features)
+
+
+def chances(sites: Sequence[str], drivers: Sequence[str], frames: Tensor, balance: float) -> Tensor:
+    """Returns how likely each of P pairs is sampled, `(P,)`; they add up to 1.
+
+    A driver's chance is shared among their pairs by frames to the power of `balance`; a site's
+    among its drivers, and everything among sites, by the sums below to the power of 1 - `balance`.
+    Powers of shares even out sources of different size, as in multilingual training (A. Conneau et
+    al. 2020, Unsupervised cross-lingual representation learning at scale, ACL, section 3.1).
+
+    Args:
+        sites: of each pair.
+        drivers: of each pair; a driver at two sites counts at each.
+        frames: of each pair, `(P,)`.
+        balance: from 0 (every pair alike) to 1.
+    """
+    of_site = np.unique(np.asarray(sites), return_inverse=True)[1]
+    who = np.unique(np.asarray(drivers), return_inverse=True)[1]
+    _, first, of_driver = np.unique(
+        of_site * len(who) + who, return_index=True, return_inverse=True
+    )
+    own = frames.double().numpy() ** balance
+    total = np.bincount(of_driver, own)
+    site = of_site[first]
+    shared = total ** (1.0 - balance)
+    of_sites = np.bincount(site, shared)
+    share = of_sites ** (1.0 - balance)
+    share = share / share.sum()
+    chance = share[of_site] * (shared / of_sites[site])[of_driver] * own / total[of_driver]
+    return torch.as_tensor(chance)
+
+
+def _chance(
+    training_data: TrainingData, pair: Tensor, present: Tensor, balance: float
+) -> Tensor | None:
+    """Returns how likely each place is sampled, `(N, B)`; None where all are alike.
+
+    Args:
+        pair: which of the P pairs stands at each place, `(N, B)`.
+        present: where one stands.
+        balance: from 0 to 1.
+    """
+    if balance == 0:
+        return None
+    pairs = len(training_data.pair)
+    drivers = training_data.drivers or tuple(str(number) for number in range(pairs))
+    sites = training_data.sites or ("",) * pairs
+    frames = training_data.split.frame.cpu()
+    found = torch.zeros(pair.shape, dtype=torch.float64)
+    for network, row in enumerate(pair.cpu()):
+        own = row[present[network].cpu()].tolist()
+        found[network, present[network].cpu()] = chances(
+            [sites[one] for one in own], [drivers[one] for one in own], frames[own], balance
+        )
+    return found.to(pair.device)
 
 
 def _recorded_once(training_data: TrainingData) -> tuple[Tensor, Tensor]:

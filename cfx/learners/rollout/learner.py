@@ -104,7 +104,7 @@ class RolloutLearner(Learner):
         generator = torch.Generator().manual_seed(training_data.seed)
         head = head_class(s.head).for_model(simulator.model)
         dataset = RolloutDataset.of(
-            training_data, policy, s.validation, generator, s.ensemble_size, head
+            training_data, policy, s.validation, generator, s.ensemble_size, head, s.balance
         )
         network = untrained(policy, dataset, head, generator)
         if not any(parameter.requires_grad for parameter in network.parameters()):

@@ -143,7 +143,12 @@ class TrajectorySampler:
         )
 
     def _validation_weight(self) -> Tensor:
-        return self.dataset.validates.gather(1, self.validation_places).float()
+        """Returns how much each validation trajectory counts, `(N, D)`: as often as sampled."""
+        weight = self.dataset.validates.float()
+        if self.dataset.chance is not None:
+            chance = self.dataset.chance * self.dataset.validates
+            weight = (chance / chance.amax(1, keepdim=True).clamp(min=1e-300)).float()
+        return weight.gather(1, self.validation_places)
 
 
 class Augmentation:

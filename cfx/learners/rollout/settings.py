@@ -88,6 +88,14 @@ class SamplingSettings(Settings):
         ge=1,
         description="drivers of a network in one step, and in validation, at most; null: all",
     )
+    balance: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="how evenly sites are sampled, in each site drivers, and of each driver frames:"
+        " 0: every pair is as likely; 1: every site, in it every driver, and of them every frame;"
+        " 0.5: by the square roots of how many pairs and frames there are",
+    )
     horizon: int = Field(30, ge=1, description="windows that a trajectory lasts")
     burn_in_s: float | None = Field(
         20.0,

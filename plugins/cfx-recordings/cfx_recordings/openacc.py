@@ -69,8 +69,9 @@ class OpenaccDataset(Dataset):
     **Cuts.** Rows with empty cells, negative speeds, gaps of 0 or less, and missing times (tunnels,
     toll stations) end a pair and are counted.
 
-    **Drivers.** A recording is one file. The same car drives in many files: an evaluation on unseen
-    drivers is one on unseen cars only if all files of a car are in one fold.
+    **Drivers.** A recording is one file, and a site the folder that it lies in: campaigns are
+    published in folders. The same car drives in many files, under its name in `Vehicle_order`: with
+    cruise control it is one driver in all of them, and without another one.
     """
 
     layout = "OpenACC (SI units)"
@@ -186,15 +187,21 @@ def _series(file: _File, ahead: int, behind: int) -> Series:
         labels={"driver_type": codes},
         driver_types=types,
         leader_driver_type=known[0] if len(known) == 1 else "",
+        site=file.path.absolute().parent.name,
+        vehicle=_car(file, behind),
     )
 
 
 def _name(file: _File, place: int) -> str:
     """Returns a vehicle's name: its place in the platoon, and what the file calls it."""
+    car = _car(file, place)
+    return f"{place}-{car}" if car else str(place)
+
+
+def _car(file: _File, place: int) -> str:
+    """Returns what the file calls the car at a place in the platoon, "" if nothing."""
     order = file.about.get("vehicle_order", [])
-    if place <= len(order):
-        return f"{place}-{order[place - 1]}"
-    return str(place)
+    return order[place - 1] if place <= len(order) else ""
 
 
 def _driver(file: _File, place: int) -> tuple[Ints, list[str]]:

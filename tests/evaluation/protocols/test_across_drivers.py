@@ -93,6 +93,48 @@ def test_recordings_stay_whole_if_wanted() -> None:
     assert [of[pair.recording] for pair in pairs] == fold
 
 
+def at_sites(*drives: tuple[str, str, str]) -> PairSet:
+    """Pairs by site, vehicle and what drives it; each is a recording of its own."""
+    pairs = straight_pairs([100] * len(drives))
+    return PairSet(
+        tuple(
+            replace(pair, recording=str(k), site=site, vehicle=vehicle, driver_type=kind)
+            for k, (pair, (site, vehicle, kind)) in enumerate(zip(pairs, drives, strict=True))
+        ),
+        "test",
+    )
+
+
+def test_each_site_is_left_out_once() -> None:
+    pairs = at_sites(("road", "", ""), ("track", "Kia", "acc"), ("road", "", ""), ("city", "", ""))
+    fold = AcrossDrivers(folds=None, together="site").folds(pairs, seed=0).tolist()
+    assert fold[0] == fold[2]
+    assert sorted({fold[0], fold[1], fold[3]}) == [0, 1, 2]
+
+
+def test_all_drives_of_a_car_stay_together_if_wanted() -> None:
+    pairs = at_sites(
+        ("road", "Kia", "acc"), ("track", "Kia", "human"), ("track", "VW", "acc"), ("road", "", "")
+    )
+    fold = AcrossDrivers(folds=None, together="vehicle").folds(pairs, seed=0).tolist()
+    assert fold[0] == fold[1]
+    assert sorted({fold[0], fold[2], fold[3]}) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("together", ["site", "recording"])
+def test_a_car_is_not_tested_by_what_learned_from_it_elsewhere(together: str) -> None:
+    pairs = at_sites(("road", "Kia", "acc"), ("track", "Kia", "acc"), ("city", "VW", "acc"))
+    with pytest.raises(DataError, match=r"'Kia \(acc\)' drives in 0 and in 1.*together=vehicle"):
+        AcrossDrivers(folds=None, together=together).folds(pairs, seed=0)
+
+
+def test_one_site_alone_cannot_be_left_out() -> None:
+    with pytest.raises(DataError, match=r"only 1 site \(name those of its recordings with data"):
+        AcrossDrivers(folds=None, together="site").folds(
+            at_sites(("", "", ""), ("", "", "")), seed=0
+        )
+
+
 def test_short_pairs_of_a_tested_recording_are_learned_from_elsewhere_only() -> None:
     long, short = in_recordings("a", "b", "a", "b"), in_recordings("a", "c", frames=50)
     shorter = [

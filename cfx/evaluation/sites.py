@@ -1,0 +1,174 @@
+"""Results by site: a row for each road or area, and one in which each site counts once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from cfx.data.pairs import PairSet
+from cfx.evaluation.result import METHODS, Evaluation
+from cfx.evaluation.statistics import improvement_statistics
+from cfx.evaluation.tables import values_of
+
+ALL = "all"
+"""What the row is called in which each site counts once, and a row of all types of drivers."""
+
+BASELINES = ("fixed", "population")
+"""What the policy is compared with in each row."""
+
+_RESAMPLES = 9_999
+
+Floats = NDArray[np.float64]
+
+
+def site_table(pairs: PairSet, evaluation: Evaluation, *, seed: int) -> pd.DataFrame | None:
+    """Summarises an evaluation by site; None if the tested pairs were recorded at one site alone.
+
+    Args:
+        pairs: of the job; those that were not tested do not count.
+        evaluation: of the tested ones.
+        seed: of the bootstrap.
+
+    Returns:
+        A row per scope (`test`, `full_trajectory`), site and driver type (`all`, and each type
+        where a site has several): scope, site, driver_type, pairs, drivers, for each method
+        `rmse_speed_METHOD` (m/s) and `rmse_gap_METHOD` (m), means over pairs; and for each baseline
+        the policy's improvement of the RMSE of speed `over_BASELINE`, `over_BASELINE_median`,
+        `over_BASELINE_low` and `over_BASELINE_high` (95 %, drivers resampled). The site `all` is
+        the mean over sites, drivers resampled within each site.
+    """
+    labels = _labels(pairs, evaluation)
+    if labels["site"].nunique() < 2:
+        return None
+    rows = []
+    for scope in ("test", "full_trajectory"):
+        speed = values_of(evaluation.values, "rmse_speed", scope)
+        gap = values_of(evaluation.values, "rmse_gap", scope)
+        if "policy" not in speed and scope != "test":
+            continue
+        about = labels.loc[speed.index]
+        for site, of_site in about.groupby("site", sort=False):
+            rows.append(_row(scope, str(site), ALL, of_site, speed, gap, seed))
+            if len(set(of_site["driver_type"])) > 1:
+                for kind, of_kind in of_site.groupby("driver_type", sort=False):
+                    name = str(kind) or "not known"
+                    rows.append(_row(scope, str(site), name, of_kind, speed, gap, seed))
+        every = [row for row in rows if row["scope"] == scope and row["driver_type"] == ALL]
+        rows.append(_mean_of_sites(scope, every, about, speed, seed))
+    return pd.DataFrame(rows)
+
+
+def _labels(pairs: PairSet, evaluation: Evaluation) -> pd.DataFrame:
+    """Returns site, driver and driver type of the tested pairs, by pair id."""
+    tested = set(evaluation.about["pair_id"])
+    labels = [
+        (pair.pair_id, pair.site, pair.driver, pair.driver_type)
+        for pair in pairs
+        if pair.pair_id in tested
+    ]
+    columns = ["pair_id", "site", "driver", "driver_type"]
+    return pd.DataFrame(labels, columns=columns).set_index("pair_id")
+
+
+def _row(
+    scope: str,
+    site: str,
+    kind: str,
+    about: pd.DataFrame,
+    speed: pd.DataFrame,
+    gap: pd.DataFrame,
+    seed: int,
+) -> dict[str, object]:
+    """Returns the row of some pairs of a site.
+
+    Args:
+        about: labels of these pairs.
+        speed: RMSE of speed, a row per pair and a column per method.
+        gap: RMSE of gap, likewise.
+    """
+    row: dict[str, object] = {
+        "scope": scope,
+        "site": site,
+        "driver_type": kind,
+        "pairs": len(about),
+        "drivers": about["driver"].nunique(),
+    }
+    own_speed, own_gap = speed.loc[about.index], gap.loc[about.index]
+    for method in METHODS:
+        if method in speed:
+            row[f"rmse_speed_{method}"] = float(own_speed[method].mean())
+            row[f"rmse_gap_{method}"] = float(own_gap[method].mean())
+    for baseline in BASELINES:
+        if baseline in speed and "policy" in speed:
+            one = improvement_statistics(
+                own_speed[baseline].to_numpy(),
+                own_speed["policy"].to_numpy(),
+                about["driver"].tolist(),
+                seed=seed,
+            )
+            row |= _improvement(baseline, one.mean, one.median, one.ci95_low, one.ci95_high)
+    return row
+
+
+def _improvement(
+    baseline: str, mean: float, median: float, low: float, high: float
+) -> dict[str, float]:
+    name = f"over_{baseline}"
+    return {name: mean, f"{name}_median": median, f"{name}_low": low, f"{name}_high": high}
+
+
+def _mean_of_sites(
+    scope: str,
+    rows: Sequence[Mapping[str, object]],
+    about: pd.DataFrame,
+    speed: pd.DataFrame,
+    seed: int,
+) -> dict[str, object]:
+    """Returns the row in which each site counts once.
+
+    Args:
+        rows: of the sites.
+        about: labels of all pairs.
+        speed: RMSE of speed, a row per pair and a column per method.
+    """
+    table = pd.DataFrame(rows)
+    row: dict[str, object] = {
+        "scope": scope,
+        "site": ALL,
+        "driver_type": ALL,
+        "pairs": int(table["pairs"].sum()),
+        "drivers": int(table["drivers"].sum()),
+    }
+    for name in table.columns:
+        if name.startswith(("rmse_", "over_")) and not name.endswith(("_low", "_high")):
+            row[name] = float(table[name].mean())
+    for baseline in BASELINES:
+        if f"over_{baseline}" in row:
+            gain = (speed[baseline] - speed["policy"]) / speed[baseline].where(speed[baseline] > 0)
+            low, high = _interval_over_sites(gain, about, seed)
+            row |= {f"over_{baseline}_low": low, f"over_{baseline}_high": high}
+    return row
+
+
+def _interval_over_sites(gain: pd.Series, about: pd.DataFrame, seed: int) -> tuple[float, float]:
+    """Returns the 95 % interval of the mean over sites of their mean gain.
+
+    Drivers are resampled within each site, with all their pairs.
+
+    Args:
+        gain: of each pair, by its id.
+        about: labels of these pairs.
+    """
+    generator = np.random.default_rng(seed)
+    means = np.zeros(_RESAMPLES)
+    of_site = about.assign(gain=gain)[np.isfinite(gain)].groupby("site")
+    for _, pairs in of_site:
+        by_driver = pairs.groupby("driver")["gain"]
+        total, number = by_driver.sum().to_numpy(), by_driver.count().to_numpy()
+        drawn = generator.integers(len(total), size=(_RESAMPLES, len(total)))
+        means += total[drawn].sum(1) / number[drawn].sum(1) / of_site.ngroups
+    low, high = np.quantile(means, [0.025, 0.975])
+    return float(low), float(high)
