@@ -50,7 +50,7 @@ def _in_words(error: BaseException) -> str:
 def _packages() -> dict[Path, registry.Entry]:
     """Returns the places of plugins' code: a package's folder, or a single module's file."""
     found: dict[Path, registry.Entry] = {}
-    for kind in registry.KINDS:
+    for kind in (*registry.KINDS, *registry.PARTS):
         for entry in registry.entries(kind):
             if entry.distribution == registry.OWN:
                 continue

@@ -21,11 +21,11 @@ import importlib.metadata
 import inspect
 import logging
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Generic, TypeVar, get_args
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -35,6 +35,9 @@ from cfx.core.errors import CfxError, ConfigError, PluginError, Terminated, near
 from cfx.core.extras import advice
 
 log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 OWN = "cfx-driving"
 """The distribution whose components nobody else's can replace."""
@@ -106,6 +109,16 @@ KINDS: dict[str, Kind] = {
 }
 """All kinds, by name."""
 
+PARTS: dict[str, Kind] = {
+    kind.name: kind
+    for kind in (
+        Kind("figure", "cfx.report.figures.figure:JobFigure", chosen=False),
+        Kind("section", "cfx.report.section:Section", chosen=False),
+        Kind("head", "cfx.policies.heads.base:ParameterHead", group="learner.head", chosen=False),
+    )
+}
+"""Kinds of classes that come in the same way, are no components to configure, and have no suite."""
+
 GROUPS: dict[str, Kind] = {kind.group: kind for kind in KINDS.values() if kind.chosen}
 """Kinds by config group, of which a job chooses one component each; of demo perhaps none."""
 
@@ -157,7 +170,7 @@ def kind_of(kind: str) -> Kind:
     Raises:
         PluginError: there is no such kind.
     """
-    for found in KINDS.values():
+    for found in (*KINDS.values(), *PARTS.values()):
         if kind in {found.name, found.group}:
             return found
     raise PluginError(
@@ -265,6 +278,77 @@ def create(kind: str, node: Mapping[str, Any]) -> Component:
     return component
 
 
+@dataclass(frozen=True)
+class Installed(Generic[T]):
+    """One of a kind of which all that are installed take part, and who brings it.
+
+    Attributes:
+        kind: such as "figure".
+        name: of its entry point.
+        part: what it is.
+        distribution: who brings it.
+    """
+
+    kind: str
+    name: str
+    part: T
+    distribution: str
+
+    def attempt(self, work: Callable[[T], R], without: R) -> R:
+        """Returns what `work` makes of it.
+
+        One of another distribution that fails is left out with a warning, and `without` is
+        returned: the job has its results.
+        """
+        try:
+            return work(self.part)
+        except Exception as error:
+            if self.distribution == OWN:
+                raise
+            _warn_of_left_out(self, f"{in_words(error)}; repair or uninstall it")
+            return without
+
+
+def installed(kind: str) -> tuple[Installed[Any], ...]:
+    """Makes all of a kind with their default settings; returns them by their `order` and name.
+
+    One of another distribution never replaces cfx's own. One that cannot be made is left out with a
+    warning.
+
+    Raises:
+        PluginError: one of cfx's own cannot be made.
+    """
+    return _installed(kind, _search_path())
+
+
+@functools.lru_cache(maxsize=8)
+def _installed(
+    kind: str,
+    search_path: tuple[tuple[str, ...], ...],  # noqa: ARG001 - part of the cache's key
+) -> tuple[Installed[Any], ...]:
+    made = []
+    for found in entries(kind):
+        others = rivals(found)
+        if others:
+            _warn_of_left_out(found, f"{others[0].distribution} brings one of that name")
+            continue
+        try:
+            part: Any = create(kind, {"name": found.name})
+        except PluginError as error:
+            if found.distribution == OWN:
+                raise
+            _warn_of_left_out(found, str(error))
+            continue
+        made.append(Installed(kind, found.name, part, found.distribution))
+    return tuple(sorted(made, key=lambda one: (one.part.order, one.name)))
+
+
+def _warn_of_left_out(one: Entry | Installed[Any], reason: str) -> None:
+    log.warning(
+        "%s %s of the distribution %s is left out: %s", one.kind, one.name, one.distribution, reason
+    )
+
+
 def is_loaded(found: Entry) -> bool:
     """Says whether the component was imported and passed its checks."""
     return found in _loaded
@@ -350,7 +434,7 @@ def _smoke_check(found: Entry, component: Component, settings: BaseModel) -> Non
     Raises:
         PluginError: it breaks its contract; names the distribution.
     """
-    kind = KINDS[found.kind]
+    kind = kind_of(found.kind)
     key = (found, settings.model_dump_json())
     if not kind.has_smoke_check or key in _smoke_checked:
         return
@@ -418,7 +502,7 @@ def _announced(
     search_path: tuple[tuple[str, ...], ...],  # noqa: ARG001 - the cache's key
 ) -> dict[str, tuple[Entry, ...]]:
     """Returns the entries of every kind, sorted."""
-    found: dict[str, list[Entry]] = {name: [] for name in KINDS}
+    found: dict[str, list[Entry]] = {name: [] for name in (*KINDS, *PARTS)}
     seen = set()
     for distribution in importlib.metadata.distributions():
         try:
@@ -442,7 +526,7 @@ def _entries(distribution: importlib.metadata.Distribution) -> Iterator[Entry]:
     Raises:
         ValueError: its metadata are damaged.
     """
-    kinds = {kind.entry_points: kind.name for kind in KINDS.values()}
+    kinds = {kind.entry_points: kind.name for kind in (*KINDS.values(), *PARTS.values())}
     points = list(distribution.entry_points)
     api = tuple(sorted(point.name for point in points if point.group == API_GROUP))
     ours = [point for point in points if point.group in kinds]
@@ -485,22 +569,24 @@ def _import(found: Entry) -> Any:
 
 def _check(found: Entry, cls: Any) -> None:
     """Raises PluginError unless `cls` keeps the contract of its kind."""
-    base = _resolve(KINDS[found.kind].base)
+    base = _resolve(kind_of(found.kind).base)
     if not inspect.isclass(cls):
         raise PluginError(
             f"{found} is no class but {type(cls).__name__};"
             f" point its entry point at a subclass of {base.__name__}"
         )
-    if not issubclass(cls, Component) or not issubclass(cls, base):
+    if not issubclass(cls, base):
         raise PluginError(f"{found} does not extend {base.__module__}.{base.__name__}")
+    missing = sorted(getattr(cls, "__abstractmethods__", ()))
+    if missing:
+        raise PluginError(f"{found} does not implement {', '.join(missing)}")
+    if not issubclass(cls, Component):
+        return
     if cls.kind != base.kind:
         raise PluginError(
             f"{found} says kind='{cls.kind}',"
             f" but a {found.kind} keeps kind='{base.kind}' of its base class"
         )
-    missing = sorted(cls.__abstractmethods__)
-    if missing:
-        raise PluginError(f"{found} does not implement {', '.join(missing)}")
     schema = cls.schema
     if not (inspect.isclass(schema) and issubclass(schema, Settings)):
         raise PluginError(f"{found}: its schema must be a subclass of cfx.Settings, not {schema!r}")

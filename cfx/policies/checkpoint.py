@@ -26,7 +26,7 @@ from cfx.policies.agent import Agent
 from cfx.policies.base import Policy
 from cfx.policies.context import ContextRule
 from cfx.policies.core import AgentCore, features_read, network_with_weights
-from cfx.policies.heads import head_class, head_names
+from cfx.policies.heads import head_class
 from cfx.policies.heads.base import ParameterHead
 from cfx.policies.scaler import Scaler
 from cfx.policies.valid_range import SIGNALS, ValidRange
@@ -249,9 +249,9 @@ def _read(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
 
 
 def _head(folder: Path, description: _Description, model: DrivingModel) -> ParameterHead:
-    if description.head not in head_names():
+    if description.head not in registry.names("head"):
         raise DataError(
             f"{folder}/{_DESCRIPTION}: this version of cfx has no head '{description.head}'; it has"
-            f" {', '.join(head_names())}"
+            f" {', '.join(registry.names('head'))}"
         )
     return head_class(description.head).for_model(model)

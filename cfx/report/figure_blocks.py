@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from cfx.report.blocks import Block, Figure, View, job_folds
-from cfx.report.figures.figure import JobFigure, draw
+from cfx.report.figures.figure import draw, figure_named
 from cfx.report.job import Job, Runs
 
 if TYPE_CHECKING:
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 def figure_of(name: str, job: Job) -> Figure | None:
     """Returns the figure of that name as the job has written it; None if the job lacks its data."""
-    found = JobFigure.named(name)
+    found = figure_named(name)
     drawing = draw(found, job.results)
     return None if drawing is None else single_view(drawing, found.part.title)
 
@@ -26,7 +26,7 @@ def figure_folds(name: str, runs: Runs) -> list[Block]:
 
 def caption(name: str) -> str:
     """Returns what a reader needs to know of the figure of that name."""
-    return JobFigure.named(name).part.caption
+    return figure_named(name).part.caption
 
 
 def single_view(drawing: Drawing, label: str) -> Figure:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import datetime
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from cfx.core import registry
 from cfx.core.files import write_output
 from cfx.data.style import CLUSTERS
+from cfx.report.blocks import Block
 from cfx.report.job import Runs, calibrations
 from cfx.report.scripts import inline_scripts, security_policy
-from cfx.report.section import Section
 from cfx.report.summary import summary
 from cfx.results.look import CLUSTER_COLOURS, COLOURS
 
@@ -54,8 +56,8 @@ def _content(runs: Runs, title: str | None) -> dict[str, Any]:
 
     scripts = inline_scripts([_asset(name) for name in _SCRIPTS])
     sections = []
-    for one in Section.installed():
-        blocks = one.attempt(lambda section: section.blocks(runs))
+    for one in registry.installed("section"):
+        blocks: Sequence[Block] = one.attempt(lambda section: section.blocks(runs), ())
         if blocks:
             sections.append((one, blocks))
     subject = "Parameters that adapt"

@@ -9,12 +9,12 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from typing import ClassVar
 
+from cfx.core.component import Component
 from cfx.report.blocks import Block
-from cfx.report.installed import Part
 from cfx.report.job import Runs
 
 
-class Section(Part):
+class Section(Component):
     """A section of the page about finished jobs.
 
     Attributes:
@@ -26,10 +26,15 @@ class Section(Part):
     """
 
     kind = "section"
-    group = "cfx.sections"
-    required = ("title", "entry")
-    entry: ClassVar[str]
+    title: ClassVar[str] = ""
+    entry: ClassVar[str] = ""
+    order: ClassVar[int] = 1000
     figures: ClassVar[tuple[str, ...]] = ()
+
+    @classmethod
+    def complaint(cls) -> str:
+        """Returns what is wrong with what a class declares; "" if nothing is."""
+        return "" if cls.title and cls.entry else " has no title or no entry; give it both"
 
     @abstractmethod
     def blocks(self, runs: Runs) -> Sequence[Block]:

@@ -13,14 +13,13 @@ back. A figure of reports takes it from `Results.tables`.
 
 from __future__ import annotations
 
-import logging
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 
 import pandas as pd
 import pyarrow as pa
@@ -38,8 +37,6 @@ if TYPE_CHECKING:
     from cfx.data.style import StyleResult
     from cfx.evaluation.protocols.base import ProtocolResult
     from cfx.evaluation.result import Evaluation
-
-log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
@@ -242,18 +239,8 @@ class InstalledTable:
 
         The job has its results.
         """
-        try:
-            return work()
-        except Exception as error:
-            if self.distribution == registry.OWN:
-                raise
-            log.warning(
-                "table %s of the distribution %s is left out: %s; repair or uninstall it",
-                self.name,
-                self.distribution,
-                registry.in_words(error),
-            )
-            return without
+        one = registry.Installed("table", self.name, self.table, self.distribution)
+        return one.attempt(lambda _: work(), without)
 
 
 @dataclass(frozen=True)
@@ -270,28 +257,11 @@ class WrittenTable:
 
 
 def installed() -> tuple[InstalledTable, ...]:
-    """Returns all tables in their order.
-
-    One of another distribution that cannot be imported is left out with a warning.
-    """
+    """Returns all tables in their order; a broken one of a plugin is left out with a warning."""
     found = []
-    for entry in registry.entries("table"):
-        if registry.rivals(entry):
-            continue
-        try:
-            table = cast(ResultTable, registry.create("table", {"name": entry.name}))
-        except PluginError as error:
-            if entry.distribution == registry.OWN:
-                raise
-            log.warning(
-                "table %s of the distribution %s is left out: %s",
-                entry.name,
-                entry.distribution,
-                error,
-            )
-            continue
-        found.append(InstalledTable(entry.name, table, entry.distribution))
-    return tuple(sorted(found, key=lambda one: (one.table.order, one.name)))
+    for one in registry.installed("table"):
+        found.append(InstalledTable(one.name, one.part, one.distribution))
+    return tuple(found)
 
 
 def read_tables(folder: Path) -> dict[str, pd.DataFrame]:

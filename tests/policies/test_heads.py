@@ -5,18 +5,19 @@ from __future__ import annotations
 import pytest
 import torch
 
+from cfx.core import registry
 from cfx.core.component import validate
 from cfx.core.errors import ConfigError, PluginError
 from cfx.learners.imitation_data import ImitationSettings
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.models.w99 import W99
-from cfx.policies.heads import head_class, head_names
+from cfx.policies.heads import head_class
 from cfx.policies.heads.base import ParameterHead
 
 MODEL = W99()
 
 
-@pytest.fixture(params=head_names())
+@pytest.fixture(params=registry.names("head"))
 def head(request: pytest.FixtureRequest) -> ParameterHead:
     return head_class(request.param).for_model(MODEL)
 
@@ -87,5 +88,5 @@ def test_a_learner_takes_the_heads_that_it_trains() -> None:
 
 
 def test_a_head_that_is_not_there() -> None:
-    with pytest.raises(PluginError, match="no head 'mixture'; write one of direct, "):
+    with pytest.raises(PluginError, match=r"there is no head 'mixture'\. Known: direct, "):
         head_class("mixture")

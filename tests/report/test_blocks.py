@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from cfx.core import registry
+from cfx.core.registry import Installed, installed
 from cfx.report import blocks, page
 from cfx.report.blocks import (
     Block,
@@ -22,7 +24,6 @@ from cfx.report.blocks import (
     Text,
     View,
 )
-from cfx.report.installed import Installed
 from cfx.report.job import Runs
 from cfx.report.runs import read_runs
 from cfx.report.section import Section
@@ -80,11 +81,12 @@ def test_a_further_section_needs_nothing_but_its_blocks(
     assert kinds == {one.__name__.lower() for one in blocks.Block.__subclasses__()}
     added = []
     for name, section in (("mine", Further()), ("empty", Empty()), ("broken", Broken())):
-        added.append(Installed(name, section, "somebody-else"))
-    known = (*Section.installed()[-2:], *added)
-    monkeypatch.setattr(Section, "installed", lambda: known)
+        added.append(Installed("section", name, section, "somebody-else"))
+    known = {"section": (*installed("section")[-2:], *added), "figure": ()}
     write_job(tmp_path / "job", pairs=3)
-    found = Page(page.render(read_runs([str(tmp_path)])))
+    runs = read_runs([str(tmp_path)])
+    monkeypatch.setattr(registry, "installed", known.__getitem__)
+    found = Page(page.render(runs))
     for words in (
         "a remark",
         "a title",

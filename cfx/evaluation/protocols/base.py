@@ -33,7 +33,7 @@ from cfx.policies.base import ConstantNetwork, Policy
 from cfx.policies.core import AgentCore, features_read
 from cfx.policies.features import token_width
 from cfx.policies.fixed import FixedPolicy
-from cfx.policies.heads import head_class, head_name, head_names
+from cfx.policies.heads import head_class, head_name
 from cfx.policies.heads.base import ParameterHead
 from cfx.policies.heads.stochastic import SCALE, StochasticHead
 from cfx.policies.scaler import Scaler
@@ -236,10 +236,10 @@ class ProtocolContext:
         """Returns the head that the learner trained its networks for."""
         has_base = training_result.base is not None
         name = training_result.head or head_name(has_base=has_base)
-        if name not in head_names():
+        if name not in registry.names("head"):
             raise PluginError(
                 f"{registry.origin(self.learner)} breaks its contract: there is no head '{name}';"
-                f" write one of {', '.join(head_names())}"
+                f" write one of {', '.join(registry.names('head'))}"
             )
         model = self.simulator.model
         head = head_class(name).for_model(model, training_result.scaler.mean.device)

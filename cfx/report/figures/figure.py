@@ -9,14 +9,16 @@ from __future__ import annotations
 from abc import abstractmethod
 from typing import TYPE_CHECKING, ClassVar
 
+from cfx.core import registry
+from cfx.core.component import Component
+from cfx.core.errors import PluginError
 from cfx.report.figures.results import Results
-from cfx.report.installed import Installed, Part
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-class JobFigure(Part):
+class JobFigure(Component):
     """A figure of a finished job, the same in its folder and in reports.
 
     Attributes:
@@ -26,9 +28,14 @@ class JobFigure(Part):
     """
 
     kind = "figure"
-    group = "cfx.figures"
-    required = ("title", "caption")
-    caption: ClassVar[str]
+    title: ClassVar[str] = ""
+    caption: ClassVar[str] = ""
+    order: ClassVar[int] = 1000
+
+    @classmethod
+    def complaint(cls) -> str:
+        """Returns what is wrong with what a class declares; "" if nothing is."""
+        return "" if cls.title and cls.caption else " has no title or no caption; give it both"
 
     @abstractmethod
     def draw(self, results: Results) -> Figure | None:
@@ -42,7 +49,19 @@ class JobFigure(Part):
         """
 
 
-def draw(one: Installed[JobFigure], results: Results) -> Figure | None:
+def figure_named(name: str) -> registry.Installed[JobFigure]:
+    """Return the figure of a name.
+
+    Raises:
+        PluginError: there is none that works.
+    """
+    for one in registry.installed("figure"):
+        if one.name == name:
+            return one
+    raise PluginError(f"there is no figure '{name}'")
+
+
+def draw(one: registry.Installed[JobFigure], results: Results) -> Figure | None:
     """Return a figure in the common look; None where there is nothing to show, or it fails."""
     from cfx.report.figures.canvas import figure_style
 
@@ -50,4 +69,4 @@ def draw(one: Installed[JobFigure], results: Results) -> Figure | None:
         with figure_style():
             return figure.draw(results)
 
-    return one.attempt(attempt)
+    return one.attempt(attempt, None)

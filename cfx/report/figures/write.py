@@ -16,10 +16,11 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from cfx.core import registry
 from cfx.core.errors import OutputError
 from cfx.core.files import atomic_write
 from cfx.report.figures.canvas import DPI, WIDTH, figure_style, hover_text
-from cfx.report.figures.figure import JobFigure, draw
+from cfx.report.figures.figure import draw
 from cfx.report.figures.results import Results
 
 _METADATA: dict[str, dict[str, None]] = {
@@ -53,7 +54,7 @@ def write_figures(
         OutputError: a file cannot be written.
     """
     paths = []
-    for one in JobFigure.installed():
+    for one in registry.installed("figure"):
         figure = draw(one, results)
         if figure is not None:
             for form in formats:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from cfx.core.registry import OWN
+from cfx.core import registry
 from cfx.report.blocks import Block, Heading, Text
 from cfx.report.figure_blocks import figure_folds
-from cfx.report.figures.figure import JobFigure
 from cfx.report.job import Runs
 from cfx.report.section import Section
 
@@ -20,11 +19,11 @@ class FurtherSection(Section):
     def blocks(self, runs: Runs) -> list[Block]:
         """Return each such figure, of each job that has its data."""
         shown: set[str] = set()
-        for section in Section.installed():
+        for section in registry.installed("section"):
             shown |= set(section.part.figures)
         found: list[Block] = []
-        for one in JobFigure.installed():
-            if one.distribution == OWN or one.name in shown:
+        for one in registry.installed("figure"):
+            if one.distribution == registry.OWN or one.name in shown:
                 continue
             folds = figure_folds(one.name, runs)
             if folds:

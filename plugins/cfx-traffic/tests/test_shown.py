@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cfx.report.figures.figure import JobFigure, draw
+from cfx.report.figures.figure import draw, figure_named
 from cfx.report.figures.results import Results
 from cfx.report.figures.words import MINUS, label
 from cfx.report.runs import read_runs
@@ -108,7 +108,7 @@ def test_traffic_has_a_plot_and_a_table(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["traffic", "traffic_paths"])
 def test_each_figure_is_drawn_where_there_is_traffic_and_nowhere_else(name: str) -> None:
-    (one,) = [one for one in JobFigure.installed() if one.name == name]
+    one = figure_named(name)
     evaluation = make_results(pairs=3, frames=20).evaluation
     assert draw(one, Results.of(evaluation)) is None
     assert draw(one, Results.of(evaluation, tables=make_traffic())) is not None

@@ -18,7 +18,7 @@ from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.evaluation.result import Evaluation
 from cfx.learners.curves import over_networks
 from cfx.report.figures.errors import errors_over_time
-from cfx.report.figures.figure import JobFigure, draw
+from cfx.report.figures.figure import draw, figure_named
 from cfx.report.figures.history import amounts_of
 from cfx.report.figures.learning import SAMPLED
 from cfx.report.figures.platoon import braking_time, worst_platoon
@@ -46,7 +46,7 @@ def all_of(made: MadeUp, *, adapts: bool = True) -> Results:
 
 
 def drawn(name: str, results: Results) -> Figure:
-    found = draw(JobFigure.named(name), results)
+    found = draw(figure_named(name), results)
     assert found is not None
     return found
 
@@ -355,8 +355,8 @@ def test_a_policy_that_does_not_adapt_has_no_figure_of_improvements() -> None:
     values = pd.concat([values[values["method"] != "policy"], same], ignore_index=True)
     made = dataclasses.replace(made, evaluation=dataclasses.replace(made.evaluation, values=values))
     still = all_of(made, adapts=False)
-    assert draw(JobFigure.named("improvement_per_driver"), still) is None
-    assert draw(JobFigure.named("calibration"), still) is not None
+    assert draw(figure_named("improvement_per_driver"), still) is None
+    assert draw(figure_named("calibration"), still) is not None
     # Its policy is one of the constant sets: it is no line of its own, and improves nothing.
     written = texts(drawn("drives", still))
     assert "policy" not in written

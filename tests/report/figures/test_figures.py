@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.metadata
-import logging
 from pathlib import Path
 
 import matplotlib as mpl
@@ -12,17 +10,15 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib import pyplot as plt
-from matplotlib.figure import Figure
 
 from cfx.core import registry
 from cfx.report.figures.canvas import canvas, hover
 from cfx.report.figures.figure import JobFigure, draw
 from cfx.report.figures.results import Results
 from cfx.report.figures.write import PLACE, inline_svg, write_figure, write_figures
-from cfx.report.installed import Installed, _installed
 from cfx.report.page import render
 from cfx.report.runs import read_runs
-from cfx.report.section import Section
+from tests.conftest import Installer
 from tests.made_up import (
     GAINS,
     make_distributions,
@@ -66,12 +62,12 @@ def everything() -> Results:
     return dataclasses.replace(results, tables={**results.tables, **tables})
 
 
-OWN = [one for one in JobFigure.installed() if one.distribution == registry.OWN]
+OWN = [one for one in registry.installed("figure") if one.distribution == registry.OWN]
 
 
 @pytest.mark.parametrize("one", OWN, ids=lambda one: one.name)
 def test_every_figure_keeps_its_contract(
-    one: Installed[JobFigure], everything: Results, tmp_path: Path
+    one: registry.Installed[JobFigure], everything: Results, tmp_path: Path
 ) -> None:
     settings = dict(mpl.rcParams)
     drawn = draw(one, everything)
@@ -94,8 +90,8 @@ def test_every_figure_keeps_its_contract(
     assert dict(mpl.rcParams) == settings
 
 
-@pytest.mark.parametrize("one", JobFigure.installed(), ids=lambda one: one.name)
-def test_a_figure_of_what_was_not_measured_is_left_out(one: Installed[JobFigure]) -> None:
+@pytest.mark.parametrize("one", registry.installed("figure"), ids=lambda one: one.name)
+def test_a_figure_of_what_was_not_measured_is_left_out(one: registry.Installed[JobFigure]) -> None:
     table = make_results(pairs=1, frames=5).evaluation.table
     bare = Results(table[table["method"] == "default"], ("default",), ())
     assert draw(one, bare) is None
@@ -117,70 +113,53 @@ def test_an_inline_figure_has_text_pictures_of_clouds_and_says_what_the_mouse_sh
     assert f"#{PLACE}" in svg
 
 
-class Further(JobFigure):
-    """A figure of a third party."""
+FURTHER = """
+    from cfx.report.figures.canvas import canvas
+    from cfx.report.figures.figure import JobFigure
 
-    title = "Something further"
-    caption = "It shows nothing."
-    order = 5
+    class Further(JobFigure):
+        \"\"\"A figure of a third party.\"\"\"
 
-    def draw(self, results: Results) -> Figure | None:
-        """Draws nothing."""
-        return canvas(2.0)
+        title = "Something further"
+        caption = "It shows nothing."
+        order = 5
 
+        def draw(self, results):
+            return canvas(2.0)
 
-class Broken(Further):
-    """One that fails."""
+    class Broken(Further):
+        def draw(self, results):
+            raise ValueError("no luck")
 
-    def draw(self, results: Results) -> Figure | None:
-        """Fails."""
-        raise ValueError("no luck")
+    class Untitled(Further):
+        title = ""
+"""
 
 
 @pytest.mark.usefixtures("blank_figures")
 def test_a_third_partys_figure_needs_a_class_and_an_entry_point(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, install: Installer, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level(logging.WARNING)
-
-    class Distribution:
-        name = "somebody-else"
-
-    found = list(importlib.metadata.entry_points(group=JobFigure.group))
-    for name, target in (
-        ("further", f"{__name__}:Further"),
-        ("broken", f"{__name__}:Broken"),
-        ("drives", f"{__name__}:Further"),
-        ("missing", "no_such_module:Figure"),
-    ):
-        entry = importlib.metadata.EntryPoint(name, target, JobFigure.group)
-        vars(entry)["dist"] = Distribution()
-        found.append(entry)
-    sections = importlib.metadata.entry_points(group=Section.group)
+    figures = {
+        name.lower(): f"further_figures:{name}" for name in ("Further", "Broken", "Untitled")
+    }
+    figures |= {"drives": "further_figures:Further", "missing": "no_such_module:Figure"}
+    install("somebody-else", {"cfx.figures": figures}, {"further_figures.py": FURTHER})
     write_job(tmp_path / "job", pairs=3)
-    monkeypatch.setattr(
-        importlib.metadata,
-        "entry_points",
-        lambda group: found if group == JobFigure.group else sections,
-    )
-    _installed.cache_clear()
-    try:
-        names = [one.name for one in JobFigure.installed()]
-        made = make_results(pairs=1, frames=5)
-        paths = write_figures(tmp_path / "figures", Results.of(made.evaluation))
-        page = render(read_runs([str(tmp_path / "job")]))
-    finally:
-        _installed.cache_clear()
+    names = [one.name for one in registry.installed("figure")]
+    made = make_results(pairs=1, frames=5)
+    paths = write_figures(tmp_path / "figures", Results.of(made.evaluation))
+    page = render(read_runs([str(tmp_path / "job")]))
     assert names[:2] == ["broken", "further"]
-    assert "missing" not in names
+    assert {"missing", "untitled"}.isdisjoint(names)
     written = [path.stem for path in paths]
     assert written[0] == "further"
-    assert {"broken", "missing"}.isdisjoint(written)
+    assert "broken" not in written
     assert "drives" in written
     assert page.count("Something further") == 2, "its heading, and the words for who sees none"
-    said = caplog.text
+    for name in ("broken", "drives", "missing", "untitled"):
+        assert f"figure {name} of the distribution somebody-else is left out" in caplog.text
     assert (
-        "figure broken of the distribution somebody-else is left out: ValueError: no luck" in said
+        "broken of the distribution somebody-else is left out: ValueError: no luck" in caplog.text
     )
-    assert "figure drives of the distribution somebody-else is left out" in said
-    assert "figure missing of the distribution somebody-else is left out" in said
+    assert "has no title or no caption" in caplog.text
