@@ -12,7 +12,7 @@ import pandas as pd
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.data.style import CLUSTERS, StyleResult
 from cfx.evaluation.distributions import DISTRIBUTION_COLUMNS
-from cfx.evaluation.forecasts import FORECAST_COLUMNS, FORECAST_METHODS, Forecasts
+from cfx.evaluation.forecasts import FORECAST_COLUMNS, FORECAST_METHODS
 from cfx.evaluation.metrics.base import MetricInfo
 from cfx.evaluation.result import Evaluation, PairTrajectory, Platoon
 from cfx.evaluation.statistics import Improvement
@@ -61,15 +61,13 @@ def make_results(
         measured=MEASURED,
         improvements={},
         trajectories=trajectories,
-        names=space.names,
-        units=tuple(p.unit for p in space.tuned),
-        bounds=np.array([[p.low for p in space.tuned], [p.high for p in space.tuned]]),
+        parameters=space.tuned,
     )
     improvements = {}
     for baseline in methods:
         if baseline != "policy":
             improvements[baseline] = summarize(evaluation.table)
-    evaluation = dataclasses.replace(evaluation, improvements=improvements)
+    evaluation = dataclasses.replace(evaluation, improvements={"test": improvements})
     curves = make_curves(pairs if networks is None else networks, epochs, seed)
     return MadeUp(evaluation, make_style([one.driver for one in trajectories], rng), curves)
 
@@ -183,7 +181,7 @@ def make_history(
     return pd.DataFrame(rows)
 
 
-def make_forecasts(drivers: int = 6, methods: tuple[str, ...] = FORECAST_METHODS) -> Forecasts:
+def make_forecasts(drivers: int = 6, methods: tuple[str, ...] = FORECAST_METHODS) -> pd.DataFrame:
     """Errors that grow with the horizon and shrink with the history, another size per method."""
     rows = []
     for k, method in enumerate(methods):
@@ -193,16 +191,15 @@ def make_forecasts(drivers: int = 6, methods: tuple[str, ...] = FORECAST_METHODS
                     error = (k + 1) * horizon * (1 + 5 / history) * (-1) ** driver / 10
                     row = (f"p{driver}", f"d{driver}", method, history, horizon)
                     rows.append((*row, error, 2 * error, abs(error)))
-    table = pd.DataFrame(rows, columns=list(FORECAST_COLUMNS))
-    return Forecasts(table, (0.5, 2.0, 10.0), "given", seed=0)
+    return pd.DataFrame(rows, columns=list(FORECAST_COLUMNS))
 
 
-def make_distributions(forecasts: Forecasts, seed: int = 0) -> pd.DataFrame:
+def make_distributions(forecasts: pd.DataFrame, seed: int = 0) -> pd.DataFrame:
     """Scores of the same origins: the policy's paths are a third better than its centre."""
     rng = np.random.default_rng(seed)
     parts = []
     for method, share in (("population_ar", 1.2), ("fixed_ar", 1.1), ("policy", 0.67)):
-        rows = forecasts.table[forecasts.table["method"] == "policy"]
+        rows = forecasts[forecasts["method"] == "policy"]
         scores = dict.fromkeys(DISTRIBUTION_COLUMNS[4:], share * rows["ade"])
         scores["crps_speed"] = share * rows["speed_error"].abs()
         scores["coverage"] = (rng.random(len(rows)) < 0.85).astype(float)

@@ -16,7 +16,7 @@ from cfx.app.job.output import Output, write_tables
 from cfx.app.job.results import JobResult
 from cfx.data.pairs import PairSet
 from cfx.evaluation.protocols.base import ProtocolResult
-from cfx.evaluation.result import Evaluation
+from cfx.evaluation.result import Evaluation, Purpose
 from cfx.evaluation.statistics import Improvement
 from cfx.results.table import Findings
 from tests.made_up import GAINS, make_history, make_platoon, make_results, with_metric
@@ -27,13 +27,7 @@ class Untracked:
         return ()
 
 
-def said(
-    evaluation: Evaluation,
-    *,
-    has_constant_baseline: bool = True,
-    adapts: bool = True,
-    width: int = 200,
-) -> str:
+def said(evaluation: Evaluation, *, width: int = 200) -> str:
     """Returns what a job prints."""
     out = io.StringIO()
     result = JobResult(evaluation.metrics(), evaluation.table, cast(Any, None), (), Path("folder"))
@@ -43,8 +37,6 @@ def said(
         (),
         Console(file=out, width=width),
         cast(Any, Untracked()),
-        has_constant_baseline=has_constant_baseline,
-        adapts=adapts,
     )
     return out.getvalue()
 
@@ -92,13 +84,14 @@ def test_parameters_that_recordings_do_not_determine_are_told() -> None:
 def test_a_model_that_follows_nobody_is_not_compared_with_its_fixed_parameters() -> None:
     evaluation = make_results(pairs=4, frames=20).evaluation
     assert "Improvement of the policy over other methods" in said(evaluation)
-    text = said(evaluation, has_constant_baseline=False)
+    text = said(dataclasses.replace(evaluation, purpose=Purpose.POLICY))
     assert "Improvement" not in text
     assert "compare the policy's RMSE with other jobs'" in text
 
 
 def test_constant_parameters_are_a_calibration_and_not_compared_with_themselves() -> None:
-    text = said(make_results(pairs=4, frames=20).evaluation, adapts=False)
+    evaluation = make_results(pairs=4, frames=20).evaluation
+    text = said(dataclasses.replace(evaluation, purpose=Purpose.CALIBRATION))
     assert "this is a calibration, without adaptation" in text
     assert "Improvement" not in text
 
@@ -111,7 +104,7 @@ def improvement(**changes: Any) -> Improvement:
 def compared(**improvements: Improvement) -> str:
     """Returns what is said of improvements over baselines."""
     evaluation = make_results(pairs=4, frames=20).evaluation
-    return said(dataclasses.replace(evaluation, improvements=improvements))
+    return said(dataclasses.replace(evaluation, improvements={"test": improvements}))
 
 
 def row(text: str, over: str) -> list[str]:
@@ -126,9 +119,11 @@ def test_improvements_are_a_table_in_percent_that_fits_80_columns() -> None:
     evaluation = make_results(pairs=4, frames=20).evaluation
     evaluation = dataclasses.replace(
         evaluation,
-        improvements=gains,
-        steady_improvements={"fixed": improvement()},
-        full_trajectory_improvements={"population": improvement()},
+        improvements={
+            "test": gains,
+            "steady": {"fixed": improvement()},
+            "full_trajectory": {"population": improvement()},
+        },
     )
     text = said(evaluation, width=80)
     cells = ["+32.5", "+21.1 to +43.3", "+42.1", "34 of 40", "3.8e-06"]
@@ -161,7 +156,7 @@ def test_platoon_and_history_are_written_and_old_ones_go(tmp_path: Path, present
     if present:
         history = make_history(evaluation.trajectories, GAINS)
         evaluation = dataclasses.replace(
-            evaluation, platoon=make_platoon({"policy": 1}), history=history
+            evaluation, platoon=make_platoon({"policy": 1}), tables={"history": history}
         )
     written = write_tables(Output(tmp_path), findings(evaluation))
     further = {one.about.file for one in written if not one.about.table.always}

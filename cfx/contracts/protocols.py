@@ -112,7 +112,7 @@ def the_table_has_a_row_for_each_pair_and_method(protocol: Protocol) -> None:
     assert set(evaluation.table["method"]) <= set(METHODS), (
         f"methods are named {', '.join(METHODS)}"
     )
-    assert set(evaluation.improvements) == set(evaluation.methods) - {"policy"}, (
+    assert set(evaluation.improvements["test"]) == set(evaluation.methods) - {"policy"}, (
         "the improvement of the policy is given over every baseline that was simulated"
     )
     counts = evaluation.table.groupby(["pair_id", "method"]).size()

@@ -230,7 +230,7 @@ def centre_errors(forecasts: pd.DataFrame) -> pd.DataFrame:
     It is what the CRPS of a distribution is that has no width.
 
     Args:
-        forecasts: as `Forecasts.table`.
+        forecasts: the table of single forecasts.
 
     Returns:
         A row per horizon: horizon_s, crps_speed (m/s; mean over drivers of each driver's mean over

@@ -79,7 +79,7 @@ def evaluate(
         metrics: what is measured; None: cfx's own metrics.
 
     Returns:
-        The comparison, without `platoon`, `history` and `outside`.
+        The comparison, without `platoon`, `tables` and `outside`.
     """
     pairs, batch, first = tested.pairs, tested.batch, tested.first
     loops = {method: scopes["test"][method] for method in METHODS if method in scopes["test"]}
@@ -96,19 +96,16 @@ def evaluate(
     values = long_table([pair.pair_id for pair in pairs], drivers, measured)
     improvements = {}
     for scope in ("test", "steady", "full_trajectory"):
-        improvements[scope] = _improvements(values, scope, drivers, seed)
+        found = _improvements(values, scope, drivers, seed)
+        if found:
+            improvements[scope] = found
     return Evaluation(
         about=_about(tested, measures, space.names),
         values=values,
         measured=infos,
-        improvements=improvements["test"],
-        steady_improvements=improvements["steady"],
+        improvements=improvements,
         trajectories=simulated_pairs(pairs, batch, first, loops),
-        names=space.names,
-        units=tuple(parameter.unit for parameter in space.tuned),
-        meanings=tuple(parameter.meaning for parameter in space.tuned),
-        bounds=policy_space.bounds().numpy(),
-        full_trajectory_improvements=improvements["full_trajectory"],
+        parameters=policy_space.tuned,
         left_out=left_out,
     )
 

@@ -9,15 +9,12 @@ Shapes: Q origins, K steps, H horizons.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import pandas as pd
 from torch import Tensor
 
 from cfx.data.pairs import PairSet
-from cfx.evaluation.distributions import distribution_metrics
 from cfx.evaluation.forecast_paths import Origins, Paths
 from cfx.evaluation.statistics import mean_interval
 
@@ -59,93 +56,67 @@ FORECAST_COLUMNS = (
     "position_error",
     "ade",
 )
-"""Columns of the table of single forecasts, which a job writes as `forecasts.parquet`."""
+"""Columns of the table of single forecasts, which a job writes as `forecasts.parquet`.
+
+It has a row per origin, method and horizon that the recording lasts to. history_s: measured history
+up to the origin; speed_error (m/s) and position_error (m): simulated minus measured at the horizon;
+ade: m.
+"""
 
 
-@dataclass(frozen=True)
-class Forecasts:
-    """Forecasts of several methods from the same origins.
+def forecast_values(table: pd.DataFrame) -> pd.DataFrame:
+    """Returns rows of the long table: pair_id, driver, method, scope, metric, value.
 
-    Metrics (`metrics`), under their names in metrics.json and MLflow:
-        `forecast/ERROR_HORIZON/METHOD`, such as `forecast/rmse_speed_0.5s/policy`: the mean over
-        drivers; ERROR is one of `ERRORS`. `forecast/ERROR_HORIZON/METHOD/ci95_low` and `ci95_high`:
-        its 95 % bootstrap interval over drivers, of `rmse_speed` and `rmse_position`.
-
-    Attributes:
-        table: a row per origin, method and horizon that the recording lasts to (columns
-            `FORECAST_COLUMNS`): history_s (s of measured history up to the origin), speed_error
-            (m/s) and position_error (m), simulated minus measured at the horizon, ade (m).
-        horizons: s.
-        leader: what was known of the leader (`LeaderFuture`).
-        seed: of the bootstrap.
-        distributions: scores of sampled paths (`cfx.evaluation.distributions`); None: none were
-            sampled. Their metrics are `distribution/SCORE_HORIZON/METHOD`, means over drivers.
+    Args:
+        table: of single forecasts.
     """
+    by_pair = errors_by(table, ["pair_id", "driver", "method", "horizon_s"])
+    parts = []
+    for error in ERRORS:
+        metric = [metric_name(error, horizon) for horizon in by_pair["horizon_s"]]
+        part = by_pair[["pair_id", "driver", "method"]].assign(
+            scope=SCOPE, metric=metric, value=by_pair[error].to_numpy()
+        )
+        parts.append(part)
+    return pd.concat(parts, ignore_index=True)
 
-    table: pd.DataFrame
-    horizons: tuple[float, ...]
-    leader: str
-    seed: int
-    distributions: pd.DataFrame | None = None
 
-    @property
-    def methods(self) -> tuple[str, ...]:
-        """The methods that were compared, known ones in the order of `FORECAST_METHODS`."""
-        return forecast_methods(self.table)
+def forecast_columns(values: pd.DataFrame, places: pd.DataFrame) -> pd.DataFrame:
+    """Returns the columns `forecast_METRIC` of `pairs.csv`; none without forecasts.
 
-    @cached_property
-    def by_pair(self) -> pd.DataFrame:
-        """A row per pair, method and horizon with a column per error."""
-        return errors_by(self.table, ["pair_id", "driver", "method", "horizon_s"])
+    Args:
+        values: the long table.
+        places: pair_id and method of each row.
+    """
+    index = pd.MultiIndex.from_frame(places)
+    columns = {}
+    of_forecasts = values[values["scope"] == SCOPE]
+    for metric, rows in of_forecasts.groupby("metric", sort=False, observed=True):
+        column = rows.set_index(["pair_id", "method"])["value"]
+        columns[f"{SCOPE}_{metric}"] = column.reindex(index).to_numpy()
+    return pd.DataFrame(columns, index=places.index)
 
-    @cached_property
-    def summary(self) -> pd.DataFrame:
-        """A row per method and horizon; see `summarize_forecasts`."""
-        return summarize_forecasts(self.table, self.seed)
 
-    @property
-    def varies_history(self) -> bool:
-        """Whether origins have so different histories that errors can be told apart by them."""
-        return len(set(errors_by_history(self.table)["span_s"])) > 1
+def forecast_metrics(table: pd.DataFrame, seed: int) -> dict[str, float]:
+    """Returns the metrics of forecasts under their names in metrics.json and MLflow.
 
-    def values(self) -> pd.DataFrame:
-        """Returns rows of the long table: pair_id, driver, method, scope, metric, value."""
-        by_pair = self.by_pair
-        parts = []
+    `forecast/ERROR_HORIZON/METHOD`, such as `forecast/rmse_speed_0.5s/policy`, is the mean over
+    drivers; ERROR is one of `ERRORS`. `forecast/ERROR_HORIZON/METHOD/ci95_low` and `ci95_high` are
+    its 95 % bootstrap interval over drivers, of `rmse_speed` and `rmse_position`.
+
+    Args:
+        table: of single forecasts.
+        seed: of the bootstrap.
+    """
+    found = {}
+    for row in summarize_forecasts(table, seed).to_dict("records"):
         for error in ERRORS:
-            metric = [metric_name(error, horizon) for horizon in by_pair["horizon_s"]]
-            part = by_pair[["pair_id", "driver", "method"]].assign(
-                scope=SCOPE, metric=metric, value=by_pair[error].to_numpy()
-            )
-            parts.append(part)
-        return pd.concat(parts, ignore_index=True)
-
-    def columns(self, places: pd.MultiIndex) -> dict[str, pd.Series]:
-        """Returns the columns `forecast_METRIC` of `pairs.csv`.
-
-        Args:
-            places: pair and method of each row.
-        """
-        values = self.values()
-        found = {}
-        for metric, rows in values.groupby("metric", sort=False):
-            column = rows.set_index(["pair_id", "method"])["value"]
-            found[f"{SCOPE}_{metric}"] = column.reindex(places).reset_index(drop=True)
-        return found
-
-    def metrics(self) -> dict[str, float]:
-        """Returns the metrics under their MLflow names."""
-        found = {}
-        for row in self.summary.to_dict("records"):
-            for error in ERRORS:
-                key = f"{SCOPE}/{metric_name(error, row['horizon_s'])}/{row['method']}"
-                found[key] = float(row[error])
-                for end in ("low", "high"):
-                    if error in _QUADRATIC:
-                        found[f"{key}/ci95_{end}"] = float(row[f"{error}_{end}"])
-        if self.distributions is not None:
-            found |= distribution_metrics(self.distributions)
-        return found
+            key = f"{SCOPE}/{metric_name(error, row['horizon_s'])}/{row['method']}"
+            found[key] = float(row[error])
+            for end in ("low", "high"):
+                if error in _QUADRATIC:
+                    found[f"{key}/ci95_{end}"] = float(row[f"{error}_{end}"])
+    return found
 
 
 def metric_name(error: str, horizon: float) -> str:
@@ -181,7 +152,7 @@ def forecast_errors(
         dt: time step, s.
 
     Returns:
-        The table of `Forecasts`.
+        A table with `FORECAST_COLUMNS`.
     """
     first, frame = origins.columns(pairs), origins.frame.cpu().numpy()
     parts = []

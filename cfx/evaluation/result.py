@@ -7,19 +7,26 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
 from cfx.calibration.flatness import with_flat_shares
-from cfx.evaluation.forecasts import Forecasts
+from cfx.core.parameters import Parameter
+from cfx.evaluation.forecasts import forecast_columns
 from cfx.evaluation.headline import improvement_key
-from cfx.evaluation.metrics.base import MetricInfo
+from cfx.evaluation.metrics.base import SCOPES, MetricInfo
 from cfx.evaluation.metrics.installed import LeftOut
 from cfx.evaluation.statistics import Improvement
 from cfx.evaluation.tables import in_text, summaries, values_of, wide_table
+
+if TYPE_CHECKING:
+    from cfx.models.base import DrivingModel
+    from cfx.policies.base import Policy
 
 Array = NDArray[np.float64]
 
@@ -121,6 +128,28 @@ class Platoon:
         return values
 
 
+class Purpose(StrEnum):
+    """What the numbers of a job say.
+
+    `ADAPTATION`: whether a policy comes closer to drivers than constant parameters do.
+    `CALIBRATION`: how close constant parameters come; the policy does not adapt them
+    (`Policy.adapts`), and improves nothing.
+    `POLICY`: how close the policy comes; with constant parameters the model follows no leader
+    (`DrivingModel.has_constant_baseline`), so that there is nothing to compare with.
+    """
+
+    ADAPTATION = "adaptation"
+    CALIBRATION = "calibration"
+    POLICY = "policy"
+
+    @classmethod
+    def of(cls, model: DrivingModel, policy: Policy) -> Purpose:
+        """Returns the purpose of a job with these components."""
+        if not policy.adapts:
+            return cls.CALIBRATION
+        return cls.ADAPTATION if model.has_constant_baseline else cls.POLICY
+
+
 @dataclass(frozen=True)
 class Evaluation:
     """The comparison of all methods.
@@ -135,10 +164,7 @@ class Evaluation:
             unit, and how the pairs become one number. `METRIC/real`: the recorded drivers'.
         `rmse_improvement/STATISTIC`, `rmse_improvement/BASELINE/STATISTIC`: see `Improvement`;
             against `fixed` unless named; `steady/...` and `full_trajectory/...` as above.
-        `platoon/MEASURE/METHOD`: see `Platoon`.
-        `history/BASE/AMOUNT/rmse_improvement`: see `history`; AMOUNT is `80pct` for "80 %" and
-            `10s` for "10 s".
-        `forecast/...`: see `Forecasts`.
+    Further tables bring metrics of their own (`cfx.results.table`).
 
     Attributes:
         about: a row per pair and method: pair_id, recording, leader_id, follower_id, driver,
@@ -147,48 +173,36 @@ class Evaluation:
             share of its range the loss is flat (`cfx.calibration.flatness`), where that was asked.
         values: a row per pair, method, scope and metric; see `cfx.evaluation.tables`.
         measured: the metrics, in the order in which they are shown.
-        improvements: statistics of the policy's improvement over each baseline.
+        improvements: statistics of the policy's improvement, by scope (`test`; `steady`, after the
+            transient, and `full_trajectory`, where there are any) and baseline.
         trajectories: the closed loops themselves, in the order of the pairs; those of a job are
             made when they are asked for.
-        names: the tuned parameters' names.
-        units: their units.
-        bounds: `(2, n)`, those within which the policy chooses.
-        full_trajectory_improvements: as `improvements`, over full trajectories of drivers that
-            nothing was fitted to; empty if there were none.
-        platoon: ten followers in a row behind a braking leader; None if no network is for any
-            driver.
-        history: what the policy gains from its burn-in; None if that was not tried. A row per pair,
-            base and amount: pair_id, driver, base (what the policy's answers are offsets from,
-            `own` or `population`), history_s (seconds of measured history before the test part that
-            the policy has seen), amount (the same in words, "10 s" or "80 %"), rmse_speed,
-            rmse_gap, improvement (over the driver's own fixed parameters, a fraction).
-        steady_improvements: as `improvements`, after the transient; empty if no test part is
-            longer.
+        parameters: the tuned ones, in the bounds within which the policy chooses.
+        purpose: what is compared.
         left_out: plugins' metrics that are broken.
         outside: how much of the test part, and of full trajectories, the policy drove outside what
             it has learned from, in words by scope; empty if it did not.
-        forecasts: from many moments of each trajectory; None if there were none.
-        meanings: what the tuned parameters are, in words; empty if that is not known.
+        platoon: ten followers in a row behind a braking leader; None if no network is for any
+            driver.
         tables: further tables of the protocol, by name (`cfx.results.table`).
     """
 
     about: pd.DataFrame
     values: pd.DataFrame
     measured: tuple[MetricInfo, ...]
-    improvements: Mapping[str, Improvement]
+    improvements: Mapping[str, Mapping[str, Improvement]]
     trajectories: Sequence[PairTrajectory]
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    bounds: Array
-    full_trajectory_improvements: Mapping[str, Improvement] = field(default_factory=dict)
-    platoon: Platoon | None = None
-    history: pd.DataFrame | None = None
-    steady_improvements: Mapping[str, Improvement] = field(default_factory=dict)
+    parameters: tuple[Parameter, ...]
+    purpose: Purpose = Purpose.ADAPTATION
     left_out: tuple[LeftOut, ...] = ()
     outside: Mapping[str, str] = field(default_factory=dict)
-    forecasts: Forecasts | None = None
-    meanings: tuple[str, ...] = ()
+    platoon: Platoon | None = None
     tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The tuned parameters' names."""
+        return tuple(parameter.name for parameter in self.parameters)
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -197,10 +211,8 @@ class Evaluation:
         With forecasts there are also the columns `forecast_METRIC`.
         """
         table = wide_table(self.about, self.values, self.measured)
-        if self.forecasts is None:
-            return table
-        columns = self.forecasts.columns(pd.MultiIndex.from_frame(table[["pair_id", "method"]]))
-        return pd.concat([table, pd.DataFrame(columns, index=table.index)], axis=1)
+        columns = forecast_columns(self.values, table[["pair_id", "method"]])
+        return pd.concat([table, columns], axis=1)
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -211,12 +223,13 @@ class Evaluation:
         """Returns the same results with the columns `flat_NAME`: see `with_flat_shares`."""
         return replace(self, about=with_flat_shares(self.about, slices, self.names))
 
-    def constant_methods(self) -> Evaluation:
-        """Returns the same results without the policy, if it is a constant set once more.
+    def distinct_methods(self) -> Evaluation:
+        """Returns the same results without a policy that is one of the constant sets once more.
 
         A policy that does not adapt is one, unless something else acts beside its parameters.
         """
-        if "policy" not in self.methods or not self._policy_repeats:
+        is_calibration = self.purpose is Purpose.CALIBRATION and "policy" in self.methods
+        if not is_calibration or not self._policy_repeats:
             return self
         about = self.about[self.about["method"] != "policy"].reset_index(drop=True)
         values = self.values[self.values["method"] != "policy"].reset_index(drop=True)
@@ -234,34 +247,19 @@ class Evaluation:
                 return True
         return False
 
-    @property
-    def improvement(self) -> Improvement:
-        """The policy's improvement over the driver's own fixed parameters."""
-        return self.improvements["fixed"]
-
     def metrics(self) -> dict[str, float]:
         """Returns the metrics under their MLflow names."""
         values: dict[str, float] = {}
-        improvements = {
-            "test": self.improvements,
-            "steady": self.steady_improvements,
-            "full_trajectory": self.full_trajectory_improvements,
-        }
-        for scope, of_scope in improvements.items():
-            if scope == "test" or of_scope:
+        for scope in SCOPES:
+            improvements = self.improvements.get(scope, {})
+            if scope == "test" or improvements:
                 values |= summaries(self.values, self.measured, scope, self.methods)
-            for baseline, improvement in of_scope.items() if "policy" in self.methods else ():
+            if "policy" not in self.methods:
+                continue
+            for baseline, improvement in improvements.items():
                 prefix = improvement_key(baseline, scope)
                 for name, value in improvement.metrics().items():
                     values[f"{prefix}/{name}"] = value
-        if self.platoon is not None:
-            values |= self.platoon.metrics()
-        if self.history is not None:
-            for (base, amount), gains in self.history.groupby(["base", "amount"])["improvement"]:
-                name = str(amount).replace(" ", "").replace("%", "pct")
-                values[f"history/{base}/{name}/rmse_improvement"] = float(gains.mean())
-        if self.forecasts is not None:
-            values |= self.forecasts.metrics()
         return values
 
     def values_tables(self) -> Iterator[pd.DataFrame]:

@@ -16,7 +16,7 @@ import pandas as pd
 from cfx.data.style import StyleResult
 from cfx.evaluation.headline import improvement_key
 from cfx.evaluation.metrics.base import MetricInfo, key_of
-from cfx.evaluation.result import METHODS, PairTrajectory
+from cfx.evaluation.result import METHODS, PairTrajectory, Purpose
 from cfx.evaluation.statistics import STATISTICS, Improvement
 from cfx.report.figures.results import ParameterAxis, Results
 from cfx.report.figures.words import TEST, scope_label
@@ -97,10 +97,10 @@ class Job:
         Without a constant baseline that is only the policy; a calibration's policy is one of its
         constant sets once more.
         """
-        if not self.has_constant_baseline:
+        if self.purpose is Purpose.POLICY:
             return ("policy",)
         constant = tuple(method for method in self.methods if method != "policy")
-        return self.methods if self.adapts or not constant else constant
+        return constant if self.purpose is Purpose.CALIBRATION and constant else self.methods
 
     @property
     def judged(self) -> str:
@@ -111,14 +111,10 @@ class Job:
         return "default"
 
     @property
-    def adapts(self) -> bool:
-        """Whether its policy may change the parameters; if not, the job is a calibration."""
-        return self.data.get("adapts") is not False
-
-    @property
-    def has_constant_baseline(self) -> bool:
-        """Whether the model follows its leader with constant parameters: those are baselines."""
-        return self.data.get("has_constant_baseline") is not False
+    def purpose(self) -> Purpose:
+        """What its numbers say."""
+        found = self.data.get("purpose")
+        return Purpose(found) if found in set(Purpose) else Purpose.ADAPTATION
 
     def metric(self, name: str, method: str, scope: str = TEST) -> float:
         """Returns a metric of a method over a part of the trajectories; NaN if it is not known."""
@@ -157,12 +153,12 @@ class Job:
     def baselines(self, scope: str = TEST) -> tuple[str, ...]:
         """Returns what the policy was compared with, driver-specific calibration first.
 
-        It is empty if `has_constant_baseline` or `adapts` is false.
+        It is empty if the job has another purpose.
 
         Args:
             scope: the part of the trajectories.
         """
-        if not (self.has_constant_baseline and self.adapts):
+        if self.purpose is not Purpose.ADAPTATION:
             return ()
         found: list[str] = []
         for method in ("fixed", *self.methods):
@@ -233,14 +229,6 @@ class Job:
     @cached_property
     def results(self) -> Results:
         """What the job's figures are drawn from."""
-        from cfx.evaluation.forecasts import Forecasts
-
-        forecasts = None
-        table = self.tables.get("forecasts")
-        if table is not None:
-            horizons = tuple(sorted(float(one) for one in table["horizon_s"].unique()))
-            leader = str(self.setting("protocol.leader"))
-            forecasts = Forecasts(table, horizons, leader, 0, self.tables.get("distributions"))
         return Results(
             pairs=self.pairs,
             methods=self.meaningful_methods,
@@ -250,7 +238,6 @@ class Job:
             style=self._style_result,
             tables=self.tables,
             metrics=self.metrics,
-            forecasts=forecasts,
             transient_s=self.transient_s,
         )
 
@@ -352,24 +339,9 @@ class Origin:
     hydra: Path | None = field(default=None)
 
 
-def with_baseline(jobs: Iterable[Job]) -> list[Job]:
-    """Returns the jobs whose policy is compared with constant parameters."""
-    return [job for job in with_constant_baseline(jobs) if job.adapts]
-
-
-def calibrations(jobs: Iterable[Job]) -> list[Job]:
-    """Returns the jobs whose parameters are constant; nothing in them adapts."""
-    return [job for job in with_constant_baseline(jobs) if not job.adapts]
-
-
-def with_constant_baseline(jobs: Iterable[Job]) -> list[Job]:
-    """Returns the jobs whose model follows its leader with constant parameters."""
-    return [job for job in jobs if job.has_constant_baseline]
-
-
-def without_baseline(jobs: Iterable[Job]) -> list[Job]:
-    """Returns the jobs whose model follows no leader with constant parameters."""
-    return [job for job in jobs if not job.has_constant_baseline]
+def of_purpose(jobs: Iterable[Job], *purposes: Purpose) -> list[Job]:
+    """Returns the jobs that have one of these purposes."""
+    return [job for job in jobs if job.purpose in purposes]
 
 
 def any_baselines(jobs: Iterable[Job], scope: str = TEST) -> list[str]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from cfx.core.errors import ConfigError
+from cfx.evaluation.result import Purpose
 from cfx.report.figures.words import common_prefix
 from cfx.report.job import Job, any_baselines
 from cfx.results.provenance import flatten
@@ -211,7 +212,7 @@ def any_adapts(rows: Sequence[Row]) -> bool:
     """Says whether any job has a policy that adapts; without one they are calibrations."""
     for row in rows:
         for job in row.jobs:
-            if job.adapts:
+            if job.purpose is not Purpose.CALIBRATION:
                 return True
     return False
 

@@ -11,8 +11,9 @@ from typing import Any
 from cfx.core import registry
 from cfx.core.files import write_output
 from cfx.data.style import CLUSTERS
+from cfx.evaluation.result import Purpose
 from cfx.report.blocks import Block
-from cfx.report.job import Runs, calibrations
+from cfx.report.job import Runs, of_purpose
 from cfx.report.scripts import inline_scripts, security_policy
 from cfx.report.summary import summary
 from cfx.results.look import CLUSTER_COLOURS, COLOURS
@@ -61,7 +62,7 @@ def _content(runs: Runs, title: str | None) -> dict[str, Any]:
         if blocks:
             sections.append((one, blocks))
     subject = "Parameters that adapt"
-    if len(calibrations(runs.jobs)) == len(runs.jobs):
+    if len(of_purpose(runs.jobs, Purpose.CALIBRATION)) == len(runs.jobs):
         subject = "Calibration"
     *others, last = dict.fromkeys(job.component("model") for job in runs.jobs)
     models = last

@@ -12,6 +12,7 @@ import pandas as pd
 
 from cfx.calibration.flatness import NEAR
 from cfx.core.files import write_output
+from cfx.evaluation.result import Purpose
 from cfx.report.figures.words import short_label
 from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs
@@ -135,7 +136,7 @@ def _parameter_tables(rows: Sequence[Row]) -> Iterator[str]:
     """Yields a table of the calibrated parameters of each calibration."""
     for row in rows:
         job = row.jobs[0]
-        spreads = () if job.adapts else spreads_of(job)
+        spreads = spreads_of(job) if job.purpose is Purpose.CALIBRATION else ()
         if not spreads:
             continue
         found = sheet(spreads, slices_of(job))

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from cfx.evaluation.headline import Comparison, contradiction
+from cfx.evaluation.result import Purpose
 from cfx.report.figures.words import TEST, explained, few_drivers, percent, plural, short_label
-from cfx.report.job import Job, calibrations, with_baseline, without_baseline
+from cfx.report.job import Job, of_purpose
 from cfx.report.names import Row, rows_over_seeds
 
 _MOST = 3
@@ -22,10 +23,10 @@ def summary(jobs: Sequence[Job]) -> list[str]:
         f"{_amount(jobs)}: is a policy that adapts the parameters closer to the real driver than"
         f" {explained('fixed')}?"
     )
-    compared = with_baseline(jobs)
+    compared = of_purpose(jobs, Purpose.ADAPTATION)
     warnings = _few(compared)
-    references = [_reference(job) for job in without_baseline(jobs)]
-    constant = calibrations(jobs)
+    references = [_reference(job) for job in of_purpose(jobs, Purpose.POLICY)]
+    constant = of_purpose(jobs, Purpose.CALIBRATION)
     if not compared and not references:
         first = f"{_amount(jobs)}: how close does the driving model come with constant parameters?"
     if len(constant) <= _MOST:
@@ -65,7 +66,7 @@ def _counts(jobs: Sequence[Job]) -> str:
 
 def _best(jobs: Sequence[Job]) -> str:
     """Says which job improves most, or which jobs over their seeds: no lucky seed is picked."""
-    rows = [row for row in rows_over_seeds(jobs) if with_baseline(row.jobs)]
+    rows = [row for row in rows_over_seeds(jobs) if of_purpose(row.jobs, Purpose.ADAPTATION)]
     best = max(rows, key=_mean_for_ranking)
     if len(best.jobs) == 1:
         return f"The best mean: {_verdict(best.jobs[0])}"

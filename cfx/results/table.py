@@ -13,7 +13,7 @@ back. A figure of reports takes it from `Results.tables`.
 
 from __future__ import annotations
 
-from abc import abstractmethod
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -32,6 +32,7 @@ from cfx.core.memory import in_units, total_memory
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
+    from rich.table import Table
 
     from cfx.data.pairs import PairSet
     from cfx.data.style import StyleResult
@@ -79,6 +80,7 @@ class Findings:
         protocol_result: what the protocol has delivered.
         slices: the loss along each calibrated parameter; None if nothing was calibrated per driver.
         fits: errors of constant parameters on both parts of each trajectory; None likewise.
+        seed: of the job.
     """
 
     pairs: PairSet
@@ -86,6 +88,7 @@ class Findings:
     protocol_result: ProtocolResult
     slices: pd.DataFrame | None = None
     fits: pd.DataFrame | None = None
+    seed: int = 0
 
     @property
     def evaluation(self) -> Evaluation:
@@ -120,16 +123,16 @@ class ResultTable(Component):
     tracked: ClassVar[bool] = True
     large: ClassVar[bool] = False
 
-    @abstractmethod
     def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
         """Returns the rows of the table, in one part or in several that follow one another.
 
-        A table that its protocol has delivered under its name is
-        `[findings.evaluation.tables.get(NAME)]`.
+        A table that its protocol delivers, under its name in `Evaluation.tables`, leaves this as it
+        is and is not asked.
 
         Returns:
             Nothing, or None alone, where the job has found nothing of it.
         """
+        return ()
 
     def metrics(self, findings: Findings) -> Mapping[str, float]:
         """Returns metrics for `metrics.json` and MLflow; NaN where one is not defined."""
@@ -170,7 +173,9 @@ class InstalledTable:
         Raises:
             PluginError: the rows lack a column that is declared.
         """
-        rows = (part for part in self.table.rows(findings) if part is not None)
+        delivered = findings.evaluation.tables.get(self.name)
+        found = self.table.rows(findings) if delivered is None else [delivered]
+        rows = (part for part in found if part is not None)
         first = self._left_out_if_broken(lambda: self._checked(next(rows, None)), None)
         return None if first is None else chain([first], rows)
 
@@ -262,6 +267,35 @@ def installed() -> tuple[InstalledTable, ...]:
     for one in registry.installed("table"):
         found.append(InstalledTable(one.name, one.part, one.distribution))
     return tuple(found)
+
+
+def metrics_table(
+    title: str,
+    methods: Iterable[str],
+    columns: Mapping[str, tuple[str, str]],
+    metrics: Mapping[str, float],
+) -> Table:
+    """Returns a table for the console with a row per method; what is not known is an empty cell.
+
+    Args:
+        title: of the table.
+        methods: the rows.
+        columns: by heading what a metric is called before `/METHOD`, and how it is formatted.
+        metrics: of the job.
+    """
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left")
+    table.add_column("method")
+    for heading in columns:
+        table.add_column(heading, justify="right")
+    for method in methods:
+        cells = []
+        for name, form in columns.values():
+            value = metrics.get(f"{name}/{method}", math.nan)
+            cells.append(f"{value:{form}}" if math.isfinite(value) else "")
+        table.add_row(method, *cells)
+    return table
 
 
 def read_tables(folder: Path) -> dict[str, pd.DataFrame]:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping
 
 import pandas as pd
 from rich.table import Table
 
-from cfx.results.table import Column, Findings, ResultTable
-
-if TYPE_CHECKING:
-    from cfx.evaluation.forecasts import Forecasts
+from cfx.calibration.flatness import flat_for
+from cfx.evaluation.distributions import (
+    LEVEL,
+    centre_errors,
+    distribution_metrics,
+    sampled_methods,
+)
+from cfx.evaluation.forecasts import SCOPE, forecast_methods, forecast_metrics, metric_name
+from cfx.learners.curves import best_losses
+from cfx.results.table import Column, Findings, ResultTable, metrics_table
 
 PAIR = Column("pair_id", "", "the pair of leader and follower", "text")
 DRIVER = Column("driver", "", "the follower of the pair", "text")
@@ -58,6 +63,11 @@ class Pairs(ResultTable):
 
     def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
         return [findings.evaluation.table]
+
+    def metrics(self, findings: Findings) -> dict[str, float]:
+        evaluation = findings.evaluation
+        shares = flat_for(evaluation.table, evaluation.names)
+        return {f"flat/{name}": share for name, share in shares.items()}
 
 
 class PairMetrics(ResultTable):
@@ -130,6 +140,9 @@ class Curves(ResultTable):
             )
         ]
 
+    def metrics(self, findings: Findings) -> dict[str, float]:
+        return best_losses(findings.protocol_result.curves)
+
 
 class Style(ResultTable):
     """Driving style, a row per driver."""
@@ -178,6 +191,10 @@ class Labels(ResultTable):
         if labels is not None:
             yield labels.to_frame(findings.pairs, findings.evaluation.names)
 
+    def metrics(self, findings: Findings) -> dict[str, float]:
+        assert findings.protocol_result.labels is not None
+        return findings.protocol_result.labels.metrics()
+
 
 class Platoon(ResultTable):
     """Followers in a row behind a leader that brakes, a row per method, network and frame."""
@@ -197,6 +214,10 @@ class Platoon(ResultTable):
         platoon = findings.evaluation.platoon
         return [None if platoon is None else platoon.table]
 
+    def metrics(self, findings: Findings) -> dict[str, float]:
+        assert findings.evaluation.platoon is not None
+        return findings.evaluation.platoon.metrics()
+
 
 class History(ResultTable):
     """What the policy gains from its burn-in, a row per pair, base and amount of history."""
@@ -214,8 +235,8 @@ class History(ResultTable):
         Column("improvement", "1", "over the driver's own fixed parameters"),
     )
 
-    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        return [findings.evaluation.history]
+    def metrics(self, findings: Findings) -> dict[str, float]:
+        return history_metrics(findings.evaluation.tables["history"])
 
 
 class ForecastErrors(ResultTable):
@@ -234,13 +255,23 @@ class ForecastErrors(ResultTable):
         Column("ade", "m", "absolute error of position, mean over the way to the horizon"),
     )
 
-    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        forecasts = findings.evaluation.forecasts
-        return [None if forecasts is None else forecasts.table]
+    def metrics(self, findings: Findings) -> dict[str, float]:
+        return forecast_metrics(findings.evaluation.tables["forecasts"], findings.seed)
 
     def console(self, findings: Findings, metrics: Mapping[str, float]) -> Iterable[Table]:
-        assert findings.evaluation.forecasts is not None
-        return [forecasts_table(findings.evaluation.forecasts)]
+        """Returns the RMSE of speed of each method at each horizon: mean over drivers."""
+        table = findings.evaluation.tables["forecasts"]
+        about = findings.protocol_result.notes["forecasts"]
+        leader = "given"
+        if about["leader"] != "given":
+            leader = f"predicted at {about['leader'].replace('_', ' ')}"
+        drivers = table["driver"].nunique()
+        title = f"Forecasts of {drivers} drivers, leader {leader}: RMSE of speed (m/s) after"
+        columns = {}
+        for horizon in about["horizons_s"]:
+            name = metric_name("rmse_speed", horizon)
+            columns[f"{horizon:g} s"] = (f"{SCOPE}/{name}", ".3f")
+        return [metrics_table(title, forecast_methods(table), columns, metrics)]
 
 
 class Distributions(ResultTable):
@@ -266,13 +297,29 @@ class Distributions(ResultTable):
         Column("likelihood_time_to_collision", "1", "likewise"),
     )
 
-    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        forecasts = findings.evaluation.forecasts
-        return [None if forecasts is None else forecasts.distributions]
+    def metrics(self, findings: Findings) -> dict[str, float]:
+        return distribution_metrics(findings.evaluation.tables["distributions"])
 
     def console(self, findings: Findings, metrics: Mapping[str, float]) -> Iterable[Table]:
-        assert findings.evaluation.forecasts is not None
-        return [distributions_table(findings.evaluation.forecasts)]
+        """Returns the CRPS of speed of each sampled method at each horizon, and its coverage.
+
+        The policy's centre, a single path, has its absolute error instead, and no coverage.
+        """
+        tables = findings.evaluation.tables
+        horizons = findings.protocol_result.notes["forecasts"]["horizons_s"]
+        methods = sampled_methods(tables["distributions"])
+        crps, coverage = {}, {}
+        for horizon in horizons:
+            heading = f"{horizon:g} s"
+            crps[heading] = (f"distribution/crps_speed_{horizon:g}s", ".3f")
+            coverage[heading] = (f"distribution/coverage_{horizon:g}s", ".0%")
+        title = "Sampled forecasts: CRPS of speed (m/s) after"
+        found = metrics_table(title, methods, crps, metrics)
+        centre = centre_errors(tables["forecasts"]).set_index("horizon_s")["crps_speed"]
+        errors = [centre.get(horizon) for horizon in horizons]
+        found.add_row("policy's centre", *("" if e is None else f"{e:.3f}" for e in errors))
+        title = f"Sampled forecasts: coverage of the central {LEVEL:.0%} after"
+        return [found, metrics_table(title, methods, coverage, metrics)]
 
 
 class Slices(ResultTable):
@@ -317,64 +364,13 @@ class Fits(ResultTable):
         return [findings.fits]
 
 
-def forecasts_table(forecasts: Forecasts) -> Table:
-    """Return the RMSE of speed of each method at each horizon: mean over drivers.
+def history_metrics(history: pd.DataFrame) -> dict[str, float]:
+    """Return `history/BASE/AMOUNT/rmse_improvement`, means over pairs.
 
-    Errors of position and intervals are in `metrics.json` and in the report.
+    AMOUNT is `80pct` for "80 %" and `10s` for "10 s".
     """
-    leader = "given"
-    if forecasts.leader != "given":
-        leader = f"predicted at {forecasts.leader.replace('_', ' ')}"
-    drivers = int(forecasts.summary["drivers"].max())
-    title = f"Forecasts of {drivers} drivers, leader {leader}: RMSE of speed (m/s) after"
-    table = _by_horizon(title, forecasts.horizons)
-    by_method = forecasts.summary.set_index(["method", "horizon_s"])["rmse_speed"]
-    for method in forecasts.methods:
-        errors = [by_method.get((method, horizon)) for horizon in forecasts.horizons]
-        table.add_row(method, *_cells(errors))
-    return table
-
-
-def distributions_table(forecasts: Forecasts) -> Table:
-    """Return the CRPS of speed of each sampled method at each horizon, and its coverage below.
-
-    The policy's centre, a single path, has its absolute error instead, and no coverage.
-    """
-    from cfx.evaluation.distributions import (
-        LEVEL,
-        centre_errors,
-        sampled_methods,
-        summarize_distributions,
-    )
-
-    assert forecasts.distributions is not None
-    share = f"{100 * LEVEL:.0f} %"
-    title = f"Sampled forecasts: CRPS of speed (m/s), coverage of {share}, after"
-    table = _by_horizon(title, forecasts.horizons)
-    summary = summarize_distributions(forecasts.distributions).set_index(["method", "horizon_s"])
-    for method in sampled_methods(forecasts.distributions):
-        cells = []
-        for horizon in forecasts.horizons:
-            crps = summary["crps_speed"].get((method, horizon))
-            coverage = summary["coverage"].get((method, horizon))
-            if crps is None or coverage is None:
-                cells.append("")
-            else:
-                cells.append(f"{crps:.3f}\n{100 * coverage:.0f} %")
-        table.add_row(method, *cells)
-    centre = centre_errors(forecasts.table).set_index("horizon_s")["crps_speed"]
-    errors = [centre.get(horizon) for horizon in forecasts.horizons]
-    table.add_row("policy's centre", *_cells(errors))
-    return table
-
-
-def _by_horizon(title: str, horizons: Sequence[float]) -> Table:
-    table = Table(title=title, title_justify="left")
-    table.add_column("method")
-    for horizon in horizons:
-        table.add_column(f"{horizon:g} s", justify="right")
-    return table
-
-
-def _cells(values: Iterable[float | None]) -> list[str]:
-    return ["" if value is None else f"{value:.3f}" for value in values]
+    values = {}
+    for (base, amount), gains in history.groupby(["base", "amount"])["improvement"]:
+        name = str(amount).replace(" ", "").replace("%", "pct")
+        values[f"history/{base}/{name}/rmse_improvement"] = float(gains.mean())
+    return values

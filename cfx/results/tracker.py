@@ -23,7 +23,7 @@ import pandas as pd
 from cfx.core.errors import CfxError, TrackingError
 from cfx.data.pairs import SIGNALS, PairSet
 from cfx.evaluation.headline import RESULT, headline
-from cfx.evaluation.result import Evaluation
+from cfx.evaluation.result import Evaluation, Purpose
 from cfx.learners.curves import over_networks
 from cfx.results import provenance
 from cfx.results.store import Store, open_store, tracking_uri, translate_errors
@@ -115,12 +115,8 @@ class Tracker:
     def log_metrics(self, metrics: Mapping[str, float]) -> None:
         """Logs further metrics."""
 
-    def log_evaluation(self, evaluation: Evaluation, *, adapts: bool = True) -> None:
-        """Logs `Evaluation.metrics()`, the headline, and the table of all pairs.
-
-        Args:
-            adapts: as `Policy.adapts`; a policy that does not adapt improves nothing.
-        """
+    def log_results(self, evaluation: Evaluation, metrics: Mapping[str, float]) -> None:
+        """Logs the metrics of a job, its headline, and the table of all pairs."""
 
     def log_data(self, pairs: PairSet, name: str) -> None:
         """Logs which recordings the job used, as MLflow's dataset of the run."""
@@ -263,13 +259,12 @@ class MlflowTracker(Tracker):
             points.append((name, value, 0))
         self._log_metrics(points)
 
-    def log_evaluation(self, evaluation: Evaluation, *, adapts: bool = True) -> None:
-        metrics = evaluation.metrics()
+    def log_results(self, evaluation: Evaluation, metrics: Mapping[str, float]) -> None:
         values, result = headline(metrics)
         tags = {RESULT: result}
-        if not adapts:
+        if evaluation.purpose is Purpose.CALIBRATION:
             tags["learner"] = "none"
-        self.log_metrics(values | metrics)
+        self.log_metrics({**values, **metrics})
         self.set_tags(tags)
         self.log_table(evaluation.table, "pairs.json")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import pandas as pd
@@ -15,7 +14,7 @@ from cfx.evaluation.closed_loop import ClosedLoop
 from cfx.evaluation.evaluate import ComparedPairs, evaluate
 from cfx.models.krauss import Krauss
 from tests.drives import straight_pairs
-from tests.made_up import GAINS, make_history, make_results
+from tests.made_up import make_results
 
 
 def test_the_table_and_the_metrics_tell_what_was_driven() -> None:
@@ -80,20 +79,6 @@ def test_a_table_without_these_columns_still_has_its_other_metrics() -> None:
     assert not [name for name in metrics if name.startswith(("jerk", "at_bounds", "hard_braking"))]
 
 
-def test_the_gain_from_history_has_metrics_under_names_without_spaces() -> None:
-    evaluation = make_results(pairs=4, frames=20).evaluation
-    metrics = dataclasses.replace(
-        evaluation, history=make_history(evaluation.trajectories, GAINS)
-    ).metrics()
-    found = {name: value for name, value in metrics.items() if name.startswith("history/")}
-    assert found == {
-        "history/own/0s/rmse_improvement": pytest.approx(-0.1),
-        "history/own/10s/rmse_improvement": pytest.approx(0.1),
-        "history/own/80pct/rmse_improvement": pytest.approx(0.2),
-        "history/population/80pct/rmse_improvement": pytest.approx(0.05),
-    }
-
-
 def test_what_comes_after_the_start_is_measured_on_its_own() -> None:
     """Errors are 1 m/s in the first five seconds, then 0.5 (fixed) and 0.2 m/s (policy).
 
@@ -124,7 +109,7 @@ def test_what_comes_after_the_start_is_measured_on_its_own() -> None:
     metrics = found.metrics()
     assert metrics["steady/rmse_speed/policy"] == pytest.approx(0.2)
     assert metrics["steady/rmse_improvement/fixed/mean"] == pytest.approx(0.6)
-    assert found.steady_improvements["fixed"].undefined == 1
+    assert found.improvements["steady"]["fixed"].undefined == 1
     alone = {
         method: ClosedLoop(*(values[1:] for values in one[:4])) for method, one in loops.items()
     }

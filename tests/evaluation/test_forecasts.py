@@ -20,7 +20,13 @@ from cfx.evaluation.forecast_paths import (
     measured_paths,
     simulate_from_origins,
 )
-from cfx.evaluation.forecasts import Forecasts, errors_by, forecast_errors
+from cfx.evaluation.forecasts import (
+    errors_by,
+    forecast_errors,
+    forecast_metrics,
+    forecast_values,
+    summarize_forecasts,
+)
 from cfx.models.krauss import Krauss
 from cfx.policies.agent import Agent
 from cfx.policies.gru import GruPolicy
@@ -177,17 +183,16 @@ def test_errors_are_means_over_drivers_of_the_rmse_over_their_origins() -> None:
         speed=measured.speed + off * ramp, travelled=measured.travelled - 2.0 * off * ramp
     )
     table = forecast_errors(pairs, origins, {"policy": path}, measured, recorded, (0.5, 1.0), 0.1)
-    forecasts = Forecasts(table, (0.5, 1.0), "given", seed=0)
-    metrics = forecasts.metrics()
+    metrics = forecast_metrics(table, seed=0)
     assert metrics["forecast/rmse_speed_1s/policy"] == pytest.approx(2.0)
     assert metrics["forecast/rmse_speed_0.5s/policy"] == pytest.approx(1.0)
     assert metrics["forecast/fde_1s/policy"] == pytest.approx(4.0)
     assert metrics["forecast/ade_1s/policy"] == pytest.approx(4.0 * np.mean(ramp[1:].numpy()))
     low = metrics["forecast/rmse_speed_1s/policy/ci95_low"]
     assert (low, metrics["forecast/rmse_speed_1s/policy/ci95_high"]) == pytest.approx((1.0, 3.0))
-    row = forecasts.summary.iloc[-1]
+    row = summarize_forecasts(table, 0).iloc[-1]
     assert (row["drivers"], row["origins"]) == (2, 34 + 4)
-    values = forecasts.values()
+    values = forecast_values(table)
     own = values[(values["metric"] == "rmse_position_1s") & (values["pair_id"] == "p1")]
     assert own["value"].tolist() == pytest.approx([6.0])
     assert set(values["scope"]) == {"forecast"}

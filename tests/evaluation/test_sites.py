@@ -42,9 +42,7 @@ def made(sites: tuple[str, ...]) -> pd.DataFrame | None:
         measured=(),
         improvements={},
         trajectories=(),
-        names=(),
-        units=(),
-        bounds=np.zeros((2, 0)),
+        parameters=(),
     )
     return site_table(pairs, evaluation, seed=0)
 

@@ -14,9 +14,10 @@ import yaml
 
 from cfx.core.parameters import ParameterSpace
 from cfx.data.style import CLUSTERS
-from cfx.evaluation.result import Evaluation
+from cfx.evaluation.result import Evaluation, Purpose
 from cfx.evaluation.statistics import Improvement, improvement_statistics
 from cfx.evaluation.tables import values_of
+from cfx.results.tables import history_metrics
 from tests.made_up import GAINS, TWO, info, make_history, make_platoon, make_results, with_metric
 
 WITHIN = ("default", "fixed", "policy")
@@ -37,7 +38,7 @@ def write_job(
     space: ParameterSpace = TWO,
     source: str = "recording.parquet",
     settings: Mapping[str, Any] | None = None,
-    has_constant_baseline: bool = True,
+    purpose: Purpose = Purpose.ADAPTATION,
     further: bool = False,
 ) -> dict[str, float | None]:
     """Writes a job's folder; returns what its metrics.json holds.
@@ -52,9 +53,8 @@ def write_job(
     if further:
         evaluation = _with_further_results(evaluation)
         assert evaluation.platoon is not None
-        assert evaluation.history is not None
         evaluation.platoon.table.to_parquet(folder / "platoon.parquet", index=False)
-        evaluation.history.to_parquet(folder / "history.parquet", index=False)
+        evaluation.tables["history"].to_parquet(folder / "history.parquet", index=False)
     config = {
         "preset": experiment or None,
         "data": {"name": "tidy", "path": source},
@@ -88,8 +88,9 @@ def write_job(
         "pairs": pairs,
         "dropped": dropped,
         "parameters": units,
-        "has_constant_baseline": has_constant_baseline,
-        "adapts": config["policy"]["name"] not in {"fixed", "default"},
+        "purpose": Purpose.CALIBRATION
+        if config["policy"]["name"] in {"fixed", "default"}
+        else purpose,
         "metrics": [metric.to_json() for metric in evaluation.measured],
     }
     (folder / "data.json").write_text(json.dumps(data), encoding="utf-8")
@@ -100,10 +101,10 @@ def write_job(
     (folder / "cfx.log").write_text(
         "2026-11-21 15:28:37,316 INFO begin\n2026-11-21 15:29:42,000 INFO end\n", encoding="utf-8"
     )
-    metrics = {
-        name: value if math.isfinite(value) else None
-        for name, value in evaluation.metrics().items()
-    }
+    found = evaluation.metrics()
+    if evaluation.platoon is not None:
+        found |= evaluation.platoon.metrics() | history_metrics(evaluation.tables["history"])
+    metrics = {name: value if math.isfinite(value) else None for name, value in found.items()}
     (folder / "metrics.json").write_text(json.dumps(metrics), encoding="utf-8")
     return metrics
 
@@ -118,14 +119,14 @@ def _with_further_results(evaluation: Evaluation) -> Evaluation:
             by_method["real"] = 0.4
         evaluation = with_metric(evaluation, metric, by_method, summary=summary)
     unseen = [method for method in methods if method != "fixed"]
-    if evaluation.full_trajectory_improvements:
+    if "full_trajectory" in evaluation.improvements:
         for metric, value in {"collisions": 0.0, "hard_braking": 2.0}.items():
             by_method = dict.fromkeys(unseen, value)
             evaluation = with_metric(evaluation, metric, by_method, scope="full_trajectory")
     return dataclasses.replace(
         evaluation,
         platoon=make_platoon(dict.fromkeys(unseen, 2)),
-        history=make_history(evaluation.trajectories, GAINS),
+        tables={"history": make_history(evaluation.trajectories, GAINS)},
     )
 
 
@@ -160,8 +161,7 @@ def _completed(evaluation: Evaluation, methods: Sequence[str], cluster: str) -> 
         about=about,
         values=values,
         measured=measured,
-        improvements=improvements,
-        full_trajectory_improvements=improvements_whole,
+        improvements={"test": improvements, "full_trajectory": improvements_whole},
     )
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from cfx.evaluation.forecasts import forecast_methods, forecast_metrics
+from cfx.evaluation.result import Purpose
 from cfx.report.job import Job
 from cfx.report.page import render
 from cfx.report.runs import read_runs
@@ -35,7 +37,7 @@ def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
             model=model,
             methods=ACROSS,
             seed=seed,
-            has_constant_baseline=model != "direct",
+            purpose=Purpose.POLICY if model == "direct" else Purpose.ADAPTATION,
             further=True,
         )
     return folder
@@ -61,7 +63,7 @@ def test_errors_of_all_jobs_stand_in_one_table_in_metres(sweep: Path) -> None:
             gap = job.metrics[f"{where}rmse_gap/policy"]
             expected.append(f"{speed:.3f} {gap:.2f}")
         assert row["policy"] == expected
-        if job.has_constant_baseline:
+        if job.purpose is Purpose.ADAPTATION:
             assert row["driver-specific"] == [
                 f"{job.metrics['rmse_speed/fixed']:.3f} {job.metrics['rmse_gap/fixed']:.2f}"
             ]
@@ -127,7 +129,7 @@ def test_a_report_of_such_a_job_alone_has_no_comparison_with_fixed_parameters(
         model="direct",
         pairs=4,
         methods=ACROSS,
-        has_constant_baseline=False,
+        purpose=Purpose.POLICY,
         further=True,
     )
     page = page_of(tmp_path)
@@ -179,15 +181,15 @@ def test_history_has_a_plot_and_a_table(sweep: Path) -> None:
 def test_forecasts_have_plots_and_tables(tmp_path: Path) -> None:
     metrics = write_job(tmp_path / "job", pairs=4)
     forecasts = make_forecasts(drivers=4)
-    forecasts.table.to_parquet(tmp_path / "job" / "forecasts.parquet", index=False)
-    found = {**metrics, **forecasts.metrics()}
+    forecasts.to_parquet(tmp_path / "job" / "forecasts.parquet", index=False)
+    found = {**metrics, **forecast_metrics(forecasts, 0)}
     (tmp_path / "job" / "metrics.json").write_text(json.dumps(found))
     page = page_of(tmp_path)
     assert "forecasts" in page.having("id")
     speed, position = (table for table in page.tables if table[0][0] == "Method")
-    assert len(speed) == len(position) == 1 + len(forecasts.methods)
+    assert len(speed) == len(position) == 1 + len(forecast_methods(forecasts))
     (job,) = read_runs([str(tmp_path)]).jobs
-    sheet = errors(job, forecasts.table, "rmse_speed", "m/s")
+    sheet = errors(job, forecasts, "rmse_speed", "m/s")
     name, _, cell, *_ = sheet.rows[0]
     assert name.text == "constant speed"
     key = "forecast/rmse_speed_2s/constant_speed"
@@ -201,17 +203,15 @@ def test_sampled_forecasts_have_a_plot_and_a_table(tmp_path: Path) -> None:
     write_job(tmp_path / "job", pairs=4)
     forecasts = make_forecasts(drivers=4)
     scores = make_distributions(forecasts)
-    forecasts.table.to_parquet(tmp_path / "job" / "forecasts.parquet", index=False)
+    forecasts.to_parquet(tmp_path / "job" / "forecasts.parquet", index=False)
     scores.to_parquet(tmp_path / "job" / "distributions.parquet", index=False)
     page = page_of(tmp_path)
     assert "distributions" in page.having("id")
-    sheet = crps_sheet(scores, forecasts.table)
+    sheet = crps_sheet(scores, forecasts)
     names = [row[0].text for row in sheet.rows]
     assert names == ["pooled + noise", "driver-specific + noise", "policy, sampled", "policy"]
     sampled, centre = sheet.rows[-2], sheet.rows[-1]
-    policy = forecasts.table[
-        (forecasts.table["method"] == "policy") & (forecasts.table["horizon_s"] == 2.0)
-    ]
+    policy = forecasts[(forecasts["method"] == "policy") & (forecasts["horizon_s"] == 2.0)]
     error = policy["speed_error"].abs().groupby(policy["driver"]).mean().mean()
     assert centre[2].text == f"{error:.3f}"
     assert sampled[2].text == f"{0.67 * error:.3f}"

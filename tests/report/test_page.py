@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from cfx.evaluation.result import Purpose
 from cfx.report.blocks import Figure, Fold, Heading, Items, Table, Text
 from cfx.report.page import render
 from cfx.report.runs import read_runs
@@ -370,12 +371,12 @@ def test_a_calibration_is_none_of_the_policies_that_adapt(tmp_path: Path) -> Non
     assert sum("Improvement of the RMSE of speed" in line for line in said) == 1
     view = overview(runs.jobs).views["against driver-specific calibration"]
     assert view.svg.count("<title>") == 3, "mean, trimmed mean and median of one job"
-    alone = [job for job in runs.jobs if not job.adapts]
+    alone = [job for job in runs.jobs if job.purpose is Purpose.CALIBRATION]
     assert "with constant parameters?" in summary(alone)[0]
     page = page_of(tmp_path / "still")
     assert "Improvement of every pair" not in page.words
     assert "policy" not in alone[0].meaningful_methods, "a constant set is shown once"
-    (moves,) = [job for job in runs.jobs if job.adapts]
+    (moves,) = [job for job in runs.jobs if job.purpose is Purpose.ADAPTATION]
     figure, fold = clusters_section.ClustersSection().blocks(runs)[1:3]
     assert isinstance(figure, Figure)
     assert isinstance(fold, Fold)

@@ -95,7 +95,9 @@ def test_a_calibration_has_its_parameters_in_a_table_and_no_policy(tmp_path: Pat
     folder = tmp_path / "calibrated"
     write_job(folder, model="w99", methods=ACROSS)
     about = json.loads((folder / "data.json").read_text(encoding="utf-8"))
-    (folder / "data.json").write_text(json.dumps({**about, "adapts": False}), encoding="utf-8")
+    (folder / "data.json").write_text(
+        json.dumps({**about, "purpose": "calibration"}), encoding="utf-8"
+    )
     text = written(folder, "--tables", "latex")
     assert text.count("\\begin{table}") == 2
     first, _, second = text.partition("\\end{table}")

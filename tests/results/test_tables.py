@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
 from pathlib import Path
 
 import pandas as pd
@@ -12,7 +11,10 @@ import pytest
 from cfx.contracts import TableContract
 from cfx.core.errors import DataError
 from cfx.results.table import Column, Findings, InstalledTable, ResultTable, installed, read_tables
+from cfx.results.tables import History
 from tests.conftest import ROOT
+from tests.made_up import GAINS, make_history, make_results
+from tests.test_job_results import findings as found
 
 
 class TestInstalled(TableContract):
@@ -27,18 +29,12 @@ class Census(ResultTable):
     meaning = "one row"
     columns = (Column("drivers", "1", "how many", "int"),)
 
-    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        return [findings.evaluation.tables.get("census")]
-
 
 def census(table: ResultTable | None = None) -> InstalledTable:
     return InstalledTable("census", table or Census(), "cfx-census")
 
 
 def findings(**tables: pd.DataFrame) -> Findings:
-    from tests.made_up import make_results
-    from tests.test_job_results import findings as found
-
     evaluation = make_results(pairs=2, frames=5).evaluation
     return found(dataclasses.replace(evaluation, tables=tables))
 
@@ -57,6 +53,17 @@ def test_a_table_that_a_protocol_delivers_is_written_and_read_back(tmp_path: Pat
     assert parts is not None
     about.write(tmp_path / about.file, parts)
     assert about.read(tmp_path / "census.parquet").to_dict("list") == {"drivers": [3.0]}
+
+
+def test_the_gain_from_history_has_metrics_under_names_without_spaces() -> None:
+    evaluation = make_results(pairs=4, frames=20).evaluation
+    history = make_history(evaluation.trajectories, GAINS)
+    assert History().metrics(findings(history=history)) == {
+        "history/own/0s/rmse_improvement": pytest.approx(-0.1),
+        "history/own/10s/rmse_improvement": pytest.approx(0.1),
+        "history/own/80pct/rmse_improvement": pytest.approx(0.2),
+        "history/population/80pct/rmse_improvement": pytest.approx(0.05),
+    }
 
 
 def test_a_table_of_others_that_fails_is_left_out(caplog: pytest.LogCaptureFixture) -> None:

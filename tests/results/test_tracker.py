@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import logging
 import os
@@ -21,6 +22,7 @@ from cfx.calibration.windows import WindowSettings
 from cfx.core.errors import TrackingError
 from cfx.data.tidy import write_tidy
 from cfx.evaluation.headline import headline
+from cfx.evaluation.result import Purpose
 from cfx.models.krauss import Krauss
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
@@ -111,7 +113,7 @@ def test_a_job_is_kept_under_the_names_of_the_contract(
     with Tracker.open(config_of(uri), tmp_path / "job") as run:
         assert client.get_run(run.run_id).info.status == "RUNNING"
         run.set_tags({"dataset.fingerprint": "f" * 64})
-        run.log_evaluation(results.evaluation)
+        run.log_results(results.evaluation, results.evaluation.metrics())
         run.log_curves(results.curves)
         run.log_figures([tmp_path / "drives.png"])
         run.log_files([tmp_path / "metrics.json"])
@@ -150,7 +152,7 @@ def test_a_job_is_kept_under_the_names_of_the_contract(
 def test_undefined_metrics_are_kept_as_such(uri: str, client: Any) -> None:
     results = make_results(pairs=1, frames=20)
     with begin(uri) as run:
-        run.log_evaluation(results.evaluation)
+        run.log_results(results.evaluation, results.evaluation.metrics())
     assert np.isnan(client.get_run(run.run_id).data.metrics["rmse_improvement/p_value"])
 
 
@@ -170,7 +172,7 @@ def test_tracking_can_be_off(tmp_path: Path) -> None:
     results = make_results(pairs=1, frames=10)
     with Tracker.open(config_of("nonsense", enabled=False), tmp_path) as run:
         run.set_tags({"a": "b"})
-        run.log_evaluation(results.evaluation)
+        run.log_results(results.evaluation, results.evaluation.metrics())
         run.log_curves(results.curves)
         run.log_table(results.evaluation.table, "pairs.json")
         run.log_figures([])
@@ -467,7 +469,7 @@ def test_nothing_is_printed_and_nothing_global_changes(
     state = (root.handlers[:], root.level, ours.level, dict(os.environ))
     results = make_results(pairs=2, frames=10)
     with begin(f"sqlite:///{tmp_path}/fresh.db") as run:
-        run.log_evaluation(results.evaluation)
+        run.log_results(results.evaluation, results.evaluation.metrics())
         run.log_curves(results.curves)
         run.log_policy(saved_policy.folder, saved_policy.pairs)
     assert tuple(capfd.readouterr()) == ("", "")
@@ -583,7 +585,10 @@ def test_the_recordings_and_a_description_are_the_runs(
 def test_a_calibration_logs_no_improvement(uri: str, client: Any) -> None:
     results = make_results(pairs=2, frames=10, methods=("default", "population", "fixed"))
     with begin(uri) as run:
-        run.log_evaluation(results.evaluation, adapts=False)
+        run.log_results(
+            dataclasses.replace(results.evaluation, purpose=Purpose.CALIBRATION),
+            results.evaluation.metrics(),
+        )
     kept = client.get_run(run.run_id).data
     assert not [name for name in kept.metrics if "improvement" in name]
     assert kept.tags["result"].startswith("calibration; driver-specific")

@@ -15,7 +15,7 @@ from cfx.calibration.flatness import NEAR, flat_for
 from cfx.evaluation.demo import PAGE
 from cfx.evaluation.headline import headline
 from cfx.evaluation.metrics.base import MetricInfo, key_of
-from cfx.evaluation.result import Evaluation
+from cfx.evaluation.result import Evaluation, Purpose
 from cfx.evaluation.statistics import Improvement
 from cfx.report.figures.words import few_drivers
 from cfx.results.table import Findings, WrittenTable
@@ -35,8 +35,6 @@ def report(
     console: Console,
     tracker: Tracker,
     *,
-    has_constant_baseline: bool = True,
-    adapts: bool = True,
     copied_to: str | None = None,
 ) -> None:
     """Prints the table, where the results are and how to open them.
@@ -47,21 +45,19 @@ def report(
         tables: those that the job has written.
         console: where it is printed.
         tracker: says how to open the job's run.
-        has_constant_baseline: as `DrivingModel.has_constant_baseline`.
-        adapts: as `Policy.adapts`.
         copied_to: URL of the folder's copy; None without.
     """
     evaluation = findings.evaluation
     console.print(methods_table(evaluation, result.metrics))
-    if evaluation.full_trajectory_improvements:
+    if "full_trajectory" in evaluation.improvements:
         console.print(methods_table(evaluation, result.metrics, "full_trajectory"))
-    if not adapts:
+    if evaluation.purpose is Purpose.CALIBRATION:
         text = (
             "The policy keeps its parameters constant: this is a calibration, without adaptation."
         )
         console.print(text, soft_wrap=True)
         _print_headline(result, console)
-    elif has_constant_baseline:
+    elif evaluation.purpose is Purpose.ADAPTATION:
         _print_improvements(evaluation, console)
         _print_headline(result, console)
     else:
@@ -156,17 +152,16 @@ def _print_headline(result: JobResult, console: Console) -> None:
 
 def _comparisons(evaluation: Evaluation) -> dict[str, Improvement]:
     """Returns what the table compares, by what it says in its first column."""
-    test, full = evaluation.improvements, evaluation.full_trajectory_improvements
-    steady = f"fixed, after {TRANSIENT_S:g} s"
     candidates = [
-        (test, "fixed", "fixed"),
-        (evaluation.steady_improvements, "fixed", steady),
-        (test, "shrunk", "shrunk"),
-        (test, "population", "population"),
-        (full, "population", "population, full"),
+        ("test", "fixed", "fixed"),
+        ("steady", "fixed", f"fixed, after {TRANSIENT_S:g} s"),
+        ("test", "shrunk", "shrunk"),
+        ("test", "population", "population"),
+        ("full_trajectory", "population", "population, full"),
     ]
     found = {}
-    for improvements, baseline, words in candidates:
+    for scope, baseline, words in candidates:
+        improvements = evaluation.improvements.get(scope, {})
         if baseline in improvements:
             found[words] = improvements[baseline]
     return found

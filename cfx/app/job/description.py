@@ -7,27 +7,26 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from cfx.core.errors import without_passwords
-from cfx.data.pairs import PairSet
 from cfx.evaluation.headline import headline
+from cfx.evaluation.result import Purpose
 from cfx.results.config import JobConfig
+from cfx.results.table import Findings
 
 _CHOSEN = ("model", "policy", "learner", "optimizer", "objective", "protocol")
 
 
-def described(
-    config: JobConfig, pairs: PairSet, metrics: Mapping[str, float], *, adapts: bool
-) -> str:
+def described(config: JobConfig, findings: Findings, metrics: Mapping[str, float]) -> str:
     """Returns what the job is, its result, its recordings, and the command that was typed.
 
     Args:
         config: of the job.
-        pairs: that it used.
+        findings: of the job.
         metrics: its results.
-        adapts: as `Policy.adapts`.
     """
+    pairs = findings.pairs
     chosen = []
     for group in _CHOSEN:
-        if group == "learner" and not adapts:
+        if group == "learner" and findings.evaluation.purpose is Purpose.CALIBRATION:
             continue
         chosen.append(f"{group} **{getattr(config, group)['name']}**")
     drivers = len({pair.driver for pair in pairs})

@@ -173,8 +173,6 @@ def write_figures(
     findings: Findings,
     tables: Mapping[str, pd.DataFrame],
     metrics: Mapping[str, float],
-    *,
-    adapts: bool,
 ) -> list[Path]:
     """Writes the figures, if the configuration wants any; returns their paths.
 
@@ -184,7 +182,6 @@ def write_figures(
         findings: what is drawn.
         tables: likewise, by name.
         metrics: of the job.
-        adapts: as `Policy.adapts`.
 
     Raises:
         OutputError: a file cannot be written.
@@ -195,11 +192,7 @@ def write_figures(
         from cfx.report.figures.write import write_figures as write_all_figures
 
         results = Results.of(
-            findings.evaluation,
-            adapts=adapts,
-            style=findings.style,
-            tables=tables,
-            metrics=metrics,
+            findings.evaluation, style=findings.style, tables=tables, metrics=metrics
         )
 
         def write_all() -> None:
@@ -241,12 +234,9 @@ def write_provenance(
     output: Output,
     pairs: PairSet,
     protocol_result: ProtocolResult,
-    *,
-    has_constant_baseline: bool,
-    adapts: bool,
     objective: Mapping[str, str],
 ) -> None:
-    """Writes `data.json`: where the data came from, and what a report must know of the model.
+    """Writes `data.json`: where the data came from, and what a report must know of the job.
 
     Args:
         objective: name and unit of what calibration has minimised; losses of labels have this unit.
@@ -259,11 +249,9 @@ def write_provenance(
     for drop in pairs.dropped:
         dropped.append({"reason": drop.reason, "count": drop.count, "unit": drop.unit})
     parameters = []
-    lows, highs = evaluation.bounds
-    meanings = evaluation.meanings or ("",) * len(evaluation.names)
-    for k, name in enumerate(evaluation.names):
-        about = {"name": name, "unit": evaluation.units[k], "meaning": meanings[k]}
-        parameters.append({**about, "low": float(lows[k]), "high": float(highs[k])})
+    for one in evaluation.parameters:
+        about = {"name": one.name, "unit": one.unit, "meaning": one.meaning}
+        parameters.append({**about, "low": one.low, "high": one.high})
     values = {
         "source": pairs.source,
         "fingerprint": pairs.fingerprint,
@@ -271,8 +259,7 @@ def write_provenance(
         "protocol": dict(protocol_result.notes),
         "dropped": dropped,
         "parameters": parameters,
-        "has_constant_baseline": has_constant_baseline,
-        "adapts": adapts,
+        "purpose": evaluation.purpose,
         "objective": dict(objective),
         "transient_s": TRANSIENT_S,
         "metrics": [metric.to_json() for metric in evaluation.measured],

@@ -76,8 +76,6 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
         tables,
         console or Console(),
         tracker,
-        has_constant_baseline=parts.model.has_constant_baseline,
-        adapts=parts.policy.adapts,
         copied_to=None if upload is None else upload.url,
     )
     return job_result

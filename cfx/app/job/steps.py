@@ -17,7 +17,6 @@ from cfx.app.job.parts import Parts, choose_device, complete, make_protocol, rep
 from cfx.app.job.results import JobResult
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
-from cfx.calibration.flatness import flat_for
 from cfx.calibration.prior import prior_weight
 from cfx.calibration.settings import WindowSettings
 from cfx.calibration.shards import Solver
@@ -28,7 +27,7 @@ from cfx.core.threads import limit_cores, set_threads
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.style import StyleResult, measure_style, select_cluster
 from cfx.evaluation.protocols.base import ProtocolContext, ProtocolResult
-from cfx.learners.curves import best_losses
+from cfx.evaluation.result import Purpose
 from cfx.policies import checkpoint
 from cfx.results.config import JobConfig
 from cfx.results.table import Findings, WrittenTable
@@ -158,14 +157,19 @@ def found(parts: Parts, context: ProtocolContext, result: object) -> Findings:
             f"{registry.origin(parts.protocol)}: run must return a cfx.ProtocolResult,"
             f" but returned a {type(result).__name__}"
         )
-    evaluation = result.evaluation
-    if not parts.policy.adapts:
-        evaluation = evaluation.constant_methods()
+    purpose = Purpose.of(parts.model, parts.policy)
+    evaluation = replace(result.evaluation, purpose=purpose).distinct_methods()
     view = calibration_view(context, evaluation)
-    if view is None:
-        return Findings(context.pairs, context.style, replace(result, evaluation=evaluation))
-    result = replace(result, evaluation=evaluation.with_slices(view.slices))
-    return Findings(context.pairs, context.style, result, slices=view.slices, fits=view.fits)
+    if view is not None:
+        evaluation = evaluation.with_slices(view.slices)
+    return Findings(
+        context.pairs,
+        context.style,
+        replace(result, evaluation=evaluation),
+        slices=None if view is None else view.slices,
+        fits=None if view is None else view.fits,
+        seed=context.seed,
+    )
 
 
 def keep(
@@ -174,25 +178,15 @@ def keep(
     """Writes everything into the folder, then into MLflow."""
     pairs, protocol_result = findings.pairs, findings.protocol_result
     evaluation = protocol_result.evaluation
-    of_training: dict[str, float] = {}
-    if protocol_result.labels is not None:
-        of_training |= protocol_result.labels.metrics()
-    of_training |= best_losses(protocol_result.curves)
-    of_training |= protocol_result.calibration
-    for name, share in flat_for(evaluation.table, evaluation.names).items():
-        of_training[f"flat/{name}"] = share
-
     output.replace(config)
     policy_folder = output.folder / "policy"
     tables = files.write_tables(output, findings)
+    metrics = evaluation.metrics() | dict(protocol_result.calibration)
     for table in tables:
-        of_training |= table.about.metrics(findings)
-    metrics = evaluation.metrics() | of_training
+        metrics |= table.about.metrics(findings)
     output.run(lambda: checkpoint.save(protocol_result.policy, policy_folder))
     rows = {table.about.name: table.rows for table in tables if table.rows is not None}
-    figures = files.write_figures(
-        output, config, findings, rows, metrics, adapts=parts.policy.adapts
-    )
+    figures = files.write_figures(output, config, findings, rows, metrics)
     shown: list[Path] = []
     if parts.demo is not None:
         shown = files.write_demo(output, parts.demo, pairs, protocol_result, config)
@@ -200,17 +194,14 @@ def keep(
         output,
         pairs,
         protocol_result,
-        has_constant_baseline=parts.model.has_constant_baseline,
-        adapts=parts.policy.adapts,
         objective={"name": config.objective["name"], "unit": parts.objective.unit},
     )
     # Before MLflow, so that no failure there loses it.
     files.write_metrics(output, metrics)
 
-    tracker.log_evaluation(evaluation, adapts=parts.policy.adapts)
+    tracker.log_results(evaluation, metrics)
     tracker.log_data(pairs, str(config.data["name"]))
-    tracker.describe(described(config, pairs, metrics, adapts=parts.policy.adapts))
-    tracker.log_metrics(of_training)
+    tracker.describe(described(config, findings, metrics))
     tracker.log_curves(protocol_result.curves)
     tracker.log_figures(figures)
     tracker.log_policy(policy_folder, pairs)

@@ -25,12 +25,11 @@ from cfx.evaluation.forecast_paths import (
     measured_paths,
     sample_from_origins,
 )
-from cfx.evaluation.forecasts import Forecasts, forecast_errors
+from cfx.evaluation.forecasts import forecast_errors, forecast_values
 from cfx.evaluation.protocols.base import ProtocolContext, ProtocolResult
 from cfx.evaluation.protocols.finished import FoldsOrFinished, FoldsOrFinishedSettings
 from cfx.evaluation.protocols.held_out import HeldOut
 from cfx.evaluation.protocols.noise import can_drive, residual_noise
-from cfx.evaluation.result import Evaluation
 from cfx.evaluation.tables import in_text
 from cfx.policies.agent import Agent
 from cfx.policies.fixed import FixedPolicy
@@ -119,13 +118,18 @@ class Forecast(FoldsOrFinished):
         trained = self.trained(context)
         test = trained.test
         evaluation = test.evaluation(self.settings.histories, fold=trained.fold)
-        forecasts = self._forecasts(test)
+        tables = self._forecasts(test)
+        values = [in_text(evaluation.values), forecast_values(tables["forecasts"])]
         return ProtocolResult(
-            _with_forecasts(evaluation, forecasts),
+            replace(
+                evaluation,
+                values=pd.concat(values, ignore_index=True),
+                tables={**evaluation.tables, **tables},
+            ),
             test.policy,
             trained.curves,
             trained.labels,
-            {**trained.notes, "forecasts": _described(forecasts)},
+            {**trained.notes, "forecasts": self._described(tables["forecasts"])},
             calibration=trained.calibration,
         )
 
@@ -148,8 +152,8 @@ class Forecast(FoldsOrFinished):
                     f" a multiple of {dt:g}"
                 )
 
-    def _forecasts(self, test: HeldOut) -> Forecasts:
-        """Forecasts the test drivers by all methods.
+    def _forecasts(self, test: HeldOut) -> dict[str, pd.DataFrame]:
+        """Forecasts the test drivers by all methods; returns the tables of it by name.
 
         Raises:
             DataError: no trajectory is long enough for a single forecast.
@@ -170,12 +174,23 @@ class Forecast(FoldsOrFinished):
         paths = self._paths(test, origins, steps)
         about = (test.pairs, origins)
         table = forecast_errors(*about, paths, measured, recorded, s.horizons, dt)
-        distributions = None
+        tables = {"forecasts": table}
         if s.samples > 0:
             happened = Recorded.of(batch, origins, measured, recorded.cpu())
             paths |= self._sampled(test, origins, steps)
-            distributions = score_distributions(*about, paths, happened, s.horizons, dt)
-        return Forecasts(table, s.horizons, s.leader, test.context.seed, distributions)
+            tables["distributions"] = score_distributions(*about, paths, happened, s.horizons, dt)
+        return tables
+
+    def _described(self, table: pd.DataFrame) -> dict[str, Any]:
+        """Returns what `data.json` says of the forecasts."""
+        of_one = table[table["method"] == table["method"].iloc[0]]
+        counts = of_one.groupby("horizon_s").size()
+        return {
+            "leader": self.settings.leader,
+            "horizons_s": list(self.settings.horizons),
+            "origins": {f"{horizon:g}": int(count) for horizon, count in counts.items()},
+            "history_s": [float(of_one["history_s"].min()), float(of_one["history_s"].max())],
+        }
 
     def _say_who_is_forecast(self, test: HeldOut, origins: Origins) -> None:
         """Logs how many drivers there are forecasts of, and horizons that few or none reach."""
@@ -291,22 +306,3 @@ def _constants(test: HeldOut) -> dict[str, Tensor]:
     if test.population is not None:
         found["population"] = test.population[test.network]
     return found
-
-
-def _with_forecasts(evaluation: Evaluation, forecasts: Forecasts) -> Evaluation:
-    """Returns the evaluation with forecasts, also in its long table."""
-    values = pd.concat([in_text(evaluation.values), forecasts.values()], ignore_index=True)
-    return replace(evaluation, values=values, forecasts=forecasts)
-
-
-def _described(forecasts: Forecasts) -> dict[str, Any]:
-    """Returns what `data.json` says of the forecasts."""
-    table = forecasts.table
-    of_one = table[table["method"] == table["method"].iloc[0]]
-    counts = of_one.groupby("horizon_s").size()
-    return {
-        "leader": forecasts.leader,
-        "horizons_s": list(forecasts.horizons),
-        "origins": {f"{horizon:g}": int(count) for horizon, count in counts.items()},
-        "history_s": [float(of_one["history_s"].min()), float(of_one["history_s"].max())],
-    }

@@ -71,9 +71,9 @@ class HeldOut:
         context = self.context
         methods = self.methods_without_history()
         loops = self._test_part(methods)
-        history = None
+        tables = {}
         if self.policy.base is not None and histories:
-            history = self.history(histories, loops["fixed"])
+            tables["history"] = self.history(histories, loops["fixed"])
         scopes = {"test": loops, "full_trajectory": self._full_trajectory(methods)}
         evaluation = evaluate(
             ComparedPairs(self.pairs, self.batch, self.first, context.style, fold),
@@ -86,7 +86,7 @@ class HeldOut:
         return replace(
             evaluation,
             platoon=self._platoons(methods),
-            history=history,
+            tables=tables,
             outside=outside_of_scopes(self.policy, scopes),
         )
 
@@ -150,7 +150,7 @@ class HeldOut:
         return measure_platoons(context.simulator.model, agents)
 
     def history(self, histories: Sequence[float], fixed: ClosedLoop) -> pd.DataFrame:
-        """Simulates the test part after different amounts of history; see `Evaluation.history`.
+        """Simulates the test part after different amounts of history.
 
         Args:
             histories: s; besides them, all there is.

@@ -15,7 +15,7 @@ from cfx.evaluation.distributions import (
     sampled_methods,
     summarize_distributions,
 )
-from cfx.evaluation.forecasts import errors_by, errors_by_history
+from cfx.evaluation.forecasts import errors_by, errors_by_history, forecast_methods
 from cfx.report.figures.canvas import (
     DASHES,
     Line,
@@ -44,7 +44,7 @@ def draw_by_horizon(summary: pd.DataFrame, methods: Sequence[str]) -> Figure:
     """Draw errors of speed and of position against the horizon.
 
     Args:
-        summary: as `Forecasts.summary`.
+        summary: as `summarize_forecasts` returns it.
         methods: those to show.
     """
     figure = canvas(4.4)
@@ -115,8 +115,8 @@ def draw_distributions(table: pd.DataFrame, forecasts: pd.DataFrame) -> Figure:
 
     Args:
         table: as `score_distributions` returns it.
-        forecasts: as `Forecasts.table`, of the same origins; the policy's centre is in the first
-            panel, with its absolute error.
+        forecasts: single ones of the same origins; the policy's centre is in the first panel, with
+            its absolute error.
     """
     figure = canvas(4.2)
     crps, coverage, pit = figure.subplots(1, 3)
@@ -164,13 +164,13 @@ class ForecastErrors(JobFigure):
 
     def draw(self, results: Results) -> Figure | None:
         """Draws it where forecasts were made."""
-        found = results.forecasts
-        if found is None:
+        table = results.tables.get("forecasts")
+        if table is None:
             return None
-        of_driver = errors_by(found.table, ["method", "horizon_s", "driver"])
+        of_driver = errors_by(table, ["method", "horizon_s", "driver"])
         grouped = of_driver.groupby(["method", "horizon_s"], sort=False, observed=True)
         summary = grouped[[error for error, _ in _ERRORS]].mean().reset_index()
-        return draw_by_horizon(summary, found.methods)
+        return draw_by_horizon(summary, forecast_methods(table))
 
 
 class ForecastsByHistory(JobFigure):
@@ -182,13 +182,13 @@ class ForecastsByHistory(JobFigure):
 
     def draw(self, results: Results) -> Figure | None:
         """Draws it where origins have so different histories that they can be told apart."""
-        found = results.forecasts
-        if found is None:
+        table = results.tables.get("forecasts")
+        if table is None:
             return None
-        by_history = errors_by_history(found.table)
+        by_history = errors_by_history(table)
         if by_history["span_s"].nunique() < 2:
             return None
-        return draw_by_history(by_history, found.methods)
+        return draw_by_history(by_history, forecast_methods(table))
 
 
 class Distributions(JobFigure):
@@ -206,7 +206,6 @@ class Distributions(JobFigure):
 
     def draw(self, results: Results) -> Figure | None:
         """Draws it where forecasts were sampled."""
-        found = results.forecasts
-        if found is None or found.distributions is None:
+        if not {"distributions", "forecasts"} <= set(results.tables):
             return None
-        return draw_distributions(found.distributions, found.table)
+        return draw_distributions(results.tables["distributions"], results.tables["forecasts"])

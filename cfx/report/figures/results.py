@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
+from cfx.evaluation.result import Purpose
 from cfx.simulation.trajectory import TRANSIENT_S
 
 if TYPE_CHECKING:
     from cfx.data.style import StyleResult
-    from cfx.evaluation.forecasts import Forecasts
     from cfx.evaluation.result import Evaluation, PairTrajectory
     from cfx.evaluation.statistics import Improvement
 
@@ -33,12 +33,9 @@ class ParameterAxis:
 
 def parameter_axes(evaluation: Evaluation) -> tuple[ParameterAxis, ...]:
     """Returns the tuned parameters of an evaluation."""
-    lows, highs = evaluation.bounds
-    meanings = evaluation.meanings or ("",) * len(evaluation.names)
     axes = []
-    for k, name in enumerate(evaluation.names):
-        low, high = float(lows[k]), float(highs[k])
-        axes.append(ParameterAxis(name, evaluation.units[k], low, high, meanings[k]))
+    for one in evaluation.parameters:
+        axes.append(ParameterAxis(one.name, one.unit, one.low, one.high, one.meaning))
     return tuple(axes)
 
 
@@ -51,12 +48,11 @@ class Results:
         methods: those that are shown, in their order; without the policy if it does not adapt.
         parameters: the tuned ones.
         trajectories: test parts of all pairs; empty if none are known.
-        improvements: of the policy by baseline; empty if it does not adapt.
+        improvements: of the policy by baseline; empty where that is not the job's purpose.
         style: of the drivers; None if it is not known. Without weights these are not known.
         tables: what the job has written, by name (`cfx.results.table`): of `curves`, `platoon`,
-            `history`, `slices`, `fits`, `labels` and those of plugins, what there is.
+            `history`, `forecasts`, `slices`, `fits`, `labels` and those of plugins, what there is.
         metrics: of the job, under their names in `metrics.json`.
-        forecasts: None if there were none.
         transient_s: length of the transient at the beginning of the test part, s.
     """
 
@@ -68,7 +64,6 @@ class Results:
     style: StyleResult | None = None
     tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
     metrics: Mapping[str, float] = field(default_factory=dict)
-    forecasts: Forecasts | None = None
     transient_s: float = TRANSIENT_S
 
     @classmethod
@@ -76,7 +71,6 @@ class Results:
         cls,
         evaluation: Evaluation,
         *,
-        adapts: bool = True,
         style: StyleResult | None = None,
         tables: Mapping[str, pd.DataFrame] | None = None,
         metrics: Mapping[str, float] | None = None,
@@ -85,20 +79,21 @@ class Results:
 
         Args:
             evaluation: of the job.
-            adapts: as `Policy.adapts`; if it does not, the policy is no method of its own.
             style: as in the attributes.
             tables: what the job has written, by name.
             metrics: as in the attributes; None: those of the evaluation alone.
         """
-        shown = evaluation if adapts else evaluation.constant_methods()
+        shown = evaluation.distinct_methods()
+        improvements: Mapping[str, Improvement] = {}
+        if evaluation.purpose is Purpose.ADAPTATION:
+            improvements = evaluation.improvements["test"]
         return cls(
             pairs=shown.table,
             methods=shown.methods,
             parameters=parameter_axes(evaluation),
             trajectories=evaluation.trajectories,
-            improvements=evaluation.improvements if adapts else {},
+            improvements=improvements,
             style=style,
             tables=tables or {},
             metrics=evaluation.metrics() if metrics is None else metrics,
-            forecasts=evaluation.forecasts,
         )

@@ -9,13 +9,14 @@ from dataclasses import replace
 import numpy as np
 
 from cfx.calibration.flatness import NEAR
+from cfx.evaluation.result import Purpose
 from cfx.report.blocks import Block, Figure, Table, Text, job_fold
 from cfx.report.figure_blocks import caption, figure_of, view
 from cfx.report.figures.calibration import AT_BOUND, ParameterSpread, parameter_spreads
 from cfx.report.figures.identifiability import SlicePanel, draw_labels, labels_of, slice_panels
 from cfx.report.figures.words import number as shown_number
 from cfx.report.figures.words import short, unit_label
-from cfx.report.job import Job, Runs, with_constant_baseline
+from cfx.report.job import Job, Runs, of_purpose
 from cfx.report.section import Section
 from cfx.report.tables import Cell, Column, Sheet, formatted, job_names, number, text
 
@@ -30,7 +31,7 @@ class CalibrationSection(Section):
     def blocks(self, runs: Runs) -> list[Block]:
         """Return a plot and a table for each calibration, with the jobs that share it."""
         together: dict[str, list[Job]] = {}
-        for job in with_constant_baseline(runs.jobs):
+        for job in of_purpose(runs.jobs, Purpose.ADAPTATION, Purpose.CALIBRATION):
             spreads = spreads_of(job)
             if spreads:
                 together.setdefault(_fingerprint(spreads), []).append(job)

@@ -8,13 +8,14 @@ import numpy as np
 import pandas as pd
 
 from cfx.data.style import CLUSTERS
+from cfx.evaluation.result import Purpose
 from cfx.evaluation.statistics import Improvement
 from cfx.report.blocks import Block, Figure, Fold, Table, Text
 from cfx.report.figure_blocks import view
 from cfx.report.figures.improvements import improvement_axis
 from cfx.report.figures.jobs import ClusterGroup, draw_clusters
 from cfx.report.figures.words import explained, label
-from cfx.report.job import Job, Runs, any_baselines, with_baseline
+from cfx.report.job import Job, Runs, any_baselines, of_purpose
 from cfx.report.names import SEPARATOR, differences
 from cfx.report.section import Section
 from cfx.report.tables import Cell, Column, Sheet, formatted, interval, number, share, text
@@ -37,7 +38,7 @@ class ClustersSection(Section):
 
     def blocks(self, runs: Runs) -> list[Block]:
         """Return the plot and a table per baseline, if any job has a baseline."""
-        jobs = with_baseline(runs.jobs)
+        jobs = of_purpose(runs.jobs, Purpose.ADAPTATION)
         if not jobs:
             return []
         baselines = any_baselines(jobs)

@@ -10,12 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from cfx.evaluation.metrics.base import MetricInfo
-from cfx.evaluation.result import METHODS
+from cfx.evaluation.result import METHODS, Purpose
 from cfx.report.blocks import Block, Figure, Fold, Heading, Table, Text, View
 from cfx.report.figure_blocks import view
 from cfx.report.figures.jobs import draw_error_dots, error_limit
 from cfx.report.figures.words import FULL_TRAJECTORY, STEADY, TEST, explained, percent, short_label
-from cfx.report.job import Job, Runs, any_baselines, any_has_metric, without_baseline
+from cfx.report.job import Job, Runs, any_baselines, any_has_metric, of_purpose
 from cfx.report.metrics import metric_title
 from cfx.report.section import Section
 from cfx.report.tables import Cell, Column, Sheet, formatted, job_names, number, tested, text
@@ -102,7 +102,7 @@ class ComparisonSection(Section):
             Text(introduction),
             Table(closeness(jobs), compact=True, explain=True),
         ]
-        unconditional = without_baseline(jobs)
+        unconditional = of_purpose(jobs, Purpose.POLICY)
         if unconditional:
             found.append(
                 Text(

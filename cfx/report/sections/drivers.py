@@ -8,13 +8,14 @@ from dataclasses import replace
 
 import pandas as pd
 
+from cfx.evaluation.result import Purpose
 from cfx.report.blocks import Block, Figure, Fold, Table, Text, View
 from cfx.report.figure_blocks import view
 from cfx.report.figures.improvements import improvement_bars
 from cfx.report.figures.jobs import draw_every_pair
 from cfx.report.figures.words import label, short_label
 from cfx.report.files import without_folders
-from cfx.report.job import Job, Runs, any_baselines, with_baseline
+from cfx.report.job import Job, Runs, any_baselines, of_purpose
 from cfx.report.section import Section
 from cfx.report.tables import Column, Sheet, formatted, number, share, text
 
@@ -35,7 +36,7 @@ class DriversSection(Section):
 
     def blocks(self, runs: Runs) -> list[Block]:
         """Return the plot, if any job has a baseline."""
-        jobs = with_baseline(runs.jobs)
+        jobs = of_purpose(runs.jobs, Purpose.ADAPTATION)
         if not jobs:
             return []
         found: list[Block] = [Text(_INTRODUCTION), per_driver(jobs)]

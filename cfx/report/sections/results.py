@@ -8,11 +8,12 @@ import numpy as np
 import pandas as pd
 
 from cfx.evaluation.metrics.base import SCOPES
+from cfx.evaluation.result import Purpose
 from cfx.report.blocks import Block, Figure, Heading, Table, Text
 from cfx.report.figure_blocks import view
 from cfx.report.figures.jobs import Statistics, draw_overview, statistics_axis
 from cfx.report.figures.words import FULL_TRAJECTORY, MINUS, TEST, label
-from cfx.report.job import Job, Runs, any_baselines, with_baseline
+from cfx.report.job import Job, Runs, any_baselines, of_purpose
 from cfx.report.section import Section
 from cfx.report.tables import (
     Cell,
@@ -41,7 +42,7 @@ class ResultsSection(Section):
         """Return improvements over each baseline, and errors."""
         jobs = runs.jobs
         found: list[Block] = []
-        if with_baseline(jobs):
+        if of_purpose(jobs, Purpose.ADAPTATION):
             words = (
                 "Mean improvement of the RMSE of speed over each baseline, with its 95 % interval."
                 " Where the interval contains 0, the job does not tell whether the policy helps."

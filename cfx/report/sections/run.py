@@ -8,6 +8,7 @@ from typing import Any
 
 import pandas as pd
 
+from cfx.evaluation.result import Purpose
 from cfx.report.blocks import Block, Facts, Heading, Items, Table, Text
 from cfx.report.figures.words import NOTHING
 from cfx.report.files import without_folders
@@ -163,7 +164,7 @@ def _range(values: pd.Series[Any]) -> str:
 def _learned(job: Job) -> str:
     """Says how the policy was learned."""
     learner = job.component("learner")
-    if not job.adapts:
+    if job.purpose is Purpose.CALIBRATION:
         return "constant parameters, nothing is learned"
     if learner:
         return f"learned by {learner}"

@@ -11,7 +11,7 @@ from cfx.report.blocks import Block, Table, Text
 from cfx.report.figures.values import finite
 from cfx.report.figures.words import explained, percent, short_label
 from cfx.report.job import Job, Runs
-from cfx.report.names import Row, baselines_of, methods_of, rows_over_seeds
+from cfx.report.names import Row, any_adapts, baselines_of, methods_of, rows_over_seeds
 from cfx.report.section import Section
 from cfx.report.tables import Cell, Column, Sheet, number, tested, text
 
@@ -71,7 +71,7 @@ def over_seeds(rows: Sequence[Row]) -> Sheet:
 def _error(row: Row, method: str) -> Cell:
     """Returns a method's mean error and its range; empty where its jobs have no such method."""
     known = finite(row.values("rmse_speed", method))
-    if not len(known) or (method == "policy" and not any(job.adapts for job in row.jobs)):
+    if not len(known) or (method == "policy" and not any_adapts([row])):
         return number(np.nan, "")
     cell = number(float(known.mean()), f"{known.mean():.3f}")
     return _with_range(cell, [f"{end:.3f}" for end in (known.min(), known.max())])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from cfx.evaluation.result import Purpose
 from cfx.report.blocks import (
     Block,
     Figure,
@@ -17,7 +18,7 @@ from cfx.report.figure_blocks import single_view
 from cfx.report.figures.trajectories import draw_pair
 from cfx.report.figures.values import RankedPair, rank_pairs
 from cfx.report.figures.words import percent_or_undefined, short_label
-from cfx.report.job import Job, Runs, calibrations
+from cfx.report.job import Job, Runs, of_purpose
 from cfx.report.section import Section
 
 _ADAPTING = (
@@ -38,7 +39,7 @@ class TrajectoriesSection(Section):
     def blocks(self, runs: Runs) -> list[Block]:
         """Return the chosen pairs of each job."""
         jobs = [job for job in runs.jobs if "trajectories" in job.tables]
-        constant = calibrations(jobs)
+        constant = of_purpose(jobs, Purpose.CALIBRATION)
         chosen = [_BOUNDS]
         if constant:
             chosen.insert(0, _CONSTANT)
@@ -63,10 +64,10 @@ def chosen_pairs(job: Job) -> tuple[RankedPair, ...]:
     """Returns the best, the median and the worst pair; fewer if there are fewer."""
     present = [trajectory.pair_id for trajectory in job.pair_trajectories]
     table = job.by_pair[job.by_pair["pair_id"].isin(present)]
-    judged = "improvement/fixed" if job.adapts else f"rmse_speed/{job.judged}"
-    gains = table[judged].to_numpy(dtype=float)
-    if not job.adapts:
-        gains = -gains
+    if job.purpose is Purpose.CALIBRATION:
+        gains = -table[f"rmse_speed/{job.judged}"].to_numpy(dtype=float)
+    else:
+        gains = table["improvement/fixed"].to_numpy(dtype=float)
     return rank_pairs(table["pair_id"].astype(str).tolist(), gains)
 
 
@@ -78,7 +79,7 @@ def pair_of(job: Job, pair_id: str) -> Figure:
 
 def _title(job: Job, pair: RankedPair) -> str:
     title = pair.title[:1].upper() + pair.title[1:]
-    if job.adapts and job.has_constant_baseline and math.isfinite(pair.improvement):
+    if job.purpose is Purpose.ADAPTATION and math.isfinite(pair.improvement):
         improvement = percent_or_undefined(pair.improvement, 1)
         title += f": {improvement} over {short_label('fixed')} calibration"
     return title

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 
-import pandas as pd
 from rich.table import Table
 
 from cfx import Column, Findings, ResultTable
 from cfx.evaluation.metrics.base import RECORDED
+from cfx.results.table import metrics_table
 from cfx_traffic.summary import traffic_methods, traffic_metrics
 
 METHOD = Column("method", "", "what drives", "text")
@@ -46,9 +46,6 @@ class Roads(ResultTable):
         Column("outside", "1", "share of windows outside what the policy has learned from"),
     )
 
-    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        return [findings.evaluation.tables.get("traffic")]
-
     def metrics(self, findings: Findings) -> Mapping[str, float]:
         tables = findings.evaluation.tables
         speed = findings.protocol_result.notes["traffic"]["recorded_wave_speed_kmh"]
@@ -60,7 +57,9 @@ class Roads(ResultTable):
         )
 
     def console(self, findings: Findings, metrics: Mapping[str, float]) -> Iterable[Table]:
-        return [traffic_table(traffic_methods(findings.evaluation.tables["traffic"]), metrics)]
+        title = "Traffic: rings in vehicles/h, m/s and km/h; platoons in m/s; collisions"
+        methods = traffic_methods(findings.evaluation.tables["traffic"])
+        return [metrics_table(title, (*methods, RECORDED), _SHOWN, metrics)]
 
 
 class Growth(ResultTable):
@@ -80,9 +79,6 @@ class Growth(ResultTable):
         ),
     )
 
-    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        return [findings.evaluation.tables.get("traffic_growth")]
-
 
 class Strips(ResultTable):
     """Flow and density of pairs of vehicles in strips of time."""
@@ -95,9 +91,6 @@ class Strips(ResultTable):
         Column("flow", "vehicles/h", "Edie's, of the strip"),
         Column("speed_std", "m/s", "standard deviation of the speeds in the strip"),
     )
-
-    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        return [findings.evaluation.tables.get("traffic_strips")]
 
 
 class Paths(ResultTable):
@@ -113,9 +106,6 @@ class Paths(ResultTable):
         Column("speed", "m/s", "simulated"),
     )
 
-    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        return [findings.evaluation.tables.get("traffic_paths")]
-
 
 def _names(table: type[ResultTable]) -> tuple[str, ...]:
     return tuple(column.name for column in table.columns)
@@ -126,29 +116,13 @@ GROWTH_COLUMNS = _names(Growth)
 STRIP_COLUMNS = _names(Strips)
 PATH_COLUMNS = _names(Paths)
 
-_SHOWN = (
-    ("capacity", "capacity", ".0f"),
-    ("error", "flow_error", ".0f"),
-    ("std", "speed_std", ".2f"),
-    ("waves", "wave_speed", ".1f"),
-    ("last", "growth_last", ".2f"),
-    ("half", "growth_half", ".2f"),
-    ("hits", "collisions", ".0f"),
-)
-"""Columns of the printed table: heading, metric, format."""
-
-
-def traffic_table(methods: Iterable[str], metrics: Mapping[str, float]) -> Table:
-    """Return what traffic looks like for each method, and recorded; it fits 80 columns."""
-    title = "Traffic: rings in vehicles/h, m/s and km/h; platoons in m/s; collisions"
-    table = Table(title=title, title_justify="left")
-    table.add_column("method")
-    for heading, _, _ in _SHOWN:
-        table.add_column(heading, justify="right")
-    for method in (*methods, RECORDED):
-        cells = []
-        for _, metric, form in _SHOWN:
-            value = metrics.get(f"traffic/{metric}/{method}", math.nan)
-            cells.append(f"{value:{form}}" if math.isfinite(value) else "")
-        table.add_row(method, *cells)
-    return table
+_SHOWN = {
+    "capacity": ("traffic/capacity", ".0f"),
+    "error": ("traffic/flow_error", ".0f"),
+    "std": ("traffic/speed_std", ".2f"),
+    "waves": ("traffic/wave_speed", ".1f"),
+    "last": ("traffic/growth_last", ".2f"),
+    "half": ("traffic/growth_half", ".2f"),
+    "hits": ("traffic/collisions", ".0f"),
+}
+"""Columns of the printed table: heading, metric, format. It fits 80 columns."""

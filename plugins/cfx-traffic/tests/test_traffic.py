@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -13,13 +14,16 @@ from rich.console import Console
 
 import cfx
 from cfx.core.errors import CfxError
+from cfx.data.pairs import PairSet
+from cfx.evaluation.protocols.base import ProtocolResult
+from cfx.results.table import Findings
 from cfx_traffic.summary import TRAFFIC_METHODS
 from cfx_traffic.tables import (
     GROWTH_COLUMNS,
     PATH_COLUMNS,
     ROAD_COLUMNS,
     STRIP_COLUMNS,
-    traffic_table,
+    Roads,
 )
 from tests.evaluation.protocols.test_across_drivers import QUICK
 
@@ -84,7 +88,12 @@ def test_traffic_stands_in_every_table(result: cfx.JobResult) -> None:
     assert result.metrics["traffic/capacity/fixed"] == pytest.approx(capacity)
     assert result.evaluation is not None
     console = Console(file=io.StringIO(), width=80)
-    console.print(traffic_table(CONSTANT, result.metrics))
+    findings = Findings(
+        PairSet((), ""),
+        cast(Any, None),
+        ProtocolResult(result.evaluation, result.policy, pd.DataFrame(), None),
+    )
+    console.print(*Roads().console(findings, result.metrics))
     assert isinstance(console.file, io.StringIO)
     shown = console.file.getvalue()
     assert f"{capacity:.0f}" in shown

@@ -6,6 +6,7 @@ import io
 import json
 import logging
 from pathlib import Path
+from typing import Any, cast
 
 import pandas as pd
 import pytest
@@ -13,8 +14,11 @@ from rich.console import Console
 
 import cfx
 from cfx.core.errors import CfxError
+from cfx.data.pairs import PairSet
 from cfx.evaluation.forecasts import FORECAST_METHODS
-from cfx.results.tables import forecasts_table
+from cfx.evaluation.protocols.base import ProtocolResult
+from cfx.results.table import Findings
+from cfx.results.tables import ForecastErrors
 from tests.evaluation.protocols.test_across_drivers import QUICK
 
 FORECAST = [
@@ -63,9 +67,14 @@ def test_forecasts_stand_in_every_table(result: cfx.JobResult) -> None:
         wide["forecast_rmse_speed_2s"], rows, check_names=False, rtol=1e-9
     )
     assert result.evaluation is not None
-    assert result.evaluation.forecasts is not None
+    about = json.loads((result.folder / "data.json").read_text())["protocol"]
+    findings = Findings(
+        PairSet((), ""),
+        cast(Any, None),
+        ProtocolResult(result.evaluation, result.policy, pd.DataFrame(), None, about),
+    )
     console = Console(file=io.StringIO(), width=80)
-    console.print(forecasts_table(result.evaluation.forecasts))
+    console.print(*ForecastErrors().console(findings, result.metrics))
     assert isinstance(console.file, io.StringIO)
     shown = console.file.getvalue()
     assert f"{result.metrics['forecast/rmse_speed_0.5s/fixed']:.3f}" in shown

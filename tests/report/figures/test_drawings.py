@@ -15,7 +15,7 @@ from matplotlib.image import imread
 
 from cfx.core.errors import ConfigError, OutputError
 from cfx.core.parameters import Parameter, ParameterSpace
-from cfx.evaluation.result import Evaluation
+from cfx.evaluation.result import Evaluation, Purpose
 from cfx.learners.curves import over_networks
 from cfx.report.figures.errors import errors_over_time
 from cfx.report.figures.figure import draw, figure_named
@@ -39,10 +39,8 @@ def texts(figure: Figure) -> str:
     return "\n".join(artist.get_text() for artist in figure.findobj(mpl.text.Text))
 
 
-def all_of(made: MadeUp, *, adapts: bool = True) -> Results:
-    return Results.of(
-        made.evaluation, adapts=adapts, style=made.style, tables={"curves": made.curves}
-    )
+def all_of(made: MadeUp) -> Results:
+    return Results.of(made.evaluation, style=made.style, tables={"curves": made.curves})
 
 
 def drawn(name: str, results: Results) -> Figure:
@@ -301,8 +299,12 @@ def test_each_method_has_its_own_speed_plot() -> None:
 
 def test_a_panel_per_method_shows_the_worst_platoon() -> None:
     platoon = make_platoon({"default": 1, "policy": 3})
-    evaluation = dataclasses.replace(make_results(pairs=1, frames=5).evaluation, platoon=platoon)
-    found = drawn("platoon", Results.of(evaluation, tables={"platoon": platoon.table}))
+    results = Results.of(
+        make_results(pairs=1, frames=5).evaluation,
+        tables={"platoon": platoon.table},
+        metrics=platoon.metrics(),
+    )
+    found = drawn("platoon", results)
     found.canvas.draw()
     default, policy = found.axes
     assert "string stable" in default.get_title(loc="left")
@@ -340,9 +342,8 @@ def test_platoon_and_history_are_written_where_a_protocol_delivered_them(tmp_pat
     results = make_results(pairs=3, frames=20)
     history = make_history(results.evaluation.trajectories, GAINS)
     platoon = make_platoon({"policy": 2})
-    further = dataclasses.replace(results.evaluation, platoon=platoon)
     tables = {"curves": results.curves, "platoon": platoon.table, "history": history}
-    every = Results.of(further, style=results.style, tables=tables)
+    every = Results.of(results.evaluation, style=results.style, tables=tables)
     names = {path.name for path in write_figures(tmp_path, every)}
     assert {"platoon.png", "history.png"} <= names
     assert len(names) == 10
@@ -353,8 +354,11 @@ def test_a_policy_that_does_not_adapt_has_no_figure_of_improvements() -> None:
     values = made.evaluation.values
     same = values[values["method"] == "fixed"].assign(method="policy")
     values = pd.concat([values[values["method"] != "policy"], same], ignore_index=True)
-    made = dataclasses.replace(made, evaluation=dataclasses.replace(made.evaluation, values=values))
-    still = all_of(made, adapts=False)
+    made = dataclasses.replace(
+        made,
+        evaluation=dataclasses.replace(made.evaluation, values=values, purpose=Purpose.CALIBRATION),
+    )
+    still = all_of(made)
     assert draw(figure_named("improvement_per_driver"), still) is None
     assert draw(figure_named("calibration"), still) is not None
     # Its policy is one of the constant sets: it is no line of its own, and improves nothing.

@@ -35,13 +35,7 @@ def everything() -> Results:
     """Results of a job that measured all that figures can show."""
     made = make_results(pairs=5, frames=60)
     forecasts = make_forecasts()
-    forecasts = dataclasses.replace(forecasts, distributions=make_distributions(forecasts))
-    evaluation = dataclasses.replace(
-        made.evaluation,
-        platoon=make_platoon({"policy": 2}),
-        history=make_history(made.evaluation.trajectories, GAINS),
-        forecasts=forecasts,
-    )
+    evaluation = made.evaluation
     results = Results.of(evaluation, style=made.style, tables={"curves": made.curves})
     ids, axis = evaluation.table["pair_id"].unique(), results.parameters[0]
     slices = pd.DataFrame(
@@ -50,11 +44,11 @@ def everything() -> Results:
     )
     fits = pd.DataFrame({"pair_id": ids, "method": "fixed"})
     labels = pd.DataFrame({"pair_id": ids[0], "time_s": [0.0, 0.5], "sensitivity": [0.1, 0.2]})
-    assert evaluation.platoon is not None
-    assert evaluation.history is not None
     tables = {
-        "platoon": evaluation.platoon.table,
-        "history": evaluation.history,
+        "platoon": make_platoon({"policy": 2}).table,
+        "history": make_history(made.evaluation.trajectories, GAINS),
+        "forecasts": forecasts,
+        "distributions": make_distributions(forecasts),
         "slices": slices,
         "fits": fits.assign(train_rmse_speed=0.3, test_rmse_speed=0.4),
         "labels": labels.assign(**{f"parameter_{axis.name}": 1.0}),

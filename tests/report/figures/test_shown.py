@@ -11,7 +11,7 @@ import pytest
 from matplotlib.axes import Axes
 
 from cfx.evaluation.distributions import centre_errors, summarize_distributions
-from cfx.evaluation.forecasts import errors_by_history
+from cfx.evaluation.forecasts import errors_by_history, forecast_methods, summarize_forecasts
 from cfx.evaluation.result import Evaluation
 from cfx.learners.curves import over_networks
 from cfx.report.figures.calibration import correlations, draw_calibration, parameter_spreads
@@ -88,7 +88,11 @@ def test_a_pair_has_its_lines_limits_notes_and_collisions(far: float) -> None:
 def test_parameters_have_their_limits_and_say_what_they_mean() -> None:
     evaluation = make_results(pairs=1, frames=30).evaluation
     meanings = ("reaction time; the equilibrium time gap", "")
-    evaluation = dataclasses.replace(evaluation, meanings=meanings)
+    parameters = [
+        dataclasses.replace(one, meaning=meaning)
+        for one, meaning in zip(evaluation.parameters, meanings, strict=True)
+    ]
+    evaluation = dataclasses.replace(evaluation, parameters=tuple(parameters))
     axes = parameter_axes(evaluation)
     panels = pair_panels(evaluation.trajectories[0], evaluation.methods, axes)
     alone = draw_parameters(panels, evaluation.methods).axes[1:]
@@ -110,7 +114,7 @@ def test_a_hidden_method_is_left_out() -> None:
 def test_improvements_are_cut_off_at_one_place() -> None:
     values = np.array([0.3, 0.25, 0.2, 0.1, np.nan, -0.1, -0.2, -7.0, 0.15, 0.05])
     ids = [f"p{k}" for k in range(10)]
-    summary = make_results(pairs=3).evaluation.improvement
+    summary = make_results(pairs=3).evaluation.improvements["test"]["fixed"]
     bars = improvement_bars(["job"], [ids], [values], marks=(summary.mean,))
     (series,) = bars.series
     for figure in (draw_improvements(bars, summary), draw_every_pair(bars, series.pair_ids)):
@@ -163,7 +167,7 @@ def test_platoons_show_speeds_collisions_and_verdicts() -> None:
 
 def test_forecasts_have_a_line_per_method() -> None:
     forecasts = make_forecasts()
-    summary, methods = forecasts.summary, forecasts.methods
+    summary, methods = summarize_forecasts(forecasts, 0), forecast_methods(forecasts)
     by_horizon = draw_by_horizon(summary, methods).axes
     for axes, error in zip(by_horizon, ("rmse_speed", "rmse_position"), strict=True):
         assert axes.get_yscale() == "log"
@@ -175,7 +179,7 @@ def test_forecasts_have_a_line_per_method() -> None:
 
 
 def test_longer_histories_stand_to_the_right() -> None:
-    by_history = errors_by_history(make_forecasts().table)
+    by_history = errors_by_history(make_forecasts())
     figure = draw_by_history(by_history, ["policy"])
     assert len(figure.axes) == 3
     assert figure.axes[-1].get_ylabel().startswith("RMSE of speed after 10 s")
@@ -187,7 +191,7 @@ def test_longer_histories_stand_to_the_right() -> None:
 def test_distributions_have_lines_and_histograms() -> None:
     forecasts = make_forecasts()
     table = make_distributions(forecasts)
-    crps, coverage, pit = draw_distributions(table, forecasts.table).axes
+    crps, coverage, pit = draw_distributions(table, forecasts).axes
     summary = summarize_distributions(table)
     shown = {"population_ar": "population_ar", "fixed_ar": "fixed_ar", "policy": "policy_sampled"}
     for axes, column in ((crps, "crps_speed"), (coverage, "coverage")):
@@ -195,7 +199,7 @@ def test_distributions_have_lines_and_histograms() -> None:
         for method, name in shown.items():
             rows = summary[summary["method"] == method].sort_values("horizon_s")
             np.testing.assert_allclose(lines[colour_of(name)].get_ydata(), rows[column])
-    centre = centre_errors(forecasts.table)["crps_speed"]
+    centre = centre_errors(forecasts)["crps_speed"]
     np.testing.assert_allclose(drawn_lines(crps)[colour_of("policy")].get_ydata(), centre)
     assert pit.get_ylabel() == "density, 2 s ahead"
     here = table[table["horizon_s"] == 2.0]
