@@ -19,6 +19,7 @@ from cfx.core.errors import DataError, PluginError, listed, nearest
 from cfx.core.files import absolute
 from cfx.core.memory import give_back
 from cfx.core.storage import is_url, local_copies
+from cfx.data.accelerations import Accelerations, with_usable_accelerations
 from cfx.data.files import FileStart, recording_of, stem
 from cfx.data.kinematics import Check, check_kinematics
 from cfx.data.pairs import SIGNALS, Dropped, Pair, PairSet
@@ -112,6 +113,11 @@ class FileDatasetSettings(DatasetSettings):
     path: FilePaths = Field(
         description="the file to read, a list of files, or a pattern such as 'i-80/*.txt';"
         " ~, relative paths and URLs such as s3://bucket/file work"
+    )
+    accelerations: Accelerations = Field(
+        "smooth",
+        description="smooth: for accelerations that are mostly noise stands the average of their"
+        " past that tells best how the speed goes on; recorded: all as recorded",
     )
 
     def files(self) -> list[Path]:
@@ -245,6 +251,8 @@ class Dataset(Component):
                 )
         selected = _select_first(_select_long(pairs, self.settings.min_frames), self.settings)
         check_kinematics(selected, self.settings.check)
+        if isinstance(self.settings, FileDatasetSettings):
+            selected = with_usable_accelerations(selected, self.settings.accelerations)
         return scaled(selected, self.settings.scale)
 
     def _check(self, pairs: Any) -> None:

@@ -362,10 +362,10 @@ def test_boundary_artefacts_are_said_until_they_are_left_out(
     rows.loc[rows.Frame_ID < 40, "v_Acc"] = 4.5
     smoothed = save(rows, tmp_path / "smoothed.csv")
     with caplog.at_level("INFO"):
-        NgsimDataset(path=straight, min_frames=2).load()
-        NgsimDataset(path=smoothed, min_frames=2, trim=3).load()
+        NgsimDataset(path=straight, min_frames=2, accelerations="recorded").load()
+        NgsimDataset(path=smoothed, min_frames=2, trim=3, accelerations="recorded").load()
         assert not caplog.messages
-        NgsimDataset(path=smoothed, min_frames=2, check="off").load()
+        NgsimDataset(path=smoothed, min_frames=2, check="off", accelerations="recorded").load()
     assert len(caplog.messages) == 1
     assert "accelerate by +1.4 and +0.2 m/s2 on average (+0.2 between)" in caplog.messages[0]
     assert "data.trim=3" in describe(smoothed)
