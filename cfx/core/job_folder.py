@@ -99,6 +99,16 @@ def parse_yaml(text: str) -> Any:
     return values
 
 
+def unreadable(path: Path, error: Exception) -> DataError:
+    """Returns the error that a file of a job cannot be read, with the first line of the reason."""
+    reason = type(error).__name__
+    for line in str(error).splitlines():
+        if line.strip():
+            reason = line.strip()
+            break
+    return DataError(f"{path} cannot be read ({reason}); run the job again, or leave it out")
+
+
 class _PlainLoader(yaml.SafeLoader):
     """YAML's safe loader; an alias, with which a short text can mean a huge one, is an error."""
 

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from cfx.core.errors import DataError
-from cfx.core.job_folder import parse_json, parse_yaml
-from cfx.results.table import unreadable
+from cfx.core.job_folder import parse_json, parse_yaml, unreadable
 
 T = TypeVar("T")
 

@@ -21,6 +21,7 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 
+import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -28,6 +29,7 @@ import pyarrow.parquet as pq
 from cfx.core import registry
 from cfx.core.component import Component
 from cfx.core.errors import DataError, PluginError
+from cfx.core.job_folder import unreadable
 from cfx.core.memory import in_units, total_memory
 
 if TYPE_CHECKING:
@@ -54,7 +56,7 @@ class Column:
             is a column for each, and none must be there.
         unit: "" for texts, "1" for numbers without a unit.
         meaning: what it says, in a few words.
-        dtype: how it is written; a table that is read back has floats for all numbers.
+        dtype: how it is written.
         required: a file without it is damaged.
     """
 
@@ -109,7 +111,8 @@ class ResultTable(Component):
         suffix: of its file, `.parquet` or `.csv`.
         order: its place among the tables of a job; smaller numbers come first.
         always: every job leaves it, whatever its protocol; a report says where it is missing.
-        tracked: MLflow keeps it too.
+        tracked: how MLflow keeps it too: as a `file`; as a `table` that its pages show besides; or
+            not at all, "".
         large: a job that writes it keeps it nowhere else: it may be more than fits into memory, and
             figures do not see it.
     """
@@ -120,7 +123,7 @@ class ResultTable(Component):
     suffix: ClassVar[Literal[".parquet", ".csv"]] = ".parquet"
     order: ClassVar[int] = 1000
     always: ClassVar[bool] = False
-    tracked: ClassVar[bool] = True
+    tracked: ClassVar[Literal["file", "table", ""]] = "file"
     large: ClassVar[bool] = False
 
     def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
@@ -208,12 +211,15 @@ class InstalledTable:
                 writer.write_table(rows)
 
     def read(self, path: Path) -> pd.DataFrame:
-        """Reads it back: its texts as texts, all other columns as floats.
+        """Reads it back: its texts as texts, all other columns as numbers.
+
+        Those are floats but for columns of whole numbers that hold nothing else.
 
         Raises:
             DataError: the file cannot be read, or holds something else.
         """
         texts = [column.name for column in self.table.columns if column.dtype == "text"]
+        whole = {column.name for column in self.table.columns if column.dtype == "int"}
         table = _load(path, texts)
         for column in self.table.columns:
             if column.required and not column.stands_for_several and column.name not in table:
@@ -221,6 +227,8 @@ class InstalledTable:
         for name in table.columns.astype(str):
             if name in texts:
                 table[name] = table[name].astype(str).astype(object)
+                continue
+            if name in whole and table[name].dtype == np.int64:
                 continue
             try:
                 table[name] = table[name].astype(float)
@@ -298,15 +306,19 @@ def metrics_table(
     return table
 
 
-def read_tables(folder: Path) -> dict[str, pd.DataFrame]:
+def read_tables(folder: Path, *names: str) -> dict[str, pd.DataFrame]:
     """Reads the tables of a finished job's folder, by name; those that are not there are left out.
+
+    Args:
+        folder: of the job.
+        names: of the tables; all installed ones if left out.
 
     Raises:
         DataError: a file cannot be read, or is not what a job writes.
     """
     found = {}
     for one in installed():
-        if (folder / one.file).exists():
+        if (not names or one.name in names) and (folder / one.file).exists():
             found[one.name] = one.read(folder / one.file)
     return found
 
@@ -337,13 +349,3 @@ def _check_memory(path: Path) -> None:
             f"{path} holds a table of {in_units(needed)}, more than this machine's memory; no job"
             " writes so much"
         )
-
-
-def unreadable(path: Path, error: Exception) -> DataError:
-    """Returns the error that a file of a job cannot be read, with the first line of the reason."""
-    reason = type(error).__name__
-    for line in str(error).splitlines():
-        if line.strip():
-            reason = line.strip()
-            break
-    return DataError(f"{path} cannot be read ({reason}); run the job again, or leave it out")

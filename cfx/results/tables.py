@@ -29,6 +29,7 @@ class Pairs(ResultTable):
 
     meaning = "a row per pair and method"
     suffix = ".csv"
+    tracked = "table"
     order = 10
     always = True
     columns = (
@@ -175,7 +176,7 @@ class Labels(ResultTable):
 
     meaning = "per-window calibrated parameters (labels), with their loss and sensitivity"
     order = 60
-    tracked = False
+    tracked = ""
     columns = (
         PAIR,
         Column("window", "1", "number of the window, from 0", "int", required=False),

@@ -12,7 +12,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 from urllib.parse import quote, urlencode
@@ -23,13 +23,14 @@ import pandas as pd
 from cfx.core.errors import CfxError, TrackingError
 from cfx.data.pairs import SIGNALS, PairSet
 from cfx.evaluation.headline import RESULT, headline
-from cfx.evaluation.result import Evaluation, Purpose
+from cfx.evaluation.result import Purpose
 from cfx.learners.curves import over_networks
 from cfx.results import provenance
 from cfx.results.store import Store, open_store, tracking_uri, translate_errors
 
 if TYPE_CHECKING:
     from cfx.results.config import JobConfig
+    from cfx.results.table import Findings, WrittenTable
 
 log = logging.getLogger(__name__)
 
@@ -43,10 +44,24 @@ _DATASET_NAME = 500  # MLflow's limit for a dataset's name
 _EXAMPLE_FRAMES = 50
 """Frames of a model's input example."""
 
-_ROWS_AT_ONCE = 20_000
-"""Rows of a table that are text at once, while it is written."""
-
 _SERVED = Path(__file__).with_name("served_policy.py")
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What a job has written.
+
+    Attributes:
+        folder: of the job, with its policy in `policy/`.
+        tables: those that it has.
+        figures: image files.
+        files: others.
+    """
+
+    folder: Path
+    tables: Sequence[WrittenTable]
+    figures: Sequence[Path]
+    files: Sequence[Path]
 
 
 class Tracker:
@@ -112,49 +127,16 @@ class Tracker:
     def set_tags(self, tags: Mapping[str, str]) -> None:
         """Adds tags to the run."""
 
-    def log_metrics(self, metrics: Mapping[str, float]) -> None:
-        """Logs further metrics."""
-
-    def log_results(self, evaluation: Evaluation, metrics: Mapping[str, float]) -> None:
-        """Logs the metrics of a job, its headline, and the table of all pairs."""
-
-    def log_data(self, pairs: PairSet, name: str) -> None:
-        """Logs which recordings the job used, as MLflow's dataset of the run."""
-
-    def describe(self, text: str) -> None:
-        """Gives the run its description, Markdown."""
-
-    def log_curves(self, curves: pd.DataFrame) -> None:
-        """Logs `train_loss` and `validation_loss`, means over the networks, by epoch.
-
-        At most `CURVE_POINTS` of each are logged.
+    def log_job(
+        self, findings: Findings, metrics: Mapping[str, float], kept: Kept, description: str
+    ) -> None:
+        """Logs what a job has found and written.
 
         Args:
-            curves: columns `network`, `epoch`, `train_loss`, `validation_loss`; may be empty.
-        """
-
-    def log_table(self, table: pd.DataFrame, name: str) -> None:
-        """Logs a table that MLflow's pages show as one; one of the same name is replaced.
-
-        Args:
-            name: ends in `.json`.
-        """
-
-    def log_figures(self, paths: Sequence[Path]) -> None:
-        """Logs image files under `figures/`."""
-
-    def log_files(self, paths: Sequence[Path]) -> None:
-        """Logs files at the top of the run's artifacts."""
-
-    def log_policy(self, folder: Path, example: PairSet | None = None) -> None:
-        """Logs a saved policy as a model.
-
-        `mlflow.pyfunc.load_model(tracker.model_uri).predict(frame)` uses it.
-
-        Args:
-            folder: what `Agent.save` wrote.
-            example: pairs of which a few seconds show what the model takes; with them the model has
-                a signature and an input example.
+            findings: of the job.
+            metrics: of the job.
+            kept: what it has written.
+            description: what the run's page says of it, Markdown.
         """
 
     def how_to_open(self) -> tuple[str, ...]:
@@ -179,6 +161,7 @@ class MlflowTracker(Tracker):
         sweep: str | None,
         parent_id: str | None,
         plugins: Mapping[str, str],
+        data: str,
     ) -> None:
         self.store = store
         self.run_id = run_id
@@ -190,7 +173,7 @@ class MlflowTracker(Tracker):
         self._parent_id = parent_id
         self._plugins = plugins
         self._model_name = re.sub(r"[^\w -]", "-", name) or "policy"
-        self._tables: list[dict[str, str]] = []
+        self._data = data
 
     @classmethod
     @contextmanager
@@ -241,7 +224,8 @@ class MlflowTracker(Tracker):
             run_id = _begin(store, run_name, known, every)
             if sweep is not None:
                 _replace_earlier(store, run_id, every)
-        tracker = cls(store, run_id, run_name, sweep, parent_id, plugins or {})
+        data = (tags or {}).get("data", "")
+        tracker = cls(store, run_id, run_name, sweep, parent_id, plugins or {}, data)
         try:
             yield tracker
         except BaseException as error:
@@ -253,22 +237,33 @@ class MlflowTracker(Tracker):
         with translate_errors("log tags"):
             self.store.client.log_batch(self.run_id, tags=_tags(tags))
 
-    def log_metrics(self, metrics: Mapping[str, float]) -> None:
-        points = []
-        for name, value in metrics.items():
-            points.append((name, value, 0))
-        self._log_metrics(points)
-
-    def log_results(self, evaluation: Evaluation, metrics: Mapping[str, float]) -> None:
+    def log_job(
+        self, findings: Findings, metrics: Mapping[str, float], kept: Kept, description: str
+    ) -> None:
         values, result = headline(metrics)
-        tags = {RESULT: result}
-        if evaluation.purpose is Purpose.CALIBRATION:
-            tags["learner"] = "none"
         self.log_metrics({**values, **metrics})
+        tags = {RESULT: result, "mlflow.note.content": description}
+        if findings.evaluation.purpose is Purpose.CALIBRATION:
+            tags["learner"] = "none"
         self.set_tags(tags)
-        self.log_table(evaluation.table, "pairs.json")
+        self.log_data(findings.pairs)
+        self.log_curves(findings.protocol_result.curves)
+        self.log_files(kept.figures, "figures")
+        self.log_policy(kept.folder / "policy", findings.pairs)
+        files = list(kept.files)
+        for table in kept.tables:
+            if table.about.table.tracked:
+                files.append(kept.folder / table.about.file)
+            if table.about.table.tracked == "table" and table.rows is not None:
+                self.log_table(table.rows, f"{table.about.name}.json")
+        self.log_files(files)
 
-    def log_data(self, pairs: PairSet, name: str) -> None:
+    def log_metrics(self, metrics: Mapping[str, float]) -> None:
+        """Logs metrics without steps."""
+        self._log_metrics([(name, value, 0) for name, value in metrics.items()])
+
+    def log_data(self, pairs: PairSet) -> None:
+        """Logs which recordings the job used, as MLflow's dataset of the run."""
         from mlflow.entities import Dataset, DatasetInput, InputTag
 
         profile = {
@@ -279,7 +274,7 @@ class MlflowTracker(Tracker):
             "fingerprint": pairs.fingerprint,
         }
         dataset = Dataset(
-            name=_dataset_name(name, Path(pairs.source).name),
+            name=_dataset_name(self._data, Path(pairs.source).name),
             digest=pairs.fingerprint[:8],
             source_type="local",
             source=json.dumps({"uri": pairs.source}),
@@ -289,10 +284,14 @@ class MlflowTracker(Tracker):
         with translate_errors("log the dataset"):
             self.store.client.log_inputs(self.run_id, [DatasetInput(dataset, tags)])
 
-    def describe(self, text: str) -> None:
-        self.set_tags({"mlflow.note.content": text})
-
     def log_curves(self, curves: pd.DataFrame) -> None:
+        """Logs `train_loss` and `validation_loss`, means over the networks, by epoch.
+
+        At most `CURVE_POINTS` of each are logged.
+
+        Args:
+            curves: columns `network`, `epoch`, `train_loss`, `validation_loss`; may be empty.
+        """
         points = []
         for column in ("train_loss", "validation_loss") if len(curves) else ():
             means = over_networks(curves, column).mean(axis=1)
@@ -304,28 +303,39 @@ class MlflowTracker(Tracker):
         self._log_metrics(points)
 
     def log_table(self, table: pd.DataFrame, name: str) -> None:
-        # MLflow's own log_table reads back and appends to a table that is there, and stumbles over
-        # pandas 3's strings.
-        entry = {"path": name, "type": "table"}
-        if entry not in self._tables:
-            self._tables.append(entry)
-        with translate_errors(f"log the table {name}"), tempfile.TemporaryDirectory() as folder:
-            _write_table(table, Path(folder) / name)
-            self.store.client.log_artifact(self.run_id, str(Path(folder) / name))
-            self.store.client.set_tag(
-                self.run_id, "mlflow.loggedArtifacts", json.dumps(self._tables)
-            )
+        """Logs a table that MLflow's pages show as one; one of the same name is replaced.
 
-    def log_figures(self, paths: Sequence[Path]) -> None:
-        self._log_artifacts(paths, "figures")
+        Args:
+            name: ends in `.json`.
+        """
+        client = self.store.client
+        with translate_errors(f"log the table {name}"):
+            if name in {file.path for file in client.list_artifacts(self.run_id)}:
+                # MLflow would append the rows to those of a job that was broken off.
+                text = table.to_json(orient="split", index=False)
+                client.log_text(self.run_id, text, name)
+            else:
+                client.log_table(self.run_id, table, name)
 
-    def log_files(self, paths: Sequence[Path]) -> None:
-        self._log_artifacts(paths, None)
+    def log_files(self, paths: Sequence[Path], place: str | None = None) -> None:
+        """Logs files at the top of the run's artifacts, or in a folder there."""
+        for path in paths:
+            with translate_errors(f"log {path}"):
+                self.store.client.log_artifact(self.run_id, str(path), place)
 
     def log_policy(self, folder: Path, example: PairSet | None = None) -> None:
+        """Logs a saved policy as a model.
+
+        `mlflow.pyfunc.load_model(tracker.model_uri).predict(frame)` uses it.
+
+        Args:
+            folder: what `Agent.save` wrote.
+            example: pairs of which a few seconds show what the model takes; with them the model has
+                a signature and an input example.
+        """
         if not folder.is_dir():
             raise TrackingError(f"{folder} holds no policy to log")
-        self._log_artifacts(sorted(folder.iterdir()), "policy")
+        self.log_files(sorted(folder.iterdir()), "policy")
         with (
             translate_errors("log the policy as a model"),
             tempfile.TemporaryDirectory() as temporary,
@@ -380,11 +390,6 @@ class MlflowTracker(Tracker):
             for first in range(0, len(metrics), 1000):  # MLflow's limit for a batch
                 self.store.client.log_batch(self.run_id, metrics=metrics[first : first + 1000])
 
-    def _log_artifacts(self, paths: Sequence[Path], place: str | None) -> None:
-        for path in paths:
-            with translate_errors(f"log {path}"):
-                self.store.client.log_artifact(self.run_id, str(path), place)
-
     def _end_badly(self, error: BaseException) -> None:
         """Closes the run after an error.
 
@@ -408,18 +413,6 @@ class MlflowTracker(Tracker):
             if self._parent_id is not None and self._sweep is not None:
                 with self.store.locked():
                     _settle(self.store, self._parent_id, _safe(self._sweep))
-
-
-def _write_table(table: pd.DataFrame, path: Path) -> None:
-    """Writes a table as MLflow's pages read it: JSON, as pandas' `orient="split"`."""
-    with path.open("w", encoding="utf-8") as file:
-        file.write(f'{{"columns":{json.dumps([str(name) for name in table.columns])},"data":[')
-        for start in range(0, len(table), _ROWS_AT_ONCE):
-            rows = table.iloc[start : start + _ROWS_AT_ONCE]
-            text = rows.to_json(orient="values", date_format="iso")
-            file.write("," if start else "")
-            file.write(text[1:-1])
-        file.write("]}")
 
 
 def _run_name(config: JobConfig, names: Mapping[str, str]) -> str:

@@ -8,7 +8,7 @@ import logging
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,6 +22,7 @@ from cfx.calibration.windows import WindowSettings
 from cfx.core.errors import TrackingError
 from cfx.data.tidy import write_tidy
 from cfx.evaluation.headline import headline
+from cfx.evaluation.protocols.base import ProtocolResult
 from cfx.evaluation.result import Purpose
 from cfx.models.krauss import Krauss
 from cfx.policies import checkpoint
@@ -34,9 +35,11 @@ from cfx.policies.scaler import Scaler
 from cfx.results import provenance
 from cfx.results.config import JobConfig
 from cfx.results.store import download_run, quiet, translate_errors
-from cfx.results.tracker import CURVE_POINTS, MlflowTracker, Tracker, sweep_link
+from cfx.results.table import Findings, InstalledTable, WrittenTable
+from cfx.results.tables import Pairs
+from cfx.results.tracker import CURVE_POINTS, Kept, MlflowTracker, Tracker, sweep_link
 from tests.drives import wavy_pairs
-from tests.made_up import make_curves, make_results
+from tests.made_up import MadeUp, make_curves, make_results
 
 NODE = {
     "data": "synthetic",
@@ -90,6 +93,23 @@ def begin(uri: str, **changes: Any) -> Any:
     return MlflowTracker.run(uri, **(options | changes))
 
 
+def log_job(
+    run: Tracker, made: MadeUp, saved: SimpleNamespace, *files: Path, figures: Sequence[Path] = ()
+) -> None:
+    """Logs made-up results, with a policy that is not theirs."""
+    result = ProtocolResult(made.evaluation, saved.policy, made.curves, None)
+    pairs = InstalledTable("pairs", Pairs(), "cfx-driving")
+    made.evaluation.table.to_csv(saved.folder.parent / pairs.file)
+    run.log_job(
+        Findings(saved.pairs, made.style, result),
+        made.evaluation.metrics(),
+        Kept(
+            saved.folder.parent, [WrittenTable(pairs, made.evaluation.table)], figures, list(files)
+        ),
+        "**What** it is.",
+    )
+
+
 def table_of(client: Any, run_id: str) -> pd.DataFrame:
     """Reads the logged table as MLflow's `load_table` does, but from this client's store."""
     return pd.read_json(client.download_artifacts(run_id, "pairs.json"), orient="split")
@@ -105,7 +125,7 @@ def config_of(uri: str | None, **tracking: Any) -> JobConfig:
 
 
 def test_a_job_is_kept_under_the_names_of_the_contract(
-    uri: str, client: Any, tmp_path: Path
+    uri: str, client: Any, tmp_path: Path, saved_policy: SimpleNamespace
 ) -> None:
     results = make_results(pairs=4, frames=20)
     (tmp_path / "metrics.json").write_text("{}")
@@ -113,10 +133,13 @@ def test_a_job_is_kept_under_the_names_of_the_contract(
     with Tracker.open(config_of(uri), tmp_path / "job") as run:
         assert client.get_run(run.run_id).info.status == "RUNNING"
         run.set_tags({"dataset.fingerprint": "f" * 64})
-        run.log_results(results.evaluation, results.evaluation.metrics())
-        run.log_curves(results.curves)
-        run.log_figures([tmp_path / "drives.png"])
-        run.log_files([tmp_path / "metrics.json"])
+        log_job(
+            run,
+            results,
+            saved_policy,
+            tmp_path / "metrics.json",
+            figures=[tmp_path / "drives.png"],
+        )
     kept = client.get_run(run.run_id)
     assert kept.info.status == "FINISHED"
     assert kept.info.run_name == "krauss-gru-random-synthetic"
@@ -139,20 +162,24 @@ def test_a_job_is_kept_under_the_names_of_the_contract(
     assert {file.path for file in client.list_artifacts(run.run_id)} == {
         "figures",
         "metrics.json",
+        "pairs.csv",
         "pairs.json",
+        "policy",
     }
     table = table_of(client, run.run_id)
     assert len(table) == 12
     assert table["rmse_speed"].to_numpy() == pytest.approx(
         results.evaluation.table["rmse_speed"].to_numpy()
     )
-    assert json.loads(tags["mlflow.loggedArtifacts"]) == [{"path": "pairs.json", "type": "table"}]
+    assert tags["mlflow.note.content"] == "**What** it is."
+    (one,) = kept.inputs.dataset_inputs
+    assert one.dataset.digest == saved_policy.pairs.fingerprint[:8]
+    assert json.loads(one.dataset.profile)["pairs"] == 2
 
 
 def test_undefined_metrics_are_kept_as_such(uri: str, client: Any) -> None:
-    results = make_results(pairs=1, frames=20)
     with begin(uri) as run:
-        run.log_results(results.evaluation, results.evaluation.metrics())
+        run.log_metrics({"rmse_improvement/p_value": float("nan")})
     assert np.isnan(client.get_run(run.run_id).data.metrics["rmse_improvement/p_value"])
 
 
@@ -168,17 +195,13 @@ def test_a_store_is_made_beside_the_outputs(tmp_path: Path) -> None:
     assert f"runs/{run.run_id}?" in line
 
 
-def test_tracking_can_be_off(tmp_path: Path) -> None:
-    results = make_results(pairs=1, frames=10)
+def test_tracking_can_be_off(tmp_path: Path, saved_policy: SimpleNamespace) -> None:
+    before = names_in(tmp_path)
     with Tracker.open(config_of("nonsense", enabled=False), tmp_path) as run:
         run.set_tags({"a": "b"})
-        run.log_results(results.evaluation, results.evaluation.metrics())
-        run.log_curves(results.curves)
-        run.log_table(results.evaluation.table, "pairs.json")
-        run.log_figures([])
-        run.log_files([])
-        run.log_policy(tmp_path)
-    assert (run.run_id, run.how_to_open(), names_in(tmp_path)) == ("", (), [])
+        log_job(run, make_results(pairs=1, frames=10), saved_policy)
+    assert (run.run_id, run.how_to_open()) == ("", ())
+    assert names_in(tmp_path) == sorted([*before, "pairs.csv"])
 
 
 @pytest.mark.parametrize(
@@ -469,9 +492,7 @@ def test_nothing_is_printed_and_nothing_global_changes(
     state = (root.handlers[:], root.level, ours.level, dict(os.environ))
     results = make_results(pairs=2, frames=10)
     with begin(f"sqlite:///{tmp_path}/fresh.db") as run:
-        run.log_results(results.evaluation, results.evaluation.metrics())
-        run.log_curves(results.curves)
-        run.log_policy(saved_policy.folder, saved_policy.pairs)
+        log_job(run, results, saved_policy)
     assert tuple(capfd.readouterr()) == ("", "")
     assert (root.handlers[:], root.level, ours.level, dict(os.environ)) == state
     assert mlflow.get_tracking_uri() == before
@@ -483,7 +504,7 @@ def test_what_mlflow_refuses_is_one_sentence(uri: str) -> None:
         pytest.raises(TrackingError, match=r"^MLflow could not log .*missing\.png: .*$") as caught,
         begin(uri) as run,
     ):
-        run.log_figures([Path("missing.png")])
+        run.log_files([Path("missing.png")])
     assert "\n" not in str(caught.value)
     with pytest.raises(TrackingError, match="holds no policy"), begin(uri) as run:
         run.log_policy(Path("missing"))
@@ -568,27 +589,13 @@ def test_flatten() -> None:
     }  # fmt: skip
 
 
-def test_the_recordings_and_a_description_are_the_runs(
+def test_a_calibration_logs_no_improvement(
     uri: str, client: Any, saved_policy: SimpleNamespace
 ) -> None:
-    pairs = saved_policy.pairs
+    made = make_results(pairs=2, frames=10, methods=("default", "population", "fixed"))
+    evaluation = dataclasses.replace(made.evaluation, purpose=Purpose.CALIBRATION)
     with begin(uri) as run:
-        run.log_data(pairs, "tidy")
-        run.describe("**What** it is.")
-    kept = client.get_run(run.run_id)
-    (one,) = kept.inputs.dataset_inputs
-    assert one.dataset.digest == pairs.fingerprint[:8]
-    assert json.loads(one.dataset.profile)["pairs"] == 2
-    assert kept.data.tags["mlflow.note.content"] == "**What** it is."
-
-
-def test_a_calibration_logs_no_improvement(uri: str, client: Any) -> None:
-    results = make_results(pairs=2, frames=10, methods=("default", "population", "fixed"))
-    with begin(uri) as run:
-        run.log_results(
-            dataclasses.replace(results.evaluation, purpose=Purpose.CALIBRATION),
-            results.evaluation.metrics(),
-        )
+        log_job(run, dataclasses.replace(made, evaluation=evaluation), saved_policy)
     kept = client.get_run(run.run_id).data
     assert not [name for name in kept.metrics if "improvement" in name]
     assert kept.tags["result"].startswith("calibration; driver-specific")

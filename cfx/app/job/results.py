@@ -17,6 +17,7 @@ from cfx.policies.agent import Agent
 from cfx.policies.ready import is_ready_made
 from cfx.report.files import read_metrics
 from cfx.results.store import folder_of
+from cfx.results.table import read_tables
 
 
 @dataclass(frozen=True, repr=False)
@@ -68,18 +69,16 @@ def load(folder_or_run: str | Path) -> JobResult:
     """
     folder = folder_of(folder_or_run)
     examine(folder)
-    try:
-        if not (folder / "metrics.json").is_file():
-            raise FileNotFoundError("it has no metrics.json")
-        pairs = pd.DataFrame()  # no recording, and nothing of one, comes with a ready-made policy
-        if not is_ready_made(folder_or_run):
-            names = {"leader_id": str, "follower_id": str}
-            pairs = pd.read_csv(folder / "pairs.csv", dtype=names)
-    except (OSError, ValueError, KeyError) as error:
-        raise DataError(
-            f"{folder} holds no finished job ({error}); give the output folder that a job printed"
-        ) from error
+    # No recording, and nothing of one, comes with a ready-made policy.
+    needed = ["metrics.json"] if is_ready_made(folder_or_run) else ["metrics.json", "pairs.csv"]
+    for name in needed:
+        if not (folder / name).is_file():
+            raise DataError(
+                f"{folder} holds no finished job (it has no {name}); give the output folder that a"
+                " job printed"
+            )
     metrics = read_metrics(folder / "metrics.json")
+    pairs = read_tables(folder, "pairs").get("pairs", pd.DataFrame())
     figures = tuple(sorted((folder / "figures").glob("*.*")))
     policy = checkpoint.load(folder / "policy")
     return JobResult(metrics, pairs, policy, figures, folder)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 
@@ -31,9 +30,7 @@ from cfx.evaluation.result import Purpose
 from cfx.policies import checkpoint
 from cfx.results.config import JobConfig
 from cfx.results.table import Findings, WrittenTable
-
-if TYPE_CHECKING:
-    from cfx.results.tracker import Tracker
+from cfx.results.tracker import Kept, Tracker
 
 log = logging.getLogger(__name__)
 
@@ -179,12 +176,11 @@ def keep(
     pairs, protocol_result = findings.pairs, findings.protocol_result
     evaluation = protocol_result.evaluation
     output.replace(config)
-    policy_folder = output.folder / "policy"
     tables = files.write_tables(output, findings)
     metrics = evaluation.metrics() | dict(protocol_result.calibration)
     for table in tables:
         metrics |= table.about.metrics(findings)
-    output.run(lambda: checkpoint.save(protocol_result.policy, policy_folder))
+    output.run(lambda: checkpoint.save(protocol_result.policy, output.folder / "policy"))
     rows = {table.about.name: table.rows for table in tables if table.rows is not None}
     figures = files.write_figures(output, config, findings, rows, metrics)
     shown: list[Path] = []
@@ -199,17 +195,9 @@ def keep(
     # Before MLflow, so that no failure there loses it.
     files.write_metrics(output, metrics)
 
-    tracker.log_results(evaluation, metrics)
-    tracker.log_data(pairs, str(config.data["name"]))
-    tracker.describe(described(config, findings, metrics))
-    tracker.log_curves(protocol_result.curves)
-    tracker.log_figures(figures)
-    tracker.log_policy(policy_folder, pairs)
-    tracked = [*files.TRACKED]
-    for table in tables:
-        if table.about.table.tracked:
-            tracked.append(table.about.file)
-    tracker.log_files([output.folder / name for name in tracked] + shown)
+    others = [output.folder / name for name in files.TRACKED] + shown
+    kept = Kept(output.folder, tables, figures, others)
+    tracker.log_job(findings, metrics, kept, described(config, findings, metrics))
     result = JobResult(
         metrics,
         evaluation.table,

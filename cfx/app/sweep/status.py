@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Self
 
+from cfx.core.errors import DataError
 from cfx.core.files import write_json
 
 STATUS = "outcome.json"
@@ -67,17 +68,13 @@ class JobStatus:
 
 def metrics_of(folder: Path) -> dict[str, float]:
     """Returns the finite metrics of a finished job; empty if there are none."""
+    from cfx.report.files import read_metrics
+
     try:
-        values = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        found = read_metrics(folder / "metrics.json")
+    except DataError:
         return {}
-    if not isinstance(values, dict):
-        return {}
-    finite = {}
-    for name, value in values.items():
-        if isinstance(value, int | float) and math.isfinite(value):
-            finite[name] = float(value)
-    return finite
+    return {name: value for name, value in found.items() if math.isfinite(value)}
 
 
 def worst(*codes: int) -> int:

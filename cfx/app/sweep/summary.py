@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cfx.app.sweep.status import JobStatus, metrics_of
 from cfx.core.console import blank_table
+from cfx.core.errors import DataError
 from cfx.core.files import atomic_write
 from cfx.evaluation.headline import main_comparison, ratio_of_means
 
 if TYPE_CHECKING:
     from rich.table import Table
+
+    from cfx.evaluation.metrics.base import MetricInfo
 
 SUMMARY = "summary.csv"
 """Says in a sweep's folder what came of it."""
@@ -28,38 +30,25 @@ _SHOWN = ("default", "fixed", "policy")
 _AFTER_OVERRIDES = "improvement_over"
 
 
-@dataclass(frozen=True)
-class MetricColumn:
-    """A metric of the policy in the table of a sweep.
-
-    Attributes:
-        metric: its name.
-        title: its heading, with the unit.
-        headline: it is printed, and not only written into `summary.csv`.
-    """
-
-    metric: str
-    title: str
-    headline: bool
-
-    @property
-    def name(self) -> str:
-        """The column of `summary.csv`."""
-        return f"{self.metric}_policy"
-
-
-def metric_columns(folders: Sequence[Path]) -> list[MetricColumn]:
+def metric_columns(folders: Sequence[Path]) -> list[MetricInfo]:
     """Returns the metrics that any of these jobs has measured, besides the RMSE of speed."""
-    found: dict[str, MetricColumn] = {}
+    from cfx.report.files import optional, read_json, read_metrics
+    from cfx.report.metrics import known_metrics
+
+    found: dict[str, MetricInfo] = {}
     for folder in folders:
-        for info in _metrics_said(folder):
-            name, unit = str(info["name"]), str(info.get("unit", ""))
-            title = str(info.get("heading", name))
-            if unit:
-                title = f"{title} [{unit}]"
-            if name != "rmse_speed":
-                found.setdefault(name, MetricColumn(name, title, bool(info.get("headline"))))
+        with suppress(DataError):  # a job that failed, or whose files are damaged, adds none
+            data = optional(folder / "data.json", read_json) or {}
+            metrics = optional(folder / "metrics.json", read_metrics) or {}
+            for one in known_metrics(data, metrics):
+                if one.name != "rmse_speed":
+                    found.setdefault(one.name, one)
     return list(found.values())
+
+
+def _column(metric: MetricInfo) -> str:
+    """Returns the column of `summary.csv` with a metric of the policy."""
+    return f"{metric.name}_policy"
 
 
 def rows(statuses: Mapping[Path, JobStatus]) -> list[dict[str, Any]]:
@@ -83,7 +72,7 @@ def rows(statuses: Mapping[Path, JobStatus]) -> list[dict[str, Any]]:
         for method in _METHODS:
             row[f"rmse_speed_{method}"] = found.get(f"rmse_speed/{method}")
         for column in columns:
-            row[column.name] = found.get(f"{column.metric}/policy")
+            row[_column(column)] = found.get(f"{column.name}/policy")
         row["seconds"] = round(status.seconds, 1)
         row["state"] = status.state
         row["message"] = status.message
@@ -99,9 +88,7 @@ def write_summary(path: Path, table: Sequence[Mapping[str, Any]]) -> None:
         writer.writerows(table)
 
 
-def summary_table(
-    table: Sequence[Mapping[str, Any]], columns: Sequence[MetricColumn] = ()
-) -> Table:
+def summary_table(table: Sequence[Mapping[str, Any]], columns: Sequence[MetricInfo] = ()) -> Table:
     """Returns `rows` as a rich table.
 
     Args:
@@ -120,7 +107,8 @@ def summary_table(
     for method in _SHOWN:
         shown.add_column(f"RMSE speed [m/s]\n{method}", justify="right")
     for column in headlines:
-        shown.add_column(f"{column.title}\npolicy", justify="right")
+        title = f"{column.heading} [{column.unit}]" if column.unit else column.heading
+        shown.add_column(f"{title}\npolicy", justify="right")
     shown.add_column("time [s]", justify="right")
     shown.add_column("state")
     for row in table:
@@ -129,7 +117,7 @@ def summary_table(
         for method in _SHOWN:
             cells.append(_number(row[f"rmse_speed_{method}"]))
         for column in headlines:
-            cells.append(_number(row[column.name]))
+            cells.append(_number(row[_column(column)]))
         shown.add_row(*cells, f"{row['seconds']:.1f}", row["state"])
     return shown
 
@@ -152,15 +140,6 @@ def _differing(given: Sequence[Mapping[str, str]]) -> list[str]:
         for key, values in keys.items():
             values.add(one.get(key))
     return [key for key, values in keys.items() if len(values) > 1] or list(keys)
-
-
-def _metrics_said(folder: Path) -> list[Mapping[str, Any]]:
-    """Returns the list `metrics` of a job's `data.json`; empty for a job that left none."""
-    try:
-        said = json.loads((folder / "data.json").read_text(encoding="utf-8"))["metrics"]
-        return [one for one in said if "name" in one]
-    except (OSError, ValueError, KeyError, TypeError):
-        return []
 
 
 def _improvement(found: Mapping[str, float]) -> dict[str, Any]:
