@@ -29,6 +29,8 @@ def complete(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
         ("cfx plugins show mod", {"model"}),
         ("cfx plugins show model kraus", {"krauss", "krauss_sumo"}),
         ("cfx policies show i80-w", {"i80-w99"}),
+        ("cfx policies m", {"make"}),
+        ("cfx policies make --w", {"--work"}),
         ("cfx report outputs/some --tables ", {"latex", "csv"}),
         ("cfx data describe ", set()),  # the shell's own completion of files
         ("cfx nonsense more", set()),

@@ -43,7 +43,8 @@ PROTOCOLS = {
     "cfx.models.speed_limit",
     "cfx.policies.features",
 }
-PUBLIC_MODULES = {"cfx", "cfx.core.errors", *READERS, *REPORTS, *PROTOCOLS} | {
+POLICIES = {"cfx.policies.checkpoint", "cfx.policies.ready", "cfx.policies.valid_range"}
+PUBLIC_MODULES = {"cfx", "cfx.core.errors", *READERS, *REPORTS, *PROTOCOLS, *POLICIES} | {
     kind.base.partition(":")[0] for kind in registry.KINDS.values()
 }
 """What a plugin may import from, and `cfx.contracts`; docs/plugins.md says so."""

@@ -73,14 +73,18 @@ def _run(arguments: Sequence[str]) -> int:
 
 
 def _command(name: str, *arguments: str) -> int:
-    """Runs a sub-command.
+    """Runs a sub-command: `NAME`, or `NAME.ACTION` where that is one of its own.
 
     Raises:
         ConfigError: there is none of that name.
         PluginError: it cannot be loaded, two distributions claim its name, or its code failed.
     """
     from cfx.core import registry
+    from cfx.core.extras import EXTRAS
 
+    action = ".".join((name, *arguments[:1]))
+    if action in registry.names("command") or ("command", action) in EXTRAS:
+        name, arguments = action, arguments[1:]
     if name not in registry.names("command"):
         from cfx.app.user_errors import no_command
 

@@ -41,10 +41,18 @@ def answer(hydra: Callable[[], int]) -> int:
     first, blank, rest = typed.partition(" ")
     commands = registry.names("command")
     if blank and first in commands:
-        print("\n".join(_words_of(first, rest)))
+        action, more, behind = rest.partition(" ")
+        if more and f"{first}.{action}" in commands:
+            print("\n".join(_words_of(f"{first}.{action}", behind)))
+            return 0
+        found = _words_of(first, rest)
+        for name in commands:
+            if not more and name.startswith(f"{first}.{action}"):
+                found.append(name.removeprefix(f"{first}."))
+        print("\n".join(found))
         return 0
     if not blank:
-        own = [name for name in commands if name.startswith(first)]
+        own = [name for name in commands if name.startswith(first) and "." not in name]
         print("\n".join(own))
         if own and first:
             return 0

@@ -169,7 +169,7 @@ def listed_commands() -> str:
                 about = f"{about} (from {distribution})".strip()
         except PluginError as error:  # it cannot be imported, or two distributions bring it
             about = str(error)
-        lines.append(f"  cfx {name:<12} {about}")
+        lines.append(f"  cfx {name.replace('.', ' '):<13} {about}")
     return "\n".join(lines).replace("$", "$$")  # Hydra fills in what follows a $
 
 

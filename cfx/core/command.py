@@ -13,7 +13,8 @@ from cfx.core.component import Component
 class Command(Component):
     """Base of every sub-command.
 
-    Its name on the command line is that of its entry point. `cfx --help` imports cfx's own
+    Its name on the command line is that of its entry point; `NAME.ACTION` is `cfx NAME ACTION`, an
+    action that a distribution adds to another's sub-command. `cfx --help` imports cfx's own
     sub-commands and tab completion the one that is typed, so the module imports nothing heavy:
     what `run` needs, it imports itself.
 

@@ -25,6 +25,7 @@ EXTRAS: dict[tuple[str, str], str] = {
     ("command", "benchmark"): "cfx-benchmark",
     ("command", "drive"): "cfx-sumo",
     ("command", "export"): "cfx-sumo",
+    ("command", "policies.make"): "cfx-benchmark",
     ("demo", "sumo"): "cfx-sumo",
     ("engine", "dask"): "cfx-dask",
     ("experiment", "sumo_demo"): "cfx-sumo",

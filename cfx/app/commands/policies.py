@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from cfx.app.completion import complete_with
 from cfx.core.command import Command
@@ -11,40 +10,26 @@ from cfx.policies import ready
 
 
 class PoliciesCommand(Command):
-    """Lists the ready-made policies, shows a card, or makes one anew."""
+    """Lists the ready-made policies, or shows the card of one."""
 
     summary = "the ready-made policies; the card of one (show)"
 
     def parser(self) -> argparse.ArgumentParser:
         made = argparse.ArgumentParser(
-            "cfx policies", description="Lists the ready-made policies that come with cfx."
+            "cfx policies",
+            description="Lists the ready-made policies that come with cfx.",
+            epilog="cfx policies make, of the distribution cfx-benchmark, trains them anew.",
         )
         actions = made.add_subparsers(dest="action")
         show = actions.add_parser("show", help="the card of a policy: what it knows, and how well")
         name = show.add_argument("name", help="such as i80-idm")
         complete_with(name, lambda _: ready.names())
-        make = actions.add_parser(
-            "make", help="train policies anew and write them into the package"
-        )
-        make.add_argument("names", nargs="*", help="such as i80-idm; all if left out")
-        make.add_argument("--data", type=Path, required=True, help="the recordings, a tidy table")
-        make.add_argument(
-            "--work",
-            type=Path,
-            default=Path("outputs/policies"),
-            help="where jobs run; finished ones are not run again",
-        )
         return made
 
     def run(self, options: argparse.Namespace) -> int:
         if options.action == "show":
             folder = ready.folder_of_ready_made(f"cfx://{options.name}")
             print((folder / "CARD.md").read_text("utf-8"))
-            return 0
-        if options.action == "make":
-            from cfx.app.publish.make import make
-
-            make(options.names, options.data, options.work)
             return 0
         _overview()
         return 0

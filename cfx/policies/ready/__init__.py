@@ -1,7 +1,8 @@
 """Ready-made policies, which come with the package: `cfx://NAME` wherever a job is named.
 
 Each is a folder with a policy, its card (`card.json`, and `CARD.md` for people) and the metrics of
-the job that tested it on unseen drivers (`metrics.json`). `cfx.app.publish` makes them.
+the job that tested it on unseen drivers (`metrics.json`). `cfx policies make`, which comes with the
+distribution cfx-benchmark, makes them.
 """
 
 from __future__ import annotations

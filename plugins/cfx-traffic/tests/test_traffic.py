@@ -14,7 +14,6 @@ from rich.console import Console
 
 import cfx
 from cfx.core.errors import CfxError
-from cfx.data.pairs import PairSet
 from cfx.evaluation.protocols.base import ProtocolResult
 from cfx.results.table import Findings
 from cfx_traffic.summary import TRAFFIC_METHODS
@@ -89,7 +88,7 @@ def test_traffic_stands_in_every_table(result: cfx.JobResult) -> None:
     assert result.evaluation is not None
     console = Console(file=io.StringIO(), width=80)
     findings = Findings(
-        PairSet((), ""),
+        cfx.PairSet((), ""),
         cast(Any, None),
         ProtocolResult(result.evaluation, result.policy, pd.DataFrame(), None),
     )

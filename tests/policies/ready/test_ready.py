@@ -11,16 +11,11 @@ import torch
 import cfx
 from cfx.app import cli
 from cfx.app.job.parts import Parts, complete, make_protocol
-from cfx.app.publish.recipes import RECIPES
 from cfx.core.errors import DataError
 from cfx.policies import checkpoint, ready
 from cfx.policies.features import History
 
 NAMES = ready.names()
-
-
-def test_there_is_one_for_each_recipe() -> None:
-    assert set(NAMES) == set(RECIPES)
 
 
 @pytest.mark.parametrize("name", NAMES)

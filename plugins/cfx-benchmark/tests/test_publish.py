@@ -7,29 +7,34 @@ from pathlib import Path
 
 import pytest
 
-from cfx.app.publish import make as publishing
-from cfx.app.publish.make import card_text, make
 from cfx.core.errors import ConfigError
-from cfx.policies import checkpoint, ready
-from tests.policies.ready.test_ready import NAMES
+from cfx.policies.checkpoint import load, save
+from cfx.policies.ready import FOLDER, card_of, names
+from cfx_benchmark import publish
+from cfx_benchmark.publish import card_text, make
+from cfx_benchmark.recipes import RECIPES
+
+
+def test_there_is_a_recipe_for_each_policy() -> None:
+    assert set(names()) == set(RECIPES)
 
 
 def test_a_finished_job_is_published_without_training(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    name = NAMES[0]
+    name = names()[0]
     job, folder = tmp_path / "work" / name, tmp_path / "ready"
-    published = ready.FOLDER / name
-    agent = checkpoint.load(published / "policy")
-    checkpoint.save(agent, job / "policy")
+    published = FOLDER / name
+    agent = load(published / "policy")
+    save(agent, job / "policy")
     (job / "metrics.json").write_text((published / "metrics.json").read_text())
     (job / "data.json").write_text(json.dumps({"fingerprint": "abc"}))
-    monkeypatch.setattr(publishing, "FOLDER", folder)
-    stress = ready.card_of(name)["stress"]
-    monkeypatch.setattr(publishing, "_stress", lambda _: stress)
+    monkeypatch.setattr(publish, "FOLDER", folder)
+    stress = card_of(name)["stress"]
+    monkeypatch.setattr(publish, "_stress", lambda _: stress)
     make([name], tmp_path / "not-needed.parquet", tmp_path / "work")
     card = json.loads((folder / name / "card.json").read_text())
-    expected = ready.card_of(name)
+    expected = card_of(name)
     for key in ("model", "errors_on_unseen_drivers", "safety", "valid_range", "command"):
         assert card[key] == expected[key]
     assert (folder / name / "CARD.md").read_text() == card_text(card)

@@ -14,13 +14,13 @@ from typing import Any
 
 import torch
 
-from cfx.app.publish.recipes import RECIPES, SHARED_OVERRIDES
 from cfx.core.errors import ConfigError, DataError, nearest
 from cfx.core.files import atomic_write, path_override, write_json
-from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
+from cfx.policies.checkpoint import load, save
 from cfx.policies.ready import FOLDER
 from cfx.policies.valid_range import FADED, SIGNALS
+from cfx_benchmark.recipes import RECIPES, SHARED_OVERRIDES
 
 _TRAINING_DATA = (
     "NGSIM I-80 (U.S. Department of Transportation, public domain), 4:00-4:15 and 5:00-5:15 pm,"
@@ -61,13 +61,13 @@ def publish(name: str, job: Path) -> None:
     Raises:
         DataError: the job has no policy for unseen drivers.
     """
-    agent = checkpoint.load(job / "policy").for_unseen_drivers()
+    agent = load(job / "policy").for_unseen_drivers()
     metrics = json.loads((job / "metrics.json").read_text(encoding="utf-8"))
     data = json.loads((job / "data.json").read_text(encoding="utf-8"))
     folder = FOLDER / name
     if folder.is_dir():
         shutil.rmtree(folder)
-    checkpoint.save(agent, folder / "policy")
+    save(agent, folder / "policy")
     write_json(folder / "metrics.json", metrics)
     card = _card(name, agent, metrics, data)
     card["size_kb"] = _kilobytes(folder)

@@ -1,1 +1,0 @@
-"""Makes ready-made policies of finished jobs, and shows them: `cfx policies`."""
