@@ -159,9 +159,9 @@ def test_platoon_and_history_are_written_and_old_ones_go(tmp_path: Path, present
             evaluation, platoon=make_platoon({"policy": 1}), tables={"history": history}
         )
     written = write_tables(Output(tmp_path), findings(evaluation))
-    further = {one.about.file for one in written if not one.about.table.always}
+    further = {one.file for one in written if not one.about.part.always}
     assert further == {"pair_metrics.parquet", *(names if present else ())}
-    assert {path.name for path in tmp_path.iterdir()} == {one.about.file for one in written}
+    assert {path.name for path in tmp_path.iterdir()} == {one.file for one in written}
     if present:
         assert set(pd.read_parquet(tmp_path / "platoon.parquet")) == {
             "method",

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from cfx.contracts.contract import contract_of
-from cfx.results.table import Column, InstalledTable, ResultTable
+from cfx.results.table import Column, ResultTable
 
 _EXAMPLES = {
     "text": ["NA", "007"],
@@ -39,10 +39,10 @@ def every_column_is_described(table: ResultTable) -> None:
 
 def what_is_written_is_read_back(table: ResultTable) -> None:
     rows = pd.DataFrame({column.name: _EXAMPLES[column.dtype] for column in table.columns})
-    about = InstalledTable("table", table, "")
     with tempfile.TemporaryDirectory() as folder:
-        about.write(Path(folder) / about.file, [rows])
-        read = about.read(Path(folder) / about.file)
+        path = Path(folder) / f"table{table.suffix}"
+        table.write(path, [rows])
+        read = table.read(path)
     for column in table.columns:
         kind = object if column.dtype == "text" else np.float64
         expected = rows[column.name].to_numpy(kind)

@@ -22,7 +22,7 @@ from cfx.report.files import (
     without_password,
 )
 from cfx.report.job import Job, Origin
-from cfx.results.table import installed, read_tables
+from cfx.results.table import file_of, installed, read_tables
 
 
 def read_job(folder: Path, origin: Origin) -> Job:
@@ -44,7 +44,7 @@ def read_job(folder: Path, origin: Origin) -> Job:
         raise DataError(f"{pairs} is missing; run the job again, or leave it out")
     if not {"policy", "fixed"} & set(tables["pairs"]["method"]):
         raise DataError(f"{pairs} is damaged: it has no row of the method 'policy' or 'fixed'")
-    missing = [one for one in installed() if one.table.always and one.name not in tables]
+    missing = [one for one in installed() if one.part.always and one.name not in tables]
     hydra = folder if origin.hydra is None else origin.hydra
     started, seconds = _duration(hydra, origin)
     return Job(
@@ -58,7 +58,7 @@ def read_job(folder: Path, origin: Origin) -> Job:
         started=started,
         seconds=seconds,
         version=_version(data, origin),
-        missing=tuple(one.file for one in missing),
+        missing=tuple(file_of(one) for one in missing),
     )
 
 

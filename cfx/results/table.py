@@ -14,12 +14,12 @@ back. A figure of reports takes it from `Results.tables`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import pandas as pd
@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from cfx.data.style import StyleResult
     from cfx.evaluation.protocols.base import ProtocolResult
     from cfx.evaluation.result import Evaluation
-
-T = TypeVar("T")
 
 _CELL_BYTES = 8
 """At the least."""
@@ -80,16 +78,12 @@ class Findings:
         pairs: of the job.
         style: of its drivers.
         protocol_result: what the protocol has delivered.
-        slices: the loss along each calibrated parameter; None if nothing was calibrated per driver.
-        fits: errors of constant parameters on both parts of each trajectory; None likewise.
         seed: of the job.
     """
 
     pairs: PairSet
     style: StyleResult
     protocol_result: ProtocolResult
-    slices: pd.DataFrame | None = None
-    fits: pd.DataFrame | None = None
     seed: int = 0
 
     @property
@@ -150,55 +144,13 @@ class ResultTable(Component):
         """
         return ()
 
-
-@dataclass(frozen=True)
-class InstalledTable:
-    """A table, and who brings it.
-
-    Attributes:
-        name: of its file without the suffix, and in `Results.tables`.
-        table: what it is.
-        distribution: who brings it.
-    """
-
-    name: str
-    table: ResultTable
-    distribution: str
-
-    @property
-    def file(self) -> str:
-        """The name of its file."""
-        return self.name + self.table.suffix
-
-    def parts(self, findings: Findings) -> Iterator[pd.DataFrame] | None:
-        """Returns its rows, some after the other; None where the job has none.
-
-        Raises:
-            PluginError: the rows lack a column that is declared.
-        """
-        delivered = findings.evaluation.tables.get(self.name)
-        found = self.table.rows(findings) if delivered is None else [delivered]
-        rows = (part for part in found if part is not None)
-        first = self._left_out_if_broken(lambda: self._checked(next(rows, None)), None)
-        return None if first is None else chain([first], rows)
-
-    def metrics(self, findings: Findings) -> Mapping[str, float]:
-        """Returns its metrics."""
-        return self._left_out_if_broken(lambda: self.table.metrics(findings), {})
-
-    def console(
-        self, findings: Findings, metrics: Mapping[str, float]
-    ) -> tuple[RenderableType, ...]:
-        """Returns what the job prints about it."""
-        return self._left_out_if_broken(lambda: tuple(self.table.console(findings, metrics)), ())
-
     def write(self, path: Path, parts: Iterable[pd.DataFrame]) -> None:
-        """Writes its parts, one after the other.
+        """Writes parts of it, one after the other.
 
         Raises:
             OSError: the file cannot be written.
         """
-        if self.table.suffix == ".csv":
+        if self.suffix == ".csv":
             pd.concat(list(parts)).to_csv(path, index=False)
             return
         with ExitStack() as opened:
@@ -218,10 +170,10 @@ class InstalledTable:
         Raises:
             DataError: the file cannot be read, or holds something else.
         """
-        texts = [column.name for column in self.table.columns if column.dtype == "text"]
-        whole = {column.name for column in self.table.columns if column.dtype == "int"}
+        texts = [column.name for column in self.columns if column.dtype == "text"]
+        whole = {column.name for column in self.columns if column.dtype == "int"}
         table = _load(path, texts)
-        for column in self.table.columns:
+        for column in self.columns:
             if column.required and not column.stands_for_several and column.name not in table:
                 raise DataError(f"{path} is damaged: it has no column '{column.name}'")
         for name in table.columns.astype(str):
@@ -239,42 +191,67 @@ class InstalledTable:
                 ) from error
         return table
 
-    def _checked(self, rows: pd.DataFrame | None) -> pd.DataFrame | None:
-        if rows is None:
-            return None
-        for column in self.table.columns:
-            if column.required and not column.stands_for_several and column.name not in rows:
-                raise PluginError(f"it declares the column '{column.name}', its rows have none")
-        return rows
-
-    def _left_out_if_broken(self, work: Callable[[], T], without: T) -> T:
-        """Returns what `work` gives; of another distribution's that fails, a warning and `without`.
-
-        The job has its results.
-        """
-        one = registry.Installed("table", self.name, self.table, self.distribution)
-        return one.attempt(lambda _: work(), without)
-
 
 @dataclass(frozen=True)
 class WrittenTable:
     """A table that a job has written.
 
     Attributes:
-        about: what it is.
+        about: what it is, and who brings it.
         rows: its rows; None if it is `large`.
     """
 
-    about: InstalledTable
+    about: registry.Installed[ResultTable]
     rows: pd.DataFrame | None
 
+    @property
+    def file(self) -> str:
+        """The name of its file."""
+        return file_of(self.about)
 
-def installed() -> tuple[InstalledTable, ...]:
+    def metrics(self, findings: Findings) -> Mapping[str, float]:
+        """Returns its metrics."""
+        return self.about.attempt(lambda table: table.metrics(findings), {})
+
+    def console(
+        self, findings: Findings, metrics: Mapping[str, float]
+    ) -> tuple[RenderableType, ...]:
+        """Returns what the job prints about it."""
+        return self.about.attempt(lambda table: tuple(table.console(findings, metrics)), ())
+
+
+def installed() -> tuple[registry.Installed[ResultTable], ...]:
     """Returns all tables in their order; a broken one of a plugin is left out with a warning."""
-    found = []
-    for one in registry.installed("table"):
-        found.append(InstalledTable(one.name, one.part, one.distribution))
-    return tuple(found)
+    return registry.installed("table")
+
+
+def file_of(one: registry.Installed[ResultTable]) -> str:
+    """Returns the name of a table's file."""
+    return one.name + one.part.suffix
+
+
+def parts_of(
+    one: registry.Installed[ResultTable], findings: Findings
+) -> Iterator[pd.DataFrame] | None:
+    """Returns the rows of a table, some after the other; None where a job has none.
+
+    Raises:
+        PluginError: the rows lack a column that is declared.
+    """
+
+    def begun(table: ResultTable) -> Iterator[pd.DataFrame] | None:
+        delivered = findings.evaluation.tables.get(one.name)
+        found = table.rows(findings) if delivered is None else [delivered]
+        rows = (part for part in found if part is not None)
+        first = next(rows, None)
+        if first is None:
+            return None
+        for column in table.columns:
+            if column.required and not column.stands_for_several and column.name not in first:
+                raise PluginError(f"it declares the column '{column.name}', its rows have none")
+        return chain([first], rows)
+
+    return one.attempt(begun, None)
 
 
 def metrics_table(
@@ -318,8 +295,9 @@ def read_tables(folder: Path, *names: str) -> dict[str, pd.DataFrame]:
     """
     found = {}
     for one in installed():
-        if (not names or one.name in names) and (folder / one.file).exists():
-            found[one.name] = one.read(folder / one.file)
+        path = folder / file_of(one)
+        if (not names or one.name in names) and path.exists():
+            found[one.name] = one.part.read(path)
     return found
 
 

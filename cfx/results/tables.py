@@ -340,9 +340,6 @@ class Slices(ResultTable):
         Column("best_loss", "as of the objective", "the loss with the calibrated parameters"),
     )
 
-    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        return [findings.slices]
-
 
 class Fits(ResultTable):
     """Errors of constant parameters, a row per pair and method."""
@@ -360,9 +357,6 @@ class Fits(ResultTable):
         Column("train_rmse_gap", "m", "on the part that was calibrated on", required=False),
         Column("test_rmse_gap", "m", "on the test part", required=False),
     )
-
-    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        return [findings.fits]
 
 
 def history_metrics(history: pd.DataFrame) -> dict[str, float]:

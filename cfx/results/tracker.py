@@ -252,9 +252,9 @@ class MlflowTracker(Tracker):
         self.log_policy(kept.folder / "policy", findings.pairs)
         files = list(kept.files)
         for table in kept.tables:
-            if table.about.table.tracked:
-                files.append(kept.folder / table.about.file)
-            if table.about.table.tracked == "table" and table.rows is not None:
+            if table.about.part.tracked:
+                files.append(kept.folder / table.file)
+            if table.about.part.tracked == "table" and table.rows is not None:
                 self.log_table(table.rows, f"{table.about.name}.json")
         self.log_files(files)
 

@@ -9,8 +9,17 @@ import pandas as pd
 import pytest
 
 from cfx.contracts import TableContract
+from cfx.core import registry
 from cfx.core.errors import DataError
-from cfx.results.table import Column, Findings, InstalledTable, ResultTable, installed, read_tables
+from cfx.results.table import (
+    Column,
+    Findings,
+    ResultTable,
+    file_of,
+    installed,
+    parts_of,
+    read_tables,
+)
 from cfx.results.tables import History
 from tests.conftest import ROOT
 from tests.made_up import GAINS, make_history, make_results
@@ -18,7 +27,7 @@ from tests.test_job_results import findings as found
 
 
 class TestInstalled(TableContract):
-    @pytest.fixture(params=[one.table for one in installed()], ids=lambda one: type(one).__name__)
+    @pytest.fixture(params=[one.part for one in installed()], ids=lambda one: type(one).__name__)
     def table(self, request: pytest.FixtureRequest) -> ResultTable:
         return request.param
 
@@ -30,8 +39,9 @@ class Census(ResultTable):
     columns = (Column("drivers", "1", "how many", "int"),)
 
 
-def census(table: ResultTable | None = None) -> InstalledTable:
-    return InstalledTable("census", table or Census(), "cfx-census")
+CENSUS: registry.Installed[ResultTable] = registry.Installed(
+    "table", "census", Census(), "cfx-census"
+)
 
 
 def findings(**tables: pd.DataFrame) -> Findings:
@@ -43,16 +53,16 @@ def test_the_list_of_files_says_what_each_table_holds() -> None:
     text = (ROOT / "docs" / "files.md").read_text(encoding="utf-8")
     for one in installed():
         if one.distribution == "cfx-driving":
-            assert f"| `{one.file}` | {one.table.meaning}" in text, one.name
+            assert f"| `{file_of(one)}` | {one.part.meaning}" in text, one.name
 
 
 def test_a_table_that_a_protocol_delivers_is_written_and_read_back(tmp_path: Path) -> None:
-    about = census()
-    assert about.parts(findings()) is None
-    parts = about.parts(findings(census=pd.DataFrame({"drivers": [3]})))
+    assert parts_of(CENSUS, findings()) is None
+    parts = parts_of(CENSUS, findings(census=pd.DataFrame({"drivers": [3]})))
     assert parts is not None
-    about.write(tmp_path / about.file, parts)
-    assert about.read(tmp_path / "census.parquet").to_dict("list") == {"drivers": [3.0]}
+    assert file_of(CENSUS) == "census.parquet"
+    CENSUS.part.write(tmp_path / "census.parquet", parts)
+    assert CENSUS.part.read(tmp_path / "census.parquet").to_dict("list") == {"drivers": [3.0]}
 
 
 def test_the_gain_from_history_has_metrics_under_names_without_spaces() -> None:
@@ -67,15 +77,15 @@ def test_the_gain_from_history_has_metrics_under_names_without_spaces() -> None:
 
 
 def test_a_table_of_others_that_fails_is_left_out(caplog: pytest.LogCaptureFixture) -> None:
-    assert census().parts(findings(census=pd.DataFrame({"heads": [3]}))) is None
+    assert parts_of(CENSUS, findings(census=pd.DataFrame({"heads": [3]}))) is None
     assert "table census of the distribution cfx-census is left out" in caplog.text
     assert "declares the column 'drivers'" in caplog.text
 
 
 def test_an_own_table_that_fails_ends_the_job() -> None:
-    own = dataclasses.replace(census(), distribution="cfx-driving")
+    own = dataclasses.replace(CENSUS, distribution="cfx-driving")
     with pytest.raises(Exception, match="declares the column 'drivers'"):
-        own.parts(findings(census=pd.DataFrame({"heads": [3]})))
+        parts_of(own, findings(census=pd.DataFrame({"heads": [3]})))
 
 
 def test_a_damaged_table_is_one_sentence(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ import pytest
 import torch
 
 from cfx.calibration.windows import WindowSettings
+from cfx.core import registry
 from cfx.core.errors import TrackingError
 from cfx.data.tidy import write_tidy
 from cfx.evaluation.headline import headline
@@ -35,7 +36,7 @@ from cfx.policies.scaler import Scaler
 from cfx.results import provenance
 from cfx.results.config import JobConfig
 from cfx.results.store import download_run, quiet, translate_errors
-from cfx.results.table import Findings, InstalledTable, WrittenTable
+from cfx.results.table import Findings, ResultTable, WrittenTable
 from cfx.results.tables import Pairs
 from cfx.results.tracker import CURVE_POINTS, Kept, MlflowTracker, Tracker, sweep_link
 from tests.drives import wavy_pairs
@@ -98,8 +99,10 @@ def log_job(
 ) -> None:
     """Logs made-up results, with a policy that is not theirs."""
     result = ProtocolResult(made.evaluation, saved.policy, made.curves, None)
-    pairs = InstalledTable("pairs", Pairs(), "cfx-driving")
-    made.evaluation.table.to_csv(saved.folder.parent / pairs.file)
+    pairs: registry.Installed[ResultTable] = registry.Installed(
+        "table", "pairs", Pairs(), "cfx-driving"
+    )
+    made.evaluation.table.to_csv(saved.folder.parent / "pairs.csv")
     run.log_job(
         Findings(saved.pairs, made.style, result),
         made.evaluation.metrics(),

@@ -67,7 +67,7 @@ def report(
         )
         console.print(text, soft_wrap=True)
     for table in tables:
-        for printed in table.about.console(findings, result.metrics):
+        for printed in table.console(findings, result.metrics):
             console.print(printed)
     _print_safety(evaluation, result.metrics, console)
     _print_flat(evaluation, console)

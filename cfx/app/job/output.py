@@ -21,7 +21,7 @@ from cfx.evaluation.demo import Demo
 from cfx.evaluation.protocols.base import ProtocolResult
 from cfx.results.config import JobConfig
 from cfx.results.provenance import commit, version
-from cfx.results.table import Findings, WrittenTable, installed
+from cfx.results.table import Findings, WrittenTable, file_of, installed, parts_of
 from cfx.simulation.trajectory import TRANSIENT_S
 
 TRACKED = ("config.yaml", "metrics.json", "data.json")
@@ -154,13 +154,13 @@ def write_tables(output: Output, findings: Findings) -> list[WrittenTable]:
     """
     written = []
     for about in installed():
-        path, parts = output.folder / about.file, about.parts(findings)
+        name, parts = file_of(about), parts_of(about, findings)
         if parts is None:
-            output.run(functools.partial(path.unlink, missing_ok=True))
+            output.run(functools.partial((output.folder / name).unlink, missing_ok=True))
             continue
-        rows = None if about.table.large else pd.concat(list(parts))
+        rows = None if about.part.large else pd.concat(list(parts))
         kept = parts if rows is None else [rows]
-        output.file(about.file, functools.partial(about.write, parts=kept))
+        output.file(name, functools.partial(about.part.write, parts=kept))
         written.append(WrittenTable(about, rows))
     if any(pair.truth for pair in findings.pairs):
         output.file("data.parquet", lambda path: write_tidy(findings.pairs, path))

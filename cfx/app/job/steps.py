@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from cfx.app.job import output as files
-from cfx.app.job.calibration_view import calibration_view
+from cfx.app.job.calibration_tables import calibration_tables
 from cfx.app.job.description import described
 from cfx.app.job.output import Output
 from cfx.app.job.parts import Parts, choose_device, complete, make_protocol, reported_objectives
@@ -144,7 +144,7 @@ def compose(config: JobConfig, parts: Parts, pairs: PairSet, style: StyleResult)
 
 
 def found(parts: Parts, context: ProtocolContext, result: object) -> Findings:
-    """Returns what a protocol has delivered, with a view of the calibration.
+    """Returns what a protocol has delivered, with tables of the calibration.
 
     Raises:
         PluginError: it is no `ProtocolResult`.
@@ -156,17 +156,12 @@ def found(parts: Parts, context: ProtocolContext, result: object) -> Findings:
         )
     purpose = Purpose.of(parts.model, parts.policy)
     evaluation = replace(result.evaluation, purpose=purpose).distinct_methods()
-    view = calibration_view(context, evaluation)
-    if view is not None:
-        evaluation = evaluation.with_slices(view.slices)
-    return Findings(
-        context.pairs,
-        context.style,
-        replace(result, evaluation=evaluation),
-        slices=None if view is None else view.slices,
-        fits=None if view is None else view.fits,
-        seed=context.seed,
-    )
+    tables = calibration_tables(context, evaluation)
+    if "slices" in tables:
+        evaluation = evaluation.with_slices(tables["slices"])
+    evaluation = replace(evaluation, tables={**evaluation.tables, **tables})
+    result = replace(result, evaluation=evaluation)
+    return Findings(context.pairs, context.style, result, context.seed)
 
 
 def keep(
@@ -179,7 +174,7 @@ def keep(
     tables = files.write_tables(output, findings)
     metrics = evaluation.metrics() | dict(protocol_result.calibration)
     for table in tables:
-        metrics |= table.about.metrics(findings)
+        metrics |= table.metrics(findings)
     output.run(lambda: checkpoint.save(protocol_result.policy, output.folder / "policy"))
     rows = {table.about.name: table.rows for table in tables if table.rows is not None}
     figures = files.write_figures(output, config, findings, rows, metrics)

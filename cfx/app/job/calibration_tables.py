@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pandas as pd
 import torch
@@ -18,30 +16,22 @@ from cfx.simulation.rollout import MemoryStepper
 _CONSTANT = ("default", "population", "fixed")
 
 
-@dataclass(frozen=True)
-class CalibrationView:
-    """Tables of a calibration.
+def calibration_tables(context: ProtocolContext, evaluation: Evaluation) -> dict[str, pd.DataFrame]:
+    """Returns the tables `slices` and `fits` of a calibration of driver-specific parameters.
 
-    Attributes:
-        slices: see `cfx.calibration.identifiability.slices`, of driver-specific parameters.
+    There are none where nothing was calibrated per driver, nor where another program simulates
+    (`simulator=sumo`): it would take minutes.
+
+    Returns:
+        slices: see `cfx.calibration.identifiability.slices`.
         fits: a row per pair and method: pair_id, driver, method, and train_rmse_speed,
             test_rmse_speed (m/s), train_rmse_gap, test_rmse_gap (m): on the part that
             driver-specific parameters were calibrated on, and on the test part.
     """
-
-    slices: pd.DataFrame
-    fits: pd.DataFrame
-
-
-def calibration_view(context: ProtocolContext, evaluation: Evaluation) -> CalibrationView | None:
-    """Returns the view; None where no driver-specific parameters were calibrated.
-
-    Nor is there one where another program simulates (`simulator=sumo`): it would take minutes.
-    """
     if "fixed" not in evaluation.methods or not evaluation.names:
-        return None
+        return {}
     if not isinstance(context.simulator, MemoryStepper):
-        return None
+        return {}
     number = {pair.pair_id: index for index, pair in enumerate(context.pairs)}
     ids = evaluation.about["pair_id"].drop_duplicates().astype(str).tolist()
     chosen = torch.tensor([number[name] for name in ids])
@@ -55,7 +45,7 @@ def calibration_view(context: ProtocolContext, evaluation: Evaluation) -> Calibr
             fits.append(_fits(evaluation, method, found))
     best = _parameters(evaluation, "fixed", ids, batch.leader_length)
     table = slices(context.calibrator, batch, last, best, ids)
-    return CalibrationView(table, pd.concat(fits, ignore_index=True))
+    return {"slices": table, "fits": pd.concat(fits, ignore_index=True)}
 
 
 def _parameters(evaluation: Evaluation, method: str, ids: list[str], like: Tensor) -> Tensor:
