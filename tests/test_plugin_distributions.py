@@ -194,13 +194,13 @@ def test_the_check_of_imports_sees_what_is_private(tmp_path: Path) -> None:
     path = tmp_path / "plugin.py"
     path.write_text(
         "import cfx\nimport cfx.core.registry\nfrom cfx import nodes, Settings\n"
-        "from cfx.models.guarded import root\nfrom cfx.models.base import DrivingModel, _x\n"
+        "from cfx.models.safe_math import safe_sqrt\nfrom cfx.models.base import DrivingModel, _x\n"
         "from cfx.contracts.models import ModelContract\ncfx.job\ncfx.get\n"
     )
     assert [text.partition(": ")[2] for text in private_uses(path)] == [
         "cfx.core.registry",
         "cfx nodes",
-        "cfx.models.guarded root",
+        "cfx.models.safe_math safe_sqrt",
         "cfx.models.base _x",
         "cfx job",
     ]

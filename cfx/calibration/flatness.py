@@ -1,4 +1,4 @@
-"""Which calibrated parameters a recording does not determine: where the loss is flat.
+"""Finds calibrated parameters that a recording does not determine: their loss is flat.
 
 From a driver's calibrated parameters one is moved from bound to bound, the others stay. Where the
 loss is within `NEAR` of its best it counts as nearly as good. The *flat share* is the share of the

@@ -1,4 +1,4 @@
-"""How well recordings determine calibrated parameters, and how they fit where they were calibrated.
+"""Tables of the loss around calibrated parameters (slices), and of their errors (fit).
 
 **Slices.** From a driver's calibrated parameters one is moved from bound to bound, the others stay.
 Where the loss hardly rises, these recordings do not determine the parameter. Where it rises, others

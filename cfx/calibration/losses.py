@@ -1,4 +1,4 @@
-"""What an optimizer minimises in a calibration: losses of simulated segments of trajectories."""
+"""Losses of simulated segments of trajectories, which a calibration minimises."""
 
 from __future__ import annotations
 
@@ -251,7 +251,7 @@ it in fetching pages."""
 
 _SUMMED_AT_ONCE = 1 << 25
 """The same where a kernel sums up losses without trajectories: what it writes is freed and written
-again, and stays in the process's own memory (`cfx.simulation.pages`)."""
+again, and stays in the process's own memory (`cfx.simulation.allocator`)."""
 
 _SEGMENTS_AT_ONCE = 1024
 """Segments that are simulated for a block of candidates: memory does not grow with their number,
@@ -263,7 +263,7 @@ _VECTOR = 32
 
 @dataclass(frozen=True)
 class PooledLosses:
-    """One parameter set for many segments: the mean over the segments of each one's loss.
+    """The mean loss over many segments, for one parameter set that is shared by all of them.
 
     The mean of losses, not the loss over all frames: every driver counts alike, and the mean is
     what an evaluation reports. Where all problems ask for the same candidates, as space-filling

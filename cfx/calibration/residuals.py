@@ -1,4 +1,4 @@
-"""What a driving model with constant parameters misses of measured accelerations.
+"""Residuals between measured accelerations and those of a model with constant parameters.
 
 Shapes: P pairs, T frames, n tuned parameters.
 """

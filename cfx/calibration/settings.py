@@ -1,4 +1,4 @@
-"""What a user may choose about windows.
+"""Settings of calibration and of windows.
 
 Imports no torch, so that a wrong configuration is answered at once.
 """
@@ -13,7 +13,7 @@ from cfx.core.component import Settings
 
 
 class CalibrationSettings(Settings):
-    """How driver-specific and pooled parameters are calibrated."""
+    """Settings of the calibration of driver-specific and pooled parameters."""
 
     prior: Literal["weak", "none"] = Field(
         "weak",
@@ -23,7 +23,7 @@ class CalibrationSettings(Settings):
 
 
 class WindowSettings(Settings):
-    """How trajectories are cut; both 5 steps (0.5 s at NGSIM's 0.1 s) in the paper."""
+    """Settings of windows; both are 5 steps (0.5 s at NGSIM's 0.1 s) in the paper."""
 
     length: int = Field(5, ge=1, description="steps that a window simulates")
     stride: int = Field(

@@ -1,4 +1,4 @@
-"""What a calibration hands to an engine: problems with the trajectories that they need.
+"""Shards of a calibration for an engine: problems with the trajectories that they need.
 
 A shard holds whatever its solution depends on, and nothing else. It is solved in the same way in
 this process, in another one and on another machine.
@@ -42,7 +42,7 @@ _SETTLING_ROUNDS = 6
 
 @dataclass(frozen=True)
 class Solver:
-    """What all problems of a calibration have in common.
+    """The model, optimizer and objective that all problems of a calibration share.
 
     Attributes:
         simulator: the model and its time step.

@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Split:
-    """Where each pair's training part ends.
+    """The end of each pair's training part.
 
     Attributes:
         frame: `(P,)` int64, the last measured state that calibration and learning may use. The test

@@ -1,1 +1,1 @@
-"""What everything stands on: errors, components, the registry, files, where work runs."""
+"""Foundations of cfx: errors, components, the registry, files, where work runs."""

@@ -1,4 +1,4 @@
-"""What every component is: a class with typed settings that an entry point names."""
+"""Base class of components: a class with typed settings that an entry point names."""
 
 from __future__ import annotations
 

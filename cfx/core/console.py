@@ -1,4 +1,4 @@
-"""What a person reads: messages while a job runs, coloured by weight on a terminal, and tables."""
+"""Console output: messages of a job, coloured by level on a terminal, and tables."""
 
 from __future__ import annotations
 

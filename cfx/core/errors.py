@@ -1,4 +1,4 @@
-"""What a user can mend: one sentence that says what is wrong, where, and what to write instead."""
+"""Errors of the user: one sentence with what is wrong, where, and what to write instead."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def nearest(name: str, choices: Iterable[str]) -> str:
 
 
 def listed(values: Iterable[object], limit: int = 12) -> str:
-    """Return the values separated by commas, cut off after `limit` of them."""
+    """Returns the values separated by commas, cut off after `limit` of them."""
     texts = [str(value) for value in values]
     text = ", ".join(texts[:limit])
     if len(texts) > limit:

@@ -1,4 +1,4 @@
-"""What is not installed, and the line that installs it: cfx's extras, and the plugins beside it."""
+"""Commands that install what is missing: cfx's extras, and the plugins beside it."""
 
 from __future__ import annotations
 

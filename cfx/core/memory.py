@@ -1,4 +1,4 @@
-"""What fits into this machine's memory, asked before anything is allocated."""
+"""Checks, before anything is allocated, whether it fits into this machine's memory."""
 
 from __future__ import annotations
 

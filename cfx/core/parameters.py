@@ -84,7 +84,7 @@ class Parameter:
 
 
 class ParameterOverride(Settings):
-    """What a config may change of one parameter; the rest stays as the model declares it."""
+    """Changes of one parameter by a config; the rest stays as the model declares it."""
 
     low: float | None = Field(None, description="lower bound")
     high: float | None = Field(None, description="upper bound")

@@ -54,13 +54,13 @@ def _packages() -> dict[Path, registry.Entry]:
         for entry in registry.entries(kind):
             if entry.distribution == registry.OWN:
                 continue
-            place = _place(entry.target.partition(":")[0].partition(".")[0])
+            place = _package_path(entry.target.partition(":")[0].partition(".")[0])
             if place is not None:
                 found.setdefault(place, entry)
     return found
 
 
-def _place(module: str) -> Path | None:
+def _package_path(module: str) -> Path | None:
     try:
         spec = importlib.util.find_spec(module)
     except (ImportError, ValueError):

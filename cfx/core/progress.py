@@ -25,7 +25,7 @@ _LINE_EVERY = 15.0
 
 
 class Task:
-    """One stretch of work; a context manager whose `advance` is called as the work goes on.
+    """Progress of one part of the work: a context manager whose `advance` the work calls.
 
     Args:
         description: what is being done, for people.

@@ -1,4 +1,4 @@
-"""How work is shared among threads, and how many of them PyTorch uses.
+"""Shares work among threads, and sets how many of them PyTorch uses.
 
 Threads of ours sleep while they have nothing to do. PyTorch's own spin, which slows down whatever
 else wants the core. PyTorch is imported where it is needed: engines are made before it.

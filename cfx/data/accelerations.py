@@ -48,7 +48,7 @@ _WORTH = 0.9
 
 
 class Average(NamedTuple):
-    """What stands for recorded accelerations.
+    """Exponential average, applied twice, that replaces recorded accelerations.
 
     Attributes:
         constant: time constant of each of the two averages, s; 0: as recorded.
@@ -66,7 +66,7 @@ class Average(NamedTuple):
 
 
 RECORDED = Average(0.0, 1.0)
-"""What is taken as recorded."""
+"""No averaging: the recorded values."""
 
 
 def with_usable_accelerations(pairs: PairSet, how: Accelerations) -> PairSet:

@@ -55,7 +55,7 @@ FilePaths = Annotated[Path | str | tuple[Path | str, ...], BeforeValidator(_file
 
 
 class DatasetSettings(Settings):
-    """What every dataset lets its user select."""
+    """Settings that all datasets have: which pairs to select."""
 
     check: Check = Field(
         "refuse",
@@ -108,7 +108,7 @@ class DatasetSettings(Settings):
 
 
 class FileDatasetSettings(DatasetSettings):
-    """What every dataset that reads a file has."""
+    """Settings of datasets that read a file."""
 
     path: FilePaths = Field(
         description="the file to read, a list of files, or a pattern such as 'i-80/*.txt';"
@@ -406,7 +406,7 @@ def _select_ids(pairs: PairSet, wanted: Sequence[str]) -> PairSet:
 
 
 def _select_label(pairs: PairSet, name: str, wanted: str | None) -> PairSet:
-    """Keep the pairs with a label; all where None is wanted.
+    """Keeps the pairs with a label; all where None is wanted.
 
     Args:
         name: recording, driver_type or leader_driver_type.

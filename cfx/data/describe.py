@@ -1,4 +1,4 @@
-"""What a recording holds, in words and tables: `python -m cfx data describe FILE`."""
+"""Describes a recording in text and tables: `python -m cfx data describe FILE`."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ def _frames(pairs: PairSet) -> int:
 
 
 class _Length(NamedTuple):
-    """How long a pair is."""
+    """Length of a pair."""
 
     frames: int
     dt: float

@@ -77,7 +77,7 @@ _BUSY = (202, 429, 500, 502, 503, 504)
 
 @dataclass(frozen=True)
 class Query:
-    """What is asked of the service; a download goes on only where it is the same.
+    """Query to the service; an interrupted download continues only with the same one.
 
     Attributes:
         url: of the data set.

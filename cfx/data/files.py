@@ -59,12 +59,12 @@ class FileStart(NamedTuple):
         return tuple(cell.strip().strip('"') for cell in self.lines[0].split(","))
 
     def has_columns(self, *names: str) -> bool:
-        """Say whether the first line has all these cells."""
+        """Says whether the first line has all these cells."""
         return set(names) <= set(self.columns)
 
 
 def beginning(path: Path) -> FileStart:
-    """Return the beginning of a file or folder.
+    """Returns the beginning of a file or folder.
 
     Raises:
         DataError: there is none, it cannot be read, or it is empty.
@@ -85,12 +85,12 @@ def beginning(path: Path) -> FileStart:
 
 
 def stem(path: Path) -> str:
-    """Return a file's name without what follows its first dot."""
+    """Returns a file's name without what follows its first dot."""
     return path.name.split(".")[0] or path.name
 
 
 def magic(path: Path) -> bytes:
-    """Return the first bytes of a file.
+    """Returns the first bytes of a file.
 
     Raises:
         DataError: the file is missing, a folder, unreadable or empty.
@@ -115,7 +115,7 @@ def magic(path: Path) -> bytes:
 
 
 def open_text(path: Path) -> BinaryIO:
-    """Open a text file, unpacking gzip by its content, whatever its name."""
+    """Opens a text file, unpacking gzip by its content, whatever its name."""
     start = magic(path)
     if start.startswith(_ZIP):
         raise DataError(f"{path}: is a zip archive; unpack it and set data.path to the file inside")
@@ -125,7 +125,7 @@ def open_text(path: Path) -> BinaryIO:
 
 
 def read_head(path: Path) -> bytes:
-    """Return the first 64 kB of a text file, unpacked.
+    """Returns the first 64 kB of a text file, unpacked.
 
     Raises:
         DataError: the file cannot be read, or its gzip is damaged.
@@ -135,7 +135,7 @@ def read_head(path: Path) -> bytes:
 
 
 def unpacked_blocks(path: Path) -> Iterator[bytes]:
-    """Yield a text file, unpacked, in blocks of 4 MB.
+    """Yields a text file, unpacked, in blocks of 4 MB.
 
     Raises:
         DataError: as `read_head`.
@@ -151,7 +151,7 @@ def unpacked_blocks(path: Path) -> Iterator[bytes]:
 
 @contextmanager
 def _unpacking(path: Path) -> Iterator[None]:
-    """Turn what a damaged gzip file raises into one sentence."""
+    """Turns what a damaged gzip file raises into one sentence."""
     try:
         yield
     except EOFError:
@@ -164,7 +164,7 @@ def _unpacking(path: Path) -> Iterator[None]:
 
 
 def partitions(path: Path) -> list[Path]:
-    """Return the parquet files below a folder, sorted by name; a file stands for itself.
+    """Returns the parquet files below a folder, sorted by name; a file stands for itself.
 
     Raises:
         DataError: the folder holds none.
@@ -181,12 +181,12 @@ def partitions(path: Path) -> list[Path]:
 
 
 def are_partitions(path: Path) -> bool:
-    """Say whether a folder holds parquet files, in folders named by recordings or beside them."""
+    """Says whether a folder holds parquet files, in folders named by recordings or beside them."""
     return path.is_dir() and next(_parquet_files(path), None) is not None
 
 
 def _parquet_files(folder: Path) -> Iterator[Path]:
-    """Yield the parquet files below a folder; folders that are links count, each once."""
+    """Yields the parquet files below a folder; folders that are links count, each once."""
     seen = set()
     for place, below, names in os.walk(folder, followlinks=True):
         home = os.path.realpath(place)
@@ -202,7 +202,7 @@ def _parquet_files(folder: Path) -> Iterator[Path]:
 
 
 def recording_of(file: Path) -> str | None:
-    """Return the recording that a file's folder is named by; None if it is not."""
+    """Returns the recording that a file's folder is named by; None if it is not."""
     for folder in file.parents:
         if folder.name.startswith(_COLUMN):
             return unquote(folder.name.removeprefix(_COLUMN))
@@ -210,7 +210,7 @@ def recording_of(file: Path) -> str | None:
 
 
 def of_recording(files: Sequence[Path], recording: str | None) -> list[Path]:
-    """Return the files that may hold a recording: those of others are not read.
+    """Returns the files that may hold a recording: those of others are not read.
 
     Args:
         files: of one or more folders.

@@ -39,7 +39,7 @@ _SAME = 0.08
 
 @dataclass(frozen=True)
 class _Rule:
-    """When a slope is judged, and what it may be.
+    """Rule of a slope: when it is checked, and its bounds.
 
     The bounds leave room for all pairs of the recordings that cfx was tried on; docs/readers.md
     has their slopes.
@@ -86,7 +86,7 @@ _GAP_FACTORS = {
 
 @dataclass(frozen=True)
 class Slope:
-    """How one signal follows the integral of its rate.
+    """Slope of one signal against the integral of its rate.
 
     Attributes:
         slope: change of the signal over that of the integral, with the sign of their correlation.

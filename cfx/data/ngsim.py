@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 
 class NgsimSettings(FileDatasetSettings):
-    """Which part of an NGSIM file to read."""
+    """Settings of the NGSIM reader."""
 
     location: str | None = Field(
         None,
@@ -103,7 +103,7 @@ class NgsimDataset(Dataset):
         )
 
     def _rows(self) -> list[Rows]:
-        """Return the rows of each file."""
+        """Returns the rows of each file."""
         return [read_ngsim(path, self.settings.location) for path in self.settings.files()]
 
     def _pairs(self, files: Sequence[Rows]) -> PairSet:
@@ -120,7 +120,7 @@ class NgsimDataset(Dataset):
 
 
 def _with_different_names(parts: Sequence[Rows]) -> list[Rows]:
-    """Return the rows of several files; no two recordings have the same name.
+    """Returns the rows of several files; no two recordings have the same name.
 
     Vehicles' ids start anew in each recording.
 
@@ -148,7 +148,7 @@ def _with_different_names(parts: Sequence[Rows]) -> list[Rows]:
 
 
 def _name_in(rows: Rows, name: str, *, is_shared: bool) -> str:
-    """Return a recording's name; the file's stands before one that several files share."""
+    """Returns a recording's name; the file's stands before one that several files share."""
     file = stem(Path(rows.source))
     if not is_shared:
         return name

@@ -81,7 +81,7 @@ _DRIVING_MPS = 1.0
 
 
 def _plain(name: str) -> str:
-    """Return a column's name in lower case without separators, in one of its spellings."""
+    """Returns a column's name in lower case without separators, in one of its spellings."""
     plain = re.sub(r"[^a-z0-9]", "", name.lower())
     return _SPELLINGS.get(plain, plain)
 
@@ -122,7 +122,7 @@ class Rows(Tracks):
     rows_read: int
 
     def trimmed(self, seconds: float) -> Rows:
-        """Leave out the rows within so many seconds of their vehicle's first or last one."""
+        """Leaves out the rows within so many seconds of their vehicle's first or last one."""
         since, until = self._since_and_until()
         near = np.minimum(since, until) < round(seconds / DT)
         if not near.any():
@@ -132,7 +132,7 @@ class Rows(Tracks):
         return replace(self.take(np.flatnonzero(~near)), dropped=(*self.dropped, lost))
 
     def boundary_artefacts(self) -> str:
-        """Say that smoothing left artefacts at the ends of vehicles' rows; "" if it did not.
+        """Says that smoothing left artefacts at the ends of vehicles' rows; "" if it did not.
 
         See `NgsimDataset`.
         """
@@ -156,11 +156,11 @@ class Rows(Tracks):
         )
 
     def pairs(self) -> PairSet:
-        """Cut the rows into pairs: see `NgsimDataset`."""
+        """Cuts the rows into pairs: see `NgsimDataset`."""
         return extract_pairs(self)
 
     def _since_and_until(self) -> tuple[Ints, Ints]:
-        """Return frames since the first and until the last row of each row's vehicle, `(N,)`."""
+        """Returns frames since the first and until the last row of each row's vehicle, `(N,)`."""
         starts = np.flatnonzero(changes(self.recording, self.vehicle))
         sizes = np.diff(np.append(starts, len(self)))
         first = np.repeat(self.frame[starts], sizes)
@@ -169,7 +169,7 @@ class Rows(Tracks):
 
 
 def read_ngsim(path: Path, location: str | None = None) -> Rows:
-    """Read an NGSIM file.
+    """Reads an NGSIM file.
 
     Args:
         location: keep the rows of this location alone.
@@ -206,7 +206,7 @@ def _rows(
     count: int,
     dropped: Sequence[Dropped],
 ) -> Rows:
-    """Return columns in feet, which are in order already, as rows in SI units."""
+    """Returns columns in feet, which are in order already, as rows in SI units."""
     vehicle = columns["Vehicle_ID"].astype(np.int64)
     return Rows(
         source=source,
@@ -227,7 +227,7 @@ def _rows(
 
 
 def _location_code(table: Table, where: Labels, location: str) -> int:
-    """Return the index of a location in `where.names`."""
+    """Returns the index of a location in `where.names`."""
     for code, name in enumerate(where.names):
         if name.lower() == location.lower():
             return code
@@ -240,7 +240,7 @@ def _location_code(table: Table, where: Labels, location: str) -> int:
 def _recordings(
     columns: Mapping[str, Floats], location: Ints, names: Sequence[str]
 ) -> tuple[Ints, tuple[str, ...]]:
-    """Return the recording of each row and the recordings' names: see `NgsimDataset`.
+    """Returns the recording of each row and the recordings' names: see `NgsimDataset`.
 
     Args:
         columns: of the file.
@@ -275,7 +275,7 @@ def _recordings(
 
 
 def _clock_ticks(columns: Mapping[str, Floats], location: Ints) -> bool:
-    """Say whether `Global_Time` advances by 100 ms from one frame of a vehicle to its next."""
+    """Says whether `Global_Time` advances by 100 ms from one frame of a vehicle to its next."""
     clock, frame, vehicle = columns[_CLOCK], columns["Frame_ID"], columns["Vehicle_ID"]
     order = np.lexsort((frame, clock, vehicle, location))
     successive = (
@@ -290,7 +290,7 @@ def _clock_ticks(columns: Mapping[str, Floats], location: Ints) -> bool:
 def _sorted(
     table: Table, columns: Mapping[str, Floats], recording: Ints, row: Ints
 ) -> tuple[Ints, int]:
-    """Return the order by recording, vehicle and frame, and how many duplicates it leaves out.
+    """Returns the order by recording, vehicle and frame, and how many duplicates it leaves out.
 
     Raises:
         DataError: a vehicle has two different rows at a frame.
@@ -316,14 +316,14 @@ def _sorted(
 
 
 def _lengths(length: Floats, recording: Ints, vehicle: Ints) -> Floats:
-    """Return each vehicle's median length at each of its rows."""
+    """Returns each vehicle's median length at each of its rows."""
     group = np.cumsum(changes(recording, vehicle))
     medians: Floats = pd.Series(length).groupby(group).transform("median").to_numpy()
     return medians
 
 
 def _check_units(rows: Rows) -> None:
-    """Raise DataError if lengths, or positions and speeds, seem not to be in feet."""
+    """Raises DataError if lengths, or positions and speeds, seem not to be in feet."""
     typical = float(np.median(rows.length)) / FOOT
     if typical < 8:
         raise DataError(

@@ -126,7 +126,7 @@ class Pair:
 
     @cached_property
     def likeness(self) -> str:
-        """What the trajectories are recognised by, however they are called and in whatever units.
+        """Summary that identifies the trajectories under other names and units.
 
         In plain numbers: frames, time step (ms), then at frames evenly spread over the pair both
         speeds (m/s) and the gap (m); see `LearnedFrom`.

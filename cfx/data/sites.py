@@ -41,7 +41,7 @@ VehiclePattern = Annotated[str, AfterValidator(_with_one_group)]
 
 
 def with_sites(pairs: PairSet, names: SiteNames) -> PairSet:
-    """Name the site of each pair.
+    """Names the site of each pair.
 
     Args:
         pairs: as read.
@@ -90,7 +90,7 @@ def _pattern(names: Mapping[str, str], of_pair: tuple[str, str]) -> str | None:
 
 
 def with_vehicles(pairs: PairSet, pattern: str | None) -> PairSet:
-    """Name each follower's vehicle by what a pattern finds in its id.
+    """Names each follower's vehicle by what a pattern finds in its id.
 
     Where the pattern does not fit an id, what the source says holds.
 

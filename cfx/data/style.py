@@ -61,7 +61,7 @@ STANDING_MPS = 0.5
 
 
 class StyleSettings(Settings):
-    """How driving style is measured, and which drivers a job uses."""
+    """Settings of the driving style, and of which drivers a job uses."""
 
     cluster: Literal["all", "conservative", "normal", "aggressive"] = Field(
         "all", description="drivers that the job uses"
@@ -103,7 +103,7 @@ class StyleResult:
 
 
 def measure_style(pairs: PairSet, settings: StyleSettings) -> StyleResult:
-    """Score every driver (`Pair.driver`) and sorts the drivers into three clusters.
+    """Scores every driver (`Pair.driver`) and sorts the drivers into three clusters.
 
     The frames of all pairs of a driver count together. Scores lie in [0, 1]; the more aggressive,
     the higher. A driver whose score is below the lower percentile is conservative, above the upper
@@ -135,7 +135,7 @@ def measure_style(pairs: PairSet, settings: StyleSettings) -> StyleResult:
 
 
 def select_cluster(pairs: PairSet, style: StyleResult, cluster: str) -> PairSet:
-    """Keep the pairs of the drivers of one cluster and counts the others; `all` keeps every pair.
+    """Keeps the pairs of the drivers of one cluster and counts the others; `all` keeps every pair.
 
     Raises:
         DataError: no driver is in this cluster.
@@ -156,7 +156,7 @@ def select_cluster(pairs: PairSet, style: StyleResult, cluster: str) -> PairSet:
 
 
 def indicators(pairs: PairSet) -> pd.DataFrame:
-    """Return a row per driver with the six indicators, in SI units.
+    """Returns a row per driver with the six indicators, in SI units.
 
     The space headway is front bumper to front bumper, `x_l - x_s`, as NGSIM's Space_Headway. The
     time headway is that over the follower's speed, averaged over the frames with a speed of 0.5 m/s
@@ -170,7 +170,7 @@ def indicators(pairs: PairSet) -> pd.DataFrame:
 
 
 def _by_driver(pairs: PairSet) -> Iterator[list[Pair]]:
-    """Yield the pairs of some drivers, then of some others: frames of all need much memory."""
+    """Yields the pairs of some drivers, then of some others: frames of all need much memory."""
     of_driver: dict[str, list[int]] = {}
     for index, pair in enumerate(pairs.pairs):
         of_driver.setdefault(pair.driver, []).append(index)
@@ -186,7 +186,7 @@ def _by_driver(pairs: PairSet) -> Iterator[list[Pair]]:
 
 
 def _indicators(pairs: Sequence[Pair]) -> pd.DataFrame:
-    """Return the indicators of drivers all of whose pairs are given."""
+    """Returns the indicators of drivers all of whose pairs are given."""
     import pandas as pd
 
     sizes = [len(pair) for pair in pairs]
@@ -225,7 +225,7 @@ def _indicators(pairs: Sequence[Pair]) -> pd.DataFrame:
 
 
 def normalise(raw: Floats, direction: Literal["signed", "printed"] = "signed") -> Floats:
-    """Map each column of `raw` `(m, n)` to [0, 1], 1 being the most aggressive.
+    """Maps each column of `raw` `(m, n)` to [0, 1], 1 being the most aggressive.
 
     A constant column becomes 0.
 
@@ -247,7 +247,7 @@ def normalise(raw: Floats, direction: Literal["signed", "printed"] = "signed") -
 
 
 def entropies(normalised: Floats) -> Floats:
-    """Return the entropy of each column of `(m, n)`, in [0, 1]: 1 is evenly spread.
+    """Returns the entropy of each column of `(m, n)`, in [0, 1]: 1 is evenly spread.
 
     ent_j = -(1 / ln m) sum_i p_ij ln p_ij with p_ij = e_ij / sum_i e_ij and 0 ln 0 = 0. A column of
     zeros (a constant indicator) and a single driver carry no information: 1.
@@ -263,7 +263,7 @@ def entropies(normalised: Floats) -> Floats:
 
 
 def entropy_weights(normalised: Floats) -> Floats:
-    """Return the weight of each column `(n,)`: not negative, sum 1; 0 for a constant column.
+    """Returns the weight of each column `(n,)`: not negative, sum 1; 0 for a constant column.
 
     w_j = (1 - ent_j) / (n - sum_j ent_j). If no indicator varies, as with a single driver, all
     weigh the same.

@@ -1,4 +1,4 @@
-"""One checked table: columns as a layout declares them, whatever they are stored as.
+"""Reads tables and checks them against a layout of declared columns.
 
 A reader is its layout and its meaning. The layout declares each column: its name and unit, other
 spellings, what its cells may hold, and what is wrong with a cell that holds something else.
@@ -107,7 +107,7 @@ class Layout:
     plain: Callable[[str], str] = str
 
     def found_in(self, source: str, names: Sequence[str]) -> dict[str, _Found]:
-        """Return the layout's columns among those of a file, by the names that they keep.
+        """Returns the layout's columns among those of a file, by the names that they keep.
 
         Raises:
             DataError: a column is missing or stands twice.
@@ -138,7 +138,7 @@ class Layout:
     def _found(
         self, column: Column, at: Mapping[str, int], plain: Mapping[str, int]
     ) -> list[_Found]:
-        """Return where a column is: once, or as often as its pattern matches."""
+        """Returns where a column is: once, or as often as its pattern matches."""
         if column.many:
             matching = [name for name in at if re.fullmatch(column.name, name)]
             return [_Found(replace(column, name=name), at[name]) for name in matching]
@@ -151,7 +151,7 @@ class Layout:
         return []
 
     def _missing(self, source: str, missing: Sequence[Column], names: Sequence[str]) -> str:
-        """Return what to say of columns that are not there."""
+        """Returns what to say of columns that are not there."""
         missing = sorted(missing, key=lambda column: bool(column.unless))
         first = missing[0]
         called = " or ".join([first.name, *first.spellings])
@@ -188,7 +188,7 @@ class Labels(NamedTuple):
     names: list[str]
 
     def at(self, row: int) -> str:
-        """Return the name in a row; "" for an empty cell."""
+        """Returns the name in a row; "" for an empty cell."""
         code = int(self.codes[row])
         if code < 0:
             return ""
@@ -222,11 +222,11 @@ class Table:
         return 0
 
     def row(self, index: int | np.integer[Any]) -> int:
-        """Return the number that an editor shows for the row `index` (from 0)."""
+        """Returns the number that an editor shows for the row `index` (from 0)."""
         return int(index) + self.first_row
 
     def at(self, index: int | np.integer[Any], column: str = "") -> str:
-        """Say where a row is: the source, the row, the column, and what identifies the row."""
+        """Says where a row is: the source, the row, the column, and what identifies the row."""
         text = f"{self.source}, row {self.row(index)}"
         if column:
             text += f", column {column}"
@@ -241,7 +241,7 @@ class Table:
         return text
 
     def refuse(self, column: str, wrong: NDArray[bool_], why: str) -> None:
-        """Raise DataError if any cell of a column of numbers is wrong; names the first.
+        """Raises DataError if any cell of a column of numbers is wrong; names the first.
 
         Args:
             column: its name.
@@ -257,12 +257,12 @@ class Table:
         raise DataError(text)
 
     def whole(self, column: str) -> Ints:
-        """Return a column of whole numbers `(N,)`."""
+        """Returns a column of whole numbers `(N,)`."""
         return self.numbers[column].astype(np.int64)
 
 
 def read_table(path: Path, layout: Layout, given: Mapping[str, str] | None = None) -> Table:
-    """Read the columns of a layout from a text or a parquet file, and checks every cell.
+    """Reads the columns of a layout from a text or a parquet file, and checks every cell.
 
     Args:
         given: a name for each column of names that a parquet file may lack: its cells all hold it.
@@ -298,7 +298,7 @@ def read_table(path: Path, layout: Layout, given: Mapping[str, str] | None = Non
 
 
 def table_of(frame: pd.DataFrame, layout: Layout, source: str) -> Table:
-    """Return the columns of a layout from a data frame, every cell checked.
+    """Returns the columns of a layout from a data frame, every cell checked.
 
     Args:
         source: what messages call it; its rows are counted from 1.
@@ -333,7 +333,7 @@ class _Columns(NamedTuple):
 
 
 def _checked(here: _Columns, columns: Mapping[str, Any], names: Sequence[str]) -> Table:
-    """Return Arrow columns as a table of numbers and names.
+    """Returns Arrow columns as a table of numbers and names.
 
     Args:
         columns: those of the layout, by its names.
@@ -366,7 +366,7 @@ def _checked(here: _Columns, columns: Mapping[str, Any], names: Sequence[str]) -
 
 
 def _require_names(table: Table, name: str, labels: Labels) -> None:
-    """Raise DataError for an empty cell of a column of names."""
+    """Raises DataError for an empty cell of a column of names."""
     empty = np.flatnonzero(labels.codes < 0)
     if len(empty):
         raise DataError(
@@ -375,7 +375,7 @@ def _require_names(table: Table, name: str, labels: Labels) -> None:
 
 
 def _require_numbers(table: Table, name: str, values: Floats, column: Column) -> None:
-    """Raise DataError for a cell that is no finite number, or not what its column declares."""
+    """Raises DataError for a cell that is no finite number, or not what its column declares."""
     is_bad = ~np.isfinite(values)
     if column.may_be_empty:
         is_bad = np.isinf(values)
@@ -393,7 +393,7 @@ def _require_numbers(table: Table, name: str, values: Floats, column: Column) ->
 
 
 def _floats(here: _Columns, name: str, column: Any) -> Floats:
-    """Return an Arrow column as numbers `(N,)`.
+    """Returns an Arrow column as numbers `(N,)`.
 
     "1,234" is read as 1234, and an empty cell as NaN.
 
@@ -426,7 +426,7 @@ def _floats(here: _Columns, name: str, column: Any) -> Floats:
 
 
 def _labels(here: _Columns, name: str, column: Any) -> Labels:
-    """Return an Arrow column as names, in the order in which they first appear.
+    """Returns an Arrow column as names, in the order in which they first appear.
 
     Raises:
         DataError: it holds something else, or bytes that are no UTF-8.
@@ -462,7 +462,7 @@ def _labels(here: _Columns, name: str, column: Any) -> Labels:
 
 
 def _first_broken(column: Any) -> str:
-    """Return ", row N" for the first cell that is no UTF-8; "" where no row is known."""
+    """Returns ", row N" for the first cell that is no UTF-8; "" where no row is known."""
     row = 1
     for chunk in column.chunks:
         if not (pa.types.is_string(chunk.type) or pa.types.is_large_string(chunk.type)):
@@ -502,7 +502,7 @@ class _Text(NamedTuple):
 
 
 def _read_text(path: Path, layout: Layout) -> Table:
-    text = _looked_at(path, layout)
+    text = _read_header(path, layout)
     where = str(path)
     found = layout.found_in(where, text.names)
     try:
@@ -515,8 +515,8 @@ def _read_text(path: Path, layout: Layout) -> Table:
     return _checked(here, by_name, text.names)
 
 
-def _looked_at(path: Path, layout: Layout) -> _Text:
-    """Look at the beginning of a text.
+def _read_header(path: Path, layout: Layout) -> _Text:
+    """Reads the header and the separator of a text file.
 
     Raises:
         DataError: it is no text in UTF-8, its columns are separated by what the layout does not
@@ -550,7 +550,7 @@ def _looked_at(path: Path, layout: Layout) -> _Text:
 
 
 def _names_without_header(path: Path, layout: Layout, width: int) -> tuple[str, ...]:
-    """Return the names of a headerless text's columns; raises DataError if none are known."""
+    """Returns the names of a headerless text's columns; raises DataError if none are known."""
     if width in layout.headerless:
         return layout.headerless[width]
     if layout.headerless:
@@ -566,7 +566,7 @@ def _names_without_header(path: Path, layout: Layout, width: int) -> tuple[str, 
 
 
 def _comma_separated(line: str) -> list[str]:
-    """Return the cells of one line of CSV."""
+    """Returns the cells of one line of CSV."""
     options = pa.csv.ReadOptions(autogenerate_column_names=True)
     table = pa.csv.read_csv(io.BytesIO(line.encode() + b"\n"), read_options=options)
     (row,) = table.to_pylist()
@@ -574,7 +574,7 @@ def _comma_separated(line: str) -> list[str]:
 
 
 def _decoded(path: Path, head: bytes) -> str:
-    """Return the beginning of a file as text; raises DataError if it is none."""
+    """Returns the beginning of a file as text; raises DataError if it is none."""
     is_binary = any(byte < 32 and byte not in b"\t\n\r\f" for byte in head)
     try:
         text = head.decode("utf-8-sig")
@@ -592,7 +592,7 @@ def _decoded(path: Path, head: bytes) -> str:
 
 
 def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any, spare: int = 0) -> Any:
-    """Return the columns found as one Arrow table with columns c0, c1, ...
+    """Returns the columns found as one Arrow table with columns c0, c1, ...
 
     Args:
         spare: columns without a name behind the others: 1 where rows end in a comma.
@@ -666,7 +666,7 @@ class _Lines(io.RawIOBase):
 
     @staticmethod
     def _whole_lines(text: _Text) -> Iterator[bytes]:
-        """Yield parts of the file that end where a line does."""
+        """Yields parts of the file that end where a line does."""
         rest = b""
         mark = _UTF8_MARK
         for block in unpacked_blocks(text.path):
@@ -677,7 +677,7 @@ class _Lines(io.RawIOBase):
 
 
 def _with_commas(lines: bytes, delimiter: str) -> bytes:
-    """Return lines whose cells are separated by commas."""
+    """Returns lines whose cells are separated by commas."""
     if delimiter == ",":
         return lines
     return b"".join(b",".join(line.split()) + b"\n" for line in lines.splitlines())

@@ -143,7 +143,7 @@ class TidyDataset(Dataset):
 
 
 def read_tidy(path: Path) -> PairSet:
-    """Read a tidy file.
+    """Reads a tidy file.
 
     Raises:
         DataError: the file cannot be read or does not keep to the layout.
@@ -154,7 +154,7 @@ def read_tidy(path: Path) -> PairSet:
 
 
 def pairs_from_frame(frame: pd.DataFrame, source: str = "table") -> PairSet:
-    """Take pairs from a table in the tidy layout.
+    """Takes pairs from a table in the tidy layout.
 
     Args:
         source: what messages call the table; its rows are counted from 1.
@@ -175,7 +175,7 @@ def _pairs(table: Table) -> PairSet:
 
 
 def _build(table: Table, order: Ints, starts: Ints) -> list[Pair]:
-    """Return the pairs of a table that was checked.
+    """Returns the pairs of a table that was checked.
 
     Args:
         order: see `cfx.data.tidy_checks.check`.
@@ -223,7 +223,7 @@ _CAMERAS = tuple(Fraction(1001, 1000 * rate) for rate in (24, 30, 48, 60, 120))
 
 
 def _simplest(step: float) -> float:
-    """Return the time step that a mean of rounded times stands for.
+    """Returns the time step that a mean of rounded times stands for.
 
     It is 0.1 for 0.09999999998, 1/30 for 0.0333333, and 1001/30000 for a camera's 29.97 frames per
     second.
@@ -246,7 +246,7 @@ _PAIRS_AT_ONCE = 1024
 
 
 def write_tidy(pairs: PairSet, path: Path | str) -> None:
-    """Write pairs in the tidy layout.
+    """Writes pairs in the tidy layout.
 
     Reading the file gives the same pairs to the last bit, truth included. The file appears whole or
     not at all. `time_s` is frame times time step.
@@ -271,13 +271,13 @@ def write_tidy(pairs: PairSet, path: Path | str) -> None:
 
 
 def frame_of(pairs: PairSet) -> pd.DataFrame:
-    """Return pairs as a table in the tidy layout."""
+    """Returns pairs as a table in the tidy layout."""
     frame: pd.DataFrame = pa.concat_tables(_tables(pairs)).to_pandas()
     return frame
 
 
 def _write(tables: Iterator[Any], temporary: Path, name: str) -> None:
-    """Write tables with the same columns, one behind the other."""
+    """Writes tables with the same columns, one behind the other."""
     first = next(tables)
     with ExitStack() as opened:
         if name.endswith(".parquet"):
@@ -294,7 +294,7 @@ def _write(tables: Iterator[Any], temporary: Path, name: str) -> None:
 
 
 def _tables(pairs: PairSet) -> Iterator[Any]:
-    """Yield pairs as Arrow tables in the tidy layout, some pairs after the other; one at least."""
+    """Yields pairs as Arrow tables in the tidy layout, some pairs after the other; one at least."""
     optional = []
     if any(pair.lane is not None for pair in pairs.pairs):
         optional.append(LANE)
@@ -308,7 +308,7 @@ def _tables(pairs: PairSet) -> Iterator[Any]:
 
 
 def _as_table(pairs: Sequence[Pair], optional: Sequence[str], truths: Sequence[str]) -> Any:
-    """Return pairs as an Arrow table in the tidy layout.
+    """Returns pairs as an Arrow table in the tidy layout.
 
     Args:
         pairs: the rows.
@@ -346,12 +346,12 @@ def _as_table(pairs: Sequence[Pair], optional: Sequence[str], truths: Sequence[s
 
 
 def _over_time(arrays: Sequence[Floats]) -> Any:
-    """Return the values of all pairs one after the other."""
+    """Returns the values of all pairs one after the other."""
     return pa.array(np.concatenate([np.zeros(0), *arrays]), pa.float64())
 
 
 def _truth_names(pairs: PairSet) -> list[str]:
-    """Return the true parameters that any pair has, in the order in which they come."""
+    """Returns the true parameters that any pair has, in the order in which they come."""
     names: list[str] = []
     for pair in pairs.pairs:
         for name in pair.truth:

@@ -1,4 +1,4 @@
-"""What the rows of a tidy file must be to each other; each broken rule is a sentence with its row.
+"""Checks the relations between rows of a tidy file; each error is a sentence with the row.
 
 What single cells may hold is declared in `cfx.data.tidy.LAYOUT`.
 """
@@ -28,7 +28,7 @@ _AGREE_M = 0.5
 
 
 def check(table: Table) -> tuple[Table, Ints, Ints]:
-    """Check everything that the layout asks for.
+    """Checks everything that the layout asks for.
 
     Returns:
         The table, completed where it has gaps in place of other columns; the order `(N,)` that
@@ -46,7 +46,7 @@ def check(table: Table) -> tuple[Table, Ints, Ints]:
 
 
 def _check_frames(table: Table) -> tuple[Ints, Ints]:
-    """Check that frames are consecutive and the time step is constant.
+    """Checks that frames are consecutive and the time step is constant.
 
     Returns:
         As `check`.
@@ -84,12 +84,12 @@ def _check_frames(table: Table) -> tuple[Ints, Ints]:
 
 
 def _sizes(order: Ints, starts: Ints) -> Ints:
-    """Return how many frames each pair has."""
+    """Returns how many frames each pair has."""
     return np.diff(np.append(starts, len(order)))
 
 
 def _check_time(table: Table, order: Ints, starts: Ints, within: Marks) -> None:
-    """Check that time advances by a constant step within a pair.
+    """Checks that time advances by a constant step within a pair.
 
     Args:
         within: whether a row is of the same pair as the row before, for all but the first.
@@ -113,7 +113,7 @@ def _check_time(table: Table, order: Ints, starts: Ints, within: Marks) -> None:
 
 
 def _check_pairs(table: Table, order: Ints, starts: Ints) -> None:
-    """Raise DataError if what describes a pair as a whole changes within it."""
+    """Raises DataError if what describes a pair as a whole changes within it."""
     first = np.repeat(order[starts], _sizes(order, starts))
     described: dict[str, NDArray[Any]] = {}
     for name, labels in table.labels.items():
@@ -146,7 +146,7 @@ def _check_pairs(table: Table, order: Ints, starts: Ints) -> None:
 
 
 def _check_gap(table: Table) -> None:
-    """Raise DataError if a leader is not ahead of its follower."""
+    """Raises DataError if a leader is not ahead of its follower."""
     rear = table.numbers["leader_position_m"] - table.numbers["leader_length_m"]
     gap = rear - table.numbers["follower_position_m"]
     at = np.flatnonzero(~(gap > 0))
@@ -162,7 +162,7 @@ def _check_gap(table: Table) -> None:
 
 
 def time_steps(time: Floats, starts: Ints) -> Floats:
-    """Return the mean time step of each pair, s.
+    """Returns the mean time step of each pair, s.
 
     Args:
         time: of the rows in order, s.
@@ -174,7 +174,7 @@ def time_steps(time: Floats, starts: Ints) -> Floats:
 
 
 def with_positions(table: Table, order: Ints, starts: Ints) -> Table:
-    """Return a table that has every column, by its gaps.
+    """Returns a table that has every column, by its gaps.
 
     An absent length is 0, so that the leader's position is that of its rear bumper; it follows from
     the gap where both positions are there. An absent leader's position follows from the follower's,
@@ -212,7 +212,7 @@ def with_positions(table: Table, order: Ints, starts: Ints) -> Table:
 
 
 def _lengths(numbers: dict[str, Floats], order: Ints, starts: Ints) -> Floats:
-    """Return each pair's median of what its positions leave over beside the gap, `(N,)`."""
+    """Returns each pair's median of what its positions leave over beside the gap, `(N,)`."""
     left = numbers["leader_position_m"] - numbers["follower_position_m"] - numbers[GAP]
     result = np.empty_like(left)
     for rows in np.split(order, starts[1:]):
@@ -227,7 +227,7 @@ def _by_pair(
     starts: Ints,
     steps: Floats,
 ) -> Floats:
-    """Return what a function of values over time and a time step makes of each pair, `(N,)`."""
+    """Returns what a function of values over time and a time step makes of each pair, `(N,)`."""
     result = np.empty_like(values)
     for rows, step in zip(np.split(order, starts[1:]), steps.tolist(), strict=True):
         result[rows] = function(values[rows], step)
@@ -235,7 +235,7 @@ def _by_pair(
 
 
 def _check_agreement(table: Table) -> None:
-    """Raise DataError where positions and lengths make another gap than the file says."""
+    """Raises DataError where positions and lengths make another gap than the file says."""
     numbers = table.numbers
     between = numbers["leader_position_m"] - numbers[LENGTH] - numbers["follower_position_m"]
     at = np.flatnonzero(np.abs(between - numbers[GAP]) > _AGREE_M)

@@ -170,7 +170,7 @@ def runs(*keys: NDArray[Any]) -> tuple[Ints, Ints]:
 
 @dataclass(frozen=True)
 class _Facts:
-    """What is known of each row and the vehicle ahead; every array is `(N,)`.
+    """Facts of each row and the vehicle ahead; every array is `(N,)`.
 
     Attributes:
         ahead: index of the leader's row at that frame, 0 where there is none.

@@ -35,7 +35,7 @@ CURVE_COLUMNS = ["network", "epoch", "train_loss", "validation_loss"]
 
 @dataclass(frozen=True)
 class TrainingData:
-    """What a learner may see: the training part of some pairs.
+    """The training part of some pairs, which is all that a learner may see.
 
     Attributes:
         simulator: simulates the driving model, with its time step.
@@ -95,7 +95,7 @@ class TrainingData:
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """What a learner returns.
+    """The trained networks of a learner.
 
     Attributes:
         network: N trained networks, in evaluation mode.

@@ -1,4 +1,4 @@
-"""What learners of many networks share: N networks train as one batched network, each as if alone.
+"""Training of N networks as one batched network, each as if alone; all learners use it.
 
 The sum of N losses trains every network by its own loss. Gradients are clipped, the best epoch is
 chosen and training stops for each network on its own.

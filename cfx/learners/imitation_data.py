@@ -1,4 +1,4 @@
-"""What imitation learns from: its settings, and labels with the windows that they belong to.
+"""Training data of imitation: its settings, and labels with their windows.
 
 Shapes: P pairs, N networks, B trajectories of the network that has most, W windows, f features of a
 token, c features of conditioning, n tuned parameters.

@@ -162,7 +162,7 @@ class DrivingModel(Component):
 
     @property
     def limits(self) -> LimitSettings | None:
-        """What the vehicle can do, whatever the model wants; the step keeps to it."""
+        """The vehicle's limits, which every step keeps to; None: no limits."""
         return self.settings.limits
 
     @property

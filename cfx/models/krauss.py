@@ -18,7 +18,7 @@ from cfx.core.component import Settings
 from cfx.core.errors import ConfigError
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.models.base import DrivingModel, Follower, Leader, ModelSettings, bumper_gap
-from cfx.models.guarded import root
+from cfx.models.safe_math import safe_sqrt
 from cfx.models.sumo_step import sumo_speed
 from cfx.models.vtype import VType
 
@@ -114,7 +114,7 @@ class Krauss(DrivingModel):
         v, v_l = follower.speed, leader.speed
         lag = p["t_r"] + 0.5 * p["t_i"]
         radicand = b * b * lag * lag + b * (v_l * p["t_i"] + v_l * v_l / b_l + 2.0 * g)
-        v_safe = root(radicand) - b * lag
+        v_safe = safe_sqrt(radicand) - b * lag
         if self.settings.variant == "paper":
             return torch.minimum(torch.minimum(v + p["a"] * dt, p["v_max"]), v_safe).clamp(min=0.0)
         creep = torch.where(g <= b * dt, torch.minimum(b * dt, g / dt), v_safe)

@@ -18,7 +18,7 @@ _AT = 1e-6
 
 
 class LimitSettings(Settings):
-    """What a vehicle can do at all; the defaults are those of SUMO's passenger car."""
+    """Limits of a vehicle's acceleration; the defaults are those of SUMO's passenger car."""
 
     acceleration: float = Field(2.6, gt=0, description="m/s2: largest acceleration")
     comfortable_deceleration: float = Field(

@@ -44,8 +44,8 @@ from cfx.core.component import content_key, folder_hash
 from cfx.core.errors import ConfigError
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
-from cfx.models.guarded import root
 from cfx.models.regimes import Temperature
+from cfx.models.safe_math import safe_sqrt
 
 TIME = Parameter(
     "residual_time",
@@ -172,7 +172,7 @@ class WithResidual(DrivingModel):
         share = -torch.expm1(-(follower.memory[..., _PASSED] / p[HANDOVER.name]).square())
         held = self._remembered(follower, _HELD, follower.acceleration)
         both = (1.0 - share) * held + share * alone
-        both = both + root(share) * follower.memory[..., _RESIDUAL]
+        both = both + safe_sqrt(share) * follower.memory[..., _RESIDUAL]
         braked = _braked(both, alone, follower, leader)
         return (follower.speed + dt * braked).clamp(min=0.0)
 

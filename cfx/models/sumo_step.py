@@ -1,4 +1,4 @@
-"""What SUMO does around every car-following model in one Euler step.
+"""SUMO's Euler step around every car-following model.
 
 It is restated from measured behaviour (SUMO 1.28).
 """

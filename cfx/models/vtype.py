@@ -1,4 +1,4 @@
-"""What SUMO calls a driving model: the vehicle type that drives as the model does."""
+"""SUMO's vehicle type for a driving model."""
 
 from __future__ import annotations
 

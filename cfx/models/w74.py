@@ -20,8 +20,8 @@ from torch import Tensor
 
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.models.base import DrivingModel, Follower, Leader
-from cfx.models.guarded import root
 from cfx.models.regimes import SPACING, SPEED, below, exact, up_to
+from cfx.models.safe_math import safe_sqrt
 
 _NEAREST_ROOM = 1e-3
 """m: bounds quotients, and their gradients, beside a threshold; the brake cap acts long before."""
@@ -177,7 +177,7 @@ class W74(DrivingModel):
         s = leader.position - follower.position
         closing = v - v_l
         ax = leader.length + p["ax_add"]
-        bx = p["bx_add"] * root(torch.minimum(v, v_l))
+        bx = p["bx_add"] * safe_sqrt(torch.minimum(v, v_l))
         abx = ax + bx
         sdx = p["sdx_mult"] * abx
         sdv = ((s - ax) / p["cx"]).square()

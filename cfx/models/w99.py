@@ -19,8 +19,8 @@ from cfx.core.component import Settings
 from cfx.core.errors import ConfigError
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.models.base import DrivingModel, Follower, Leader, ModelSettings, bumper_gap
-from cfx.models.guarded import divisor, root
 from cfx.models.regimes import SPACING, SPEED, below, exact, up_to
+from cfx.models.safe_math import safe_divisor, safe_sqrt
 from cfx.models.sumo_step import sumo_speed
 from cfx.models.vtype import VType
 
@@ -183,20 +183,22 @@ class W99(DrivingModel):
         blocked = torch.where(dx < v * dt + _RESERVE * cc0, -p["b_max"], 0.0)
         beyond = dx > cc0
         brake = a_l + torch.where(
-            beyond, dv * dv / divisor(cc0 - dx, beyond), 0.5 * (dv - opening_threshold)
+            beyond, dv * dv / safe_divisor(cc0 - dx, beyond), 0.5 * (dv - opening_threshold)
         )
         brake = torch.where(dv < 0, brake.clamp(max=0.0), blocked)
-        brake = torch.where(brake > -cc7, -cc7, torch.maximum(brake, 0.5 * root(v) - 10.0))
+        brake = torch.where(brake > -cc7, -cc7, torch.maximum(brake, 0.5 * safe_sqrt(v) - 10.0))
         too_close = torch.where(v_l > 0, brake, blocked)
         # 2. Approaching.
         room = near - dx - 0.1
-        approaching = 0.5 * dv * dv / divisor(room, room.abs() > 0)
+        approaching = 0.5 * dv * dv / safe_divisor(room, room.abs() > 0)
         # 3. Following, unconsciously.
         following = torch.where(a_old <= 0, torch.minimum(a_old, -cc7), torch.maximum(a_old, cc7))
         # 4. Free, or closing the gap.
         a_max, cap = self._limits(v, cc8, p["cc9"])
         inside = dx < far
-        free = torch.where(inside, torch.minimum(dv * dv / divisor(far - dx, inside), a_max), a_max)
+        free = torch.where(
+            inside, torch.minimum(dv * dv / safe_divisor(far - dx, inside), a_max), a_max
+        )
         free = torch.where(dx > near, free, 0.0)
 
         if not exact(self.temperature):

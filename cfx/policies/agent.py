@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 
 class AgentState(NamedTuple):
-    """Where D drivers stand between two windows.
+    """State of D drivers between two windows.
 
     Attributes:
         network: which network drives each, `(D,)` int64.
@@ -164,7 +164,7 @@ class Agent:
 
     @property
     def is_stochastic(self) -> bool:
-        """Whether it leaves something to chance."""
+        """Whether it draws random numbers."""
         return self.head.noise_width > 0
 
     def stepper(self, simulator: Stepper) -> Stepper:

@@ -83,7 +83,7 @@ def load(folder: Path | str) -> Agent:
 
 
 class _Description(BaseModel):
-    """What `policy.json` must hold."""
+    """Schema of `policy.json`."""
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 

@@ -1,4 +1,4 @@
-"""What an agent knows of drivers before it drives in their place.
+"""Context of drivers: base parameters and driver features, known before driving.
 
 Shapes: D drivers, n tuned parameters, k driver features.
 """
@@ -12,7 +12,7 @@ from torch import Tensor
 
 
 class DriverContext(NamedTuple):
-    """What is known of D drivers; an empty context is that of unseen drivers.
+    """Context of D drivers; an empty one is that of unseen drivers.
 
     Attributes:
         base: parameters that answers refer to, `(D, n)`, or those of the driving model alone, `(D,
@@ -31,7 +31,7 @@ UNSEEN = DriverContext()
 
 @dataclass(frozen=True)
 class ContextRule:
-    """How a driver's context is made for an agent, as it was in training.
+    """Makes a driver's context for an agent, as in training.
 
     Attributes:
         driver_specific: the base is the driver's own calibrated parameters where these are known;

@@ -33,7 +33,7 @@ _SEEN, _ACTED, _FLAGS = 0, 1, 2
 
 
 class DrivenModel(NamedTuple):
-    """What an estimator simulates.
+    """The driving model that an estimator simulates.
 
     Attributes:
         model: the driving model.

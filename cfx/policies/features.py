@@ -1,4 +1,4 @@
-"""What a policy sees: the recent states of leader and follower, one token per window.
+"""Inputs of policies: the recent states of leader and follower, one token per window.
 
 The token of a window holds the last `length` frames up to and including the window's first, so it
 never looks ahead. Shapes: f features of a token.

@@ -32,7 +32,7 @@ _JITTER = 1e-9
 
 
 class FilterSettings(ResidualSettings):
-    """What filters of parameters assume; parameters are in the squashed space (logits)."""
+    """Settings of filters of parameters; parameters are in the squashed space (logits)."""
 
     spread: float = Field(
         0.5, gt=0, description="standard deviation of a driver's parameters around the pooled ones"

@@ -1,4 +1,4 @@
-"""What an agent has learned from, and how far a situation lies outside it.
+"""Valid range of a policy: the situations it learned from, and the distance to others.
 
 A situation is five signals: the follower's speed and acceleration, the leader's acceleration, the
 relative speed and the logarithm of the gap. Its score is its Mahalanobis distance from those that

@@ -1,4 +1,4 @@
-"""What calibration, learning and evaluation ask of whatever takes the steps."""
+"""Base class of steppers, which take a model's steps for calibration, learning and evaluation."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ _BYTES = 200.0  # of a pair and frame: signals, and the true parameters over tim
 
 
 class SyntheticSettings(DatasetSettings):
-    """What to simulate."""
+    """Settings of synthetic pairs."""
 
     min_frames: int = Field(2, ge=2, description="shortest pair that is kept, frames")
     seed: int = Field(0, ge=0, description="same seed, same data")

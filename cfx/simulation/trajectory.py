@@ -1,4 +1,4 @@
-"""Where a rollout begins, what it is compared with, and what it gives."""
+"""Segments that a rollout starts from and is compared with, and the trajectories it gives."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Start(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """What a rollout gives; all tensors `(*batch, time)`, frame 0 being the start.
+    """The result of a rollout; all tensors `(*batch, time)`, frame 0 being the start.
 
     Attributes:
         position: front bumper, m.

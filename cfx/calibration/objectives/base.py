@@ -21,7 +21,7 @@ Signal = Literal["speed", "gap"]
 
 
 class FrameValues(NamedTuple):
-    """What an objective sees: one frame `(*batch,)`, or many frames with a dimension of time.
+    """Simulated and recorded values: one frame `(*batch,)`, or many with a dimension of time.
 
     A signal that the objective does not list in `signals` may be NaN or have another shape.
 

@@ -43,7 +43,7 @@ _LOSSES_AT_ONCE = 1 << 19
 
 
 class CandidateLosses(Protocol):
-    """What an optimizer minimises: the losses of candidates in P independent problems.
+    """The losses of candidates in P independent problems, which an optimizer minimises.
 
     In a calibration these are values of the job's objective (`cfx.Objective`), in its unit.
     """
@@ -68,7 +68,7 @@ class CandidateLosses(Protocol):
 
 @dataclass(frozen=True)
 class Solution:
-    """What an optimizer found.
+    """The best candidates of each problem, and their losses.
 
     Attributes:
         best: `(P, n)` in unit space: of the candidates whose loss ties with the lowest, the nearest
@@ -202,10 +202,10 @@ class Optimizer(Component):
         guesses = guesses.double().clamp(0.0, 1.0)
         ended = Event()
 
-        def part(first: int) -> tuple[_Guarded, Tensor]:
+        def part(first: int) -> tuple[_CheckedLosses, Tensor]:
             last = min(first + chunk, problems)
             losses, origin = objective.select(first, last), registry.origin(self)
-            return _Guarded(losses, progress, n, origin, ended), guesses[first:last]
+            return _CheckedLosses(losses, progress, n, origin, ended), guesses[first:last]
 
         def reduced(own: Tensor, tried: Tried, losses: Tensor) -> tuple[Tensor, ...]:
             blocks = tried if isinstance(tried, tuple) else (tried,)
@@ -225,7 +225,7 @@ class Optimizer(Component):
                 for losses, own in map(part, starts):
                     pieces.append(reduced(own, *self.solve(losses, own, seed=seed)))
         finally:
-            ended.set()  # one thread failed, or a signal came: nobody waits for the others
+            ended.set()  # one thread failed, or a signal came: stop the others
         best, loss, filling, diverged = (torch.cat(parts) for parts in zip(*pieces, strict=True))
         return Solution(best, loss, filling, diverged)
 
@@ -322,10 +322,10 @@ def _in_unit_space(candidates: Tensor) -> bool:
     return bool(((candidates >= 0) & (candidates <= 1)).all())
 
 
-class _Guarded:
-    """Losses without NaN, which becomes infinity, of blocks of `AT_ONCE` candidates.
+class _CheckedLosses:
+    """Evaluates candidates in blocks of `AT_ONCE`, and replaces NaN by infinity.
 
-    Counts evaluations and refuses candidates outside the bounds, and all once the work has ended.
+    Counts evaluations. Refuses candidates outside the bounds, and all after the minimization ended.
     """
 
     def __init__(
@@ -348,7 +348,7 @@ class _Guarded:
 
     def __call__(self, candidates: Tensor) -> Tensor:
         if self._ended.is_set():
-            raise RuntimeError("nobody waits for these losses any more")
+            raise RuntimeError("this minimization has ended")
         shape = tuple(candidates.shape)
         if (
             candidates.dtype != torch.float64
@@ -376,7 +376,7 @@ class _Guarded:
         return torch.cat(found, dim=1)
 
     def select(self, first: int, last: int) -> CandidateLosses:
-        return _Guarded(
+        return _CheckedLosses(
             self._objective.select(first, last),
             self._progress,
             self._n,

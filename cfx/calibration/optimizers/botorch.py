@@ -166,7 +166,7 @@ class BotorchOptimizer(Optimizer):
 
 
 class _Search:
-    """What a chunk's Gaussian processes have seen, and what they propose next."""
+    """The Gaussian processes of a chunk of problems: their evaluations and next candidates."""
 
     def __init__(
         self, settings: BotorchSettings, tried: Tensor, losses: Tensor, *, guesses: int, seed: int

@@ -1,1 +1,1 @@
-"""Where a job's work runs: this machine's cores, or a cluster's."""
+"""Engines, which run a job's work: this machine's cores, or a cluster's."""

@@ -62,7 +62,7 @@ def _work_along(
 ) -> Generator[tuple[int, ResultT], None, None]:
     """Yields results of the workers and of this process."""
 
-    def look_after(units: int) -> None:
+    def report_and_hand_out(units: int) -> None:
         workers.report(units)
         workers.check()
         workers.hand_out(source)
@@ -70,7 +70,7 @@ def _work_along(
     workers.hand_out(source)
     for number, shard in source:
         with one_thread(), one_core():
-            result = work(shard, look_after)
+            result = work(shard, report_and_hand_out)
         yield number, result
         yield from workers.finished()
         workers.hand_out(source)

@@ -1,4 +1,4 @@
-"""What closed-loop training learns from: drivers placed on networks, with their bases and inputs.
+"""Training data of the closed loop: drivers assigned to networks, with bases and inputs.
 
 Shapes: P pairs of the training data, U recorded pairs among them, N networks (each member of an
 ensemble counts), E ensembles, B drivers of the network that has most, D trajectories of each
@@ -43,7 +43,7 @@ on motorways."""
 
 
 class Conditioning(NamedTuple):
-    """What is known of the drivers of N by D trajectories.
+    """Context of the drivers of N by D trajectories: pairs, bases and features.
 
     Attributes:
         pair: which pair each is of, `(N, D)`.
@@ -204,7 +204,7 @@ class RolloutDataset:
             total=len(self.pair),
         )
 
-    def lots(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+    def uniform(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
         """Returns uniform random numbers from 0 to 1 for these networks, `(N, *shape)`.
 
         Args:
@@ -214,7 +214,7 @@ class RolloutDataset:
         return self._of_these(torch.rand((self._total, *shape), generator=generator))
 
     def normal(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
-        """As `lots`, from the standard normal distribution."""
+        """As `uniform`, from the standard normal distribution."""
         return self._of_these(torch.randn((self._total, *shape), generator=generator))
 
     @property
@@ -279,8 +279,8 @@ class RolloutDataset:
             count: how many.
             generator: on the CPU.
         """
-        lots = self.lots(tuple(wanted.shape[1:]), generator)
-        return torch.where(wanted, lots, -1.0).topk(count, dim=1).indices.sort(1).values
+        draws = self.uniform(tuple(wanted.shape[1:]), generator)
+        return torch.where(wanted, draws, -1.0).topk(count, dim=1).indices.sort(1).values
 
     def _draw(self, chance: Tensor, count: int, generator: torch.Generator) -> Tensor:
         """Draws `count` places of each network with replacement, `(N, count)`, in order.
@@ -291,8 +291,8 @@ class RolloutDataset:
             generator: on the CPU.
         """
         upto = chance.cumsum(1)
-        lots = self.lots((count,), generator) * upto[:, -1:]
-        places = torch.searchsorted(upto, lots, right=True)
+        draws = self.uniform((count,), generator) * upto[:, -1:]
+        places = torch.searchsorted(upto, draws, right=True)
         last = (chance > 0).long().cumsum(1).argmax(1, keepdim=True)
         return places.minimum(last).sort(1).values
 
@@ -419,7 +419,7 @@ def usual_time_gap(batch: PairBatch, last: Tensor) -> Tensor:
 
 
 class _Validation(NamedTuple):
-    """Which drivers are kept for validation.
+    """The drivers kept for validation.
 
     Attributes:
         kept: whether a place's driver is, bool `(N, B)`.

@@ -94,7 +94,7 @@ class RolloutBatch(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """What was measured at simulated frames, `(N, D, frames)` each.
+    """Recorded values at simulated frames, `(N, D, frames)` each.
 
     Attributes:
         speed: m/s.
@@ -109,7 +109,7 @@ class Measured(NamedTuple):
 
 @dataclass(frozen=True)
 class RolloutInputs:
-    """What is measured around trajectories.
+    """Recorded values before, during and after trajectories.
 
     Positions are relative to the follower's at the start of its trajectory.
 

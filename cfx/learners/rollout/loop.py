@@ -30,7 +30,7 @@ from cfx.learners.rollout.window import GradientPath, LeaderWindow, LoopState, W
 
 
 class ExpertState(NamedTuple):
-    """Where experts stand beside N by D trajectories.
+    """State of the experts beside N by D trajectories.
 
     Attributes:
         conditioning: what they know of the drivers.
@@ -98,7 +98,7 @@ class Expert:
 
 
 class Segment(NamedTuple):
-    """What was simulated between two cuts of the gradients, `(N, D, frames)` each.
+    """Simulated values between two cuts of the gradients, `(N, D, frames)` each.
 
     Attributes:
         speed: m/s.

@@ -39,7 +39,7 @@ _LEAST_DIVISOR = 1e-6
 
 
 class Divisors(NamedTuple):
-    """What the terms of each trajectory's loss are divided by, `(N, D)` each.
+    """Divisors of the terms of each trajectory's loss, `(N, D)` each.
 
     Attributes:
         objective: in the objective's unit.
@@ -230,7 +230,7 @@ frames after the start nothing can be wrong."""
 
 
 class FrameWeights(NamedTuple):
-    """How much each frame after the start counts, `(N, 1, K)` each, 1 in the mean error.
+    """Weight of each frame after the start, `(N, 1, K)` each, 1 in the mean error.
 
     Frames after the last count as the last.
 

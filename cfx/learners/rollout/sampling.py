@@ -1,4 +1,4 @@
-"""Which trajectories are simulated in a gradient step and in validation, and their augmentation.
+"""Samples the trajectories of gradient steps and of validation, and augments them.
 
 Trajectories are augmented where they are simulated (`RolloutBatch.scale`, `RolloutBatch.shift`).
 `Augmentation` does the same to single situations, for the valid range, with as many that are made
@@ -74,11 +74,11 @@ class TrajectorySampler:
         generator = torch.Generator().manual_seed(self.step_seed(step))
         place = dataset.training_places(s.drivers, generator).repeat(1, s.draws)
         shape = tuple(place.shape[1:])
-        share = dataset.lots(shape, generator)
+        share = dataset.uniform(shape, generator)
         until = dataset.until.gather(1, place)
         latest = (until // self.stride - s.horizon // 2).clamp(min=1)
-        lots = dataset.lots(shape, generator)
-        cold_start = lots < self.cold_start_fraction
+        draws = dataset.uniform(shape, generator)
+        cold_start = draws < self.cold_start_fraction
         scale = None
         if self.cold_start_fraction > 0 and s.scaling > 0:
             factor = torch.exp(s.scaling * dataset.normal(shape, generator))
@@ -97,8 +97,8 @@ class TrajectorySampler:
         if self.cold_start_fraction == 0 or s.speed_shift == 0:
             return None, None
         shape = tuple(place.shape[1:])
-        lots, speed = dataset.lots(shape, generator), dataset.lots(shape, generator)
-        shift = torch.where(cold_start & (lots < SHIFTED), s.speed_shift * speed, 0.0)
+        draws, speed = dataset.uniform(shape, generator), dataset.uniform(shape, generator)
+        shift = torch.where(cold_start & (draws < SHIFTED), s.speed_shift * speed, 0.0)
         time_gap = dataset.time_gap[dataset.pair.gather(1, place)]
         return shift, shift * time_gap
 
@@ -171,9 +171,9 @@ class Augmentation:
         """Returns other situations of pairs `(P,)`; signals `(P, W)` each."""
         s, like = self.settings, history.gap
         normal = torch.randn(like.shape, generator=self.generator).to(like)
-        lots = torch.rand((2, *like.shape), generator=self.generator).to(like)
+        draws = torch.rand((2, *like.shape), generator=self.generator).to(like)
         scale = torch.exp(s.scaling * normal)
-        shift = torch.where(lots[0] < SHIFTED, s.speed_shift * lots[1], 0.0)
+        shift = torch.where(draws[0] < SHIFTED, s.speed_shift * draws[1], 0.0)
         wider = shift * self.time_gap[pairs][:, None].to(like)
         return History(
             leader_speed=history.leader_speed * scale + shift,

@@ -16,7 +16,7 @@ from cfx.simulation.rollout import Compile
 
 
 class HeadSettings(Settings):
-    """What networks answer."""
+    """Settings of the head."""
 
     head: Annotated[str, AfterValidator(trained_head("rollout"))] = Field(
         "offset",

@@ -118,7 +118,7 @@ class TrainingShard:
 
 @dataclass(frozen=True)
 class TrainedShard:
-    """What the networks of a shard have learned.
+    """The trained networks of a shard, and their learning curves.
 
     Attributes:
         weights: of each one's best epoch.

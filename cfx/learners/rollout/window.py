@@ -1,4 +1,4 @@
-"""One window of the closed loop under gradients: what it carries, its steps, the way back.
+"""One window of the closed loop under gradients: its state, steps and backward pass.
 
 Training repeats a window thousands of times for all networks and trajectories at once, so it is one
 function of plain tensors that `torch.compile` turns into few kernels, forwards and backwards. Agent
@@ -33,7 +33,7 @@ from cfx.simulation.step import advance_vehicle
 
 
 class LoopState(NamedTuple):
-    """Where N by D trajectories stand: the follower's last L frames, the last being now.
+    """State of N by D trajectories: the follower's last L frames, the last being now.
 
     Attributes:
         position: front bumper, `(N, D, L)`, m.

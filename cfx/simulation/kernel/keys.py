@@ -1,4 +1,4 @@
-"""What recorded steps are known by, in one process and, where that is safe, in later ones."""
+"""Keys of recorded steps, within one process and, where that is safe, on disk."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cfx.simulation import step
 
 
 class ComponentKey(NamedTuple):
-    """What a component's equations depend on.
+    """Key of a component's equations.
 
     Attributes:
         component: the class.
@@ -24,7 +24,7 @@ class ComponentKey(NamedTuple):
 
 
 class KernelKey(NamedTuple):
-    """What a kernel depends on.
+    """Key of a kernel.
 
     Attributes:
         model: the driving model.

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from cfx.core.threads import share
 from cfx.models.base import DrivingModel
-from cfx.simulation import pages
+from cfx.simulation import allocator
 from cfx.simulation.kernel import compiler
 from cfx.simulation.kernel.columns import Unsupported
 from cfx.simulation.kernel.graph import record
@@ -72,7 +72,7 @@ def accumulate(
     kernel = _kernel(model, dt, p, terms, key)
     if kernel is None:
         return None
-    pages.keep()
+    allocator.keep_freed_memory()
     shape = common_shape([(len(segments.speed), 1), *[value.shape for value in p.values()]])
     sums = segments.speed.new_empty((kernel.terms, *shape))
     memory = model.initial_memory(segments.speed).contiguous()

@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 
-def root(value: Tensor) -> Tensor:
+def safe_sqrt(value: Tensor) -> Tensor:
     """Returns `sqrt(value)` where `value > 0`, and 0 with slope 0 elsewhere."""
     positive = value > 0
     return torch.where(positive, torch.sqrt(torch.where(positive, value, 1.0)), 0.0)
 
 
-def divisor(value: Tensor, used: Tensor) -> Tensor:
+def safe_divisor(value: Tensor, used: Tensor) -> Tensor:
     """Returns `value` where `used`, 1 elsewhere: a divisor for the branch that `used` selects.
 
     Args:

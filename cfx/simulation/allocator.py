@@ -1,4 +1,4 @@
-"""Memory that a process freed stays with it for a while.
+"""Keeps freed memory in the process, so that the next arrays need no fresh pages.
 
 A calibration writes arrays of a few megabytes, frees them and asks for them again. By its own
 rule glibc gives such memory back to the system each time, which must then clear and map fresh
@@ -15,8 +15,8 @@ _TRIM_BYTES, _MMAP_BYTES = 64 << 20, 32 << 20
 
 
 @functools.cache
-def keep() -> bool:
-    """Lets this process keep up to 64 MB that it freed; returns whether glibc is there to do so.
+def keep_freed_memory() -> bool:
+    """Makes glibc keep up to 64 MB of freed memory; returns whether this is glibc.
 
     The values are the highest that glibc itself would come to; it only starts from lower ones.
     """
