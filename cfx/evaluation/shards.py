@@ -16,7 +16,7 @@ from cfx.core import scratch
 from cfx.core.engine.base import Engine, Report
 from cfx.core.memory import give_back
 from cfx.evaluation.closed_loop import ClosedLoop, Followers, simulate_closed_loop
-from cfx.policies.agent import Agent
+from cfx.policies.agent import Agent, TrainedOn
 from cfx.simulation.base import Stepper
 
 PAIRS_AT_ONCE = 1024
@@ -59,8 +59,8 @@ def simulate_in_shards(
         engine: where shards are simulated; few pairs are simulated here.
         simulator, agent, followers, first: as for `simulate_closed_loop`.
     """
-    # Whom it has learned from is a long list, and drives nothing.
-    agent = replace(agent, learned_from={})
+    # What it has learned from is a long list, and drives nothing.
+    agent = replace(agent, trained_on=TrainedOn())
     whole = ClosedLoopShard(simulator, agent, followers, first)
     batch = followers.batch
     if len(batch) <= PAIRS_AT_ONCE:

@@ -93,6 +93,20 @@ class AgentState(NamedTuple):
 
 
 @dataclass(frozen=True)
+class TrainedOn:
+    """What a policy learned from, as far as it says.
+
+    Attributes:
+        pairs: those that were learned from or calibrated on: `Pair.likeness` and the driver's name.
+        quantiles: 5, 50 and 95 % of speed (m/s), acceleration (m/s2) and time gap (s) of the
+            drivers; empty if they are not known.
+    """
+
+    pairs: Mapping[str, str] = field(default_factory=dict)
+    quantiles: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Agent:
     """N networks that are ready to drive.
 
@@ -107,10 +121,7 @@ class Agent:
         context_rule: how a driver's context is made.
         population: pooled parameters calibrated on the drivers that each network learned from,
             `(N, n)`, SI units; None if there are none.
-        learned_from: the pairs that were learned from or calibrated on: `Pair.likeness` and the
-            driver's name.
-        recorded: quantiles (5, 50, 95 %) of speed (m/s), acceleration (m/s2) and time gap (s) of
-            the drivers learned from; empty if they are not known.
+        trained_on: what it learned from.
         valid_range: the situations that each network learned from; None if they are not known.
             Outside, answers fade towards the base, or towards the pooled parameters where the head
             has no base.
@@ -127,10 +138,9 @@ class Agent:
     base: Tensor | None = None
     context_rule: ContextRule = field(default_factory=ContextRule)
     population: Tensor | None = None
-    learned_from: Mapping[str, str] = field(default_factory=dict)
+    trained_on: TrainedOn = field(default_factory=TrainedOn)
     valid_range: ValidRange | None = None
     dispersion: Tensor | None = None
-    recorded: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     @property
     def policy(self) -> Policy:

@@ -22,7 +22,7 @@ from cfx.core.errors import ConfigError, DataError, ParameterError
 from cfx.core.files import atomic_write
 from cfx.core.job_folder import examine, parse_json
 from cfx.models.base import DrivingModel
-from cfx.policies.agent import Agent
+from cfx.policies.agent import Agent, TrainedOn
 from cfx.policies.base import Policy
 from cfx.policies.context import ContextRule
 from cfx.policies.core import AgentCore, features_read, network_with_weights
@@ -163,10 +163,9 @@ def _agent(
             history_s=description.history,
         ),
         population=weights.get("population"),
-        learned_from=description.learned_from,
+        trained_on=TrainedOn(description.learned_from, description.recorded),
         valid_range=_valid_range(weights),
         dispersion=weights.get("dispersion"),
-        recorded=description.recorded,
     )
 
 
@@ -224,8 +223,8 @@ def _description(agent: Agent) -> dict[str, Any]:
         "shrinkage": rule.shrinkage,
         "own": rule.driver_specific,
         "history": rule.history_s,
-        "learned_from": dict(agent.learned_from),
-        "recorded": {name: list(values) for name, values in agent.recorded.items()},
+        "learned_from": dict(agent.trained_on.pairs),
+        "recorded": {name: list(values) for name, values in agent.trained_on.quantiles.items()},
     }
 
 

@@ -15,6 +15,7 @@ from cfx.evaluation import shards
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.evaluation.shards import simulate_in_shards
 from cfx.models.krauss import Krauss
+from cfx.policies.agent import TrainedOn
 from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
 from tests.drives import wavy_pairs
@@ -65,7 +66,7 @@ def test_a_shard_holds_nothing_of_the_others(monkeypatch: pytest.MonkeyPatch) ->
     model, pairs = Krauss(), pairs_of_several_lengths()
     batch, engine = PairBatch.of(pairs), Remembering()
     agent = adaptive(model, GruPolicy(hidden_size=4), len(pairs), 30)
-    agent = replace(agent, learned_from={"content": "driver"})
+    agent = replace(agent, trained_on=TrainedOn({"content": "driver"}))
     first, network = torch.full((5,), 10), torch.arange(5)
     simulate_in_shards(engine, MemoryStepper(model, 0.1), agent, Followers(batch, network), first)
     assert [len(one.followers.batch) for one in engine.shards] == [2, 2, 1]
@@ -75,7 +76,7 @@ def test_a_shard_holds_nothing_of_the_others(monkeypatch: pytest.MonkeyPatch) ->
         assert one.followers.batch.leader_speed.untyped_storage().nbytes() == rows * row
         assert one.first.untyped_storage().nbytes() == rows * one.first.itemsize
         assert len(one.agent.names) == len(one.agent.scaler.mean) == rows
-        assert not one.agent.learned_from
+        assert not one.agent.trained_on.pairs
 
 
 def counted(values: Tensor, frames: Tensor) -> Tensor:

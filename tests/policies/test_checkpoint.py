@@ -13,7 +13,7 @@ from cfx.core.errors import DataError
 from cfx.data.pairs import PairBatch
 from cfx.models.krauss import Krauss
 from cfx.policies import checkpoint
-from cfx.policies.agent import Agent
+from cfx.policies.agent import Agent, TrainedOn
 from cfx.policies.context import ContextRule, DriverContext
 from cfx.policies.features import measured_history
 from tests.agents import adaptive
@@ -40,13 +40,13 @@ def test_a_loaded_agent_chooses_what_the_saved_one_chose(tmp_path: Path, head: s
     agent = replace(
         made,
         context_rule=ContextRule(driver_specific=False, shrinkage=0.3, history_s=20.0),
-        learned_from={"abc": "a/1"},
+        trained_on=TrainedOn({"abc": "a/1"}),
     )
     checkpoint.save(agent, tmp_path)
     loaded = checkpoint.load(tmp_path)
     assert torch.equal(chosen(loaded), chosen(agent))
     assert loaded.context_rule == agent.context_rule
-    assert loaded.learned_from == agent.learned_from
+    assert loaded.trained_on == agent.trained_on
     assert loaded.names == agent.names
     description = json.loads((tmp_path / "policy.json").read_text())
     assert description["head"] == head

@@ -28,7 +28,7 @@ from cfx.evaluation.metrics.installed import MetricSet
 from cfx.evaluation.result import Evaluation
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingResult
 from cfx.models.residual import TIME
-from cfx.policies.agent import Agent
+from cfx.policies.agent import Agent, TrainedOn
 from cfx.policies.base import ConstantNetwork, Policy
 from cfx.policies.core import AgentCore, features_read
 from cfx.policies.features import token_width
@@ -98,8 +98,8 @@ class ProtocolContext:
         return self.calibrator.engine
 
     @cached_property
-    def _recorded(self) -> dict[str, tuple[float, ...]]:
-        """`Agent.recorded` of all agents here."""
+    def _quantiles(self) -> dict[str, tuple[float, ...]]:
+        """`TrainedOn.quantiles` of all agents here."""
         return recorded_quantiles(self.batch)
 
     def labels(self, counts: Tensor, fixed: Tensor) -> Labels | None:
@@ -226,10 +226,9 @@ class ProtocolContext:
             dt=self.simulator.dt,
             names=names,
             base=training_result.base,
-            learned_from=learned_from,
+            trained_on=TrainedOn(learned_from, self._quantiles),
             valid_range=training_result.valid_range,
             dispersion=training_result.dispersion,
-            recorded=self._recorded,
         )
 
     def _head(self, policy: Policy, training_result: TrainingResult) -> ParameterHead:

@@ -105,7 +105,7 @@ class FinishedPolicy:
         )
         notes = {
             "run": str(self.run),
-            "pairs_learned_from": len(policy.learned_from),
+            "pairs_learned_from": len(policy.trained_on.pairs),
             "drivers_named_as_some_learned_from": self._named_alike(pairs),
         }
         return Trained(
@@ -129,7 +129,7 @@ class FinishedPolicy:
                 f"{where}: this policy drives in steps of {policy.dt:g} s, {pairs.source} has"
                 f" {pairs.dt:g} s; set data.time_step={policy.dt:g}"
             )
-        learned_from = LearnedFrom(policy.learned_from)
+        learned_from = LearnedFrom(policy.trained_on.pairs)
         known = [pair.pair_id for pair in pairs if pair in learned_from]
         if known:
             raise DataError(
@@ -137,7 +137,7 @@ class FinishedPolicy:
                 f" {pairs.source}, the first of them '{known[0]}'; test it on others"
                 " (data.recording, data.pair_ids)"
             )
-        if not policy.learned_from:
+        if not policy.trained_on.pairs:
             log.info(
                 "%s does not say which pairs its policy has learned from; check yourself that these"
                 " are others",
@@ -154,7 +154,7 @@ class FinishedPolicy:
 
     def _named_alike(self, pairs: PairSet) -> int:
         """Counts drivers here who have the name of one that the policy learned from."""
-        return len({pair.driver for pair in pairs} & set(self.agent.learned_from.values()))
+        return len({pair.driver for pair in pairs} & set(self.agent.trained_on.pairs.values()))
 
 
 class FoldsOrFinishedSettings(AcrossDriversSettings):

@@ -57,36 +57,64 @@ class Conditioning(NamedTuple):
     features: Tensor
 
 
+class Part(NamedTuple):
+    """Some of all networks of a training: which these are, and how many there are in all."""
+
+    networks: slice
+    total: int
+
+
+@dataclass
+class Recordings:
+    """What was measured of U pairs, each held once however many networks learn from it.
+
+    Attributes:
+        batch: the pairs.
+        pair: which of the P pairs each is, `(U,)`.
+        tokens: measured, `(U, W, f)`.
+        driver_features: from each driver's whole training part, `(U, k)`; NaN where too little was
+            measured.
+        time_gap: each driver's usual one, `(U,)`, s.
+    """
+
+    batch: PairBatch
+    pair: Tensor
+    tokens: Tensor
+    driver_features: Tensor
+    time_gap: Tensor
+
+    def __getitem__(self, rows: Tensor) -> Recordings:
+        """Returns some of the pairs."""
+        return Recordings(
+            self.batch[rows],
+            self.pair[rows],
+            self.tokens[rows],
+            self.driver_features[rows],
+            self.time_gap[rows],
+        )
+
+
 @dataclass
 class RolloutDataset:
     """The training data, placed as N networks by B drivers, in single precision.
 
-    Networks learn from the same recordings: each is held once.
-
     Attributes:
-        batch: the U pairs.
-        recorded: which of the P pairs each is, `(U,)`.
+        recordings: of the U pairs.
         pair: which of the U pairs stands at each place, `(N, B)`.
         trains, validates: what a place is used for, bool `(N, B)`.
         until: last frame that training may use, `(N, B)`.
         last: last frame of the training part, `(N, B)`.
         base: each driver's base in unit space, `(N, B, n)`.
         pooled: the base of drivers without one of their own, in unit space, `(N, n)`.
-        tokens: measured, `(U, W, f)`.
-        driver_features: from each driver's whole training part, `(U, k)`; NaN where too little was
-            measured.
-        time_gap: each driver's usual one, `(U,)`, s.
         chance: how likely each place is sampled, in relation to the others of its network, `(N,
             B)`; None: all places alike.
         scaler: normalises tokens and conditioning, f + c features; alike for all members of an
             ensemble.
         ensemble_size: networks of an ensemble, which stand behind one another.
-        networks: which of all networks of the training these are; None: all.
-        total: how many networks there are in all, where these are some.
+        part: which of all networks of the training these are; None: all.
     """
 
-    batch: PairBatch
-    recorded: Tensor
+    recordings: Recordings
     pair: Tensor
     trains: Tensor
     validates: Tensor
@@ -94,14 +122,10 @@ class RolloutDataset:
     last: Tensor
     base: Tensor
     pooled: Tensor
-    tokens: Tensor
-    driver_features: Tensor
-    time_gap: Tensor
     scaler: Scaler
     chance: Tensor | None = None
     ensemble_size: int = 1
-    networks: slice | None = None
-    total: int = 0
+    part: Part | None = None
 
     @classmethod
     def of(
@@ -158,8 +182,9 @@ class RolloutDataset:
         placed = base[pair]
         scaler = _scaler(seen, placed[first], driver_features, of_driver[first], counted)
         return cls(
-            batch=batch,
-            recorded=recorded,
+            recordings=Recordings(
+                batch, recorded, seen, driver_features, _usual_time_gaps(batch, frame)
+            ),
             pair=of_driver,
             trains=trains,
             validates=present & (few | kept) & (share > 0),
@@ -167,9 +192,6 @@ class RolloutDataset:
             last=last,
             base=placed,
             pooled=pooled.repeat_interleave(ensemble_size, 0),
-            tokens=seen,
-            driver_features=driver_features,
-            time_gap=_usual_time_gaps(batch, frame),
             chance=_chance(training_data, pair, present, balance),
             scaler=Scaler(
                 scaler.mean.repeat_interleave(ensemble_size, 0),
@@ -186,8 +208,7 @@ class RolloutDataset:
         rows, pair = torch.unique(self.pair[networks], return_inverse=True)
         return replace(
             self,
-            batch=self.batch[rows],
-            recorded=self.recorded[rows],
+            recordings=self.recordings[rows],
             pair=pair,
             trains=self.trains[networks],
             validates=self.validates[networks],
@@ -195,13 +216,9 @@ class RolloutDataset:
             last=self.last[networks],
             base=self.base[networks],
             pooled=self.pooled[networks],
-            tokens=self.tokens[rows],
-            driver_features=self.driver_features[rows],
-            time_gap=self.time_gap[rows],
             chance=None if self.chance is None else self.chance[networks],
             scaler=Scaler(self.scaler.mean[networks], self.scaler.scale[networks]),
-            networks=networks,
-            total=len(self.pair),
+            part=Part(networks, len(self.pair)),
         )
 
     def uniform(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
@@ -219,17 +236,17 @@ class RolloutDataset:
 
     @property
     def _total(self) -> int:
-        return self.total if self.networks is not None else len(self.pair)
+        return len(self.pair) if self.part is None else self.part.total
 
     def _of_these(self, values: Tensor) -> Tensor:
-        if self.networks is not None:
-            values = values[self.networks]
+        if self.part is not None:
+            values = values[self.part.networks]
         return values.to(self.pair.device)
 
     def for_base(self, base: Tensor) -> RolloutDataset:
         """Returns the same drivers with one base of another model, `(n,)` in its unit space."""
         networks, drivers = self.pair.shape
-        token_end = self.tokens.shape[-1]
+        token_end = self.recordings.tokens.shape[-1]
         base_end = token_end + self.base.shape[-1]
         mean, scale = self.scaler.mean, self.scaler.scale
         center = squashed(base).expand(networks, -1)
@@ -305,9 +322,9 @@ class RolloutDataset:
         pair, cold_start = self.pair.gather(1, batch.place), batch.cold_start[..., None]
         base = torch.where(cold_start, self.pooled[:, None], self.base[batch.row, batch.place])
         features = squashed(base)
-        count = self.driver_features.shape[-1]
+        count = self.recordings.driver_features.shape[-1]
         if count > 0:
-            measured = self.driver_features[pair]
+            measured = self.recordings.driver_features[pair]
             usual = self.scaler.mean[:, None, -count:]
             known = torch.where(cold_start | measured.isnan(), usual, measured)
             features = torch.cat([features, known], -1)

@@ -149,7 +149,7 @@ def burn_in(
     if most is not None:
         count = min(count, most)
     windows = start - count + torch.arange(count, device=start.device)[:, None, None]
-    tokens = dataset.tokens[conditioning.pair, windows.clamp(min=0)]
+    tokens = dataset.recordings.tokens[conditioning.pair, windows.clamp(min=0)]
     state = step.core.network.initial_state(*conditioning.pair.shape)
     if state.is_floating_point() and torch.is_grad_enabled():
         # As all later states, so that one compiled function serves all windows.
@@ -192,7 +192,7 @@ def simulate(
     state = state.repeat(1, paths, 1)
     batch = batch.repeated(paths)
     conditioning = dataset.condition(batch)
-    inputs = RolloutInputs.of(dataset.batch, conditioning.pair, batch, step, windows)
+    inputs = RolloutInputs.of(dataset.recordings.batch, conditioning.pair, batch, step, windows)
     now = inputs.initial(state)
     expert_state: ExpertState | None = None
     if expert is not None:

@@ -84,10 +84,10 @@ class BaseErrors:
         wanted = torch.cat([pair, torch.cat([own, pooled], 1)], -1)
         rows, row = torch.unique(wanted.flatten(0, 1), dim=0, return_inverse=True)
         row = row.view(networks, 2 * drivers)
-        bases = _Bases.of(rows[:, 0].long(), rows[:, 1:], len(dataset.batch))
+        bases = _Bases.of(rows[:, 0].long(), rows[:, 1:], len(dataset.recordings.batch))
         simulation = _ConstantParameters(training_data, dataset, bases)
         stride = training_data.windows.stride
-        frames = torch.arange(dataset.tokens.shape[1], device=own.device) * stride
+        frames = torch.arange(dataset.recordings.tokens.shape[1], device=own.device) * stride
         over_windows = simulation.errors(frames, horizon * stride)
         over_pair = simulation.errors(frames[:1], int(dataset.last.max()))[:, 0]
         objective = training_data.objective
@@ -169,9 +169,9 @@ class _ConstantParameters:
         self.simulator = training_data.simulator
         self.objective = training_data.objective
         self.batch = training_data.recorded
-        self.pair = training_data.pair[dataset.recorded]
-        frame = training_data.split.frame.to(dataset.recorded.device)
-        self.last = frame[dataset.recorded]
+        self.pair = training_data.pair[dataset.recordings.pair]
+        frame = training_data.split.frame.to(dataset.recordings.pair.device)
+        self.last = frame[dataset.recordings.pair]
         self.bases = bases
 
     @torch.no_grad()

@@ -99,7 +99,7 @@ class TrajectorySampler:
         shape = tuple(place.shape[1:])
         draws, speed = dataset.uniform(shape, generator), dataset.uniform(shape, generator)
         shift = torch.where(cold_start & (draws < SHIFTED), s.speed_shift * speed, 0.0)
-        time_gap = dataset.time_gap[dataset.pair.gather(1, place)]
+        time_gap = dataset.recordings.time_gap[dataset.pair.gather(1, place)]
         return shift, shift * time_gap
 
     def validation_with_history(

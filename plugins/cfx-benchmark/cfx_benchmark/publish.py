@@ -106,8 +106,8 @@ def _card(name: str, agent: Agent, metrics: dict[str, Any], data: dict[str, Any]
         "command": command_of(name),
         "training_data": {
             "source": _TRAINING_DATA,
-            "pairs": len(agent.learned_from),
-            "drivers": len(set(agent.learned_from.values())),
+            "pairs": len(agent.trained_on.pairs),
+            "drivers": len(set(agent.trained_on.pairs.values())),
             "fingerprint": data.get("fingerprint", ""),
         },
         "evaluation": "5 folds over drivers: nothing of a tested driver was learned from",

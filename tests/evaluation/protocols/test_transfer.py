@@ -282,6 +282,6 @@ def test_a_job_that_drives_a_saved_policy_hands_it_on(unseen: Path, tmp_path: Pa
     twice = transferred(once.folder, tmp_path / "twice")
     pd.testing.assert_frame_equal(twice.pairs, once.pairs)
     assert (
-        checkpoint.load(twice.folder / "policy").learned_from
-        == checkpoint.load(unseen / "policy").learned_from
+        checkpoint.load(twice.folder / "policy").trained_on.pairs
+        == checkpoint.load(unseen / "policy").trained_on.pairs
     )

@@ -18,7 +18,7 @@ MODULE = module_of(DATA, cold_start_fraction=1.0, speed_shift=20.0)
 def inputs(batch: RolloutBatch) -> RolloutInputs:
     dataset = MODULE.dataset
     pair = dataset.pair.gather(1, batch.place)
-    return RolloutInputs.of(dataset.batch, pair, batch, MODULE.exact_step, 3)
+    return RolloutInputs.of(dataset.recordings.batch, pair, batch, MODULE.exact_step, 3)
 
 
 def batch(shift: float, wider: float) -> RolloutBatch:
@@ -64,7 +64,7 @@ def test_some_cold_starts_are_faster_and_their_gap_fits() -> None:
         share.append(float((shift > 0).float().mean()))
     assert 0.15 < sum(share) / len(share) < 0.45
     pair = MODULE.dataset.pair.gather(1, drawn.place)
-    time_gap = MODULE.dataset.time_gap[pair]
+    time_gap = MODULE.dataset.recordings.time_gap[pair]
     torch.testing.assert_close(drawn.wider[faster], (drawn.shift * time_gap)[faster])
     none = module_of(DATA, cold_start_fraction=1.0, speed_shift=0.0).sampler.training(0)
     assert none.shift is None

@@ -61,14 +61,14 @@ def test_divisors_grow_with_the_scale_of_a_trajectory_where_the_objective_has_a_
 def test_networks_that_share_pairs_and_bases_share_their_errors() -> None:
     data = training_data(networks=3, base=TRUE.repeat(3, 1))
     dataset = placed(data, gru(), 0.0)
-    assert len(dataset.batch) == 6
+    assert len(dataset.recordings.batch) == 6
     errors = BaseErrors.of(data, dataset, 12)
     assert len(errors.over_windows) == 12
     assert torch.equal(errors.own[0], errors.own[2])
     one = data.split.frame[:6].clone()
     one[0] = 120  # one network's training part of a pair ends earlier
     split = replace(data.split, frame=torch.cat([one, data.split.frame[6:]]))
-    assert len(placed(replace(data, split=split), gru(), 0.0).batch) == 7
+    assert len(placed(replace(data, split=split), gru(), 0.0).recordings.batch) == 7
 
 
 def test_errors_of_some_networks_are_those_of_all() -> None:

@@ -41,7 +41,7 @@ def test_an_expert_says_what_it_would_do_where_the_student_stands() -> None:
     batch = batch_of(dataset, torch.where(cold_start, 0, 15), cold_start)
     with torch.no_grad():
         conditioning = dataset.condition(batch)
-        inputs = RolloutInputs.of(dataset.batch, conditioning.pair, batch, step, 8)
+        inputs = RolloutInputs.of(dataset.recordings.batch, conditioning.pair, batch, step, 8)
         own = inputs.initial(burn_in(step, dataset, batch, conditioning))
         state = expert.begin(batch, inputs.leader_length, None)
         for window in range(8):
@@ -80,12 +80,12 @@ def test_nothing_is_imitated_beyond_the_training_part() -> None:
         dataset = module.dataset
         ends = dataset.last - 100
         dataset.last, dataset.until = ends, ends
-        frames = torch.arange(dataset.batch.mask.shape[1])
+        frames = torch.arange(dataset.recordings.batch.mask.shape[1])
         secret = frames > ends[0, dataset.pair[0].argsort()][:, None]
-        dataset.batch = replace(
-            dataset.batch,
-            leader_speed=dataset.batch.leader_speed + beyond * secret,
-            leader_position=dataset.batch.leader_position + beyond * secret,
+        dataset.recordings.batch = replace(
+            dataset.recordings.batch,
+            leader_speed=dataset.recordings.batch.leader_speed + beyond * secret,
+            leader_position=dataset.recordings.batch.leader_position + beyond * secret,
         )
         starts = module.sampler.training(0).start
         assert bool((starts * WINDOWS.stride + 60 > ends[:, :1]).any())

@@ -50,7 +50,7 @@ def test_training_simulates_what_evaluation_simulates(
     if driver_features:  # training measures full trajectories, evaluation what was before
         frame = torch.full_like(data.network, 200)
         measured = measure(data.batch, driver_features, 0.1, 0 * frame, frame)
-        dataset.driver_features = measured.float()
+        dataset.recordings.driver_features = measured.float()
     batch = batch_of(dataset, torch.full((1, 6), 40))
     with torch.no_grad():
         segment = next(simulate(module.exact_step, dataset, batch, 11, NoGradients()))
@@ -109,7 +109,7 @@ def test_a_bounded_burn_in_forgets_what_was_before() -> None:
         for number, first in enumerate(start[0, :5].tolist()):
             state = network.initial_state(1, 6)
             for window in range(max(0, first - 5), first):
-                token = dataset.tokens[:, window][dataset.pair]
+                token = dataset.recordings.tokens[:, window][dataset.pair]
                 state = step.observe(token, squashed(dataset.base), state, everyone)
             torch.testing.assert_close(short[0, number], state[0, number])
     assert not bool(short[0, 5].any())

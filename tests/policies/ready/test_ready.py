@@ -37,7 +37,7 @@ def test_each_drives_an_unseen_driver(name: str) -> None:
     agent = cfx.load(f"cfx://{name}").policy
     assert agent.names == ("all",) or len(agent.names) == 1
     assert agent.valid_range is not None
-    assert agent.recorded
+    assert agent.trained_on.quantiles
     frames = torch.full((1, agent.windows.length), 10.0, dtype=torch.float64)
     history = History(frames, frames * 0, frames, frames * 0, frames * 2)
     chosen, state = agent.act(history, agent.begin(torch.zeros(1, dtype=torch.int64)))

@@ -441,7 +441,7 @@ class _Run:
         for name, driver in self._fleet.drivers.items():
             limited[name] = driver.counts.limited / max(1, driver.counts.steps)
             outside[name] = driver.outside_in_words()
-            recorded[name] = driver.policy.recorded
+            recorded[name] = driver.policy.trained_on.quantiles
         return ScenarioRun(
             self._tallies,
             self._steps,
