@@ -12,13 +12,12 @@ import pytest
 from rich.console import Console
 
 from cfx.app.job.console import report
-from cfx.app.job.output import Output, write_tables
-from cfx.app.job.results import JobResult
+from cfx.app.job.output import write_tables
 from cfx.data.pairs import PairSet
 from cfx.evaluation.protocols.base import ProtocolResult
 from cfx.evaluation.result import Evaluation, Purpose
 from cfx.evaluation.statistics import Improvement
-from cfx.results.table import Findings
+from cfx.results.table import Findings, Kept
 from tests.made_up import GAINS, make_history, make_platoon, make_results, with_metric
 
 
@@ -30,14 +29,8 @@ class Untracked:
 def said(evaluation: Evaluation, *, width: int = 200) -> str:
     """Returns what a job prints."""
     out = io.StringIO()
-    result = JobResult(evaluation.metrics(), evaluation.table, cast(Any, None), (), Path("folder"))
-    report(
-        result,
-        findings(evaluation),
-        (),
-        Console(file=out, width=width),
-        cast(Any, Untracked()),
-    )
+    kept = Kept(Path("folder"), evaluation.metrics(), (), (), ())
+    report(findings(evaluation), kept, Console(file=out, width=width), cast(Any, Untracked()))
     return out.getvalue()
 
 
@@ -158,7 +151,7 @@ def test_platoon_and_history_are_written_and_old_ones_go(tmp_path: Path, present
         evaluation = dataclasses.replace(
             evaluation, platoon=make_platoon({"policy": 1}), tables={"history": history}
         )
-    written = write_tables(Output(tmp_path), findings(evaluation))
+    written = write_tables(tmp_path, findings(evaluation))
     further = {one.file for one in written if not one.about.part.always}
     assert further == {"pair_metrics.parquet", *(names if present else ())}
     assert {path.name for path in tmp_path.iterdir()} == {one.file for one in written}

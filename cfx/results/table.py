@@ -14,7 +14,7 @@ back. A figure of reports takes it from `Results.tables`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import chain
@@ -218,6 +218,25 @@ class WrittenTable:
     ) -> tuple[RenderableType, ...]:
         """Returns what the job prints about it."""
         return self.about.attempt(lambda table: tuple(table.console(findings, metrics)), ())
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What a job has written.
+
+    Attributes:
+        folder: of the job, with its policy in `policy/`.
+        metrics: of the job, under their MLflow names.
+        tables: those that it has.
+        figures: image files.
+        files: others that MLflow keeps too.
+    """
+
+    folder: Path
+    metrics: dict[str, float]
+    tables: Sequence[WrittenTable]
+    figures: Sequence[Path]
+    files: Sequence[Path]
 
 
 def installed() -> tuple[registry.Installed[ResultTable], ...]:

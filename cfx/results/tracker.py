@@ -12,7 +12,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 from urllib.parse import quote, urlencode
@@ -30,7 +30,7 @@ from cfx.results.store import Store, open_store, tracking_uri, translate_errors
 
 if TYPE_CHECKING:
     from cfx.results.config import JobConfig
-    from cfx.results.table import Findings, WrittenTable
+    from cfx.results.table import Findings, Kept
 
 log = logging.getLogger(__name__)
 
@@ -45,23 +45,6 @@ _EXAMPLE_FRAMES = 50
 """Frames of a model's input example."""
 
 _SERVED = Path(__file__).with_name("served_policy.py")
-
-
-@dataclass(frozen=True)
-class Kept:
-    """What a job has written.
-
-    Attributes:
-        folder: of the job, with its policy in `policy/`.
-        tables: those that it has.
-        figures: image files.
-        files: others.
-    """
-
-    folder: Path
-    tables: Sequence[WrittenTable]
-    figures: Sequence[Path]
-    files: Sequence[Path]
 
 
 class Tracker:
@@ -127,14 +110,11 @@ class Tracker:
     def set_tags(self, tags: Mapping[str, str]) -> None:
         """Adds tags to the run."""
 
-    def log_job(
-        self, findings: Findings, metrics: Mapping[str, float], kept: Kept, description: str
-    ) -> None:
+    def log_job(self, findings: Findings, kept: Kept, description: str) -> None:
         """Logs what a job has found and written.
 
         Args:
             findings: of the job.
-            metrics: of the job.
             kept: what it has written.
             description: what the run's page says of it, Markdown.
         """
@@ -237,11 +217,9 @@ class MlflowTracker(Tracker):
         with translate_errors("log tags"):
             self.store.client.log_batch(self.run_id, tags=_tags(tags))
 
-    def log_job(
-        self, findings: Findings, metrics: Mapping[str, float], kept: Kept, description: str
-    ) -> None:
-        values, result = headline(metrics)
-        self.log_metrics({**values, **metrics})
+    def log_job(self, findings: Findings, kept: Kept, description: str) -> None:
+        values, result = headline(kept.metrics)
+        self.log_metrics({**values, **kept.metrics})
         tags = {RESULT: result, "mlflow.note.content": description}
         if findings.evaluation.purpose is Purpose.CALIBRATION:
             tags["learner"] = "none"

@@ -36,9 +36,9 @@ from cfx.policies.scaler import Scaler
 from cfx.results import provenance
 from cfx.results.config import JobConfig
 from cfx.results.store import download_run, quiet, translate_errors
-from cfx.results.table import Findings, ResultTable, WrittenTable
+from cfx.results.table import Findings, Kept, ResultTable, WrittenTable
 from cfx.results.tables import Pairs
-from cfx.results.tracker import CURVE_POINTS, Kept, MlflowTracker, Tracker, sweep_link
+from cfx.results.tracker import CURVE_POINTS, MlflowTracker, Tracker, sweep_link
 from tests.drives import wavy_pairs
 from tests.made_up import MadeUp, make_curves, make_results
 
@@ -105,9 +105,12 @@ def log_job(
     made.evaluation.table.to_csv(saved.folder.parent / "pairs.csv")
     run.log_job(
         Findings(saved.pairs, made.style, result),
-        made.evaluation.metrics(),
         Kept(
-            saved.folder.parent, [WrittenTable(pairs, made.evaluation.table)], figures, list(files)
+            saved.folder.parent,
+            made.evaluation.metrics(),
+            [WrittenTable(pairs, made.evaluation.table)],
+            figures,
+            files,
         ),
         "**What** it is.",
     )

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cfx.app.job.results import JobResult
 from cfx.calibration.flatness import NEAR, flat_for
 from cfx.evaluation.demo import PAGE
 from cfx.evaluation.headline import headline
@@ -18,7 +17,7 @@ from cfx.evaluation.metrics.base import MetricInfo, key_of
 from cfx.evaluation.result import Evaluation, Purpose
 from cfx.evaluation.statistics import Improvement
 from cfx.report.figures.words import few_drivers
-from cfx.results.table import Findings, WrittenTable
+from cfx.results.table import Findings, Kept
 from cfx.simulation.trajectory import TRANSIENT_S
 
 if TYPE_CHECKING:
@@ -29,47 +28,44 @@ _SCOPES = {"test": "test part", "full_trajectory": "full trajectories"}
 
 
 def report(
-    result: JobResult,
     findings: Findings,
-    tables: Iterable[WrittenTable],
+    kept: Kept,
     console: Console,
     tracker: Tracker,
-    *,
     copied_to: str | None = None,
 ) -> None:
     """Prints the table, where the results are and how to open them.
 
     Args:
-        result: of the job.
         findings: what was measured.
-        tables: those that the job has written.
+        kept: what the job has written.
         console: where it is printed.
         tracker: says how to open the job's run.
         copied_to: URL of the folder's copy; None without.
     """
     evaluation = findings.evaluation
-    console.print(methods_table(evaluation, result.metrics))
+    console.print(methods_table(evaluation, kept.metrics))
     if "full_trajectory" in evaluation.improvements:
-        console.print(methods_table(evaluation, result.metrics, "full_trajectory"))
+        console.print(methods_table(evaluation, kept.metrics, "full_trajectory"))
     if evaluation.purpose is Purpose.CALIBRATION:
         text = (
             "The policy keeps its parameters constant: this is a calibration, without adaptation."
         )
         console.print(text, soft_wrap=True)
-        _print_headline(result, console)
+        _print_headline(kept.metrics, console)
     elif evaluation.purpose is Purpose.ADAPTATION:
         _print_improvements(evaluation, console)
-        _print_headline(result, console)
+        _print_headline(kept.metrics, console)
     else:
         text = (
             "With constant parameters the model follows no leader: compare the policy's RMSE"
             " with other jobs'."
         )
         console.print(text, soft_wrap=True)
-    for table in tables:
-        for printed in table.console(findings, result.metrics):
+    for table in kept.tables:
+        for printed in table.console(findings, kept.metrics):
             console.print(printed)
-    _print_safety(evaluation, result.metrics, console)
+    _print_safety(evaluation, kept.metrics, console)
     _print_flat(evaluation, console)
     for scope, words in evaluation.outside.items():
         text = f"Policy, {_SCOPES[scope]}: {words}; there it fades towards its base parameters."
@@ -77,10 +73,10 @@ def report(
     for one in evaluation.left_out:
         text = f"Not measured: {one.name} of the distribution {one.distribution} ({one.reason})."
         console.print(text, soft_wrap=True, highlight=False)
-    console.print(f"Results: {result.folder}", soft_wrap=True, highlight=False, markup=False)
+    console.print(f"Results: {kept.folder}", soft_wrap=True, highlight=False, markup=False)
     if copied_to is not None:
         console.print(f"Copied to: {copied_to}", soft_wrap=True, highlight=False, markup=False)
-    for page in sorted(result.folder.glob(f"*/{PAGE}")):
+    for page in sorted(kept.folder.glob(f"*/{PAGE}")):
         console.print(
             f"Demonstration, for any browser: {page}", soft_wrap=True, highlight=False, markup=False
         )
@@ -143,9 +139,9 @@ def _print_improvements(evaluation: Evaluation, console: Console) -> None:
         console.print(warning, soft_wrap=True, highlight=False)
 
 
-def _print_headline(result: JobResult, console: Console) -> None:
+def _print_headline(metrics: Mapping[str, float], console: Console) -> None:
     """Prints the one number by which the job is known elsewhere: in MLflow, a report, Python."""
-    _, words = headline(result.metrics)
+    _, words = headline(metrics)
     if words:
         console.print(f"In short: {words}.", soft_wrap=True, highlight=False)
 

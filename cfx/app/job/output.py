@@ -2,249 +2,167 @@
 
 from __future__ import annotations
 
-import functools
-import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 import yaml
 
 from cfx.core.errors import OutputError
-from cfx.core.files import atomic_write, remove_leftovers
-from cfx.data.pairs import PairSet
+from cfx.core.files import atomic_write, remove_leftovers, write_json
 from cfx.data.tidy import write_tidy
-from cfx.evaluation.demo import Demo
-from cfx.evaluation.protocols.base import ProtocolResult
+from cfx.policies import checkpoint
 from cfx.results.config import JobConfig
 from cfx.results.provenance import commit, version
-from cfx.results.table import Findings, WrittenTable, file_of, installed, parts_of
+from cfx.results.table import Findings, Kept, WrittenTable, file_of, installed, parts_of
 from cfx.simulation.trajectory import TRANSIENT_S
 
-TRACKED = ("config.yaml", "metrics.json", "data.json")
-"""Files of a job's folder that MLflow keeps too, besides its tables, figures and policy."""
-
+if TYPE_CHECKING:
+    from cfx.app.job.parts import Parts
+    from cfx.evaluation.demo import Demo
 
 METRICS = "metrics.json"
 """The file that is written last: a folder that has it is complete."""
 
-
-class Output:
-    """Writes a job's files.
-
-    Attributes:
-        folder: the job's output folder.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-
-    @classmethod
-    def make(cls, folder: Path) -> Output:
-        """Makes the folder, if it is not there.
-
-        Raises:
-            OutputError: it cannot be made.
-        """
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(
-                f"cannot make the output folder {folder}: {error.strerror};"
-                " set hydra.run.dir to a place that can be written"
-            ) from error
-        output = cls(folder)
-        output.run(lambda: remove_leftovers(folder))
-        return output
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether the folder holds the results of an earlier job."""
-        return (self.folder / METRICS).is_file()
-
-    def begin(self, config: JobConfig) -> None:
-        """Writes the configuration of the job that begins.
-
-        Where the folder holds an earlier job's results, these stay as they are until the new ones
-        are there (`replace`), so that the folder never mixes two jobs.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
-        if not self.is_complete:
-            write_config(self, config)
-
-    def replace(self, config: JobConfig) -> None:
-        """Removes what marks results as complete, and writes the configuration of new ones.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
-        self.run(lambda: (self.folder / METRICS).unlink(missing_ok=True))
-        write_config(self, config)
-
-    def file(self, name: str, write: Callable[[Path], object]) -> None:
-        """Writes one file, whole.
-
-        Args:
-            write: is given a path to write to; the file takes its name when it returns.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
-
-        def write_whole() -> None:
-            with atomic_write(self.folder / name) as temporary:
-                write(temporary)
-
-        self.run(write_whole)
-
-    def text(self, name: str, text: str) -> None:
-        """Writes a text file.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
-        self.file(name, lambda path: path.write_text(text, encoding="utf-8"))
-
-    def json(self, name: str, values: Mapping[str, Any]) -> None:
-        """Writes a JSON file.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
-        self.text(name, json.dumps(values, indent=2) + "\n")
-
-    def run(self, write: Callable[[], object]) -> None:
-        """Calls a function that writes into the folder.
-
-        Raises:
-            OutputError: it cannot write.
-        """
-        try:
-            write()
-        except OSError as error:
-            raise OutputError(
-                f"cannot write into {self.folder}: {error.strerror or error};"
-                " the calibration is cached, so run again"
-            ) from error
+_TRACKED = ("config.yaml", METRICS, "data.json")
+"""Files that MLflow keeps too, besides tables, figures and the policy."""
 
 
-def write_config(output: Output, config: JobConfig) -> None:
-    """Writes `config.yaml`.
+def begin(folder: Path, config: JobConfig) -> None:
+    """Makes a job's folder, if it is not there, and writes the job's configuration into it.
+
+    Where the folder holds an earlier job's results, these stay as they are until the new ones are
+    there, so that the folder never mixes two jobs.
 
     Raises:
-        OutputError: the file cannot be written.
+        OutputError: the folder cannot be made, or not be written.
     """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"cannot make the output folder {folder}: {error.strerror};"
+            " set hydra.run.dir to a place that can be written"
+        ) from error
+    with _writing(folder):
+        remove_leftovers(folder)
+        if not (folder / METRICS).is_file():
+            _write_config(folder, config)
+
+
+def write_job(folder: Path, config: JobConfig, parts: Parts, findings: Findings) -> Kept:
+    """Writes all that a job leaves behind.
+
+    Raises:
+        CfxError: a demonstration cannot be shown, or a file cannot be written.
+    """
+    result = findings.protocol_result
+    with _writing(folder):
+        (folder / METRICS).unlink(missing_ok=True)
+        _write_config(folder, config)
+        tables = write_tables(folder, findings)
+        metrics = findings.evaluation.metrics() | dict(result.calibration)
+        for table in tables:
+            metrics |= table.metrics(findings)
+        checkpoint.save(result.policy, folder / "policy")
+        figures: list[Path] = []
+        if config.figures.enabled:
+            figures = _write_figures(folder, config, findings, tables, metrics)
+        files = [folder / name for name in _TRACKED]
+        if parts.demo is not None:
+            files += _write_demo(folder, parts.demo, config, findings)
+        objective = {"name": config.objective["name"], "unit": parts.objective.unit}
+        write_json(folder / "data.json", _description(findings, objective))
+        defined = {}
+        for name, value in metrics.items():
+            defined[name] = value if math.isfinite(value) else None
+        write_json(folder / METRICS, defined)
+    return Kept(folder, metrics, tables, figures, files)
+
+
+@contextmanager
+def _writing(folder: Path) -> Iterator[None]:
+    """Runs a block that writes into a job's folder.
+
+    Raises:
+        OutputError: the file system refuses.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(
+            f"cannot write into {folder}: {error.strerror or error};"
+            " the calibration is cached, so run again"
+        ) from error
+
+
+def _write_config(folder: Path, config: JobConfig) -> None:
     values = config.model_dump(mode="json")
-    output.text("config.yaml", yaml.safe_dump(values, sort_keys=False))
+    with atomic_write(folder / "config.yaml") as temporary:
+        temporary.write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
 
 
-def write_tables(output: Output, findings: Findings) -> list[WrittenTable]:
+def write_tables(folder: Path, findings: Findings) -> list[WrittenTable]:
     """Writes the tables of the results; those that an earlier job left in the folder go.
 
     Returns:
         Those that this job has.
 
     Raises:
-        OutputError: a file cannot be written.
+        OSError: a file cannot be written.
     """
     written = []
     for about in installed():
-        name, parts = file_of(about), parts_of(about, findings)
+        path, parts = folder / file_of(about), parts_of(about, findings)
         if parts is None:
-            output.run(functools.partial((output.folder / name).unlink, missing_ok=True))
+            path.unlink(missing_ok=True)
             continue
         rows = None if about.part.large else pd.concat(list(parts))
-        kept = parts if rows is None else [rows]
-        output.file(name, functools.partial(about.part.write, parts=kept))
+        with atomic_write(path) as temporary:
+            about.part.write(temporary, parts if rows is None else [rows])
         written.append(WrittenTable(about, rows))
     if any(pair.truth for pair in findings.pairs):
-        output.file("data.parquet", lambda path: write_tidy(findings.pairs, path))
+        with atomic_write(folder / "data.parquet") as temporary:
+            write_tidy(findings.pairs, temporary)
     return written
 
 
-def write_figures(
-    output: Output,
+def _write_figures(
+    folder: Path,
     config: JobConfig,
     findings: Findings,
-    tables: Mapping[str, pd.DataFrame],
+    tables: list[WrittenTable],
     metrics: Mapping[str, float],
 ) -> list[Path]:
-    """Writes the figures, if the configuration wants any; returns their paths.
+    from cfx.report.figures.results import Results
+    from cfx.report.figures.write import write_figures
 
-    Args:
-        output: the job's folder.
-        config: of the job.
-        findings: what is drawn.
-        tables: likewise, by name.
-        metrics: of the job.
-
-    Raises:
-        OutputError: a file cannot be written.
-    """
-    paths: list[Path] = []
-    if config.figures.enabled:
-        from cfx.report.figures.results import Results
-        from cfx.report.figures.write import write_figures as write_all_figures
-
-        results = Results.of(
-            findings.evaluation, style=findings.style, tables=tables, metrics=metrics
-        )
-
-        def write_all() -> None:
-            folder, formats = output.folder / "figures", config.figures.formats
-            paths.extend(write_all_figures(folder, results, formats=formats))
-
-        output.run(write_all)
-    return paths
+    rows = {table.about.name: table.rows for table in tables if table.rows is not None}
+    results = Results.of(findings.evaluation, style=findings.style, tables=rows, metrics=metrics)
+    return write_figures(folder / "figures", results, formats=config.figures.formats)
 
 
-def write_demo(
-    output: Output,
-    demo: Demo,
-    pairs: PairSet,
-    protocol_result: ProtocolResult,
-    config: JobConfig,
-) -> list[Path]:
-    """Writes the demonstration into a folder of its name; returns its paths.
-
-    The policy must have been saved before.
-
-    Raises:
-        CfxError: it cannot be shown, or a file cannot be written.
-    """
+def _write_demo(folder: Path, demo: Demo, config: JobConfig, findings: Findings) -> list[Path]:
+    """Writes the demonstration into a folder of its name; the policy is beside it."""
     assert config.demo is not None
-    folder = output.folder / config.demo["name"]
-    policy, evaluation = protocol_result.policy, protocol_result.evaluation
-    paths: list[Path] = []
-
-    def write_all() -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        paths.extend(demo.write(folder, pairs, policy, evaluation, config.protocol))
-
-    output.run(write_all)
-    return paths
+    own = folder / config.demo["name"]
+    own.mkdir(parents=True, exist_ok=True)
+    policy = findings.protocol_result.policy
+    return list(demo.write(own, findings.pairs, policy, findings.evaluation, config.protocol))
 
 
-def write_provenance(
-    output: Output,
-    pairs: PairSet,
-    protocol_result: ProtocolResult,
-    objective: Mapping[str, str],
-) -> None:
-    """Writes `data.json`: where the data came from, and what a report must know of the job.
+def _description(findings: Findings, objective: Mapping[str, str]) -> dict[str, Any]:
+    """Returns what `data.json` says: where the data came from, and what a report must know.
 
     Args:
+        findings: of the job.
         objective: name and unit of what calibration has minimised; losses of labels have this unit.
-
-    Raises:
-        OutputError: the file cannot be written.
     """
-    evaluation = protocol_result.evaluation
+    pairs, evaluation = findings.pairs, findings.evaluation
     dropped = []
     for drop in pairs.dropped:
         dropped.append({"reason": drop.reason, "count": drop.count, "unit": drop.unit})
@@ -252,11 +170,11 @@ def write_provenance(
     for one in evaluation.parameters:
         about = {"name": one.name, "unit": one.unit, "meaning": one.meaning}
         parameters.append({**about, "low": one.low, "high": one.high})
-    values = {
+    return {
         "source": pairs.source,
         "fingerprint": pairs.fingerprint,
         "pairs": len(pairs),
-        "protocol": dict(protocol_result.notes),
+        "protocol": dict(findings.protocol_result.notes),
         "dropped": dropped,
         "parameters": parameters,
         "purpose": evaluation.purpose,
@@ -268,21 +186,3 @@ def write_provenance(
         "cfx": version(),
         "commit": commit(Path.cwd()),
     }
-    output.json("data.json", values)
-
-
-def write_metrics(output: Output, metrics: Mapping[str, float]) -> None:
-    """Writes `metrics.json`; null stands for a metric that is not defined.
-
-    It is the last file of a job, so that a folder with a `metrics.json` is complete.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    defined: dict[str, float | None] = {}
-    for name, value in metrics.items():
-        if math.isfinite(value):
-            defined[name] = value
-        else:
-            defined[name] = None
-    output.json("metrics.json", defined)

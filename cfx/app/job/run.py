@@ -43,16 +43,16 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
     # These take seconds to import: a wrong path or column has been answered by now.
     from rich.console import Console
 
-    from cfx.app.job import steps
+    from cfx.app.job import output, steps
     from cfx.app.job.console import report
-    from cfx.app.job.output import Output
+    from cfx.app.job.description import described
+    from cfx.app.job.results import JobResult
     from cfx.app.job.upload import Upload
     from cfx.results.tracker import Tracker
 
     data = config.data
     config, parts = steps.prepare(config)
-    output = Output.make(folder)
-    output.begin(config)
+    output.begin(folder, config)
     upload = Upload.of(config.output.url, folder)
     with Tracker.open(config, folder) as tracker:
         if config.data != data:  # the protocol has determined other data
@@ -66,16 +66,21 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
             # It splits the pairs, calibrates, has the learner train, and evaluates.
             result = parts.protocol.run(context)
             findings = steps.found(parts, context, result)
-        job_result, tables = steps.keep(config, parts, output, findings, tracker)
+        kept = output.write_job(folder, config, parts, findings)
+        # After the folder, so that no failure of MLflow loses it.
+        tracker.log_job(findings, kept, described(config, findings, kept.metrics))
         if upload is not None:
             upload.finish()
             tracker.set_tags({"cfx.output_url": upload.url})
-    report(
-        job_result,
-        findings,
-        tables,
-        console or Console(),
-        tracker,
-        copied_to=None if upload is None else upload.url,
+    copied_to = None if upload is None else upload.url
+    report(findings, kept, console or Console(), tracker, copied_to)
+    return JobResult(
+        metrics=kept.metrics,
+        pairs=findings.evaluation.table,
+        policy=findings.protocol_result.policy,
+        figures=tuple(kept.figures),
+        folder=folder,
+        run_id=tracker.run_id,
+        evaluation=findings.evaluation,
+        style=findings.style,
     )
-    return job_result

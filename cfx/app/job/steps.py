@@ -8,12 +8,8 @@ from pathlib import Path
 
 import torch
 
-from cfx.app.job import output as files
 from cfx.app.job.calibration_tables import calibration_tables
-from cfx.app.job.description import described
-from cfx.app.job.output import Output
 from cfx.app.job.parts import Parts, choose_device, complete, make_protocol, reported_objectives
-from cfx.app.job.results import JobResult
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.prior import prior_weight
@@ -27,10 +23,8 @@ from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.style import StyleResult, measure_style, select_cluster
 from cfx.evaluation.protocols.base import ProtocolContext, ProtocolResult
 from cfx.evaluation.result import Purpose
-from cfx.policies import checkpoint
 from cfx.results.config import JobConfig
-from cfx.results.table import Findings, WrittenTable
-from cfx.results.tracker import Kept, Tracker
+from cfx.results.table import Findings
 
 log = logging.getLogger(__name__)
 
@@ -162,45 +156,3 @@ def found(parts: Parts, context: ProtocolContext, result: object) -> Findings:
     evaluation = replace(evaluation, tables={**evaluation.tables, **tables})
     result = replace(result, evaluation=evaluation)
     return Findings(context.pairs, context.style, result, context.seed)
-
-
-def keep(
-    config: JobConfig, parts: Parts, output: Output, findings: Findings, tracker: Tracker
-) -> tuple[JobResult, list[WrittenTable]]:
-    """Writes everything into the folder, then into MLflow."""
-    pairs, protocol_result = findings.pairs, findings.protocol_result
-    evaluation = protocol_result.evaluation
-    output.replace(config)
-    tables = files.write_tables(output, findings)
-    metrics = evaluation.metrics() | dict(protocol_result.calibration)
-    for table in tables:
-        metrics |= table.metrics(findings)
-    output.run(lambda: checkpoint.save(protocol_result.policy, output.folder / "policy"))
-    rows = {table.about.name: table.rows for table in tables if table.rows is not None}
-    figures = files.write_figures(output, config, findings, rows, metrics)
-    shown: list[Path] = []
-    if parts.demo is not None:
-        shown = files.write_demo(output, parts.demo, pairs, protocol_result, config)
-    files.write_provenance(
-        output,
-        pairs,
-        protocol_result,
-        objective={"name": config.objective["name"], "unit": parts.objective.unit},
-    )
-    # Before MLflow, so that no failure there loses it.
-    files.write_metrics(output, metrics)
-
-    others = [output.folder / name for name in files.TRACKED] + shown
-    kept = Kept(output.folder, tables, figures, others)
-    tracker.log_job(findings, metrics, kept, described(config, findings, metrics))
-    result = JobResult(
-        metrics,
-        evaluation.table,
-        protocol_result.policy,
-        tuple(figures),
-        output.folder,
-        tracker.run_id,
-        evaluation,
-        findings.style,
-    )
-    return result, tables
