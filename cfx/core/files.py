@@ -19,7 +19,7 @@ from pydantic_core import PydanticCustomError
 from cfx.core.errors import OutputError
 
 _DAY_S = 86400.0
-"""Seconds after which another machine's temporary file that nobody has written to is left over."""
+"""Age in seconds, since the last write, at which another machine's temporary file is removed."""
 
 _TEMPORARY = re.compile(r"\.(?P<process>\d+)@(?P<host>[\w-]*)-[0-9a-f]{8}\..")
 """How names of temporary files begin: process, machine, and what tells those of one apart."""
@@ -91,7 +91,7 @@ def write_output(path: Path, text: str, what: str) -> None:
 def remove_leftovers(folder: Path) -> None:
     """Removes temporary files of `atomic_write` whose processes have ended, here and below.
 
-    Nobody here knows which processes run on another machine: its files go when they are a day old.
+    Processes of other machines are unknown here: their files are removed when they are a day old.
 
     Raises:
         OSError: one cannot be removed.

@@ -1,7 +1,7 @@
-"""A job's folder, as data that somebody else may have made.
+"""Reads a job's folder as untrusted data.
 
-Nothing in it is run, nothing outside it is read, and nothing is read that is larger or more deeply
-nested than what a job writes.
+Runs nothing in it, reads nothing outside it, and refuses files that are larger or more deeply
+nested than those that a job writes.
 """
 
 from __future__ import annotations

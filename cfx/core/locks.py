@@ -1,10 +1,9 @@
 """Locks between processes, on this machine's disks and on shared ones.
 
 The operating system frees a lock when its process ends, however it ends; on a network file system
-it may free it too early, too late or never. There a lock is a lease: a file that is created if it
-is not there, which every such system can do, and which its holder renews. Nothing is lost if two
-processes hold one all the same: entries of the cache are the same whoever writes them, every file
-appears whole, and what marks a job as done is written last.
+it may free it too early, too late or never. There a lock is a lease: a file that is created
+exclusively and renewed by its holder. Two holders at once do no harm: cache entries have the same
+content from any process, files are written atomically, and a job's marker is written last.
 """
 
 from __future__ import annotations
@@ -15,13 +14,13 @@ from pathlib import Path
 from filelock import BaseFileLock, FileLock, SoftFileLease
 
 LEASE_S = 60.0
-"""Seconds after which a lease that nobody renews is free."""
+"""Seconds after which a lease that is not renewed is free."""
 
 _SHARED = ("nfs", "cifs", "smb", "lustre", "gpfs", "beegfs", "ceph", "afs", "9p", "panfs", "wekafs")
-"""What types of network file systems begin with."""
+"""Prefixes of the types of network file systems."""
 
 _SHARED_IN_USER_SPACE = ("sshfs", "gluster", "s3fs", "gcsfuse", "cvmfs", "juicefs")
-"""What stands behind `fuse.`, or is part of it."""
+"""Parts of the type of network file systems in user space, after `fuse.`."""
 
 
 def lock_for(path: Path, *, timeout: float = -1) -> BaseFileLock:
@@ -40,7 +39,7 @@ def lock_for(path: Path, *, timeout: float = -1) -> BaseFileLock:
 def is_shared(folder: Path) -> bool:
     """Says whether a folder lies on a network file system.
 
-    `CFX_SHARED_STORAGE=1` says so of every folder: for file systems that are not known by name.
+    `CFX_SHARED_STORAGE=1` makes it true of every folder: for file systems not recognised by name.
     """
     if os.environ.get("CFX_SHARED_STORAGE", "") not in {"", "0"}:
         return True
@@ -51,7 +50,7 @@ def is_shared(folder: Path) -> bool:
 
 
 def _file_system(folder: Path) -> str:
-    """Returns the type of the file system on which a folder lies, "" where nobody says so."""
+    """Returns the type of the file system on which a folder lies, "" where it is unknown."""
     try:
         mounts = Path("/proc/self/mounts").read_text(encoding="utf-8").splitlines()
     except OSError:

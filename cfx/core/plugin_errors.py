@@ -1,4 +1,4 @@
-"""Errors inside third parties' code while a job runs: whose they are, in one sentence."""
+"""Reports errors inside plugins' code in one sentence that names the distribution."""
 
 from __future__ import annotations
 

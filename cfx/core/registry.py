@@ -40,7 +40,7 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 OWN = "cfx-driving"
-"""The distribution whose components nobody else's can replace."""
+"""cfx's own distribution: no other can replace its components."""
 
 API_GROUP = "cfx.api"
 """Entry-point group in which a distribution says which version of the plugin API it needs."""

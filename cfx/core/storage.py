@@ -157,7 +157,7 @@ def _opened(url: str) -> tuple[Any, str]:
 
     Raises:
         NotInstalledError: its package is not installed.
-        CfxError: nobody knows such URLs.
+        CfxError: no file system has such URLs.
     """
     import fsspec
 

@@ -1,11 +1,11 @@
-"""Recorded accelerations that are mostly noise, and what stands for them.
+"""Replaces recorded accelerations that are mostly noise by averages of their past.
 
 Many recordings have accelerations that are differences of rounded or noisy speeds: between two
-frames they change by more than any car's does. Policies see accelerations, and start with the one
-that the driver has and with its jerk; noise there is a jolt that no driver made. What can be known
-of an acceleration is an exponential average of its past, smoothed twice so that it has a jerk too
-(R. G. Brown 1959, Statistical forecasting for inventory control), with the time constant that tells
-best how the speed goes on, times the regression coefficient of how it does.
+frames they change by more than any car's does. Policies read accelerations and start with the
+driver's acceleration and jerk, so noise there makes jolts. The replacement is an exponential
+average of the past, smoothed twice so that it has a jerk too (R. G. Brown 1959, Statistical
+forecasting for inventory control), with the time constant that best predicts the change of speed,
+times the coefficient of that regression.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ RECORDED = Average(0.0, 1.0)
 
 
 def with_usable_accelerations(pairs: PairSet, how: Accelerations) -> PairSet:
-    """Replaces accelerations that tell less of what follows than their moving average does.
+    """Replaces accelerations that predict the speed worse than their moving average does.
 
     Leader and follower are judged each on their own; speeds and positions stay as they are.
 
@@ -109,7 +109,7 @@ def with_usable_accelerations(pairs: PairSet, how: Accelerations) -> PairSet:
 
 
 def best_average(speed: Floats, acceleration: Floats, dt: float) -> Average:
-    """Returns the average of accelerations that tells best how the speed goes on.
+    """Returns the average of accelerations that best predicts the change of speed.
 
     It is `RECORDED` where the acceleration as recorded tells as much, or where there is too little
     to say.

@@ -60,8 +60,8 @@ class DatasetSettings(Settings):
     check: Check = Field(
         "refuse",
         description="pairs whose positions, speeds, accelerations and gaps contradict one another,"
-        " as with a wrong unit or time step: refuse: the job ends; report: a warning; off: nobody"
-        " looks",
+        " as with a wrong unit or time step: refuse: the job ends; report: a warning; off: not"
+        " checked",
     )
     min_frames: int = Field(
         700, ge=2, description="shortest pair that is kept, frames; the paper keeps 700"
@@ -116,8 +116,8 @@ class FileDatasetSettings(DatasetSettings):
     )
     accelerations: Accelerations = Field(
         "smooth",
-        description="smooth: for accelerations that are mostly noise stands the average of their"
-        " past that tells best how the speed goes on; recorded: all as recorded",
+        description="smooth: accelerations that are mostly noise are replaced by the average of"
+        " their past that best predicts the speed; recorded: all as recorded",
     )
 
     def files(self) -> list[Path]:

@@ -164,7 +164,7 @@ def _unpacking(path: Path) -> Iterator[None]:
 
 
 def partitions(path: Path) -> list[Path]:
-    """Returns the parquet files below a folder, sorted by name; a file stands for itself.
+    """Returns the parquet files below a folder, sorted by name; of a file, the file itself.
 
     Raises:
         DataError: the folder holds none.

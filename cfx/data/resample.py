@@ -16,9 +16,9 @@ def resampled(pairs: PairSet, step: float) -> PairSet:
     """Returns the same trajectories in frames `step` seconds apart.
 
     Pairs that have this step already stay as they are. Between frames every signal is interpolated
-    by a monotone cubic (Fritsch and Butland 1984, SciPy's `PchipInterpolator`), which overshoots
-    nowhere: nobody reverses, and no speed is above the fastest one recorded. What is faster than
-    the new step is not filtered out before. True parameters are those of the last frame before. A
+    by a monotone cubic (Fritsch and Butland 1984, SciPy's `PchipInterpolator`), which does not
+    overshoot: no speed is negative or above the fastest recorded one. Signals are not low-pass
+    filtered before. True parameters are those of the last frame before. A
     trajectory ends at its last new frame; one with fewer than two is left out and counted.
 
     Args:

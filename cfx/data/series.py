@@ -174,6 +174,6 @@ def accelerations(speed: Floats, dt: float) -> Floats:
 
 
 def frames_at(time: Floats, dt: float) -> Ints:
-    """Returns the number of the frame that each time stands for, 0 at the first, `(T,)`."""
+    """Returns the frame number of each time, 0 at the first, `(T,)`."""
     frames: Ints = np.rint((time - time[0]) / dt).astype(np.int64)
     return frames

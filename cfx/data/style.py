@@ -34,7 +34,7 @@ Floats = NDArray[np.float64]
 
 
 _PAIRS_AT_ONCE = 4096
-"""Pairs whose frames are looked at together."""
+"""Pairs whose frames are read at once."""
 
 
 class Indicator(NamedTuple):

@@ -487,7 +487,7 @@ def _first_line(error: Exception) -> str:
 
 
 class _Text(NamedTuple):
-    """A delimited text whose first lines have been looked at.
+    """A delimited text: its separator, and the names of its columns.
 
     Attributes:
         delimiter: "," or " ", the latter for any run of white space.

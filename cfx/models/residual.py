@@ -1,4 +1,4 @@
-"""A driving model that takes over from the acceleration that a vehicle has.
+"""A driving model that takes over from a vehicle's measured acceleration.
 
     a(t) = (1 - m(t)) h(t) + m(t) a_model(t) + sqrt(m(t)) r(t)
     m(t) = 1 - exp(-((t - t0) / tau_m)^2)
@@ -6,26 +6,23 @@
     j(t + dt) = j(t) exp(-dt / tau_j)                       j(t0) = jerk_measured(t0)
     r(t + dt) = c + (r(t) - c) exp(-dt / tau)               r(t0) = 0
 
-A simulation starts with the acceleration that the vehicle has, and holds it: h goes on changing
-with the jerk that the vehicle has at the start, which is forgotten with the time constant tau_j, as
-people's accelerations change smoothly. The model's share m is 0 at first, and goes to 1 with the
-time constant tau_m. Beside it stands a residual r, in m/s2, which goes from 0 to the target c with
-the time constant tau. What a vehicle does next is known as long as it goes on as it does; so the
-residual's variance counts as the model does.
+A simulation starts with the vehicle's acceleration h, which changes with the jerk at the start; the
+jerk decays with the time constant tau_j. The model's share m rises from 0 to 1 with the time
+constant tau_m. The residual r, in m/s2, goes from 0 to the target c with the time constant tau. Its
+variance is weighted by m, because the acceleration is known at first.
 
-The usual form adds what the model misses at the start to all that it wants later, `a_model(t) +
-r(t)` with `r(t0) = a_measured(t0) - a_model(t0)`. It has the vehicle's acceleration in the first
-step alone: afterwards the model's own changes come on top. A stiff model, such as Krauss's, takes
-the speed that it wants within a step; what it misses at the start says nothing of the next step.
+The usual form adds the model's error at the start: `a_model(t) + r(t)` with
+`r(t0) = a_measured(t0) - a_model(t0)`. It has the vehicle's acceleration in the first step alone:
+afterwards the model's own changes are added. A stiff model, such as Krauss's, reaches its desired
+speed within a step, so its error at the start does not predict that of the next step.
 
 Target and time constants are parameters like the model's own: constants make a baseline,
 and a policy may choose them anew for each window. The jerk is a parameter too, which is read in the
-first step only; 0 where nobody knows it. With c drawn at random the residual is
+first step only; 0 where it is unknown. With c drawn at random the residual is
 the auto-regressive noise of C. Zhang and L. Sun (2024), *Bayesian calibration of the intelligent
 driver model*, IEEE T-ITS 25(8), whose errors of acceleration are AR(1).
 
-Where a vehicle has to brake hard so as not to hit its leader, nothing of this keeps it from that:
-see `WithResidual`.
+It never prevents a vehicle from braking hard enough to avoid its leader: see `WithResidual`.
 
 Shapes: `*batch` are any leading dimensions; m is the width of the inner model's memory.
 """

@@ -35,7 +35,7 @@ class PolicyNetwork(nn.Module, ABC):
         """Returns the state `(N, B, s)` before the first window; s may be 0."""
 
     def observe(self, tokens: Tensor, state: Tensor) -> Tensor:
-        """Reads windows of measured driving, in which somebody else drives.
+        """Updates the state with windows of measured driving.
 
         Args:
             tokens: `(N, B, W, f)`, normalised.

@@ -228,5 +228,5 @@ class EstimatorNetwork(PolicyNetwork):
 
 
 def bounded(values: Tensor) -> Tensor:
-    """Returns squashed parameters that are not too far out to come back."""
+    """Clamps squashed parameters, so that later updates can still move them."""
     return values.clamp(-_LARGEST, _LARGEST)

@@ -50,7 +50,7 @@ _RECORDED = (0.05, 0.5, 0.95)
 """Quantiles of recordings that are kept, to be set beside live traffic."""
 
 _MOST_PAIRS = 4096
-"""Pairs whose recordings are looked at for these quantiles."""
+"""Pairs whose recordings these quantiles are measured on."""
 
 _WALKING_MPS = 1.5
 """Speed below which a time gap means nothing."""

@@ -40,7 +40,7 @@ class Trajectory(NamedTuple):
         position: front bumper, m.
         speed: m/s.
         gap: bumper to bumper, m; negative from a collision on.
-        collided: bool, the gap is negative. A rollout goes on after a collision: nothing is hidden.
+        collided: bool, the gap is negative. A rollout continues after a collision.
             False where the gap is NaN.
     """
 

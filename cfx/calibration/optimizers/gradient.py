@@ -24,7 +24,7 @@ _SAMPLES_OF_SEARCH = 512
 """Samples for each local search, those of the screening included."""
 
 _KEPT = 4
-"""One search of so many goes on to its minimum."""
+"""One search in this many is continued to its minimum."""
 
 _LENGTHS = (3.0, 1.0, 0.5, 0.2, 0.05, 0.01)
 """Multiples of a step that are tried at once."""
@@ -69,18 +69,18 @@ class GradientSettings(Settings):
 
 
 class GradientSearch(Optimizer):
-    """Evaluates guesses and Sobol points, and goes downhill from the best few.
+    """Evaluates guesses and Sobol points, and searches locally from the best few.
 
     Each search is BFGS within the bounds. Slopes are differences towards the middle of the bounds,
-    so any model and any simulator will do. Six lengths of each step are tried at once: where
+    so any model and any simulator works. Six lengths of each step are tried at once: where
     simulation is batched this costs no more time than one. A step that finds nothing better starts
-    again along the plain gradient, ten times shorter. All searches of all problems go on together.
+    again along the plain gradient, ten times shorter. All searches of all problems are one batch.
 
     More samples become more searches, not longer ones: models with regimes, such as Wiedemann's,
     have many local minima. A few steps show which searches are promising; the best quarter of them
-    goes on to its minimum, with as many evaluations as all had before.
+    is continued to its minimum, with as many evaluations as all had before.
 
-    What is left of the samples, too little for one more round, becomes further Sobol points.
+    Samples that are too few for another round become further Sobol points.
     """
 
     schema: ClassVar[type[Settings]] = GradientSettings

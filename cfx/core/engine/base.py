@@ -68,12 +68,12 @@ class Engine(Component):
                 says False, and an engine may then run several on one machine.
 
         Yields:
-            The number of each shard and its result, as soon as it is there, in any order. Whoever
-            stops listening cancels what is left.
+            The number of each shard and its result, as soon as it is there, in any order. Closing
+            the generator cancels the rest.
 
         Raises:
             CfxError: what `work` raises is raised again; or the workers are lost for good.
         """
 
     def close(self) -> None:
-        """Lets go of workers and connections; `map` may make them again."""
+        """Ends workers and closes connections; `map` may make them again."""

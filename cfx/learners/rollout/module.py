@@ -55,11 +55,11 @@ _STARTS = (0.8, 0.9)
 driver-specific parameters on what is before, so that networks are surer there."""
 
 _COVERING = 19
-"""Sampled paths whose range holds 90 % of what happens, if it is one of them as far as anybody can
-tell: it is the least or the greatest of twenty in two cases of twenty."""
+"""Number of sampled paths whose range covers 90 % of calibrated outcomes: an outcome exchangeable
+with 19 paths is the least or the greatest of the twenty in two cases of twenty."""
 
 _TOGETHER = 4_000
-"""Of these paths as many trajectories are simulated at once, which bounds the memory."""
+"""Trajectories of these paths that are simulated at once, which bounds the memory."""
 
 _COVERED = (_COVERING - 1) / (_COVERING + 1)
 

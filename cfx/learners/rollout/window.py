@@ -264,7 +264,7 @@ class ThroughTime(GradientPath):
 
 
 class ThroughMemory(ThroughTime):
-    """Gradients come back through the policy's memory alone, not through the vehicle's motion."""
+    """Back-propagates through the policy's memory alone, not through the vehicle's motion."""
 
     def after_window(self, state: LoopState) -> LoopState:
         bounded = super().after_window(state)
@@ -279,7 +279,7 @@ class ThroughMemory(ThroughTime):
 
 
 class _Bounded(torch.autograd.Function):
-    """The identity, whose gradient is scaled and clipped on its way back."""
+    """The identity; its backward pass scales and clips the gradient."""
 
     @staticmethod
     def forward(ctx, value, decay, clip):  # type: ignore[no-untyped-def]  # torch's signature
