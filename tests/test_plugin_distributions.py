@@ -21,8 +21,6 @@ ROOT = Path(__file__).resolve().parent.parent
 PLUGINS = sorted(path.parent for path in (ROOT / "plugins").glob("*/pyproject.toml"))
 READERS = {"cfx.data.files", "cfx.data.series", "cfx.data.table", "cfx.data.tracks"}
 REPORTS = {
-    "cfx.report.blocks",
-    "cfx.report.figure_blocks",
     "cfx.report.figures.canvas",
     "cfx.report.figures.figure",
     "cfx.report.figures.results",

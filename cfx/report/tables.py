@@ -1,13 +1,17 @@
-"""Tables of a report: cells, columns with the words that explain them, and what several share."""
+"""Tables of a report: columns that say what a row shows, cells, and words that several share."""
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
 from cfx.report.figures.words import MINUS, NOTHING, explained, percent, short_label
 from cfx.report.job import Job
+
+R = TypeVar("R")
 
 
 @dataclass(frozen=True)
@@ -32,31 +36,53 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Column:
-    """A column: its heading, and a sentence on it that needs no other document."""
+class Column(Generic[R]):
+    """A column of a table.
+
+    Attributes:
+        heading: of the column.
+        cell: takes a row and returns its cell; a text is one too.
+        meaning: a sentence on it that needs no other document.
+        group: a heading above it and those of its neighbours that have the same.
+    """
 
     heading: str
+    cell: Callable[[R], Cell | str]
     meaning: str = ""
-    number: bool = True
+    group: str = ""
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table.
+    """A table: its columns, and rows of a cell per column."""
 
-    Attributes:
-        columns: of the table.
-        rows: a cell per column each.
-        groups: headings above the columns, each with how many it spans.
-    """
-
-    columns: tuple[Column, ...]
+    columns: tuple[Column[Any], ...]
     rows: tuple[tuple[Cell, ...], ...]
-    groups: tuple[tuple[str, int], ...] = ()
 
-    def explained(self) -> tuple[Column, ...]:
+    @classmethod
+    def of(cls, columns: Sequence[Column[R]], rows: Iterable[R]) -> Sheet:
+        """Returns a table with a row for each of `rows`."""
+        found = []
+        for row in rows:
+            cells = [column.cell(row) for column in columns]
+            found.append(tuple(text(cell) if isinstance(cell, str) else cell for cell in cells))
+        return cls(tuple(columns), tuple(found))
+
+    @property
+    def groups(self) -> list[tuple[str, int]]:
+        """The headings above the columns, each with how many it spans; none without any."""
+        if not any(column.group for column in self.columns):
+            return []
+        runs = itertools.groupby(self.columns, key=lambda column: column.group)
+        return [(group, len(list(columns))) for group, columns in runs]
+
+    def holds_numbers(self, column: int) -> bool:
+        """Says whether a column holds numbers."""
+        return any(row[column].number for row in self.rows)
+
+    def explained(self) -> list[Column[Any]]:
         """Returns the columns that have something to explain."""
-        return tuple(column for column in self.columns if column.meaning)
+        return [column for column in self.columns if column.meaning]
 
 
 def text(value: object) -> Cell:
@@ -64,27 +90,28 @@ def text(value: object) -> Cell:
     return Cell(str(value) or NOTHING)
 
 
-def number(value: float, shown: str) -> Cell:
-    """Returns a cell with a number; one that is not defined is sorted last."""
+def number(value: float, form: str, second: str = "") -> Cell:
+    """Returns a cell with a number in a format as of `formatted`; undefined ones are sorted last.
+
+    Args:
+        value: the number.
+        form: its format.
+        second: a smaller line below.
+    """
     if not math.isfinite(value):
-        return Cell(NOTHING, number=True)
-    return Cell(shown, repr(float(value)), number=True)
+        return Cell(NOTHING, number=True, second=second)
+    return Cell(formatted(value, form), repr(float(value)), number=True, second=second)
 
 
 def formatted(value: float, form: str) -> str:
-    """Returns a number in a format such as ".2f" or ".0%", with a real minus sign."""
+    """Returns a number in a format such as ".2f" or "+.0%", with a real minus sign."""
     if not math.isfinite(value):
         return NOTHING
     return f"{value:{form}}".replace("%", " %").replace("-", MINUS)
 
 
-def share(value: float) -> Cell:
-    """Returns a cell with a signed percentage."""
-    return number(value, percent(value, 1))
-
-
 def interval(low: float, high: float) -> Cell:
-    """Returns a cell with an interval, sorted by its lower end."""
+    """Returns a cell with an interval of signed percentages, sorted by its lower end."""
     if not (math.isfinite(low) and math.isfinite(high)):
         return Cell(NOTHING, number=True)
     return Cell(f"{percent(low, 1)} to {percent(high, 1)}", repr(low), number=True)
@@ -93,11 +120,6 @@ def interval(low: float, high: float) -> Cell:
 def method_cell(method: str) -> Cell:
     """Returns a cell that names a method in its colour."""
     return Cell(short_label(method), colour=method)
-
-
-def probability(value: float) -> str:
-    """Returns a p value as one writes it."""
-    return "< 0.0001" if value < 1e-4 else f"{value:.2g}"
 
 
 def tested(jobs: Iterable[Job]) -> str:

@@ -14,9 +14,8 @@ from cfx.report.job import Job
 from cfx.report.page import render
 from cfx.report.runs import read_runs
 from cfx.report.sections.comparison import absolute, closeness, safety
-from cfx.report.sections.distributions import crps_sheet
-from cfx.report.sections.forecasts import errors
-from cfx.report.sections.safety import safety_of_methods
+from cfx.report.sections.forecasts import crps_sheet, errors
+from cfx.report.sections.metrics import safety_of_methods
 from cfx.report.summary import summary
 from cfx.report.tables import Sheet
 from tests.browser import Browser
@@ -164,7 +163,7 @@ def test_jobs_of_an_older_version_have_a_page_without_what_they_did_not_measure(
 def test_a_default_far_off_does_not_shrink_the_others(tmp_path: Path) -> None:
     write_job(tmp_path / "job", pairs=4)
     (job,) = read_runs([str(tmp_path)]).jobs
-    view = absolute([job]).views["speed, test part"]
+    view = absolute([job])["speed, test part"]
     assert "1 job with default parameters further off" in view.note
 
 

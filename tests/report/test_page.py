@@ -14,7 +14,6 @@ import pandas as pd
 import pytest
 
 from cfx.evaluation.result import Purpose
-from cfx.report.blocks import Figure, Fold, Heading, Items, Table, Text
 from cfx.report.page import render
 from cfx.report.runs import read_runs
 from cfx.report.sections import clusters as clusters_section
@@ -221,7 +220,7 @@ def test_few_very_bad_pairs_do_not_shrink_the_others(tmp_path: Path) -> None:
     table.loc[worst, "improvement"] = -40.0
     table.to_csv(tmp_path / "job" / "pairs.csv", index=False)
     runs = read_runs([str(tmp_path)])
-    view = per_driver(runs.jobs).views["against driver-specific calibration"]
+    view = per_driver(runs.jobs)["against driver-specific calibration"]
     assert "1 of 12 improvements are lower" in view.note
     assert "\N{MINUS SIGN}4000 %" in view.note
     assert "\N{MINUS SIGN}4000.0 %</title>" in view.svg
@@ -264,7 +263,7 @@ def test_best_median_and_worst_drives_alone_are_shown(tmp_path: Path) -> None:
         ("median", gain.index[4]),
         ("worst", gain.index[8]),
     ]
-    svg = pair_of(job, chosen[0].pair_id).views[""].svg
+    svg = pair_of(job, chosen[0].pair_id)[""].svg
     for words in ("speed (m/s)", "gap (m)", "t_r (s)", "t_i (s)", "real driver"):
         assert words in svg
     labels = page_of(tmp_path).having("aria-label")
@@ -293,8 +292,8 @@ def test_what_is_gained_after_the_start_has_a_view_of_its_own(tmp_path: Path) ->
     write_job(tmp_path / "a")
     metrics = json.loads((tmp_path / "a" / "metrics.json").read_text())
     views = [
-        overview(read_runs([tmp_path / "a"]).jobs).views,
-        absolute(read_runs([tmp_path / "a"]).jobs).views,
+        overview(read_runs([tmp_path / "a"]).jobs),
+        absolute(read_runs([tmp_path / "a"]).jobs),
     ]
     assert not any("5 s" in name for view in views for name in view)  # test parts may be no longer
     steady = {
@@ -304,10 +303,8 @@ def test_what_is_gained_after_the_start_has_a_view_of_its_own(tmp_path: Path) ->
     errors = {f"steady/rmse_speed/{method}": 0.5 for method in ("default", "fixed", "policy")}
     (tmp_path / "a" / "metrics.json").write_text(json.dumps(metrics | steady | errors))
     jobs = read_runs([tmp_path / "a"]).jobs
-    assert (
-        "against driver-specific calibration, test part after the first 5 s" in overview(jobs).views
-    )
-    assert "speed, test part after the first 5 s" in absolute(jobs).views
+    assert "against driver-specific calibration, test part after the first 5 s" in overview(jobs)
+    assert "speed, test part after the first 5 s" in absolute(jobs)
 
 
 @pytest.mark.usefixtures("blank_figures")
@@ -369,7 +366,7 @@ def test_a_calibration_is_none_of_the_policies_that_adapt(tmp_path: Path) -> Non
     said = summary(runs.jobs)
     assert any("a calibration; its parameters stay constant" in line for line in said)
     assert sum("Improvement of the RMSE of speed" in line for line in said) == 1
-    view = overview(runs.jobs).views["against driver-specific calibration"]
+    view = overview(runs.jobs)["against driver-specific calibration"]
     assert view.svg.count("<title>") == 3, "mean, trimmed mean and median of one job"
     alone = [job for job in runs.jobs if job.purpose is Purpose.CALIBRATION]
     assert "with constant parameters?" in summary(alone)[0]
@@ -377,12 +374,10 @@ def test_a_calibration_is_none_of_the_policies_that_adapt(tmp_path: Path) -> Non
     assert "Improvement of every pair" not in page.words
     assert "policy" not in alone[0].meaningful_methods, "a constant set is shown once"
     (moves,) = [job for job in runs.jobs if job.purpose is Purpose.ADAPTATION]
-    figure, fold = clusters_section.ClustersSection().blocks(runs)[1:3]
-    assert isinstance(figure, Figure)
-    assert isinstance(fold, Fold)
-    (table,) = fold.blocks
-    assert isinstance(table, Table)
-    assert {row[0].text for row in table.sheet.rows} == {moves.name}
+    sheet = clusters_section.clusters(cluster_series([moves]), "fixed")
+    found = clusters_section.ClustersSection().context(runs)
+    assert found is not None
+    assert found["sheets"]["driver-specific calibration"].rows == sheet.rows
     assert "over driver-specific calibration" not in page.words.split("Trajectories")[-1]
 
 
@@ -412,18 +407,19 @@ def test_the_papers_figures_stand_beside_those_of_its_experiments(
     write_job(tmp_path / "pair", pairs=1, experiment="paper/pair")
     write_job(tmp_path / "pairs", pairs=5, experiment="paper/pairs")
     write_job(tmp_path / "own", pairs=5)
-    blocks = paper.PaperSection().blocks(read_runs([str(tmp_path)]))
-    assert [one.words for one in blocks if isinstance(one, Heading)] == [
+    found = paper.PaperSection().context(read_runs([str(tmp_path)]))
+    assert found is not None
+    assert [one["heading"] for one in found["experiments"]] == [
         "One pair: follower 11 behind leader 1",
         "A network for each pair",
     ]
-    pair, pairs = (one.sheet.rows for one in blocks if isinstance(one, Table))
+    pair, pairs = (one["sheet"].rows for one in found["experiments"])
     texts = [cell.text for cell in pair[0]]
     assert texts == ["paper", "11/1", "krauss", "3.393", "1.033", "0.666", "+35.5 %"]
     assert pair[1][1].text == "1000/990"
     assert [row[3].text for row in pairs[:2]] == ["below 0 %", "below 0 %"]
     assert pairs[2][2].text == "5"
-    (said,) = (one.words for one in blocks[-1:] if isinstance(one, Text))
+    said = found["experiments"][-1]["differences"]
     assert "the number of pairs (here 5; there 94 in all)" in said
     assert "the search (here random; there Bayesian optimization)" in said
     _, metrics, page = clusters
@@ -447,11 +443,11 @@ def test_the_best_of_a_grid_search_is_chosen_by_the_validation_loss(tmp_path: Pa
         (folder / "metrics.json").write_text(
             json.dumps(metrics | {"validation_loss/best": loss}), encoding="utf-8"
         )
-    blocks = paper.PaperSection().blocks(read_runs([str(tmp_path)]))
-    (sheet,) = (one.sheet for one in blocks if isinstance(one, Table))
-    assert [row[1].text for row in sheet.rows] == ["500", "500", "100"]
-    (items,) = (one.words for one in blocks if isinstance(one, Items))
-    assert items[0] == "The smallest of the last column here: krauss · epochs=500."
+    found = paper.PaperSection().context(read_runs([str(tmp_path)]))
+    assert found is not None
+    (one,) = found["experiments"]
+    assert [row[1].text for row in one["sheet"].rows] == ["500", "500", "100"]
+    assert one["verdicts"][0] == "The smallest of the last column here: krauss · epochs=500."
 
 
 def test_durations_are_said_as_one_says_them() -> None:

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from cfx.calibration.flatness import NEAR
 from cfx.evaluation.result import Purpose
-from cfx.report.blocks import Block, Figure, Table, Text, job_fold
-from cfx.report.figure_blocks import caption, figure_of, view
 from cfx.report.figures.calibration import AT_BOUND, ParameterSpread, parameter_spreads
 from cfx.report.figures.identifiability import SlicePanel, draw_labels, labels_of, slice_panels
-from cfx.report.figures.words import number as shown_number
+from cfx.report.figures.words import number as shown
 from cfx.report.figures.words import short, unit_label
 from cfx.report.job import Job, Runs, of_purpose
-from cfx.report.section import Section
-from cfx.report.tables import Cell, Column, Sheet, formatted, job_names, number, text
+from cfx.report.section import Section, View
+from cfx.report.tables import Cell, Column, Sheet, formatted, job_names, number
 
 
 class CalibrationSection(Section):
@@ -27,42 +25,55 @@ class CalibrationSection(Section):
     title = "Calibrated parameters"
     entry = "Calibration"
     order = 1400
+    template = """
+<p>{{ caption("calibration") }}</p>
+{% for one in calibrations %}
+{% call fold(one.names, loop.first, "job") %}
+{{ drawn("calibration", one.job) }}
+{{ table(one.sheet, explain=loop.first) }}
+{% for name in ("identifiability", "fit_train_test") %}
+{% set beyond = drawn(name, one.job) %}
+{% if beyond %}
+<p>{{ caption(name) }}</p>
+{{ beyond }}
+{% endif %}
+{% endfor %}
+{% if one.labels %}
+<p>{{ caption("labels_over_time") }}</p>
+{{ figure(one.labels, "Per-window calibrated parameters over time, and how much they mattered",
+   "Pair") }}
+{% endif %}
+{% endcall %}
+{% endfor %}
+"""
 
-    def blocks(self, runs: Runs) -> list[Block]:
-        """Return a plot and a table for each calibration, with the jobs that share it."""
+    def context(self, runs: Runs) -> Mapping[str, Any] | None:
+        """Return each calibration with the jobs that share it."""
         together: dict[str, list[Job]] = {}
         for job in of_purpose(runs.jobs, Purpose.ADAPTATION, Purpose.CALIBRATION):
             spreads = spreads_of(job)
             if spreads:
                 together.setdefault(_fingerprint(spreads), []).append(job)
-        found: list[Block] = []
-        for k, jobs in enumerate(together.values()):
-            spreads = spreads_of(jobs[0])
-            table = Table(sheet(spreads, slices_of(jobs[0])), explain=k == 0)
-            parts = [figure_of("calibration", jobs[0]), table, *_beyond(jobs)]
-            shown = [part for part in parts if part is not None]
-            found.append(job_fold(job_names(jobs), shown, first=k == 0))
-        return [Text(caption("calibration")), *found] if found else []
+        found = []
+        for jobs in together.values():
+            table = sheet(spreads_of(jobs[0]), slices_of(jobs[0]))
+            about = {"names": job_names(jobs), "job": jobs[0], "sheet": table}
+            found.append({**about, "labels": _labels(jobs)})
+        return {"calibrations": found} if found else None
 
 
-def _beyond(jobs: Sequence[Job]) -> list[Block]:
-    """Returns what calibration found beyond its parameters, as far as a job has kept it."""
-    found: list[Block] = []
-    for name in ("identifiability", "fit_train_test"):
-        figure = figure_of(name, jobs[0])
-        if figure is not None:
-            found += [Text(caption(name)), figure]
-    kept = [job for job in jobs if "labels" in job.tables]
-    for job in kept:
-        results = job.results
+def _labels(jobs: Sequence[Job]) -> dict[str, View]:
+    """Returns the per-window parameters of some pairs of the first job that has kept any."""
+    for job in jobs:
         views = {}
-        drivers = labels_of(job.tables["labels"], results.pairs, results.parameters)
-        for pair_id, labels in drivers.items():
-            views[short(pair_id)] = view(draw_labels(pair_id, labels, results.parameters))
+        if "labels" in job.tables:
+            axes = job.results.parameters
+            drivers = labels_of(job.tables["labels"], job.pairs, axes)
+            for pair_id, labels in drivers.items():
+                views[short(pair_id)] = View(draw_labels(pair_id, labels, axes))
         if views:
-            title = "Per-window calibrated parameters over time, and how much they mattered"
-            return [*found, Text(caption("labels_over_time")), Figure(views, title, "Pair")]
-    return found
+            return views
+    return {}
 
 
 def slices_of(job: Job) -> tuple[SlicePanel, ...]:
@@ -86,51 +97,72 @@ def _fingerprint(spreads: tuple[ParameterSpread, ...]) -> str:
     return found.hexdigest()
 
 
+class _Row(NamedTuple):
+    """A parameter; `near` and `flat` as of `SlicePanel`, NaN where the loss was not examined."""
+
+    spread: ParameterSpread
+    near: float
+    flat: float
+
+    def quantile(self, share: float) -> float:
+        return float(np.quantile(self.spread.values, share))
+
+    @property
+    def pooled(self) -> float:
+        return float(self.spread.pooled.mean()) if len(self.spread.pooled) else np.nan
+
+
 def sheet(spreads: Sequence[ParameterSpread], panels: Sequence[SlicePanel] = ()) -> Sheet:
     """Returns a row per parameter."""
-    at = f"{AT_BOUND:.0%}".replace("%", " %")
-    columns = (
-        Column("Parameter", number=False),
-        Column("Bounds", "Within them calibration has searched.", number=False),
-        Column("Default", "The model's."),
-        Column("Pooled", "Mean over the folds' pooled parameters."),
-        Column("Median", "Of the driver-specific values: half of the pairs have more."),
-        Column("5 % to 95 %", "Quantiles of the driver-specific values.", number=False),
-        Column("At the lower bound", f"Share of the pairs within {at} of the range of it."),
-        Column("At the upper bound", "The same."),
-        Column(
-            "Flat on",
-            f"Share of the range on which the loss is within {NEAR:.0%} of its best, the others"
-            " held; median over pairs.".replace("%", " %", 1),
-        ),
-        Column(
-            "Flat for",
-            "Share of the pairs for which that is the whole range: these recordings do not"
-            " determine the parameter, and its value says nothing of the driver.",
-        ),
-    )
-    of_name = {panel.axis.name: panel for panel in panels}
-    return Sheet(columns, tuple(_row(spread, of_name) for spread in spreads))
+    examined = {panel.axis.name: (panel.near, panel.flat) for panel in panels}
+    unknown = (np.nan, np.nan)
+    return Sheet.of(_COLUMNS, [_Row(one, *examined.get(one.axis.name, unknown)) for one in spreads])
 
 
-def _row(spread: ParameterSpread, panels: Mapping[str, SlicePanel]) -> tuple[Cell, ...]:
-    axis = spread.axis
-    assert axis.low is not None
-    assert axis.high is not None
-    share = flat = float("nan")
-    if axis.name in panels:
-        share, flat = panels[axis.name].near, panels[axis.name].flat
-    low, median, high = np.quantile(spread.values, (0.05, 0.5, 0.95))
-    pooled = float(spread.pooled.mean()) if len(spread.pooled) else float("nan")
-    return (
-        replace(text(unit_label(axis.name, axis.unit)), second=axis.meaning),
-        text(f"{shown_number(axis.low)} to {shown_number(axis.high)}"),
-        number(spread.default, shown_number(spread.default)),
-        number(pooled, shown_number(pooled)),
-        number(float(median), shown_number(float(median))),
-        text(f"{shown_number(float(low))} to {shown_number(float(high))}"),
-        number(spread.at_low, formatted(spread.at_low, ".0%")),
-        number(spread.at_high, formatted(spread.at_high, ".0%")),
-        number(share, formatted(share, ".0%")),
-        number(flat, formatted(flat, ".0%")),
-    )
+def _name(row: _Row) -> Cell:
+    axis = row.spread.axis
+    return Cell(unit_label(axis.name, axis.unit), second=axis.meaning)
+
+
+def _bounds(row: _Row) -> str:
+    assert row.spread.axis.low is not None
+    assert row.spread.axis.high is not None
+    return f"{shown(row.spread.axis.low)} to {shown(row.spread.axis.high)}"
+
+
+_COLUMNS: tuple[Column[_Row], ...] = (
+    Column("Parameter", _name),
+    Column("Bounds", _bounds, "Within them calibration has searched."),
+    Column("Default", lambda row: number(row.spread.default, ".3g"), "The model's."),
+    Column(
+        "Pooled", lambda row: number(row.pooled, ".3g"), "Mean over the folds' pooled parameters."
+    ),
+    Column(
+        "Median",
+        lambda row: number(row.quantile(0.5), ".3g"),
+        "Of the driver-specific values: half of the pairs have more.",
+    ),
+    Column(
+        "5 % to 95 %",
+        lambda row: f"{shown(row.quantile(0.05))} to {shown(row.quantile(0.95))}",
+        "Quantiles of the driver-specific values.",
+    ),
+    Column(
+        "At the lower bound",
+        lambda row: number(row.spread.at_low, ".0%"),
+        f"Share of the pairs within {formatted(AT_BOUND, '.0%')} of the range of it.",
+    ),
+    Column("At the upper bound", lambda row: number(row.spread.at_high, ".0%"), "The same."),
+    Column(
+        "Flat on",
+        lambda row: number(row.near, ".0%"),
+        f"Share of the range on which the loss is within {formatted(NEAR, '.0%')} of its best, the"
+        " others held; median over pairs.",
+    ),
+    Column(
+        "Flat for",
+        lambda row: number(row.flat, ".0%"),
+        "Share of the pairs for which that is the whole range: these recordings do not"
+        " determine the parameter, and its value says nothing of the driver.",
+    ),
+)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -10,23 +11,16 @@ import pandas as pd
 from cfx.data.style import CLUSTERS
 from cfx.evaluation.result import Purpose
 from cfx.evaluation.statistics import Improvement
-from cfx.report.blocks import Block, Figure, Fold, Table, Text
-from cfx.report.figure_blocks import view
 from cfx.report.figures.improvements import improvement_axis
 from cfx.report.figures.jobs import ClusterGroup, draw_clusters
 from cfx.report.figures.words import explained, label
 from cfx.report.job import Job, Runs, any_baselines, of_purpose
 from cfx.report.names import SEPARATOR, differences
-from cfx.report.section import Section
-from cfx.report.tables import Cell, Column, Sheet, formatted, interval, number, share, text
+from cfx.report.section import Section, View
+from cfx.report.tables import Cell, Column, Sheet, interval, number
 
 Series = Mapping[str, Mapping[str, pd.DataFrame]]
 """By name of some jobs and by cluster, some rows of `Job.by_pair`."""
-
-_INTRODUCTION = (
-    "A box reaches from the lower to the upper quartile of the pairs, its line is the median, the"
-    " dashed one the mean; the dots are the pairs."
-)
 
 
 class ClustersSection(Section):
@@ -35,20 +29,26 @@ class ClustersSection(Section):
     title = "By cluster of driving style"
     entry = "By cluster"
     order = 1300
+    template = """
+<p>A box reaches from the lower to the upper quartile of the pairs, its line is the median, the
+dashed one the mean; the dots are the pairs.</p>
+{{ figure(views, "Improvement by cluster of driving style") }}
+{% for baseline, sheet in sheets.items() %}
+{% call fold("Policy against " ~ baseline, loop.first) %}
+{{ table(sheet, explain=loop.first) }}
+{% endcall %}
+{% endfor %}
+"""
 
-    def blocks(self, runs: Runs) -> list[Block]:
+    def context(self, runs: Runs) -> Mapping[str, Any] | None:
         """Return the plot and a table per baseline, if any job has a baseline."""
         jobs = of_purpose(runs.jobs, Purpose.ADAPTATION)
         if not jobs:
-            return []
+            return None
         baselines = any_baselines(jobs)
         series = cluster_series(jobs)
-        found: list[Block] = [Text(_INTRODUCTION), per_cluster(series, baselines)]
-        for k, baseline in enumerate(baselines):
-            first = k == 0
-            table = Table(clusters(series, baseline), explain=first)
-            found.append(Fold(f"Policy against {label(baseline)}", (table,), unfolded=first))
-        return found
+        sheets = {label(baseline): clusters(series, baseline) for baseline in baselines}
+        return {"views": per_cluster(series, baselines), "sheets": sheets}
 
 
 def cluster_series(jobs: Sequence[Job]) -> dict[str, dict[str, pd.DataFrame]]:
@@ -83,13 +83,8 @@ def _by_cluster(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
     return found
 
 
-def per_cluster(series: Series, baselines: Sequence[str]) -> Figure:
-    """Distribution of the improvement by cluster; a view per baseline.
-
-    Args:
-        series: the pairs.
-        baselines: what the policy is compared with.
-    """
+def per_cluster(series: Series, baselines: Sequence[str]) -> dict[str, View]:
+    """Distribution of the improvement by cluster; a view per baseline."""
     views = {}
     for baseline in baselines:
         column = f"improvement/{baseline}"
@@ -100,8 +95,8 @@ def per_cluster(series: Series, baselines: Sequence[str]) -> Figure:
                 groups.append(_group(name, pd.concat(tables, ignore_index=True), column))
         every = np.concatenate([np.empty(0), *(group.values for group in groups)])
         axis = improvement_axis(every, baseline=baseline)
-        views[f"against {label(baseline)}"] = view(draw_clusters(groups, axis), axis.note)
-    return Figure(views, "Improvement by cluster of driving style")
+        views[f"against {label(baseline)}"] = View(draw_clusters(groups, axis), axis.note)
+    return views
 
 
 def _group(name: str, pairs: pd.DataFrame, column: str) -> ClusterGroup:
@@ -110,48 +105,48 @@ def _group(name: str, pairs: pd.DataFrame, column: str) -> ClusterGroup:
     return ClusterGroup(name, tuple(clusters), tuple(ids), values)
 
 
-def clusters(series: Series, baseline: str) -> Sheet:
-    """Returns the improvement by cluster.
+class _Row(NamedTuple):
+    jobs: str
+    cluster: str
+    found: Improvement
 
-    Args:
-        series: the pairs.
-        baseline: what the policy is compared with.
-    """
-    columns = (
-        Column("Jobs", number=False),
-        Column(
-            "Cluster",
-            "A quarter of the drivers, a half and a quarter by style score, unless the cuts say"
-            " otherwise.",
-            number=False,
-        ),
-        Column("Pairs", "Pairs of drivers of this cluster whose improvement is defined."),
-        Column("Mean", f"Improvement over {explained(baseline)}."),
-        Column("95 % interval", "Of the mean, as above."),
-        Column("Trimmed mean", "As above."),
-        Column("Median", "As above."),
-        Column("Better for", "As above."),
-    )
+
+def clusters(series: Series, baseline: str) -> Sheet:
+    """Returns the improvement over a baseline by cluster."""
     rows = []
     for name, by_cluster in series.items():
         for cluster, table in by_cluster.items():
             # Jobs without this baseline may stand beside others that have it.
             if f"rmse_speed/{baseline}" in table:
-                rows.append((text(name), *_row(cluster, statistics(table, baseline))))
-    return Sheet(columns, tuple(rows))
-
-
-def _row(cluster: str, found: Improvement) -> tuple[Cell, ...]:
-    place = str(CLUSTERS.index(cluster)) if cluster in CLUSTERS else cluster
-    return (
-        Cell(cluster, place, colour=cluster),
-        number(found.pairs, str(found.pairs)),
-        share(found.mean),
-        interval(found.ci95_low, found.ci95_high),
-        share(found.trimmed_mean),
-        share(found.median),
-        number(found.win_rate, formatted(found.win_rate, ".0%")),
+                rows.append(_Row(name, cluster, statistics(table, baseline)))
+    columns: tuple[Column[_Row], ...] = (
+        Column("Jobs", lambda row: row.jobs),
+        Column(
+            "Cluster",
+            lambda row: Cell(row.cluster, str(CLUSTERS.index(row.cluster)), colour=row.cluster),
+            "A quarter of the drivers, a half and a quarter by style score, unless the cuts say"
+            " otherwise.",
+        ),
+        Column(
+            "Pairs",
+            lambda row: number(row.found.pairs, "d"),
+            "Pairs of drivers of this cluster whose improvement is defined.",
+        ),
+        Column(
+            "Mean",
+            lambda row: number(row.found.mean, "+.1%"),
+            f"Improvement over {explained(baseline)}.",
+        ),
+        Column(
+            "95 % interval",
+            lambda row: interval(row.found.ci95_low, row.found.ci95_high),
+            "Of the mean, as above.",
+        ),
+        Column("Trimmed mean", lambda row: number(row.found.trimmed_mean, "+.1%"), "As above."),
+        Column("Median", lambda row: number(row.found.median, "+.1%"), "As above."),
+        Column("Better for", lambda row: number(row.found.win_rate, ".0%"), "As above."),
     )
+    return Sheet.of(columns, rows)
 
 
 def statistics(table: pd.DataFrame, baseline: str) -> Improvement:

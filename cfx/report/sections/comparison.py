@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from cfx.evaluation.metrics.base import MetricInfo
 from cfx.evaluation.result import METHODS, Purpose
-from cfx.report.blocks import Block, Figure, Fold, Heading, Table, Text, View
-from cfx.report.figure_blocks import view
 from cfx.report.figures.jobs import draw_error_dots, error_limit
 from cfx.report.figures.words import FULL_TRAJECTORY, STEADY, TEST, explained, percent, short_label
 from cfx.report.job import Job, Runs, any_baselines, any_has_metric, of_purpose
 from cfx.report.metrics import metric_title
-from cfx.report.section import Section
-from cfx.report.tables import Cell, Column, Sheet, formatted, job_names, number, tested, text
+from cfx.report.section import Section, View
+from cfx.report.tables import Cell, Column, Sheet, formatted, job_names, number, tested
 
 _RECORDED = "Behind recorded leaders"
 _IN_PLATOON = "Platoon behind a braking leader"
@@ -26,18 +25,6 @@ _PLATOON = (
     "Ten followers in a row, all driven by the policy, behind a leader that brakes from 15 to"
     " 7 m/s and recovers."
 )
-
-
-class _Measure(NamedTuple):
-    """A measure of safety over a part of the trajectories, and the baseline that stands below."""
-
-    metric: str
-    scope: str
-    baseline: str
-    form: str
-    heading: str
-    meaning: str
-
 
 _SAFETY = (
     ("collisions", TEST, "fixed", ".0f", "Collisions"),
@@ -51,6 +38,8 @@ _SAFETY = (
     ("platoon/min_gap", TEST, "population", ".1f", "Least gap (m)"),
     ("platoon/collisions", TEST, "population", ".0f", "Collisions"),
 )
+"""Measures: metric, part of the trajectories, baseline that stands below, format, heading."""
+
 _MEANINGS = {
     "collisions": "Pairs in which the simulated gap becomes negative, on the test part.",
     "hard_braking": "Frames with an acceleration below \N{MINUS SIGN}8 m/s², test part.",
@@ -79,6 +68,8 @@ _GAINS = (
     ("population", FULL_TRAJECTORY),
 )
 
+_JOB = Column[Job]("Job", lambda job: job.name)
+
 
 class ComparisonSection(Section):
     """All jobs side by side: how close each is to the real drivers, and how safely it drives."""
@@ -86,44 +77,41 @@ class ComparisonSection(Section):
     title = "Side by side"
     entry = "Side by side"
     order = 200
+    template = """
+<p>Errors in m/s and m compare across driving models and learners; lower is closer to the real
+driver.
+{% if runs.jobs | length > 1 %}
+The best of a column is bold where all jobs are tested on the same pairs.
+{% endif %}
+</p>
+{{ table(closeness, compact=true, explain=true) }}
+{% if unconditional %}
+<p class="note">{{ unconditional }}: the policy sets the acceleration itself. With constant
+parameters the model follows no leader, so that no calibration is a baseline. Its errors are an
+upper reference for the models that follow.</p>
+{% endif %}
+{{ figure(errors, "Errors of every job and method", "RMSE of") }}
+<h3>Is it safe, and smooth?</h3>
+<p>The numbers are the policy's; the smaller line below is a baseline's.</p>
+{{ table(safety, compact=true, explain=true) }}
+{% if every_metric %}
+{% call fold("Every metric of every job, test part") %}
+<p>The numbers are the policy's; the smaller line: driver-specific calibration.</p>
+{{ table(every_metric, compact=true, explain=true) }}
+{% endcall %}
+{% endif %}
+"""
 
-    def blocks(self, runs: Runs) -> list[Block]:
+    def context(self, runs: Runs) -> Mapping[str, Any]:
         """Return the comparison of all jobs."""
         jobs = runs.jobs
-        introduction = (
-            "Errors in m/s and m compare across driving models and learners; lower is closer to the"
-            " real driver."
-        )
-        if len(jobs) > 1:
-            introduction += (
-                " The best of a column is bold where all jobs are tested on the same pairs."
-            )
-        found: list[Block] = [
-            Text(introduction),
-            Table(closeness(jobs), compact=True, explain=True),
-        ]
-        unconditional = of_purpose(jobs, Purpose.POLICY)
-        if unconditional:
-            found.append(
-                Text(
-                    f"{job_names(unconditional)}: the policy sets the acceleration itself. With"
-                    " constant parameters the model follows no leader, so that no calibration is a"
-                    " baseline. Its errors are an upper reference for the models that follow.",
-                    "note",
-                )
-            )
-        found += [
-            absolute(jobs),
-            Heading("Is it safe, and smooth?"),
-            Text("The numbers are the policy's; the smaller line below is a baseline's."),
-            Table(safety(jobs), compact=True, explain=True),
-        ]
-        further = every_metric(jobs)
-        if further is not None:
-            words = "The numbers are the policy's; the smaller line: driver-specific calibration."
-            table = Table(further, compact=True, explain=True)
-            found.append(Fold("Every metric of every job, test part", (Text(words), table)))
-        return found
+        return {
+            "closeness": closeness(jobs),
+            "unconditional": job_names(of_purpose(jobs, Purpose.POLICY)),
+            "errors": absolute(jobs),
+            "safety": safety(jobs),
+            "every_metric": every_metric(jobs),
+        }
 
 
 def closeness(jobs: Sequence[Job]) -> Sheet:
@@ -132,63 +120,41 @@ def closeness(jobs: Sequence[Job]) -> Sheet:
         TEST: tested(jobs),
         FULL_TRAJECTORY: "the full trajectory of unseen drivers, from its first frame on",
     }
-    columns = [Column("Job", number=False)]
-    rows = [[text(job.name)] for job in jobs]
-    groups = [("", 1)]
-    for scope, title in (
+    columns = [_JOB]
+    for scope, group in (
         (TEST, "Test part: RMSE of speed in m/s, below it of gap in m"),
         (FULL_TRAJECTORY, "Full trajectories: the same"),
     ):
-        methods = _measured_methods(jobs, scope)
-        for method in methods:
-            meaning = f"RMSE over {frames[scope]}, with {explained(method)}."
-            columns.append(Column(short_label(method), meaning))
-            for row, job in zip(rows, jobs, strict=True):
-                row.append(_error(job, scope, method))
-        if methods:
-            groups.append((title, len(methods)))
-    gains = 0
+        for method in METHODS:
+            showing = [job for job in jobs if method in job.meaningful_methods]
+            if any_has_metric(showing, "rmse_speed", method, scope):
+                meaning = f"RMSE over {frames[scope]}, with {explained(method)}."
+                cell = partial(_error, scope=scope, method=method)
+                columns.append(Column(short_label(method), cell, meaning, group))
     for baseline, scope in _GAINS:
-        if baseline not in any_baselines(jobs, scope):
-            continue
-        gains += 1
-        suffix = "" if scope == TEST else ", full"
-        meaning = (
-            f"Mean improvement of the RMSE of speed over {explained(baseline)}, on"
-            f" {frames[scope]}; below it the 95 % interval."
-        )
-        columns.append(Column(f"over {short_label(baseline)}{suffix}", meaning))
-        for row, job in zip(rows, jobs, strict=True):
-            row.append(_gain(job, baseline, scope))
-    if gains:
-        groups.append(("Improvement of the policy", gains))
-    _mark_best(rows, jobs, columns)
-    return Sheet(tuple(columns), tuple(tuple(row) for row in rows), tuple(groups))
+        if baseline in any_baselines(jobs, scope):
+            suffix = "" if scope == TEST else ", full"
+            meaning = (
+                f"Mean improvement of the RMSE of speed over {explained(baseline)}, on"
+                f" {frames[scope]}; below it the 95 % interval."
+            )
+            heading = f"over {short_label(baseline)}{suffix}"
+            cell = partial(_gain, baseline=baseline, scope=scope)
+            columns.append(Column(heading, cell, meaning, "Improvement of the policy"))
+    return _with_best(Sheet.of(columns, jobs), jobs)
 
 
 def safety(jobs: Sequence[Job]) -> Sheet:
     """Returns a row per job: the policy's measures of safety, and below them a baseline's."""
-    kept = []
+    columns = [_JOB]
     for metric, scope, baseline, form, heading in _SAFETY:
         if any(job.has_metric(metric, job.judged, scope) for job in jobs):
             meaning = _MEANINGS[metric] if scope == TEST else "The same over full trajectories."
-            kept.append(_Measure(metric, scope, baseline, form, heading, meaning))
-    columns = [Column("Job", number=False)]
-    for one in kept:
-        meaning = f"{one.meaning} Below it the same for {explained(one.baseline)}."
-        columns.append(Column(one.heading, meaning))
-    rows = []
-    for job in jobs:
-        cells = [text(job.name)]
-        for one in kept:
-            cells.append(_with_baseline(job, one.metric, one.scope, one.baseline, one.form))
-        rows.append(tuple(cells))
-    platoon = len([one for one in kept if one.metric.startswith("platoon/")])
-    groups = [("", 1)]
-    for title, count in ((_RECORDED, len(kept) - platoon), (_IN_PLATOON, platoon)):
-        if count:
-            groups.append((title, count))
-    return Sheet(tuple(columns), tuple(rows), tuple(groups))
+            meaning += f" Below it the same for {explained(baseline)}."
+            group = _IN_PLATOON if metric.startswith("platoon/") else _RECORDED
+            cell = partial(_with_baseline, metric=metric, scope=scope, baseline=baseline, form=form)
+            columns.append(Column(heading, cell, meaning, group))
+    return Sheet.of(columns, jobs)
 
 
 def every_metric(jobs: Sequence[Job]) -> Sheet | None:
@@ -196,26 +162,18 @@ def every_metric(jobs: Sequence[Job]) -> Sheet | None:
     known: dict[str, MetricInfo] = {}
     for job in jobs:
         known |= {one.name: one for one in job.known_metrics if TEST in one.scopes}
-    if not known:
-        return None
-    columns = [Column("Job", number=False)]
+    columns = [_JOB]
     for metric in known.values():
         better = "" if metric.direction == "none" else f" The {metric.direction} the better."
-        columns.append(
-            Column(metric_title(metric), f"{metric.meaning}, {metric.summary} over pairs.{better}")
-        )
-    rows = []
-    for job in jobs:
-        cells = [text(job.name)]
-        for name in known:
-            cells.append(_with_baseline(job, name, TEST, "fixed", ".3g"))
-        rows.append(tuple(cells))
-    return Sheet(tuple(columns), tuple(rows))
+        meaning = f"{metric.meaning}, {metric.summary} over pairs.{better}"
+        cell = partial(_with_baseline, metric=metric.name, scope=TEST, baseline="fixed", form=".3g")
+        columns.append(Column(metric_title(metric), cell, meaning))
+    return Sheet.of(columns, jobs) if known else None
 
 
-def absolute(jobs: Sequence[Job]) -> Figure:
+def absolute(jobs: Sequence[Job]) -> dict[str, View]:
     """Errors of each method in m/s and m; a view for each error and part of the trajectories."""
-    views: dict[str, View] = {}
+    views = {}
     for metric, scope in _ERRORS:
         if not any(job.has_metric(metric, job.judged, scope) for job in jobs):
             continue
@@ -229,36 +187,25 @@ def absolute(jobs: Sequence[Job]) -> Figure:
         what = f"RMSE of {signal}, mean over pairs"
         drawn = draw_error_dots(names, values, unit=unit, what=what)
         note = error_limit(values, unit)[1]
-        views[f"{signal}, {jobs[0].scope_label(scope)}"] = view(drawn, note)
-    return Figure(views, "Errors of every job and method", chooser="RMSE of")
+        views[f"{signal}, {jobs[0].scope_label(scope)}"] = View(drawn, note)
+    return views
 
 
 def _shown_error(job: Job, metric: str, method: str, scope: str) -> float:
     return job.metric(metric, method, scope) if method in job.meaningful_methods else math.nan
 
 
-def _measured_methods(jobs: Sequence[Job], scope: str) -> list[str]:
-    found = []
-    for method in METHODS:
-        showing = [job for job in jobs if method in job.meaningful_methods]
-        if any_has_metric(showing, "rmse_speed", method, scope):
-            found.append(method)
-    return found
-
-
 def _error(job: Job, scope: str, method: str) -> Cell:
-    shown = method in job.meaningful_methods
-    if not (shown and job.has_metric("rmse_speed", method, scope)):
+    if not (method in job.meaningful_methods and job.has_metric("rmse_speed", method, scope)):
         return number(math.nan, "")
-    speed, gap = job.metric("rmse_speed", method, scope), job.metric("rmse_gap", method, scope)
-    second = f"{gap:.2f}" if math.isfinite(gap) else ""
-    return replace(number(speed, f"{speed:.3f}"), second=second)
+    gap = job.metric("rmse_gap", method, scope)
+    second = formatted(gap, ".2f") if math.isfinite(gap) else ""
+    return number(job.metric("rmse_speed", method, scope), ".3f", second)
 
 
 def _gain(job: Job, baseline: str, scope: str) -> Cell:
     if baseline not in job.baselines(scope):
         return number(math.nan, "")
-    mean = job.improvement("mean", baseline, scope)
     low = job.improvement("ci95_low", baseline, scope)
     high = job.improvement("ci95_high", baseline, scope)
     second = ""
@@ -266,32 +213,31 @@ def _gain(job: Job, baseline: str, scope: str) -> Cell:
         digits = 0 if max(abs(low), abs(high)) >= 1 else 1
         ends = (percent(low, digits), percent(high, digits))
         second = " to ".join(end.removesuffix(" %") for end in ends)
-    return replace(number(mean, percent(mean, 1)), second=second)
+    return number(job.improvement("mean", baseline, scope), "+.1%", second)
 
 
 def _with_baseline(job: Job, metric: str, scope: str, baseline: str, form: str) -> Cell:
     """Returns the policy's number, and below it the baseline's."""
-    value = job.metric(metric, job.judged, scope)
-    cell = number(value, formatted(value, form))
-    if not job.has_metric(metric, baseline, scope):
-        return cell
-    return replace(cell, second=formatted(job.metric(metric, baseline, scope), form))
+    second = ""
+    if job.has_metric(metric, baseline, scope):
+        second = formatted(job.metric(metric, baseline, scope), form)
+    return number(job.metric(metric, job.judged, scope), form, second)
 
 
-def _mark_best(rows: list[list[Cell]], jobs: Sequence[Job], columns: Sequence[Column]) -> None:
+def _with_best(sheet: Sheet, jobs: Sequence[Job]) -> Sheet:
     """Marks the policy's smallest error and largest improvement, if all are tested on the same."""
     tests = set()
     for job in jobs:
         fingerprint = str(job.data.get("fingerprint"))
         tests.add((fingerprint, frozenset(job.pairs["pair_id"]), job.split))
-    if len(rows) < 2 or len(tests) > 1:
-        return
-    for k, column in enumerate(columns):
+    if len(jobs) < 2 or len(tests) > 1:
+        return sheet
+    rows = [list(row) for row in sheet.rows]
+    for k, column in enumerate(sheet.columns):
         is_error = column.heading == "policy"
-        if not is_error and not column.heading.startswith("over "):
-            continue
         known = [float(row[k].sort) for row in rows if row[k].sort]
-        if known:
+        if known and (is_error or column.heading.startswith("over ")):
             best = min(known) if is_error else max(known)
             for row in rows:
                 row[k] = replace(row[k], best=row[k].sort == repr(best))
+    return replace(sheet, rows=tuple(map(tuple, rows)))

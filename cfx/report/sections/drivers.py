@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
 
 import pandas as pd
 
 from cfx.evaluation.result import Purpose
-from cfx.report.blocks import Block, Figure, Fold, Table, Text, View
-from cfx.report.figure_blocks import view
 from cfx.report.figures.improvements import improvement_bars
 from cfx.report.figures.jobs import draw_every_pair
 from cfx.report.figures.words import label, short_label
 from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs, any_baselines, of_purpose
-from cfx.report.section import Section
-from cfx.report.tables import Column, Sheet, formatted, number, share, text
+from cfx.report.section import Section, View
+from cfx.report.tables import Cell, Column, Sheet, formatted, number
 
-_INTRODUCTION = (
-    "Improvement of every pair on its test part, in the order of the first job; above 0 the policy"
-    " is closer to the real driver. The mouse shows the pair; a click on a heading of the tables"
-    " sorts pairs by driver, style or errors."
-)
 _STATISTICS = ("mean", "ci95_low", "ci95_high")
+
+Pair = Mapping[str, Any]
+"""A row of `Job.by_pair`."""
 
 
 class DriversSection(Section):
@@ -33,25 +30,31 @@ class DriversSection(Section):
     title = "Driver by driver"
     entry = "Driver by driver"
     order = 1200
+    template = """
+<p>Improvement of every pair on its test part, in the order of the first job; above 0 the policy is
+closer to the real driver. The mouse shows the pair; a click on a heading of the tables sorts pairs
+by driver, style or errors.</p>
+{{ figure(views, "Improvement of every pair") }}
+{% for name, sheet in sheets.items() %}
+{% call fold("Every pair: " ~ name) %}{{ table(sheet, compact=true) }}{% endcall %}
+{% endfor %}
+"""
 
-    def blocks(self, runs: Runs) -> list[Block]:
-        """Return the plot, if any job has a baseline."""
+    def context(self, runs: Runs) -> Mapping[str, Any] | None:
+        """Return the plot and a table per job, if any job has a baseline."""
         jobs = of_purpose(runs.jobs, Purpose.ADAPTATION)
         if not jobs:
-            return []
-        found: list[Block] = [Text(_INTRODUCTION), per_driver(jobs)]
-        for job in jobs:
-            found.append(Fold(f"Every pair: {job.name}", (Table(pairs_of(job), compact=True),)))
-        return found
+            return None
+        return {"views": per_driver(jobs), "sheets": {job.name: pairs_of(job) for job in jobs}}
 
 
-def per_driver(jobs: Sequence[Job]) -> Figure:
+def per_driver(jobs: Sequence[Job]) -> dict[str, View]:
     """Improvement of every pair; a view per baseline."""
     tables = [_keyed(job, jobs) for job in jobs]
     views = {}
     for baseline in any_baselines(jobs):
         views[f"against {label(baseline)}"] = _view(jobs, tables, baseline)
-    return Figure(views, "Improvement of every pair")
+    return views
 
 
 def _keyed(job: Job, jobs: Sequence[Job]) -> pd.DataFrame:
@@ -78,33 +81,32 @@ def _view(jobs: Sequence[Job], tables: Sequence[pd.DataFrame], baseline: str) ->
     keys: dict[str, None] = {}
     for series in bars.series:
         keys |= dict.fromkeys(series.pair_ids)
-    return view(draw_every_pair(bars, list(keys)), bars.axis.note)
+    return View(draw_every_pair(bars, list(keys)), bars.axis.note)
 
 
 def pairs_of(job: Job) -> Sheet:
     """Returns a row per pair of a job: its driver, improvements and errors."""
     columns = [
-        Column("Pair", number=False),
-        Column("Driver", number=False),
-        Column("Cluster", number=False),
-        Column("Style score", "0 conservative, 1 aggressive."),
+        Column[Pair]("Pair", lambda row: str(row["pair_id"])),
+        Column("Driver", lambda row: str(row["driver"])),
+        Column("Cluster", lambda row: str(row["cluster"])),
+        Column("Style score", partial(_value, "style_score"), "0 conservative, 1 aggressive."),
     ]
     for baseline in job.baselines():
-        columns.append(Column(f"over {short_label(baseline)}", "Improvement of the RMSE of speed."))
+        cell = partial(_value, f"improvement/{baseline}", form="+.1%")
+        heading, meaning = f"over {short_label(baseline)}", "Improvement of the RMSE of speed."
+        columns.append(Column(heading, cell, meaning, "Improvement of the policy"))
+    errors = "RMSE of speed in m/s, below it of gap in m"
     for method in job.methods:
-        meaning = "RMSE of speed in m/s, below it of gap in m."
-        columns.append(Column(short_label(method), meaning))
-    rows = []
-    for row in job.by_pair.to_dict("records"):
-        score = float(row.get("style_score", math.nan))
-        cells = [text(str(row["pair_id"])), text(str(row["driver"])), text(str(row["cluster"]))]
-        cells.append(number(score, formatted(score, ".3f")))
-        cells += [share(float(row[f"improvement/{one}"])) for one in job.baselines()]
-        for method in job.methods:
-            speed = float(row[f"rmse_speed/{method}"])
-            gap = formatted(float(row[f"rmse_gap/{method}"]), ".2f")
-            cells.append(replace(number(speed, formatted(speed, ".3f")), second=gap))
-        rows.append(tuple(cells))
-    groups = (("", 4), ("Improvement of the policy", len(job.baselines())))
-    errors = ("RMSE of speed in m/s, below it of gap in m", len(job.methods))
-    return Sheet(tuple(columns), tuple(rows), (*groups, errors))
+        cell = partial(_error, method)
+        columns.append(Column(short_label(method), cell, f"{errors}.", errors))
+    return Sheet.of(columns, job.by_pair.to_dict("records"))
+
+
+def _value(name: str, row: Pair, form: str = ".3f", second: str = "") -> Cell:
+    return number(float(row.get(name, math.nan)), form, second)
+
+
+def _error(method: str, row: Pair) -> Cell:
+    gap = formatted(float(row[f"rmse_gap/{method}"]), ".2f")
+    return _value(f"rmse_speed/{method}", row, second=gap)

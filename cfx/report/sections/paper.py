@@ -9,15 +9,16 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from importlib import resources
+from operator import itemgetter
 from typing import Any
 
-from cfx.report.blocks import Block, Heading, Items, Table, Text
 from cfx.report.figures.words import percent_or_undefined, plural
 from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs
 from cfx.report.section import Section
-from cfx.report.tables import Cell, Column, Sheet, formatted, number, text
+from cfx.report.tables import Cell, Column, Sheet, number, text
 
 
 class PaperSection(Section):
@@ -27,22 +28,34 @@ class PaperSection(Section):
     entry = "The paper's numbers"
     order = 1100
 
-    def blocks(self, runs: Runs) -> list[Block]:
+    template = """
+<p>{{ paper.citation }}</p>
+{% for one in experiments %}
+<h3>{{ one.heading }}</h3>
+{{ table(one.sheet, sortable=false) }}
+<ul>{% for words in one.verdicts %}<li>{{ words }}</li>{% endfor %}</ul>
+<p>{{ one.differences }}</p>
+{% endfor %}
+"""
+
+    def context(self, runs: Runs) -> Mapping[str, Any] | None:
         """Return a comparison for each of the paper's experiments among the jobs."""
         paper = published()
-        found: list[Block] = []
+        found = []
         for experiment, about in paper["experiments"].items():
             jobs = [job for job in runs.jobs if job.experiment == experiment]
             if "ranked" in about:
                 jobs = _ranked(jobs, about["ranked"])
             if jobs:
-                found += [
-                    Heading(about["heading"]),
-                    Table(comparison(about, jobs), sortable=False),
-                    Items(tuple(verdicts(about, jobs))),
-                    Text(differences(paper, about, jobs)),
-                ]
-        return [Text(paper["citation"]), *found] if found else []
+                found.append(
+                    {
+                        "heading": about["heading"],
+                        "sheet": comparison(about, jobs),
+                        "verdicts": verdicts(about, jobs),
+                        "differences": differences(paper, about, jobs),
+                    }
+                )
+        return {"paper": paper, "experiments": found} if found else None
 
 
 def published() -> dict[str, Any]:
@@ -53,22 +66,16 @@ def published() -> dict[str, Any]:
 
 
 def comparison(about: Mapping[str, Any], jobs: Sequence[Job]) -> Sheet:
-    """Return the paper's rows of an experiment, and a row per job."""
-    columns = [Column("", number=False)]
-    for one in about["columns"]:
-        columns.append(Column(one["heading"], one.get("meaning", ""), number="form" in one))
-    named = [("paper", row) for row in about["published"]]
+    """Return the paper's rows of an experiment, and a row per job; names stand first."""
+    rows = [("paper", *row) for row in about["published"]]
     for job in jobs:
-        named.append(
-            (f"here: {job.name}", [value_of(job, one["value"]) for one in about["columns"]])
-        )
-    rows = []
-    for name, values in named:
-        cells = [text(name)]
-        for one, value in zip(about["columns"], values, strict=True):
-            cells.append(_cell(value, one.get("form", "")))
-        rows.append(tuple(cells))
-    return Sheet(tuple(columns), tuple(rows))
+        values = [value_of(job, one["value"]) for one in about["columns"]]
+        rows.append((f"here: {job.name}", *values))
+    columns = [Column[Sequence[Any]]("", itemgetter(0))]
+    for place, one in enumerate(about["columns"], start=1):
+        cell = partial(_cell, place, one.get("form", ""))
+        columns.append(Column(one["heading"], cell, one.get("meaning", "")))
+    return Sheet.of(columns, rows)
 
 
 def value_of(job: Job, path: str) -> Any:
@@ -163,9 +170,10 @@ def differences(paper: Mapping[str, Any], about: Mapping[str, Any], jobs: Sequen
     return f"The numbers need not agree, because these things differ, or may: {told}."
 
 
-def _cell(value: Any, form: str) -> Cell:
+def _cell(place: int, form: str, row: Sequence[Any]) -> Cell:
+    value = row[place]
     if not form:
         return text(value)
     if isinstance(value, int | float):
-        return number(value, formatted(value, form))
+        return number(value, form)
     return Cell("" if value is None else str(value), number=True)

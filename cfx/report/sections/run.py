@@ -1,20 +1,21 @@
-"""What was run: data, components and settings of each job."""
+"""What was run: data, components and settings of each job, and its whole configuration."""
 
 from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
+from operator import itemgetter
 from typing import Any
 
 import pandas as pd
+import yaml
 
 from cfx.evaluation.result import Purpose
-from cfx.report.blocks import Block, Facts, Heading, Items, Table, Text
 from cfx.report.figures.words import NOTHING
 from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs
 from cfx.report.section import Section
-from cfx.report.tables import Column, Sheet, text
+from cfx.report.tables import Column, Sheet
 
 _TOGETHER = {"platoon": " of whole platoons", "recording": " of whole recordings"}
 
@@ -25,49 +26,83 @@ class RunSection(Section):
     title = "What was run"
     entry = "What was run"
     order = 300
+    template = """
+{% if unfinished %}
+<p class="lacking">Not in this page, because they have not finished:</p>
+<ul>{% for place, reason in unfinished %}<li>{{ place }}: {{ reason }}</li>{% endfor %}</ul>
+{% endif %}
+<dl class="facts">
+{% for name, value in common %}
+  <div><dt>{{ name }}</dt><dd>{{ value }}</dd></div>
+{% endfor %}
+</dl>
+{% if differing %}
+<h3>What differs between the jobs</h3>
+{{ table(differing) }}
+{% endif %}
+"""
 
-    def blocks(self, runs: Runs) -> list[Block]:
+    def context(self, runs: Runs) -> Mapping[str, Any]:
         """Return what all jobs share, and a table of what they do not."""
-        found: list[Block] = []
-        if runs.unfinished:
-            found.append(Text("Not in this page, because they have not finished:", "lacking"))
-            found.append(
-                Items(
-                    tuple(f"{without_folders(one.place)}: {one.reason}" for one in runs.unfinished)
-                )
-            )
-        common, own = facts(runs.jobs)
-        found.append(Facts(tuple(common)))
-        if own is not None:
-            found += [Heading("What differs between the jobs"), Table(own)]
-        return found
+        unfinished = [(without_folders(one.place), one.reason) for one in runs.unfinished]
+        common, differing = facts(runs.jobs)
+        return {"unfinished": unfinished, "common": common, "differing": differing}
+
+
+class ConfigurationsSection(Section):
+    """The whole configuration of each job."""
+
+    title = "Configurations"
+    entry = "Configurations"
+    order = 2000
+    template = """
+<p>The whole configuration of each job, as it ran.</p>
+{% for name, place, configuration in configurations %}
+{% call fold(name) %}
+<p class="fine">{{ place }}</p>
+<pre>{{ configuration }}</pre>
+{% endcall %}
+{% endfor %}
+"""
+
+    def context(self, runs: Runs) -> Mapping[str, Any]:
+        """Return the place and the configuration of each job."""
+        found = []
+        for job in runs.jobs:
+            found.append((job.name, without_folders(job.place), _configuration(job)))
+        return {"configurations": found}
+
+
+def _configuration(job: Job) -> str:
+    """Returns the configuration as YAML, after what the protocol noted of its design."""
+    design = ""
+    notes = job.data.get("protocol")
+    if isinstance(notes, Mapping):
+        for name, value in notes.items():
+            design += f"# {str(name).replace('_', ' ')}: {value}\n"
+    text = yaml.safe_dump(dict(job.config), sort_keys=False, allow_unicode=True)
+    return design + without_folders(str(text))
 
 
 def facts(jobs: Sequence[Job]) -> tuple[list[tuple[str, str]], Sheet | None]:
     """Returns what all jobs share, and a table of what they do not (None if they share all)."""
-    every = [_facts(job, jobs) for job in jobs]
+    rows = []
     names: dict[str, None] = {}
-    for one in every:
-        names |= dict.fromkeys(one)
-    common, differing = [], []
+    for job in jobs:
+        found = _facts(job, jobs)
+        rows.append({"Job": job.name, **found})
+        names |= dict.fromkeys(found)
+    common = []
+    columns = [Column[Mapping[str, str]]("Job", itemgetter("Job"))]
     for name in names:
-        values = {one.get(name, NOTHING) for one in every}
+        for row in rows:
+            row.setdefault(name, NOTHING)
+        values = {row[name] for row in rows}
         if len(values) == 1:
             common.append((name, values.pop()))
         else:
-            differing.append(name)
-    if not differing:
-        return common, None
-    columns = [Column("Job", number=False)]
-    for name in differing:
-        columns.append(Column(name, number=False))
-    rows = []
-    for job, one in zip(jobs, every, strict=True):
-        cells = [text(job.name)]
-        for name in differing:
-            cells.append(text(one.get(name, NOTHING)))
-        rows.append(tuple(cells))
-    return common, Sheet(tuple(columns), tuple(rows))
+            columns.append(Column(name, itemgetter(name)))
+    return common, Sheet.of(columns, rows) if len(columns) > 1 else None
 
 
 def duration(seconds: float | None) -> str:

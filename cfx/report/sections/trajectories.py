@@ -3,30 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 from cfx.evaluation.result import Purpose
-from cfx.report.blocks import (
-    Block,
-    Figure,
-    Group,
-    Heading,
-    Text,
-    job_folds,
-    missing_file,
-)
-from cfx.report.figure_blocks import single_view
 from cfx.report.figures.trajectories import draw_pair
 from cfx.report.figures.values import RankedPair, rank_pairs
-from cfx.report.figures.words import percent_or_undefined, short_label
+from cfx.report.figures.words import percent, short_label
 from cfx.report.job import Job, Runs, of_purpose
-from cfx.report.section import Section
-
-_ADAPTING = (
-    "The pair that improves most over driver-specific calibration, the one in the middle and the"
-    " one that improves least, on the test part."
-)
-_CONSTANT = "Of a calibration: the pairs with the least, the median and the largest RMSE of speed."
-_BOUNDS = "What lies outside a parameter's bounds is shaded."
+from cfx.report.section import Section, View
 
 
 class TrajectoriesSection(Section):
@@ -35,29 +20,37 @@ class TrajectoriesSection(Section):
     title = "Trajectories"
     entry = "Trajectories"
     order = 1600
+    template = """
+<p>
+{% if adapting %}
+The pair that improves most over driver-specific calibration, the one in the middle and the one that
+improves least, on the test part.
+{% endif %}
+{% if constant %}
+Of a calibration: the pairs with the least, the median and the largest RMSE of speed.
+{% endif %}
+What lies outside a parameter's bounds is shaded.
+</p>
+{% for job in jobs %}
+{% call fold(job.name, loop.first, "job") %}
+{% for pair in chosen(job) %}
+<div class="pair">
+<h3>{{ title(job, pair) }} <span class="fine">{{ errors(job, pair) }}</span></h3>
+{{ figure(view(job, pair.pair_id), "Speed, gap and parameters of pair " ~ pair.pair_id) }}
+</div>
+{% endfor %}
+{% endcall %}
+{% endfor %}
+{{ missing("trajectories.parquet", "speed, gap and parameters over time") }}
+"""
 
-    def blocks(self, runs: Runs) -> list[Block]:
-        """Return the chosen pairs of each job."""
+    def context(self, runs: Runs) -> Mapping[str, Any]:
+        """Return the jobs that kept their trajectories, and what is shown of their pairs."""
         jobs = [job for job in runs.jobs if "trajectories" in job.tables]
         constant = of_purpose(jobs, Purpose.CALIBRATION)
-        chosen = [_BOUNDS]
-        if constant:
-            chosen.insert(0, _CONSTANT)
-        if len(constant) < len(jobs):
-            chosen.insert(0, _ADAPTING)
-        what = "speed, gap and parameters over time"
-        lacking = missing_file(runs, "trajectories.parquet", what)
-        return [Text(" ".join(chosen)), *job_folds(runs, _pairs), *lacking]
-
-
-def _pairs(job: Job) -> list[Block]:
-    if "trajectories" not in job.tables:
-        return []
-    groups: list[Block] = []
-    for pair in chosen_pairs(job):
-        heading = Heading(_title(job, pair), _errors(job, pair))
-        groups.append(Group((heading, pair_of(job, pair.pair_id))))
-    return groups
+        shown = {"chosen": chosen_pairs, "title": _title, "errors": _errors, "view": pair_of}
+        adapting = len(constant) < len(jobs)
+        return {"jobs": jobs, "adapting": adapting, "constant": bool(constant), **shown}
 
 
 def chosen_pairs(job: Job) -> tuple[RankedPair, ...]:
@@ -71,17 +64,15 @@ def chosen_pairs(job: Job) -> tuple[RankedPair, ...]:
     return rank_pairs(table["pair_id"].astype(str).tolist(), gains)
 
 
-def pair_of(job: Job, pair_id: str) -> Figure:
+def pair_of(job: Job, pair_id: str) -> dict[str, View]:
     """Speed, gap and each tuned parameter of one pair of a job."""
-    title = f"Speed, gap and parameters of pair {pair_id}"
-    return single_view(draw_pair(job.results, pair_id), title)
+    return {"": View(draw_pair(job.results, pair_id))}
 
 
 def _title(job: Job, pair: RankedPair) -> str:
     title = pair.title[:1].upper() + pair.title[1:]
     if job.purpose is Purpose.ADAPTATION and math.isfinite(pair.improvement):
-        improvement = percent_or_undefined(pair.improvement, 1)
-        title += f": {improvement} over {short_label('fixed')} calibration"
+        title += f": {percent(pair.improvement, 1)} over {short_label('fixed')} calibration"
     return title
 
 

@@ -3,27 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
 
 import pandas as pd
 
 from cfx.evaluation.metrics.base import RECORDED, key_of
-from cfx.report.blocks import Block, Table, Text, job_fold
-from cfx.report.figure_blocks import figure_of
-from cfx.report.figures.words import MINUS
 from cfx.report.job import Job, Runs
 from cfx.report.section import Section
-from cfx.report.tables import Cell, Column, Sheet, formatted, method_cell, methods_explained, number
+from cfx.report.tables import Cell, Column, Sheet, method_cell, methods_explained, number
 from cfx_traffic.summary import traffic_methods
-
-_INTRODUCTION = (
-    "Each vehicle of a road is a recorded driver, drawn with replacement; all methods have the same"
-    " drivers at the same places. Lines over density: means of ring roads. Grey points and the"
-    " black line are recorded: strips between a follower and its leader of 10 s, whose density is 1"
-    " over the mean spacing and whose flow is the follower's way over the strip's area (Edie's"
-    " definitions). Waves: how fast changes of speed travel from vehicle to vehicle; the band,"
-    f" {MINUS}20 to {MINUS}15 km/h, is what people show in congestion. The last panel has platoons"
-    " behind leaders that keep their speed: what vehicles add by themselves."
-)
 
 _COLUMNS = (
     ("Capacity (1/h)", "capacity", ".0f", "Largest mean flow of a ring over all densities."),
@@ -76,26 +66,33 @@ class TrafficSection(Section):
     entry = "Traffic"
     order = 900
     figures = ("traffic", "traffic_paths")
+    template = """
+<p>Each vehicle of a road is a recorded driver, drawn with replacement; all methods have the same
+drivers at the same places. Lines over density: means of ring roads. Grey points and the black line
+are recorded: strips between a follower and its leader of 10 s, whose density is 1 over the mean
+spacing and whose flow is the follower's way over the strip's area (Edie's definitions). Waves: how
+fast changes of speed travel from vehicle to vehicle; the band, \N{MINUS SIGN}20 to
+\N{MINUS SIGN}15 km/h, is what people show in congestion. The last panel has platoons behind leaders
+that keep their speed: what vehicles add by themselves.</p>
+<p>Methods: {{ methods }}</p>
+{% for job, sheet in roads %}
+{% call fold(job.name, loop.first, "job") %}
+{{ drawn("traffic", job) }}
+{{ table(sheet, explain=true) }}
+{% endcall %}
+{% endfor %}
+"""
 
-    def blocks(self, runs: Runs) -> list[Block]:
-        """Return plots and a table for each job with traffic."""
-        found: list[Block] = []
-        methods: dict[str, None] = {}
+    def context(self, runs: Runs) -> Mapping[str, Any] | None:
+        """Return a table for each job with traffic."""
+        found = []
+        methods: list[str] = []
         for job in runs.jobs:
             table = job.tables.get("traffic")
             if table is not None:
-                found.append(job_fold(job.name, _job_blocks(job, table), first=not found))
-                methods |= dict.fromkeys(traffic_methods(table))
-        if not found:
-            return []
-        return [Text(_INTRODUCTION), Text(f"Methods: {methods_explained(methods)}"), *found]
-
-
-def _job_blocks(job: Job, roads: pd.DataFrame) -> list[Block]:
-    figure = figure_of("traffic", job)
-    shown: list[Block] = [] if figure is None else [figure]
-    shown.append(Table(traffic_sheet(job, roads), explain=True))
-    return shown
+                found.append((job, traffic_sheet(job, table)))
+                methods += traffic_methods(table)
+        return {"roads": found, "methods": methods_explained(methods)} if found else None
 
 
 def traffic_sheet(job: Job, roads: pd.DataFrame) -> Sheet:
@@ -105,13 +102,11 @@ def traffic_sheet(job: Job, roads: pd.DataFrame) -> Sheet:
         job: of the report.
         roads: the table `Roads`.
     """
-    columns = [Column("Driven by", number=False)]
-    columns += [Column(heading, meaning) for heading, _, _, meaning in _COLUMNS]
-    rows: list[tuple[Cell, ...]] = []
-    for method in (*traffic_methods(roads), RECORDED):
-        cells = [method_cell(method)]
-        for _, metric, form, _ in _COLUMNS:
-            value = job.metrics.get(key_of(f"traffic/{metric}", method), math.nan)
-            cells.append(number(value, formatted(value, form)))
-        rows.append(tuple(cells))
-    return Sheet(tuple(columns), tuple(rows))
+    columns = [Column[str]("Driven by", method_cell)]
+    for heading, metric, form, meaning in _COLUMNS:
+        columns.append(Column(heading, partial(_measure, job, metric, form), meaning))
+    return Sheet.of(columns, (*traffic_methods(roads), RECORDED))
+
+
+def _measure(job: Job, metric: str, form: str, method: str) -> Cell:
+    return number(job.metrics.get(key_of(f"traffic/{metric}", method), math.nan), form)
