@@ -34,13 +34,13 @@ from cfx.core.storage import RemoteFolder
 log = logging.getLogger(__name__)
 
 Arrays = dict[str, NDArray[Any]]
-"""What an entry holds, by name."""
+"""The arrays of an entry, by name."""
 
 _SHARES = 32
 """Parts in which processes claim the entries of one calibration."""
 
 _MARK = b"cfx calibration 1 "
-"""What an entry begins with; the number counts layouts."""
+"""First bytes of an entry; the number counts layouts."""
 
 _LARGEST = 1 << 30
 """Bytes: no calibration of one pair or group is larger."""

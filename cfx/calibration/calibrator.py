@@ -423,7 +423,7 @@ class Calibrator:
 
 
 class _Work:
-    """The entries of one calibration: what the cache holds, and what is still to be solved.
+    """The entries of one calibration: those cached, and those still to be solved.
 
     Attributes:
         evaluations: of each problem.
@@ -499,7 +499,7 @@ class _Work:
 
 
 def _runs(indices: list[int], problems: list[int], together: int) -> Iterator[list[int]]:
-    """Yields runs of indices with so many problems at most, or one index if it alone has more."""
+    """Yields runs of indices with at most this many problems, or one index that alone has more."""
     group: list[int] = []
     size = 0
     for index in indices:

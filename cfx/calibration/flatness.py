@@ -17,7 +17,7 @@ NEAR = 0.05
 """A loss that is higher than the best by no more than this share of it counts as nearly as good."""
 
 COLUMN = "flat_"
-"""What columns of flat shares begin with."""
+"""Prefix of the columns of flat shares."""
 
 
 def flat_shares(slices: pd.DataFrame) -> pd.DataFrame:

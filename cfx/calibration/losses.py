@@ -81,7 +81,7 @@ class SegmentLosses:
 
     @property
     def device(self) -> torch.device:
-        """Where the tensors lie."""
+        """The device of the tensors."""
         return self.segments.leader_length.device
 
     @property
@@ -229,7 +229,7 @@ class FullTrajectories:
 
     @property
     def device(self) -> torch.device:
-        """Where the tensors lie."""
+        """The device of the tensors."""
         return self.last.device
 
     @property
@@ -258,7 +258,7 @@ _SEGMENTS_AT_ONCE = 1024
 and the block stays long."""
 
 _VECTOR = 32
-"""Blocks of candidates are multiples of this, as the kernel simulates so many together."""
+"""Blocks of candidates are multiples of this, the number that the kernel simulates together."""
 
 
 @dataclass(frozen=True)
@@ -289,7 +289,7 @@ class PooledLosses:
 
     @property
     def device(self) -> torch.device:
-        """Where the tensors lie."""
+        """The device of the tensors."""
         return self.segments.device
 
     @property

@@ -21,7 +21,7 @@ from its default costs 1 % of the default's loss over n; 13 instead of 33 m/s, o
 units away."""
 
 _EDGE = 0.005
-"""How close to a bound, in unit space, a parameter counts as being, so that its logit is finite."""
+"""Least distance to a bound, in unit space, that a logit is taken at, so that it is finite."""
 
 
 def prior_weight(name: str) -> float:

@@ -30,14 +30,14 @@ from cfx.data.pairs import PairBatch
 from cfx.simulation.base import Stepper
 
 _SAME_RELATIVE, _SAME_ABSOLUTE = 1e-5, 1e-8
-"""How far a loss that is computed again may differ: candidates in another batch round otherwise."""
+"""Tolerance for a loss that is computed again: other batches of candidates round differently."""
 
 _WAY = (1.0, 0.9, 0.7, 0.5, 0.3, 0.1, 0.03, 0.01, 0.0)
 """Parts of the way from where a search ended to the default that are tried at once; with the last
 one it stays."""
 
 _SETTLING_ROUNDS = 6
-"""How often each parameter is tried at most."""
+"""Most passes over each parameter."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Solver:
 
     @property
     def scope(self) -> dict[str, Any]:
-        """What every result depends on besides its trajectories; keys of the cache hold it."""
+        """Everything but the trajectories that results depend on, for keys of the cache."""
         model = self.simulator.model
         parameters = [(p.name, p.low, p.high, p.default, p.tuned) for p in self.space]
         return {
@@ -133,7 +133,7 @@ class Solver:
     def _settled(
         self, losses: SegmentLosses | PooledLosses, best: Tensor, default: Tensor
     ) -> Tensor:
-        """Moves what a search has found to where prior plus loss is lowest along each parameter.
+        """Moves the best candidates to where prior plus loss is lowest along each parameter.
 
         A search stops at what it has tried. Where a parameter hardly matters, the prior alone
         says where it belongs, and its slope is too small for a search among steep ones. So each
@@ -202,7 +202,7 @@ class CalibrationShard:
         return self.segments(pair, pair, pair + 1).accumulates
 
     def solve(self, report: Report) -> list[Arrays]:
-        """Returns an entry of the cache for each of what was asked for, wherever it is called.
+        """Returns a cache entry for each request.
 
         Raises:
             EngineError: here is other code than where the shard was cut.

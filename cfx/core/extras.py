@@ -58,7 +58,7 @@ EXTRAS: dict[tuple[str, str], str] = {
 
 
 def advice(group: str, name: str, known: Sequence[str]) -> str:
-    """Returns what to do about an option that is not there: install it, or take another.
+    """Returns advice on a missing option: install it, or choose another.
 
     Args:
         group: such as `model`.

@@ -1,4 +1,4 @@
-"""Paths that users write, and files that appear whole or not at all."""
+"""Paths of users, and files that are written atomically."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _DAY_S = 86400.0
 """Age in seconds, since the last write, at which another machine's temporary file is removed."""
 
 _TEMPORARY = re.compile(r"\.(?P<process>\d+)@(?P<host>[\w-]*)-[0-9a-f]{8}\..")
-"""How names of temporary files begin: process, machine, and what tells those of one apart."""
+"""Names of temporary files: process, machine, and random digits."""
 
 
 def absolute(value: Any) -> Path:

@@ -36,7 +36,7 @@ def total_memory() -> float:
 
 
 def give_back() -> None:
-    """Gives the system back what is free in this process, such as what reading a file has needed.
+    """Returns this process's free memory to the system, such as that of a file just read.
 
     Arrow keeps it otherwise, and so does glibc.
     """

@@ -151,7 +151,7 @@ class ParameterSpace:
         return tuple(parameter.name for parameter in self.tuned)
 
     def for_settings(self, settings: Settings) -> ParameterSpace:
-        """Returns the space of a model with these settings: what it does not use is not tuned."""
+        """Returns the space of a model with these settings: unused parameters are not tuned."""
         parameters = []
         for parameter in self.parameters:
             tuned = parameter.tuned and parameter.is_used(settings)

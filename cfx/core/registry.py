@@ -470,7 +470,7 @@ def _warn_of_deprecated(found: Entry, cls: type[Component], settings: BaseModel)
 
 
 def _search_path() -> tuple[tuple[str, ...], ...]:
-    """Returns what changes when a distribution is installed.
+    """Returns a stamp that changes when a distribution is installed.
 
     With it as a key of a cache, a new plugin is seen without a restart.
     """

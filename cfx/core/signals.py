@@ -66,6 +66,6 @@ def signal_behind(error: BaseException) -> BaseException | None:
 
 
 def ignore_signals() -> None:
-    """Ignores Ctrl-C and SIGTERM from now on: what was to be done is done, or said."""
+    """Ignores Ctrl-C and SIGTERM from now on, at the end of the program."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)

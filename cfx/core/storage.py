@@ -21,10 +21,10 @@ from cfx.core.extras import install_line
 from cfx.core.files import atomic_write
 
 _PACKAGES = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "abfs": "adlfs"}
-"""What fsspec needs for a kind of URL, where it is not fsspec itself."""
+"""Packages that fsspec needs for kinds of URLs."""
 
 _VERSIONS = ("ETag", "etag", "md5Hash", "content_md5", "mtime", "LastModified", "updated")
-"""What stores call the version of a content, or its time, the surest first."""
+"""Names of the version or time of a file in stores, the most reliable first."""
 
 _CHARACTERS_OF_A_SCHEME = r"[a-zA-Z][a-zA-Z0-9+.-]+://"
 
@@ -114,7 +114,7 @@ class RemoteFolder:
         return content
 
     def write(self, name: str, content: bytes) -> None:
-        """Writes a file: object stores show it whole or not at all.
+        """Writes a file, atomically in object stores.
 
         Raises:
             OSError: it cannot be written.
@@ -213,7 +213,7 @@ def _kept(what: str) -> Path:
 
 
 def _version(about: Any) -> str:
-    """Returns what changes when a file does: its size, and what its store calls its version."""
+    """Returns a file's size and version, which change when it does."""
     for name in _VERSIONS:
         if name in about:
             mark = str(about[name]).strip('"')

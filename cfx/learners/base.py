@@ -89,7 +89,7 @@ class TrainingData:
 
     @property
     def device(self) -> torch.device:
-        """Where the trajectories lie."""
+        """The device of the trajectories."""
         return self.recorded.lengths.device
 
 

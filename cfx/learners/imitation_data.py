@@ -69,7 +69,7 @@ class ImitationSettings(Settings):
 
 
 class _Rows(NamedTuple):
-    """The trajectories that networks learn from, R of them: a pair is there once for each base.
+    """The R trajectories that networks learn from: one for each pair and base.
 
     Attributes:
         pair: `(R,)`.

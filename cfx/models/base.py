@@ -137,7 +137,7 @@ class DrivingModel(Component):
         return ""
 
     def refuse_unused(self) -> None:
-        """Refuses to tune what the model does not use with its settings.
+        """Refuses to tune parameters that the model does not use with its settings.
 
         A job asks for this. A saved policy that answers such a parameter still drives.
 

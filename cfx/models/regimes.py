@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 Temperature = float | Tensor
-"""How gradually regimes switch, in multiples of the scales below; 0 is exact.
+"""Width of the smooth switch between regimes, in multiples of the scales below; 0 is exact.
 
 A 0-dimensional tensor may change while compiled code runs, and is never exact.
 """

@@ -1,4 +1,4 @@
-"""The agent: what drives in evaluation, in platoons and in SUMO, and what a saved policy is.
+"""The agent, which drives in evaluation, platoons and SUMO, and is saved as a policy.
 
 An agent is made of three things: a context of each driver (`cfx.policies.context`), networks with
 their scaler and inputs, and a parameter head (both in `cfx.policies.core`). Training through the
@@ -94,7 +94,7 @@ class AgentState(NamedTuple):
 
 @dataclass(frozen=True)
 class TrainedOn:
-    """What a policy learned from, as far as it says.
+    """Training data of a policy, as far as it is known.
 
     Attributes:
         pairs: those that were learned from or calibrated on: `Pair.likeness` and the driver's name.
@@ -423,7 +423,7 @@ class Agent:
         return drawn, state._replace(latent=latent.to(state.latent))
 
     def _judged(self, history: History, state: AgentState) -> AgentState:
-        """Notes how far outside what was learned the drivers are."""
+        """Records how far outside the valid range the drivers are."""
         if self.valid_range is None:
             return state
         situation = situation_of(history)

@@ -37,7 +37,7 @@ _DESCRIPTION = "policy.json"
 _TENSORS = "policy.safetensors"
 
 _RANGE = "valid_range."
-"""What names of tensors of the valid range begin with."""
+"""Prefix of the names of the valid range's tensors."""
 
 
 def save(agent: Agent, folder: Path) -> None:

@@ -46,7 +46,7 @@ class AgentCore:
 
     @property
     def ensemble_size(self) -> int:
-        """How many networks answer together."""
+        """The number of networks of an ensemble."""
         return ensemble_size(self.network)
 
     def to(self, device: torch.device) -> AgentCore:

@@ -175,7 +175,7 @@ class EstimatorNetwork(PolicyNetwork):
         return torch.stack(answers, 2), state
 
     def _saw(self, token: Tensor, state: Tensor) -> Tensor:
-        """Returns the state `(N, B, w + 2)` after one more window; what was driven is not used."""
+        """Returns the state `(N, B, w + 2)` after one more window, if it was measured."""
         belief = state[..., _FLAGS:]
         is_measured = (state[..., _SEEN] > 0) & (state[..., _ACTED] == 0)
         after = self.updated(self._history(token), belief)

@@ -40,7 +40,7 @@ class ParticleFilterSettings(FilterSettings):
 
 
 class ParticleFilterPolicy(EstimatorPolicy):
-    """A thousand parameter sets per driver, weighted by how well each explains what they do.
+    """A thousand parameter sets per driver, weighted by their likelihood.
 
     It assumes what `policy=ukf` assumes, with any shape of the belief: particles are drawn around
     the pooled parameters in the squashed space and change at random with `drift`. In each window a

@@ -21,7 +21,7 @@ _BYTES = 16.0
 """Of a weight in training: itself, its gradient and what Adam remembers of it."""
 
 _EDGE = 0.02
-"""How close to a bound an untrained network may start, in unit space."""
+"""Least distance to a bound of an untrained network's answer, in unit space."""
 
 
 class RecurrentSettings(PolicySettings):

@@ -147,7 +147,7 @@ def weight_of_answer(score: Tensor) -> Tensor:
 
 
 def recorded_quantiles(batch: PairBatch) -> dict[str, tuple[float, ...]]:
-    """Returns quantiles of what recorded drivers do: see `TrainedOn.quantiles`.
+    """Returns quantiles of recorded motion: see `TrainedOn.quantiles`.
 
     Of very many pairs only some are looked at, which are spread evenly over all.
     """

@@ -13,7 +13,7 @@ Terms = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, ...]]
 """Simulated speed and gap, measured speed and gap, to what one frame adds to each sum."""
 
 TRANSIENT_S = 5.0
-"""How long the transient of a test part is, s (`transient_s` in `data.json`).
+"""Length of the transient of a test part, s (`transient_s` in `data.json`).
 
 Within some such time constant parameters lead from the measured state to a steady one of their own.
 """

@@ -88,7 +88,7 @@ class Solution:
 
     @property
     def sensitivity(self) -> Tensor:
-        """How much the choice of parameters matters, `(P,)`, in the unit of the loss.
+        """Sensitivity of the loss to the parameters, `(P,)`, in the unit of the loss.
 
         The median loss of the space-filling candidates minus `loss`; never negative. It is 0 where
         nothing tells candidates apart or every candidate diverged.

@@ -30,7 +30,7 @@ _LENGTHS = (3.0, 1.0, 0.5, 0.2, 0.05, 0.01)
 """Multiples of a step that are tried at once."""
 
 _FIRST_RADIUS, _LARGEST_RADIUS, _SMALLEST_RADIUS = 0.1, 0.5, 1e-6
-"""How far one step may go in any coordinate of unit space."""
+"""Length of one step in any coordinate of unit space."""
 
 
 class GradientSettings(Settings):

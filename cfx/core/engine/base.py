@@ -20,7 +20,7 @@ Report = Callable[[int], None]
 """Called with how many more units of work are done."""
 
 Work = Callable[[ShardT, Report], ResultT]
-"""What is done with each shard: a function of a module, which a worker can import by its name."""
+"""Work on one shard: a module's function, which a worker can import by its name."""
 
 
 class Unfit(Exception):  # noqa: N818 - the shard is well, its worker is not

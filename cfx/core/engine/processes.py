@@ -113,13 +113,13 @@ class _Workers(Generic[ShardT, ResultT]):
             self._running[self._pool.submit(_do, self._work, shard)] = number
 
     def report(self, units: int) -> None:
-        """Reports what was done here, and what workers have done since."""
+        """Reports the units done here, and those that workers have done since."""
         self._report(units)
         while not self._units.empty():
             self._report(self._units.get())
 
     def check(self) -> None:
-        """Raises what one of them has raised, though its result is not fetched yet."""
+        """Raises the error of a worker whose result is not fetched yet."""
         for future in self._running:
             if future.done():
                 future.result()
@@ -132,13 +132,13 @@ class _Workers(Generic[ShardT, ResultT]):
             self.report(0)
 
     def finished(self) -> Iterator[tuple[int, ResultT]]:
-        """Yields what is there."""
+        """Yields the results that have arrived."""
         for future in [one for one in self._running if one.done()]:
             number = self._running.pop(future)
             yield number, future.result()
 
     def end(self, *, kill: bool) -> None:
-        """Ends them; one that ends by itself also ends what libraries have started in it."""
+        """Ends the workers; one that exits normally also ends its libraries' processes."""
         self._pool.shutdown(wait=True, kill_workers=kill)
 
 

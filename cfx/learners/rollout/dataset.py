@@ -66,7 +66,7 @@ class Part(NamedTuple):
 
 @dataclass
 class Recordings:
-    """What was measured of U pairs, each held once however many networks learn from it.
+    """Recordings of U pairs, each stored once for all networks that learn from it.
 
     Attributes:
         batch: the pairs.

@@ -52,7 +52,7 @@ _HALVINGS = 5
 
 _STARTS = (0.8, 0.9)
 """Shares of a validation trajectory from which these paths are sampled. Most protocols calibrate
-driver-specific parameters on what is before, so that networks are surer there."""
+driver-specific parameters on the part before, where networks are surer."""
 
 _COVERING = 19
 """Number of sampled paths whose range covers 90 % of calibrated outcomes: an outcome exchangeable

@@ -106,7 +106,7 @@ def _fit(module: RolloutModule, checkpoint: Path | None) -> None:
 
 
 def _expert(shard: TrainingShard, on_epoch: Callable[[], None]) -> Expert:
-    """Returns experts trained on the same trajectories; from the checkpoint if it is there."""
+    """Returns experts trained on the same trajectories; from the checkpoint if it exists."""
     assert shard.expert_weights is not None
     expert_data, expert_dataset = for_experts(shard.training_data, shard.dataset)
     head = OffsetHead.for_model(expert_data.simulator.model)

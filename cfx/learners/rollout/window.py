@@ -195,7 +195,7 @@ class GradientPath(ABC):
 
     @abstractmethod
     def segment_length(self, windows: int) -> int:
-        """Returns after how many windows a loss is taken, for trajectories of so many windows."""
+        """Returns the number of windows between two losses, for trajectories of `windows`."""
 
     @abstractmethod
     def after_window(self, state: LoopState) -> LoopState:

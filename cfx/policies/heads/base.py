@@ -102,7 +102,7 @@ class ParameterHead(ABC):
 
     @property
     def answers(self) -> int:
-        """How many numbers networks answer; n, unless the head fills in some itself."""
+        """The number of outputs of a network; n, unless the head fills in some itself."""
         return len(self.space)
 
     @property

@@ -164,5 +164,5 @@ def _scale_of(parameter: Parameter, default: float) -> Parameter:
 
 
 def _scale_name(name: str) -> str:
-    """Returns what the scale of a parameter is called."""
+    """Returns the name of a parameter's scale."""
     return f"{name}_scale"

@@ -41,7 +41,7 @@ INPUTS = (
     "measured_speed",
     "measured_gap",
 )
-"""What a step reads, before the model's parameters. The last three are of the next frame."""
+"""Inputs of a step, before the model's parameters. The last three are of the next frame."""
 
 _MOST_COLUMNS = 512
 """The widest memory of a model that has a kernel; two of them lie on a thread's stack."""
@@ -190,7 +190,7 @@ class _Recording:
         return array(shape, computed)
 
     def _named(self, computed: Expressions, value: Tensor) -> Expressions:
-        """Returns names of what is computed, of which each is one statement."""
+        """Returns the names of expressions; each that computes becomes a statement."""
         names = []
         for expression in map(str, computed.flat):
             name = expression
@@ -258,7 +258,7 @@ _TEMPLATES: dict[str, str] = {
 """PyTorch's elementwise operations in C++; `smaller` and `greater` treat NaN as it does."""
 
 _UNCHANGED = {"alias", "clone", "detach", "expand", "lift_fresh_copy", "scalar_tensor"}
-"""Operations that return what they are given, but for its shape."""
+"""Operations that return their argument in another shape."""
 
 _OTHER_MEANINGS = {"rounding_mode", "nan", "posinf", "neginf"}
 """Arguments with which an operation computes something else."""
