@@ -25,7 +25,7 @@ REPORTS = {
     "cfx.report.figures.figure",
     "cfx.report.figures.results",
     "cfx.report.figures.values",
-    "cfx.report.figures.words",
+    "cfx.report.figures.text",
     "cfx.report.job",
     "cfx.report.runs",
     "cfx.report.section",

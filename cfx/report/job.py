@@ -19,7 +19,7 @@ from cfx.evaluation.metrics.base import MetricInfo, key_of
 from cfx.evaluation.result import METHODS, PairTrajectory, Purpose
 from cfx.evaluation.statistics import STATISTICS, Improvement
 from cfx.report.figures.results import ParameterAxis, Results
-from cfx.report.figures.words import TEST, scope_label
+from cfx.report.figures.text import TEST, scope_label
 from cfx.report.metrics import known_metrics
 from cfx.simulation.trajectory import TRANSIENT_S
 
@@ -214,17 +214,9 @@ class Job:
         """The tuned parameters of the trajectories, with what is known of them."""
         if "trajectories" not in self.tables:
             return ()
-        known = {}
-        for one in self.data.get("parameters") or ():
-            if isinstance(one, Mapping):
-                known[str(one.get("name"))] = one
-        axes = []
-        for name in _parameter_names(self.tables["trajectories"], self._simulated):
-            about = known.get(name, {})
-            low, high = _number(about.get("low")), _number(about.get("high"))
-            unit, meaning = str(about.get("unit", "")), str(about.get("meaning", ""))
-            axes.append(ParameterAxis(name, unit, low, high, meaning))
-        return tuple(axes)
+        known = {axis.name: axis for axis in self.described_parameters}
+        names = _parameter_names(self.tables["trajectories"], self._simulated)
+        return tuple(known.get(name, ParameterAxis(name)) for name in names)
 
     @cached_property
     def results(self) -> Results:
@@ -234,19 +226,38 @@ class Job:
             methods=self.meaningful_methods,
             parameters=self.parameters or self.described_parameters,
             trajectories=self.pair_trajectories,
-            improvements={one: self._improvement(one) for one in self.baselines()},
+            improvements={one: self.statistics(one) for one in self.baselines()},
             style=self._style_result,
             tables=self.tables,
             metrics=self.metrics,
             transient_s=self.transient_s,
         )
 
-    def _improvement(self, baseline: str) -> Improvement:
-        column = self.by_pair[f"improvement/{baseline}"]
-        known = int(np.isfinite(column).sum())
-        statistics = {name: self.improvement(name, baseline) for name in STATISTICS}
-        undefined, drivers = len(column) - known, self.by_pair["driver"].nunique()
+    def statistics(self, baseline: str, scope: str = TEST) -> Improvement:
+        """Returns the improvement over a baseline; NaN where a statistic is not known.
+
+        Args:
+            baseline: one of `baselines`.
+            scope: the part of the trajectories.
+        """
+        statistics = {name: self.improvement(name, baseline, scope) for name in STATISTICS}
+        known = self._improved(baseline, scope)
+        undefined, drivers = len(self.by_pair) - known, self.by_pair["driver"].nunique()
         return Improvement(**statistics, pairs=known, undefined=undefined, drivers=drivers)
+
+    def _improved(self, baseline: str, scope: str) -> int:
+        """Returns the number of pairs whose improvement over a baseline is defined."""
+        nothing = pd.Series(dtype=float)
+        if scope == TEST:
+            return int(np.isfinite(self.by_pair.get(f"improvement/{baseline}", nothing)).sum())
+        column = f"{scope}_rmse_speed"
+        if column not in self.pairs:
+            return 0
+        speeds = self.pairs.pivot_table(
+            index="pair_id", columns="method", values=column, aggfunc="first"
+        )
+        before, after = speeds.get(baseline, nothing), speeds.get("policy", nothing)
+        return int((np.isfinite(before) & np.isfinite(after) & (before > 0)).sum())
 
     @property
     def _style_result(self) -> StyleResult | None:

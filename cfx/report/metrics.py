@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from cfx.evaluation.metrics.base import SUMMARIES, MetricInfo
-from cfx.report.figures.words import TEST, pretty_unit
+from cfx.report.figures.text import TEST, pretty_unit
 
 
 def known_metrics(data: Mapping[str, Any], metrics: Mapping[str, float]) -> tuple[MetricInfo, ...]:

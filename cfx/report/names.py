@@ -10,7 +10,7 @@ import numpy as np
 
 from cfx.core.errors import ConfigError
 from cfx.evaluation.result import Purpose
-from cfx.report.figures.words import common_prefix
+from cfx.report.figures.text import common_prefix
 from cfx.report.job import Job, any_baselines
 from cfx.results.provenance import flatten
 

@@ -13,7 +13,7 @@ import pandas as pd
 from cfx.calibration.flatness import NEAR
 from cfx.core.files import write_output
 from cfx.evaluation.result import Purpose
-from cfx.report.figures.words import short_label
+from cfx.report.figures.text import short_label
 from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs
 from cfx.report.names import Row, any_adapts, baselines_of, methods_of, rows_of

@@ -9,7 +9,7 @@ import numpy as np
 
 from cfx.evaluation.headline import Comparison, contradiction
 from cfx.evaluation.result import Purpose
-from cfx.report.figures.words import TEST, explained, few_drivers, percent, plural, short_label
+from cfx.report.figures.text import TEST, explained, few_drivers, percent, plural, short_label
 from cfx.report.job import Job, of_purpose
 from cfx.report.names import Row, rows_over_seeds
 

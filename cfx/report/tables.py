@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from cfx.report.figures.words import MINUS, NOTHING, explained, percent, short_label
+from cfx.report.figures.text import MINUS, NOTHING, explained, percent, short_label
 from cfx.report.job import Job
 
 R = TypeVar("R")

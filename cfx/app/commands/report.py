@@ -77,7 +77,7 @@ def report(
         DataError, TrackingError: the jobs cannot be read.
         OutputError: the page cannot be written.
     """
-    from cfx.report.figures.words import plural
+    from cfx.report.figures.text import plural
     from cfx.report.page import write_report
     from cfx.report.paper import FORMS, write_table
     from cfx.report.runs import read_runs

@@ -16,7 +16,7 @@ from cfx.evaluation.headline import headline
 from cfx.evaluation.metrics.base import MetricInfo, key_of
 from cfx.evaluation.result import Evaluation, Purpose
 from cfx.evaluation.statistics import Improvement
-from cfx.report.figures.words import few_drivers
+from cfx.report.figures.text import few_drivers
 from cfx.results.table import Findings, Kept
 from cfx.simulation.trajectory import TRANSIENT_S
 

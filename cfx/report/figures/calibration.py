@@ -15,8 +15,8 @@ from matplotlib.ticker import PercentFormatter
 from cfx.report.figures.canvas import canvas, draw_points, styled
 from cfx.report.figures.figure import JobFigure
 from cfx.report.figures.results import ParameterAxis, Results
+from cfx.report.figures.text import label, number, percent, unit_label
 from cfx.report.figures.values import Array
-from cfx.report.figures.words import label, number, percent, unit_label
 from cfx.results.look import EDGE, INK, colour_of
 
 AT_BOUND = 0.01

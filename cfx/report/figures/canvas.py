@@ -18,8 +18,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import ArrayLike
 
+from cfx.report.figures.text import label, percent
 from cfx.report.figures.values import Array
-from cfx.report.figures.words import label, percent
 from cfx.results.look import EDGE, INK, PALE, colour_of
 
 P = ParamSpec("P")

@@ -13,9 +13,9 @@ from cfx.calibration.flatness import NEAR, flat_shares
 from cfx.report.figures.canvas import canvas, draw_points, styled
 from cfx.report.figures.figure import JobFigure
 from cfx.report.figures.results import ParameterAxis, Results
+from cfx.report.figures.text import label, number, percent, plural, short, unit_label
 from cfx.report.figures.trajectories import TIME_TITLE
 from cfx.report.figures.values import Array
-from cfx.report.figures.words import label, number, percent, plural, short, unit_label
 from cfx.results.look import EDGE, INK, colour_of
 
 RATIO_TITLE = "loss, as a multiple of the best"

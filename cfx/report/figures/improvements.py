@@ -15,8 +15,7 @@ from cfx.evaluation.statistics import Improvement
 from cfx.report.figures.canvas import Dash, canvas, hover, percent_axis, say, styled
 from cfx.report.figures.figure import JobFigure
 from cfx.report.figures.results import Results
-from cfx.report.figures.values import Array, finite
-from cfx.report.figures.words import (
+from cfx.report.figures.text import (
     common_prefix,
     label,
     percent,
@@ -24,6 +23,7 @@ from cfx.report.figures.words import (
     plural,
     short,
 )
+from cfx.report.figures.values import Array, finite
 from cfx.results.look import COLOURS, INK
 
 WORST_WITHOUT_CUT = -0.6

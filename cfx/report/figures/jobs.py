@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter
 
 from cfx.data.style import CLUSTERS
+from cfx.evaluation.statistics import Improvement
 from cfx.report.figures.calibration import spread_offsets
 from cfx.report.figures.canvas import canvas, draw_points, hover, percent_tick, styled
 from cfx.report.figures.improvements import (
@@ -21,8 +22,7 @@ from cfx.report.figures.improvements import (
     improvement_axis,
     vertical_improvements,
 )
-from cfx.report.figures.values import Array, finite
-from cfx.report.figures.words import (
+from cfx.report.figures.text import (
     common_prefix,
     label,
     number,
@@ -30,6 +30,7 @@ from cfx.report.figures.words import (
     plural,
     short,
 )
+from cfx.report.figures.values import Array, finite
 from cfx.results.look import INK, JOB_COLOURS, colour_of
 
 _WIDE = 1.6
@@ -37,23 +38,14 @@ _WIDE = 1.6
 
 
 _MARKERS = ("o", "s", "D", "P", "X", "*", "h", "p")
+_SHOWN = ("mean", "ci95_low", "ci95_high", "trimmed_mean", "median")
+"""Statistics of an improvement that are drawn."""
+
 _NAMED = 90
 """Up to so many pairs carry their names under the axis."""
 
 _BARS = 3
 """Up to so many jobs are drawn as bars beside each other, more as dots."""
-
-
-@dataclass(frozen=True)
-class Statistics:
-    """A job's improvement over one baseline, fractions; NaN where it is not defined."""
-
-    job: str
-    mean: float
-    low: float
-    high: float
-    trimmed_mean: float
-    median: float
 
 
 @dataclass(frozen=True)
@@ -73,11 +65,11 @@ class ClusterGroup:
     values: Array
 
 
-def statistics_axis(rows: Sequence[Statistics], baseline: str) -> ImprovementAxis:
+def statistics_axis(found: Iterable[Improvement], baseline: str) -> ImprovementAxis:
     """Return the axis of several jobs' statistics."""
     values: list[float] = []
-    for row in rows:
-        values += finite([row.mean, row.low, row.high, row.trimmed_mean, row.median]).tolist()
+    for one in found:
+        values += finite([getattr(one, name) for name in _SHOWN]).tolist()
     what = "means, medians and ends of intervals"
     return improvement_axis(np.array(values), baseline=baseline, what=what)
 
@@ -106,17 +98,17 @@ def error_limit(values: Mapping[str, Array], unit: str) -> tuple[float, str]:
 
 
 @styled
-def draw_overview(rows: Sequence[Statistics], baseline: str, axis: ImprovementAxis) -> Figure:
+def draw_overview(found: Mapping[str, Improvement], baseline: str, axis: ImprovementAxis) -> Figure:
     """Draw mean improvement with its 95 % interval, trimmed mean and median: a line per job."""
-    figure, axes, places = _by_job([row.job for row in rows])
+    figure, axes, places = _by_job(list(found))
     colour = colour_of(baseline)
-    for row, place in zip(rows, places, strict=True):
-        reach = np.nan_to_num([[row.mean - row.low], [row.high - row.mean]])
+    for (job, row), place in zip(found.items(), places, strict=True):
+        reach = np.nan_to_num([[row.mean - row.ci95_low], [row.ci95_high - row.mean]])
         drawn = axes.errorbar(
             [row.mean], [place], xerr=reach, color=colour, marker="o", markersize=8, capsize=4
         )
-        low, high = percent_or_undefined(row.low, 1), percent_or_undefined(row.high, 1)
-        said = f"{row.job}: mean {percent_or_undefined(row.mean, 1)}, 95 % interval {low} to {high}"
+        low, high = percent_or_undefined(row.ci95_low, 1), percent_or_undefined(row.ci95_high, 1)
+        said = f"{job}: mean {percent_or_undefined(row.mean, 1)}, 95 % interval {low} to {high}"
         hover(drawn.lines[0], said)
         for name, value, marker in (
             ("trimmed mean", row.trimmed_mean, "D"),
@@ -124,7 +116,7 @@ def draw_overview(rows: Sequence[Statistics], baseline: str, axis: ImprovementAx
         ):
             mark = draw_points(axes, [value], [place], marker, "black", 8 if marker == "D" else 13)
             mark.set(markerfacecolor="none", markeredgewidth=1.3)
-            hover(mark, f"{row.job}: {name} {percent_or_undefined(value, 1)}")
+            hover(mark, f"{job}: {name} {percent_or_undefined(value, 1)}")
     axes.axvline(0, color=INK, linewidth=0.9, zorder=1)
     axes.set_xlim(axis.low, axis.high)
     axes.xaxis.set_major_formatter(FuncFormatter(percent_tick))

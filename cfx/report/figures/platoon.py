@@ -15,8 +15,8 @@ from cfx.evaluation.metrics.base import key_of
 from cfx.report.figures.canvas import canvas, styled
 from cfx.report.figures.figure import JobFigure
 from cfx.report.figures.results import Results
+from cfx.report.figures.text import label, number
 from cfx.report.figures.values import Array, finite
-from cfx.report.figures.words import label, number
 from cfx.results.look import COLLISION_COLOUR, COLOURS, vehicle_colour
 
 TIME_TITLE = "time from the braking of the leader (s)"

@@ -13,8 +13,8 @@ from cfx.data.style import CLUSTERS, StyleResult
 from cfx.report.figures.canvas import canvas, styled
 from cfx.report.figures.figure import JobFigure
 from cfx.report.figures.results import Results
+from cfx.report.figures.text import plural
 from cfx.report.figures.values import Array, finite
-from cfx.report.figures.words import plural
 from cfx.results.look import CLUSTER_COLOURS, INK
 
 INDICATORS = {

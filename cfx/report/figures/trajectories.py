@@ -20,8 +20,8 @@ from cfx.report.figures.canvas import HIDDEN, Line, canvas, draw_lines, method_l
 from cfx.report.figures.figure import JobFigure
 from cfx.report.figures.improvements import improvement_title
 from cfx.report.figures.results import ParameterAxis, Results
+from cfx.report.figures.text import label, number, percent, short, short_label, unit_label
 from cfx.report.figures.values import Array, RankedPair, finite, rank_pairs, without_infinity
-from cfx.report.figures.words import label, number, percent, short, short_label, unit_label
 from cfx.results.look import BAND, EDGE, INK, colour_of
 
 TIME_TITLE = "time from the start of the pair (s)"

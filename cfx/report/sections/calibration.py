@@ -12,8 +12,8 @@ from cfx.calibration.flatness import NEAR
 from cfx.evaluation.result import Purpose
 from cfx.report.figures.calibration import AT_BOUND, ParameterSpread, parameter_spreads
 from cfx.report.figures.identifiability import SlicePanel, draw_labels, labels_of, slice_panels
-from cfx.report.figures.words import number as shown
-from cfx.report.figures.words import short, unit_label
+from cfx.report.figures.text import number as shown
+from cfx.report.figures.text import short, unit_label
 from cfx.report.job import Job, Runs, of_purpose
 from cfx.report.section import Section, View
 from cfx.report.tables import Cell, Column, Sheet, formatted, job_names, number

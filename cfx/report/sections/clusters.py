@@ -13,7 +13,7 @@ from cfx.evaluation.result import Purpose
 from cfx.evaluation.statistics import Improvement
 from cfx.report.figures.improvements import improvement_axis
 from cfx.report.figures.jobs import ClusterGroup, draw_clusters
-from cfx.report.figures.words import explained, label
+from cfx.report.figures.text import explained, label
 from cfx.report.job import Job, Runs, any_baselines, of_purpose
 from cfx.report.names import SEPARATOR, differences
 from cfx.report.section import Section, View

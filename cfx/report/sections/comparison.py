@@ -13,7 +13,7 @@ import numpy as np
 from cfx.evaluation.metrics.base import MetricInfo
 from cfx.evaluation.result import METHODS, Purpose
 from cfx.report.figures.jobs import draw_error_dots, error_limit
-from cfx.report.figures.words import FULL_TRAJECTORY, STEADY, TEST, explained, percent, short_label
+from cfx.report.figures.text import FULL_TRAJECTORY, STEADY, TEST, explained, percent, short_label
 from cfx.report.job import Job, Runs, any_baselines, any_has_metric, of_purpose
 from cfx.report.metrics import metric_title
 from cfx.report.section import Section, View

@@ -12,7 +12,7 @@ import pandas as pd
 from cfx.evaluation.result import Purpose
 from cfx.report.figures.improvements import improvement_bars
 from cfx.report.figures.jobs import draw_every_pair
-from cfx.report.figures.words import label, short_label
+from cfx.report.figures.text import label, short_label
 from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs, any_baselines, of_purpose
 from cfx.report.section import Section, View

@@ -8,7 +8,7 @@ from typing import Any
 
 from cfx.core import registry
 from cfx.report.figures.history import BASE_LABELS, history_curves
-from cfx.report.figures.words import plural
+from cfx.report.figures.text import plural
 from cfx.report.job import Job, Runs
 from cfx.report.section import MOST, Section
 from cfx.report.tables import Column, Sheet, interval, job_names, number

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from cfx.evaluation.metrics.base import MetricInfo
-from cfx.report.figures.words import explained, short_label
+from cfx.report.figures.text import explained, short_label
 from cfx.report.job import Job, Runs
 from cfx.report.metrics import metric_title
 from cfx.report.section import Section

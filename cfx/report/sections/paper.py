@@ -14,7 +14,7 @@ from importlib import resources
 from operator import itemgetter
 from typing import Any
 
-from cfx.report.figures.words import percent_or_undefined, plural
+from cfx.report.figures.text import percent_or_undefined, plural
 from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs
 from cfx.report.section import Section

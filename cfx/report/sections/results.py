@@ -7,13 +7,11 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-import numpy as np
-import pandas as pd
-
 from cfx.evaluation.metrics.base import SCOPES
 from cfx.evaluation.result import Purpose
-from cfx.report.figures.jobs import Statistics, draw_overview, statistics_axis
-from cfx.report.figures.words import FULL_TRAJECTORY, MINUS, TEST, label
+from cfx.evaluation.statistics import Improvement
+from cfx.report.figures.jobs import draw_overview, statistics_axis
+from cfx.report.figures.text import FULL_TRAJECTORY, MINUS, TEST, label
 from cfx.report.job import Job, Runs, any_baselines, of_purpose
 from cfx.report.section import Section, View
 from cfx.report.tables import (
@@ -63,13 +61,12 @@ def overview(jobs: Sequence[Job]) -> dict[str, View]:
     for scope in SCOPES:
         suffix = "" if scope == TEST else f", {jobs[0].scope_label(scope)}"
         for baseline in any_baselines(jobs, scope):
-            rows = [
-                _statistics(job, baseline, scope)
-                for job in jobs
-                if baseline in job.baselines(scope)
-            ]
-            axis = statistics_axis(rows, baseline)
-            drawn = draw_overview(rows, baseline, axis)
+            found = {}
+            for job in jobs:
+                if baseline in job.baselines(scope):
+                    found[job.name] = job.statistics(baseline, scope)
+            axis = statistics_axis(found.values(), baseline)
+            drawn = draw_overview(found, baseline, axis)
             views[f"against {label(baseline)}{suffix}"] = View(drawn, axis.note)
     return views
 
@@ -139,12 +136,10 @@ def _metric(name: str, row: _Tested, form: str = ".3f", scope: str = TEST) -> Ce
 
 
 class _Compared(NamedTuple):
-    job: Job
+    job: str
     baseline: str
     scope: str
-
-    def statistic(self, name: str) -> float:
-        return self.job.improvement(name, self.baseline, self.scope)
+    found: Improvement
 
 
 def improvements(jobs: Sequence[Job]) -> Sheet:
@@ -159,9 +154,10 @@ def improvements(jobs: Sequence[Job]) -> Sheet:
         for baseline in dict.fromkeys(baselines):
             for job in jobs:
                 if baseline in job.baselines(scope):
-                    rows.append(_Compared(job, baseline, scope))
+                    found = job.statistics(baseline, scope)
+                    rows.append(_Compared(job.name, baseline, scope, found))
     columns = [
-        Column[_Compared]("Job", lambda row: row.job.name),
+        Column[_Compared]("Job", lambda row: row.job),
         Column(
             "Policy against",
             lambda row: method_cell(row.baseline),
@@ -183,7 +179,7 @@ def _frames(row: _Compared) -> str:
 
 
 def _p_value(row: _Compared) -> Cell:
-    value = row.statistic("p_value")
+    value = row.found.p_value
     cell = number(value, ".2g")
     return replace(cell, text="< 0.0001") if value < 1e-4 else cell
 
@@ -191,30 +187,30 @@ def _p_value(row: _Compared) -> Cell:
 _STATISTICS: tuple[Column[_Compared], ...] = (
     Column(
         "Mean",
-        lambda row: number(row.statistic("mean"), "+.1%"),
+        lambda row: number(row.found.mean, "+.1%"),
         f"Improvement of a pair: (RMSE of the baseline {MINUS} RMSE of the policy) / RMSE of the"
         " baseline, RMSE of the speed over these frames. Above 0 the policy is closer to the real"
         " driver. Here the mean over the pairs.",
     ),
     Column(
         "95 % interval",
-        lambda row: interval(row.statistic("ci95_low"), row.statistic("ci95_high")),
+        lambda row: interval(row.found.ci95_low, row.found.ci95_high),
         "Bootstrap confidence interval of that mean; drivers are resampled, each with all their"
         " pairs.",
     ),
     Column(
         "Trimmed mean",
-        lambda row: number(row.statistic("trimmed_mean"), "+.1%"),
+        lambda row: number(row.found.trimmed_mean, "+.1%"),
         "Mean without the top and the bottom tenth of the pairs, as the paper averages.",
     ),
     Column(
         "Median",
-        lambda row: number(row.statistic("median"), "+.1%"),
+        lambda row: number(row.found.median, "+.1%"),
         "Half of the pairs improve more.",
     ),
     Column(
         "Better for",
-        lambda row: number(row.statistic("win_rate"), ".0%"),
+        lambda row: number(row.found.win_rate, ".0%"),
         "Share of the pairs with an improvement above 0.",
     ),
     Column(
@@ -225,34 +221,7 @@ _STATISTICS: tuple[Column[_Compared], ...] = (
     ),
     Column(
         "Pairs",
-        lambda row: number(counted(*row), "d"),
+        lambda row: number(row.found.pairs, "d"),
         "Pairs that count. One does not if the baseline has no error or a simulation diverges.",
     ),
 )
-
-
-def counted(job: Job, baseline: str, scope: str = TEST) -> int:
-    """Returns the number of pairs whose improvement over a baseline is defined."""
-    nothing = pd.Series(dtype=float)
-    if scope == TEST:
-        return int(np.isfinite(job.by_pair.get(f"improvement/{baseline}", nothing)).sum())
-    column = f"{scope}_rmse_speed"
-    if column not in job.pairs:
-        return 0
-    speeds = job.pairs.pivot_table(
-        index="pair_id", columns="method", values=column, aggfunc="first"
-    )
-    before, after = speeds.get(baseline, nothing), speeds.get("policy", nothing)
-    return int((np.isfinite(before) & np.isfinite(after) & (before > 0)).sum())
-
-
-def _statistics(job: Job, baseline: str, scope: str) -> Statistics:
-    found = _Compared(job, baseline, scope).statistic
-    return Statistics(
-        job=job.name,
-        mean=found("mean"),
-        low=found("ci95_low"),
-        high=found("ci95_high"),
-        trimmed_mean=found("trimmed_mean"),
-        median=found("median"),
-    )

@@ -11,7 +11,7 @@ import pandas as pd
 import yaml
 
 from cfx.evaluation.result import Purpose
-from cfx.report.figures.words import NOTHING
+from cfx.report.figures.text import NOTHING
 from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs
 from cfx.report.section import Section

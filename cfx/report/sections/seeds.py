@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from cfx.report.figures.text import explained, short_label
 from cfx.report.figures.values import finite
-from cfx.report.figures.words import explained, short_label
 from cfx.report.job import Runs
 from cfx.report.names import Row, any_adapts, baselines_of, methods_of, rows_over_seeds
 from cfx.report.section import Section

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from cfx.evaluation.result import Purpose
+from cfx.report.figures.text import percent, short_label
 from cfx.report.figures.trajectories import draw_pair
 from cfx.report.figures.values import RankedPair, rank_pairs
-from cfx.report.figures.words import percent, short_label
 from cfx.report.job import Job, Runs, of_purpose
 from cfx.report.section import Section, View
 

@@ -14,8 +14,8 @@ from cfx.evaluation.metrics.base import RECORDED
 from cfx.report.figures.canvas import Line, canvas, draw_lines, mark_points, method_legend, styled
 from cfx.report.figures.figure import JobFigure
 from cfx.report.figures.results import Results
+from cfx.report.figures.text import label
 from cfx.report.figures.values import Array
-from cfx.report.figures.words import label
 from cfx.results.look import BAND, EDGE
 from cfx_traffic.summary import binned, mean_growth, ring_means, traffic_methods
 

@@ -12,7 +12,7 @@ import pytest
 
 from cfx.report.figures.figure import draw, figure_named
 from cfx.report.figures.results import Results
-from cfx.report.figures.words import MINUS, label
+from cfx.report.figures.text import MINUS, label
 from cfx.report.runs import read_runs
 from cfx_traffic.figures import draw_paths, draw_traffic, path_panels, traffic_panels
 from cfx_traffic.section import traffic_sheet

@@ -14,8 +14,8 @@ from cfx.report.figures.improvements import WORST_WITHOUT_CUT, improvement_axis,
 from cfx.report.figures.jobs import error_limit
 from cfx.report.figures.results import ParameterAxis
 from cfx.report.figures.style import draw_style
+from cfx.report.figures.text import common_prefix, scope_label, short
 from cfx.report.figures.values import evenly_spread, natural_order, rank_pairs
-from cfx.report.figures.words import common_prefix, scope_label, short
 
 GAIN = st.floats(-50, 1) | st.sampled_from([np.nan, -np.inf])
 GAINS = st.lists(GAIN, min_size=1, max_size=30)

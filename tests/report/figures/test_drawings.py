@@ -23,8 +23,8 @@ from cfx.report.figures.history import amounts_of
 from cfx.report.figures.learning import SAMPLED
 from cfx.report.figures.platoon import braking_time, worst_platoon
 from cfx.report.figures.results import Results
+from cfx.report.figures.text import percent, pretty_unit, short, unit_label
 from cfx.report.figures.trajectories import drives
-from cfx.report.figures.words import percent, pretty_unit, short, unit_label
 from cfx.report.figures.write import write_figures
 from cfx.results.look import COLOURS
 from tests.made_up import GAINS, MadeUp, make_history, make_platoon, make_results

@@ -13,7 +13,7 @@ from cfx.core.files import atomic_write
 from cfx.evaluation.result import Evaluation
 from cfx.policies.agent import Agent
 from cfx.report.figures.results import Results
-from cfx.report.figures.words import LABELS
+from cfx.report.figures.text import label
 from cfx.report.scripts import embedded_json, inline_scripts, security_policy
 from cfx.results.look import COLOURS
 from cfx_sumo.demo.motorway import Motorway
@@ -74,7 +74,7 @@ def render(
         scripts=scripts,
         style=_asset("demo.css"),
         colours={kind: COLOURS[kind] for kind in vehicles},
-        labels={kind: LABELS[kind] for kind in vehicles},
+        labels={kind: label(kind) for kind in vehicles},
         content=embedded_json(_content(road, simulated, plots)),
         simulated=simulated,
         plots=plots,
@@ -109,7 +109,7 @@ def _content(
         lanes.append({"width": lane.width, "inner": lane.inner, "shape": shape})
     return {
         "colours": {kind: COLOURS[kind] for kind in ("leader", *FOLLOWERS)},
-        "labels": {kind: LABELS[kind] for kind in FOLLOWERS},
+        "labels": {kind: label(kind) for kind in FOLLOWERS},
         "followers": FOLLOWERS,
         "carLength": CAR_LENGTH,
         "lanes": lanes,

@@ -14,8 +14,8 @@ from matplotlib.transforms import Affine2D
 from cfx.evaluation.result import Evaluation
 from cfx.report.figures.canvas import canvas, styled
 from cfx.report.figures.results import Results
+from cfx.report.figures.text import label, short
 from cfx.report.figures.trajectories import drives
-from cfx.report.figures.words import LABELS, short
 from cfx.report.figures.write import write_figure
 from cfx.results.look import COLOURS, INK
 from cfx_sumo.demo.motorway import Motorway
@@ -80,7 +80,7 @@ def snapshots(road: Motorway, main: SimulatedPair, together: Sequence[SimulatedP
         axes.spines[["left", "bottom"]].set_visible(False)
     handles = []
     for kind in ("leader", *FOLLOWERS):
-        handles.append(Patch(color=COLOURS[kind], label=LABELS[kind]))
+        handles.append(Patch(color=COLOURS[kind], label=label(kind)))
     name = short(main.pair.pair_id, 50)
     figure.legend(
         handles=handles,

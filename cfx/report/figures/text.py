@@ -1,69 +1,94 @@
-"""The words of figures and reports: names of methods, parts of trajectories, numbers, units."""
+"""Text of figures and reports: names of methods, parts of trajectories, numbers, units."""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from cfx.evaluation.metrics.base import SCOPES
 from cfx.simulation.trajectory import TRANSIENT_S
 
 MINUS = "\N{MINUS SIGN}"
 NOTHING = "\N{EN DASH}"
-LABELS = {
-    "real": "real driver",
-    "leader": "leader",
-    "default": "default parameters",
-    "population": "pooled calibration",
-    "fixed": "driver-specific calibration",
-    "shrunk": "driver-specific, shrunk",
-    "policy": "policy",
-    "constant_speed": "constant speed",
-    "constant_acceleration": "constant acceleration",
-    "population_residual": "pooled, with residual",
-    "fixed_residual": "driver-specific, with residual",
-    "population_ar": "pooled, with noise",
-    "fixed_ar": "driver-specific, with noise",
-    "policy_sampled": "policy, sampled",
-}
-"""Methods and recorded vehicles as legends name them."""
 
-SHORT = {
-    "population": "pooled",
-    "fixed": "driver-specific",
-    "shrunk": "shrunk",
-    "constant_speed": "constant speed",
-    "constant_acceleration": "constant acceleration",
-    "population_residual": "pooled + residual",
-    "fixed_residual": "driver-specific + residual",
-    "population_ar": "pooled + noise",
-    "fixed_ar": "driver-specific + noise",
-    "policy_sampled": "policy, sampled",
-}
-"""Methods as tables name them, where the key of the metrics says too little."""
 
-EXPLAINED = {
-    "real": "the recorded drivers",
-    "default": "the model's default parameters",
-    "population": "pooled calibration, which is one set of parameters for all drivers, calibrated"
-    " jointly on the training drivers",
-    "fixed": "driver-specific calibration, which is one set of parameters for each driver,"
-    " calibrated on the first part of their own trajectory",
-    "shrunk": "driver-specific calibration shrunk towards the default, which is where the policy"
-    " starts from",
-    "policy": "parameters that the policy chooses anew in each window",
-    "constant_speed": "the driver goes on at the speed that they have",
-    "constant_acceleration": "the driver goes on at the acceleration that they have",
-    "population_residual": "pooled calibration, which takes over from the acceleration at the"
-    " origin within seconds",
-    "fixed_residual": "driver-specific calibration, which takes over from the acceleration at the"
-    " origin within seconds",
-    "population_ar": "pooled calibration with auto-regressive noise on the acceleration, as"
-    " measured on recorded drivers",
-    "fixed_ar": "driver-specific calibration with auto-regressive noise on the acceleration, as"
-    " measured on the driver",
-    "policy_sampled": "the policy with all that it leaves to chance, drawn with the job's seed",
+class MethodText(NamedTuple):
+    """What a method is called.
+
+    Attributes:
+        label: in legends.
+        short: in tables.
+        explained: in words that end a sentence.
+    """
+
+    label: str
+    short: str
+    explained: str
+
+
+METHOD_TEXTS: dict[str, MethodText] = {
+    "real": MethodText("real driver", "real", "the recorded drivers"),
+    "leader": MethodText("leader", "leader", "the recorded leader"),
+    "default": MethodText("default parameters", "default", "the model's default parameters"),
+    "population": MethodText(
+        "pooled calibration",
+        "pooled",
+        "pooled calibration, which is one set of parameters for all drivers, calibrated jointly"
+        " on the training drivers",
+    ),
+    "fixed": MethodText(
+        "driver-specific calibration",
+        "driver-specific",
+        "driver-specific calibration, which is one set of parameters for each driver, calibrated"
+        " on the first part of their own trajectory",
+    ),
+    "shrunk": MethodText(
+        "driver-specific, shrunk",
+        "shrunk",
+        "driver-specific calibration shrunk towards the default, which is where the policy starts"
+        " from",
+    ),
+    "policy": MethodText(
+        "policy", "policy", "parameters that the policy chooses anew in each window"
+    ),
+    "constant_speed": MethodText(
+        "constant speed", "constant speed", "the driver goes on at the speed that they have"
+    ),
+    "constant_acceleration": MethodText(
+        "constant acceleration",
+        "constant acceleration",
+        "the driver goes on at the acceleration that they have",
+    ),
+    "population_residual": MethodText(
+        "pooled, with residual",
+        "pooled + residual",
+        "pooled calibration, which takes over from the acceleration at the origin within seconds",
+    ),
+    "fixed_residual": MethodText(
+        "driver-specific, with residual",
+        "driver-specific + residual",
+        "driver-specific calibration, which takes over from the acceleration at the origin within"
+        " seconds",
+    ),
+    "population_ar": MethodText(
+        "pooled, with noise",
+        "pooled + noise",
+        "pooled calibration with auto-regressive noise on the acceleration, as measured on"
+        " recorded drivers",
+    ),
+    "fixed_ar": MethodText(
+        "driver-specific, with noise",
+        "driver-specific + noise",
+        "driver-specific calibration with auto-regressive noise on the acceleration, as measured"
+        " on the driver",
+    ),
+    "policy_sampled": MethodText(
+        "policy, sampled",
+        "policy, sampled",
+        "the policy with all that it leaves to chance, drawn with the job's seed",
+    ),
 }
-"""Methods in words that end a sentence."""
+"""Methods and recorded vehicles."""
 
 FEW_DRIVERS = 20
 
@@ -73,17 +98,17 @@ TEST, STEADY, FULL_TRAJECTORY = SCOPES
 
 def label(method: str) -> str:
     """Returns how a legend names a method."""
-    return LABELS.get(method, method)
+    return METHOD_TEXTS[method].label if method in METHOD_TEXTS else method
 
 
 def short_label(method: str) -> str:
     """Returns how a table names a method."""
-    return SHORT.get(method, method)
+    return METHOD_TEXTS[method].short if method in METHOD_TEXTS else method
 
 
 def explained(method: str) -> str:
     """Returns what a method is, in words that end a sentence."""
-    return EXPLAINED.get(method, method)
+    return METHOD_TEXTS[method].explained if method in METHOD_TEXTS else method
 
 
 def scope_label(scope: str, transient_s: float = TRANSIENT_S) -> str:
