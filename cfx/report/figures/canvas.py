@@ -11,6 +11,7 @@ from typing import Any, Literal, ParamSpec
 from weakref import WeakKeyDictionary
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -94,7 +95,7 @@ class Line:
     Attributes:
         method: whose it is: a method, `real` or `leader`.
         time: `(T,)` s.
-        values: `(T,)`, NaN where there is none.
+        values: `(T,)`, NaN where there is none, and for infinity, which no axis can show.
         steps: whether a value holds until the next frame.
     """
 
@@ -102,6 +103,10 @@ class Line:
     time: Array
     values: Array
     steps: bool = False
+
+    def __post_init__(self) -> None:
+        values = np.where(np.isfinite(self.values), self.values, np.nan)
+        object.__setattr__(self, "values", values)
 
     @property
     def hidden(self) -> bool:

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.gridspec import GridSpec
 from matplotlib.ticker import MaxNLocator
 
 from cfx.core.errors import ConfigError, nearest
@@ -21,7 +22,7 @@ from cfx.report.figures.figure import JobFigure
 from cfx.report.figures.improvements import improvement_title
 from cfx.report.figures.results import ParameterAxis, Results
 from cfx.report.figures.text import label, number, percent, short, short_label, unit_label
-from cfx.report.figures.values import Array, RankedPair, finite, rank_pairs, without_infinity
+from cfx.report.figures.values import Array, RankedPair, finite, rank_pairs
 from cfx.results.look import BAND, EDGE, INK, colour_of
 
 TIME_TITLE = "time from the start of the pair (s)"
@@ -82,15 +83,14 @@ def pair_panels(
     """
     time = trajectory.time
     present = [method for method in methods if method in trajectory.speed]
-    speed_lines = [_line("leader", time, trajectory.leader_speed)]
+    speed_lines = [Line("leader", time, trajectory.leader_speed)]
     speed_lines += _lines(time, trajectory.real_speed, trajectory.speed, present)
     gap_lines = _lines(time, trajectory.real_gap, trajectory.gap, present)
     panels = []
     for k, parameter in enumerate(parameters):
         lines = []
         for method in present:
-            values = without_infinity(trajectory.parameters[method][:, k])
-            lines.append(Line(method, time, values, steps=True))
+            lines.append(Line(method, time, trajectory.parameters[method][:, k], steps=True))
         panels.append(_parameter_panel(parameter, tuple(lines)))
     return PairPanels(
         trajectory.pair_id,
@@ -100,32 +100,12 @@ def pair_panels(
     )
 
 
-def errors_text(what: str, unit: str, errors: Mapping[str, float]) -> str:
-    """Returns a title such as "RMSE of speed (m/s): default 1.02, policy 0.31".
-
-    Args:
-        what: the signal.
-        unit: of the errors.
-        errors: by method; hidden methods are left out.
-    """
-    listed = []
-    for method, error in errors.items():
-        if method not in HIDDEN:
-            value = f"{error:.2f}" if np.isfinite(error) else "none"
-            listed.append(f"{short_label(method)} {value}")
-    return f"RMSE of {what} ({unit}): {', '.join(listed)}"
-
-
-def _line(method: str, time: Array, values: Array) -> Line:
-    return Line(method, time, without_infinity(values))
-
-
 def _lines(
     time: Array, real: Array, simulated: Mapping[str, Array], methods: Sequence[str]
 ) -> list[Line]:
-    lines = [_line("real", time, real)]
+    lines = [Line("real", time, real)]
     for method in methods:
-        lines.append(_line(method, time, simulated[method]))
+        lines.append(Line(method, time, simulated[method]))
     return lines
 
 
@@ -221,7 +201,7 @@ def draw_pairs(
         _two_line_title(gap_axes, "", title[2])
     for axes in grid[-1]:
         axes.set_xlabel(TIME_TITLE)
-    method_legend(figure, ["real", "leader", *_visible(methods)], explained)
+    _legend(figure, methods, explained)
     return figure
 
 
@@ -269,19 +249,12 @@ def draw_parameters(pair: PairPanels, methods: Sequence[str]) -> Figure:
     draw_lines(speeds, shown)
     speeds.set_title(pair.speed.title)
     panels = [speeds]
-    for k, panel in enumerate(pair.parameters):
-        axes = figure.add_subplot(grid[divmod(k + span, columns)], sharex=speeds)
-        draw_panel(axes, panel)
-        _titles_of_parameter(axes, panel, _LINE // columns)
-        axes.set_ylabel("")
-        panels.append(axes)
+    panels += _draw_parameters(speeds, grid, pair.parameters, first=span)
     # Shared by all; labels of small axes must not touch.
     speeds.xaxis.set_major_locator(MaxNLocator(12 // columns, integer=True))
     for axes in panels:
         axes.tick_params(labelbottom=axes in panels[-columns:])
-    figure.supxlabel(TIME_TITLE, fontsize=10.5, color=INK)
-    title = f"pair {short(pair.pair_id, 60)}"
-    method_legend(figure, ["real", "leader", *_visible(methods)], title)
+    _finish(figure, methods, f"pair {short(pair.pair_id, 60)}")
     return figure
 
 
@@ -302,15 +275,35 @@ def draw_pair(results: Results, pair_id: str) -> Figure:
     gaps = figure.add_subplot(grid[0, columns // 2 :], sharex=speeds)
     draw_panel(speeds, pair.speed)
     draw_panel(gaps, pair.gap)
-    for k, panel in enumerate(pair.parameters):
-        row, column = divmod(k, columns)
-        axes = figure.add_subplot(grid[row + 1, column], sharex=speeds)
-        draw_panel(axes, panel)
-        _titles_of_parameter(axes, panel, _LINE // columns)
-        axes.set_ylabel("")
-    figure.supxlabel(TIME_TITLE, fontsize=10.5, color=INK)
-    method_legend(figure, ["real", "leader", *_visible(results.methods)])
+    _draw_parameters(speeds, grid, pair.parameters, first=columns)
+    _finish(figure, results.methods)
     return figure
+
+
+def _draw_parameters(
+    speeds: Axes, grid: GridSpec, panels: Sequence[Panel], first: int
+) -> list[Axes]:
+    """Draws a panel for each parameter into the cells of a grid from the `first` on."""
+    drawn = []
+    for k, panel in enumerate(panels, start=first):
+        place = grid[divmod(k, grid.ncols)]
+        axes = speeds.figure.add_subplot(place, sharex=speeds)
+        draw_panel(axes, panel)
+        _titles_of_parameter(axes, panel, _LINE // grid.ncols)
+        axes.set_ylabel("")
+        drawn.append(axes)
+    return drawn
+
+
+def _finish(figure: Figure, methods: Sequence[str], title: str | None = None) -> None:
+    """Says below all panels what time they share, and above them who drives."""
+    figure.supxlabel(TIME_TITLE, fontsize=10.5, color=INK)
+    _legend(figure, methods, title)
+
+
+def _legend(figure: Figure, methods: Sequence[str], title: str | None = None) -> None:
+    visible = [method for method in methods if method not in HIDDEN]
+    method_legend(figure, ["real", "leader", *visible], title)
 
 
 def draw_panel(axes: Axes, panel: Panel) -> None:
@@ -336,10 +329,6 @@ def draw_panel(axes: Axes, panel: Panel) -> None:
             annotation_clip=True,
         )
         axes.axhline(0, color=INK, linewidth=0.8)
-
-
-def _visible(methods: Sequence[str]) -> list[str]:
-    return [method for method in methods if method not in HIDDEN]
 
 
 def _columns(parameters: int) -> int:
@@ -424,9 +413,8 @@ def drives(results: Results, pair_id: str | Sequence[str] | None = None, count: 
             explained = f"percentages: {improvement_title('fixed')}"
         elif {"fixed", "policy"} <= set(results.methods):
             name += ":  improvement undefined"
-        rmse = errors_text("speed", "m/s", _errors(results, trajectory.pair_id, "rmse_speed"))
-        rmse_gap = errors_text("gap", "m", _errors(results, trajectory.pair_id, "rmse_gap"))
-        titles.append((name, rmse, rmse_gap))
+        speed = _errors_text(results, trajectory.pair_id, "speed", "m/s")
+        titles.append((name, speed, _errors_text(results, trajectory.pair_id, "gap", "m")))
         panels.append(pair_panels(trajectory, results.methods, results.parameters))
     return draw_pairs(titles, panels, results.methods, explained)
 
@@ -455,7 +443,7 @@ class Speeds(JobFigure):
         if not len(results.trajectories):
             return None
         ((_, trajectory),) = _chosen(results, None, 1)
-        errors = _errors(results, trajectory.pair_id, "rmse_speed")
+        errors = _errors(results, trajectory.pair_id, "speed")
         return draw_speeds(trajectory, results.methods, errors)
 
 
@@ -480,7 +468,9 @@ def _chosen(
 ) -> list[tuple[RankedPair, PairTrajectory]]:
     by_id = {trajectory.pair_id: trajectory for trajectory in results.trajectories}
     is_calibration = "policy" not in results.methods
-    judged = _constant(results) if is_calibration else "policy"
+    judged = "policy"
+    if is_calibration:  # the drivers' own constant set, which stands last, if there is one
+        judged = [method for method in results.methods if method not in HIDDEN][-1]
     rows = results.pairs[results.pairs["method"] == judged]
     rows = rows[rows["pair_id"].isin(list(by_id))]
     gains = pd.Series(np.nan, index=rows["pair_id"].astype(str))
@@ -505,14 +495,18 @@ def _chosen(
     return chosen
 
 
-def _constant(results: Results) -> str:
-    """Returns the calibrated constant set that is shown: the drivers' own, if there are any."""
-    shown = [method for method in results.methods if method not in HIDDEN]
-    return shown[-1]
-
-
-def _errors(results: Results, pair_id: str, column: str) -> dict[str, float]:
-    """Returns the errors of one pair by method, in the methods' order."""
+def _errors(results: Results, pair_id: str, signal: str) -> dict[str, float]:
+    """Returns the RMSE of a signal of one pair by method, in the methods' order."""
     rows = results.pairs[results.pairs["pair_id"] == pair_id].drop_duplicates("method")
-    errors = rows.set_index("method")[column]
+    errors = rows.set_index("method")[f"rmse_{signal}"]
     return {method: float(errors[method]) for method in results.methods if method in errors}
+
+
+def _errors_text(results: Results, pair_id: str, signal: str, unit: str) -> str:
+    """Returns a title such as "RMSE of speed (m/s): default 1.02, policy 0.31"."""
+    listed = []
+    for method, error in _errors(results, pair_id, signal).items():
+        if method not in HIDDEN:
+            value = f"{error:.2f}" if np.isfinite(error) else "none"
+            listed.append(f"{short_label(method)} {value}")
+    return f"RMSE of {signal} ({unit}): {', '.join(listed)}"

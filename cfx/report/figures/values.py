@@ -18,11 +18,6 @@ def finite(values: Sequence[float] | Array) -> Array:
     return array[np.isfinite(array)]
 
 
-def without_infinity(signal: Array) -> Array:
-    """Returns the signal with NaN for infinity, which no axis can show."""
-    return np.where(np.isfinite(signal), signal, np.nan)
-
-
 def natural_order(name: str) -> list[tuple[int, str]]:
     """Returns a sorting key that puts "i80/9" before "i80/11"."""
     key = []
