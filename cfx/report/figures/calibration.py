@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from cfx.report.figures.canvas import canvas, draw_points, styled
+from cfx.report.figures.canvas import canvas, draw_points, legend_above, styled
 from cfx.report.figures.figure import JobFigure
 from cfx.report.figures.results import ParameterAxis, Results
 from cfx.report.figures.text import label, number, percent, unit_label
@@ -121,9 +121,7 @@ def draw_calibration(spreads: Sequence[ParameterSpread], table: pd.DataFrame) ->
     left, right = figure.subplots(1, 2, width_ratios=(2.0, 1.0))
     _values(left, spreads)
     _correlations(right, table)
-    figure.legend(
-        *left.get_legend_handles_labels(), loc="outside upper center", ncols=3, handlelength=1.2
-    )
+    legend_above(figure, left.get_legend_handles_labels()[0], handlelength=1.2)
     return figure
 
 

@@ -79,6 +79,7 @@ _STYLE: dict[str, Any] = {
     "ytick.labelsize": 9.5,
     "legend.frameon": False,
     "legend.fontsize": 10.0,
+    "legend.title_fontsize": 10.5,
     "figure.dpi": DPI,
     "savefig.dpi": DPI,
     "pdf.fonttype": 42,  # letters stay letters, as journals ask
@@ -224,15 +225,25 @@ def method_handles(methods: Iterable[str]) -> list[Line2D]:
 def method_legend(figure: Figure, methods: Sequence[str], title: str | None = None) -> None:
     """Puts a legend of methods above a figure, in one row; many take two."""
     rows = 1 if len(methods) <= _LEGEND_ROW else 2
-    figure.legend(
-        handles=method_handles(methods),
-        loc="outside upper center",
-        ncols=-(-len(methods) // rows),
-        columnspacing=1.4,
-        handlelength=2.2,
-        title=title,
-        title_fontsize=11,
-    )
+    columns = -(-len(methods) // rows)
+    spacing = {"columnspacing": 1.4, "handlelength": 2.2, "title_fontsize": 11}
+    legend_above(figure, method_handles(methods), columns, title=title, **spacing)
+
+
+def legend_above(
+    figure: Figure, handles: Sequence[Artist] | None = None, columns: int = 3, **more: Any
+) -> None:
+    """Puts a legend above a figure.
+
+    Args:
+        figure: what it belongs to.
+        handles: its entries; None for what the figure's panels have labelled.
+        columns: at most so many.
+        more: as of `Figure.legend`.
+    """
+    if handles is not None:
+        columns = min(columns, max(len(handles), 1))
+    figure.legend(handles=handles, loc="outside upper center", ncols=columns, **more)
 
 
 def percent_axis(axes: Axes) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from cfx.report.figures.canvas import canvas, percent_axis, styled
+from cfx.report.figures.canvas import canvas, legend_above, percent_axis, styled
 from cfx.report.figures.figure import JobFigure
 from cfx.report.figures.improvements import improvement_title
 from cfx.report.figures.results import Results
@@ -91,7 +91,7 @@ def draw_history(history: pd.DataFrame) -> Figure:
     axes.set_ylabel(improvement_title("fixed").replace(" over ", "\nover ") + " (%)")
     percent_axis(axes)
     title = "mean over pairs and its 95 % interval"
-    figure.legend(loc="outside upper center", ncols=2, title=title, title_fontsize=10.5)
+    legend_above(figure, columns=2, title=title)
     return figure
 
 

@@ -10,7 +10,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from cfx.calibration.flatness import NEAR, flat_shares
-from cfx.report.figures.canvas import canvas, draw_points, styled
+from cfx.report.figures.canvas import canvas, draw_points, legend_above, styled
 from cfx.report.figures.figure import JobFigure
 from cfx.report.figures.results import ParameterAxis, Results
 from cfx.report.figures.text import label, number, percent, plural, short, unit_label
@@ -200,7 +200,7 @@ def draw_fits(fits: Mapping[str, pd.DataFrame]) -> Figure:
     axes.set_aspect("equal")
     axes.set_xlabel("RMSE of speed on the part calibrated on (m/s)")
     axes.set_ylabel("RMSE of speed on the test part (m/s)")
-    figure.legend(loc="outside upper center", ncols=1, handlelength=1.0)
+    legend_above(figure, columns=1, handlelength=1.0)
     return figure
 
 

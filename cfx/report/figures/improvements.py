@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from cfx.evaluation.statistics import Improvement
-from cfx.report.figures.canvas import Dash, canvas, hover, percent_axis, say, styled
+from cfx.report.figures.canvas import Dash, canvas, hover, legend_above, percent_axis, say, styled
 from cfx.report.figures.figure import JobFigure
 from cfx.report.figures.results import Results
 from cfx.report.figures.text import (
@@ -213,9 +213,7 @@ def draw_improvements(bars: ImprovementBars, summary: Improvement) -> Figure:
     axes.set_xlabel(_pairs_title(bars, prefix if named else ""))
     if not count:
         say(axes, "no pair has a defined improvement")
-    figure.legend(
-        handles=handles, loc="outside upper center", ncols=3, columnspacing=1.8, handlelength=1.8
-    )
+    legend_above(figure, handles, columnspacing=1.8, handlelength=1.8)
     return figure
 
 

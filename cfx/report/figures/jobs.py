@@ -15,7 +15,7 @@ from matplotlib.ticker import FuncFormatter
 from cfx.data.style import CLUSTERS
 from cfx.evaluation.statistics import Improvement
 from cfx.report.figures.calibration import spread_offsets
-from cfx.report.figures.canvas import canvas, draw_points, hover, percent_tick, styled
+from cfx.report.figures.canvas import canvas, draw_points, hover, legend_above, percent_tick, styled
 from cfx.report.figures.improvements import (
     ImprovementAxis,
     ImprovementBars,
@@ -123,7 +123,7 @@ def draw_overview(found: Mapping[str, Improvement], baseline: str, axis: Improve
     axes.set_xlabel(f"{axis.title} (%)")
     handles = [_mark("o", colour, "mean and its 95 % interval")]
     handles += [_mark("D", "black", "trimmed mean"), _mark("|", "black", "median")]
-    figure.legend(handles=handles, loc="outside upper center", ncols=3)
+    legend_above(figure, handles)
     return figure
 
 
@@ -149,7 +149,7 @@ def draw_error_dots(
             hover(mark, f"{job}, {label(method)}: {value:.3f} {unit}")
     axes.set_xlim(0, error_limit(values, unit)[0])
     axes.set_xlabel(f"{what} ({unit})")
-    figure.legend(handles=handles, loc="outside upper center", ncols=min(5, len(handles)))
+    legend_above(figure, handles, 5)
     return figure
 
 
@@ -183,7 +183,7 @@ def draw_clusters(groups: Sequence[ClusterGroup], axis: ImprovementAxis) -> Figu
     axes.grid(visible=False, axis="x")
     axes.set_xlabel("cluster of driving style")
     vertical_improvements(axes, axis)
-    figure.legend(handles=handles, loc="outside upper center", ncols=min(3, max(len(handles), 1)))
+    legend_above(figure, handles)
     return figure
 
 
@@ -245,7 +245,7 @@ def draw_every_pair(bars: ImprovementBars, pair_ids: Sequence[str]) -> Figure:
     of_what = f" of {short(prefix.rstrip('_-/:.'), 30)}" if prefix else ""
     axes.set_xlabel(f"{plural(len(pair_ids), 'pair')} of a leader and a follower{of_what}")
     vertical_improvements(axes, bars.axis)
-    figure.legend(handles=handles, loc="outside upper center", ncols=min(3, max(len(handles), 1)))
+    legend_above(figure, handles)
     return figure
 
 

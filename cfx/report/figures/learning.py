@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter
 
 from cfx.learners.curves import first_sampled_epoch, over_networks
-from cfx.report.figures.canvas import canvas, plain_tick, say, styled
+from cfx.report.figures.canvas import canvas, legend_above, plain_tick, say, styled
 from cfx.report.figures.figure import JobFigure
 from cfx.report.figures.results import Results
 from cfx.report.figures.values import Array
@@ -107,7 +107,7 @@ def draw_learning(curves: pd.DataFrame) -> Figure:
     elif len(next(iter(losses.values()))) == 1:
         axes.set_xticks([int(curves["epoch"].iloc[0])])
     title = f"{networks} networks: median and quartiles" if networks > 1 else "one network"
-    figure.legend(loc="outside upper center", ncols=3, title=title, title_fontsize=10.5)
+    legend_above(figure, title=title)
     return figure
 
 

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from cfx.evaluation.metrics.base import key_of
-from cfx.report.figures.canvas import canvas, styled
+from cfx.report.figures.canvas import canvas, legend_above, styled
 from cfx.report.figures.figure import JobFigure
 from cfx.report.figures.results import Results
 from cfx.report.figures.text import label, number
@@ -108,7 +108,7 @@ def draw_platoons(
     figure.supxlabel(TIME_TITLE, fontsize=10.5)
     grid[0].set_ylabel("speed (m/s)")
     grid[0].set_ylim(*_speed_range(finite(np.concatenate(speeds))))
-    figure.legend(handles=_handles(), loc="outside upper center", ncols=4, columnspacing=1.8)
+    legend_above(figure, _handles(), 4, columnspacing=1.8)
     return figure
 
 
