@@ -20,7 +20,7 @@ from cfx.calibration.windows import Split, Windows, WindowSettings
 from cfx.contracts.contract import contract_of
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
-from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
+from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingPairs, TrainingResult
 from cfx.models.krauss import Krauss
 from cfx.policies.agent import Agent
 from cfx.policies.core import AgentCore, features_read
@@ -68,12 +68,14 @@ def training_data(
     return TrainingData(
         simulator=MemoryStepper(model, pairs.dt),
         recorded=PairBatch.of(pairs),
-        pair=torch.arange(PAIRS),
-        split=split,
+        pairs=TrainingPairs(
+            index=torch.arange(PAIRS),
+            split=split,
+            network=network,
+            fixed=model.space.from_unit((model.space.to_unit(truth) + 0.25).clamp(0.05, 0.95)),
+            labels=labels,
+        ),
         windows=WINDOWS,
-        fixed=model.space.from_unit((model.space.to_unit(truth) + 0.25).clamp(0.05, 0.95)),
-        labels=labels,
-        network=network,
         names=names,
         seed=seed,
     )
@@ -151,7 +153,7 @@ def learns_something(learner: Learner) -> None:
     result = _fitted(learner, data)
     head = _head(result, data)
     default = head.space.to_unit(head.space.defaults()).float()
-    start = head.untrained_answer(head.space.to_unit(data.fixed).float())
+    start = head.untrained_answer(head.space.to_unit(data.pairs.fixed).float())
     features = features_read(_POLICY, head, WINDOWS.length)
     untrained = _POLICY.build(features, default, start, torch.Generator().manual_seed(0)).eval()
     before = _rmse(replace(result, network=untrained), data)
@@ -194,7 +196,7 @@ def another_seed_gives_other_networks(learner: Learner) -> None:
 def reads_no_frame_after_the_training_part(learner: Learner) -> None:
     data = training_data(needs_labels=learner.needs_labels)
     frames = torch.arange(data.recorded.mask.shape[1])
-    secret = frames > data.split.frame[:, None]
+    secret = frames > data.pairs.split.frame[:, None]
     changed: dict[str, Any] = {}
     for name in SIGNALS:
         signal = getattr(data.recorded, name)
@@ -216,12 +218,13 @@ def networks_are_independent(learner: Learner) -> None:
             signal = getattr(data.recorded, name)
             changed[name] = torch.where(first, 1.0 + 0.8 * signal, signal)
     other = replace(data, recorded=replace(data.recorded, **changed))
-    labels = data.labels
+    labels = data.pairs.labels
     if labels is not None:
         of_first = (labels.windows.pair == 0)[:, None]
         default = data.simulator.model.space.defaults()
         parameters = torch.where(of_first, default, labels.parameters)
-        other = replace(other, labels=replace(labels, parameters=parameters))
+        labels = replace(labels, parameters=parameters)
+        other = replace(other, pairs=replace(other.pairs, labels=labels))
     one, two = _state(_fitted(learner, data)), _state(learner.fit(_POLICY, other))
     message = (
         "what a network learns must not depend on the drivers of another network: one driver was"
@@ -243,10 +246,10 @@ def the_training_data_stays_as_it_is(learner: Learner) -> None:
         one, two = getattr(data.recorded, name), getattr(untouched.recorded, name)
         assert torch.equal(one, two), f"recorded.{name} of the training data {message}"
     for name in ("fixed", "network"):
-        one, two = getattr(data, name), getattr(untouched, name)
+        one, two = getattr(data.pairs, name), getattr(untouched.pairs, name)
         assert torch.equal(one, two), f"{name} of the training data {message}"
-    if data.labels is not None and untouched.labels is not None:
-        assert torch.equal(data.labels.parameters, untouched.labels.parameters), (
+    if data.pairs.labels is not None and untouched.pairs.labels is not None:
+        assert torch.equal(data.pairs.labels.parameters, untouched.pairs.labels.parameters), (
             f"labels of the training data {message}"
         )
 
@@ -285,9 +288,9 @@ def _fitted(learner: Learner, data: TrainingData) -> TrainingResult:
 def _answers(result: TrainingResult, data: TrainingData) -> Tensor:
     """Returns the parameters chosen on the measured training parts, `(P, W, n)` in unit space."""
     agent = _agent(result, data)
-    state = agent.begin(data.network)
+    state = agent.begin(data.pairs.network)
     pairs, answers = torch.arange(PAIRS), []
-    for first in range(0, int(data.split.frame.min()), WINDOWS.stride):
+    for first in range(0, int(data.pairs.split.frame.min()), WINDOWS.stride):
         frame = torch.full((PAIRS,), first)
         chosen, state = agent.act(measured_history(data.batch, pairs, frame, WINDOWS.length), state)
         answers.append(agent.space.to_unit(chosen))
@@ -297,10 +300,10 @@ def _answers(result: TrainingResult, data: TrainingData) -> Tensor:
 def _rmse(result: TrainingResult, data: TrainingData) -> float:
     """Returns the RMSE of speed in closed loop over the training parts, m/s."""
     first = torch.zeros(PAIRS, dtype=torch.int64)
-    followers = Followers(data.batch, data.network)
+    followers = Followers(data.batch, data.pairs.network)
     loop = simulate_closed_loop(data.simulator, _agent(result, data), followers, first)
     frames = torch.arange(loop.speed.shape[1])
-    counted = (frames > 0) & (frames <= data.split.frame[:, None])
+    counted = (frames > 0) & (frames <= data.pairs.split.frame[:, None])
     error = (loop.speed - data.batch.follower_speed[:, : loop.speed.shape[1]])[counted]
     return float(error.square().mean().sqrt())
 

@@ -182,23 +182,21 @@ def learners_get_only_what_they_may_use(protocol: Protocol) -> None:
     protocol.run(context(recording(), learner=watched))
     assert watched.training_data_seen, "a trainable policy must be trained by the context's learner"
     for training_data in watched.training_data_seen:
-        pairs = len(training_data.pair)
-        per_pair = (training_data.split.frame, training_data.network, training_data.fixed)
-        assert all(len(values) == pairs for values in per_pair), (
+        pairs = training_data.pairs
+        per_pair = (pairs.split.frame, pairs.network, pairs.fixed)
+        assert all(len(values) == len(pairs) for values in per_pair), (
             "split, network and fixed of training data have an entry for each of its pairs"
         )
-        assert bool(
-            (training_data.split.frame < training_data.recorded.lengths[training_data.pair]).all()
-        ), "`split.frame` is a frame of the pair"
-        assert set(training_data.network.tolist()) == set(range(len(training_data.names))), (
+        assert bool((pairs.split.frame < training_data.recorded.lengths[pairs.index]).all()), (
+            "`split.frame` is a frame of the pair"
+        )
+        assert set(pairs.network.tolist()) == set(range(len(training_data.names))), (
             "every network of training data has a name and learns from at least one pair"
         )
-        assert training_data.labels is not None, (
-            "the learner needs labels: find them with `context.labels`"
-        )
-        windows = training_data.labels.windows
+        assert pairs.labels is not None, "the learner needs labels: find them with `context.labels`"
+        windows = pairs.labels.windows
         ends = windows.first + windows.settings.length
-        assert bool((ends <= training_data.split.frame[windows.pair]).all()), (
+        assert bool((ends <= pairs.split.frame[windows.pair]).all()), (
             "a label's window must end within the training part: labels are found from measurements"
         )
 

@@ -34,27 +34,48 @@ CURVE_COLUMNS = ["network", "epoch", "train_loss", "validation_loss"]
 
 
 @dataclass(frozen=True)
-class TrainingData:
-    """The training part of some pairs, which is all that a learner may see.
+class TrainingPairs:
+    """P pairs to learn from, one behind the other for all networks.
 
     Attributes:
-        simulator: simulates the driving model, with its time step.
-        recorded: U pairs, full trajectories; only frames up to `split.frame` may be read.
-        pair: which of them each of the P pairs is, `(P,)` int64.
-        split: where the training part of each of the P pairs ends.
-        windows: how trajectories are cut.
+        index: which of the U recorded pairs each is, `(P,)` int64.
+        split: where the training part of each ends.
+        network: which network learns from each, `(P,)` int64.
         fixed: the parameters that each pair's network starts from, `(P, n)`, SI units: the driver's
             own calibrated set, or the pooled one where networks are for unseen drivers.
-        labels: per-window calibrated parameters of the training parts; None if the learner needs
-            none.
-        network: which network learns from each pair, `(P,)` int64.
-        names: what each network is for, N of them.
-        seed: for initial weights and everything random.
         base: the parameters that answers refer to for each driver whose history was observed, `(P,
             n)`, SI units, while those in `fixed` serve unseen drivers; None where there are no
             unseen drivers. Only learners of offsets read them.
+        labels: per-window calibrated parameters of the training parts; None if the learner needs
+            none.
         drivers: whose pair each is; None if each is another driver's.
-        sites: where each pair was recorded; None if all were recorded at one site.
+        sites: where each was recorded; None if all were recorded at one site.
+    """
+
+    index: Tensor
+    split: Split
+    network: Tensor
+    fixed: Tensor
+    base: Tensor | None = None
+    labels: Labels | None = None
+    drivers: tuple[str, ...] | None = None
+    sites: tuple[str, ...] | None = None
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """What a learner may see: the training part of some pairs.
+
+    Attributes:
+        simulator: simulates the driving model, with its time step.
+        recorded: U pairs, full trajectories; only frames up to `pairs.split.frame` may be read.
+        pairs: what is learned from each of P pairs, and by which network.
+        windows: how trajectories are cut.
+        names: what each network is for, N of them.
+        seed: for initial weights and everything random.
         workspace: a folder for what training needs to go on after an interruption; None: nothing is
             kept.
         objective: what training that simulates in closed loop minimises; calibration has minimised
@@ -64,17 +85,10 @@ class TrainingData:
 
     simulator: Stepper
     recorded: PairBatch
-    pair: Tensor
-    split: Split
+    pairs: TrainingPairs
     windows: WindowSettings
-    fixed: Tensor
-    labels: Labels | None
-    network: Tensor
     names: tuple[str, ...]
     seed: int
-    base: Tensor | None = None
-    drivers: tuple[str, ...] | None = None
-    sites: tuple[str, ...] | None = None
     workspace: Path | None = None
     objective: Objective = field(default_factory=SpeedRmse)
     engine: Engine = field(default_factory=LocalEngine)
@@ -83,9 +97,9 @@ class TrainingData:
     def batch(self) -> PairBatch:
         """The P pairs, copied: as many times as many recordings as there are networks.
 
-        A learner that is to learn from thousands of pairs reads `recorded` and `pair`.
+        A learner that is to learn from thousands of pairs reads `recorded` and `pairs`.
         """
-        return self.recorded[self.pair]
+        return self.recorded[self.pairs.index]
 
     @property
     def device(self) -> torch.device:

@@ -60,13 +60,13 @@ class ImitationLearner(Learner):
         dataset = ImitationDataset.of(policy, training_data, s, head)
         generator = torch.Generator().manual_seed(training_data.seed)
         default = space.to_unit(space.defaults()).float()
-        grid = Grid(training_data.network.to(device), len(names))
-        fixed = grid.mean(space.to_unit(training_data.fixed)).float()
+        grid = Grid(training_data.pairs.network.to(device), len(names))
+        fixed = grid.mean(space.to_unit(training_data.pairs.fixed)).float()
         start = head.untrained_answer(fixed.cpu())
         network = policy.build(dataset.features.shape[-1], default, start, generator)
         base = None
         if head.needs_base:
-            base = space.from_unit(fixed.to(training_data.fixed.dtype))
+            base = space.from_unit(fixed.to(training_data.pairs.fixed.dtype))
         if not any(parameter.requires_grad for parameter in network.parameters()):
             curves = pd.DataFrame(columns=CURVE_COLUMNS)
             found = learned_range(training_data)

@@ -85,9 +85,9 @@ class _Rows(NamedTuple):
 def _rows(training_data: TrainingData, head: ParameterHead) -> _Rows:
     """Returns each pair with its base, and with the pooled one where that is another."""
     device = training_data.device
-    pair = torch.arange(len(training_data.pair), device=device)
-    network = training_data.network.to(device)
-    pooled, own = training_data.fixed, training_data.base
+    pair = torch.arange(len(training_data.pairs), device=device)
+    network = training_data.pairs.network.to(device)
+    pooled, own = training_data.pairs.fixed, training_data.pairs.base
     unit_pooled = head.space.to_unit(pooled).float()
     if own is None or not head.needs_base or torch.equal(own, pooled):
         return _Rows(pair, network, unit_pooled)
@@ -147,12 +147,12 @@ class ImitationDataset(nn.Module):
         Raises:
             DataError: a pair has too few windows to keep some for validation.
         """
-        labels, pairs = training_data.labels, len(training_data.pair)
+        labels, pairs = training_data.pairs.labels, len(training_data.pairs)
         if labels is None:
             raise TypeError("imitation needs labels: the parameters calibrated for each window")
         windows, device = labels.windows, training_data.device
         pair, first = windows.pair.to(device), windows.first.to(device)
-        recorded = training_data.pair.to(device)[pair]
+        recorded = training_data.pairs.index.to(device)[pair]
         length = training_data.windows.length
         history = measured_history(training_data.recorded, recorded, first, length)
         seen = tokens(history, policy.inputs, policy.summary).float()

@@ -30,11 +30,11 @@ def learned_range(training_data: TrainingData, augment: Augment | None = None) -
         augment: what training made of situations besides; None: nothing.
     """
     device = training_data.device
-    last = training_data.split.frame.to(device)
+    last = training_data.pairs.split.frame.to(device)
     windows = torch.arange(0, int(last.max()) + 1, training_data.windows.stride, device=device)
-    networks = training_data.network.to(device)
+    networks = training_data.pairs.network.to(device)
     rows = _some_of_each(networks, len(training_data.names))
-    pair = training_data.pair.to(device)[rows]
+    pair = training_data.pairs.index.to(device)[rows]
     history = measured_history(training_data.recorded, pair[:, None], windows, 1)
     recorded = History(*(signal[..., 0] for signal in history))
     counted = windows <= last[rows, None]

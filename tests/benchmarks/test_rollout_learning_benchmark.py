@@ -19,7 +19,7 @@ import torch
 from cfx.calibration.windows import Split, WindowSettings
 from cfx.core.threads import one_thread
 from cfx.data.pairs import PairBatch
-from cfx.learners.base import TrainingData
+from cfx.learners.base import TrainingData, TrainingPairs
 from cfx.learners.rollout import RolloutSettings
 from cfx.learners.rollout.dataset import RolloutDataset
 from cfx.learners.rollout.module import RolloutModule
@@ -49,15 +49,10 @@ def _training_data(model: DrivingModel, networks: int) -> TrainingData:
     return TrainingData(
         MemoryStepper(model, 0.1),
         batch,
-        index,
-        split,
+        TrainingPairs(index, split, network, fixed, base=fixed),
         windows,
-        fixed,
-        None,
-        network,
         names,
         seed=0,
-        base=fixed,
     )
 
 

@@ -13,7 +13,7 @@ from cfx.calibration.calibrator import Labels
 from cfx.calibration.windows import Split, Windows, WindowSettings
 from cfx.core.threads import one_thread
 from cfx.data.pairs import PairBatch
-from cfx.learners.base import TrainingData
+from cfx.learners.base import TrainingData, TrainingPairs
 from cfx.learners.imitation import ImitationLearner
 from cfx.models.krauss import Krauss
 from cfx.policies.gru import GruPolicy
@@ -44,14 +44,10 @@ def _training_data() -> TrainingData:
     return TrainingData(
         MemoryStepper(model, 0.1),
         PairBatch.of(pairs),
-        torch.arange(PAIRS),
-        split,
+        TrainingPairs(torch.arange(PAIRS), split, torch.arange(PAIRS), fixed, labels=labels),
         settings,
-        fixed,
-        labels,
-        torch.arange(PAIRS),
         names,
-        0,
+        seed=0,
     )
 
 

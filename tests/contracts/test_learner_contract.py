@@ -26,7 +26,7 @@ class Plain(Learner):
 
     def fit(self, policy: Policy, training_data: TrainingData) -> TrainingResult:
         torch_seed = torch.Generator().manual_seed(self.seed(training_data))
-        windows = training_data.labels.windows
+        windows = training_data.pairs.labels.windows
         history = measured_history(
             training_data.batch,
             windows.pair,
@@ -38,12 +38,12 @@ class Plain(Learner):
         )
         space = training_data.simulator.model.space
         wanted, _ = windows.to_grid(
-            space.to_unit(training_data.labels.parameters).float(), len(training_data.batch)
+            space.to_unit(training_data.pairs.labels.parameters).float(), len(training_data.batch)
         )
-        network_of, names = training_data.network, training_data.names
+        network_of, names = training_data.pairs.network, training_data.names
         grid, mask, wanted = (self.arrange(x, network_of, len(names)) for x in (seen, mask, wanted))
         scaler = self.scaler(grid, mask)
-        start = space.to_unit(training_data.fixed).float()
+        start = space.to_unit(training_data.pairs.fixed).float()
         first = torch.stack([start[network_of == k].mean(0) for k in range(len(names))])
         network = policy.build(grid.shape[-1], first[0], first, torch_seed)
         rows = self.train(network, scaler(grid), wanted, mask)
@@ -155,16 +155,15 @@ class Separate(Plain):
     """Makes a network for each pair, whatever the training data wants."""
 
     def fit(self, policy: Policy, training_data: TrainingData) -> TrainingResult:
-        return super().fit(
-            policy, replace(training_data, network=torch.arange(3), names=("a", "b", "c"))
-        )
+        pairs = replace(training_data.pairs, network=torch.arange(3))
+        return super().fit(policy, replace(training_data, pairs=pairs, names=("a", "b", "c")))
 
 
 class Meddling(Plain):
     def finish(
         self, training_result: TrainingResult, training_data: TrainingData
     ) -> TrainingResult:
-        training_data.fixed.mul_(1.01)
+        training_data.pairs.fixed.mul_(1.01)
         return training_result
 
 

@@ -97,10 +97,9 @@ class _Telling(ImitationLearner):
 
     def fit(self, policy: Policy, training_data: TrainingData) -> TrainingResult:
         whole = Split.none(self._context.pairs, self._context.windows)
-        return self._learner.fit(
-            policy,
-            replace(training_data, labels=self._context.labels(whole.windows, training_data.fixed)),
-        )
+        labels = self._context.labels(whole.windows, training_data.pairs.fixed)
+        told = replace(training_data, pairs=replace(training_data.pairs, labels=labels))
+        return self._learner.fit(policy, told)
 
 
 class Telling(WithinDriver):

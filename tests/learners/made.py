@@ -13,7 +13,7 @@ import torch
 from cfx.calibration.windows import Split, WindowSettings
 from cfx.data.pairs import PairBatch
 from cfx.evaluation.closed_loop import ClosedLoop, Followers, simulate_closed_loop
-from cfx.learners.base import TrainingData, TrainingResult
+from cfx.learners.base import TrainingData, TrainingPairs, TrainingResult
 from cfx.learners.rollout import RolloutLearner, RolloutSettings
 from cfx.learners.rollout.dataset import RolloutDataset
 from cfx.learners.rollout.inputs import RolloutBatch
@@ -60,17 +60,19 @@ def training_data(
     data = TrainingData(
         simulator=MemoryStepper(model, 0.1),
         recorded=PairBatch.of(pairs),
-        pair=index,
-        split=Split.none(pairs, WINDOWS)[index],
+        pairs=TrainingPairs(
+            index=index,
+            split=Split.none(pairs, WINDOWS)[index],
+            network=torch.arange(networks).repeat_interleave(len(pairs)),
+            fixed=fixed,
+            drivers=tuple(pair.driver for pair in pairs) * networks,
+        ),
         windows=WINDOWS,
-        fixed=fixed,
-        labels=None,
-        network=torch.arange(networks).repeat_interleave(len(pairs)),
         names=tuple(f"n{number}" for number in range(networks)),
         seed=0,
-        drivers=tuple(pair.driver for pair in pairs) * networks,
     )
-    return replace(data, **changes)
+    of_pairs = {name: changes.pop(name) for name in set(changes) & set(vars(data.pairs))}
+    return replace(data, pairs=replace(data.pairs, **of_pairs), **changes)
 
 
 def ready(result: TrainingResult, data: TrainingData, policy: Policy) -> Agent:
@@ -97,13 +99,13 @@ def loop(
     seed: int | None = None,
 ) -> ClosedLoop:
     """Returns the closed loop of evaluation from a frame on; with a seed, sampled."""
-    frames = torch.full_like(data.network, first)
+    frames = torch.full_like(data.pairs.network, first)
     agent = ready(result, data, policy)
     generator = None if seed is None else torch.Generator().manual_seed(seed)
     return simulate_closed_loop(
         data.simulator,
         agent,
-        Followers(data.batch, data.network, base=base),
+        Followers(data.batch, data.pairs.network, base=base),
         frames,
         generator=generator,
     )

@@ -13,7 +13,7 @@ from cfx.calibration.calibrator import Labels
 from cfx.calibration.windows import Split, Windows, WindowSettings
 from cfx.core.errors import DataError
 from cfx.data.pairs import PairBatch
-from cfx.learners.base import TrainingData, TrainingResult
+from cfx.learners.base import TrainingData, TrainingPairs, TrainingResult
 from cfx.learners.imitation import ImitationLearner
 from cfx.models.krauss import Krauss
 from cfx.policies.checkpoint import load, save
@@ -56,12 +56,14 @@ def training_data(
     return TrainingData(
         simulator=MemoryStepper(model, 0.1),
         recorded=batch,
-        pair=torch.arange(pairs),
-        split=split,
+        pairs=TrainingPairs(
+            index=torch.arange(pairs),
+            split=split,
+            network=network,
+            fixed=model.space.defaults().expand(pairs, 2),
+            labels=labels,
+        ),
         windows=SETTINGS,
-        fixed=model.space.defaults().expand(pairs, 2),
-        labels=labels,
-        network=network,
         names=groups,
         seed=0,
     )
@@ -69,9 +71,9 @@ def training_data(
 
 def own_bases(data: TrainingData) -> torch.Tensor:
     """Returns a base for each driver, `(P, n)`, all different."""
-    shift = torch.linspace(-0.2, 0.2, len(data.fixed)).double()[:, None]
+    shift = torch.linspace(-0.2, 0.2, len(data.pairs.fixed)).double()[:, None]
     space = data.simulator.model.space
-    return space.from_unit(space.to_unit(data.fixed) + shift)
+    return space.from_unit(space.to_unit(data.pairs.fixed) + shift)
 
 
 def same_weights(one: TrainingResult, two: TrainingResult) -> bool:
@@ -95,13 +97,13 @@ def test_answers_as_offsets_begin_at_the_base_of_each_driver() -> None:
     data = training_data(together=True)
     own = own_bases(data)
     learner = ImitationLearner(epochs=1, learning_rate=1e-12, head="offset")
-    result = learner.fit(GruPolicy(), replace(data, base=own))
+    result = learner.fit(GruPolicy(), replace(data, pairs=replace(data.pairs, base=own)))
     assert result.base is not None
-    torch.testing.assert_close(result.base, data.fixed[:1], rtol=1e-6, atol=0)
+    torch.testing.assert_close(result.base, data.pairs.fixed[:1], rtol=1e-6, atol=0)
     agent = ready(result, data, GruPolicy())
     history = measured_history(data.batch, torch.arange(3), torch.full((3,), 50), SETTINGS.length)
-    for base, expected in ((own, own), (None, data.fixed)):
-        state = agent.begin(data.network, DriverContext(base=base))
+    for base, expected in ((own, own), (None, data.pairs.fixed)):
+        state = agent.begin(data.pairs.network, DriverContext(base=base))
         chosen, _ = agent.act(history, state)
         torch.testing.assert_close(chosen, expected, rtol=1e-5, atol=1e-6)
 
@@ -109,23 +111,23 @@ def test_answers_as_offsets_begin_at_the_base_of_each_driver() -> None:
 def test_offsets_are_learned_from_each_drivers_base_and_from_the_pooled_one() -> None:
     """Labels are the drivers' own parameters: no offset from these, one from the pooled base."""
     data = training_data(together=True)
-    assert data.labels is not None
+    assert data.pairs.labels is not None
     own = own_bases(data)
-    labels = replace(data.labels, parameters=own[data.labels.windows.pair])
-    data = replace(data, labels=labels, base=own)
+    labels = replace(data.pairs.labels, parameters=own[data.pairs.labels.windows.pair])
+    data = replace(data, pairs=replace(data.pairs, labels=labels, base=own))
     learner = ImitationLearner(epochs=60, learning_rate=0.02, patience=None, head="offset")
     result = learner.fit(GruPolicy(), data)
     agent, space = ready(result, data, GruPolicy()), data.simulator.model.space
     truth = space.to_unit(own)
     errors = {}
     for name, base in (("own", own), ("pooled", None)):
-        frames = torch.full_like(data.network, 100)
-        state = agent.begin(data.network, DriverContext(base=base))
+        frames = torch.full_like(data.pairs.network, 100)
+        state = agent.begin(data.pairs.network, DriverContext(base=base))
         state = agent.burn_in(data.batch, frames, state)
         history = measured_history(data.batch, torch.arange(3), frames, SETTINGS.length)
         chosen, _ = agent.act(history, state)
         errors[name] = float((space.to_unit(chosen) - truth).abs().mean())
-    untrained = float((space.to_unit(data.fixed) - truth).abs().mean())
+    untrained = float((space.to_unit(data.pairs.fixed) - truth).abs().mean())
     assert errors["own"] < 0.3 * untrained
     assert errors["pooled"] < 0.7 * untrained
 
@@ -135,7 +137,9 @@ def test_a_saved_policy_of_offsets_answers_the_same(tmp_path: Path) -> None:
     own = own_bases(data)
     policy = GruPolicy()
     learner = ImitationLearner(epochs=3, learning_rate=0.05, head="offset")
-    agent = ready(learner.fit(policy, replace(data, base=own)), data, policy)
+    agent = ready(
+        learner.fit(policy, replace(data, pairs=replace(data.pairs, base=own))), data, policy
+    )
     agent = replace(agent, model_node={"name": "krauss"}, policy_node={"name": "gru"})
     save(agent, tmp_path)
     again = load(tmp_path)
@@ -143,7 +147,7 @@ def test_a_saved_policy_of_offsets_answers_the_same(tmp_path: Path) -> None:
     history = measured_history(data.batch, torch.arange(3), torch.full((3,), 50), SETTINGS.length)
     answers = []
     for one in (agent, again):
-        state = one.begin(data.network, DriverContext(base=own))
+        state = one.begin(data.pairs.network, DriverContext(base=own))
         answers.append(one.act(history, state)[0])
     assert torch.equal(*answers)
 
@@ -151,7 +155,7 @@ def test_a_saved_policy_of_offsets_answers_the_same(tmp_path: Path) -> None:
 def test_direct_answers_do_not_depend_on_bases() -> None:
     learner, data = ImitationLearner(**QUICK), training_data(together=True)
     one = learner.fit(GruPolicy(), data)
-    two = learner.fit(GruPolicy(), replace(data, base=own_bases(data)))
+    two = learner.fit(GruPolicy(), replace(data, pairs=replace(data.pairs, base=own_bases(data))))
     assert same_weights(one, two)
     assert one.base is None
     assert two.base is None
@@ -222,17 +226,17 @@ def test_one_network_for_all_pairs() -> None:
 def test_windows_without_sensitivity_weigh_nothing() -> None:
     """Labels of such windows are replaced by noise; only an unweighted error notices."""
     data = training_data(1)
-    assert data.labels is not None
-    mute = torch.arange(len(data.labels.windows)) % 2 == 0
+    assert data.pairs.labels is not None
+    mute = torch.arange(len(data.pairs.labels.windows)) % 2 == 0
     sensitivity = torch.where(mute, 0.0, 1.0).double()
-    silent = replace(data.labels, sensitivity=sensitivity)
+    silent = replace(data.pairs.labels, sensitivity=sensitivity)
     noise = torch.where(mute[:, None], silent.parameters.flip(0), silent.parameters)
     scrambled = replace(silent, parameters=noise)
     results = {}
     for weighted in (True, False):
         learner = ImitationLearner(weight_by_sensitivity=weighted, **QUICK)
-        one = learner.fit(GruPolicy(), replace(data, labels=silent))
-        two = learner.fit(GruPolicy(), replace(data, labels=scrambled))
+        one = learner.fit(GruPolicy(), replace(data, pairs=replace(data.pairs, labels=silent)))
+        two = learner.fit(GruPolicy(), replace(data, pairs=replace(data.pairs, labels=scrambled)))
         results[weighted] = same_weights(one, two)
     assert results == {True: True, False: False}
 
@@ -247,7 +251,7 @@ def test_labels_without_any_sensitivity_still_train() -> None:
 def test_only_the_training_part_is_read(head: str) -> None:
     """NaN after the split would reach every weight."""
     data = training_data(2)
-    after = torch.arange(data.batch.mask.shape[1]) > data.split.frame[:, None]
+    after = torch.arange(data.batch.mask.shape[1]) > data.pairs.split.frame[:, None]
     hidden = {}
     for name in ("leader_speed", "follower_speed", "follower_position", "leader_position"):
         hidden[name] = torch.where(after, torch.nan, getattr(data.batch, name))

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from cfx.learners import situations
+from cfx.learners.base import TrainingPairs
 from cfx.learners.situations import learned_range
 from tests.learners.made import training_data
 
@@ -19,10 +20,12 @@ def test_of_many_pairs_as_many_of_each_network_are_measured(
     rows = torch.tensor([0, 2, 4, 6, 8, 10])  # every second one of each network
     some = replace(
         data,
-        pair=data.pair[rows],
-        split=data.split[rows],
-        fixed=data.fixed[rows],
-        network=data.network[rows],
+        pairs=TrainingPairs(
+            index=data.pairs.index[rows],
+            split=data.pairs.split[rows],
+            network=data.pairs.network[rows],
+            fixed=data.pairs.fixed[rows],
+        ),
     )
     monkeypatch.setattr(situations, "_PAIRS_AT_MOST", 3)
     found, expected = learned_range(data), learned_range(some)

@@ -18,7 +18,7 @@ from cfx.data.pairs import PairSet
 from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.evaluation.protocols.folds import Together, assign_folds, describe_folds, learned_from
 from cfx.evaluation.protocols.held_out import HeldOut
-from cfx.learners.base import TrainingData, TrainingResult
+from cfx.learners.base import TrainingData, TrainingPairs, TrainingResult
 from cfx.policies.agent import Agent
 from cfx.policies.context import ContextRule
 from cfx.policies.heads.offset import shrunk
@@ -292,18 +292,20 @@ def _training_data(
     return TrainingData(
         simulator=context.simulator,
         recorded=context.batch,
-        pair=rows,
-        split=full[index],
+        pairs=TrainingPairs(
+            index=rows,
+            split=full[index],
+            network=network,
+            fixed=start,
+            base=base,
+            labels=labels,
+            drivers=tuple(context.pairs[number].driver for number in index.tolist()),
+            sites=tuple(context.pairs[number].site for number in index.tolist()),
+        ),
         windows=context.windows,
-        fixed=start,
-        labels=labels,
-        network=network,
         names=names,
         seed=context.seed,
         objective=context.objective,
-        base=base,
-        drivers=tuple(context.pairs[number].driver for number in index.tolist()),
-        sites=tuple(context.pairs[number].site for number in index.tolist()),
         workspace=context.workspace,
         engine=context.engine,
     )

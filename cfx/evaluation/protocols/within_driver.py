@@ -18,7 +18,7 @@ from cfx.evaluation.platoon import measure_platoons
 from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.evaluation.result import Platoon
 from cfx.evaluation.shards import simulate_in_shards
-from cfx.learners.base import TrainingData
+from cfx.learners.base import TrainingData, TrainingPairs
 from cfx.policies.agent import Agent
 from cfx.policies.default import DefaultPolicy
 from cfx.policies.fixed import FixedPolicy
@@ -58,17 +58,19 @@ class WithinDriver(Protocol):
             training_data = TrainingData(
                 simulator=context.simulator,
                 recorded=batch,
-                pair=torch.arange(len(batch), device=batch.lengths.device),
-                split=split,
+                pairs=TrainingPairs(
+                    index=torch.arange(len(batch), device=batch.lengths.device),
+                    split=split,
+                    network=network,
+                    fixed=fixed,
+                    base=fixed if self.settings.networks == "all" else None,
+                    labels=labels,
+                    drivers=tuple(pair.driver for pair in pairs),
+                ),
                 windows=context.windows,
-                fixed=fixed,
-                labels=labels,
-                network=network,
                 names=names,
                 seed=context.seed,
                 objective=context.objective,
-                base=fixed if self.settings.networks == "all" else None,
-                drivers=tuple(pair.driver for pair in pairs),
                 workspace=context.workspace,
                 engine=context.engine,
             )

@@ -153,24 +153,24 @@ class RolloutDataset:
         if head is None:
             head = OffsetHead.for_model(training_data.simulator.model)
         recorded, row = _recorded_once(training_data)
-        batch = _single_precision(training_data.recorded, training_data.pair[recorded])
+        batch = _single_precision(training_data.recorded, training_data.pairs.index[recorded])
         device = batch.lengths.device
-        space, fixed = head.space, head.completed(training_data.fixed)
-        grid = Grid(training_data.network.to(device), len(training_data.names))
+        space, fixed = head.space, head.completed(training_data.pairs.fixed)
+        grid = Grid(training_data.pairs.network.to(device), len(training_data.names))
         pairs = torch.arange(len(row), device=device)
         pair = grid.scatter(pairs).repeat_interleave(ensemble_size, 0)
         present = grid.scatter(torch.ones_like(pairs)).bool().repeat_interleave(ensemble_size, 0)
         pooled = grid.mean(space.to_unit(fixed)).float()
-        last = training_data.split.frame.to(device)[pair]
+        last = training_data.pairs.split.frame.to(device)[pair]
         validation = _validation_drivers(training_data, pair.cpu(), present.cpu(), share, generator)
         kept, few = validation.kept.to(device), validation.few.to(device)[:, None]
         trains = present & (few | ~kept)
         until = torch.where(few, (last * (1.0 - share)).long(), last)
-        if training_data.base is None:
+        if training_data.pairs.base is None:
             base = space.to_unit(fixed).float()
         else:
-            base = space.to_unit(head.completed(training_data.base)).float()
-        frame = training_data.split.frame.to(device)[recorded]
+            base = space.to_unit(head.completed(training_data.pairs.base)).float()
+        frame = training_data.pairs.split.frame.to(device)[recorded]
         seen = _measured_tokens(training_data, policy, batch, frame)
         driver_features = _driver_features(training_data, policy, batch, frame)
         of_driver = row[pair]
@@ -373,10 +373,10 @@ def _chance(
     """
     if balance == 0:
         return None
-    pairs = len(training_data.pair)
-    drivers = training_data.drivers or tuple(str(number) for number in range(pairs))
-    sites = training_data.sites or ("",) * pairs
-    frames = training_data.split.frame.cpu()
+    pairs = len(training_data.pairs)
+    drivers = training_data.pairs.drivers or tuple(str(number) for number in range(pairs))
+    sites = training_data.pairs.sites or ("",) * pairs
+    frames = training_data.pairs.split.frame.cpu()
     found = torch.zeros(pair.shape, dtype=torch.float64)
     for network, row in enumerate(pair.cpu()):
         own = row[present[network].cpu()].tolist()
@@ -395,8 +395,8 @@ def _recorded_once(training_data: TrainingData) -> tuple[Tensor, Tensor]:
     Returns:
         Which of the P pairs these are, `(U,)`, and which one of these stands for each, `(P,)`.
     """
-    frame = training_data.split.frame.to(training_data.device)
-    marks = torch.stack([training_data.pair.to(frame), frame], 1)
+    frame = training_data.pairs.split.frame.to(training_data.device)
+    marks = torch.stack([training_data.pairs.index.to(frame), frame], 1)
     _, group = torch.unique(marks, dim=0, return_inverse=True)
     number = torch.arange(len(group), device=group.device)
     first = torch.full_like(number, len(group)).scatter_reduce(0, group, number, "amin")
@@ -407,8 +407,8 @@ def _recorded_once(training_data: TrainingData) -> tuple[Tensor, Tensor]:
 def time_gaps(training_data: TrainingData) -> Tensor:
     """Returns each driver's usual time gap in the training part, `(P,)`, s."""
     recorded, row = _recorded_once(training_data)
-    last = training_data.split.frame.to(training_data.device)[recorded]
-    return _usual_time_gaps(training_data.recorded, last, training_data.pair[recorded])[row]
+    last = training_data.pairs.split.frame.to(training_data.device)[recorded]
+    return _usual_time_gaps(training_data.recorded, last, training_data.pairs.index[recorded])[row]
 
 
 def _usual_time_gaps(batch: PairBatch, last: Tensor, pair: Tensor | None = None) -> Tensor:
@@ -455,9 +455,9 @@ def _validation_drivers(
     generator: torch.Generator,
 ) -> _Validation:
     """Chooses validation drivers for each network; all pairs of a driver stay together."""
-    drivers = training_data.drivers
+    drivers = training_data.pairs.drivers
     if drivers is None:
-        drivers = tuple(str(number) for number in range(len(training_data.pair)))
+        drivers = tuple(str(number) for number in range(len(training_data.pairs)))
     kept, few = torch.zeros_like(present), torch.zeros(len(pair), dtype=torch.bool)
     for network in range(len(pair)):
         places = present[network].nonzero()[:, 0].tolist()

@@ -175,7 +175,9 @@ class RolloutLearner(Learner):
         """Returns the networks with the situations that they have learned from."""
         head = head_class(self.settings.head).for_model(training_data.simulator.model)
         found = _training_result(network, dataset, training_data, curves, head)
-        has_cold_starts = training_data.base is not None and self.settings.cold_start_fraction > 0
+        has_cold_starts = (
+            training_data.pairs.base is not None and self.settings.cold_start_fraction > 0
+        )
         augment = None
         if has_cold_starts:
             generator = torch.Generator().manual_seed(training_data.seed)
@@ -204,6 +206,6 @@ def _training_result(
         network=network,
         scaler=Scaler(dataset.scaler.mean[first].clone(), dataset.scaler.scale[first].clone()),
         curves=curves,
-        base=head.space.from_unit(dataset.pooled[first].to(training_data.fixed.dtype)),
+        base=head.space.from_unit(dataset.pooled[first].to(training_data.pairs.fixed.dtype)),
         head=head.name,
     )

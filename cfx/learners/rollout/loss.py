@@ -78,7 +78,7 @@ class BaseErrors:
         networks, drivers = dataset.pair.shape
         own = dataset.base
         pooled = dataset.pooled[:, None].expand(-1, drivers, -1)
-        if training_data.base is None:
+        if training_data.pairs.base is None:
             pooled = own
         pair = torch.cat([dataset.pair, dataset.pair], 1)[..., None].to(own.dtype)
         wanted = torch.cat([pair, torch.cat([own, pooled], 1)], -1)
@@ -169,8 +169,8 @@ class _ConstantParameters:
         self.simulator = training_data.simulator
         self.objective = training_data.objective
         self.batch = training_data.recorded
-        self.pair = training_data.pair[dataset.recordings.pair]
-        frame = training_data.split.frame.to(dataset.recordings.pair.device)
+        self.pair = training_data.pairs.index[dataset.recordings.pair]
+        frame = training_data.pairs.split.frame.to(dataset.recordings.pair.device)
         self.last = frame[dataset.recordings.pair]
         self.bases = bases
 

@@ -137,7 +137,7 @@ class RolloutModule(BatchedModule):
             dataset,
             settings,
             windows.stride,
-            has_cold_starts=training_data.base is not None,
+            has_cold_starts=training_data.pairs.base is not None,
             seed=training_data.seed,
         )
         if settings.time_weighting == "relative":

@@ -23,7 +23,7 @@ from torch import Tensor
 from cfx.core.component import content_key, folder_hash
 from cfx.core.engine.local import LocalEngine
 from cfx.learners import base
-from cfx.learners.base import TrainingData
+from cfx.learners.base import TrainingData, TrainingPairs
 from cfx.learners.rollout.dataset import RolloutDataset
 from cfx.learners.rollout.loss import BaseErrors
 from cfx.learners.rollout.settings import RolloutSettings
@@ -55,7 +55,7 @@ def checkpoint_path(
         "code": folder_hash(base.__file__),
         "trajectories": _digest(training_data),
         "names": training_data.names,
-        "drivers": training_data.drivers,
+        "drivers": training_data.pairs.drivers,
         "seed": training_data.seed,
     }
     return training_data.workspace / f"{content_key(description)}.ckpt"
@@ -69,13 +69,13 @@ def _digest(training_data: TrainingData) -> str:
         batch.leader_speed,
         batch.follower_position,
         batch.follower_speed,
-        training_data.pair,
-        training_data.split.frame,
-        training_data.fixed,
-        training_data.network,
+        training_data.pairs.index,
+        training_data.pairs.split.frame,
+        training_data.pairs.fixed,
+        training_data.pairs.network,
     ]
-    if training_data.base is not None:
-        tensors.append(training_data.base)
+    if training_data.pairs.base is not None:
+        tensors.append(training_data.pairs.base)
     digest = hashlib.sha256()
     for tensor in tensors:
         digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
@@ -228,18 +228,18 @@ def _weights(network: PolicyNetwork, networks: slice) -> dict[str, Tensor]:
 def _of_networks(training_data: TrainingData, ensemble_size: int, networks: slice) -> TrainingData:
     """Returns what is said of some networks; their pairs are left to the dataset."""
     names = slice(networks.start // ensemble_size, networks.stop // ensemble_size)
-    base = training_data.base
+    pairs = training_data.pairs
     return replace(
         training_data,
         recorded=training_data.recorded[:0],
-        pair=training_data.pair[:0],
-        split=training_data.split[:0],
-        fixed=training_data.fixed[:0],
-        base=None if base is None else base[:0],
-        labels=None,
-        network=training_data.network[:0],
+        pairs=TrainingPairs(
+            index=pairs.index[:0],
+            split=pairs.split[:0],
+            network=pairs.network[:0],
+            fixed=pairs.fixed[:0],
+            base=None if pairs.base is None else pairs.base[:0],
+        ),
         names=training_data.names[names],
-        drivers=None,
         workspace=None,
         engine=LocalEngine(),
     )
@@ -289,13 +289,16 @@ def for_experts(
 ) -> tuple[TrainingData, RolloutDataset]:
     """Returns what experts learn from: the same trajectories, to be driven by `Direct`."""
     simulator = MemoryStepper(Direct(), training_data.simulator.dt)
-    space, fixed = simulator.model.adaptation_space, training_data.fixed
+    space, fixed = simulator.model.adaptation_space, training_data.pairs.fixed
     default = space.defaults(dtype=fixed.dtype, device=fixed.device)
     expert_fixed = default.expand(len(fixed), -1)
     expert_data = replace(
         training_data,
         simulator=simulator,
-        fixed=expert_fixed,
-        base=None if training_data.base is None else expert_fixed,
+        pairs=replace(
+            training_data.pairs,
+            fixed=expert_fixed,
+            base=None if training_data.pairs.base is None else expert_fixed,
+        ),
     )
     return expert_data, dataset.for_base(space.to_unit(default).float())

@@ -71,7 +71,7 @@ def test_some_cold_starts_are_faster_and_their_gap_fits() -> None:
 
 
 def test_time_gaps_are_those_of_people() -> None:
-    found = usual_time_gap(DATA.batch, DATA.split.frame)
+    found = usual_time_gap(DATA.batch, DATA.pairs.split.frame)
     assert bool(((found >= 0.8) & (found <= 2.5)).all())
 
 

@@ -24,7 +24,7 @@ def test_errors_of_the_base_are_those_of_constant_parameters() -> None:
     # The true parameters drive as the drivers did.
     with_history = errors.over_windows[errors.own]
     assert float(with_history[..., :30, 0].max()) < 1e-3
-    result = untrained(replace(data, base=None), gru())
+    result = untrained(replace(data, pairs=replace(data.pairs, base=None)), gru())
     found = loop(result, data, gru())
     squares = (found.speed - data.batch.follower_speed).square()[:, 1:]
     near = {"rtol": 1e-3, "atol": 1e-3}
@@ -65,10 +65,11 @@ def test_networks_that_share_pairs_and_bases_share_their_errors() -> None:
     errors = BaseErrors.of(data, dataset, 12)
     assert len(errors.over_windows) == 12
     assert torch.equal(errors.own[0], errors.own[2])
-    one = data.split.frame[:6].clone()
+    one = data.pairs.split.frame[:6].clone()
     one[0] = 120  # one network's training part of a pair ends earlier
-    split = replace(data.split, frame=torch.cat([one, data.split.frame[6:]]))
-    assert len(placed(replace(data, split=split), gru(), 0.0).recordings.batch) == 7
+    split = replace(data.pairs.split, frame=torch.cat([one, data.pairs.split.frame[6:]]))
+    data = replace(data, pairs=replace(data.pairs, split=split))
+    assert len(placed(data, gru(), 0.0).recordings.batch) == 7
 
 
 def test_errors_of_some_networks_are_those_of_all() -> None:

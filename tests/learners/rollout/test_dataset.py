@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from cfx.calibration.prior import squashed
+from cfx.learners.base import TrainingPairs
 from cfx.learners.rollout import dataset as dataset_module
 from cfx.learners.rollout.dataset import RolloutDataset, time_gaps
 from cfx.learners.rollout.loss import BaseErrors
@@ -18,13 +19,13 @@ from tests.learners.made import TRUE, batch_of, gru, placed, training_data
 def test_networks_read_the_driver_features_of_each_of_their_drivers() -> None:
     """The mean of the training drivers stands for those that are unknown, and for cold starts."""
     data = training_data(networks=1, base=TRUE)
-    data.split.frame[1] = 120
+    data.pairs.split.frame[1] = 120
     policy = gru(driver_features=("time_gap", "time_headway"))
     dataset = placed(data, policy)
     cold_start = torch.tensor([[True, False, False, False, False, False]])
     start = torch.zeros_like(cold_start).long()
     features = dataset.condition(batch_of(dataset, start, cold_start)).features
-    frame = data.split.frame
+    frame = data.pairs.split.frame
     expected = measure(data.batch, policy.driver_features, 0.1, 0 * frame, frame).float()
     torch.testing.assert_close(features[0, 2:, 2:], expected[dataset.pair[0, 2:]])
     usual = dataset.scaler.mean[:, -2:].expand(2, -1)
@@ -56,11 +57,13 @@ def test_a_network_of_few_drivers_keeps_the_end_of_their_trajectories() -> None:
     data = training_data(networks=1)
     few = replace(
         data,
-        pair=data.pair[:2],
-        split=data.split[torch.arange(2)],
-        fixed=data.fixed[:2],
-        network=data.network[:2],
-        drivers=("a", "b"),
+        pairs=TrainingPairs(
+            index=data.pairs.index[:2],
+            split=data.pairs.split[torch.arange(2)],
+            network=data.pairs.network[:2],
+            fixed=data.pairs.fixed[:2],
+            drivers=("a", "b"),
+        ),
     )
     dataset = placed(few, gru())
     assert bool((dataset.trains & dataset.validates).all())
@@ -98,5 +101,5 @@ def test_pairs_that_are_read_some_after_the_other_are_the_same(
 def test_training_data_hold_each_recording_once() -> None:
     data = training_data(networks=3)
     assert len(data.recorded) == 6
-    assert len(data.batch) == len(data.pair) == 18
+    assert len(data.batch) == len(data.pairs) == 18
     assert torch.equal(data.batch.follower_speed[6:12], data.recorded.follower_speed)

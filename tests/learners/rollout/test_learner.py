@@ -48,7 +48,7 @@ def test_untrained_it_is_the_fixed_model(has_base: bool) -> None:
     """With the pooled base and with driver-specific ones, to the last bits."""
     own = TRUE.repeat(2, 1)
     policy, data = gru(), training_data(base=own)
-    expected = own if has_base else data.fixed
+    expected = own if has_base else data.pairs.fixed
     found = loop(untrained(data, policy), data, policy, first=100, base=own if has_base else None)
     constant = expected[:, None].expand_as(found.parameters)
     torch.testing.assert_close(found.parameters, constant, rtol=0, atol=1e-6)
@@ -91,7 +91,7 @@ def test_it_minimises_the_objective_of_the_job(objective: Objective) -> None:
     result = RolloutLearner(**options).fit(policy, data)
     curve = result.curves.groupby("epoch").train_loss.mean()
     assert curve.iloc[-1] < curve.iloc[0]
-    default = RolloutLearner(**options).fit(policy, training_data(base=data.base))
+    default = RolloutLearner(**options).fit(policy, training_data(base=data.pairs.base))
     assert default.curves.train_loss.tolist() != result.curves.train_loss.tolist()
 
 

@@ -48,7 +48,7 @@ def test_training_simulates_what_evaluation_simulates(
     dataset.scaler = result.scaler
     module = RolloutModule(result.network, dataset, policy, data, settings)
     if driver_features:  # training measures full trajectories, evaluation what was before
-        frame = torch.full_like(data.network, 200)
+        frame = torch.full_like(data.pairs.network, 200)
         measured = measure(data.batch, driver_features, 0.1, 0 * frame, frame)
         dataset.recordings.driver_features = measured.float()
     batch = batch_of(dataset, torch.full((1, 6), 40))
