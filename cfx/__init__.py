@@ -9,7 +9,6 @@ change. Importing cfx imports nothing heavy: each name is loaded when it is firs
 
 from __future__ import annotations
 
-import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -61,9 +60,6 @@ if TYPE_CHECKING:
     from cfx.simulation.trajectory import Start as Start
 
     __version__: str
-
-# MLflow reports its use to its makers unless told not to; nothing goes to the network unasked.
-os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
 
 _HOMES = {
     "run": "cfx.app.application",

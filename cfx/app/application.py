@@ -42,6 +42,7 @@ from cfx.app.sweep import (
 from cfx.app.user_errors import explain, is_user_error
 from cfx.core import registry
 from cfx.core.errors import CfxError, ConfigError, Terminated, printable, without_passwords
+from cfx.core.guest import default_torch, guest
 from cfx.core.memory import is_out_of_memory
 from cfx.core.plugin_errors import blame
 from cfx.core.signals import raise_if_terminated, signal_behind, terminable
@@ -253,7 +254,9 @@ def _call_hydra(job: JobFunction, arguments: Sequence[str]) -> None:
     application = hydra.main(
         config_path=str(nodes.conf_dir()), config_name="config", version_base="1.3"
     )
-    with _process_state(arguments):
+    with guest(), terminable():
+        sys.argv = ["cfx", *arguments]
+        os.environ["HYDRA_FULL_ERROR"] = "1"
         hydra_source.register()
         application(job)()
 
@@ -261,7 +264,8 @@ def _call_hydra(job: JobFunction, arguments: Sequence[str]) -> None:
 def run(overrides: Sequence[str] = (), *, run_job: RunJob | None = None) -> JobResult:
     """Runs the job that `python -m cfx OVERRIDES` runs.
 
-    It runs in this process, and writes into a new output folder.
+    It runs in this process, and writes into a new output folder. What belongs to the process is
+    afterwards as it was: see `cfx.core.guest`.
 
     Args:
         overrides: as on the command line: `["model=w99", "data.max_pairs=10"]`.
@@ -271,6 +275,14 @@ def run(overrides: Sequence[str] = (), *, run_job: RunJob | None = None) -> JobR
     """
     if isinstance(overrides, str):
         raise ConfigError(f"give a list of overrides: cfx.run({overrides.split()!r})")
+    import torch  # noqa: F401 - a guest puts the state of what is there already back
+
+    with guest(), default_torch():
+        return _compose_and_run(overrides, run_job)
+
+
+def _compose_and_run(overrides: Sequence[str], run_job: RunJob | None) -> JobResult:
+    """Does what `run` promises."""
     try:
         config = hydra_source.composed(overrides)
         values = hydra_source.plain(config)
@@ -403,35 +415,6 @@ def _new_folder(folder: Path) -> Path:
             raise ConfigError(explain(error, ())) from None
         else:
             return candidate
-
-
-@contextlib.contextmanager
-def _process_state(arguments: Sequence[str]) -> Iterator[None]:
-    """Lends Hydra the process: arguments, environment, logging and SIGTERM come back afterwards."""
-    root = logging.getLogger()
-    handlers = list(root.handlers)
-    level = root.level
-    argv = sys.argv
-    before = os.environ.get("HYDRA_FULL_ERROR")
-    sys.argv = ["cfx", *arguments]
-    os.environ["HYDRA_FULL_ERROR"] = "1"
-    try:
-        with terminable():
-            yield
-    finally:
-        sys.argv = argv
-        if before is None:
-            os.environ.pop("HYDRA_FULL_ERROR", None)
-        else:
-            os.environ["HYDRA_FULL_ERROR"] = before
-        for handler in list(root.handlers):
-            if handler not in handlers:
-                root.removeHandler(handler)
-                handler.close()
-        for handler in handlers:
-            if handler not in root.handlers:
-                root.addHandler(handler)
-        root.setLevel(level)
 
 
 @contextlib.contextmanager

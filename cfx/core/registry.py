@@ -33,6 +33,7 @@ from pydantic.fields import FieldInfo
 from cfx.core.component import API_VERSION, Component, Settings, validate
 from cfx.core.errors import CfxError, ConfigError, PluginError, Terminated, nearest
 from cfx.core.extras import advice
+from cfx.core.guest import same_environment
 
 log = logging.getLogger(__name__)
 
@@ -556,7 +557,8 @@ def _entries(distribution: importlib.metadata.Distribution) -> Iterator[Entry]:
 def _import(found: Entry) -> Any:
     module, _, attribute = found.target.partition(":")
     try:
-        imported = importlib.import_module(module)
+        with same_environment():  # libraries set variables as they are imported
+            imported = importlib.import_module(module)
         return functools.reduce(getattr, attribute.split("."), imported)
     except (KeyboardInterrupt, Terminated):
         raise

@@ -28,6 +28,11 @@ def limit_cores(count: int | None) -> None:
     _LIMIT[:] = [] if count is None else [count]
 
 
+def cores_limit() -> int | None:
+    """Returns what `limit_cores` was last called with."""
+    return _LIMIT[0] if _LIMIT else None
+
+
 def own_cores(count: int) -> None:
     """Says how many of the machine's cores this process has, where no job asks for a number."""
     _OWN[:] = [count]

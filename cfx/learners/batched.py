@@ -8,10 +8,11 @@ Shapes: N networks.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
@@ -201,8 +202,6 @@ def fit(
         checkpoint: written after every epoch, so that interrupted training goes on there, and
             training that ended gives the same at once. None: no such file.
     """
-    for name in ("lightning.pytorch", "lightning.fabric"):
-        logging.getLogger(name).setLevel(logging.ERROR)
     is_gpu = device.type == "cuda"
     devices = [device] if is_gpu else []
     callbacks: list[pl.Callback] = []
@@ -210,7 +209,7 @@ def fit(
         callbacks.append(EveryEpoch(checkpoint))
     with torch.random.fork_rng(devices=devices):
         torch.manual_seed(seed)
-        with warnings.catch_warnings(), one_thread():
+        with warnings.catch_warnings(), one_thread(), _quiet_lightning():
             warnings.filterwarnings("ignore", module=r"lightning\.")
             # torch's compiler looks at everything that it is given.
             of_compiler = r"The \.grad attribute of a Tensor that is not a leaf"
@@ -233,6 +232,20 @@ def fit(
             _run(trainer, module, data, checkpoint)
     module.restore_best()
     module.network.to(device).eval()
+
+
+@contextlib.contextmanager
+def _quiet_lightning() -> Iterator[None]:
+    """Keeps Lightning's messages about devices and epochs off the terminal."""
+    loggers = [logging.getLogger(f"lightning.{name}") for name in ("pytorch", "fabric")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
 
 
 class EveryEpoch(ModelCheckpoint):

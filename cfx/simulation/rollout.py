@@ -26,6 +26,7 @@ from torch import Tensor
 
 from cfx.core.component import folder_hash
 from cfx.core.errors import ParameterError
+from cfx.core.guest import same_environment
 from cfx.core.threads import one_thread
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.simulation.base import Stepper
@@ -254,6 +255,7 @@ def _frames(leader: Leader, first: int, last: int) -> Leader:
     )
 
 
+@same_environment()
 def simulate(
     model: DrivingModel,
     parameters: Tensor | Mapping[str, Tensor | float] | None,

@@ -8,6 +8,7 @@ from pathlib import Path
 import pandas as pd
 
 from cfx.core.errors import DataError
+from cfx.core.guest import guest
 from cfx.core.job_folder import examine
 from cfx.data.style import StyleResult
 from cfx.evaluation.headline import headline
@@ -57,6 +58,7 @@ class JobResult:
         return f"JobResult({', '.join(said)},\n  folder={str(self.folder)!r})"
 
 
+@guest()
 def load(folder_or_run: str | Path) -> JobResult:
     """Reads a finished job back.
 
