@@ -44,7 +44,8 @@ class Section(Component):
     - `figure(views, label, chooser)`: `View`s by what the reader chooses.
     - `caption(name)`: what a reader needs to know of a figure.
     - `fold(summary, unfolded, style)`: what a click shows, as `{% call fold("More") %}`.
-    - `cards(headed)`: figures beside each other, each with a heading and a smaller remark.
+    - `cards(name, headed)`: the figure of that name of several jobs beside each other; `headed` has
+      a heading, a smaller remark and a job for each.
     - `missing(file, what)`: a remark on the jobs that lack a file.
 
     Attributes:

@@ -29,7 +29,8 @@ class Further(Section):
 <p>{{ words }}</p>
 {{ table(sheet, compact=true, explain=true) }}
 {{ figure(views, "a figure", "Show") }}
-{{ cards([("in a card", "fine print", drawn("drives", runs.jobs[0])), ("empty", "", "")]) }}
+{{ cards("drives", [("in a card", "fine print", runs.jobs[0])]) }}
+{{ cards("platoon", [("no card", "", runs.jobs[0])]) }}
 {% call fold("a fold", true) %}{% call fold("a fold inside") %}far inside{% endcall %}{% endcall %}
 {{ drawn_folds("drives", runs.jobs) }}
 {{ missing("curves.parquet", "what was learned") }}
@@ -109,6 +110,7 @@ def test_a_further_section_needs_nothing_but_a_template_and_its_context(
         "what was learned; this job has no curves.parquet",
     ):
         assert words in found.words
+    assert "no card" not in found.words
     assert found.having("aria-label").count("a figure") == 1
     title = "Speed and gap of the best, the median and the worst pair"
     assert found.having("aria-label").count(title) == 2

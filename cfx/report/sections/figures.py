@@ -32,11 +32,7 @@ class StyleSection(Section):
     figures = ("style_distribution",)
     template = """
 <p>{{ caption("style_distribution") }}</p>
-{% set headed = [] %}
-{% for names, job in scorings %}
-{{ headed.append((names, "", drawn("style_distribution", job))) or "" }}
-{% endfor %}
-{{ cards(headed) }}
+{{ cards("style_distribution", scorings) }}
 {{ missing("style.csv", "the distribution of the style scores") }}
 """
 
@@ -49,7 +45,8 @@ class StyleSection(Section):
                 scoring = hashlib.sha256(table.encode()).hexdigest()
                 jobs.setdefault(scoring, []).append(job)
         named = len(jobs) > 1
-        return {"scorings": [(job_names(one) if named else "", one[0]) for one in jobs.values()]}
+        scorings = [(job_names(one) if named else "", "", one[0]) for one in jobs.values()]
+        return {"scorings": scorings}
 
 
 class LearningSection(Section):
@@ -61,11 +58,7 @@ class LearningSection(Section):
     figures = ("learning_curve",)
     template = """
 <p>{{ caption("learning_curve") }}</p>
-{% set headed = [] %}
-{% for job, networks in learned %}
-{{ headed.append((job.name, "(" ~ networks ~ ")", drawn("learning_curve", job))) or "" }}
-{% endfor %}
-{{ cards(headed) }}
+{{ cards("learning_curve", learned) }}
 {% if without %}<p class="fine">Nothing was learned in {{ without }}.</p>{% endif %}
 {{ missing("curves.parquet", "the learning curves") }}
 """
@@ -76,7 +69,8 @@ class LearningSection(Section):
         for job in runs.jobs:
             table = job.tables.get("curves")
             if table is not None and len(table):
-                learned.append((job, plural(int(table["network"].nunique()), "network")))
+                networks = plural(int(table["network"].nunique()), "network")
+                learned.append((job.name, f"({networks})", job))
             elif table is not None:
                 without.append(job)
         names = job_names(without) if len(without) <= MOST else f"{len(without)} jobs"
@@ -92,9 +86,7 @@ class HistorySection(Section):
     figures = ("history",)
     template = """
 <p>{{ caption("history") }}</p>
-{% set headed = [] %}
-{% for job in jobs %}{{ headed.append((job.name, "", drawn("history", job))) or "" }}{% endfor %}
-{{ cards(headed) }}
+{{ cards("history", varied) }}
 {{ table(amounts) }}
 """
 
@@ -105,7 +97,8 @@ class HistorySection(Section):
         for job in jobs:
             for one in history_curves(job.tables["history"]).to_dict("records"):
                 rows.append({"job": job.name, **{str(key): one[key] for key in one}})
-        return {"jobs": jobs, "amounts": Sheet.of(_AMOUNTS, rows)} if jobs else None
+        varied = [(job.name, "", job) for job in jobs]
+        return {"varied": varied, "amounts": Sheet.of(_AMOUNTS, rows)} if jobs else None
 
 
 _AMOUNTS: tuple[Column[dict[str, Any]], ...] = (
