@@ -72,7 +72,9 @@ class TrackingSettings(Settings):
 
     enabled: bool = Field(True, description="log the job to MLflow")
     uri: str | None = Field(
-        None, description="tracking store; null: MLFLOW_TRACKING_URI, or SQLite beside the outputs"
+        None,
+        description="this job's tracking store; null: MLFLOW_TRACKING_URI, or SQLite beside the"
+        " outputs",
     )
     experiment: str = Field("cfx", min_length=1, description="MLflow's experiment")
 

@@ -83,16 +83,18 @@ def default_store() -> Path:
 def tracking_uri(configured: str | None, default: Path | None = None) -> str:
     """Returns the tracking URI, always absolute.
 
-    It is `MLFLOW_TRACKING_URI`, else the config's, else SQLite at `default`.
+    It is the config's, which somebody has set for this job; else `MLFLOW_TRACKING_URI`; else SQLite
+    at `default`.
 
     Raises:
         TrackingError: it is neither a database nor a server.
     """
+    if configured:
+        return absolute_uri(configured, "tracking.uri")
     of_environment = os.environ.get("MLFLOW_TRACKING_URI")
     if of_environment:
         return absolute_uri(of_environment, "MLFLOW_TRACKING_URI")
-    uri = configured or f"sqlite:///{default or default_store()}"
-    return absolute_uri(uri, "tracking.uri")
+    return absolute_uri(f"sqlite:///{default or default_store()}", "tracking.uri")
 
 
 def absolute_uri(uri: str, said_by: str) -> str:

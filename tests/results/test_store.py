@@ -141,14 +141,15 @@ def test_a_server_that_does_not_answer() -> None:
         open_store(f"http://127.0.0.1:{port}", "cfx")
 
 
-def test_the_address_is_the_environments_then_the_configs_then_beside_the_outputs(
+def test_the_address_is_the_jobs_then_the_environments_then_beside_the_outputs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert tracking_uri(None) == f"sqlite:///{tmp_path}/outputs/mlflow.db"
     assert tracking_uri("sqlite:///mine/a.db") == f"sqlite:///{tmp_path}/mine/a.db"
     assert tracking_uri("http://host:5000") == "http://host:5000"
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "sqlite:///env.db")
-    assert tracking_uri("sqlite:///mine/a.db") == f"sqlite:///{tmp_path}/env.db"
+    assert tracking_uri("sqlite:///mine/a.db") == f"sqlite:///{tmp_path}/mine/a.db"
+    assert tracking_uri(None) == f"sqlite:///{tmp_path}/env.db"
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "")
     assert tracking_uri("postgresql+psycopg2://u@h/db") == "postgresql+psycopg2://u@h/db"
 

@@ -15,12 +15,13 @@ from torch import Tensor
 
 from cfx import DrivingModel
 from cfx.calibration.flatness import COLUMN
-from cfx.core.errors import ConfigError, DataError
+from cfx.core.errors import ConfigError, DataError, listed
 from cfx.core.files import write_output
-from cfx.core.job_folder import examine, parse_yaml
+from cfx.core.job_folder import examine, parse_json, parse_yaml
 from cfx.core.registry import create
 from cfx.models.vtype import InSumo, VType
 from cfx.results.store import folder_of
+from cfx_sumo.limits import lost_limits
 
 NAME = "drivers.add.xml"
 
@@ -54,6 +55,11 @@ def export(run: str | Path, output: str | Path | None = None) -> list[str]:
     node, table = _read(folder)
     kind, notes = vtypes(node, table)
     notes += _undetermined(table)
+    step = _time_step(folder)
+    notes.append(
+        f"the parameters belong to steps of {step:g} s; SUMO's own step is 1 s unless it is told"
+        " otherwise"
+    )
     path = Path(output).expanduser() if output else home / NAME
     write_output(path, _xml(table, kind, notes), "the list of vTypes")
     first = quoteattr(str(table["cluster"].iloc[0]))
@@ -64,8 +70,8 @@ def export(run: str | Path, output: str | Path | None = None) -> list[str]:
         f"vTypes of SUMO's {kind.car_follow_model}, in one vTypeDistribution for each cluster:"
         f" {', '.join(counts)}; all together in '{ALL_DRIVERS}'",
         *[f"Note: {note}" for note in notes],
-        f"Use it: sumo --additional-files {path.absolute()}; then in a flow or vehicle:"
-        f' type="{ALL_DRIVERS}", or type={first}',
+        f"Use it: sumo --step-length {step:g} --additional-files {path.absolute()}; then in a flow"
+        f' or vehicle: type="{ALL_DRIVERS}", or type={first}',
     ]
 
 
@@ -97,7 +103,14 @@ def vtypes(node: Mapping[str, Any], table: pd.DataFrame) -> tuple[VType, list[st
             f"SUMO has no car-following model that drives as model={node['name']}; export jobs with"
             " model=idm, krauss, w99, krauss_sumo, idm_sumo or sumo_vtype"
         )
-    return model.sumo_vtype(p), notes
+    kind = model.sumo_vtype(p)
+    lost = lost_limits(model, kind)
+    if lost:
+        notes.append(
+            f"SUMO knows nothing of {listed(lost)}, with which the parameters were calibrated, and"
+            " keeps to accel, decel and emergencyDecel"
+        )
+    return kind, notes
 
 
 def _krauss(node: Mapping[str, Any], p: Mapping[str, Tensor]) -> tuple[DrivingModel, list[str]]:
@@ -149,6 +162,21 @@ def _read(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
             " that calibrated some"
         )
     return node, fixed
+
+
+def _time_step(folder: Path) -> float:
+    """Returns the time step in which a job calibrated, s; its policy says so."""
+    path = folder / "policy" / "policy.json"
+    try:
+        step = float(parse_json(path.read_text(encoding="utf-8"))["dt"])
+        if not 0 < step < np.inf:
+            raise ValueError(f"dt: {step}")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(
+            f"{path} does not say the time step ({error}); give the output folder that a job"
+            " printed"
+        ) from error
+    return step
 
 
 def _undetermined(table: pd.DataFrame) -> list[str]:

@@ -18,6 +18,7 @@ from cfx.models.w74 import W74
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import MemoryStepper
 from cfx_sumo.simulation.simulator import SumoSimulator
+from cfx_sumo.simulation.stepper import require_in_sumo
 from cfx_sumo.vtype import SumoVType
 
 pytestmark = pytest.mark.skipif(
@@ -130,6 +131,19 @@ def test_longer_time_steps_are_sumos_too(model: DrivingModel, dt: float, case: C
         sumo.advance(sumo.begin(far), case.part(0, 12), p)[2], expected, rtol=0.0, atol=1e-9
     )
     sumo.close()
+
+
+@pytest.mark.parametrize("model", [KRAUSS_SUMO, IDM_SUMO, W99])
+@pytest.mark.parametrize(
+    "changed", ["response_time=0.3", "acceleration=1.5", "emergency_deceleration=6"]
+)
+def test_limits_that_sumo_does_not_keep_to_are_refused(
+    model: type[DrivingModel], changed: str
+) -> None:
+    name, value = changed.split("=")
+    with pytest.raises(ConfigError, match=rf"knows nothing of model\.limits\.{changed}"):
+        require_in_sumo(model(limits={name: float(value)}))
+    require_in_sumo(model(limits={"comfortable_deceleration": 3.0}))
 
 
 def test_a_leader_of_length_0_is_where_its_rear_bumper_is(case: Case) -> None:

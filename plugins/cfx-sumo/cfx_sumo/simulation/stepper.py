@@ -13,10 +13,11 @@ from torch import Tensor
 
 from cfx import DrivingModel, Follower, Leader, Stepper
 from cfx.core.component import content_key, folder_hash
-from cfx.core.errors import ConfigError, SumoError
+from cfx.core.errors import ConfigError, SumoError, listed
 from cfx.core.threads import cores
 from cfx.models.vtype import InSumo, VType
 from cfx_sumo.installed import require_sumo
+from cfx_sumo.limits import lost_limits
 from cfx_sumo.simulation.schema import check_vtype
 from cfx_sumo.simulation.session import Session
 from cfx_sumo.simulation.worker import Array, Request
@@ -245,7 +246,8 @@ def require_in_sumo(model: DrivingModel) -> InSumo:
     """Returns the model as what SUMO drives.
 
     Raises:
-        ConfigError: SUMO does not have it, or not as it is set up, or knows no such attribute.
+        ConfigError: SUMO does not have it, or not as it is set up, or knows no such attribute or
+            limit.
         SumoError: SUMO is not installed, or another version.
     """
     require_sumo()
@@ -254,7 +256,14 @@ def require_in_sumo(model: DrivingModel) -> InSumo:
             f"simulator=sumo: SUMO has no car-following model {type(model).__name__}; choose"
             " model=krauss_sumo, idm_sumo, w99, krauss or sumo_vtype, or simulator=memory"
         )
-    check_vtype(model.sumo_vtype(model.space.unpack(model.space.defaults())))
+    kind = model.sumo_vtype(model.space.unpack(model.space.defaults()))
+    check_vtype(kind)
+    lost = lost_limits(model, kind)
+    if lost:
+        raise ConfigError(
+            f"simulator=sumo: SUMO knows nothing of {listed(lost)}, and keeps to its vType's accel,"
+            " decel and emergencyDecel; leave it out, or choose simulator=memory"
+        )
     return model
 
 
