@@ -11,6 +11,9 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from cfx.data.pairs import PairSet
+from cfx.simulation.synthetic import SyntheticDataset
+
 pytest_plugins = ["tests.browser"]
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -18,6 +21,32 @@ ROOT = Path(__file__).resolve().parent.parent
 # A slow machine is no failure, and a failure must come again on the next run.
 settings.register_profile("cfx", deadline=None, derandomize=True, max_examples=50)
 settings.load_profile("cfx")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def simulated_anew() -> Iterator[list[bool]]:
+    """Simulates each synthetic recording once a session; while the list holds True, every time."""
+    anew = [False]
+    known: dict[str, PairSet] = {}
+    read = SyntheticDataset.read
+
+    def read_once(self: SyntheticDataset) -> PairSet:
+        key = self.settings.model_dump_json()
+        if anew[0] or key not in known:
+            known[key] = read(self)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SyntheticDataset, "read", read_once)
+        yield anew
+
+
+@pytest.fixture(autouse=True)
+def _simulates_anew(request: pytest.FixtureRequest, simulated_anew: list[bool]) -> Iterator[None]:
+    """Lets tests whose names say that synthetic recordings are tested simulate them."""
+    simulated_anew[0] = "synthetic" in request.node.nodeid
+    yield
+    simulated_anew[0] = False
 
 
 @pytest.fixture(scope="session")

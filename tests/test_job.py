@@ -25,6 +25,7 @@ from cfx.simulation.synthetic import SyntheticDataset
 QUICK = [
     "debug=quick",
     "data.pairs=3",
+    "data.platoon_size=1",
     "data.frames=200",
     "data.max_pairs=null",
     "figures.enabled=false",

@@ -245,7 +245,7 @@ def test_every_built_in_component_keeps_its_contract() -> None:
             assert registry.get(kind, name).kind == kind
 
 
-@pytest.mark.parametrize("kind", registry.KINDS)
+@pytest.mark.parametrize("kind", [kind for kind in registry.KINDS if kind != "table"])
 def test_a_class_that_leaves_its_contract_open_cannot_be_made(kind: str) -> None:
     module, _, name = registry.KINDS[kind].base.partition(":")
     base = getattr(importlib.import_module(module), name)

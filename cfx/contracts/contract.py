@@ -1,17 +1,16 @@
-"""What the checks of every kind share.
-
-Nothing here or in `cfx.contracts` needs pytest.
-"""
+"""What the contracts of all kinds share: finding the statements, checking them, reporting."""
 
 from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
-from cfx.core.errors import NotInstalledError, PluginError
+from cfx.core import registry
+from cfx.core.errors import NotInstalledError, PluginError, nearest
 
 Check = Callable[..., None]
 """Takes a component and checks one statement of its kind's contract.
@@ -30,12 +29,14 @@ class Contract:
 
     Attributes:
         kind: as in `cfx.get(kind, name)`.
-        checks: every statement that needs nothing but the component.
-        slow: those of them that take more than a second or two; `quick` leaves them out.
+        checks: every statement.
+        first: those that take milliseconds; a new component is held to them before a job uses it.
+        slow: those that take more than a second or two; `cfx plugins check` leaves them out.
     """
 
     kind: str
     checks: tuple[Check, ...]
+    first: tuple[Check, ...] = ()
     slow: frozenset[Check] = frozenset()
 
     @property
@@ -44,7 +45,9 @@ class Contract:
         return tuple(check for check in self.checks if check not in self.slow)
 
 
-def contract_of(module: str, kind: str, *, slow: Iterable[Check] = ()) -> Contract:
+def contract_of(
+    module: str, kind: str, *, first: Collection[Check] = (), slow: Collection[Check] = ()
+) -> Contract:
     """Returns the contract that a module's public functions are.
 
     Each takes the component first, under the name of its kind.
@@ -52,23 +55,65 @@ def contract_of(module: str, kind: str, *, slow: Iterable[Check] = ()) -> Contra
     Args:
         module: name of the module, which is imported already.
         kind: as in `cfx.get(kind, name)`.
-        slow: see `Contract`.
+        first, slow: see `Contract`.
     """
     checks = []
     for name, function in vars(sys.modules[module]).items():
         if name.startswith("_") or not inspect.isfunction(function):
             continue
         is_own = function.__module__ == module
-        parameters = list(inspect.signature(function).parameters)
-        if is_own and parameters and parameters[0] == kind:
+        if is_own and next(iter(inspect.signature(function).parameters), "") == kind:
             checks.append(function)
-    return Contract(kind, tuple(checks), frozenset(slow))
+    return Contract(kind, tuple(checks), tuple(first), frozenset(slow))
+
+
+def contract_for(kind: str) -> Contract:
+    """Returns the contract of a kind of component.
+
+    Raises:
+        PluginError: there is no such kind.
+    """
+    if kind not in registry.KINDS:
+        raise PluginError(
+            f"there is no contract for '{kind}'.{nearest(kind, registry.KINDS)}"
+            f" Known: {', '.join(registry.KINDS)}."
+        )
+    plural = registry.KINDS[kind].entry_points.removeprefix("cfx.")
+    found: Contract = import_module(f"cfx.contracts.{plural}").CONTRACT
+    return found
+
+
+def check_contract(component: Any, **further: Any) -> None:
+    """Holds a component to its contract, whose statements are named in what is raised.
+
+    Args:
+        component: with settings that make its work short.
+        further: what single statements can be given beside it, by name: a model's `equilibrium`
+            (gap at which nothing changes, m, of the common speed, m/s, and the parameters) and
+            `leader_deceleration` (m/s2, if it claims to avoid collisions), an optimizer's
+            `tolerance` (distance in unit space at which it may end from a known optimum), the
+            `model` that a simulator shall drive.
+
+    Raises:
+        AssertionError: statements that do not hold: what the contract is and why.
+        NotInstalledError: what the component needs to run is not installed.
+        TypeError: no statement takes one of `further`.
+    """
+    broken = list(violations(component, **further))
+    sentences = [f"{name}: {sentence}" for name, sentence in broken]
+    if sentences:
+        raise AssertionError("\n".join(sentences)) from None
 
 
 def violations(
-    contract: Contract, component: Any, *, quick: bool = True
+    component: Any, checks: Collection[Check] | None = None, **further: Any
 ) -> Iterator[tuple[str, str]]:
-    """Checks a component without pytest.
+    """Checks a component.
+
+    Args:
+        component: what must keep the contract of its kind.
+        checks: the statements; by default all.
+        further: see `check_contract`.
 
     Yields:
         For each statement that does not hold: the check's name, and what the contract is and why,
@@ -78,18 +123,25 @@ def violations(
     Raises:
         NotInstalledError: what the component needs to run is not installed.
         RuntimeError: Python was started with -O, which removes the assertions that make a check.
+        TypeError: no statement takes one of `further`.
     """
     if not __debug__:
         raise RuntimeError(
             "contract checks are made of assertions, which python -O removes;"
             " start python without -O"
         )
-    checks = contract.checks
-    if quick:
-        checks = contract.quick
-    for check in checks:
+    if checks is None:
+        checks = contract_for(component.kind).checks
+    wanted = {check: inspect.signature(check).parameters for check in checks}
+    unknown = sorted(
+        name for name in further if not any(name in taken for taken in wanted.values())
+    )
+    if unknown:
+        raise TypeError(f"no statement of this contract takes {', '.join(unknown)}")
+    for check, taken in wanted.items():
+        given = {name: value for name, value in further.items() if name in taken}
         try:
-            check(component)
+            check(component, **given)
         except NotApplicable:
             continue
         except NotInstalledError:
@@ -97,5 +149,22 @@ def violations(
         except (AssertionError, PluginError) as broken:
             yield check.__name__, str(broken)
         except Exception as error:  # a plugin may raise anything
-            sentence = f"the component raised {type(error).__name__}: {error}"
-            yield check.__name__, sentence.rstrip(": ")
+            yield check.__name__, f"the component raised {registry.in_words(error)}"
+
+
+def expect_tensor(
+    value: Any, what: str, shape: tuple[int, ...], dtype: Any, shape_in_words: str
+) -> None:
+    """Asserts that a component gives a tensor of a shape and a dtype."""
+    import torch
+
+    given = f"a {type(value).__name__}"
+    if isinstance(value, torch.Tensor):
+        given = f"the shape {tuple(value.shape)}"
+    assert isinstance(value, torch.Tensor) and value.shape == shape, (  # noqa: PT018 - one sentence
+        f"{what} gives {given}; it must give {shape_in_words}, here {shape}"
+    )
+    assert value.dtype == dtype, (
+        f"{what} gives {value.dtype} for {dtype}; a component computes in the dtype of what it is"
+        " given"
+    )

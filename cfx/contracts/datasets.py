@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from cfx.contracts.contract import contract_of
 from cfx.core.errors import CfxError, DataError
 from cfx.data.base import Dataset, DatasetSettings
-from cfx.data.pairs import SIGNALS, PairBatch
+from cfx.data.pairs import SIGNALS, PairBatch, PairSet
 
 
 def every_number_is_finite(dataset: Dataset) -> None:
-    pairs = dataset.load()
+    pairs = _loaded(dataset)
     for pair in pairs:
         for name in SIGNALS:
             assert bool(np.isfinite(getattr(pair, name)).all()), (
@@ -23,7 +24,7 @@ def every_number_is_finite(dataset: Dataset) -> None:
 
 
 def leaders_are_ahead_and_nobody_reverses(dataset: Dataset) -> None:
-    pairs = dataset.load()
+    pairs = _loaded(dataset)
     for pair in pairs:
         assert float(pair.gap.min()) > 0, (
             f"pair {pair.pair_id}: the gap is bumper to bumper, in m, and positive:"
@@ -36,7 +37,7 @@ def leaders_are_ahead_and_nobody_reverses(dataset: Dataset) -> None:
 
 
 def units_are_si(dataset: Dataset) -> None:
-    pairs = dataset.load()
+    pairs = _loaded(dataset)
     for pair in pairs:
         distance = float(pair.leader_position[-1] - pair.leader_position[0])
         integral = float(pair.leader_speed[1:].sum() * pair.dt)
@@ -47,14 +48,14 @@ def units_are_si(dataset: Dataset) -> None:
 
 
 def loading_again_gives_the_same(dataset: Dataset) -> None:
-    pairs = dataset.load()
+    pairs = _loaded(dataset)
     assert dataset.load().fingerprint == pairs.fingerprint, (
         "the same settings must give the same pairs: results are cached by them"
     )
 
 
 def pairs_stack(dataset: Dataset) -> None:
-    pairs = dataset.load()
+    pairs = _loaded(dataset)
     try:
         batch = PairBatch.of(pairs)
     except CfxError as error:
@@ -68,7 +69,7 @@ def pairs_stack(dataset: Dataset) -> None:
 
 
 def max_pairs_keeps_the_first_and_counts_the_rest(dataset: Dataset) -> None:
-    pairs = dataset.load()
+    pairs = _loaded(dataset)
     fewer = _with(dataset, max_pairs=1).load()
     assert [pair.pair_id for pair in fewer] == [pairs[0].pair_id], (
         "max_pairs keeps the first pairs, in the same order, for users to try a job on"
@@ -80,7 +81,7 @@ def max_pairs_keeps_the_first_and_counts_the_rest(dataset: Dataset) -> None:
 
 
 def asking_for_too_much_is_an_error(dataset: Dataset) -> None:
-    pairs = dataset.load()
+    pairs = _loaded(dataset)
     longest = max(len(pair) for pair in pairs)
     said = None
     try:
@@ -94,6 +95,16 @@ def asking_for_too_much_is_an_error(dataset: Dataset) -> None:
         "where no pair is long enough the DataError must name min_frames, for users to change:"
         f" {said}"
     )
+
+
+_known: WeakKeyDictionary[Dataset, PairSet] = WeakKeyDictionary()
+
+
+def _loaded(dataset: Dataset) -> PairSet:
+    """Loads a dataset once for all checks."""
+    if dataset not in _known:
+        _known[dataset] = dataset.load()
+    return _known[dataset]
 
 
 def _with(dataset: Dataset, **changes: object) -> Dataset:

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cfx.contracts.contract import NotApplicable, contract_of
+from cfx.contracts.contract import NotApplicable, contract_of, expect_tensor
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.evaluation.metrics.base import Metric, Trajectories
 
@@ -54,18 +54,16 @@ def trajectories(dtype: torch.dtype = torch.float64) -> Trajectories:
 
 
 def a_metric_gives_one_number_for_each_pair(metric: Metric) -> None:
-    values = metric.compute(trajectories())
-    assert isinstance(values, Tensor), f"`compute` must return a tensor, not {type(values)}"
-    assert values.shape == (PAIRS,), (
-        f"`compute` must give a number for each pair, {(PAIRS,)}, not {tuple(values.shape)}"
-    )
-    assert values.is_floating_point(), f"the numbers must be floating point, not {values.dtype}"
-    assert not bool(values.isinf().any()), (
-        "a number that is not defined is NaN, not infinite: it would make every mean infinite"
-    )
-    assert bool(values.isfinite().any()), (
-        "of ordinary trajectories at least one must have a number that is defined"
-    )
+    for dtype in (torch.float64, torch.float32):
+        values = metric.compute(trajectories(dtype))
+        given = values.dtype if isinstance(values, Tensor) and values.is_floating_point() else dtype
+        expect_tensor(values, "compute", (PAIRS,), given, "a number for each pair, (pairs,)")
+        assert not bool(values.isinf().any()), (
+            "a number that is not defined is NaN, not infinite: it would make every mean infinite"
+        )
+        assert bool(values.isfinite().any()), (
+            "of ordinary trajectories at least one must have a number that is defined"
+        )
 
 
 def frames_that_do_not_count_do_not_matter(metric: Metric) -> None:
@@ -167,4 +165,4 @@ def _same(values: Tensor, expected: Tensor, message: str) -> None:
     torch.testing.assert_close(values, expected, rtol=1e-9, atol=1e-12, equal_nan=True, msg=message)
 
 
-CONTRACT = contract_of(__name__, "metric")
+CONTRACT = contract_of(__name__, "metric", first=[a_metric_gives_one_number_for_each_pair])

@@ -11,7 +11,7 @@ from typing import Literal, get_args, get_origin
 import torch
 from torch import Tensor
 
-from cfx.contracts.contract import NotApplicable, contract_of
+from cfx.contracts.contract import NotApplicable, contract_of, expect_tensor
 from cfx.core.errors import CfxError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.simulation.rollout import simulate
@@ -39,8 +39,14 @@ _EXTREMES = (
 )
 
 
+def _require_equations(model: DrivingModel) -> None:
+    if model.needs_simulator:
+        raise NotApplicable(f"the model has equations in {model.needs_simulator} only")
+
+
 def _ordinary(model: DrivingModel) -> _Step:
     """Returns states as traffic has them and parameters drawn within the bounds, float64."""
+    _require_equations(model)
     draw = torch.Generator().manual_seed(0)
     unit = torch.rand((DRIVES, len(model.space)), generator=draw, dtype=torch.float64)
     return (*_states(model, draw), model.space.unpack(model.space.from_unit(unit)))
@@ -48,6 +54,7 @@ def _ordinary(model: DrivingModel) -> _Step:
 
 def _extreme(model: DrivingModel) -> _Step:
     """Returns all combinations of extreme states at 200 corners of the bounds, float64."""
+    _require_equations(model)
     states = torch.tensor(list(itertools.product(*_EXTREMES)), dtype=torch.float64)
     gap, v, v_l, a_l, a = states.unbind(dim=1)
     corner = torch.randint(
@@ -91,6 +98,7 @@ def constants_can_be_tuned_and_tuned_parameters_fixed(model: DrivingModel) -> No
 
 
 def every_tuned_parameter_changes_a_trajectory(model: DrivingModel) -> None:
+    _require_equations(model)
     for variant, said in _variants(model):
         moved = _largest_changes(variant)
         dead = [name for name, change in moved.items() if change < _FELT]
@@ -107,35 +115,67 @@ def keeps_shape_dtype_and_device(model: DrivingModel) -> None:
     for dtype in (torch.float64, torch.float32):
         follower, leader, p = _to(ordinary, dtype)
         speed = model.next_speed(follower, leader, p, DT)
-        memory = model.next_memory(follower, leader, p, DT, speed)
-        assert speed.shape == (DRIVES,), (
-            f"next_speed must give (*batch,), got {tuple(speed.shape)}: one speed for each follower"
-        )
-        assert speed.dtype == dtype, (
-            f"{dtype} states must give {dtype} speeds, got {speed.dtype}: a step is no place to"
-            " convert"
-        )
+        expect_tensor(speed, "next_speed", (DRIVES,), dtype, "(*batch,)")
         assert speed.device == follower.speed.device, (
             "the speed must stay on the device of the states: a step on a GPU must not wait for a"
             " copy"
         )
-        assert memory.shape == (DRIVES, model.memory_size), (
-            "next_memory must give (*batch, memory_size), which the next step is given"
+        memories = {
+            "next_memory": model.next_memory(follower, leader, p, DT, speed),
+            "initial_memory": model.initial_memory(speed),
+        }
+        for what, memory in memories.items():
+            shape = (DRIVES, model.memory_size)
+            expect_tensor(memory, what, shape, dtype, "(*batch, memory_size)")
+
+
+def steps_are_finite_and_never_negative(model: DrivingModel) -> None:
+    for dtype in (torch.float64, torch.float32):
+        follower, leader, p = _to(_ordinary(model), dtype)
+        standing = torch.arange(DRIVES) < 3
+        stopping = (torch.arange(DRIVES) > 0) & (torch.arange(DRIVES) < 5)
+        follower = follower._replace(speed=follower.speed.masked_fill(standing, 0.0))
+        leader = leader._replace(speed=leader.speed.masked_fill(stopping, 0.0))
+        speed = model.next_speed(follower, leader, p, DT)
+        wrong = ~(speed.isfinite() & (speed >= 0))
+        assert not bool(wrong.any()), (
+            f"next_speed gives {speed[wrong][0].item():g} m/s in {int(wrong.sum())} of {DRIVES}"
+            " ordinary states; it must give finite speeds, not negative"
         )
-        assert model.initial_memory(speed).shape == memory.shape, (
-            "initial_memory must give (*batch, memory_size), which the first step is given"
+        memory = model.next_memory(follower, leader, p, DT, speed)
+        assert bool(memory.isfinite().all()), (
+            "next_memory gives a number that is not finite in an ordinary state"
         )
+
+
+def reads_the_parameters_that_it_declares(model: DrivingModel) -> None:
+    follower, leader, values = _ordinary(model)
+    p = _ReadParameters(values)
+    speed = model.next_speed(follower, leader, p, DT)
+    model.next_memory(follower, leader, p, DT, speed)
+    for name, field in model.schema.model_fields.items():
+        default = field.get_default(call_default_factory=True)
+        if name != "parameters" and model.settings.__dict__[name] != default:
+            return  # a variant may leave some out
+    names = model.parameters.for_settings(model.settings).names
+    unread = [name for name in names if name not in p.read]
+    assert not unread, (
+        f"it declares {len(names)} tuned parameters ({', '.join(names)}),"
+        f" but next_speed never reads {', '.join(unread)}"
+    )
 
 
 def is_pure(model: DrivingModel) -> None:
     follower, leader, p = _ordinary(model)
-    before = [tensor.clone() for tensor in (*follower, *leader, *p.values())]
+    inputs = {f"follower.{name}": value for name, value in follower._asdict().items()}
+    inputs |= {f"leader.{name}": value for name, value in leader._asdict().items()}
+    inputs |= {f"p['{name}']": value for name, value in p.items()}
+    before = {name: value.clone() for name, value in inputs.items()}
     first = model.next_speed(follower, leader, p, DT)
-    after = (*follower, *leader, *p.values())
-    assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True)), (
-        "a step must not change its inputs in place: they are recorded trajectories, or states"
-        " that others read"
-    )
+    for name, value in before.items():
+        assert torch.equal(value, inputs[name]), (
+            f"a step changes {name} in place; compute new tensors, for others read these"
+        )
     assert torch.equal(first, model.next_speed(follower, leader, p, DT)), (
         "the same state must give the same speed: a step draws no random numbers and keeps no state"
     )
@@ -284,6 +324,7 @@ def has_a_constant_baseline_as_claimed(model: DrivingModel) -> None:
 
 
 def no_rollout_leaves_what_is_finite(model: DrivingModel) -> None:
+    _require_equations(model)
     draw = torch.Generator().manual_seed(3)
     corner = torch.randint(0, 2, (256, len(model.space)), generator=draw).double()
     leader = _stop_and_go(torch.tensor(25.0, dtype=torch.float64), 6.0)
@@ -363,6 +404,31 @@ def can_be_compiled_as_one_graph(model: DrivingModel) -> None:
         eager,
         msg="compiling the step changes its numbers: calibrations would find others",
     )
+
+
+class _ReadParameters(Mapping[str, Tensor]):
+    """Parameters by name that remembers which were read; reading all at once reads each."""
+
+    def __init__(self, values: dict[str, Tensor]) -> None:
+        self._values = values
+        self.read: set[str] = set()
+
+    def __getitem__(self, name: str) -> Tensor:
+        assert name in self._values, (
+            f"next_speed reads the parameter '{name}',"
+            f" which is not in its `parameters` ({', '.join(self._values)})"
+        )
+        self.read.add(name)
+        return self._values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __or__(self, other: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        return {**self, **other}
 
 
 def _variants(model: DrivingModel) -> Iterator[tuple[DrivingModel, str]]:
@@ -487,4 +553,14 @@ def _describe(step: _Step, wrong: Tensor) -> str:
     )
 
 
-CONTRACT = contract_of(__name__, "model", slow=[can_be_compiled_as_one_graph, gradients_are_right])
+CONTRACT = contract_of(
+    __name__,
+    "model",
+    first=[
+        reads_the_parameters_that_it_declares,
+        keeps_shape_dtype_and_device,
+        steps_are_finite_and_never_negative,
+        is_pure,
+    ],
+    slow=[can_be_compiled_as_one_graph, gradients_are_right],
+)

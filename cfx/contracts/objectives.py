@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.objectives.base import FrameValues, Objective
-from cfx.contracts.contract import contract_of
+from cfx.contracts.contract import contract_of, expect_tensor
 
 FRAMES, PROBLEMS, CANDIDATES = 12, 3, 4
 DT = 0.1
@@ -51,7 +51,7 @@ def _changed(frames: FrameValues, change: Callable[[Tensor], Tensor]) -> FrameVa
 
 
 def says_its_unit_and_its_signals(objective: Objective) -> None:
-    assert isinstance(objective.unit, str), (
+    assert isinstance(getattr(objective, "unit", None), str), (
         "an objective says the unit of its loss, such as unit = 'm/s'; '' for none"
     )
     signals = tuple(objective.signals)
@@ -80,9 +80,7 @@ def reads_only_the_signals_it_names(objective: Objective) -> None:
 
 def a_loss_is_finite_and_never_negative(objective: Objective) -> None:
     loss = objective(_frames(), _counted())
-    assert loss.shape == (PROBLEMS, CANDIDATES), (
-        f"a loss has the shape of the batch, here {(PROBLEMS, CANDIDATES)}, not {tuple(loss.shape)}"
-    )
+    expect_tensor(loss, "finish", (PROBLEMS, CANDIDATES), torch.float64, "(*batch,)")
     assert bool(loss.isfinite().all()), "ordinary trajectories have a finite loss"
     assert bool((loss >= 0).all()), "a loss is never negative: training divides by it"
 
@@ -196,9 +194,7 @@ def one_frame_needs_no_dimension_of_time(objective: Objective) -> None:
 
 def float32_agrees_with_float64(objective: Objective) -> None:
     single = objective(_frames(torch.float32), _counted(torch.float32))
-    assert single.dtype == torch.float32, (
-        f"a loss has the dtype of the frames, torch.float32; it has {single.dtype}"
-    )
+    expect_tensor(single, "finish", (PROBLEMS, CANDIDATES), torch.float32, "(*batch,)")
     torch.testing.assert_close(
         single.double(),
         objective(_frames(), _counted()),
@@ -242,4 +238,13 @@ def what_it_is_given_stays_as_it_is(objective: Objective) -> None:
         assert torch.equal(signal, copy), "an objective must not change what it is given in place"
 
 
-CONTRACT = contract_of(__name__, "objective")
+CONTRACT = contract_of(
+    __name__,
+    "objective",
+    first=[
+        says_its_unit_and_its_signals,
+        a_loss_is_finite_and_never_negative,
+        reads_only_the_signals_it_names,
+        float32_agrees_with_float64,
+    ],
+)

@@ -111,6 +111,24 @@ def corner(candidates: Tensor, _: Tensor) -> Tensor:
     return (2.0 - candidates).square().mean(dim=-1)
 
 
+def says_how_much_it_does_in_whole_numbers(optimizer: Optimizer) -> None:
+    numbers = {
+        "evaluations()": optimizer.evaluations(),
+        "evaluations_at_once()": optimizer.evaluations_at_once(),
+        "space_filling()": optimizer.space_filling(),
+        "bytes_per_problem(n)": optimizer.bytes_per_problem(5),
+    }
+    for name, value in numbers.items():
+        least = int(name != "bytes_per_problem(n)")
+        assert type(value) is int, f"{name} gives {value!r}; it must give a whole number"
+        assert value >= least, f"{name} gives {value}; it must give at least {least}"
+    assert numbers["space_filling()"] <= numbers["evaluations()"], (
+        f"space_filling() gives more than the {numbers['evaluations()']} evaluations that"
+        " evaluations() gives: the sensitivity, which weighs windows, is measured over the first"
+        " of them"
+    )
+
+
 def recovers_a_known_optimum(optimizer: Optimizer, tolerance: float = TOLERANCE) -> None:
     optima = _random(8, 2, seed=11)
     for function in (distance, bowl):
@@ -274,11 +292,7 @@ def evaluates_exactly_what_it_says(optimizer: Optimizer) -> None:
         )
 
 
-def says_how_many_evaluations_fill_the_space(optimizer: Optimizer) -> None:
-    assert 1 <= optimizer.space_filling() <= optimizer.evaluations(), (
-        "space_filling() is a number of evaluations: the sensitivity, which weighs windows, is"
-        " measured over the first of them"
-    )
+def measures_the_sensitivity_where_parameters_matter(optimizer: Optimizer) -> None:
     found = _solve(optimizer, Problems(distance, _random(3, 2, seed=5)), n=2, guesses=1)
     low, median, high = found.filling.unbind(1)
     assert bool((low <= median).all() and (median <= high).all()), (
@@ -355,6 +369,7 @@ def _kept_random_states() -> Iterator[None]:
 CONTRACT = contract_of(
     __name__,
     "optimizer",
+    first=[says_how_much_it_does_in_whole_numbers],
     slow=[
         problems_are_independent,
         survives_whatever_the_losses_are,
@@ -365,6 +380,6 @@ CONTRACT = contract_of(
         the_same_seed_gives_the_same_result,
         ties_go_to_the_first_guess,
         finds_a_corner,
-        says_how_many_evaluations_fill_the_space,
+        measures_the_sensitivity_where_parameters_matter,
     ],
 )

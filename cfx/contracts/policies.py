@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.settings import WindowSettings
-from cfx.contracts.contract import contract_of
+from cfx.contracts.contract import contract_of, expect_tensor
 from cfx.models.idm import IDM
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import token_width
@@ -37,13 +37,33 @@ def _tokens(policy: Policy) -> Tensor:
     )
 
 
+def answers_in_the_precision_of_a_job(policy: Policy) -> None:
+    # A learner trains in single precision; what needs no training computes in double precision, so
+    # that constants stay what they are.
+    dtype = torch.float32 if policy.trainable else torch.float64
+    with torch.no_grad(), torch.random.fork_rng(devices=[]):
+        network = _build(policy, _features(policy), seed=1, dtype=dtype)
+        assert isinstance(network, PolicyNetwork), (
+            f"build returns a {type(network).__name__} and no PolicyNetwork"
+        )
+        state = network.initial_state(NETWORKS, DRIVERS)
+        answer, after = network.eval()(_tokens(policy).to(dtype), state)
+    known = isinstance(state, Tensor) and state.dim() == 3
+    shape = (NETWORKS, DRIVERS, state.shape[2] if known else 0)
+    words = "(networks, drivers, s)"
+    expect_tensor(state, "initial_state", shape, getattr(state, "dtype", dtype), words)
+    expect_tensor(after, "the state after the last window", shape, state.dtype, words)
+    wanted = (NETWORKS, DRIVERS, WINDOWS, PARAMETERS)
+    expect_tensor(answer, "forward", wanted, dtype, "(networks, drivers, windows, parameters)")
+    assert bool(((answer >= 0) & (answer <= 1)).all()), (  # written so that NaN fails too
+        "forward answers NaN or a number outside [0, 1]; parameters are chosen in unit space"
+    )
+
+
 def outputs_lie_within_the_bounds(policy: Policy) -> None:
     network = _network(policy)
     tokens = _tokens(policy)
     out, _ = network(1e3 * tokens, network.initial_state(NETWORKS, DRIVERS))
-    assert out.shape == (NETWORKS, DRIVERS, WINDOWS, PARAMETERS), (
-        "a policy answers one parameter vector per network, driver and window"
-    )
     assert bool(((out >= 0) & (out <= 1)).all()), (
         "a policy answers in unit space: no parameter is ever outside the model's bounds"
     )
@@ -146,11 +166,13 @@ def a_trainable_policy_has_gradients(policy: Policy) -> None:
         )
 
 
-def _build(policy: Policy, features: int, *, seed: int) -> PolicyNetwork:
+def _build(
+    policy: Policy, features: int, *, seed: int, dtype: torch.dtype = torch.float32
+) -> PolicyNetwork:
     policy = policy.for_model(IDM(), DT, WindowSettings(length=LENGTH, stride=LENGTH))
     generator = torch.Generator().manual_seed(seed)
-    fixed = torch.rand((NETWORKS, PARAMETERS), generator=torch.Generator().manual_seed(0))
-    return policy.build(features, torch.full((PARAMETERS,), 0.5), fixed, generator)
+    fixed = torch.rand((NETWORKS, PARAMETERS), generator=torch.Generator().manual_seed(0)).to(dtype)
+    return policy.build(features, torch.full((PARAMETERS,), 0.5, dtype=dtype), fixed, generator)
 
 
-CONTRACT = contract_of(__name__, "policy")
+CONTRACT = contract_of(__name__, "policy", first=[answers_in_the_precision_of_a_job])

@@ -14,7 +14,7 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-from cfx.contracts.contract import NotApplicable, contract_of
+from cfx.contracts.contract import NotApplicable, contract_of, expect_tensor
 from cfx.core.errors import CfxError, ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.idm_sumo import IdmSumo
@@ -32,6 +32,8 @@ TOLERANCE = 1e-6
 """How far, in m and m/s, simulations of the same thing in double precision may differ."""
 
 _CANDIDATES: tuple[type[DrivingModel], ...] = (Krauss, KraussSumo, IdmSumo, W99, W74)
+
+Model = DrivingModel | None
 
 _Parameters = dict[str, Tensor]
 
@@ -62,11 +64,11 @@ def refuses_what_it_cannot_drive(simulator: Simulator) -> None:
     )
 
 
-def makes_a_stepper_for_the_model(simulator: Simulator, model: DrivingModel | None = None) -> None:
+def makes_a_stepper_for_the_model(simulator: Simulator, model: Model = None) -> None:
     chosen = _model(simulator, model)
     stepper = _stepper(simulator, chosen)
     assert isinstance(stepper, Stepper), (
-        f"`stepper` must return a cfx.Stepper, not a {type(stepper).__name__}"
+        f"stepper returns a {type(stepper).__name__} and no Stepper"
     )
     assert stepper.model is chosen, (
         "the stepper's `model` must be the model it was made for: calibration reads its parameters"
@@ -78,23 +80,27 @@ def makes_a_stepper_for_the_model(simulator: Simulator, model: DrivingModel | No
     )
 
 
-def keeps_shape_dtype_and_device(simulator: Simulator, model: DrivingModel | None = None) -> None:
-    stepper = _stepper(simulator, _model(simulator, model))
+def keeps_shape_dtype_and_device(simulator: Simulator, model: Model = None) -> None:
+    stepper, wide = _ready(simulator, model)
     for dtype in (torch.float64, torch.float32):
-        scene = _to(_scene(stepper.model), dtype)
+        scene = _to(wide, dtype)
         end, position, speed = _advance(stepper, scene)
+        expect_tensor(end.speed, "advance's follower", (FOLLOWERS,), dtype, "(*batch,)")
         for name, value in (("positions", position), ("speeds", speed)):
-            assert value.shape == (STEPS, FOLLOWERS), (
-                f"{name} must be (K, *batch), here {(STEPS, FOLLOWERS)}, not {tuple(value.shape)}:"
-                " frames 1 to K"
-            )
-            assert value.dtype == dtype, f"{name} must have the dtype of the states, {dtype}"
+            expect_tensor(value, f"advance's {name}", (STEPS, FOLLOWERS), dtype, "(K, *batch)")
             assert value.device == scene.start.speed.device, f"{name} must stay on their device"
-        assert end.speed.shape == (FOLLOWERS,), "the follower at the end must have the same batch"
-        assert end.speed.dtype == dtype, f"the follower at the end must stay in {dtype}"
+            assert bool(value.isfinite().all()), (
+                f"advance gives {name} that are not finite in ordinary states"
+            )
 
 
-def ends_where_the_last_step_led(simulator: Simulator, model: DrivingModel | None = None) -> None:
+def steps_in_this_process_keep_shape_and_dtype(simulator: Simulator, model: Model = None) -> None:
+    if not simulator.differentiable:
+        raise NotApplicable("its steps may be another process's, which takes seconds to start")
+    keeps_shape_dtype_and_device(simulator, model)
+
+
+def ends_where_the_last_step_led(simulator: Simulator, model: Model = None) -> None:
     stepper = _stepper(simulator, _model(simulator, model))
     end, position, speed = _advance(stepper, _scene(stepper.model))
     realised = (speed[-1] - speed[-2]) / stepper.dt
@@ -111,9 +117,8 @@ def ends_where_the_last_step_led(simulator: Simulator, model: DrivingModel | Non
         )
 
 
-def no_steps_change_nothing(simulator: Simulator, model: DrivingModel | None = None) -> None:
-    stepper = _stepper(simulator, _model(simulator, model))
-    scene = _scene(stepper.model)
+def no_steps_change_nothing(simulator: Simulator, model: Model = None) -> None:
+    stepper, scene = _ready(simulator, model)
     end, position, speed = _advance(stepper, scene._replace(leader=_frames(scene.leader, 0, 0)))
     assert position.shape == speed.shape == (0, FOLLOWERS), (
         "a leader without frames must give no positions and no speeds, (0, *batch)"
@@ -121,11 +126,8 @@ def no_steps_change_nothing(simulator: Simulator, model: DrivingModel | None = N
     assert torch.equal(end.speed, scene.start.speed), "without a step the follower stays as it is"
 
 
-def positions_and_speeds_belong_together(
-    simulator: Simulator, model: DrivingModel | None = None
-) -> None:
-    stepper = _stepper(simulator, _model(simulator, model))
-    scene = _scene(stepper.model)
+def positions_and_speeds_belong_together(simulator: Simulator, model: Model = None) -> None:
+    stepper, scene = _ready(simulator, model)
     _, position, speed = _advance(stepper, scene)
     assert bool(speed.isfinite().all()), "speeds must be finite"
     assert bool((speed >= 0).all()), "speeds must not be negative"
@@ -140,9 +142,8 @@ def positions_and_speeds_belong_together(
     )
 
 
-def followers_are_independent(simulator: Simulator, model: DrivingModel | None = None) -> None:
-    stepper = _stepper(simulator, _model(simulator, model))
-    scene = _scene(stepper.model)
+def followers_are_independent(simulator: Simulator, model: Model = None) -> None:
+    stepper, scene = _ready(simulator, model)
     _, _, together = _advance(stepper, scene)
     for first, last in ((0, 1), (4, FOLLOWERS)):
         _, _, alone = _advance(stepper, _some(scene, first, last))
@@ -154,11 +155,8 @@ def followers_are_independent(simulator: Simulator, model: DrivingModel | None =
         )
 
 
-def leaders_and_parameters_broadcast(
-    simulator: Simulator, model: DrivingModel | None = None
-) -> None:
-    stepper = _stepper(simulator, _model(simulator, model))
-    scene = _scene(stepper.model)
+def leaders_and_parameters_broadcast(simulator: Simulator, model: Model = None) -> None:
+    stepper, scene = _ready(simulator, model)
     _, _, expected = _advance(stepper, scene)
     shape = (FOLLOWERS, 2)
     wide = Start(*(state[:, None].expand(shape) for state in scene.start))
@@ -183,11 +181,8 @@ def leaders_and_parameters_broadcast(
     )
 
 
-def sees_no_later_frame_of_the_leader(
-    simulator: Simulator, model: DrivingModel | None = None
-) -> None:
-    stepper = _stepper(simulator, _model(simulator, model))
-    scene = _scene(stepper.model)
+def sees_no_later_frame_of_the_leader(simulator: Simulator, model: Model = None) -> None:
+    stepper, scene = _ready(simulator, model)
     _, _, expected = _advance(stepper, scene)
     known = STEPS // 2
     later = torch.arange(STEPS)[:, None] >= known
@@ -204,9 +199,8 @@ def sees_no_later_frame_of_the_leader(
     )
 
 
-def parts_give_the_whole(simulator: Simulator, model: DrivingModel | None = None) -> None:
-    stepper = _stepper(simulator, _model(simulator, model))
-    scene = _scene(stepper.model)
+def parts_give_the_whole(simulator: Simulator, model: Model = None) -> None:
+    stepper, scene = _ready(simulator, model)
     _, position, speed = _advance(stepper, scene)
     half = STEPS // 2
     follower = stepper.begin(scene.start)
@@ -222,9 +216,8 @@ def parts_give_the_whole(simulator: Simulator, model: DrivingModel | None = None
     _close(second_speed, speed[half:], sentence)
 
 
-def the_same_again_gives_the_same(simulator: Simulator, model: DrivingModel | None = None) -> None:
-    stepper = _stepper(simulator, _model(simulator, model))
-    scene = _scene(stepper.model)
+def the_same_again_gives_the_same(simulator: Simulator, model: Model = None) -> None:
+    stepper, scene = _ready(simulator, model)
     _, _, first = _advance(stepper, scene)
     _, _, second = _advance(stepper, scene)
     assert torch.equal(first, second), (
@@ -232,9 +225,8 @@ def the_same_again_gives_the_same(simulator: Simulator, model: DrivingModel | No
     )
 
 
-def the_inputs_stay_as_they_are(simulator: Simulator, model: DrivingModel | None = None) -> None:
-    stepper = _stepper(simulator, _model(simulator, model))
-    scene = _scene(stepper.model)
+def the_inputs_stay_as_they_are(simulator: Simulator, model: Model = None) -> None:
+    stepper, scene = _ready(simulator, model)
     inputs = (*scene.start, *scene.leader, *scene.p.values())
     before = [tensor.clone() for tensor in inputs]
     _advance(stepper, scene)
@@ -244,9 +236,8 @@ def the_inputs_stay_as_they_are(simulator: Simulator, model: DrivingModel | None
         )
 
 
-def goes_on_after_it_was_closed(simulator: Simulator, model: DrivingModel | None = None) -> None:
-    stepper = _stepper(simulator, _model(simulator, model))
-    scene = _scene(stepper.model)
+def goes_on_after_it_was_closed(simulator: Simulator, model: Model = None) -> None:
+    stepper, scene = _ready(simulator, model)
     _, _, expected = _advance(stepper, scene)
     stepper.close()
     _, _, again = _advance(stepper.for_work(STEPS * FOLLOWERS), scene)
@@ -258,23 +249,19 @@ def goes_on_after_it_was_closed(simulator: Simulator, model: DrivingModel | None
     )
 
 
-def says_what_results_depend_on(simulator: Simulator, model: DrivingModel | None = None) -> None:
+def says_what_results_depend_on(simulator: Simulator, model: Model = None) -> None:
     chosen = _model(simulator, model)
     identity = _stepper(simulator, chosen).identity()
-    assert isinstance(identity, str), (
-        f"`identity` must give a text, not a {type(identity).__name__}"
-    )
-    assert identity, (
-        "`identity` must be a text that changes with whatever changes results: caches carry it"
+    assert isinstance(identity, str) and identity, (  # noqa: PT018 - one sentence
+        "identity() must give a text that changes with whatever changes results: caches carry it"
     )
     assert simulator.stepper(chosen, DT).identity() == identity, (
         "two steppers of one simulator must have one `identity`, or no cached result is found again"
     )
 
 
-def gradients_are_as_claimed(simulator: Simulator, model: DrivingModel | None = None) -> None:
-    stepper = _stepper(simulator, _model(simulator, model))
-    scene = _scene(stepper.model)
+def gradients_are_as_claimed(simulator: Simulator, model: Model = None) -> None:
+    stepper, scene = _ready(simulator, model)
     names = stepper.model.space.names
     wanting = dict(scene.p)
     for name in names:
@@ -332,6 +319,11 @@ def _model(simulator: Simulator, model: DrivingModel | None) -> DrivingModel:
 @cache
 def _candidates() -> tuple[DrivingModel, ...]:
     return tuple(kind() for kind in _CANDIDATES)
+
+
+def _ready(simulator: Simulator, model: Model) -> tuple[Stepper, _Scene]:
+    stepper = _stepper(simulator, _model(simulator, model))
+    return stepper, _scene(stepper.model)
 
 
 def _stepper(simulator: Simulator, model: DrivingModel) -> Stepper:
@@ -397,4 +389,12 @@ def _close(value: Tensor, expected: Tensor, sentence: str) -> None:
     torch.testing.assert_close(value, expected, rtol=0.0, atol=TOLERANCE, msg=sentence)
 
 
-CONTRACT = contract_of(__name__, "simulator")
+CONTRACT = contract_of(
+    __name__,
+    "simulator",
+    first=[
+        makes_a_stepper_for_the_model,
+        says_what_results_depend_on,
+        steps_in_this_process_keep_shape_and_dtype,
+    ],
+)

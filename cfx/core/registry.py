@@ -55,8 +55,8 @@ class Kind:
         name: as in `cfx.get(kind, name)`.
         base: module and class that its components extend.
         group: its config group, the folder in `conf/` and the key in configs; by default its name.
-        has_smoke_check: `cfx.contracts.smoke` tries a new component for some milliseconds; base
-            classes of the other kinds check what a component gives.
+        is_tried: a new component is held to the `first` statements of its contract; base classes of
+            the other kinds check what a component gives.
         chosen: a job chooses one of this kind, by a config group; metrics are all measured, tables
             are all written, and sub-commands are none of a job.
     """
@@ -64,7 +64,7 @@ class Kind:
     name: str
     base: str
     group: str = ""
-    has_smoke_check: bool = False
+    is_tried: bool = False
     chosen: bool = True
 
     def __post_init__(self) -> None:
@@ -88,11 +88,11 @@ KINDS: dict[str, Kind] = {
     kind.name: kind
     for kind in (
         Kind("dataset", "cfx.data.base:Dataset", group="data"),
-        Kind("model", "cfx.models.base:DrivingModel", has_smoke_check=True),
-        Kind("policy", "cfx.policies.base:Policy", has_smoke_check=True),
-        Kind("optimizer", "cfx.calibration.optimizers.base:Optimizer", has_smoke_check=True),
-        Kind("simulator", "cfx.simulation.simulator:Simulator", has_smoke_check=True),
-        Kind("objective", "cfx.calibration.objectives.base:Objective", has_smoke_check=True),
+        Kind("model", "cfx.models.base:DrivingModel", is_tried=True),
+        Kind("policy", "cfx.policies.base:Policy", is_tried=True),
+        Kind("optimizer", "cfx.calibration.optimizers.base:Optimizer", is_tried=True),
+        Kind("simulator", "cfx.simulation.simulator:Simulator", is_tried=True),
+        Kind("objective", "cfx.calibration.objectives.base:Objective", is_tried=True),
         Kind("engine", "cfx.core.engine.base:Engine"),
         Kind("learner", "cfx.learners.base:Learner"),
         Kind("protocol", "cfx.evaluation.protocols.base:Protocol"),
@@ -100,7 +100,7 @@ KINDS: dict[str, Kind] = {
             "metric",
             "cfx.evaluation.metrics.base:Metric",
             group="metrics",
-            has_smoke_check=True,
+            is_tried=True,
             chosen=False,
         ),
         Kind("table", "cfx.results.table:ResultTable", chosen=False),
@@ -161,7 +161,7 @@ class Entry:
 _loaded: dict[Entry, type[Component]] = {}
 """Classes that were imported and passed their checks."""
 
-_smoke_checked: set[tuple[Entry, str]] = set()
+_tried: set[tuple[Entry, str]] = set()
 """Components that were tried, with their settings as JSON."""
 
 
@@ -275,7 +275,7 @@ def create(kind: str, node: Mapping[str, Any]) -> Component:
         raise PluginError(
             f"{found} cannot be created: {in_words(error)}{_remedy(found)}"
         ) from error
-    _smoke_check(found, component, settings)
+    _try(found, component, settings)
     return component
 
 
@@ -429,25 +429,21 @@ def in_words(error: BaseException) -> str:
     return f"{type(error).__name__}: {first}".rstrip(": ")
 
 
-def _smoke_check(found: Entry, component: Component, settings: BaseModel) -> None:
-    """Tries a component once for each of its settings.
+def _try(found: Entry, component: Component, settings: BaseModel) -> None:
+    """Holds a component to the first statements of its contract, once for each of its settings.
+
+    Statements are assertions: python -O leaves this out.
 
     Raises:
         PluginError: it breaks its contract; names the distribution.
     """
-    kind = kind_of(found.kind)
     key = (found, settings.model_dump_json())
-    if not kind.has_smoke_check or key in _smoke_checked:
+    if not kind_of(found.kind).is_tried or key in _tried or not __debug__:
         return
-    try:
-        _resolve(f"cfx.contracts.smoke:smoke_check_{kind.name}")(component)
-    except PluginError as broken:
-        raise PluginError(f"{found} breaks its contract: {broken}{_remedy(found)}") from broken
-    except Exception as error:  # a plugin may raise anything
-        raise PluginError(
-            f"{found} breaks its contract: trying it raised {in_words(error)}{_remedy(found)}"
-        ) from error
-    _smoke_checked.add(key)
+    contract = _resolve("cfx.contracts:contract_for")(found.kind)
+    for _, sentence in _resolve("cfx.contracts:violations")(component, contract.first):
+        raise PluginError(f"{found} breaks its contract: {sentence}{_remedy(found)}")
+    _tried.add(key)
 
 
 def _remedy(found: Entry) -> str:

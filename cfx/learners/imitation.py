@@ -11,7 +11,8 @@ token, c features of conditioning, n tuned parameters.
 from __future__ import annotations
 
 import logging
-from typing import ClassVar
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import pandas as pd
 import torch
@@ -44,6 +45,7 @@ class ImitationLearner(Learner):
 
     schema: ClassVar[type[Settings]] = ImitationSettings
     settings: ImitationSettings
+    trial: ClassVar[Mapping[str, Any]] = {"epochs": 30, "learning_rate": 0.03}
     needs_labels = True
 
     def fit(self, policy: Policy, training_data: TrainingData) -> TrainingResult:

@@ -13,6 +13,7 @@ process with Matern-3/2 covariance: continuous, with a continuous slope).
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -106,6 +107,7 @@ class SyntheticDataset(Dataset):
 
     schema: ClassVar[type[Settings]] = SyntheticSettings
     settings: SyntheticSettings
+    trial: ClassVar[Mapping[str, Any]] = {"pairs": 4, "platoon_size": 2, "frames": 150}
 
     def read(self) -> PairSet:
         s = self.settings

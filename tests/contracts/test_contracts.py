@@ -1,61 +1,91 @@
-"""The package `cfx.contracts` itself: it offers contracts, and needs pytest for suites alone."""
+"""How contracts are found and checked; every registered component keeps the one of its kind."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
+from typing import Any
 
 import pytest
 
-import cfx.contracts
-from cfx.contracts.contract import NotApplicable
-from cfx.contracts.suites import hold
-from cfx.core.errors import PluginError
-from cfx.core.registry import KINDS
+from cfx.contracts import NotApplicable, check_contract, contract_for, violations
+from cfx.core import registry
+from cfx.core.errors import NotInstalledError, PluginError
 from cfx.models.krauss import Krauss
 
-SUITES = {
-    "dataset": cfx.contracts.DatasetContract,
-    "model": cfx.contracts.ModelContract,
-    "engine": cfx.contracts.EngineContract,
-    "simulator": cfx.contracts.SimulatorContract,
-    "objective": cfx.contracts.ObjectiveContract,
-    "optimizer": cfx.contracts.OptimizerContract,
-    "policy": cfx.contracts.PolicyContract,
-    "learner": cfx.contracts.LearnerContract,
-    "protocol": cfx.contracts.ProtocolContract,
-    "metric": cfx.contracts.MetricContract,
-    "table": cfx.contracts.TableContract,
-    "demo": cfx.contracts.DemoContract,
-    "command": cfx.contracts.CommandContract,
-}
+SLOW = {("protocol", "forecast"), ("protocol", "traffic"), ("engine", "local"), ("engine", "dask")}
+"""Those that take long even with the settings of their `trial`."""
+
+FURTHER: dict[tuple[str, str], dict[str, Any]] = {("optimizer", "botorch"): {"tolerance": 0.1}}
+"""What few evaluations make harder."""
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_suite_tests_every_statement_of_its_contract(kind: str) -> None:
-    contract = cfx.contracts.contract_for(kind)
+def registered() -> list[Any]:
+    """Returns all components that need no settings; those that do are checked in tests of theirs."""
+    found = []
+    for kind in registry.KINDS:
+        for name in registry.names(kind):
+            fields = registry.get(kind, name).schema.model_fields.values()
+            if not any(registry.is_blank(field) for field in fields):
+                marks = [pytest.mark.slow] if (kind, name) in SLOW else []
+                found.append(pytest.param(kind, name, marks=marks, id=f"{kind}-{name}"))
+    return found
+
+
+@pytest.mark.parametrize(("kind", "name"), registered())
+def test_every_registered_component_keeps_its_contract(kind: str, name: str) -> None:
+    cls = registry.get(kind, name)
+    component = registry.create(kind, {"name": name, **cls.trial})
+    try:
+        check_contract(component, **FURTHER.get((kind, name), {}))
+    except NotInstalledError as error:
+        pytest.skip(str(error))
+
+
+@pytest.mark.parametrize("kind", registry.KINDS)
+def test_each_kind_has_a_contract(kind: str) -> None:
+    contract = contract_for(kind)
     assert contract.kind == kind
-    (mark,) = SUITES[kind].test_contract.pytestmark
-    assert mark.args == ("check", contract.checks)
-    assert set(contract.quick) | contract.slow == set(contract.checks)
-    assert contract.quick
+    assert contract.slow < set(contract.checks)
+    assert set(contract.first) <= set(contract.quick)
+    assert bool(contract.first) == registry.KINDS[kind].is_tried
 
 
-def test_everything_it_names_is_there() -> None:
-    for name in cfx.contracts.__all__:
-        assert getattr(cfx.contracts, name) is not None
-    with pytest.raises(AttributeError, match="no attribute 'Modelcontract'"):
-        _ = cfx.contracts.Modelcontract
+def test_there_is_none_for_an_unknown_kind() -> None:
     with pytest.raises(PluginError, match="Did you mean 'model'"):
-        cfx.contracts.contract_for("modell")
+        contract_for("modell")
 
 
-def test_a_check_that_has_nothing_to_verify_is_skipped() -> None:
-    def check(model: Krauss) -> None:
-        raise NotApplicable("the model claims nothing")
+def fails(model: Krauss) -> None:
+    raise AssertionError("it is wrong")
 
-    with pytest.raises(pytest.skip.Exception, match="claims nothing"):
-        hold(check, Krauss())
+
+def breaks(model: Krauss) -> None:
+    raise ValueError("no luck")
+
+
+def skips(model: Krauss) -> None:
+    raise NotApplicable("the model claims nothing")
+
+
+def test_what_does_not_hold_is_told_by_name_and_what_has_nothing_to_verify_is_left_out() -> None:
+    found = list(violations(Krauss(), (skips, fails, breaks)))
+    assert found == [
+        ("fails", "it is wrong"),
+        ("breaks", "the component raised ValueError: no luck"),
+    ]
+
+
+def test_all_that_does_not_hold_is_in_one_error() -> None:
+    class Unsourced(Krauss):
+        reference = ""
+
+        def next_speed(self, *state: Any) -> Any:
+            return -super().next_speed(*state)
+
+    with pytest.raises(AssertionError, match="set `reference`") as told:
+        check_contract(Unsourced())
+    assert "\nsteps_are_finite_and_never_negative: next_speed gives -" in str(told.value)
 
 
 def test_a_check_gets_what_it_asks_for() -> None:
@@ -64,32 +94,26 @@ def test_a_check_gets_what_it_asks_for() -> None:
     def check(model: Krauss, tolerance: float = 0.1) -> None:
         seen.append(tolerance)
 
-    hold(check, Krauss(), tolerance=0.2, equilibrium=None)
+    assert not list(violations(Krauss(), (check, skips), tolerance=0.2))
     assert seen == [0.2]
+    with pytest.raises(TypeError, match="takes tolerence"):
+        list(violations(Krauss(), (check,), tolerence=0.2))
 
 
-def test_without_pytest_components_can_be_checked_and_suites_say_what_they_need() -> None:
+def test_it_needs_no_pytest_and_importing_it_nothing_heavy() -> None:
     code = """
 import sys
 sys.modules["pytest"] = None
-import cfx.contracts
+from cfx.contracts import check_contract
 assert "torch" not in sys.modules
 from cfx.models.krauss import Krauss
-print(list(cfx.contracts.violations(cfx.contracts.contract_for("model"), Krauss())))
-try:
-    cfx.contracts.ModelContract
-except ModuleNotFoundError as error:
-    print(error)
+check_contract(Krauss())
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.startswith(
-        "[]\ncfx.contracts.ModelContract is a pytest suite and pytest is not installed:"
-        " pip install pytest"
-    )
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_checks_refuse_to_run_where_assertions_are_removed() -> None:
-    code = "import cfx.contracts as t; next(t.violations(t.Contract('model', ()), None))"
+    code = "from cfx.contracts import check_contract; check_contract(None)"
     done = subprocess.run(
         [sys.executable, "-O", "-c", code], capture_output=True, text=True, check=False
     )

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from cfx.contracts import DemoContract
+from cfx.contracts import check_contract
 from cfx.contracts import demos as checks
 from cfx.contracts.contract import Check, NotApplicable
 from cfx.core.errors import DataError
@@ -22,10 +22,8 @@ class Page(Demo):
         return [folder / PAGE]
 
 
-class TestPage(DemoContract):
-    @pytest.fixture
-    def demo(self) -> Page:
-        return Page()
+def test_one_that_writes_a_page_holds_it() -> None:
+    check_contract(Page())
 
 
 class Talkative(Page):

@@ -11,10 +11,8 @@ from torch import Tensor
 from cfx.calibration.objectives.base import FrameValues, Objective, root_mean_square
 from cfx.calibration.objectives.rmse import SpeedRmse
 from cfx.calibration.objectives.theil import TheilU
+from cfx.contracts import check_contract
 from cfx.contracts import objectives as checks
-from cfx.contracts import violations
-from cfx.contracts.smoke import smoke_check_objective
-from cfx.core.errors import PluginError
 
 
 class Silent(SpeedRmse):
@@ -130,7 +128,7 @@ BROKEN: dict[str, tuple[Objective, Any, str]] = {
     "drifting": (Drifting(), checks.time_may_be_any_dimension, "which dimension is time"),
     "drifting in parts": (Drifting(), checks.parts_add_up_to_the_whole, "frame by frame"),
     "growing": (Growing(), checks.one_frame_needs_no_dimension_of_time, "as many tensors"),
-    "double": (Double(), checks.float32_agrees_with_float64, "has the dtype"),
+    "double": (Double(), checks.float32_agrees_with_float64, "computes in the dtype"),
     "detached": (Detached(), checks.gradients_are_right, "Jacobian mismatch"),
     "vertical": (Vertical(), checks.the_slope_at_a_perfect_simulation_is_finite, "epsilon"),
     "overwriting": (Overwriting(), checks.what_it_is_given_stays_as_it_is, "in place"),
@@ -149,19 +147,4 @@ def test_every_statement_has_an_objective_that_breaks_it() -> None:
 
 
 def test_a_good_objective_holds_all_of_them() -> None:
-    assert not list(violations(checks.CONTRACT, TheilU(), quick=False))
-
-
-@pytest.mark.parametrize(
-    ("objective", "sentence"),
-    [
-        (Silent(), "no `unit`"),
-        (Blind(), "must be of 'speed', 'gap'"),
-        (Secretive(), "it says that it reads speed alone"),
-        (Negative(), "not negative"),
-        (Double(), "gives torch.float64 for torch.float32"),
-    ],
-)
-def test_a_job_refuses_an_objective_that_cannot_work(objective: Objective, sentence: str) -> None:
-    with pytest.raises(PluginError, match=sentence):
-        smoke_check_objective(objective)
+    check_contract(TheilU())

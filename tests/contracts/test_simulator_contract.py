@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 import torch
 
+from cfx.contracts import check_contract
 from cfx.contracts import simulators as checks
-from cfx.contracts.contract import violations
 from cfx.core.errors import ConfigError, SumoError
 from cfx.models.base import DrivingModel, Follower
 from cfx.models.krauss import Krauss
@@ -157,7 +157,7 @@ BROKEN: dict[str, tuple[Simulator, Any, str]] = {
     "no stepper": (
         With(lambda model, dt: None),
         checks.makes_a_stepper_for_the_model,
-        "not a NoneType",
+        "returns a NoneType and no Stepper",
     ),
     "another model": (
         With(lambda model, dt: MemoryStepper(Krauss(), dt)),
@@ -165,7 +165,12 @@ BROKEN: dict[str, tuple[Simulator, Any, str]] = {
         "must be the model it was made for",
     ),
     "unlike": (With(Unlike), checks.makes_a_stepper_for_the_model, "must agree"),
-    "single": (With(Single), checks.keeps_shape_dtype_and_device, "dtype of the states"),
+    "single": (With(Single), checks.keeps_shape_dtype_and_device, "computes in the dtype"),
+    "single here": (
+        With(Single),
+        checks.steps_in_this_process_keep_shape_and_dtype,
+        "computes in the dtype",
+    ),
     "wishful": (With(Wishful), checks.ends_where_the_last_step_led, "realised"),
     "restless": (With(Restless), checks.no_steps_change_nothing, "stays as it is"),
     "jumping": (With(Jumping), checks.positions_and_speeds_belong_together, "two stories"),
@@ -205,7 +210,7 @@ def test_what_is_not_installed_is_left_out() -> None:
         def require(self, model: DrivingModel) -> None:
             raise SumoError("it is not installed")
 
-    assert not list(violations(checks.CONTRACT, Missing(), quick=False))
+    check_contract(Missing())
 
 
 def test_a_model_of_its_own_can_be_given() -> None:
@@ -217,5 +222,5 @@ def test_a_model_of_its_own_can_be_given() -> None:
     class Own(Krauss):
         pass
 
-    assert not list(violations(checks.CONTRACT, Picky(), quick=False))
-    checks.followers_are_independent(Picky(), Own())
+    check_contract(Picky())
+    check_contract(Picky(), model=Own())

@@ -11,6 +11,7 @@ import torch
 
 from cfx.calibration.calibrator import Labels
 from cfx.calibration.windows import Split, Windows, WindowSettings
+from cfx.contracts import check_contract
 from cfx.core.errors import DataError
 from cfx.data.pairs import PairBatch
 from cfx.learners.base import TrainingData, TrainingPairs, TrainingResult
@@ -79,6 +80,10 @@ def own_bases(data: TrainingData) -> torch.Tensor:
 def same_weights(one: TrainingResult, two: TrainingResult) -> bool:
     others = dict(two.network.named_parameters())
     return all(torch.equal(value, others[name]) for name, value in one.network.named_parameters())
+
+
+def test_contract_with_offsets() -> None:
+    check_contract(ImitationLearner(epochs=30, learning_rate=0.03, head="offset"))
 
 
 @pytest.mark.parametrize("head", ["direct", "offset"])

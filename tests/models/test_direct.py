@@ -4,17 +4,10 @@ import pytest
 import torch
 
 import cfx
-from cfx.contracts import ModelContract
 from cfx.models.base import Leader
 from cfx.models.direct import Direct
 from cfx.simulation.rollout import simulate
 from cfx.simulation.trajectory import Start
-
-
-class TestDirect(ModelContract):
-    @pytest.fixture
-    def model(self) -> Direct:
-        return Direct()
 
 
 def drive(acceleration: float, seconds: float, leader_speed: float = 12.0) -> list[float]:

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from cfx.contracts import ModelContract
-from cfx.contracts.models import Equilibrium
+from cfx.contracts import check_contract
+from cfx.contracts.models import keeps_its_equilibrium
 from cfx.models.base import Follower, Leader
 from cfx.models.krauss import Krauss
 
@@ -26,29 +26,15 @@ def next_speed(model: Krauss, *, gap: float, v: float, v_l: float, **parameters:
     return model.next_speed(follower, leader, p, 0.1).item()
 
 
-class TestPaper(ModelContract):
-    @pytest.fixture
-    def model(self) -> Krauss:
-        return Krauss()
-
-    @pytest.fixture
-    def equilibrium(self) -> Equilibrium:
-        def gap(speed: Tensor, p: Mapping[str, Tensor]) -> Tensor:
-            return speed * p["t_r"] + p["min_gap"]
-
-        return gap
+def equilibrium_gap(speed: Tensor, p: Mapping[str, Tensor]) -> Tensor:
+    return speed * p["t_r"] + p["min_gap"]
 
 
-class TestSumoVariant(TestPaper):
-    @pytest.fixture
-    def model(self) -> Krauss:
-        return Krauss(variant="sumo", parameters={"min_gap": {"default": 2.5}})
-
-
-class TestCautious(ModelContract):
-    @pytest.fixture
-    def model(self) -> Krauss:
-        return Krauss(leader_deceleration=6.0)
+def test_contract_of_its_variants() -> None:
+    keeps_its_equilibrium(Krauss(), equilibrium_gap)
+    sumo = Krauss(variant="sumo", parameters={"min_gap": {"default": 2.5}})
+    check_contract(sumo, equilibrium=equilibrium_gap)
+    check_contract(Krauss(leader_deceleration=6.0))
 
 
 @given(v=st.floats(0.1, 40), t_r=st.floats(0.1, 10), t_i=st.floats(0, 2), b=st.floats(1, 9))

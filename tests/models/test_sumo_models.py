@@ -3,24 +3,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from cfx.contracts import ModelContract
 from cfx.core.errors import ConfigError
-from cfx.models.idm_sumo import IdmSumo
 from cfx.models.krauss import Krauss
 from cfx.models.krauss_sumo import KraussSumo
 from cfx.models.w99 import W99
-
-
-class TestKraussSumo(ModelContract):
-    @pytest.fixture
-    def model(self) -> KraussSumo:
-        return KraussSumo()
-
-
-class TestIdmSumo(ModelContract):
-    @pytest.fixture
-    def model(self) -> IdmSumo:
-        return IdmSumo()
 
 
 def test_krauss_sumo_keeps_its_time_gap_behind_a_steady_leader() -> None:

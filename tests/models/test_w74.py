@@ -4,7 +4,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.contracts import ModelContract
 from cfx.models.base import Follower, Leader
 from cfx.models.w74 import W74
 from cfx.simulation.rollout import simulate
@@ -37,12 +36,6 @@ def acceleration(
 
 def sdv(spacing: float, cx: float = 50.0) -> float:
     return ((spacing - AX) / cx) ** 2
-
-
-class TestW74(ModelContract):
-    @pytest.fixture
-    def model(self) -> W74:
-        return W74()
 
 
 def test_following_keeps_the_sign_of_the_last_acceleration() -> None:

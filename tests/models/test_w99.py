@@ -6,22 +6,14 @@ import pytest
 import torch
 
 import cfx
-from cfx.contracts import ModelContract
+from cfx.contracts import check_contract
 from cfx.core.errors import ConfigError
 from cfx.models.base import Follower, Leader
 from cfx.models.w99 import W99
 
 
-class TestSumo(ModelContract):
-    @pytest.fixture
-    def model(self) -> W99:
-        return W99()
-
-
-class TestVissim(ModelContract):
-    @pytest.fixture
-    def model(self) -> W99:
-        return W99(variant="vissim")
+def test_contract_of_the_other_variant() -> None:
+    check_contract(W99(variant="vissim"))
 
 
 def free_acceleration(model: W99, speed: float) -> float:

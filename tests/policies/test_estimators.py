@@ -16,7 +16,7 @@ from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.optimizers.gradient import GradientSearch
 from cfx.calibration.shards import Solver
 from cfx.calibration.windows import WindowSettings
-from cfx.contracts import PolicyContract
+from cfx.contracts import check_contract
 from cfx.core.errors import ConfigError
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
@@ -26,7 +26,6 @@ from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
-from cfx.policies.base import Policy
 from cfx.policies.core import AgentCore
 from cfx.policies.estimator import EstimatorPolicy
 from cfx.policies.features import token_width
@@ -48,10 +47,9 @@ ESTIMATORS = {
 }
 
 
-class TestEstimators(PolicyContract):
-    @pytest.fixture(params=ESTIMATORS)
-    def policy(self, request: pytest.FixtureRequest) -> Policy:
-        return ESTIMATORS[request.param]
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_contract_of_other_settings(name: str) -> None:
+    check_contract(ESTIMATORS[name])
 
 
 def agent_of(policy: EstimatorPolicy, model: DrivingModel, prior: Tensor) -> Agent:

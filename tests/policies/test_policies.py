@@ -5,44 +5,19 @@ from __future__ import annotations
 import pytest
 import torch
 
-from cfx.contracts import PolicyContract
+from cfx.contracts import check_contract
 from cfx.core.errors import ConfigError
 from cfx.policies.base import Policy
-from cfx.policies.default import DefaultPolicy
 from cfx.policies.features import INPUT_SETS, INPUTS, History, token_width, tokens
-from cfx.policies.fixed import FixedPolicy
 from cfx.policies.gru import GruPolicy
 from cfx.policies.lstm import LstmPolicy
 from cfx.policies.recurrent import RecurrentNetwork
 
 
-class TestDefault(PolicyContract):
-    @pytest.fixture
-    def policy(self) -> Policy:
-        return DefaultPolicy()
-
-
-class TestFixed(PolicyContract):
-    @pytest.fixture
-    def policy(self) -> Policy:
-        return FixedPolicy()
-
-
-class TestGru(PolicyContract):
-    @pytest.fixture(params=[1, 2])
-    def policy(self, request: pytest.FixtureRequest) -> Policy:
-        return GruPolicy(layers=request.param, hidden_size=8)
-
-
-class TestLstm(PolicyContract):
-    @pytest.fixture(params=[1, 2])
-    def policy(self, request: pytest.FixtureRequest) -> Policy:
-        return LstmPolicy(
-            layers=request.param,
-            hidden_size=8,
-            inputs=("gap", "relative_speed"),
-            summary="mean_std",
-        )
+@pytest.mark.parametrize("component", [GruPolicy, LstmPolicy])
+def test_contract_of_two_layers_and_other_inputs(component: type[Policy]) -> None:
+    inputs = ("gap", "relative_speed")
+    check_contract(component(layers=2, hidden_size=8, inputs=inputs, summary="mean_std"))
 
 
 @pytest.mark.parametrize(

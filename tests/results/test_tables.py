@@ -8,7 +8,6 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from cfx.contracts import TableContract
 from cfx.core import registry
 from cfx.core.errors import DataError
 from cfx.results.table import (
@@ -24,12 +23,6 @@ from cfx.results.tables import History
 from tests.conftest import ROOT
 from tests.made_up import GAINS, make_history, make_results
 from tests.test_job_results import findings as found
-
-
-class TestInstalled(TableContract):
-    @pytest.fixture(params=[one.part for one in installed()], ids=lambda one: type(one).__name__)
-    def table(self, request: pytest.FixtureRequest) -> ResultTable:
-        return request.param
 
 
 class Census(ResultTable):

@@ -149,14 +149,14 @@ def _broken_contract(entry: registry.Entry, component: object) -> str:
     """Returns the first statement of the contract that does not hold; "" if all hold."""
     from cfx.contracts import contract_for, violations
 
-    found = list(violations(contract_for(entry.kind), component))
+    found = list(violations(component, contract_for(entry.kind).quick))
     if not found:
         return ""
     check, sentence = found[0]
     text = f"{entry} breaks its contract: {' '.join(sentence.split())} ({check})"
     if len(found) > 1:
         text += f"; and {len(found) - 1} more"
-    return f"{text}; its own tests with cfx.contracts's suite show all of it"
+    return f"{text}; cfx.contracts.check_contract in its own tests shows all of it"
 
 
 def _not_tried(entry: registry.Entry, required: list[str]) -> str:

@@ -90,13 +90,11 @@ def _check_free(kind: registry.Kind, name: str) -> None:
 
 def _words(kind: registry.Kind, name: str) -> dict[str, Any]:
     """Returns what the templates call by name."""
-    base = kind.base.rpartition(":")[2]
     class_name = "".join(part.capitalize() for part in name.split("_"))
     return {
         "kind": kind.name,
         "group": kind.group,
         "entry_points": kind.entry_points,
-        "suite": f"{base.removeprefix('Driving')}Contract",
         "name": name,
         "class_name": class_name,
         "package": f"cfx_{name}",

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from typing import Any, ClassVar
@@ -128,6 +128,15 @@ class BotorchOptimizer(Optimizer):
 
     schema: ClassVar[type[Settings]] = BotorchSettings
     settings: BotorchSettings
+    trial: ClassVar[Mapping[str, Any]] = {
+        "initial": 6,
+        "iterations": 7,
+        "first_fit_steps": 15,
+        "fit_steps": 4,
+        "raw_samples": 128,
+        "restarts": 2,
+        "climb_steps": 3,
+    }
     in_parts = True
 
     def evaluations(self) -> int:

@@ -6,7 +6,8 @@ finite differences (chapter 8), projection onto bounds (chapter 16).
 
 from __future__ import annotations
 
-from typing import ClassVar, NamedTuple
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from pydantic import Field, model_validator
@@ -85,6 +86,7 @@ class GradientSearch(Optimizer):
 
     schema: ClassVar[type[Settings]] = GradientSettings
     settings: GradientSettings
+    trial: ClassVar[Mapping[str, Any]] = {"samples": 512}
     in_threads = True
 
     def evaluations(self) -> int:

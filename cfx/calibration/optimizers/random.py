@@ -8,6 +8,7 @@ integrals*; scrambling after A. B. Owen (1998) and J. Matousek (1998), as PyTorc
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import torch
@@ -34,6 +35,7 @@ class RandomSearch(Optimizer):
 
     schema: ClassVar[type[Settings]] = RandomSettings
     settings: RandomSettings
+    trial: ClassVar[Mapping[str, Any]] = {"samples": 1024}
     in_threads = True
 
     def evaluations(self) -> int:

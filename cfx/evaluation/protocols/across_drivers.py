@@ -138,6 +138,7 @@ class AcrossDrivers(Protocol):
 
     schema: ClassVar[type[Settings]] = AcrossDriversSettings
     settings: AcrossDriversSettings
+    trial: ClassVar[Mapping[str, Any]] = {"folds": 3}
 
     def run(self, context: ProtocolContext) -> ProtocolResult:
         trained = self.trained(context)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any, ClassVar
 
@@ -112,6 +112,7 @@ class Forecast(FoldsOrFinished):
 
     schema: ClassVar[type[Settings]] = ForecastSettings
     settings: ForecastSettings
+    trial: ClassVar[Mapping[str, Any]] = {"folds": 3, "horizons": (0.5, 1.0), "histories": ()}
 
     def run(self, context: ProtocolContext) -> ProtocolResult:
         self._check(context)

@@ -78,6 +78,7 @@ class RolloutLearner(Learner):
     uses_driver_features = True
     trial: ClassVar[Mapping[str, Any]] = {
         "ensemble_size": 2,
+        "distillation_epochs": 2,
         "epochs": 4,
         "steps": 12,
         "horizon": 10,

@@ -11,20 +11,12 @@ import pytest
 
 import cfx
 from cfx.app.cli import main
-from cfx.contracts import CommandContract
 from cfx.core.errors import DataError, Terminated
 from cfx.data.tidy import write_tidy
-from cfx_benchmark.command import BenchmarkCommand
 from cfx_benchmark.compare import compared, lines_of, read_errors
 from cfx_benchmark.frozen import DATA, METHODS, TESTED, protocol_hash
 from cfx_benchmark.row import Row, errors_of, markdown, protocol_name, values_of
 from cfx_benchmark.run import overrides_of, row_name, run
-
-
-class TestBenchmarkCommand(CommandContract):
-    @pytest.fixture
-    def command(self) -> BenchmarkCommand:
-        return BenchmarkCommand()
 
 
 def dataset(name: str, **settings: object) -> cfx.PairSet:

@@ -11,8 +11,7 @@ from scipy.optimize import brentq
 from torch import Tensor
 
 from cfx import Leader, Start, simulate
-from cfx.contracts import ModelContract
-from cfx.contracts.models import Equilibrium
+from cfx.contracts.models import keeps_its_equilibrium
 from cfx_classics.gipps import Gipps
 
 from .steps import next_speed, number
@@ -20,30 +19,11 @@ from .steps import next_speed, number
 TAU = 2 / 3
 
 
-class TestGipps(ModelContract):
-    @pytest.fixture
-    def model(self) -> Gipps:
-        return Gipps()
+def test_it_keeps_its_equilibrium_below_its_desired_speed() -> None:
+    def gap(speed: Tensor, p: Mapping[str, Tensor]) -> Tensor:
+        return p["s0"] + 1.5 * speed * p["tau"] + speed**2 * (1 / p["b"] - 1 / p["b_hat"]) / 2
 
-
-class TestGippsBelowItsDesiredSpeed(ModelContract):
-    """The equilibrium is that of speeds below V; the contract asks for it at up to 20 m/s."""
-
-    @pytest.fixture
-    def model(self) -> Gipps:
-        return Gipps(parameters={"V": {"low": 21.0, "default": 25.0}})
-
-    @pytest.fixture
-    def equilibrium(self) -> Equilibrium:
-        def gap(speed: Tensor, p: Mapping[str, Tensor]) -> Tensor:
-            return p["s0"] + 1.5 * speed * p["tau"] + speed**2 * (1 / p["b"] - 1 / p["b_hat"]) / 2
-
-        return gap
-
-    @pytest.fixture
-    def leader_deceleration(self) -> float:
-        """Returns what the driver expects of the leader."""
-        return 3.2
+    keeps_its_equilibrium(Gipps(parameters={"V": {"low": 21.0, "default": 25.0}}), gap)
 
 
 def papers_step(gap: float, v: float, v_l: float) -> float:

@@ -12,8 +12,7 @@ from torch import Tensor
 
 import cfx
 from cfx import DrivingModel, Follower, Leader, Start, simulate
-from cfx.contracts import ModelContract
-from cfx.contracts.models import Equilibrium
+from cfx.contracts.models import keeps_its_equilibrium
 from cfx.core.errors import ConfigError
 from cfx_classics.gipps import Gipps
 from cfx_classics.gipps_delay import GippsDelay
@@ -25,30 +24,11 @@ TAU = 2 / 3
 START_SPEED, START_GAP = 11.0, 25.0
 
 
-class TestGippsDelay(ModelContract):
-    @pytest.fixture
-    def model(self) -> GippsDelay:
-        return GippsDelay()
+def test_it_keeps_its_equilibrium_below_its_desired_speed() -> None:
+    def gap(speed: Tensor, p: Mapping[str, Tensor]) -> Tensor:
+        return p["s0"] + 1.5 * speed * p["tau"] + speed**2 * (1 / p["b"] - 1 / p["b_hat"]) / 2
 
-
-class TestGippsDelayBelowItsDesiredSpeed(ModelContract):
-    """The equilibrium is that of speeds below V; the contract asks for it at up to 20 m/s."""
-
-    @pytest.fixture
-    def model(self) -> GippsDelay:
-        return GippsDelay(parameters={"V": {"low": 21.0, "default": 25.0}})
-
-    @pytest.fixture
-    def equilibrium(self) -> Equilibrium:
-        def gap(speed: Tensor, p: Mapping[str, Tensor]) -> Tensor:
-            return p["s0"] + 1.5 * speed * p["tau"] + speed**2 * (1 / p["b"] - 1 / p["b_hat"]) / 2
-
-        return gap
-
-    @pytest.fixture
-    def leader_deceleration(self) -> float:
-        """Returns what the driver expects of the leader."""
-        return 3.2
+    keeps_its_equilibrium(GippsDelay(parameters={"V": {"low": 21.0, "default": 25.0}}), gap)
 
 
 def leader_of(dt: float, frames: int) -> Leader:

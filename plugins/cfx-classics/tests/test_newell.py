@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from cfx import Leader, Start, simulate
-from cfx.contracts import ModelContract
-from cfx.contracts.models import Equilibrium
+from cfx.contracts.models import keeps_its_equilibrium
 from cfx_classics.newell import Newell
 
 from .steps import LENGTH, gain, next_speed, number
@@ -19,30 +18,11 @@ from .steps import LENGTH, gain, next_speed, number
 TAU, D = 1.4, 2.5
 
 
-class TestNewell(ModelContract):
-    @pytest.fixture
-    def model(self) -> Newell:
-        return Newell()
+def test_it_keeps_its_equilibrium_below_its_desired_speed() -> None:
+    def gap(speed: Tensor, p: Mapping[str, Tensor]) -> Tensor:
+        return p["d"] + speed * p["tau"]
 
-
-class TestNewellBelowItsDesiredSpeed(ModelContract):
-    """The equilibrium is that of speeds below v_f; the contract asks for it at up to 20 m/s."""
-
-    @pytest.fixture
-    def model(self) -> Newell:
-        return Newell(parameters={"v_f": {"low": 21.0}})
-
-    @pytest.fixture
-    def equilibrium(self) -> Equilibrium:
-        def gap(speed: Tensor, p: Mapping[str, Tensor]) -> Tensor:
-            return p["d"] + speed * p["tau"]
-
-        return gap
-
-    @pytest.fixture
-    def leader_deceleration(self) -> float:
-        """Returns any: the follower never drives past where the leader's bumper is."""
-        return 50.0
+    keeps_its_equilibrium(Newell(parameters={"v_f": {"low": 21.0}}), gap)
 
 
 def stop_and_go(dt: float, frames: int) -> Leader:

@@ -13,8 +13,8 @@ from torch import Tensor
 
 import cfx
 from cfx import DrivingModel, Leader, Start, simulate
-from cfx.contracts import ModelContract
-from cfx.contracts.models import Equilibrium
+from cfx.contracts import check_contract
+from cfx.contracts.models import keeps_its_equilibrium
 from cfx_classics.fvdm import FVDM
 from cfx_classics.ovm import OVM
 
@@ -27,38 +27,15 @@ DEFAULTS: Mapping[type[DrivingModel], Mapping[str, float]] = {
 }
 
 
-class TestOvm(ModelContract):
-    @pytest.fixture
-    def model(self) -> OVM:
-        return OVM()
+def equilibrium_gap(speed: Tensor, p: Mapping[str, Tensor]) -> Tensor:
+    shift = torch.tanh(p["beta"])
+    return p["width"] * (p["beta"] + torch.atanh((1 + shift) * speed / p["v0"] - shift))
 
 
-class TestFvdm(ModelContract):
-    @pytest.fixture
-    def model(self) -> FVDM:
-        return FVDM()
-
-
-class TestOvmBelowItsDesiredSpeed(ModelContract):
-    """The equilibrium is that of speeds below v0; the contract asks for it at up to 20 m/s."""
-
-    @pytest.fixture
-    def model(self) -> DrivingModel:
-        return OVM(parameters={"v0": {"low": 21.0}})
-
-    @pytest.fixture
-    def equilibrium(self) -> Equilibrium:
-        def gap(speed: Tensor, p: Mapping[str, Tensor]) -> Tensor:
-            shift = torch.tanh(p["beta"])
-            return p["width"] * (p["beta"] + torch.atanh((1 + shift) * speed / p["v0"] - shift))
-
-        return gap
-
-
-class TestFvdmBelowItsDesiredSpeed(TestOvmBelowItsDesiredSpeed):
-    @pytest.fixture
-    def model(self) -> DrivingModel:
-        return FVDM(parameters={"v0": {"low": 21.0}, "reach": {"tuned": True}})
+def test_they_keep_their_equilibrium_below_their_desired_speed() -> None:
+    keeps_its_equilibrium(OVM(parameters={"v0": {"low": 21.0}}), equilibrium_gap)
+    tuned = FVDM(parameters={"v0": {"low": 21.0}, "reach": {"tuned": True}})
+    check_contract(tuned, equilibrium=equilibrium_gap)
 
 
 def test_with_the_papers_units_it_is_bandos_function() -> None:

@@ -9,6 +9,7 @@ implementation is Hansen's own: the package `cma`.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -63,6 +64,7 @@ class CmaOptimizer(Optimizer):
 
     schema: ClassVar[type[Settings]] = CmaSettings
     settings: CmaSettings
+    trial: ClassVar[Mapping[str, Any]] = {"samples": 90, "initial": 8}
 
     def evaluations(self) -> int:
         return self.settings.samples

@@ -6,23 +6,15 @@ import pytest
 import torch
 
 import cfx
-from cfx.contracts import OptimizerContract, Problems
+from cfx.contracts import check_contract
+from cfx.contracts.optimizers import Problems
 from cfx.core.errors import ConfigError
 from cfx_cma.evolution import CmaOptimizer
 
 
-class TestCma(OptimizerContract):
-    @pytest.fixture
-    def optimizer(self) -> CmaOptimizer:
-        return CmaOptimizer(samples=90, initial=8)
-
-
-class TestCmaWithAPopulationThatDoesNotDivideTheBudget(OptimizerContract):
-    tolerance = 0.15
-
-    @pytest.fixture
-    def optimizer(self) -> CmaOptimizer:
-        return CmaOptimizer(samples=71, initial=3, population=9, sigma=0.4)
+def test_contract_of_a_population_that_does_not_divide_the_budget() -> None:
+    optimizer = CmaOptimizer(samples=71, initial=3, population=9, sigma=0.4)
+    check_contract(optimizer, tolerance=0.15)
 
 
 def random(*shape: int) -> torch.Tensor:

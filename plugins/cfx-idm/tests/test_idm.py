@@ -18,8 +18,7 @@ from torch import Tensor
 
 import cfx
 from cfx import Follower, Leader, Start, simulate
-from cfx.contracts import ModelContract
-from cfx.contracts.models import Equilibrium
+from cfx.contracts import check_contract
 from cfx_idm.iidm import IIDM
 
 from .rollouts import order
@@ -42,44 +41,20 @@ def acceleration(
     return (model.next_speed(follower, leader, p, 1e-3).item() - v) / 1e-3
 
 
-class TestIdm(ModelContract):
-    @pytest.fixture
-    def model(self) -> IDM:
-        return IDM()
+def gap_of_idm(speed: Tensor, p: Mapping[str, Tensor]) -> Tensor:
+    return (p["s0"] + speed * p["T"]) / torch.sqrt(1.0 - (speed / p["v0"]) ** p["delta"])
 
 
-class TestIdmBelowItsDesiredSpeed(ModelContract):
-    """The equilibrium is that of speeds below v0; the contract asks for it at up to 20 m/s."""
-
-    @pytest.fixture
-    def model(self) -> IDM:
-        return IDM(parameters={"v0": {"low": 21.0}, "delta": {"tuned": True}})
-
-    @pytest.fixture
-    def equilibrium(self) -> Equilibrium:
-        def gap(speed: Tensor, p: Mapping[str, Tensor]) -> Tensor:
-            return (p["s0"] + speed * p["T"]) / torch.sqrt(1.0 - (speed / p["v0"]) ** p["delta"])
-
-        return gap
+def gap_of_iidm(speed: Tensor, p: Mapping[str, Tensor]) -> Tensor:
+    return p["s0"] + speed * p["T"]
 
 
-class TestIidm(ModelContract):
-    @pytest.fixture
-    def model(self) -> IIDM:
-        return IIDM()
-
-
-class TestIidmBelowItsDesiredSpeed(ModelContract):
-    @pytest.fixture
-    def model(self) -> IIDM:
-        return IIDM(parameters={"v0": {"low": 21.0}, "delta": {"tuned": True}})
-
-    @pytest.fixture
-    def equilibrium(self) -> Equilibrium:
-        def gap(speed: Tensor, p: Mapping[str, Tensor]) -> Tensor:
-            return p["s0"] + speed * p["T"]
-
-        return gap
+@pytest.mark.parametrize(("kind", "equilibrium"), [(IDM, gap_of_idm), (IIDM, gap_of_iidm)])
+def test_contract_below_the_desired_speed_with_all_parameters_tuned(
+    kind: Any, equilibrium: Any
+) -> None:
+    model = kind(parameters={"v0": {"low": 21.0}, "delta": {"tuned": True}})
+    check_contract(model, equilibrium=equilibrium)
 
 
 def test_the_defaults_are_the_papers() -> None:

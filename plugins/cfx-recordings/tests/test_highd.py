@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 import cfx
-from cfx.contracts import DatasetContract
+from cfx.contracts import check_contract
 from cfx.core.errors import DataError
 from cfx_recordings.highd import HighdDataset
 
@@ -76,10 +76,9 @@ def write_highd(folder: Path, pairs: cfx.PairSet, number: str = "01") -> Path:
     return tracks
 
 
-class TestHighd(DatasetContract):
-    @pytest.fixture
-    def dataset(self, tmp_path: Path) -> HighdDataset:
-        return HighdDataset(path=write_highd(tmp_path, made_pairs()), min_frames=100, max_gap=None)
+def test_contract(tmp_path: Path) -> None:
+    path = write_highd(tmp_path, made_pairs())
+    check_contract(HighdDataset(path=path, min_frames=100, max_gap=None))
 
 
 def test_both_directions_give_the_trajectories_back(tmp_path: Path) -> None:

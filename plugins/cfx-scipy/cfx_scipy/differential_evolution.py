@@ -12,6 +12,7 @@ and each solver goes on with its losses. SciPy's public function does all the wo
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -100,6 +101,7 @@ class DifferentialEvolution(Optimizer):
 
     schema: ClassVar[type[Settings]] = DifferentialEvolutionSettings
     settings: DifferentialEvolutionSettings
+    trial: ClassVar[Mapping[str, Any]] = {"population": 12, "generations": 11}
 
     def evaluations(self) -> int:
         return self.settings.population * (self.settings.generations + 1)

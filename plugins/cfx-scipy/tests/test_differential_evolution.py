@@ -8,25 +8,17 @@ import torch
 from scipy.optimize import differential_evolution
 
 import cfx
-from cfx.contracts import OptimizerContract, Problems
+from cfx.contracts import check_contract
+from cfx.contracts.optimizers import Problems
 from cfx.core.errors import ConfigError
 from cfx_scipy.differential_evolution import DifferentialEvolution
 
 
-class TestDifferentialEvolution(OptimizerContract):
-    @pytest.fixture
-    def optimizer(self) -> DifferentialEvolution:
-        return DifferentialEvolution(population=12, generations=11)
-
-
-class TestAnotherStrategy(OptimizerContract):
-    tolerance = 0.15
-
-    @pytest.fixture
-    def optimizer(self) -> DifferentialEvolution:
-        return DifferentialEvolution(
-            population=10, generations=10, strategy="randtobest1exp", recombination=0.9
-        )
+def test_contract_of_another_strategy() -> None:
+    optimizer = DifferentialEvolution(
+        population=10, generations=10, strategy="randtobest1exp", recombination=0.9
+    )
+    check_contract(optimizer, tolerance=0.15)
 
 
 def random(*shape: int) -> torch.Tensor:

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 import cfx
-from cfx.contracts import DemoContract
+from cfx.contracts import check_contract
 from cfx.core.errors import ConfigError, DataError, SumoError
 from cfx.policies.checkpoint import save
 from cfx_sumo.demo import motorway
@@ -33,10 +33,8 @@ SMALL = [
 OSM = SHIPPED.with_name("motorway.osm.xml")
 
 
-class TestSumoDemo(DemoContract):
-    @pytest.fixture
-    def demo(self) -> SumoDemo:
-        return SumoDemo(pairs=2)
+def test_contract() -> None:
+    check_contract(SumoDemo(pairs=2))
 
 
 @pytest.fixture(scope="module")

@@ -12,17 +12,16 @@ import numpy as np
 import pytest
 
 from cfx.app.cli import main
-from cfx.contracts import DatasetContract
+from cfx.contracts import check_contract
 from cfx.core.errors import DataError
 from cfx_sumo.fcd import SumoFcdDataset
 from tests.data.layouts import made_pairs, write_fcd
 
 
-class TestSumoFcd(DatasetContract):
-    @pytest.fixture(params=[True, False])
-    def dataset(self, request: pytest.FixtureRequest, tmp_path: Path) -> SumoFcdDataset:
-        path = write_fcd(tmp_path / "fcd.xml", made_pairs(), leaders=request.param)
-        return SumoFcdDataset(path=path, min_frames=100, max_gap=None)
+@pytest.mark.parametrize("leaders", [True, False])
+def test_contract(leaders: bool, tmp_path: Path) -> None:
+    path = write_fcd(tmp_path / "fcd.xml", made_pairs(), leaders=leaders)
+    check_contract(SumoFcdDataset(path=path, min_frames=100, max_gap=None))
 
 
 @pytest.mark.parametrize("leaders", [True, False])

@@ -11,7 +11,7 @@ from torch import Tensor
 
 import cfx
 from cfx import DrivingModel, Follower, Leader, Start
-from cfx.contracts import SimulatorContract
+from cfx.contracts import check_contract
 from cfx.core.errors import ConfigError, SumoError
 from cfx.models.krauss import Krauss
 from cfx.models.w74 import W74
@@ -40,10 +40,8 @@ def sumo() -> SumoSimulator:
     return SumoSimulator(workers=1)
 
 
-class TestSumo(SimulatorContract):
-    @pytest.fixture
-    def simulator(self, sumo: SumoSimulator) -> SumoSimulator:
-        return sumo
+def test_contract(sumo: SumoSimulator) -> None:
+    check_contract(sumo)
 
 
 class Case:

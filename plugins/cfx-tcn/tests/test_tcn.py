@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -8,30 +9,21 @@ import torch
 from torch import Tensor, nn
 
 import cfx
-from cfx.contracts import PolicyContract
+from cfx.contracts import check_contract
 from cfx_tcn.policy import TcnNetwork, TcnPolicy, TcnSettings
 
 
-class TestTcn(PolicyContract):
-    @pytest.fixture(
-        params=[
-            {},
-            {"levels": 1, "kernel": 4},
-            {"channels": 10, "levels": 2, "kernel": 2, "start": "middle"},
-        ]
-    )
-    def policy(self, request: pytest.FixtureRequest) -> TcnPolicy:
-        return TcnPolicy(**{"channels": 6, **request.param})
-
-
-class TestTcnWhoseTokensAreAsWideAsItsChannels(PolicyContract):
-    """Then nothing stands in the way around a block."""
-
-    @pytest.fixture
-    def policy(self) -> TcnPolicy:
-        return TcnPolicy(
-            channels=4, inputs=("gap", "relative_speed"), summary="mean_std", dropout=0.2
-        )
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"channels": 6, "levels": 1, "kernel": 4},
+        {"channels": 10, "levels": 2, "kernel": 2, "start": "middle"},
+        # Tokens as wide as its channels: nothing stands in the way around a block.
+        {"channels": 4, "inputs": ("gap", "relative_speed"), "summary": "mean_std", "dropout": 0.2},
+    ],
+)
+def test_contract(options: dict[str, Any]) -> None:
+    check_contract(TcnPolicy(**options))
 
 
 def build(seed: int = 0, networks: int = 2, **options: object) -> TcnNetwork:

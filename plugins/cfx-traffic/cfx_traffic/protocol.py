@@ -156,6 +156,17 @@ class TrafficProtocol(FoldsOrFinished):
 
     schema: ClassVar[type[Settings]] = TrafficSettings
     settings: TrafficSettings
+    trial: ClassVar[Mapping[str, Any]] = {
+        "folds": 3,
+        "histories": (),
+        "densities": (30.0,),
+        "vehicles": 5,
+        "demands": (900.0,),
+        "leader_speeds": (8.0,),
+        "platoon": 3,
+        "duration": 10.0,
+        "settle": 5.0,
+    }
 
     def run(self, context: ProtocolContext) -> ProtocolResult:
         length = float(context.batch.leader_length.mean())

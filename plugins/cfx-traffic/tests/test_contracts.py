@@ -7,10 +7,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from cfx import Protocol, ResultTable
-from cfx.contracts import ProtocolContract, TableContract
+from cfx.contracts import check_contract
 from cfx_traffic.protocol import TrafficProtocol
-from cfx_traffic.tables import Growth, Paths, Roads, Strips
 from tests.evaluation.protocols.test_finished import drawn, job
 from tests.evaluation.protocols.test_transfer import HERE
 
@@ -30,18 +28,6 @@ FINISHED = [
     "protocol.settle=10",
 ]
 
-TRAFFIC = TrafficProtocol(
-    folds=3,
-    histories=(),
-    densities=(30.0,),
-    vehicles=5,
-    demands=(900.0,),
-    leader_speeds=(8.0,),
-    platoon=3,
-    duration=10.0,
-    settle=5.0,
-)
-
 
 @pytest.fixture(scope="module")
 def traffic(drawn: Path) -> TrafficProtocol:
@@ -58,24 +44,8 @@ def traffic(drawn: Path) -> TrafficProtocol:
     )
 
 
-@pytest.mark.slow  # calibration and training are those of across_drivers
-class TestTraffic(ProtocolContract):
-    @pytest.fixture
-    def protocol(self) -> Protocol:
-        return TRAFFIC
-
-
-class TestFinished(ProtocolContract):
-    @pytest.fixture
-    def protocol(self, traffic: TrafficProtocol) -> Protocol:
-        return traffic
-
-
-class TestTables(TableContract):
-    @pytest.fixture(params=[Roads, Growth, Strips, Paths], ids=lambda table: table.__name__)
-    def table(self, request: pytest.FixtureRequest) -> ResultTable:
-        found: ResultTable = request.param()
-        return found
+def test_contract_with_a_finished_policy(traffic: TrafficProtocol) -> None:
+    check_contract(traffic)
 
 
 def test_the_finished_policy_is_set_on_roads(drawn: Path, tmp_path: Path) -> None:

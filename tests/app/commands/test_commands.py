@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-import cfx
 from cfx.app import cli
-from cfx.contracts import CommandContract
 from cfx.core import registry
-from cfx.core.command import Command
 from tests.conftest import Installer
 
 OWN = [one.name for one in registry.entries("command") if one.distribution == registry.OWN]
@@ -35,14 +33,6 @@ CENSUS = """
 """
 
 COUNTS = CENSUS.format(loaded="", run="print('counted', options.city)\n            return 1")
-
-
-class TestOwn(CommandContract):
-    @pytest.fixture(params=OWN)
-    def command(self, request: pytest.FixtureRequest) -> Command:
-        made = cfx.get("command", request.param)()
-        assert isinstance(made, Command)
-        return made
 
 
 @pytest.fixture
@@ -70,7 +60,7 @@ def test_help_completion_and_advice_know_it(
     assert "cfx_census" not in sys.modules
     assert capsys.readouterr().out.split() == ["census"]
     assert cli.main(["--help"]) == 0
-    assert "cfx census       counts (from cfx-census)" in capsys.readouterr().out
+    assert re.search(r"cfx census +counts \(from cfx-census\)", capsys.readouterr().out)
     monkeypatch.setenv("COMP_LINE", "cfx census --city u")
     monkeypatch.setenv("COMP_POINT", "19")
     assert cli.main(["-sc", "query=bash"]) == 0

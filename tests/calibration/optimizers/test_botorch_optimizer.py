@@ -7,41 +7,22 @@ from botorch.models import SingleTaskGP
 from cfx.calibration.optimizers import botorch
 from cfx.calibration.optimizers.botorch import BotorchOptimizer
 from cfx.calibration.optimizers.random import RandomSearch
-from cfx.contracts import OptimizerContract
+from cfx.contracts import check_contract
 from cfx.contracts.optimizers import Function, Problems, bowl, distance
 from cfx.core.errors import ConfigError
 
 
-class TestBotorchOptimizer(OptimizerContract):
-    tolerance = 0.1  # with 13 evaluations
-
-    @pytest.fixture
-    def optimizer(self) -> BotorchOptimizer:
-        return BotorchOptimizer(
-            initial=6,
-            iterations=7,
-            first_fit_steps=15,
-            fit_steps=4,
-            raw_samples=128,
-            restarts=2,
-            climb_steps=3,
-        )
-
-
-class TestBotorchOptimizerWithScreening(OptimizerContract):
-    tolerance = 0.1
-
-    @pytest.fixture
-    def optimizer(self) -> BotorchOptimizer:
-        return BotorchOptimizer(
-            initial=4,
-            iterations=2,
-            screening=200,
-            first_fit_steps=5,
-            raw_samples=64,
-            restarts=2,
-            climb_steps=3,
-        )
+def test_contract_with_screening() -> None:
+    optimizer = BotorchOptimizer(
+        initial=4,
+        iterations=2,
+        screening=200,
+        first_fit_steps=5,
+        raw_samples=64,
+        restarts=2,
+        climb_steps=3,
+    )
+    check_contract(optimizer, tolerance=0.1)
 
 
 @pytest.mark.parametrize("function", [distance, pytest.param(bowl, marks=pytest.mark.slow)])

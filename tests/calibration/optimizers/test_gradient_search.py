@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from pydantic import ValidationError
@@ -8,25 +10,14 @@ from torch import Tensor
 
 from cfx.calibration.optimizers.gradient import GradientSearch, _stages
 from cfx.calibration.optimizers.random import RandomSearch
-from cfx.contracts import OptimizerContract
+from cfx.contracts import check_contract
 from cfx.contracts.optimizers import Problems, bowl, distance
 from cfx.core.errors import ConfigError
 
 
-class TestGradientSearch(OptimizerContract):
-    tolerance = 1e-3
-
-    @pytest.fixture
-    def optimizer(self) -> GradientSearch:
-        return GradientSearch(samples=512)
-
-
-class TestGradientSearchFromOnePoint(OptimizerContract):
-    tolerance = 1e-3
-
-    @pytest.fixture
-    def optimizer(self) -> GradientSearch:
-        return GradientSearch(samples=300, starts=1, screening=0.1)
+@pytest.mark.parametrize("options", [{}, {"samples": 300, "starts": 1, "screening": 0.1}])
+def test_contract_with_optima_found_to_a_thousandth(options: dict[str, Any]) -> None:
+    check_contract(GradientSearch(**{"samples": 512, **options}), tolerance=1e-3)
 
 
 def valley(candidates: Tensor, optima: Tensor) -> Tensor:

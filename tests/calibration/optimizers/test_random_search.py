@@ -4,15 +4,8 @@ import pytest
 import torch
 
 from cfx.calibration.optimizers.random import RandomSearch
-from cfx.contracts import OptimizerContract
 from cfx.contracts.optimizers import Problems, bowl, distance
 from cfx.core.errors import ConfigError
-
-
-class TestRandomSearch(OptimizerContract):
-    @pytest.fixture
-    def optimizer(self) -> RandomSearch:
-        return RandomSearch(samples=1024)
 
 
 def test_every_problem_sees_the_same_points() -> None:

@@ -7,28 +7,16 @@ from collections.abc import Iterator
 import pytest
 
 import cfx
-from cfx.contracts import EngineContract
+from cfx.contracts import check_contract
 from cfx.core import registry, threads
-from cfx.core.engine.base import Engine
 from cfx.core.engine.local import LocalEngine
 from cfx_dask.engine.engine import DaskEngine
 from tests.core.engine.clusters import running_cluster
 
 
-class TestLocalOnOneCore(EngineContract):
-    @pytest.fixture
-    def engine(self, monkeypatch: pytest.MonkeyPatch) -> Engine:
-        monkeypatch.setattr(threads, "_LIMIT", [1])
-        return LocalEngine()
-
-
-@pytest.mark.slow
-class TestLocal(EngineContract):
-    """In processes of its own, each of which imports PyTorch."""
-
-    @pytest.fixture
-    def engine(self) -> Engine:
-        return LocalEngine()
+def test_contract_on_one_core() -> None:
+    with threads.one_core():
+        check_contract(LocalEngine())
 
 
 def test_it_is_chosen_by_name() -> None:
@@ -43,7 +31,5 @@ def cluster() -> Iterator[str]:
         yield made.address
 
 
-class TestDask(EngineContract):
-    @pytest.fixture
-    def engine(self, cluster: str) -> Engine:
-        return DaskEngine(address=cluster)
+def test_contract_on_a_running_cluster(cluster: str) -> None:
+    check_contract(DaskEngine(address=cluster))

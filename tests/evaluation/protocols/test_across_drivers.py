@@ -19,13 +19,18 @@ from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.optimizers.random import RandomSearch
 from cfx.calibration.shards import Solver
 from cfx.calibration.windows import Split, WindowSettings
+from cfx.contracts import protocols
 from cfx.core.errors import DataError
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
 from cfx.data.tidy import write_tidy
 from cfx.evaluation.protocols.across_drivers import AcrossDrivers
+from cfx.learners.base import TrainingData, TrainingResult
+from cfx.learners.rollout import RolloutLearner
 from cfx.models.krauss import Krauss
+from cfx.policies.base import Policy
 from cfx.policies.ensemble import Ensemble
 from cfx.policies.features import History
+from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.synthetic import SyntheticDataset
 from tests.drives import straight_pairs, wavy_pairs
@@ -34,6 +39,7 @@ QUICK = [
     "debug=quick",
     "data.max_pairs=null",
     "data.pairs=6",
+    "data.platoon_size=1",
     "data.frames=200",
     "figures.enabled=false",
     "tracking.enabled=false",
@@ -351,7 +357,7 @@ def rollout(folder: Path, *changes: str) -> cfx.JobResult:
 
 
 def test_a_job_learns_by_rollout_and_measures_how_much_history_matters(tmp_path: Path) -> None:
-    result = rollout(tmp_path / "one", "protocol.histories=[0,5]")
+    result = rollout(tmp_path / "one", "protocol.histories=[0,5]", "data.platoon_size=4")
     history = pd.read_parquet(tmp_path / "one" / "history.parquet")
     assert set(history["base"]) == {"own", "population"}
     assert list(dict.fromkeys(history["amount"])) == ["0 s", "5 s", "80 %"]
@@ -377,7 +383,8 @@ def test_a_job_learns_by_rollout_and_measures_how_much_history_matters(tmp_path:
 
 
 def test_less_history_is_what_the_plot_says(tmp_path: Path) -> None:
-    one, other = rollout(tmp_path / "one"), rollout(tmp_path / "other", "protocol.history=0")
+    one = rollout(tmp_path / "one", "protocol.histories=[0]")
+    other = rollout(tmp_path / "other", "protocol.history=0", "protocol.histories=[]")
     history = pd.read_parquet(tmp_path / "one" / "history.parquet")
     none = history[(history["base"] == "own") & (history["amount"] == "0 s")][
         "rmse_speed"
@@ -463,61 +470,60 @@ def test_a_reach_without_offsets_is_said_to_change_nothing(
     assert result.policy.space == Krauss().space
 
 
+class EnoughError(Exception):
+    """Nothing after it is looked at."""
+
+
+class Unwilling(RolloutLearner):
+    """Ends a job where training would begin."""
+
+    def fit(self, policy: Policy, training_data: TrainingData) -> TrainingResult:
+        raise EnoughError
+
+
+def warnings_of(
+    caplog: pytest.LogCaptureFixture,
+    policy: Policy | None = None,
+    cold_start_fraction: float = 0.5,
+    **options: Any,
+) -> str:
+    """Returns what a protocol warns of before it trains."""
+    learner = Unwilling(cold_start_fraction=cold_start_fraction)
+    job = protocols.context(protocols.recording(), policy=policy, learner=learner)
+    with pytest.raises(EnoughError):
+        AcrossDrivers(folds=2, **options).run(job)
+    return caplog.text
+
+
 @pytest.mark.parametrize(
     ("options", "warned"),
     [
-        (["learner.cold_start_fraction=1"], True),
-        (
-            ["learner.cold_start_fraction=1", "protocol.history=0"],
-            True,
-        ),  # and 10 and 30 s, for comparison
-        (["learner.cold_start_fraction=1", "protocol.history=0", "protocol.histories=[]"], False),
-        (["learner.cold_start_fraction=0.9"], False),
+        ({"cold_start_fraction": 1.0}, True),
+        ({"cold_start_fraction": 1.0, "history": 0}, True),  # and 10 and 30 s, for comparison
+        ({"cold_start_fraction": 1.0, "history": 0, "histories": ()}, False),
+        ({"cold_start_fraction": 0.9}, False),
     ],
 )
 def test_a_burn_in_without_history_in_training_is_warned_of(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, options: list[str], warned: bool
+    caplog: pytest.LogCaptureFixture, options: dict[str, Any], warned: bool
 ) -> None:
-    short = [
-        "protocol=across_drivers",
-        "protocol.folds=2",
-        "learner=rollout",
-        "learner.epochs=1",
-        "learner.steps=1",
-    ]
-    cfx.run([*QUICK, *short, *options, f"hydra.run.dir={tmp_path / 'job'}"])
-    assert ("with history before it" in caplog.text) == warned
+    said = warnings_of(caplog, **options)
+    assert ("with history before it" in said) == warned
 
 
 @pytest.mark.parametrize(
     ("options", "warned"),
     [
-        (["protocol.history=0"], True),
-        (["learner.cold_start_fraction=1", "protocol.histories=[]"], True),
-        ([], False),
+        ({"history": 0}, True),
+        ({"cold_start_fraction": 1.0, "histories": ()}, True),
+        ({}, False),
     ],
 )
 def test_driver_features_without_history_are_warned_of(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, options: list[str], warned: bool
+    caplog: pytest.LogCaptureFixture, options: dict[str, Any], warned: bool
 ) -> None:
-    short = [
-        "protocol=across_drivers",
-        "protocol.folds=2",
-        "learner=rollout",
-        "learner.epochs=1",
-        "learner.steps=1",
-    ]
-    result = cfx.run(
-        [
-            *QUICK,
-            *short,
-            "policy.driver_features=all",
-            *options,
-            f"hydra.run.dir={tmp_path / 'job'}",
-        ]
-    )
-    assert ("policy.driver_features are measured from a driver's history" in caplog.text) == warned
-    assert len(cfx.load(result.folder).policy.policy.driver_features) == 6
+    said = warnings_of(caplog, GruPolicy(driver_features="all"), **options)
+    assert ("policy.driver_features are measured from a driver's history" in said) == warned
 
 
 def test_trajectories_that_are_too_short_to_test_change_what_is_learned(tmp_path: Path) -> None:

@@ -12,12 +12,11 @@ import torch
 import yaml
 
 import cfx
-from cfx.contracts import ProtocolContract
+from cfx.contracts import check_contract
 from cfx.core.errors import CfxError, DataError
 from cfx.data.pairs import PairBatch
 from cfx.evaluation.closed_loop import Followers
 from cfx.evaluation.forecast_paths import Origins, simulate_from_origins
-from cfx.evaluation.protocols.base import Protocol
 from cfx.evaluation.protocols.forecast import Forecast
 from cfx.policies import checkpoint
 from cfx.simulation.rollout import MemoryStepper
@@ -44,10 +43,8 @@ def forecast(drawn: Path) -> Forecast:
     return Forecast(run=drawn, horizons=(0.5, 1.0), histories=())
 
 
-class TestForecast(ProtocolContract):
-    @pytest.fixture
-    def protocol(self, forecast: Forecast) -> Protocol:
-        return forecast
+def test_contract(forecast: Forecast) -> None:
+    check_contract(forecast)
 
 
 def job(base: list[str], run: Path, folder: Path, *overrides: str) -> cfx.JobResult:

@@ -12,12 +12,11 @@ import torch
 import yaml
 
 import cfx
-from cfx.contracts import ProtocolContract
+from cfx.contracts import check_contract
 from cfx.core.errors import CfxError, DataError, TrackingError
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.tidy import TidyDataset, frame_of, write_tidy
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
-from cfx.evaluation.protocols.base import Protocol
 from cfx.evaluation.protocols.transfer import Transfer
 from cfx.policies import checkpoint
 from cfx.policies.placement import ALL
@@ -27,6 +26,7 @@ from cfx.simulation.synthetic import SyntheticDataset
 QUICK = [
     "debug=quick",
     "data.max_pairs=null",
+    "data.platoon_size=1",
     "data.frames=200",
     "figures.enabled=false",
     "tracking.enabled=false",
@@ -69,9 +69,30 @@ def known(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def one_for_all(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A job without a population, whose policy answers parameters."""
-    return trained(tmp_path_factory.mktemp("jobs") / "one", "protocol.networks=all")
+def store(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    return [
+        "tracking.enabled=true",
+        f"tracking.uri=sqlite:///{tmp_path_factory.mktemp('store')}/a.db",
+    ]
+
+
+@pytest.fixture(scope="module")
+def one_for_all(tmp_path_factory: pytest.TempPathFactory, store: list[str]) -> cfx.JobResult:
+    """A tracked job without a population, whose policy answers parameters."""
+    folder = tmp_path_factory.mktemp("jobs") / "one"
+    return cfx.run([*TRAINED, "protocol.networks=all", f"hydra.run.dir={folder}", *store])
+
+
+@pytest.fixture(scope="module")
+def of_all(tmp_path_factory: pytest.TempPathFactory, one_for_all: cfx.JobResult) -> cfx.JobResult:
+    """A job that drives its policy."""
+    return transferred(one_for_all.folder, tmp_path_factory.mktemp("of all"))
+
+
+@pytest.fixture(scope="module")
+def moved(tmp_path_factory: pytest.TempPathFactory, unseen: Path) -> cfx.JobResult:
+    """A job in which a policy drives that knows nothing of its drivers."""
+    return transferred(unseen, tmp_path_factory.mktemp("moved"))
 
 
 @pytest.fixture(scope="module")
@@ -79,14 +100,12 @@ def saved(unseen: Path) -> Transfer:
     return Transfer(run=unseen)
 
 
-class TestTransfer(ProtocolContract):
-    @pytest.fixture
-    def protocol(self, saved: Transfer) -> Protocol:
-        return saved
+def test_contract(saved: Transfer) -> None:
+    check_contract(saved)
 
 
 def elsewhere(seed: int = 9) -> PairSet:
-    return SyntheticDataset(pairs=3, frames=200, seed=seed).load()
+    return SyntheticDataset(pairs=3, platoon_size=1, frames=200, seed=seed).load()
 
 
 def transferred(run: Path, tmp_path: Path, *overrides: str) -> cfx.JobResult:
@@ -94,9 +113,9 @@ def transferred(run: Path, tmp_path: Path, *overrides: str) -> cfx.JobResult:
 
 
 def test_it_drives_with_the_network_of_all_from_the_populations_parameters(
-    unseen: Path, tmp_path: Path
+    unseen: Path, moved: cfx.JobResult
 ) -> None:
-    result = transferred(unseen, tmp_path)
+    result = moved
     policy = checkpoint.load(unseen / "policy")
     batch = PairBatch.of(elsewhere())
     number = torch.full((3,), policy.names.index(ALL))
@@ -138,10 +157,12 @@ def test_own_parameters_are_the_models_alone_where_the_policy_has_a_residual(
     assert metrics["rmse_speed/policy"] > 0.0
 
 
-def test_model_policy_and_windows_are_those_it_was_trained_with(
-    unseen: Path, tmp_path: Path
+def test_model_policy_and_windows_are_those_it_was_trained_with_and_drivers_of_the_same_names_count(
+    unseen: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    result = transferred(unseen, tmp_path, "model=w99", "policy=lstm", "windows.length=7")
+    with caplog.at_level("WARNING"):  # all synthetic recordings are called synthetic
+        result = transferred(unseen, tmp_path, "model=w99", "policy=lstm", "windows.length=7")
+    assert "3 drivers have the same names, including the recording" in caplog.text
     config = yaml.safe_load((result.folder / "config.yaml").read_text())
     assert (config["model"]["name"], config["policy"]["name"], config["windows"]["length"]) == (
         "krauss",
@@ -149,35 +170,28 @@ def test_model_policy_and_windows_are_those_it_was_trained_with(
         5,
     )
     assert config["policy"]["inputs"] == "situation"
-    assert (
-        json.loads((result.folder / "data.json").read_text())["protocol"]["pairs_learned_from"] == 6
-    )
+    notes = json.loads((result.folder / "data.json").read_text())["protocol"]
+    assert notes["pairs_learned_from"] == 6
+    assert notes["drivers_named_as_some_learned_from"] == 3
 
 
-def test_the_job_may_be_named_by_its_mlflow_run(tmp_path: Path) -> None:
-    tracked = ["tracking.enabled=true", f"tracking.uri=sqlite:///{tmp_path / 'jobs.db'}"]
-    first = cfx.run(
-        [*TRAINED, "protocol.networks=all", f"hydra.run.dir={tmp_path / 'first'}", *tracked]
-    )
-    there = transferred(first.folder, tmp_path / "by folder")
-    named = cfx.run(
-        [*HERE, f"protocol.run={first.run_id}", f"hydra.run.dir={tmp_path / 'by id'}", *tracked]
-    )
-    pd.testing.assert_frame_equal(named.pairs, there.pairs)
-    assert (
-        yaml.safe_load((named.folder / "config.yaml").read_text())["protocol"]["run"]
-        == first.run_id
-    )
+def test_the_job_may_be_named_by_its_mlflow_run(
+    one_for_all: cfx.JobResult, of_all: cfx.JobResult, store: list[str], tmp_path: Path
+) -> None:
+    run = one_for_all.run_id
+    named = cfx.run([*HERE, f"protocol.run={run}", f"hydra.run.dir={tmp_path / 'by id'}", *store])
+    pd.testing.assert_frame_equal(named.pairs, of_all.pairs)
+    config = yaml.safe_load((named.folder / "config.yaml").read_text())
+    assert config["protocol"]["run"] == run
+    nowhere = [f"protocol.run={'f' * 32}", f"hydra.run.dir={tmp_path / 'nothing'}"]
     with pytest.raises(TrackingError, match=r"could not read run f{32}"):
-        cfx.run(
-            [*HERE, f"protocol.run={'f' * 32}", f"hydra.run.dir={tmp_path / 'nothing'}", *tracked]
-        )
+        cfx.run([*HERE, *nowhere, *store])
 
 
 def test_without_a_population_the_default_is_the_only_baseline_for_unseen_drivers(
-    one_for_all: Path, tmp_path: Path
+    of_all: cfx.JobResult,
 ) -> None:
-    result = transferred(one_for_all, tmp_path)
+    result = of_all
     assert set(result.pairs.method) == {"default", "fixed", "policy"}
     assert result.pairs[result.pairs.method == "policy"]["full_trajectory_rmse_speed"].notna().all()
 
@@ -189,7 +203,7 @@ def test_what_it_has_learned_from_is_refused_whatever_it_is_called(
         DataError, match=r"has learned from 3 of the 3 pairs in .*, the first of them 'synthetic-"
     ):
         transferred(unseen, tmp_path, "data.seed=5", "data.pairs=6", "data.max_pairs=3")
-    seen = SyntheticDataset(pairs=6, frames=200, seed=5).load()
+    seen = SyntheticDataset(pairs=6, platoon_size=1, frames=200, seed=5).load()
     renamed = tuple(
         replace(pair, recording="other", pair_id=f"x{pair.pair_id}", truth={}) for pair in seen[:4]
     )
@@ -212,7 +226,7 @@ def test_other_units_and_fewer_decimals_do_not_hide_what_it_has_learned_from(
     unseen: Path, tmp_path: Path
 ) -> None:
     """The same pairs through km/h, and saved with two decimals."""
-    seen = SyntheticDataset(pairs=6, frames=200, seed=5).load()
+    seen = SyntheticDataset(pairs=6, platoon_size=1, frames=200, seed=5).load()
     table = frame_of(PairSet(tuple(replace(pair, recording="other") for pair in seen), "seen"))
     speeds = ["leader_speed_mps", "follower_speed_mps"]
     for name, saved in {
@@ -233,23 +247,6 @@ def test_constant_parameters_are_not_tested_on_whom_they_were_calibrated_on(tmp_
         transferred(constant, tmp_path, "data.seed=5", "data.pairs=6", "data.max_pairs=3")
     there = transferred(constant, tmp_path)
     assert set(there.pairs["method"]) == {"default", "population", "fixed"}
-
-
-def test_drivers_of_the_same_names_are_counted(
-    unseen: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    with caplog.at_level("WARNING"):
-        result = transferred(unseen, tmp_path)  # all synthetic recordings are called synthetic
-    assert any(
-        "3 drivers have the same names, including the recording" in message
-        for message in caplog.messages
-    )
-    assert (
-        json.loads((result.folder / "data.json").read_text())["protocol"][
-            "drivers_named_as_some_learned_from"
-        ]
-        == 3
-    )
 
 
 def test_other_time_steps_are_refused(unseen: Path, tmp_path: Path) -> None:
@@ -277,10 +274,11 @@ def test_runs_that_have_no_policy_for_others_are_refused(tmp_path: Path) -> None
         cfx.run([*HERE, f"hydra.run.dir={tmp_path / 'job'}"])
 
 
-def test_a_job_that_drives_a_saved_policy_hands_it_on(unseen: Path, tmp_path: Path) -> None:
-    once = transferred(unseen, tmp_path / "once")
-    twice = transferred(once.folder, tmp_path / "twice")
-    pd.testing.assert_frame_equal(twice.pairs, once.pairs)
+def test_a_job_that_drives_a_saved_policy_hands_it_on(
+    unseen: Path, moved: cfx.JobResult, tmp_path: Path
+) -> None:
+    twice = transferred(moved.folder, tmp_path)
+    pd.testing.assert_frame_equal(twice.pairs, moved.pairs)
     assert (
         checkpoint.load(twice.folder / "policy").trained_on.pairs
         == checkpoint.load(unseen / "policy").trained_on.pairs

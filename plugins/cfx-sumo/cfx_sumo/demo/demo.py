@@ -58,6 +58,7 @@ class SumoDemo(Demo):
 
     schema: ClassVar[type[Settings]] = SumoDemoSettings
     settings: SumoDemoSettings
+    trial: ClassVar[Mapping[str, Any]] = {"pairs": 2}
 
     def check(self, pairs: PairSet) -> None:
         """Refuses what cannot be shown.
