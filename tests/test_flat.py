@@ -22,6 +22,7 @@ from cfx_sumo.export import export
 JOB = [
     "debug=quick",
     "data.pairs=3",
+    "data.platoon_size=1",
     "data.frames=200",
     "data.max_pairs=null",
     "figures.enabled=false",

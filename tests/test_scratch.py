@@ -25,7 +25,13 @@ from cfx.data.tidy import read_tidy, write_tidy
 from cfx.evaluation import result, shards, trajectories
 from cfx.simulation.synthetic import SyntheticDataset
 
-JOB = ("debug=quick", "figures.enabled=false", "tracking.enabled=false", "cache.enabled=false")
+JOB = (
+    "debug=quick",
+    "data.platoon_size=1",
+    "figures.enabled=false",
+    "tracking.enabled=false",
+    "cache.enabled=false",
+)
 
 
 def maps() -> int:

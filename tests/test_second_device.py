@@ -21,6 +21,7 @@ from tests.learners.made import module_of, training_data
 _SMALL = [
     "data=synthetic",
     "data.pairs=4",
+    "data.platoon_size=1",
     "data.frames=80",
     "policy=fixed",
     "optimizer.samples=16",

@@ -6,6 +6,7 @@ The work is made up: small sums, which any worker can do that can import this mo
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
 
 from cfx.contracts.contract import contract_of
 from cfx.core.engine.base import Engine, Report
@@ -41,26 +42,21 @@ def _nothing(_units: int) -> None:
 
 
 def every_shard_has_its_own_result(engine: Engine) -> None:
-    try:
-        for shares_cores in (True, False):
+    expected = {}
+    for number, shard in enumerate(_shards()):
+        expected[number] = [one * one for one in shard]
+    for shares_cores in (True, False):
+        with closing(engine):
             found = dict(engine.map(_squares, _shards(), _nothing, shares_cores=shares_cores))
-            expected = {}
-            for number, shard in enumerate(_shards()):
-                expected[number] = [one * one for one in shard]
-            assert found == expected, (
-                "map yields the number of each shard, as it was given, with its result, once each"
-            )
-    finally:
-        engine.close()
+        assert found == expected, (
+            "map yields the number of each shard, as it was given, with its result, once each"
+        )
 
 
 def progress_adds_up(engine: Engine) -> None:
     reported: list[int] = []
-    try:
-        for _ in engine.map(_squares, _shards(), reported.append):
-            pass
-    finally:
-        engine.close()
+    with closing(engine):
+        list(engine.map(_squares, _shards(), reported.append))
     expected = sum(len(shard) for shard in _shards())
     assert sum(reported) == expected, (
         f"what the shards report arrives whole: {expected} units, not {sum(reported)}"
@@ -68,22 +64,18 @@ def progress_adds_up(engine: Engine) -> None:
 
 
 def no_shards_are_no_work(engine: Engine) -> None:
-    try:
+    with closing(engine):
         found = list(engine.map(_squares, [], _nothing))
-    finally:
-        engine.close()
     assert found == [], "without a shard there is no result"
 
 
 def what_the_work_raises_is_raised_again(engine: Engine) -> None:
     sentence = ""
-    try:
-        for _ in engine.map(_fails_at_three, _shards(), _nothing):
-            pass
-    except DataError as error:
-        sentence = str(error)
-    finally:
-        engine.close()
+    with closing(engine):
+        try:
+            list(engine.map(_fails_at_three, _shards(), _nothing))
+        except DataError as error:
+            sentence = str(error)
     assert "write 4 instead" in sentence, (
         "the error of a worker is the job's own error, with its sentence: it must not be lost, or"
         " the job would go on without the shard's result"
@@ -99,12 +91,10 @@ def whoever_stops_listening_cancels_the_rest(engine: Engine) -> None:
             made += 1
             yield [made]
 
-    try:
+    with closing(engine):
         results = engine.map(_squares, endless(), _nothing)
         next(results)
         results.close()
-    finally:
-        engine.close()
     assert made < 10_000, "shards are made not long before they are worked on, however many follow"
 
 

@@ -105,6 +105,8 @@ class ParameterSpace:
     Attributes:
         parameters: in order.
         open: a config may add parameters that it names, with both bounds and the default.
+        tuned: those of them that are tuned.
+        names: names of the tuned parameters, in tensor order.
 
     Example:
         >>> space = ParameterSpace.of(Parameter("tau", "s", 0.5, 3.0, 1.0, "time headway"))
@@ -114,9 +116,14 @@ class ParameterSpace:
 
     parameters: tuple[Parameter, ...]
     open: bool = False
+    tuned: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
+    names: tuple[str, ...] = field(init=False, repr=False, compare=False)
     _by_name: dict[str, Parameter] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        tuned = tuple(parameter for parameter in self.parameters if parameter.tuned)
+        object.__setattr__(self, "tuned", tuned)
+        object.__setattr__(self, "names", tuple(parameter.name for parameter in tuned))
         by_name = {parameter.name: parameter for parameter in self.parameters}
         if len(by_name) != len(self.parameters):
             raise ParameterError("a parameter space names each parameter once")
@@ -140,15 +147,6 @@ class ParameterSpace:
                 f" {', '.join(self._by_name)}."
             )
         return self._by_name[name]
-
-    @property
-    def tuned(self) -> tuple[Parameter, ...]:
-        return tuple(parameter for parameter in self.parameters if parameter.tuned)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the tuned parameters, in tensor order."""
-        return tuple(parameter.name for parameter in self.tuned)
 
     def for_settings(self, settings: Settings) -> ParameterSpace:
         """Returns the space of a model with these settings: unused parameters are not tuned."""

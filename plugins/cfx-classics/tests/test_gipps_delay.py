@@ -176,6 +176,8 @@ def test_a_policy_learns_by_rollout_through_the_delay(tmp_path, monkeypatch) -> 
             "policy=gru",
             "learner=rollout",
             "learner.epochs=2",
+            "learner.steps=3",
+            "learner.ensemble_size=1",
             "protocol=across_drivers",
             "protocol.folds=2",
             "data.pairs=4",
