@@ -26,7 +26,6 @@ QUICK = [
     "protocol=within_driver",
     "data=synthetic",
     "data.pairs=2",
-    "data.platoon_size=1",
     "data.frames=150",
     "optimizer=random",
     "optimizer.samples=16",

@@ -206,7 +206,9 @@ def test_full_trajectories_belong_to_training() -> None:
 def result(tmp_path_factory: pytest.TempPathFactory) -> cfx.JobResult:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("across"))
-        return cfx.run([*QUICK, "protocol=across_drivers", "protocol.folds=3", "learner.epochs=5"])
+        platoons = "data.platoon_size=4"  # drivers follow one another across folds
+        across = ["protocol=across_drivers", "protocol.folds=3", "learner.epochs=5"]
+        return cfx.run([*QUICK, platoons, *across])
 
 
 def test_all_methods_are_simulated_over_the_same_frames(result: cfx.JobResult) -> None:

@@ -210,7 +210,7 @@ def test_what_it_has_learned_from_is_refused_whatever_it_is_called(
     write_tidy(PairSet((*renamed, *elsewhere()), "both"), tmp_path / "renamed.csv")
     tidy = [
         *QUICK[1:2],
-        *QUICK[3:],
+        *QUICK[4:],
         "data=tidy",
         "data.min_frames=100",
         "protocol=transfer",

@@ -48,7 +48,7 @@ def test_untrained_it_is_the_fixed_model(has_base: bool) -> None:
     """With the pooled base and with driver-specific ones, to the last bits."""
     own = TRUE.repeat(2, 1)
     policy, data = gru(), training_data(base=own)
-    expected = own if has_base else data.fixed
+    expected = own if has_base else data.pairs.fixed
     found = loop(untrained(data, policy), data, policy, first=100, base=own if has_base else None)
     constant = expected[:, None].expand_as(found.parameters)
     torch.testing.assert_close(found.parameters, constant, rtol=0, atol=1e-6)
@@ -268,7 +268,7 @@ def test_distillation_makes_a_policy_drive_better() -> None:
     policy, data = gru(), training_data(networks=1)
     before = untrained(data, policy).curves.validation_loss.iloc[0]
     options = {
-        "epochs": 7,
+        "epochs": 12,
         "distillation_epochs": 6,
         "cold_start_fraction": 0.0,
         "patience": None,
