@@ -253,9 +253,14 @@ def test_other_time_steps_are_refused(unseen: Path, tmp_path: Path) -> None:
     with pytest.raises(
         DataError, match=r"drives in steps of 0.1 s, .* has 0.05 s; set data.time_step=0.1"
     ):
-        transferred(unseen, tmp_path, "data.dt=0.05")
+        transferred(unseen, tmp_path, "data.dt=0.05", "data.platoon_size=4")
     assert transferred(
-        unseen, tmp_path, "data.dt=0.05", "data.frames=400", "data.time_step=0.1"
+        unseen,
+        tmp_path,
+        "data.dt=0.05",
+        "data.platoon_size=4",
+        "data.frames=400",
+        "data.time_step=0.1",
     ).metrics
 
 
