@@ -242,6 +242,7 @@ class Dataset(Component):
             pairs = _select_ids(pairs, self.settings.pair_ids)
         for name in ("driver_type", "leader_driver_type"):
             pairs = _select_label(pairs, name, getattr(self.settings, name))
+        recorded = {pair.pair_id: pair for pair in pairs}
         if self.settings.time_step is not None:
             pairs = resampled(pairs, self.settings.time_step)
             if not len(pairs):
@@ -250,7 +251,8 @@ class Dataset(Component):
                     " two such steps; give a shorter one"
                 )
         selected = _select_first(_select_long(pairs, self.settings.min_frames), self.settings)
-        check_kinematics(selected, self.settings.check)
+        used = tuple(recorded[pair.pair_id] for pair in selected.pairs)
+        check_kinematics(replace(selected, pairs=used), self.settings.check)
         if isinstance(self.settings, FileDatasetSettings):
             selected = with_usable_accelerations(selected, self.settings.accelerations)
         return scaled(selected, self.settings.scale)
