@@ -38,6 +38,7 @@ PROTOCOLS = {
     "cfx.evaluation.protocols.finished",
     "cfx.evaluation.protocols.held_out",
     "cfx.evaluation.protocols.noise",
+    "cfx.models.limits",
     "cfx.models.speed_limit",
     "cfx.policies.features",
 }

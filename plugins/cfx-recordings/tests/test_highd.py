@@ -83,7 +83,8 @@ def test_contract(tmp_path: Path) -> None:
 
 def test_both_directions_give_the_trajectories_back(tmp_path: Path) -> None:
     made = made_pairs()
-    pairs = HighdDataset(path=write_highd(tmp_path, made), min_frames=2, max_gap=None).load()
+    path = write_highd(tmp_path, made)
+    pairs = HighdDataset(path=path, min_frames=2, max_gap=None).read()
     assert [len(pair) for pair in pairs] == [len(pair) for pair in made]
     for pair, original in zip(pairs, made, strict=True):
         for name in SIGNALS:
