@@ -85,10 +85,10 @@ def _moved(data: TrainingData) -> TrainingData:
         value = getattr(data.recorded, field.name)
         if isinstance(value, Tensor):
             recorded[field.name] = value.to(DEVICE)
-    return replace(
-        data,
-        recorded=replace(data.recorded, **recorded),
-        pair=data.pair.to(DEVICE),
-        fixed=data.fixed.to(DEVICE),
-        network=data.network.to(DEVICE),
+    pairs = replace(
+        data.pairs,
+        index=data.pairs.index.to(DEVICE),
+        fixed=data.pairs.fixed.to(DEVICE),
+        network=data.pairs.network.to(DEVICE),
     )
+    return replace(data, recorded=replace(data.recorded, **recorded), pairs=pairs)
