@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from cfx.calibration.flatness import COLUMN
 from cfx.evaluation.metrics.base import RECORDED, SCOPES, MetricInfo, column_of, key_of
+from cfx.simulation.trajectory import TRANSIENT_S
 
 VALUE_COLUMNS = ("pair_id", "driver", "method", "scope", "metric", "value")
 """Columns of the long table, which a job writes as `pair_metrics.parquet`."""
@@ -63,6 +64,22 @@ def long_table(
 def _categories(codes: NDArray[Any], names: list[str]) -> Any:
     """Returns a column of names, each a number in memory."""
     return pd.Categorical.from_codes(codes, pd.Index(names))
+
+
+def scope_label(scope: str, transient_s: float = TRANSIENT_S) -> str:
+    """Returns how a part of trajectories is named: "test part after the first 5 s".
+
+    Args:
+        scope: one of `SCOPES`, or the name of another part, which is returned as it is.
+        transient_s: length of the transient at the beginning of the test part, s.
+    """
+    if scope == "test":
+        return "test part"
+    if scope == "steady":
+        return f"test part after the first {transient_s:g} s"
+    if scope == "full_trajectory":
+        return "full trajectories"
+    return scope
 
 
 def in_text(rows: pd.DataFrame) -> pd.DataFrame:

@@ -18,8 +18,9 @@ from cfx.evaluation.headline import improvement_key
 from cfx.evaluation.metrics.base import MetricInfo, key_of
 from cfx.evaluation.result import METHODS, PairTrajectory, Purpose
 from cfx.evaluation.statistics import STATISTICS, Improvement
+from cfx.evaluation.tables import scope_label
 from cfx.report.figures.results import ParameterAxis, Results
-from cfx.report.figures.text import TEST, scope_label
+from cfx.report.figures.text import TEST
 from cfx.report.metrics import known_metrics
 from cfx.simulation.trajectory import TRANSIENT_S
 

@@ -11,10 +11,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from cfx.evaluation.result import METHODS
-from cfx.evaluation.sites import ALL, BASELINES, site_table
+from cfx.evaluation.sites import ALL, BASELINES
+from cfx.evaluation.tables import scope_label
 from cfx.results.table import Column, Findings, ResultTable
-
-_SCOPES = {"test": "test part", "full_trajectory": "full trajectories"}
 
 
 class Sites(ResultTable):
@@ -41,34 +40,30 @@ class Sites(ResultTable):
     )
 
     def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        return [site_table(findings.pairs, findings.evaluation, seed=0)]
+        return [findings.sites]
 
     def metrics(self, findings: Findings) -> Mapping[str, float]:
-        found = {}
-        for table in self.rows(findings):
-            if table is None:
-                continue
-            for _, row in table[table["driver_type"] == ALL].iterrows():
-                site = re.sub(r"[^\w.\- ]", "_", str(row["site"]))
-                prefix = (
-                    f"site/{site}" if row["scope"] == "test" else f"full_trajectory/site/{site}"
-                )
-                for method in METHODS:
-                    for metric in ("rmse_speed", "rmse_gap"):
-                        if f"{metric}_{method}" in row:
-                            found[f"{prefix}/{metric}/{method}"] = float(row[f"{metric}_{method}"])
-                for baseline in BASELINES:
-                    if f"over_{baseline}" in row:
-                        value = float(row[f"over_{baseline}"])
-                        found[f"{prefix}/rmse_improvement/{baseline}"] = value
+        found: dict[str, float] = {}
+        table = findings.sites
+        if table is None:
+            return found
+        for _, row in table[table["driver_type"] == ALL].iterrows():
+            site = re.sub(r"[^\w.\- ]", "_", str(row["site"]))
+            prefix = f"site/{site}" if row["scope"] == "test" else f"full_trajectory/site/{site}"
+            for method in METHODS:
+                for metric in ("rmse_speed", "rmse_gap"):
+                    if f"{metric}_{method}" in row:
+                        found[f"{prefix}/{metric}/{method}"] = float(row[f"{metric}_{method}"])
+            for baseline in BASELINES:
+                if f"over_{baseline}" in row:
+                    value = float(row[f"over_{baseline}"])
+                    found[f"{prefix}/rmse_improvement/{baseline}"] = value
         return found
 
     def console(self, findings: Findings, metrics: Mapping[str, float]) -> Iterable[Table]:
-        for table in self.rows(findings):
-            if table is None:
-                continue
-            for scope, rows in table.groupby("scope", sort=False):
-                yield _printed(rows, _SCOPES[str(scope)])
+        if findings.sites is not None:
+            for scope, rows in findings.sites.groupby("scope", sort=False):
+                yield _printed(rows, scope_label(str(scope)))
 
 
 def _printed(rows: pd.DataFrame, scope: str) -> Table:

@@ -17,6 +17,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -90,6 +91,13 @@ class Findings:
     def evaluation(self) -> Evaluation:
         """What was measured."""
         return self.protocol_result.evaluation
+
+    @cached_property
+    def sites(self) -> pd.DataFrame | None:
+        """The evaluation by site, for a file, metrics and the console: see `site_table`."""
+        from cfx.evaluation.sites import site_table
+
+        return site_table(self.pairs, self.evaluation, seed=self.seed)
 
 
 class ResultTable(Component):

@@ -16,15 +16,13 @@ from cfx.evaluation.headline import headline
 from cfx.evaluation.metrics.base import MetricInfo, key_of
 from cfx.evaluation.result import Evaluation, Purpose
 from cfx.evaluation.statistics import Improvement
+from cfx.evaluation.tables import scope_label
 from cfx.report.figures.text import few_drivers
 from cfx.results.table import Findings, Kept
 from cfx.simulation.trajectory import TRANSIENT_S
 
 if TYPE_CHECKING:
     from cfx.results.tracker import Tracker
-
-_SCOPES = {"test": "test part", "full_trajectory": "full trajectories"}
-"""The scopes that have a table of their own, in words."""
 
 
 def report(
@@ -68,7 +66,7 @@ def report(
     _print_safety(evaluation, kept.metrics, console)
     _print_flat(evaluation, console)
     for scope, words in evaluation.outside.items():
-        text = f"Policy, {_SCOPES[scope]}: {words}; there it fades towards its base parameters."
+        text = f"Policy, {scope_label(scope)}: {words}; there it fades towards its base parameters."
         console.print(text, soft_wrap=True, highlight=False)
     for one in evaluation.left_out:
         text = f"Not measured: {one.name} of the distribution {one.distribution} ({one.reason})."
@@ -90,7 +88,7 @@ def methods_table(
     """Returns the metrics of one scope that are headlines: a row per method that has any."""
     count = len(evaluation.trajectories)
     plural = "" if count == 1 else "s"
-    title = f"{count} pair{plural}, {_SCOPES[scope]} in closed loop"
+    title = f"{count} pair{plural}, {scope_label(scope)} in closed loop"
     table = Table(title=title, title_justify="left")
     table.add_column("method")
     shown = [one for one in evaluation.measured if one.headline and scope in one.scopes]

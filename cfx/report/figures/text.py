@@ -6,7 +6,6 @@ import math
 from typing import NamedTuple
 
 from cfx.evaluation.metrics.base import SCOPES
-from cfx.simulation.trajectory import TRANSIENT_S
 
 MINUS = "\N{MINUS SIGN}"
 NOTHING = "\N{EN DASH}"
@@ -109,22 +108,6 @@ def short_label(method: str) -> str:
 def explained(method: str) -> str:
     """Returns what a method is, in words that end a sentence."""
     return METHOD_TEXTS[method].explained if method in METHOD_TEXTS else method
-
-
-def scope_label(scope: str, transient_s: float = TRANSIENT_S) -> str:
-    """Returns how a part of trajectories is named: "test part after the first 5 s".
-
-    Args:
-        scope: one of `SCOPES`, or the name of another part, which is returned as it is.
-        transient_s: length of the transient at the beginning of the test part, s.
-    """
-    if scope == TEST:
-        return "test part"
-    if scope == STEADY:
-        return f"test part after the first {transient_s:g} s"
-    if scope == FULL_TRAJECTORY:
-        return "full trajectories"
-    return scope
 
 
 def percent(fraction: float, digits: int = 0) -> str:
