@@ -32,6 +32,7 @@ from cfx.policies.valid_range import ValidRange
 from cfx.simulation.rollout import MemoryStepper
 from cfx_sumo.demo.motorway import read_motorway
 from cfx_sumo.demo.simulated import FinishedJob, PolicyKnowledge, simulate_in_sumo
+from cfx_sumo.live.draws import standard_normal
 from cfx_sumo.live.driver import Driver, needed_deceleration
 from cfx_sumo.live.fleet import Fleet
 from cfx_sumo.live.surroundings import Seen
@@ -126,9 +127,9 @@ def counted(policy: Agent, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     calls: list[int] = []
     original = Agent.act
 
-    def act(self: Agent, history: Any, state: Any, generator: Any) -> tuple[Tensor, Any]:
+    def act(self: Agent, history: Any, state: Any) -> tuple[Tensor, Any]:
         calls.append(len(history.gap))
-        return original(self, history, state, generator)
+        return original(self, history, state)
 
     monkeypatch.setattr(Agent, "act", act)
     return calls
@@ -475,6 +476,45 @@ def test_a_stochastic_policy_draws_live_with_a_seed() -> None:
     assert told[0][0] != told[1][0] != told[None][0]
     assert told[0][0][:4] != told[0][0][4:], "equal vehicles differ"
     assert told[None][0][:4] == told[None][0][4:]
+
+
+def drawn_speeds(
+    driver: Driver, vehicles: Sequence[str], steps: int = 12
+) -> dict[str, list[float]]:
+    """Returns what vehicles of a new road are told, in the order in which they are named."""
+    road = platoon(5)
+    for _ in range(steps):
+        driver.step(road, vehicles)
+        road.advance()
+    return {name: road.cars[name].told for name in vehicles}
+
+
+def test_what_is_drawn_for_a_vehicle_depends_on_no_other_vehicle() -> None:
+    policy = adaptive({"name": "krauss"}, stochastic=True)
+    alone = drawn_speeds(Driver(policy), ["v0", "v1"])
+    reversed_order = drawn_speeds(Driver(policy), ["v1", "v0"])
+    more = drawn_speeds(Driver(policy), ["v4", "v0", "v3", "v1"])
+    for name in ("v0", "v1"):
+        assert reversed_order[name] == alone[name]
+        assert more[name] == pytest.approx(alone[name], abs=1e-12)
+    other = drawn_speeds(Driver(policy, seed=1), ["v0", "v1"])
+    assert other["v0"] != alone["v0"]
+
+
+def test_a_driver_begins_anew_where_time_goes_back() -> None:
+    driver = Driver(adaptive({"name": "krauss"}, stochastic=True))
+    first = drawn_speeds(driver, ["v0", "v1"], 7)
+    assert drawn_speeds(driver, ["v0", "v1"], 7) == first
+
+
+def test_random_numbers_of_vehicles_are_standard_normal_and_independent() -> None:
+    names = [f"v{number}" for number in range(4000)]
+    drawn = torch.cat([standard_normal(0, names, now, 3) for now in (0.0, 0.1)], 1)
+    mean, correlation = drawn.mean(0), torch.corrcoef(drawn.T) - torch.eye(6)
+    assert float(mean.abs().max()) < 0.06
+    assert float((drawn.std(0) - 1.0).abs().max()) < 0.05
+    assert float(correlation.abs().max()) < 0.06
+    assert float((drawn < -1.645).double().mean()) == pytest.approx(0.05, abs=0.01)
 
 
 def test_a_network_may_be_named_behind_the_run(tmp_path: Path) -> None:

@@ -41,6 +41,7 @@ from cfx.policies.scaler import Scaler
 from cfx.policies.valid_range import share_in_words
 from cfx.results.store import folder_of
 from cfx.simulation.step import advance_vehicle
+from cfx_sumo.live.draws import standard_normal
 from cfx_sumo.live.surroundings import Connection, Seen, look
 from cfx_sumo.live.vehicles import VehicleTable
 
@@ -67,7 +68,8 @@ class DriverOptions(TypedDict, total=False):
         look_ahead: m; a vehicle farther ahead (bumper to bumper) is no leader.
         speed_mode: SUMO's bit set of `vehicle.setSpeedMode` while a vehicle is driven: 31 obeys
             lights, stops and junctions and keeps SUMO's safe gap; 0 does none of it.
-        seed: of what a stochastic policy leaves to chance; None: nothing is drawn.
+        seed: of what a stochastic policy leaves to chance: what is drawn for a vehicle depends on
+            it, the vehicle's id and the simulated time alone; None: nothing is drawn.
     """
 
     look_ahead: float
@@ -156,7 +158,8 @@ class Driver:
     vType's `minGap` needs more: see `needed_deceleration`. SUMO's `decel` of the vehicle is raised
     to that meanwhile.
 
-    A driver holds the state of one simulation; make another for another simulation.
+    A driver holds the state of one simulation. Where time goes back, all its vehicles begin anew;
+    several simulations at once need a driver each.
     """
 
     def __init__(
@@ -181,7 +184,7 @@ class Driver:
                 lights, stops and junctions and keeps SUMO's safe gap; 0 does none of it.
             model: the driving model; None for the one that the policy was trained for.
             source: where the policy comes from, for messages.
-            seed: of what a stochastic policy leaves to chance; None: nothing is drawn.
+            seed: of what a stochastic policy leaves to chance, as in `DriverOptions`.
 
         Raises:
             DataError: `look_ahead` is no distance; the policy has no such network; or its driving
@@ -209,9 +212,7 @@ class Driver:
                 " (or model.variant=sumo) to drive live"
             )
         self._driven = policy.head.driven_model(self.model)
-        self._generator: torch.Generator | None = None
-        if seed is not None:
-            self._generator = torch.Generator().manual_seed(seed)
+        self._seed = seed
         self._network = None
         if network is not None:
             self._network = self._number(network)
@@ -227,6 +228,7 @@ class Driver:
         self._free: list[int] = []
         self._store = VehicleTable.empty(policy, self._driven, 0)
         self._swept = math.nan
+        self._now = -math.inf
 
     @classmethod
     def load(
@@ -422,6 +424,9 @@ class Driver:
         names = [vehicles] if isinstance(vehicles, str) else list(vehicles)
         now = connection.simulation.getTime()
         self._check_step(connection)
+        if now < self._now:
+            self._forget_all()
+        self._now = now
         self._forget_gone(connection, names, now)
         following, leaders, seen, alone = look(
             connection, self._not_yet(names, now), self.look_ahead
@@ -436,11 +441,12 @@ class Driver:
         if drive:
             self._take_over(connection, following, slots)
         store = self._store
-        due = slots[store.steps[slots] % self.policy.windows.stride == 0]
+        due = store.steps[slots] % self.policy.windows.stride == 0
         if drive:
-            self._choose(due)
+            beginning = [following[index] for index in due.nonzero().flatten().tolist()]
+            self._choose(slots[due], beginning, now)
         else:
-            self._observe(due)
+            self._observe(slots[due])
         store.steps[slots] += 1
         if drive:
             self.counts.add(store.score[slots], store.beyond[slots])
@@ -467,6 +473,11 @@ class Driver:
         slot = self._slots.pop(vehicle, None)
         if slot is not None:
             self._free.append(slot)
+
+    def _forget_all(self) -> None:
+        """Drops all vehicles: time went back, so this is another simulation or an earlier state."""
+        for vehicle in self.vehicles:
+            self.forget(vehicle)
 
     def release(self, connection: Connection, vehicle: str) -> None:
         """Hands a vehicle back to SUMO's own model and drops what is known of it."""
@@ -598,16 +609,28 @@ class Driver:
             self._speed_modes.setdefault(name, connection.vehicle.getSpeedMode(name))
             connection.vehicle.setSpeedMode(name, self.speed_mode)
 
-    def _choose(self, slots: Tensor) -> None:
+    def _choose(self, slots: Tensor, names: list[str], now: float) -> None:
         """Lets the policy choose the parameters of vehicles whose window begins."""
         if len(slots) == 0:
             return
         store = self._store
-        chosen, after = self.policy.act(*self._known(slots), self._generator)
+        chosen, after = self.policy.act(*self._known(slots))
+        if self._seed is not None and self.policy.is_stochastic:
+            noise = standard_normal(self._seed, names, now, self.policy.head.noise_width)
+            chosen, after = self._drawn(chosen, after, noise)
         store.parameters[slots] = chosen
         store.score[slots], store.beyond[slots] = after.score, after.beyond
         store.latent[slots] = after.latent
         store.state[slots] = after.state[after.network, after.place]
+
+    def _drawn(self, chosen: Tensor, state: AgentState, noise: Tensor) -> tuple[Tensor, AgentState]:
+        """Draws parameters `(D, n)` around those that were chosen, from noise `(D, k)`."""
+        policy = self.policy
+        if policy.dispersion is not None:
+            noise = noise * policy.dispersion[state.network, None].to(noise)
+        window_s = policy.windows.stride * policy.dt
+        drawn, latent = policy.head.sampled(chosen, noise, state.latent.to(chosen), window_s)
+        return drawn, state._replace(latent=latent.to(state.latent))
 
     def _observe(self, slots: Tensor) -> None:
         """Lets the policy see windows of vehicles that somebody else drives."""
