@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import cfx
-from cfx.data.tidy import write_tidy
+from cfx.data.tidy import frame_of, write_tidy
 from cfx.simulation.synthetic import SyntheticDataset
 from cfx_sumo.drive.scenarios import SCENARIOS
 from tests.conftest import ROOT
@@ -41,6 +41,17 @@ def write_ngsim(pairs: cfx.PairSet, path: Path) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
+def write_trips(pairs: cfx.PairSet, path: Path) -> None:
+    """Writes pairs with names of columns of its owner's, speeds in km/h, and gaps alone."""
+    frame = frame_of(pairs)
+    gap = frame["leader_position_m"] - frame["leader_length_m"] - frame["follower_position_m"]
+    trips = frame[["recording", "leader_id", "follower_id", "frame"]].copy()
+    trips["trip"], trips["t"], trips["net_gap"] = frame["pair_id"], frame["time_s"], gap
+    trips["v_kmh"] = frame["follower_speed_mps"] * 3.6
+    trips["v_ahead"] = frame["leader_speed_mps"] * 3.6
+    trips.to_csv(path, index=False)
+
+
 @pytest.fixture(scope="module")
 def reader(tmp_path_factory: pytest.TempPathFactory) -> Reader:
     folder = tmp_path_factory.mktemp("reader")
@@ -57,6 +68,7 @@ def write_recordings(folder: Path) -> None:
     for pair in SyntheticDataset(pairs=6, frames=720, seed=1).load():
         others.append(replace(pair, pair_id=f"other-{pair.pair_id}", recording="other"))
     write_tidy(cfx.PairSet(tuple(others), "other"), folder / "other.parquet")
+    write_trips(made, folder / "trips.csv")
     SCENARIOS["motorway"].write(folder, 60.0).rename(folder / "my.sumocfg")
 
 

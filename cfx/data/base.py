@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from abc import abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, NamedTuple
@@ -209,6 +209,13 @@ class Dataset(Component):
             vehicles.add((pair.recording, pair.follower_id))
         return Contents(pairs, rows, len(vehicles))
 
+    def units(self) -> Mapping[str, str] | None:
+        """Returns the units in which settings say that the source has its signals; None: none can.
+
+        `speed`, `position`, `acceleration`, `leader_speed` and so on, `gap` and `time` are keys.
+        """
+        return None
+
     @abstractmethod
     def read(self) -> PairSet:
         """Returns every pair found, in a fixed order, with a count of whatever it had to leave out.
@@ -252,7 +259,7 @@ class Dataset(Component):
                 )
         selected = _select_first(_select_long(pairs, self.settings.min_frames), self.settings)
         used = tuple(recorded[pair.pair_id] for pair in selected.pairs)
-        check_kinematics(replace(selected, pairs=used), self.settings.check)
+        check_kinematics(replace(selected, pairs=used), self.settings.check, self.units())
         if isinstance(self.settings, FileDatasetSettings):
             selected = with_usable_accelerations(selected, self.settings.accelerations)
         return scaled(selected, self.settings.scale)

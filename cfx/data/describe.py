@@ -6,9 +6,9 @@ import io
 import logging
 import shlex
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,40 +53,63 @@ _ROUND = 50
 """Frames; a least length that is advised is a multiple of it, if pairs are that long."""
 
 
-def describe(path: Path) -> str:
+def describe(path: Path, settings: Mapping[str, Any] | None = None, options: str = "") -> str:
     """Says what a recording holds.
 
     These are its rows, recordings and pairs, their motion, what was left out and why, and what
-    looks wrong. The layout is found from the file itself: each dataset says whether it is its own,
-    those of plugins too.
+    looks wrong. Without settings the layout is found from the file itself: each dataset says
+    whether it is its own, those of plugins too.
+
+    Args:
+        settings: of the dataset that reads it, and its `name`.
+        options: what stands on the command line for these settings, after a blank.
 
     Raises:
         DataError: the file cannot be used; the message says why.
+        ConfigError: a setting is wrong.
     """
     path = path.expanduser()
-    name = _dataset_of(path)
-    cls = cast(type[Dataset], registry.get("dataset", name))
-    if name == "tidy" and path.is_dir():
-        return _describe_partitions(path, cls)
-    dataset = cls(path=path)
+    if settings is None:
+        settings = {"name": _dataset_of(path)}
+    reader = _Reader(settings, options)
+    if reader.name == "tidy" and path.is_dir():
+        return _describe_partitions(path, reader)
+    dataset = reader.of(path)
     contents = dataset.contents()
-    pieces: list[RenderableType] = [str(path), "", _overview(cls.layout, contents)]
+    pieces: list[RenderableType] = [str(path), "", _overview(dataset.layout, contents)]
     if len(contents.pairs):
         pieces += ["", _motion(contents.pairs)]
     pieces += ["", *_left_out(contents.pairs)]
     if contents.pairs.ends:
         pieces += ["", "Why pairs end:", *_counts(contents.pairs.ends)]
-    pieces += ["", *_problems(contents)]
-    options, kept = _advice(_lengths(contents.pairs), dataset.settings.min_frames)
-    pieces += [
-        "",
-        f"Use it: data={name} {shlex.quote(path_override('data.path', path))}{options}",
-        *kept,
-    ]
+    pieces += ["", *_problems(contents, dataset)]
+    more, kept = _advice(_lengths(contents.pairs), dataset.settings.min_frames)
+    pieces += ["", reader.use(path) + more, *kept]
     return _text(pieces)
 
 
-def _describe_partitions(folder: Path, cls: type[Dataset]) -> str:
+class _Reader(NamedTuple):
+    """Settings of the dataset that reads the files, and what stands for them on a command line."""
+
+    settings: Mapping[str, Any]
+    options: str
+
+    @property
+    def name(self) -> str:
+        return str(self.settings["name"])
+
+    def of(self, path: Path) -> Dataset:
+        """Returns the dataset of a file."""
+        created = registry.create("dataset", {**self.settings, "path": str(path)})
+        return cast(Dataset, created)
+
+    def use(self, path: Path) -> str:
+        """Returns the line that names the file in a job."""
+        override = shlex.quote(path_override("data.path", path))
+        return f"Use it: data={self.name} {override}{self.options}"
+
+
+def _describe_partitions(folder: Path, reader: _Reader) -> str:
     """Says what each file of a folder holds; reads one file after the other."""
     table = Table(box=None, padding=(0, 2), header_style="")
     table.add_column("file")
@@ -97,7 +120,8 @@ def _describe_partitions(folder: Path, cls: type[Dataset]) -> str:
     lengths: list[_Length] = []
     files = partitions(folder)
     for file in files:
-        contents = cls(path=file).contents()
+        dataset = reader.of(file)
+        contents = dataset.contents()
         pairs = contents.pairs
         recordings = {pair.recording for pair in pairs}
         drivers = {pair.driver for pair in pairs}
@@ -109,17 +133,17 @@ def _describe_partitions(folder: Path, cls: type[Dataset]) -> str:
         cells = [f"{count:,}" for count in counts]
         table.add_row(str(file.relative_to(folder)), listed(sorted(recordings), 2), *cells)
     table.add_row("all", f"{len(names):,}", *[f"{count:,}" for count in totals])
-    options, kept = _advice(lengths, cls.schema.model_fields["min_frames"].default)
+    more, kept = _advice(lengths, dataset.settings.min_frames)
     return _text(
         [
             str(folder),
             "",
-            f"{cls.layout}, {len(files)} files, read one after the other",
+            f"{dataset.layout}, {len(files)} files, read one after the other",
             "",
             table,
             "",
             "A recording alone: python -m cfx data describe FILE",
-            f"Use it: data=tidy {shlex.quote(path_override('data.path', folder))}{options}",
+            reader.use(folder) + more,
             *kept,
             "One recording of it: data.recording=NAME",
         ]
@@ -157,7 +181,8 @@ def _dataset_of(path: Path) -> str:
         columns = listed(start.columns, 20) or "none: it is a folder"
         raise DataError(
             f"{path}: no dataset knows this layout. Columns found: {columns}. Known layouts:"
-            f" {'; '.join(layouts)}. Write its pairs in the tidy layout, or see docs/readers.md"
+            f" {'; '.join(layouts)}. Name the columns of a table of pairs (data.columns, see"
+            " docs/how-to/own-recording.md), or see docs/readers.md"
         )
     return "ngsim"  # whose reader says what is wrong with a file without column names
 
@@ -301,9 +326,9 @@ def _counts(counts: Sequence[Dropped]) -> list[str]:
     return [f"  {one.count:,} {one.unit}: {one.reason}" for one in counts]
 
 
-def _problems(contents: Contents) -> list[str]:
+def _problems(contents: Contents, dataset: Dataset) -> list[str]:
     """Returns what a recording may hold but rarely should."""
-    found = list(_suspicions(contents.pairs))
+    found = list(_suspicions(contents.pairs, dataset.units()))
     if contents.problem:
         found.append(contents.problem)
     if not found:
@@ -311,7 +336,7 @@ def _problems(contents: Contents) -> list[str]:
     return ["Problems:", *(f"  {sentence}" for sentence in found)]
 
 
-def _suspicions(pairs: PairSet) -> Iterator[str]:
+def _suspicions(pairs: PairSet, units: Mapping[str, str] | None) -> Iterator[str]:
     """Yields a sentence for each kind of values that a recording rarely holds."""
     if not len(pairs):
         yield "there is no leader-follower pair in it"
@@ -331,7 +356,7 @@ def _suspicions(pairs: PairSet) -> Iterator[str]:
             " a column gap_m was given or leader positions are those of rear bumpers, and too long"
             " by a vehicle if not"
         )
-    words = in_words(pairs)
+    words = in_words(pairs, units)
     if words:
         yield f"{words}; a job that uses them is refused (data.check)"
     for what, wrong in _CHECKS.items():

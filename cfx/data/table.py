@@ -62,6 +62,8 @@ class Column:
         least: smallest number that is possible.
         above: every number is greater than this.
         wrong: what is wrong with a number that is not whole or out of bounds, and what to do.
+        called: the file's own name of the column, under which alone it is looked for; "": its name.
+        factor: what the file's numbers are multiplied by once they are checked.
     """
 
     name: str
@@ -76,6 +78,20 @@ class Column:
     least: float = -np.inf
     above: float = -np.inf
     wrong: str = ""
+    called: str = ""
+    factor: float = 1.0
+
+    @property
+    def title(self) -> str:
+        """What messages call the column."""
+        return self.called or self.name
+
+    @property
+    def written(self) -> tuple[str, ...]:
+        """The names under which it is looked for."""
+        if self.called:
+            return (self.called,)
+        return (self.name, *self.spellings)
 
 
 @dataclass(frozen=True)
@@ -142,10 +158,10 @@ class Layout:
         if column.many:
             matching = [name for name in at if re.fullmatch(column.name, name)]
             return [_Found(replace(column, name=name), at[name]) for name in matching]
-        for name in (column.name, *column.spellings):
+        for name in column.written:
             if name in at:
                 return [_Found(column, at[name])]
-        for name in (column.name, *column.spellings):
+        for name in column.written:
             if self.plain(name) in plain:
                 return [_Found(column, plain[self.plain(name)])]
         return []
@@ -154,20 +170,20 @@ class Layout:
         """Returns what to say of columns that are not there."""
         missing = sorted(missing, key=lambda column: bool(column.unless))
         first = missing[0]
-        called = " or ".join([first.name, *first.spellings])
-        own = {column.name for column in self.columns}
+        called = " or ".join(first.written)
+        own = {column.title for column in self.columns}
         spare = [name for name in names if name not in own]
         where = source
         if self.above:
             where += f", row {self.above + 1}"
         text = f"{where}: column {called} is missing."
         if len(names) > 1:
-            text += nearest(first.name, spare)
-        also = [column.name for column in missing[1:] if not column.unless]
+            text += nearest(first.title, spare)
+        also = [column.title for column in missing[1:] if not column.unless]
         if also:
             text += f" So {'is' if len(also) == 1 else 'are'} {listed(also, 5)}."
         for unless in dict.fromkeys(column.unless for column in missing if column.unless):
-            spared = [column.name for column in missing if column.unless == unless]
+            spared = [column.title for column in missing if column.unless == unless]
             text += f" {listed(spared, 10)}: missing too, but not needed beside a column {unless}."
         hints = dict.fromkeys(self.elsewhere.get(self.plain(name), "") for name in names)
         text += "".join(f" {hint}" for hint in hints if hint)
@@ -201,10 +217,11 @@ class Table:
 
     Attributes:
         source: what messages call it.
-        numbers: columns of numbers `(N,)`, in the file's units.
+        numbers: columns of numbers `(N,)`, in the layout's units.
         labels: columns of names `(N,)`.
         first_row: the number of the first row in messages.
         ignored: names of the columns that are not part of the layout.
+        titles: what messages call the columns that the file calls otherwise than the layout.
     """
 
     source: str
@@ -213,6 +230,7 @@ class Table:
     labels: Mapping[str, Labels]
     first_row: int
     ignored: Sequence[str]
+    titles: Mapping[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         for values in self.numbers.values():
@@ -229,7 +247,7 @@ class Table:
         """Says where a row is: the source, the row, the column, and what identifies the row."""
         text = f"{self.source}, row {self.row(index)}"
         if column:
-            text += f", column {column}"
+            text += f", column {self.title(column)}"
         known = []
         for word, key in self.layout.keys.items():
             if key in self.numbers:
@@ -239,6 +257,10 @@ class Table:
         if known:
             text += f" ({', '.join(known)})"
         return text
+
+    def title(self, column: str) -> str:
+        """Returns what messages call a column."""
+        return self.titles.get(column, column)
 
     def refuse(self, column: str, wrong: NDArray[bool_], why: str) -> None:
         """Raises DataError if any cell of a column of numbers is wrong; names the first.
@@ -346,15 +368,19 @@ def _checked(here: _Columns, columns: Mapping[str, Any], names: Sequence[str]) -
     labels = {}
     for name, one in here.found.items():
         if one.column.is_name:
-            labels[name] = _labels(here, name, columns[name])
+            labels[name] = _labels(here, one.column.title, columns[name])
         else:
-            numbers[name] = _floats(here, name, columns[name])
+            numbers[name] = _floats(here, one.column.title, columns[name])
     used = {one.at for one in here.found.values()}
     ignored = []
     for at, name in enumerate(names):
         if at not in used and name != _PANDAS_INDEX:
             ignored.append(name)
-    table = Table(here.source, here.layout, numbers, labels, here.first_row, ignored)
+    titles = {}
+    for name, one in here.found.items():
+        if one.column.title != name:
+            titles[name] = one.column.title
+    table = Table(here.source, here.layout, numbers, labels, here.first_row, ignored, titles)
     if not len(table):
         raise DataError(f"{here.source}: has the right columns but no rows")
     for name, own in labels.items():
@@ -362,7 +388,17 @@ def _checked(here: _Columns, columns: Mapping[str, Any], names: Sequence[str]) -
             _require_names(table, name, own)
     for name, values in numbers.items():
         _require_numbers(table, name, values, here.found[name].column)
-    return table
+    return _converted(table, here)
+
+
+def _converted(table: Table, here: _Columns) -> Table:
+    """Returns a table whose numbers are in the layout's units."""
+    numbers = dict(table.numbers)
+    for name, values in table.numbers.items():
+        factor = here.found[name].column.factor
+        if factor != 1.0:
+            numbers[name] = values * factor
+    return replace(table, numbers=numbers)
 
 
 def _require_names(table: Table, name: str, labels: Labels) -> None:
@@ -559,7 +595,7 @@ def _names_without_header(path: Path, layout: Layout, width: int) -> tuple[str, 
             f"{path}: its first row has {width} columns; {layout.name}'s files without a header"
             f" have {widths}"
         )
-    needed = [column.name for column in layout.columns if column.needed and not column.many]
+    needed = [column.title for column in layout.columns if column.needed and not column.many]
     raise DataError(
         f"{path}: the first row must hold the column names of {layout.name}: {listed(needed, 20)}"
     )

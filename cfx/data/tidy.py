@@ -18,6 +18,8 @@ One row per pair and frame, SI units, a constant time step within a pair, no gap
 | `lane` | | optional, one value for each pair |
 | `true_model`, `true_NAME` | | optional: a synthetic driver's model and its parameters over time |
 
+A file may call these otherwise and have other units: see `cfx.data.own_columns`.
+
 A length of 0 says that the leader's position is that of its rear bumper. See
 `cfx.data.tidy_checks.with_positions` for what follows from a column of gaps.
 """
@@ -25,7 +27,7 @@ A length of 0 says that the leader's position is that of its rear bumper. See
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from fractions import Fraction
 from pathlib import Path
@@ -36,6 +38,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet as pq
+from pydantic import Field, model_validator
 
 from cfx.core import scratch
 from cfx.core.component import Settings
@@ -52,6 +55,7 @@ from cfx.data.files import (
     partitions,
     recording_of,
 )
+from cfx.data.own_columns import OwnColumns, OwnUnits, own_layout, written_units
 from cfx.data.pairs import Dropped, Pair, PairSet
 from cfx.data.table import Column, Layout, Table, read_table, table_of
 from cfx.data.tidy_checks import GAP, LANE, LENGTH, TRUE, check, time_steps
@@ -110,8 +114,34 @@ LAYOUT = Layout(
 )
 
 
+class TidySettings(FileDatasetSettings):
+    """Settings of the reader of tidy pairs."""
+
+    columns: OwnColumns = Field(
+        OwnColumns(),
+        description="the file's own names of its columns, such as columns.speed=v_kmh; null: as"
+        " the layout calls them",
+    )
+    units: OwnUnits = Field(
+        OwnUnits(),
+        description="the units of columns that are named above, such as units.speed=km/h",
+    )
+
+    @model_validator(mode="after")
+    def _columns_and_units_agree(self) -> TidySettings:
+        """Refuses two quantities in one column, and units of columns that have their own."""
+        self.own_layout()
+        return self
+
+    def own_layout(self) -> Layout:
+        """Returns the layout with the file's own names and units."""
+        return own_layout(LAYOUT, self.columns, self.units)
+
+
 class TidyDataset(Dataset):
     """Pairs in the tidy layout (see the module), from parquet or CSV; gzipped CSV is fine.
+
+    Columns may have names and units of the file's own (`columns`, `units`).
 
     A folder stands for the parquet files in it, one recording each (`cfx.data.partitions`).
     With `data.recording` the others are not read.
@@ -124,8 +154,8 @@ class TidyDataset(Dataset):
     """
 
     layout = "tidy pairs (SI units)"
-    schema: ClassVar[type[Settings]] = FileDatasetSettings
-    settings: FileDatasetSettings
+    schema: ClassVar[type[Settings]] = TidySettings
+    settings: TidySettings
 
     @classmethod
     def recognises(cls, start: FileStart) -> bool:
@@ -139,30 +169,40 @@ class TidyDataset(Dataset):
         for path in self.settings.files():
             files += partitions(path)
         files = of_recording(files, self.settings.recording)
-        return joined(read_tidy(file) for file in files)
+        layout = self.settings.own_layout()
+        return joined(read_tidy(file, layout) for file in files)
+
+    def units(self) -> Mapping[str, str]:
+        return written_units(self.settings.columns, self.settings.units)
 
 
-def read_tidy(path: Path) -> PairSet:
+def read_tidy(path: Path, layout: Layout = LAYOUT) -> PairSet:
     """Reads a tidy file.
+
+    Args:
+        layout: the tidy layout, perhaps with the file's own names and units.
 
     Raises:
         DataError: the file cannot be read or does not keep to the layout.
     """
     recording = recording_of(path)
     given = {} if recording is None else {"recording": recording}
-    return _pairs(read_table(path, LAYOUT, given))
+    return _pairs(read_table(path, layout, given))
 
 
-def pairs_from_frame(frame: pd.DataFrame, source: str = "table") -> PairSet:
+def pairs_from_frame(
+    frame: pd.DataFrame, source: str = "table", layout: Layout = LAYOUT
+) -> PairSet:
     """Takes pairs from a table in the tidy layout.
 
     Args:
         source: what messages call the table; its rows are counted from 1.
+        layout: the tidy layout, perhaps with the table's own names and units.
 
     Raises:
         DataError: the table does not keep to the layout.
     """
-    return _pairs(table_of(frame, LAYOUT, source))
+    return _pairs(table_of(frame, layout, source))
 
 
 def _pairs(table: Table) -> PairSet:

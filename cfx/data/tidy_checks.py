@@ -154,7 +154,7 @@ def _check_gap(table: Table) -> None:
         raise DataError(
             f"{table.at(at[0])}: the leader is behind its follower, or overlaps it: the gap is"
             f" {gap[at[0]]:.2f} m ({len(at)} such rows); cut the pair there, or correct positions"
-            " and leader_length_m"
+            f" and {table.title(LENGTH)}"
         )
 
 
@@ -242,6 +242,6 @@ def _check_agreement(table: Table) -> None:
     if len(at):
         raise DataError(
             f"{table.at(at[0], GAP)}: is {numbers[GAP][at[0]]:.2f} m, but the positions and"
-            f" {LENGTH} make it {between[at[0]]:.2f} m ({len(at)} such rows); leave out the columns"
-            f" that are less exact: the positions, or {GAP}"
+            f" {table.title(LENGTH)} make it {between[at[0]]:.2f} m ({len(at)} such rows);"
+            f" leave out the columns that are less exact: the positions, or {table.title(GAP)}"
         )

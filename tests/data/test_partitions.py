@@ -16,6 +16,7 @@ from cfx.core.errors import DataError
 from cfx.data import tidy
 from cfx.data.describe import describe
 from cfx.data.pairs import PairSet
+from cfx.data.table import Layout
 from cfx.data.tidy import TidyDataset, read_tidy, write_tidy
 from tests.drives import straight_pairs
 
@@ -76,9 +77,9 @@ def test_a_job_of_a_sweep_is_done_again_when_a_file_of_the_folder_has_changed(fo
 def test_other_recordings_are_not_read(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[Path] = []
 
-    def counted(path: Path) -> PairSet:
+    def counted(path: Path, layout: Layout) -> PairSet:
         read.append(path)
-        return read_tidy(path)
+        return read_tidy(path, layout)
 
     monkeypatch.setattr(tidy, "read_tidy", counted)
     found = TidyDataset(path=folder, recording="us 101", min_frames=2).load()

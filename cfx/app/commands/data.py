@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import shlex
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from cfx.core.command import Command
+from cfx.core.errors import CfxError, ConfigError
 
 
 class DataCommand(Command):
@@ -17,7 +21,13 @@ class DataCommand(Command):
         parser = argparse.ArgumentParser("cfx data", description="Looks at recordings.")
         actions = parser.add_subparsers(dest="action", required=True)
         describe = actions.add_parser("describe", help="what recordings hold")
-        describe.add_argument("files", nargs="+", metavar="FILE", help="a recording")
+        describe.add_argument(
+            "files",
+            nargs="+",
+            metavar="FILE",
+            help="a recording; and settings of the reader, such as data.columns.speed=v_kmh"
+            " data.units.speed=km/h (of data=tidy unless data=NAME is among them)",
+        )
         fetch = actions.add_parser(
             "fetch",
             help="download a public recording; nothing else in cfx uses the network unasked",
@@ -44,16 +54,48 @@ class DataCommand(Command):
             return 0
         from cfx.data.describe import describe
 
-        for number, file in enumerate(options.files):
+        overrides = [word for word in options.files if _is_setting(word)]
+        files = [word for word in options.files if not _is_setting(word)]
+        if not files:
+            raise ConfigError("cfx data describe: name the file to look at")
+        settings = None
+        if overrides:
+            settings = _settings(overrides)
+        own = [word for word in overrides if not word.startswith("data=")]
+        words = "".join(f" {shlex.quote(word)}" for word in own)
+        for number, file in enumerate(files):
             if number:
                 print()
-            print(describe(Path(file)))
+            print(describe(Path(file), settings, words))
         return 0
 
 
-def _fetch(options: argparse.Namespace) -> None:
-    import shlex
+def _is_setting(word: str) -> bool:
+    """Says whether a word of the command line is a setting of the dataset, not a file."""
+    key, is_setting, _ = word.partition("=")
+    return bool(is_setting) and (key == "data" or key.lstrip("+~").startswith("data."))
 
+
+def _settings(overrides: Sequence[str]) -> dict[str, Any]:
+    """Returns the node of the dataset that a job with these overrides would have.
+
+    Raises:
+        ConfigError: one of them fits nothing.
+    """
+    from cfx.app import hydra_source
+    from cfx.app.user_errors import explain, is_user_error
+
+    if not any(word.startswith("data=") for word in overrides):
+        overrides = ["data=tidy", *overrides]
+    try:
+        return dict(hydra_source.plain(hydra_source.composed(overrides))["data"])
+    except Exception as error:
+        if is_user_error(error) and not isinstance(error, CfxError):
+            raise ConfigError(explain(error, overrides)) from None
+        raise
+
+
+def _fetch(options: argparse.Namespace) -> None:
     from cfx.core.console import console_logging
     from cfx.core.files import path_override
     from cfx.data.fetch import URL, fetch_ngsim_i80
