@@ -93,7 +93,12 @@ class Road:
         return self.cars[name].decel
 
     def setDecel(self, name: str, decel: float) -> None:  # noqa: N802
+        self.cars[name].kind = self.cars[name].kind.partition("@")[0] + f"@{name}"
         self.cars[name].decel = decel
+
+    def setType(self, name: str, kind: str) -> None:  # noqa: N802
+        self.cars[name].kind = kind
+        self.cars[name].decel = 4.5
 
     def setSpeed(self, name: str, speed: float) -> None:  # noqa: N802
         self.cars[name].told.append(speed)
@@ -419,6 +424,7 @@ def test_a_live_vehicle_brakes_comfortably_unless_it_must_brake_harder() -> None
     road.advance()
     driver.step(road, "v")
     assert road.cars["v"].decel == 4.5, "SUMO's own bound is restored"
+    assert road.cars["v"].kind == "calm", "and its vType"
     exact = Driver(adaptive(node), speed_mode=0)
     road = Road(lead=Car(speed=10.0), v=Car(speed=10.0, gap=1.0, leader="lead"))
     exact.step(road, "v")

@@ -42,6 +42,7 @@ from cfx.policies.valid_range import share_in_words
 from cfx.results.store import folder_of
 from cfx.simulation.step import advance_vehicle
 from cfx_sumo.live.draws import standard_normal
+from cfx_sumo.live.saved import DriverRecord, read_state, write_state
 from cfx_sumo.live.surroundings import Connection, Seen, look
 from cfx_sumo.live.vehicles import VehicleTable
 
@@ -220,8 +221,7 @@ class Driver:
         self._bases: dict[str, list[float]] = {}
         self._driver_features: dict[str, list[float]] = {}
         self._speed_modes: dict[str, int] = {}
-        self._decels: dict[str, float] = {}
-        self._raised: set[str] = set()
+        self._raised: dict[str, tuple[str, float]] = {}
         self.counts = DriveCounts()
         self._leaders: dict[str, str] = {}
         self._slots: dict[str, int] = {}
@@ -453,6 +453,7 @@ class Driver:
             speeds = self._speeds(connection, following, slots, seen).tolist()
             for name, speed in zip(following, speeds, strict=True):
                 connection.vehicle.setSpeed(name, speed)
+            store.told[slots] = torch.tensor(speeds, dtype=torch.float64)
 
     def _not_yet(self, names: list[str], now: float) -> list[str]:
         """Returns the vehicles that were not stepped at this instant before."""
@@ -464,12 +465,117 @@ class Driver:
                 wanted.append(name)
         return wanted
 
+    def save_state(self, path: str | Path) -> None:
+        """Writes what is known of all vehicles, for a simulation that goes on from here.
+
+        SUMO's own state of the same instant (`simulation.saveState`) belongs to it; SUMO writes it
+        exactly with `--save-state.precision 17`.
+
+        Args:
+            path: of the file.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        write_state(Path(path), [self.record()])
+
+    def load_state(self, connection: Connection, path: str | Path) -> None:
+        """Goes on from what `save_state` wrote; call it after SUMO's `simulation.loadState`.
+
+        Args:
+            connection: to a simulation at the instant at which the state was saved.
+            path: of the file.
+
+        Raises:
+            DataError: there is no such file, or it is of another policy.
+            SumoError: the simulation is at another time, or lacks one of the vehicles.
+        """
+        drivers, _ = read_state(Path(path))
+        if len(drivers) != 1:
+            raise DataError(f"{path} holds the state of a fleet; load it with Fleet.load_state")
+        self.go_on(connection, drivers[0], str(path))
+
+    def record(self) -> DriverRecord:
+        """Returns all that is known of the vehicles."""
+        names = list(self._slots)
+        described = {
+            "now": self._now,
+            "policy": self._identity(),
+            "vehicles": names,
+            "leaders": self._leaders,
+            "speed_modes": self._speed_modes,
+            "raised": self._raised,
+            "assigned": self._assigned,
+            "bases": self._bases,
+            "driver_features": self._driver_features,
+        }
+        return DriverRecord(described, self._store.columns_of(self._slots_of(names)))
+
+    def go_on(self, connection: Connection, record: DriverRecord, source: str) -> None:
+        """Goes on from a record in a simulation that stands where it was made.
+
+        Args:
+            connection: to the simulation.
+            record: of a driver of the same policy.
+            source: where the record comes from, for messages.
+
+        Raises:
+            DataError: the record is of another policy.
+            SumoError: the simulation is at another time, or lacks one of the vehicles.
+        """
+        described, rows = record
+        if described["policy"] != self._identity():
+            raise DataError(
+                f"{source} is of a driver with another policy than {self.source}; load it with the"
+                " policy that it was saved with"
+            )
+        now = connection.simulation.getTime()
+        if abs(now - described["now"]) > 1e-6:
+            raise SumoError(
+                f"{source} was saved at {described['now']:g} s, the simulation is at {now:g} s;"
+                " load SUMO's state of that instant first (simulation.loadState)"
+            )
+        names = described["vehicles"]
+        missing = sorted(set(names) - set(connection.vehicle.getIDList()))
+        if missing:
+            raise SumoError(
+                f"{source} has vehicle '{missing[0]}', which the simulation lacks; load SUMO's"
+                " state of the same run first (simulation.loadState)"
+            )
+        self._forget_all()
+        self._now = now
+        slots = torch.tensor([self._slot(name) for name in names], dtype=torch.int64)
+        self._store.put_columns(slots, rows)
+        self._leaders = dict(described["leaders"])
+        self._speed_modes = dict(described["speed_modes"])
+        self._raised = {name: (kind, own) for name, (kind, own) in described["raised"].items()}
+        self._assigned = dict(described["assigned"])
+        self._bases = dict(described["bases"])
+        self._driver_features = dict(described["driver_features"])
+        told = self._store.told.tolist()
+        for name in self._speed_modes:  # SUMO's state keeps nothing of TraCI's
+            connection.vehicle.setSpeedMode(name, self.speed_mode)
+            connection.vehicle.setSpeed(name, told[self._slots[name]])
+
+    def _identity(self) -> list[object]:
+        """Returns what policies must share to go on from one another's state."""
+        windows = self.policy.windows
+        return [
+            self.policy.model_node["name"],
+            list(self.policy.space.names),
+            list(self.policy.names),
+            [windows.length, windows.stride, self.policy.dt],
+        ]
+
+    def _slots_of(self, names: Iterable[str]) -> Tensor:
+        """Returns the rows of vehicles that are known, `(D,)` int64."""
+        return torch.tensor([self._slots[name] for name in names], dtype=torch.int64)
+
     def forget(self, vehicle: str) -> None:
         """Drops all that is known of a vehicle; SUMO keeps the last speed that it was given."""
         self._speed_modes.pop(vehicle, None)
-        self._decels.pop(vehicle, None)
         self._leaders.pop(vehicle, None)
-        self._raised.discard(vehicle)
+        self._raised.pop(vehicle, None)
         slot = self._slots.pop(vehicle, None)
         if slot is not None:
             self._free.append(slot)
@@ -478,6 +584,7 @@ class Driver:
         """Drops all vehicles: time went back, so this is another simulation or an earlier state."""
         for vehicle in self.vehicles:
             self.forget(vehicle)
+        self._swept = math.nan
 
     def release(self, connection: Connection, vehicle: str) -> None:
         """Hands a vehicle back to SUMO's own model and drops what is known of it."""
@@ -685,18 +792,23 @@ class Driver:
         return torch.minimum(speed, limit)
 
     def _set_decel(self, connection: Connection, name: str, bound: float) -> None:
-        """Lets SUMO brake a vehicle by `bound`, m/s2, where that is more than its own `decel`."""
+        """Lets SUMO brake a vehicle by `bound`, m/s2, where that is more than its own `decel`.
+
+        SUMO makes a vType for this vehicle then; it has its own one again as soon as it can.
+        """
         if bound == 0.0 and name not in self._raised:
             return
-        if name not in self._decels:
-            self._decels[name] = connection.vehicle.getDecel(name)
-        own = self._decels[name]
+        vehicle = connection.vehicle
+        kind, own = self._raised.get(name) or (vehicle.getTypeID(name), vehicle.getDecel(name))
         if bound > own:
-            connection.vehicle.setDecel(name, bound)
-            self._raised.add(name)
+            vehicle.setDecel(name, bound)
+            self._raised[name] = kind, own
         elif name in self._raised:
-            connection.vehicle.setDecel(name, own)
-            self._raised.discard(name)
+            del self._raised[name]
+            if vehicle.getTypeID(name) == kind:
+                vehicle.setDecel(name, own)  # it had a vType of its own before
+            else:
+                vehicle.setType(name, kind)
 
 
 def _load_policy(run: str | Path) -> Agent:

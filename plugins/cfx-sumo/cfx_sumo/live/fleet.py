@@ -9,6 +9,7 @@ from typing import Unpack
 from cfx.core.errors import DataError
 from cfx.policies.placement import ALL
 from cfx_sumo.live.driver import Driver, DriverOptions
+from cfx_sumo.live.saved import read_state, write_state
 from cfx_sumo.live.surroundings import Connection
 
 
@@ -85,13 +86,42 @@ class Fleet:
                 known = connection.vehicle.getTypeID(vehicle).partition("@")[0]
             types[vehicle] = known
         self._type_of = types
-        drivers = {id(driver): driver for driver in self.drivers.values()}
-        vehicles: dict[int, list[str]] = {key: [] for key in drivers}
+        vehicles: dict[int, list[str]] = {id(driver): [] for driver in self._each_driver()}
         for vehicle, name in types.items():
             if name in self.drivers:
                 vehicles[id(self.drivers[name])].append(vehicle)
-        for key, driver in drivers.items():
-            driver.step(connection, vehicles[key])
+        for driver in self._each_driver():
+            driver.step(connection, vehicles[id(driver)])
+
+    def save_state(self, path: str | Path) -> None:
+        """Writes what all drivers know, as `Driver.save_state` does.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        write_state(Path(path), [driver.record() for driver in self._each_driver()], self._type_of)
+
+    def load_state(self, connection: Connection, path: str | Path) -> None:
+        """Goes on from what `save_state` wrote, as `Driver.load_state` does.
+
+        Raises:
+            DataError: there is no such file, or it is of another fleet.
+            SumoError: the simulation is at another time, or lacks one of the vehicles.
+        """
+        records, types = read_state(Path(path))
+        drivers = self._each_driver()
+        if len(records) != len(drivers):
+            raise DataError(
+                f"{path} holds the state of {len(records)} drivers, this fleet has {len(drivers)};"
+                " load it with the fleet that it was saved with"
+            )
+        for driver, record in zip(drivers, records, strict=True):
+            driver.go_on(connection, record, str(path))
+        self._type_of = types
+
+    def _each_driver(self) -> list[Driver]:
+        """Returns each driver once, in the order of their types."""
+        return list({id(driver): driver for driver in self.drivers.values()}.values())
 
     def driver(self, vehicle: str) -> Driver:
         """Returns the driver of a vehicle of the fleet."""

@@ -6,6 +6,7 @@ of the networks' state, k driver features, q numbers that a stochastic head keep
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
 import torch
@@ -34,6 +35,7 @@ class VehicleTable:
         driven: `(C,)` bool; the others are watched.
         score: `(C,)`, how far outside what was learned each was when its window began.
         beyond: `(C, 2 f)` bool, which signals alone were unusual then.
+        told: `(C,)` m/s, the speed that SUMO was last told to drive; NaN before the first.
     """
 
     history: Tensor
@@ -49,6 +51,7 @@ class VehicleTable:
     driven: Tensor
     score: Tensor
     beyond: Tensor
+    told: Tensor
 
     @classmethod
     def empty(cls, agent: Agent, model: DrivingModel, count: int) -> VehicleTable:
@@ -71,7 +74,22 @@ class VehicleTable:
             driven=torch.zeros(count, dtype=torch.bool),
             score=torch.zeros(count, dtype=torch.float64),
             beyond=torch.zeros((count, begun.beyond.shape[-1]), dtype=torch.bool),
+            told=_unknown(count),
         )
+
+    def columns_of(self, rows: Tensor) -> dict[str, Tensor]:
+        """Returns the columns of some rows, `(D,)` int64."""
+        return {column.name: getattr(self, column.name)[rows] for column in fields(self)}
+
+    def put_columns(self, rows: Tensor, columns: Mapping[str, Tensor]) -> None:
+        """Puts what `columns_of` gave into rows `(D,)`.
+
+        Raises:
+            KeyError: a column is missing.
+            RuntimeError: the columns are those of another agent.
+        """
+        for column in fields(self):
+            getattr(self, column.name)[rows] = columns[column.name]
 
     def with_rows(self, more: VehicleTable) -> VehicleTable:
         """Returns these rows and then the others."""
