@@ -270,21 +270,37 @@ class Agent:
 
         Returns:
             Parameters `(D, n)` in SI units, in the dtype of the history, and the state afterwards.
+
+        Raises:
+            PluginError: the networks answer numbers that are not finite.
         """
-        dtype = history.follower_speed.dtype
-        answers, after = self.core.answer(self._features(history, state), state.state)
-        answer = answers[state.network, state.place].to(dtype)
+        answer, after = self._answer(history, state)
         if not bool(answer.isfinite().all()):
             raise PluginError(
                 f"{registry.origin(self.policy)}: its networks answer numbers that are not finite;"
                 " train with a smaller learner.learning_rate, or repair that policy"
             )
-        state = self._judged(history, state)
-        unit = self._faded(answer.double(), state).to(dtype)
-        chosen = self.head.measured(self.space.from_unit(unit), history, self.dt)
+        noise = None
         if generator is not None and self.is_stochastic:
-            chosen, state = self._drawn(chosen, state, generator)
-        return chosen, state._replace(state=after)
+            shape = (len(answer), self.head.noise_width)
+            noise = torch.randn(shape, generator=generator, dtype=torch.float64)
+        return self._apply(answer, history, after, noise)
+
+    def choose(
+        self, history: History, state: AgentState, noise: Tensor | None = None
+    ) -> tuple[Tensor, AgentState]:
+        """As `act`, as a pure function of tensors that no value branches: it can be exported.
+
+        Args:
+            history, state: as for `act`.
+            noise: standard normal, `(D, k)`, for what a stochastic head leaves to chance; None:
+                nothing is drawn.
+
+        Returns:
+            As `act`. Answers of the networks that are not finite make parameters that are not.
+        """
+        answer, after = self._answer(history, state)
+        return self._apply(answer, history, after, noise)
 
     def burn_in(
         self, batch: PairBatch, until: Tensor, state: AgentState, since: Tensor | None = None
@@ -410,12 +426,25 @@ class Agent:
             dispersion=None if self.dispersion is None else self.dispersion.to(device),
         )
 
-    def _drawn(
-        self, chosen: Tensor, state: AgentState, generator: torch.Generator
+    def _answer(self, history: History, state: AgentState) -> tuple[Tensor, AgentState]:
+        """Returns the networks' answers `(D, n)`, in the history's dtype, and their state."""
+        answers, after = self.core.answer(self._features(history, state), state.state)
+        answer = answers[state.network, state.place].to(history.follower_speed.dtype)
+        return answer, state._replace(state=after)
+
+    def _apply(
+        self, answer: Tensor, history: History, state: AgentState, noise: Tensor | None
     ) -> tuple[Tensor, AgentState]:
+        """Returns parameters `(D, n)`, SI units, that answers mean, and the state afterwards."""
+        state = self._judged(history, state)
+        unit = self._faded(answer.double(), state).to(answer.dtype)
+        chosen = self.head.measured(self.space.from_unit(unit), history, self.dt)
+        if noise is None:
+            return chosen, state
+        return self._drawn(chosen, state, noise.to(chosen))
+
+    def _drawn(self, chosen: Tensor, state: AgentState, noise: Tensor) -> tuple[Tensor, AgentState]:
         """Draws the parameters `(D, n)` of a window, SI units, around those that were chosen."""
-        shape = (len(chosen), self.head.noise_width)
-        noise = torch.randn(shape, generator=generator, dtype=torch.float64).to(chosen)
         if self.dispersion is not None:
             noise = noise * self.dispersion[state.network, None].to(noise)
         window_s = self.windows.stride * self.dt
@@ -435,10 +464,10 @@ class Agent:
     def _faded(self, answer: Tensor, state: AgentState) -> Tensor:
         """Returns the parameters `(D, n)`, in unit space, of answers as far as they are used."""
         unit = self.head.unit_parameters(answer, state.base)
-        weight = weight_of_answer(state.score)[:, None]
         fallback = self._fallback(state)
-        if fallback is None or not bool((weight < 1.0).any()):
+        if fallback is None:
             return unit
+        weight = weight_of_answer(state.score)[:, None]
         return torch.where(weight < 1.0, blended(fallback, unit, weight), unit)
 
     def _fallback(self, state: AgentState) -> Tensor | None:

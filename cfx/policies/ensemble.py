@@ -45,7 +45,7 @@ class Ensemble(PolicyNetwork):
         apart = self._apart(state)
         answers, after = self.members(tokens.repeat_interleave(self.size, 0), apart)
         logits = torch.logit(answers, eps=_EDGE).view(len(state), self.size, *answers.shape[1:])
-        return logits.quantile(0.5, dim=1).sigmoid(), self._together(after)
+        return _median(logits).sigmoid(), self._together(after)
 
     def _apart(self, state: Tensor) -> Tensor:
         """Arranges states `(N, B, M s)` as those of each network, `(N M, B, s)`."""
@@ -57,3 +57,14 @@ class Ensemble(PolicyNetwork):
         """Arranges the networks' states `(N M, B, s)` as `(N, B, M s)`."""
         apart = states.view(len(states) // self.size, self.size, *states.shape[1:])
         return apart.transpose(1, 2).flatten(2)
+
+
+def _median(values: Tensor) -> Tensor:
+    """Returns the medians over the second dimension; NaN where a value is.
+
+    As `quantile(0.5)`, but of operations that exported networks have.
+    """
+    size = values.shape[1]
+    ordered = values.sort(dim=1).values
+    median = torch.lerp(ordered[:, (size - 1) // 2], ordered[:, size // 2], 0.5)
+    return torch.where(values.isnan().any(dim=1), torch.nan, median)

@@ -1,0 +1,227 @@
+"""One step of drivers: what a policy drives with in any simulator, as a pure function of tensors.
+
+The policy, its head, the driving model and the guard are one function from what a driver sees and
+what is remembered of them to their next speed. It knows no simulator: live drivers in other
+programs, environments for reinforcement learning and exported networks are made of it.
+
+Shapes: D drivers, L frames of a token, n tuned parameters, m width of the model's memory, s width
+of the network's state, q numbers that a stochastic head keeps, k random numbers of a window.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from cfx.core.errors import ConfigError
+from cfx.core.registry import create
+from cfx.models.base import DrivingModel, Follower, Leader
+from cfx.policies.agent import Agent, AgentState
+from cfx.policies.context import UNSEEN, DriverContext
+from cfx.policies.features import History
+from cfx.simulation.step import advance_vehicle
+
+
+class Motion(NamedTuple):
+    """Motion of D vehicles at one instant.
+
+    Attributes:
+        speed: `(D,)`, m/s.
+        acceleration: the last realised one, `(v(t) - v(t - dt)) / dt`, `(D,)`, m/s2.
+    """
+
+    speed: Tensor
+    acceleration: Tensor
+
+
+class DriverState(NamedTuple):
+    """What is remembered of D drivers between two steps; all 0 for a driver who begins.
+
+    Attributes:
+        steps: since the driver began, `(D,)` int64.
+        history: the signals of `History` at the last L frames, `(D, 5, L)`, SI units.
+        parameters: those that hold in this window, `(D, n)`, SI units.
+        memory: of the model, `(D, m)`.
+        network: of the policy's network, `(D, s)`, in its precision.
+        latent: what a stochastic head keeps of its random numbers, `(D, q)`.
+        score: how far outside what was learned each was when the window began, `(D,)`; up to 1 is
+            inside.
+    """
+
+    steps: Tensor
+    history: Tensor
+    parameters: Tensor
+    memory: Tensor
+    network: Tensor
+    latent: Tensor
+    score: Tensor
+
+    def of(self, drivers: Tensor) -> DriverState:
+        """Returns the state of some of the drivers, by their indices or a bool for each."""
+        return DriverState(*(value[drivers] for value in self))
+
+    def with_drivers(self, drivers: Tensor, other: DriverState) -> DriverState:
+        """Returns the state with another of some of the drivers, by their indices."""
+        columns = []
+        for value, new in zip(self, other, strict=True):
+            columns.append(value.index_copy(0, drivers, new))
+        return DriverState(*columns)
+
+
+class DriverStep:
+    """Advances drivers of one network by one time step after the other.
+
+    State is passed in and returned, never kept. It is the closed loop in which cfx evaluates a
+    policy, to the last bits.
+
+    Args:
+        agent: chooses parameters; one network of it drives all.
+        context: of the drivers, one for all: a base `(1, n)` and driver features `(1, k)`.
+
+    Raises:
+        DataError: the agent has a network for each of its own drivers, and none for others.
+        ConfigError: the equations of its driving model are in a simulator only.
+
+    Attributes:
+        agent: the agent with that one network.
+        model: what it drives: its driving model, or one around it.
+        dt: the time step, s.
+        noise_width: k; 0: nothing is left to chance.
+    """
+
+    def __init__(self, agent: Agent, context: DriverContext = UNSEEN) -> None:
+        self.agent = agent.for_unseen_drivers()
+        model = create("model", agent.model_node)
+        assert isinstance(model, DrivingModel)
+        if model.needs_simulator:
+            raise ConfigError(
+                f"model={agent.model_node['name']} has equations in {model.needs_simulator} only,"
+                " so that nothing else can drive it; give a policy of a model that cfx has, such as"
+                " krauss or idm"
+            )
+        self.model = self.agent.head.driven_model(model)
+        self.dt = self.agent.dt
+        self.noise_width = self.agent.head.noise_width
+        self._begun = self.agent.begin(torch.zeros(1, dtype=torch.int64), context)
+
+    def begin(self, drivers: int) -> DriverState:
+        """Returns the state of D drivers before their first step: zeros."""
+        begun = self._begun
+        signals, length = len(History._fields), self.agent.windows.length
+        return DriverState(
+            torch.zeros(drivers, dtype=torch.int64),
+            torch.zeros((drivers, signals, length), dtype=torch.float64),
+            torch.zeros((drivers, len(self.agent.space)), dtype=torch.float64),
+            torch.zeros((drivers, self.model.memory_size), dtype=torch.float64),
+            begun.state.new_zeros((drivers, begun.state.shape[-1])),
+            torch.zeros((drivers, begun.latent.shape[-1]), dtype=torch.float64),
+            torch.zeros(drivers, dtype=torch.float64),
+        )
+
+    @torch.no_grad()
+    def __call__(
+        self,
+        state: DriverState,
+        ego: Motion,
+        leader: Motion,
+        gap: Tensor,
+        noise: Tensor | None = None,
+    ) -> tuple[Tensor, DriverState]:
+        """Returns the next speeds of D drivers.
+
+        Args:
+            state: what is remembered of them.
+            ego: their vehicles.
+            leader: the vehicles ahead.
+            gap: bumper to bumper, `(D,)`, m.
+            noise: standard normal, `(D, k)`, of which a driver whose window begins draws; None:
+                nothing is drawn.
+
+        Returns:
+            Speeds one time step later, `(D,)`, m/s, and the state then.
+        """
+        state = self._remembered(state, ego, leader, gap)
+        due = self._is_due(state).nonzero().flatten()
+        if len(due):
+            drawn = None if noise is None else noise[due]
+            state = state.with_drivers(due, self._chosen(state.of(due), drawn))
+        return self._advanced(state, ego, leader, gap)
+
+    def unbranched(
+        self,
+        state: DriverState,
+        ego: Motion,
+        leader: Motion,
+        gap: Tensor,
+        noise: Tensor | None = None,
+    ) -> tuple[Tensor, DriverState]:
+        """As a call, but no value branches, so that the step exports to other runtimes.
+
+        The network answers for every driver in every step, and the answer counts where a window
+        begins.
+        """
+        state = self._remembered(state, ego, leader, gap)
+        due = self._is_due(state)
+        columns = []
+        for new, old in zip(self._chosen(state, noise), state, strict=True):
+            columns.append(torch.where(_as_wide(due, old), new, old))
+        return self._advanced(DriverState(*columns), ego, leader, gap)
+
+    def _remembered(
+        self, state: DriverState, ego: Motion, leader: Motion, gap: Tensor
+    ) -> DriverState:
+        """Returns the state with this instant; a first frame stands for those before it."""
+        begins = state.steps == 0
+        signals = History(leader.speed, leader.acceleration, ego.speed, ego.acceleration, gap)
+        frame = torch.stack(list(signals), -1)[..., None]
+        going = torch.cat([state.history[..., 1:], frame], -1)
+        initial = self.model.initial_memory(ego.speed)
+        return state._replace(
+            history=torch.where(_as_wide(begins, going), frame, going),
+            memory=torch.where(_as_wide(begins, initial), initial, state.memory),
+            network=torch.where(begins[:, None], self._begun.state[0], state.network),
+        )
+
+    def _is_due(self, state: DriverState) -> Tensor:
+        """Says for which drivers a window begins, bool `(D,)`."""
+        return state.steps % self.agent.windows.stride == 0
+
+    def _chosen(self, state: DriverState, noise: Tensor | None) -> DriverState:
+        """Returns the state of drivers whose window begins with their new parameters."""
+        begun, count = self._begun, state.steps.shape[0]  # `len` would export it as a constant
+        base = None if begun.base is None else begun.base.expand(count, -1)
+        known = AgentState(
+            begun.network.expand(count),
+            torch.arange(count, device=begun.network.device),
+            state.network[None],
+            base,
+            begun.conditioning.expand(count, -1),
+            state.score,
+            begun.beyond.expand(count, -1),
+            state.latent,
+        )
+        chosen, after = self.agent.choose(History(*state.history.unbind(1)), known, noise)
+        return state._replace(
+            parameters=chosen, network=after.state[0], latent=after.latent, score=after.score
+        )
+
+    def _advanced(
+        self, state: DriverState, ego: Motion, leader: Motion, gap: Tensor
+    ) -> tuple[Tensor, DriverState]:
+        """Takes the model's step within the limits of the vehicle."""
+        zero = torch.zeros_like(gap)
+        after = advance_vehicle(
+            self.model,
+            Follower(zero, ego.speed, ego.acceleration, state.memory),
+            Leader(gap, leader.speed, leader.acceleration, zero),
+            self.agent.space.unpack(state.parameters),
+            self.dt,
+        )
+        return after.speed, state._replace(steps=state.steps + 1, memory=after.memory)
+
+
+def _as_wide(drivers: Tensor, like: Tensor) -> Tensor:
+    """Returns a bool for each driver, `(D,)`, in as many dimensions as a tensor `(D, ...)`."""
+    return drivers.view(-1, *[1] * (like.dim() - 1))
