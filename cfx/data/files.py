@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import gzip
 import os
+import re
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -18,6 +19,8 @@ from typing import BinaryIO, NamedTuple, cast
 from urllib.parse import unquote
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cfx.core.errors import DataError, listed, nearest
@@ -53,10 +56,12 @@ class FileStart(NamedTuple):
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The cells of the first line, where commas separate them."""
+        """The names of a parquet file's columns; of a text, the cells of the first line."""
+        if self.magic == PARQUET:
+            return _parquet_columns(self.path)
         if not self.lines:
             return ()
-        return tuple(cell.strip().strip('"') for cell in self.lines[0].split(","))
+        return tuple(cell.strip().strip('"') for cell in re.split("[,;]", self.lines[0]))
 
     def has_columns(self, *names: str) -> bool:
         """Says whether the first line has all these cells."""
@@ -82,6 +87,14 @@ def beginning(path: Path) -> FileStart:
     if "\0" in text:
         text = ""
     return FileStart(path, start, tuple(text.splitlines()[:20]))
+
+
+def _parquet_columns(path: Path) -> tuple[str, ...]:
+    """Returns the names of a parquet file's columns; () if it is damaged."""
+    try:
+        return tuple(pq.read_schema(path).names)
+    except (pa.ArrowException, OSError, UnicodeDecodeError):
+        return ()
 
 
 def stem(path: Path) -> str:

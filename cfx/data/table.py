@@ -107,6 +107,7 @@ class Layout:
         headerless: names of the columns of a text without a header, by their number.
         above: lines of a text above its header that are no part of the table.
         spaces: whether white space may separate columns of a text.
+        separators: what else may separate them.
         parquet: whether it may be stored as parquet too.
         plain: turns a column's name into the form in which names are compared.
     """
@@ -119,6 +120,7 @@ class Layout:
     headerless: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
     above: int = 0
     spaces: bool = False
+    separators: tuple[str, ...] = (",",)
     parquet: bool = False
     plain: Callable[[str], str] = str
 
@@ -526,7 +528,7 @@ class _Text(NamedTuple):
     """A delimited text: its separator, and the names of its columns.
 
     Attributes:
-        delimiter: "," or " ", the latter for any run of white space.
+        delimiter: one character; " " stands for any run of white space.
         names: of the columns.
         skipped: lines above the first row of data.
     """
@@ -569,9 +571,10 @@ def _read_header(path: Path, layout: Layout) -> _Text:
     has_header = any(character.isalpha() for character in exponents_removed)
     delimiter = " "
     cells = first.split()
-    if "," in first:
-        delimiter = ","
-        cells = _comma_separated(first)
+    own = next((separator for separator in layout.separators if separator in first), "")
+    if own:
+        delimiter = own
+        cells = _cells(first, own)
     else:
         for separator, plural in _OTHER_SEPARATORS.items():
             if separator in first and not (separator == "\t" and not has_header):
@@ -601,10 +604,12 @@ def _names_without_header(path: Path, layout: Layout, width: int) -> tuple[str, 
     )
 
 
-def _comma_separated(line: str) -> list[str]:
+def _cells(line: str, delimiter: str) -> list[str]:
     """Returns the cells of one line of CSV."""
     options = pa.csv.ReadOptions(autogenerate_column_names=True)
-    table = pa.csv.read_csv(io.BytesIO(line.encode() + b"\n"), read_options=options)
+    how = pa.csv.ParseOptions(delimiter=delimiter)
+    file = io.BytesIO(line.encode() + b"\n")
+    table = pa.csv.read_csv(file, read_options=options, parse_options=how)
     (row,) = table.to_pylist()
     return [str(cell).strip() for cell in row.values()]
 
@@ -643,6 +648,7 @@ def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any, spare: i
         broken.append(row)
         return "error"
 
+    parsed_by = "," if text.delimiter == " " else text.delimiter
     types = {}
     for one in found.values():
         types[f"c{one.at}"] = number_type
@@ -657,7 +663,7 @@ def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any, spare: i
     )
     options = {
         "read_options": read_options,
-        "parse_options": pa.csv.ParseOptions(invalid_row_handler=note),
+        "parse_options": pa.csv.ParseOptions(delimiter=parsed_by, invalid_row_handler=note),
         "convert_options": pa.csv.ConvertOptions(column_types=types, include_columns=list(types)),
     }
     try:
@@ -667,7 +673,7 @@ def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any, spare: i
         if broken:
             row = broken[0]
             more = row.actual_columns - len(text.names)
-            if spare == 0 and more == 1 and str(row.text).rstrip().endswith(","):
+            if spare == 0 and more == 1 and str(row.text).rstrip().endswith(parsed_by):
                 return _parsed(text, found, number_type, spare=1)
             raise DataError(
                 f"{text.path}, row {row.number}: {row.actual_columns} columns instead of"
@@ -713,7 +719,7 @@ class _Lines(io.RawIOBase):
 
 
 def _with_commas(lines: bytes, delimiter: str) -> bytes:
-    """Returns lines whose cells are separated by commas."""
-    if delimiter == ",":
+    """Returns lines with commas in place of white space, where that separates their cells."""
+    if delimiter != " ":
         return lines
     return b"".join(b",".join(line.split()) + b"\n" for line in lines.splitlines())

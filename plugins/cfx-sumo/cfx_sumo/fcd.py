@@ -5,29 +5,19 @@ https://sumo.dlr.de/docs/Simulation/Output/FCDOutput.html
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any, ClassVar
-from xml.parsers import expat
+from collections.abc import Callable
+from typing import ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from cfx import Dataset, PairSet, Settings
 from cfx.core.errors import DataError
 from cfx.data.base import FileDatasetSettings, joined
-from cfx.data.files import FileStart, Floats, Ints, open_text, stem
-from cfx.data.tracks import NOBODY, Tracks, changes, extract_pairs
-
-_BLOCK = 1 << 20
-
-_NEEDED = ("id", "speed", "pos", "lane")
-
-_HOW = (
-    "write it with --fcd-output.attributes id,type,speed,pos,lane,acceleration,leaderID,leaderGap"
-    " --fcd-output.max-leader-distance 200 --precision 6"
-)
+from cfx.data.files import FileStart, Floats, Ints, stem
+from cfx.data.tracks import NOBODY, Marks, Tracks, counted, extract_pairs
+from cfx_sumo.fcd_lanes import Couples, Lanes
+from cfx_sumo.fcd_rows import FcdRows, is_fcd, read_rows
 
 
 class SumoFcdSettings(FileDatasetSettings):
@@ -45,10 +35,16 @@ class SumoFcdSettings(FileDatasetSettings):
     lengths: dict[str, float] | None = Field(
         None, description="m: of vehicles by their vType, for instance {truck: 12.0}"
     )
+    width: float = Field(
+        1.8,
+        gt=0,
+        description="m: vehicles in one lane that are farther apart sideways drive side by side"
+        " (SUMO's sublane model)",
+    )
 
 
 class SumoFcdDataset(Dataset):
-    """Pairs from what SUMO writes with `--fcd-output`; gzipped files are fine.
+    """Pairs from what SUMO writes with `--fcd-output`: XML or CSV, gzipped or not, or parquet.
 
     With `--fcd-output.max-leader-distance` SUMO writes who the leader is and the bumper-to-bumper
     gap, on the next edge too. Pairs then go on over junctions, and vehicles' lengths follow from
@@ -60,6 +56,17 @@ class SumoFcdDataset(Dataset):
     the last step, as SUMO defines it. `driver_type` is the vType; of a vehicle whose type SUMO made
     its own (`truck@t.0` after `setTau`), the type that it had before.
 
+    Some vehicles follow nobody, nor does anybody follow them, though SUMO writes them in a lane:
+
+    - one that is parked: it stands while others drive through it, or (by `x` and `y`) beside the
+      lane;
+    - one that drives against the lane's direction, to overtake where others come towards it.
+
+    Their rows are left out and counted. Of vehicles in one lane that drive side by side (the
+    sublane model) neither follows the other: those that are `width` apart by `posLat`, or by `x`,
+    `y` and `angle`. A file that has neither does not say so; vehicles that pass each other in one
+    lane are then no pair there.
+
     SUMO writes two decimals unless `--precision` says more: speeds are then rounded to 0.01 m/s,
     and accelerations that follow from them in steps of 0.1 s to 0.1 m/s2.
     """
@@ -70,254 +77,142 @@ class SumoFcdDataset(Dataset):
 
     @classmethod
     def recognises(cls, start: FileStart) -> bool:
-        if not start.lines or not start.lines[0].lstrip().startswith("<"):
-            return False
-        if "<fcd-export" in "\n".join(start.lines):
-            return True
-        return _root(start.path) == "fcd-export"
+        return is_fcd(start)
 
     def read(self) -> PairSet:
         parts = []
         for path in self.settings.files():
-            tracks = _tracks(_parsed(path), self.settings)
+            tracks = _tracks(read_rows(path), self.settings)
             parts.append(extract_pairs(tracks, max_gap=self.settings.max_gap))
         return joined(parts)
 
 
-class _Root(Exception):  # noqa: N818 - no error: it ends the parser at the first element
-    """The first element was seen; its name is the argument."""
-
-
-def _root(path: Path) -> str:
-    """Returns the name of the root element; "" if the file is no XML."""
-
-    def begin(name: str, _: Any) -> None:
-        raise _Root(name)
-
-    parser = expat.ParserCreate()
-    parser.StartElementHandler = begin
-    try:
-        with open_text(path) as file:
-            while block := file.read(_BLOCK):
-                parser.Parse(block)
-    except _Root as found:
-        return str(found.args[0])
-    except expat.ExpatError:
-        pass
-    return ""
-
-
-class _Parsed:
-    """The vehicles of all time steps, in the order of the file."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.step = -1
-        self.times: list[float] = []
-        self.at: list[int] = []
-        self.numbers: dict[str, list[float]] = {
-            "speed": [],
-            "pos": [],
-            "acceleration": [],
-            "leaderGap": [],
-        }
-        self.texts: dict[str, list[str]] = {"id": [], "lane": [], "type": [], "leaderID": []}
-
-    def begin(self, name: str, attributes: Mapping[str, str]) -> None:
-        """Takes the beginning of an element."""
-        if name == "timestep":
-            self.step += 1
-            self.times.append(self._number(attributes, "time"))
-        elif name == "vehicle":
-            for needed in _NEEDED:
-                if needed not in attributes:
-                    raise DataError(
-                        f"{self.path}, time {self.times[-1]:g} s: a vehicle has no attribute"
-                        f" '{needed}'; {_HOW}"
-                    )
-            self.at.append(self.step)
-            for key, numbers in self.numbers.items():
-                numbers.append(self._number(attributes, key))
-            for key, texts in self.texts.items():
-                texts.append(attributes.get(key, ""))
-        elif self.step < 0 and name != "fcd-export":
-            raise DataError(
-                f"{self.path}: is XML of <{name}>, not SUMO's FCD output (<fcd-export>)"
-            )
-
-    def _number(self, attributes: Mapping[str, str], key: str) -> float:
-        text = attributes.get(key)
-        if text is None:
-            return float("nan")
-        try:
-            return float(text)
-        except ValueError:
-            raise DataError(
-                f"{self.path}, time step {self.step}: {key}='{text}' is not a number"
-            ) from None
-
-
-def _parsed(path: Path) -> _Parsed:
-    """Reads a file. A DOCTYPE is refused, and with it every entity that could expand or be fetched.
-
-    Raises:
-        DataError: it is no XML, is cut off, or is not of SUMO's FCD output.
-    """
-    parsed = _Parsed(path)
-
-    def refuse(*_: Any) -> None:
-        raise DataError(f"{path}: has a DOCTYPE, which SUMO never writes; remove it")
-
-    parser = expat.ParserCreate()
-    parser.StartElementHandler = parsed.begin
-    parser.StartDoctypeDeclHandler = refuse
-    try:
-        with open_text(path) as file:
-            while block := file.read(_BLOCK):
-                parser.Parse(block)
-        parser.Parse(b"", True)
-    except expat.ExpatError as error:
-        raise DataError(
-            f"{path}, line {error.lineno}: the XML is cut off or damaged"
-            f" ({expat.ErrorString(error.code)}); write it again"
-        ) from None
-    except EOFError:
-        raise DataError(f"{path}: the gzip file is cut off; write it again") from None
-    if not parsed.at:
-        raise DataError(f"{path}: holds no vehicles")
-    return parsed
-
-
-def _tracks(parsed: _Parsed, settings: SumoFcdSettings) -> Tracks:
+def _tracks(rows: FcdRows, settings: SumoFcdSettings) -> Tracks:
     """Returns the vehicles' rows in order, with their leaders."""
-    dt = _step(parsed)
-    names, vehicle = np.unique(np.array(parsed.texts["id"]), return_inverse=True)
+    dt = _step(rows)
+    names, vehicle = np.unique(rows.texts["id"], return_inverse=True)
     vehicle = vehicle + 1
-    frames = np.rint(np.array(parsed.times) / dt).astype(np.int64)
-    frame = frames[np.array(parsed.at)]
-    numbers = {key: np.array(values) for key, values in parsed.numbers.items()}
+    frame = np.rint(rows.times / dt).astype(np.int64)[rows.step]
     order = np.lexsort((frame, vehicle))
-    has_leaders = not bool(np.isnan(numbers["leaderGap"]).all())
-    lanes, lane = np.unique(np.array(parsed.texts["lane"]), return_inverse=True)
-    own = [
-        kind.removesuffix(f"@{name}")
-        for name, kind in zip(parsed.texts["id"], parsed.texts["type"], strict=True)
-    ]
-    types, kind = np.unique(np.array(own), return_inverse=True)
-    columns = _Columns(vehicle[order], frame[order], lane[order], numbers["pos"][order])
-    gap: Floats | None = None
-    if has_leaders:
-        known = {name: number + 1 for number, name in enumerate(names.tolist())}
-        leaders = [known.get(name, NOBODY) for name in parsed.texts["leaderID"]]
-        leader = np.array(leaders, dtype=np.int64)[order]
-        gap = np.where(leader == NOBODY, np.nan, numbers["leaderGap"][order])
-    else:
-        leader = columns.next_in_lane()
+    edges, lane = np.unique(rows.texts["lane"], return_inverse=True)
+    numbers = {key: values[order] for key, values in rows.numbers.items()}
+    every = Lanes(
+        vehicle=vehicle[order],
+        frame=frame[order],
+        lane=lane[order],
+        position=numbers["pos"],
+        speed=numbers["speed"],
+        lateral=numbers["posLat"],
+        x=numbers["x"],
+        y=numbers["y"],
+        heading=np.radians(numbers["angle"]),
+    )
+    acceleration = every.accelerations(numbers["acceleration"], dt)
+    is_oncoming = every.is_oncoming(dt)
+    couples = _without(every.passes(), is_oncoming)
+    is_parked = every.is_parked(couples) & ~is_oncoming
+    kept = np.flatnonzero(~is_oncoming & ~is_parked)
+    couples = _at(_without(couples, is_parked), kept)
+    order = order[kept]
+    lanes = every.take(kept)
+    beside = lanes.beside(couples, settings.width)
+    leader = lanes.next_in_lane(beside)
+    types, kind = _types(rows)
+    kind = kind[order]
     lengths_of = settings.lengths or {}
-    length = np.array([lengths_of.get(str(name), settings.length) for name in types])
-    lengths = length[kind[order]]
-    position, number_of_lane = columns.position, columns.lane
-    if gap is not None:
-        lengths = columns.lengths(leader, gap, lengths)
-        position = columns.driven(numbers["speed"][order], dt)
-        number_of_lane = columns.lane_stints(lanes)
+    length = np.array([lengths_of.get(name, settings.length) for name in types])[kind]
+    position, number_of_lane = lanes.position, lanes.lane
+    gap: Floats | None = None
+    if not bool(np.isnan(rows.numbers["leaderGap"]).all()):
+        known = {name: number + 1 for number, name in enumerate(names.tolist())}
+        named = [known.get(name, NOBODY) for name in rows.texts["leaderID"][order].tolist()]
+        by_name = _Ahead(np.array(named), numbers["leaderGap"][kept], length)
+        leader, gap, length = _as_named(lanes, by_name, leader, beside)
+        position = lanes.driven(dt)
+        number_of_lane = lanes.lane_stints(edges)
+    left_out = {
+        "driving against its lane's direction": is_oncoming,
+        "parked beside the lane": is_parked,
+    }
     return Tracks(
-        source=str(parsed.path),
+        source=str(rows.path),
         dt=dt,
-        recordings=(stem(parsed.path),),
+        recordings=(stem(rows.path),),
         recording=np.zeros(len(order), dtype=np.int64),
-        vehicle=columns.vehicle,
-        frame=columns.frame,
+        vehicle=lanes.vehicle,
+        frame=lanes.frame,
         lane=number_of_lane,
         leader=leader,
         position=position,
-        speed=numbers["speed"][order],
-        acceleration=columns.accelerations(numbers["acceleration"], numbers["speed"], order, dt),
-        length=lengths,
+        speed=lanes.speed,
+        acceleration=acceleration[kept],
+        length=length,
         gap=gap,
-        driver_type=kind[order],
-        driver_types=tuple(types.tolist()),
+        driver_type=kind,
+        driver_types=types,
         names=("", *names.tolist()),
+        dropped=(*rows.dropped, *counted(left_out, "rows")),
     )
 
 
-def _step(parsed: _Parsed) -> float:
+def _types(rows: FcdRows) -> tuple[tuple[str, ...], Ints]:
+    """Returns the vTypes, and `(N,)` which each row has; of a vehicle's own, where it came from."""
+    own = []
+    for name, kind in zip(rows.texts["id"].tolist(), rows.texts["type"].tolist(), strict=True):
+        own.append(kind.removesuffix(f"@{name}"))
+    types, kind = np.unique(np.array(own), return_inverse=True)
+    return tuple(types.tolist()), kind
+
+
+def _without(couples: Couples, left_out: Marks) -> Couples:
+    """Returns the couples neither of whose rows is left out."""
+    kept = ~left_out[couples.passed] & ~left_out[couples.passing]
+    return Couples(couples.passed[kept], couples.passing[kept])
+
+
+def _at(couples: Couples, kept: Ints) -> Couples:
+    """Returns couples as indices into the rows that are kept, `(M,)` ascending."""
+    return Couples(np.searchsorted(kept, couples.passed), np.searchsorted(kept, couples.passing))
+
+
+class _Ahead(NamedTuple):
+    """The leader of each row, the gap to it and the row's own vehicle's length, `(N,)` each."""
+
+    leader: Ints
+    gap: Floats
+    length: Floats
+
+
+def _as_named(
+    lanes: Lanes, named: _Ahead, by_place: Ints, beside: Callable[[Ints, Ints], Marks]
+) -> _Ahead:
+    """Returns the leaders that SUMO names, and vehicles' lengths as they follow from its gaps.
+
+    SUMO names the next vehicle in the lane even where it drives beside: there the leader is that of
+    `by_place`.
+    """
+    leader = named.leader.copy()
+    length = lanes.lengths(leader, named.gap, named.length)
+    at, is_there = lanes.rows_of(leader)
+    same = np.flatnonzero(is_there & (lanes.lane[at] == lanes.lane))
+    wrong = same[beside(same, at[same])]
+    leader[wrong] = by_place[wrong]
+    at, _ = lanes.rows_of(leader)
+    gap = named.gap.copy()
+    gap[wrong] = (lanes.position[at] - length[at] - lanes.position)[wrong]
+    return _Ahead(leader, np.where(leader == NOBODY, np.nan, gap), length)
+
+
+def _step(rows: FcdRows) -> float:
     """Returns the time step, s; raises DataError where steps differ."""
-    times = np.array(parsed.times)
-    steps = np.diff(times)
+    steps = np.diff(rows.times)
     if not len(steps) or not bool((steps > 0).all()):
-        raise DataError(f"{parsed.path}: the times of its steps do not advance")
+        raise DataError(f"{rows.path}: the times of its steps do not advance")
     usual = float(np.median(steps))
     whole = steps / usual
     if float(np.abs(whole - np.rint(whole)).max()) > 0.05:
         raise DataError(
-            f"{parsed.path}: its time steps differ ({steps.min():g} to {steps.max():g} s); a"
+            f"{rows.path}: its time steps differ ({steps.min():g} to {steps.max():g} s); a"
             " recording has one"
         )
     return round(usual, 6)
-
-
-class _Columns:
-    """Rows sorted by vehicle and frame, `(N,)` each, and what follows from them."""
-
-    def __init__(self, vehicle: Ints, frame: Ints, lane: Ints, position: Floats) -> None:
-        self.vehicle = vehicle
-        self.frame = frame
-        self.lane = lane
-        self.position = position
-        self.starts = changes(vehicle)
-        """Where a vehicle's rows begin."""
-
-    def next_in_lane(self) -> Ints:
-        """Returns the next vehicle ahead in each row's lane, 0 where there is none."""
-        order = np.lexsort((self.position, self.lane, self.frame))
-        same = ~changes(self.frame[order], self.lane[order])
-        leader = np.zeros(len(order), dtype=np.int64)
-        behind, ahead = order[:-1][same[1:]], order[1:][same[1:]]
-        leader[behind] = self.vehicle[ahead]
-        return leader
-
-    def driven(self, speed: Floats, dt: float) -> Floats:
-        """Returns the distance that each vehicle has driven since its first row, m."""
-        total = np.cumsum(np.where(self.starts, 0.0, speed * dt))
-        vehicle = np.cumsum(self.starts) - 1
-        driven: Floats = total - total[self.starts][vehicle]
-        return driven
-
-    def lane_stints(self, lanes: NDArray[np.str_]) -> Ints:
-        """Returns a number that changes where a vehicle goes to another lane of the same edge."""
-        edges = [name.rpartition("_")[0] for name in lanes.tolist()]
-        _, edge = np.unique(np.array(edges), return_inverse=True)
-        here = edge[self.lane]
-        changed = np.zeros(len(here), dtype=bool)
-        changed[1:] = (here[1:] == here[:-1]) & (self.lane[1:] != self.lane[:-1])
-        return np.cumsum(changed & ~self.starts)
-
-    def lengths(self, leader: Ints, gap: Floats, default: Floats) -> Floats:
-        """Returns vehicles' lengths by gaps to them from within their own lane, m.
-
-        Args:
-            default: of vehicles that nobody follows in their own lane.
-        """
-        frames = int(self.frame.max()) + 1
-        keys = self.vehicle * frames + self.frame
-        at = np.minimum(np.searchsorted(keys, leader * frames + self.frame), len(keys) - 1)
-        is_beside = (self.vehicle[at] == leader) & (self.frame[at] == self.frame)
-        is_known = is_beside & (self.lane[at] == self.lane) & (leader != NOBODY)
-        left = (self.position[at] - self.position - gap)[is_known]
-        own = leader[is_known]
-        order = np.lexsort((left, own))
-        starts = np.flatnonzero(changes(own[order]))
-        sizes = np.diff(np.append(starts, len(order)))
-        medians = left[order][starts + sizes // 2]
-        by_vehicle = np.full(int(self.vehicle.max()) + 1, np.nan)
-        by_vehicle[own[order][starts]] = np.where(medians > 0, np.round(medians, 1), np.nan)
-        measured = by_vehicle[self.vehicle]
-        return np.where(np.isnan(measured), default, measured)
-
-    def accelerations(self, given: Floats, speed: Floats, order: Ints, dt: float) -> Floats:
-        """Returns accelerations as SUMO wrote them; where it wrote none, by the last step's."""
-        speeds = speed[order]
-        change = np.zeros(len(speeds))
-        change[1:] = np.where(self.starts[1:], 0.0, np.diff(speeds) / dt)
-        return np.where(np.isnan(given[order]), change, given[order])

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import textwrap
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -159,3 +160,194 @@ def test_types_of_one_vehicle_are_the_type_they_came_from(of_sumo: Path) -> None
     behind = [pair for pair in pairs if pair.leader_id == "t.0"]
     assert behind, "somebody follows it"
     assert {(pair.leader_driver_type, pair.leader_length) for pair in behind} == {("truck", 12.0)}
+
+
+TWO_WAYS = """
+<net version="1.20">
+<location netOffset="0,0" convBoundary="0,0,2000,10" origBoundary="0,0,1,1" projParameter="!"/>
+<edge id="e1" from="a" to="b" priority="1">
+<lane id="e1_0" index="0" speed="25" length="2000" shape="0,-1.6 2000,-1.6"><neigh lane="e2_0"/></lane></edge>
+<edge id="e2" from="b" to="a" priority="1">
+<lane id="e2_0" index="0" speed="25" length="2000" shape="2000,1.6 0,1.6"><neigh lane="e1_0"/></lane></edge>
+<junction id="a" type="dead_end" x="0" y="0" incLanes="e2_0" intLanes="" shape="0,0"/>
+<junction id="b" type="dead_end" x="2000" y="0" incLanes="e1_0" intLanes="" shape="2000,0"/>
+</net>
+"""
+
+PARKED = """
+<routes><vType id="car" length="4.3"/><route id="r" edges="e1"/>
+<vehicle id="parked" type="car" route="r" depart="0" departPos="300" departSpeed="0">
+<stop lane="e1_0" startPos="295" endPos="320" duration="17" parking="true"/></vehicle>
+<flow id="f" type="car" route="r" begin="0" end="30" period="3" departLane="0" departSpeed="max"/>
+</routes>
+"""
+
+SUBLANE = """
+<routes><vType id="car" length="4.3" latAlignment="compact" maxSpeed="15"/>
+<vType id="moto" vClass="motorcycle" length="2.2" latAlignment="right" maxSpeed="22" lcPushy="0.5"/>
+<route id="r" edges="e1"/>
+<flow id="f" type="car" route="r" begin="0" end="60" period="3" departLane="0" departSpeed="max"/>
+<flow id="m" type="moto" route="r" begin="0" end="60" period="5" departLane="0" departSpeed="max"/>
+</routes>
+"""
+
+ONCOMING = """
+<routes><vType id="car" length="4.3"/><vType id="slow" length="4.3" maxSpeed="8"/>
+<route id="r" edges="e1"/><route id="q" edges="e2"/>
+<vehicle id="slow" type="slow" route="r" depart="0" departSpeed="max"/>
+<flow id="f" type="car" route="r" begin="3" end="30" period="6" departSpeed="max"/>
+<vehicle id="on0" type="car" route="q" depart="14" departSpeed="5"/>
+<vehicle id="on1" type="car" route="q" depart="17" departSpeed="5"/>
+</routes>
+"""
+
+KINDS = """
+import sys, libsumo
+LEADERS = ["--fcd-output.max-leader-distance", "200"]
+SUBLANE = ["--lateral-resolution", "0.4"]
+PLAIN = ["--fcd-output.attributes", "id,type,speed,pos,lane"]
+for net, routes, end, file, options in [
+    ("n", "parked", 35, "parked.xml", []),
+    ("n", "parked", 35, "parked-leaders.xml", LEADERS),
+    ("n", "parked", 35, "parked-plain.xml", PLAIN),
+    ("n", "parked", 9, "nobody-passes.xml", []),
+    ("n", "sublane", 40, "sublane.xml", SUBLANE),
+    ("n", "sublane", 40, "sublane-leaders.xml", SUBLANE + LEADERS),
+    ("n", "sublane", 40, "sublane-plain.xml", SUBLANE + PLAIN),
+    ("two", "oncoming", 40, "oncoming.xml", []),
+    ("two", "oncoming", 40, "oncoming-leaders.xml", LEADERS),
+    ("n", "r", 20, "same.xml", []),
+    ("n", "r", 20, "same.csv", []),
+    ("n", "r", 20, "same.csv.gz", ["--output.column-header", "plain"]),
+    ("n", "r", 20, "same.parquet", []),
+    ("n", "r", 20, "leaders.csv", LEADERS + ["--fcd-output.acceleration", "--output.column-separator", ","]),
+]:
+    libsumo.start(["sumo", "-n", net + ".net.xml", "-r", routes + ".rou.xml", "--step-length",
+        "0.1", "--seed", "3", "--no-step-log", "--no-warnings", "--precision", "6",
+        "--fcd-output", file, *options])
+    while libsumo.simulation.getTime() < end:
+        libsumo.simulationStep()
+    libsumo.close()
+"""
+
+
+@pytest.fixture(scope="module")
+def kinds(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of what SUMO writes of parked, sublane and oncoming vehicles, and its formats."""
+    pytest.importorskip("importlib.metadata").version("libsumo")
+    folder = tmp_path_factory.mktemp("kinds")
+    files = {
+        "n.net.xml": NETWORK,
+        "two.net.xml": TWO_WAYS,
+        "r.rou.xml": ROUTES,
+        "parked.rou.xml": PARKED,
+        "sublane.rou.xml": SUBLANE,
+        "oncoming.rou.xml": ONCOMING,
+    }
+    for name, text in files.items():
+        (folder / name).write_text(text)
+    command = [sys.executable, "-c", textwrap.dedent(KINDS)]
+    subprocess.run(command, cwd=folder, check=True, capture_output=True)
+    return folder
+
+
+LENGTHS = {"car": 4.3, "slow": 4.3, "moto": 2.2, "truck": 12.0}
+
+
+def _rows(path: Path) -> dict[tuple[str, int], dict[str, str]]:
+    """What SUMO wrote of each vehicle in each frame."""
+    rows = {}
+    root = ElementTree.parse(path).getroot()  # noqa: S314 - SUMO has just written it
+    for frame, step in enumerate(root):
+        for vehicle in step:
+            rows[vehicle.attrib["id"], frame] = dict(vehicle.attrib)
+    return rows
+
+
+@pytest.mark.parametrize("name", ["parked", "parked-leaders", "parked-plain", "nobody-passes"])
+def test_parked_vehicles_neither_lead_nor_follow(kinds: Path, name: str) -> None:
+    path = kinds / f"{name}.xml"
+    rows = _rows(path)
+    pairs = SumoFcdDataset(path=path, min_frames=2, lengths=LENGTHS).read()
+    assert len(pairs) >= 2
+    assert any(drop.reason == "parked beside the lane" for drop in pairs.dropped)
+    for pair in pairs:
+        for frame in range(pair.first_frame, pair.first_frame + len(pair)):
+            for who in (pair.leader_id, pair.follower_id):
+                assert float(rows[who, frame].get("y", 0)) >= 0.0
+                assert who != "parked" or float(rows[who, frame]["speed"]) > 0.0
+
+
+@pytest.mark.parametrize("name", ["sublane", "sublane-leaders"])
+def test_vehicles_side_by_side_in_a_lane_are_no_pair(kinds: Path, name: str) -> None:
+    path = kinds / f"{name}.xml"
+    rows = _rows(path)
+    pairs = SumoFcdDataset(path=path, min_frames=20, lengths=LENGTHS).load()
+    assert len(pairs) > 10
+    for pair in pairs:
+        frames = range(pair.first_frame, pair.first_frame + len(pair))
+        leader = [float(rows[pair.leader_id, frame]["y"]) for frame in frames]
+        follower = [float(rows[pair.follower_id, frame]["y"]) for frame in frames]
+        assert np.abs(np.subtract(leader, follower)).max() < 1.8
+        assert pair.gap.min() > 0
+
+
+def test_vehicles_that_pass_each_other_in_a_lane_are_no_pair_there(kinds: Path) -> None:
+    pairs = SumoFcdDataset(path=kinds / "sublane-plain.xml", min_frames=2, lengths=LENGTHS).load()
+    couples = {(pair.leader_id, pair.follower_id) for pair in pairs}
+    assert couples, "cars still follow cars"
+    assert not {(one, other) for other, one in couples} & couples
+
+
+@pytest.mark.parametrize("name", ["oncoming", "oncoming-leaders"])
+def test_oncoming_vehicles_are_no_pair(kinds: Path, name: str) -> None:
+    path = kinds / f"{name}.xml"
+    rows = _rows(path)
+    overtakes = [who for (who, _), row in rows.items() if row["lane"] == "e2_0" and who[0] == "f"]
+    assert overtakes, "somebody overtakes in the lane of those who come towards it"
+    pairs = SumoFcdDataset(path=path, min_frames=2, max_gap=None, lengths=LENGTHS).load()
+    assert {(pair.leader_id, pair.follower_id) for pair in pairs} >= {("on0", "on1")}
+    for pair in pairs:
+        ways = {rows[who, pair.first_frame]["angle"] for who in (pair.leader_id, pair.follower_id)}
+        assert len(ways) == 1
+        assert rows[pair.leader_id, pair.first_frame]["lane"] in {"e1_0", "e2_0"}
+        heads_back = ways == {"270.000000"}
+        assert (rows[pair.follower_id, pair.first_frame]["lane"] == "e2_0") == heads_back
+
+
+@pytest.mark.parametrize("name", ["same.csv", "same.csv.gz", "same.parquet"])
+def test_every_format_gives_the_same_pairs(
+    kinds: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    expected = SumoFcdDataset(path=kinds / "same.xml", min_frames=2, lengths=LENGTHS).read()
+    pairs = SumoFcdDataset(path=kinds / name, min_frames=2, lengths=LENGTHS).read()
+    assert pairs.dropped == expected.dropped
+    for pair, other in zip(pairs, expected, strict=True):
+        assert (pair.pair_id, pair.driver_type) == (other.pair_id, other.driver_type)
+        np.testing.assert_allclose(pair.gap, other.gap, atol=2e-6)
+        np.testing.assert_allclose(pair.follower_speed, other.follower_speed, atol=1e-6)
+    assert main(["data", "describe", str(kinds / name)]) == 0
+    assert "SUMO's FCD output" in capsys.readouterr().out
+
+
+def test_csv_with_leaders_gives_lengths(kinds: Path) -> None:
+    pairs = SumoFcdDataset(path=kinds / "leaders.csv", min_frames=2).load()
+    lengths = {pair.leader_driver_type: pair.leader_length for pair in pairs}
+    assert lengths == {"car": 4.3, "truck": 12.0}
+
+
+def test_rows_of_persons_and_empty_steps_are_no_vehicles(tmp_path: Path) -> None:
+    path = tmp_path / "fcd.csv"
+    head = "timestep_time;vehicle_id;vehicle_type;vehicle_speed;vehicle_pos;vehicle_lane"
+    rows = [head, "0.000;;;;;"]
+    for frame in range(1, 6):
+        rows.append(f"{frame};a;car;10;{100 + 10 * frame};e_0")
+        rows.append(f"{frame};b;car;10;{80 + 10 * frame};e_0")
+        rows.append(f"{frame};walker;DEFAULT_PEDTYPE;1;{frame};")
+    path.write_text("\n".join(rows) + "\n")
+    pairs = SumoFcdDataset(path=path, min_frames=2).read()
+    assert [(pair.leader_id, pair.follower_id, len(pair)) for pair in pairs] == [("a", "b", 5)]
+    assert ("a person, or in no lane", 5) in [(drop.reason, drop.count) for drop in pairs.dropped]
+    path.write_text(path.read_text().replace("1;a;car;10;", "1;a;car;;"))
+    with pytest.raises(DataError, match=r"row 3, column speed .*a vehicle in a lane has a speed"):
+        SumoFcdDataset(path=path, min_frames=2).read()
