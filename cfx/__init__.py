@@ -13,6 +13,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from cfx.api.experiment import Experiment as Experiment
+    from cfx.api.experiment import config as config
+    from cfx.api.experiment import from_config as from_config
+    from cfx.api.fit import Fit as Fit
+    from cfx.api.fit import calibrate as calibrate
+    from cfx.api.pairs import Pairs as Pairs
+    from cfx.api.pairs import read as read
+    from cfx.api.simulation import simulate as simulate
     from cfx.app.application import run as run
     from cfx.app.job import JobResult as JobResult
     from cfx.app.job import load as load
@@ -54,7 +62,6 @@ if TYPE_CHECKING:
     from cfx.results.table import Findings as Findings
     from cfx.results.table import ResultTable as ResultTable
     from cfx.simulation.base import Stepper as Stepper
-    from cfx.simulation.rollout import simulate as simulate
     from cfx.simulation.simulator import Simulator as Simulator
     from cfx.simulation.simulator import SimulatorSettings as SimulatorSettings
     from cfx.simulation.trajectory import Start as Start
@@ -62,9 +69,16 @@ if TYPE_CHECKING:
     __version__: str
 
 _HOMES = {
+    "read": "cfx.api.pairs",
+    "Pairs": "cfx.api.pairs",
+    "calibrate": "cfx.api.fit",
+    "Fit": "cfx.api.fit",
+    "simulate": "cfx.api.simulation",
+    "config": "cfx.api.experiment",
+    "from_config": "cfx.api.experiment",
+    "Experiment": "cfx.api.experiment",
     "run": "cfx.app.application",
     "get": "cfx.core.registry",
-    "simulate": "cfx.simulation.rollout",
     "load": "cfx.app.job",
     "JobResult": "cfx.app.job",
     "Dataset": "cfx.data.base",

@@ -18,6 +18,7 @@ from cfx.app.hydra_source import composed
 from cfx.contracts import contract_for
 from cfx.core import registry
 from cfx.models.base import DrivingModel
+from cfx.simulation.rollout import simulate
 from tests.conftest import ROOT
 from tests.drives import straight_pairs
 from tests.printed import Reader, all_blocks, blocks
@@ -225,7 +226,7 @@ def test_the_model_in_the_guide_can_be_simulated() -> None:
     start = cfx.Start(
         batch.follower_position[:, 0], batch.follower_speed[:, 0], batch.follower_acceleration[:, 0]
     )
-    out = cfx.simulate(kind(), {"headway": 2.0}, leader, start, batch.dt)
+    out = simulate(kind(), {"headway": 2.0}, leader, start, batch.dt)
     assert not bool(out.collided.any())
     torch.testing.assert_close(
         out.gap[0, -1], torch.tensor(20.0, dtype=torch.float64), atol=0.5, rtol=0

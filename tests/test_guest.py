@@ -19,6 +19,7 @@ import hydra
 import lightning.pytorch  # noqa: F401 - its loggers are there before a job sets their levels
 import mlflow
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from hydra.core.global_hydra import GlobalHydra
@@ -29,6 +30,7 @@ from omegaconf import OmegaConf
 import cfx
 from cfx.core import registry
 from cfx.core.threads import cores_limit, limit_cores
+from cfx.simulation.rollout import simulate
 
 QUICK = ["debug=quick", "data.max_pairs=3", "learner.epochs=1", "figures.enabled=false"]
 
@@ -69,16 +71,27 @@ def nothing_loaded() -> None:
 
 
 def simulation() -> None:
-    cfx.simulate(_model(), None, *_scene(), 0.1)
+    cfx.simulate("idm", {"T": 1.2}, leader=_leader())
 
 
 def compiled_simulation() -> None:
-    cfx.simulate(_model(), None, *_scene(), 0.1, compile="always")
+    simulate(_model(), None, *_scene(), 0.1, compile="always")
 
 
 def refused_simulation() -> None:
     with pytest.raises(cfx.errors.CfxError, match="outside its bounds"):
-        cfx.simulate(_model(), {"T": -1.0}, *_scene(), 0.1)
+        cfx.simulate("idm", {"T": -1.0}, leader=_leader())
+
+
+def calibration() -> None:
+    pairs = cfx.read(dataset="synthetic", pairs=2, frames=150)
+    fit = cfx.calibrate(pairs, "idm", optimizer="random")
+    assert len(fit.losses) == 6
+
+
+def refused_calibration() -> None:
+    with pytest.raises(cfx.errors.ConfigError, match="there is no objective"):
+        cfx.calibrate(cfx.read(dataset="synthetic", pairs=2, frames=150), objective="none")
 
 
 def components() -> None:
@@ -101,6 +114,8 @@ CALLS = [
     simulation,
     compiled_simulation,
     refused_simulation,
+    calibration,
+    refused_calibration,
     components,
     unknown_component,
 ]
@@ -137,6 +152,10 @@ def _disturb(_config: Any, _folder: Path) -> Any:
 
 def _model() -> cfx.DrivingModel:
     return cast("cfx.DrivingModel", registry.create("model", {"name": "idm"}))
+
+
+def _leader() -> pd.DataFrame:
+    return pd.DataFrame({"time_s": np.arange(50) * 0.1, "speed": 12.0})
 
 
 def _scene() -> tuple[cfx.Leader, cfx.Start]:

@@ -26,6 +26,7 @@ FLOORS = (
     ("results",),
     ("report",),
     ("app", "contracts"),
+    ("api",),
 )
 """From the ground up; a room may use rooms on its own floor and below."""
 

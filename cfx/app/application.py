@@ -42,7 +42,7 @@ from cfx.app.sweep import (
 from cfx.app.user_errors import explain, is_user_error
 from cfx.core import registry
 from cfx.core.errors import CfxError, ConfigError, Terminated, printable, without_passwords
-from cfx.core.guest import default_torch, guest
+from cfx.core.guest import guest, visit
 from cfx.core.memory import is_out_of_memory
 from cfx.core.plugin_errors import blame
 from cfx.core.signals import raise_if_terminated, signal_behind, terminable
@@ -275,9 +275,7 @@ def run(overrides: Sequence[str] = (), *, run_job: RunJob | None = None) -> JobR
     """
     if isinstance(overrides, str):
         raise ConfigError(f"give a list of overrides: cfx.run({overrides.split()!r})")
-    import torch  # noqa: F401 - a guest puts the state of what is there already back
-
-    with guest(), default_torch():
+    with visit():
         return _compose_and_run(overrides, run_job)
 
 

@@ -139,11 +139,20 @@ _PLAIN = re.compile(r"[\w./+-]+", re.ASCII)
 
 def path_override(key: str, path: Path) -> str:
     """Returns the override that gives a setting a path, quoted where its signs ask for it."""
-    text = str(path)
-    if _PLAIN.fullmatch(text):
-        return f"{key}={text}"
+    return f"{key}={quoted(str(path))}"
+
+
+def quoted(text: str, *, always: bool = False) -> str:
+    """Returns a text as a value in Hydra's grammar, in quotes where its signs ask for them.
+
+    Args:
+        text: the value.
+        always: in quotes whatever its signs are.
+    """
+    if not always and _PLAIN.fullmatch(text):
+        return text
     # Backslashes count as such in a quoted value only before a quote.
     escaped = re.sub(r"(\\*)'", r"\1\1\\'", text)
     ending = re.search(r"\\*$", escaped)
     assert ending is not None
-    return f"{key}='{escaped}{ending[0]}'"
+    return f"'{escaped}{ending[0]}'"

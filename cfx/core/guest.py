@@ -76,6 +76,15 @@ def default_torch() -> Iterator[None]:
         torch.set_default_dtype(dtype)
 
 
+@contextlib.contextmanager
+def visit() -> Iterator[None]:
+    """Runs a block that computes for a program: `guest` and `default_torch` together."""
+    import torch  # noqa: F401 - a guest puts the state of what is there already back
+
+    with guest(), default_torch():
+        yield
+
+
 def _environment() -> _Undo:
     before = dict(os.environ)
 

@@ -70,7 +70,7 @@ def describe(path: Path, settings: Mapping[str, Any] | None = None, options: str
     """
     path = path.expanduser()
     if settings is None:
-        settings = {"name": _dataset_of(path)}
+        settings = {"name": dataset_of(path)}
     reader = _Reader(settings, options)
     if reader.name == "tidy" and path.is_dir():
         return _describe_partitions(path, reader)
@@ -159,7 +159,7 @@ def _text(pieces: Sequence[RenderableType]) -> str:
     return "\n".join(line.rstrip() for line in text.getvalue().splitlines())
 
 
-def _dataset_of(path: Path) -> str:
+def dataset_of(path: Path) -> str:
     """Returns the name of the dataset that reads a file; cfx's own are asked before plugins'.
 
     Raises:

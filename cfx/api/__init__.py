@@ -1,0 +1,1 @@
+"""cfx from Python: functions on data frames, over the components that Hydra composes."""

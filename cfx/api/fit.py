@@ -1,0 +1,261 @@
+"""Calibration from Python: constant parameters of each driver, pooled ones, and their errors.
+
+Shapes: P pairs, n tuned parameters.
+"""
+
+from __future__ import annotations
+
+from contextlib import closing
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from cfx.api.experiment import Experiment, config
+from cfx.api.pairs import Pairs, PairsLike
+from cfx.core.guest import visit
+
+if TYPE_CHECKING:
+    import torch
+    from matplotlib.figure import Figure
+    from torch import Tensor
+
+    from cfx.app.job.parts import Parts
+    from cfx.evaluation.protocols.base import ProtocolContext
+
+METHODS = ("default", "population", "fixed")
+"""What is compared: the model's defaults, pooled and driver-specific parameters."""
+
+_AT_BOUND = 0.01
+"""So near to a bound, as a share of the distance between both, a value is at it."""
+
+
+@dataclass(frozen=True, repr=False)
+class Fit:
+    """Calibrated parameters of a model; `cfx.calibrate` makes it.
+
+    Attributes:
+        experiment: the configuration, with the command that repeats it.
+        pairs: what was calibrated on.
+        parameters: a row per pair: the driver's own parameters, SI units.
+    """
+
+    experiment: Experiment
+    pairs: Pairs
+    parameters: pd.DataFrame
+    _context: ProtocolContext = field(compare=False)
+    _last: torch.Tensor = field(compare=False)
+
+    @property
+    def model(self) -> str:
+        """Name of the driving model."""
+        return str(self.experiment.config.model["name"])
+
+    @property
+    def command(self) -> str:
+        """The command line that calibrates the same; see `Experiment.command`."""
+        return self.experiment.command
+
+    @cached_property
+    def pooled(self) -> pd.Series:
+        """One set of parameters for all drivers, SI units: it minimises the mean of their losses.
+
+        It is calibrated on the same frames when it is first asked for.
+        """
+        import torch
+
+        members = torch.ones((1, len(self.pairs)), dtype=torch.bool)
+        context = self._context
+        with visit():
+            found = context.calibrator.population(context.pairs, context.batch, self._last, members)
+        return pd.Series(found[0].tolist(), index=self.parameters.columns, name="pooled")
+
+    @property
+    def defaults(self) -> pd.Series:
+        """The model's default parameters, SI units."""
+        space = self._context.space
+        values = [space[name].default for name in space.names]
+        return pd.Series(values, index=self.parameters.columns, name="default")
+
+    @cached_property
+    def losses(self) -> pd.DataFrame:
+        """Errors of each pair and method: pair_id, driver, method, and RMSE of speed and gap.
+
+        `train_rmse_speed` (m/s) and `train_rmse_gap` (m) are of the part that was calibrated on,
+        `test_...` of the rest, simulated in closed loop from the last measured state before it.
+        `method` is `default`, `population` (pooled) or `fixed` (driver-specific).
+        """
+        tables = []
+        with visit():
+            for method in METHODS:
+                tables.append(self._errors(method))
+        return pd.concat(tables, ignore_index=True)
+
+    def summary(self) -> pd.DataFrame:
+        """Returns a row per parameter: its unit, default, pooled value, and the drivers' spread.
+
+        Columns: unit, default, pooled, mean, std, 25%, 50%, 75%, at_bound (share of the pairs
+        whose value is at a bound, where the recording does not determine it).
+        """
+        space = self._context.space
+        table = self.parameters.describe().T[["mean", "std", "25%", "50%", "75%"]]
+        units, at_bound = [], []
+        for name in space.names:
+            one = space[name]
+            units.append(one.unit)
+            place = (self.parameters[name] - one.low) / (one.high - one.low)
+            at_bound.append(float(((place < _AT_BOUND) | (place > 1 - _AT_BOUND)).mean()))
+        table.insert(0, "unit", units)
+        table.insert(1, "default", self.defaults)
+        table.insert(2, "pooled", self.pooled)
+        table["at_bound"] = at_bound
+        return table.rename_axis("parameter")
+
+    def plot(self) -> Figure:
+        """Draws the parameters between their bounds, and how they go together."""
+        from cfx.api.figures import for_notebooks
+        from cfx.report.figures.calibration import (
+            correlations,
+            draw_calibration,
+            parameter_spreads,
+        )
+        from cfx.report.figures.results import ParameterAxis
+
+        tables = []
+        for method in METHODS:
+            table = self._of(method).add_prefix("parameter_")
+            tables.append(table.assign(method=method))
+        rows = pd.concat(tables, ignore_index=True)
+        axes = []
+        for one in self._context.space.tuned:
+            axes.append(ParameterAxis(one.name, one.unit, one.low, one.high, one.meaning))
+        figure = draw_calibration(parameter_spreads(rows, axes), correlations(rows, axes))
+        return for_notebooks(figure)
+
+    def _of(self, method: str) -> pd.DataFrame:
+        """Returns a method's parameters, a row per pair."""
+        if method == "fixed":
+            return self.parameters
+        same = self.pooled if method == "population" else self.defaults
+        rows = np.tile(same.to_numpy(dtype=np.float64), (len(self.parameters), 1))
+        return pd.DataFrame(rows, self.parameters.index, self.parameters.columns)
+
+    def _tensor(self, method: str) -> Tensor:
+        """Returns a method's parameters as `(P, n)`."""
+        import torch
+
+        batch = self._context.batch
+        values = torch.tensor(self._of(method).to_numpy(dtype=np.float64))
+        return values.to(batch.leader_length)
+
+    def _errors(self, method: str) -> pd.DataFrame:
+        """Returns a method's rows of `losses`."""
+        import torch
+
+        from cfx.calibration.identifiability import training_errors
+        from cfx.evaluation.closed_loop import Followers
+        from cfx.evaluation.evaluate import closed_loop_errors
+        from cfx.evaluation.shards import simulate_in_shards
+        from cfx.policies.fixed import FixedPolicy
+
+        context, parameters = self._context, self._tensor(method)
+        batch = context.batch
+        first = self._last.to(batch.lengths.device)
+        train = training_errors(context.calibrator, batch, first, parameters)
+        agent = context.constant(FixedPolicy(), parameters)
+        each = torch.arange(len(batch), device=batch.lengths.device)
+        loop = simulate_in_shards(
+            context.engine, context.simulator, agent, Followers(batch, each), first
+        )
+        speed, gap = closed_loop_errors(batch, first, loop)
+        return pd.DataFrame(
+            {
+                "pair_id": [pair.pair_id for pair in context.pairs],
+                "driver": [pair.driver for pair in context.pairs],
+                "method": method,
+                "train_rmse_speed": train["rmse_speed"].cpu().numpy(),
+                "test_rmse_speed": speed,
+                "train_rmse_gap": train["rmse_gap"].cpu().numpy(),
+                "test_rmse_gap": gap,
+            }
+        )
+
+    def __repr__(self) -> str:
+        found = self.losses.groupby("method")["test_rmse_speed"].mean()
+        means = [f"{method} {found[method]:.3f}" for method in METHODS]
+        return (
+            f"Fit({self.model}, {len(self.parameters)} pairs; RMSE of speed on the test part, m/s:"
+            f" {', '.join(means)})"
+        )
+
+    def _repr_html_(self) -> str:
+        from cfx.api.figures import as_html
+
+        return as_html(repr(self), self.summary())
+
+
+def calibrate(
+    pairs: PairsLike,
+    model: str = "idm",
+    *,
+    objective: str = "speed_rmse",
+    seed: int = 0,
+    **settings: Any,
+) -> Fit:
+    """Calibrates a model to each driver, as `python -m cfx model=MODEL policy=fixed` does.
+
+    The first part of each trajectory (`split`, 80 %) is calibrated on, the rest tests. The
+    parameters are those of the command with the same settings, to the last bit. Nothing is
+    written.
+
+    Args:
+        pairs: as `cfx.read` takes them.
+        model: as after `model=`.
+        objective: what is minimised, as after `objective=`: `speed_rmse`, `gap_rmse`, ...
+        seed: the same seed gives the same parameters.
+        settings: others of the command line: `optimizer="botorch"`, `split=0.7`,
+            `**{"model.parameters.T.high": 4.0}`.
+
+    Raises:
+        CfxError: the pairs or a setting are wrong, in one sentence.
+
+    Examples:
+        >>> import cfx
+        >>> pairs = cfx.read(dataset="synthetic", pairs=3, frames=200, variation=0.0)
+        >>> fit = cfx.calibrate(pairs, "idm", objective="gap_rmse")
+        >>> fit.parameters.shape
+        (3, 5)
+        >>> bool((fit.losses["test_rmse_gap"] >= 0).all())
+        True
+    """
+    chosen = {"model": model, "objective": objective, "seed": seed, **settings}
+    experiment = config(pairs, policy="fixed", protocol="within_driver", **chosen)
+    recording = experiment.pairs
+    assert recording is not None
+    with visit():
+        context, parts = prepared(experiment, recording)
+        from cfx.calibration.windows import Split
+
+        with closing(parts.engine):
+            last = Split.of(context.pairs, context.windows, context.split).frame
+            found = context.calibrator.fixed(context.pairs, context.batch, last)
+    ids = pd.Index([pair.pair_id for pair in context.pairs], name="pair_id")
+    table = pd.DataFrame(found.cpu().numpy(), ids, list(context.space.names))
+    return Fit(experiment, recording, table, context, last)
+
+
+def prepared(experiment: Experiment, pairs: Pairs) -> tuple[ProtocolContext, Parts]:
+    """Returns what a protocol would work with, and the components; no cache is kept.
+
+    Raises:
+        CfxError: a setting is wrong.
+    """
+    from cfx.app.job import steps
+    from cfx.results.config import JobConfig
+
+    config, parts = steps.prepare(experiment.config)
+    selected, style = steps.select_pairs(pairs.selected, config)
+    uncached = JobConfig.of({**config.model_dump(), "cache": {"enabled": False}})
+    return steps.compose(uncached, parts, selected, style), parts

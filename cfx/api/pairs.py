@@ -1,0 +1,231 @@
+"""Leader-follower pairs from a file or a data frame, read by the datasets of the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+
+from cfx.app.overrides import config_of
+from cfx.core import registry
+from cfx.core.component import validate
+from cfx.core.errors import ConfigError, DataError
+from cfx.core.files import absolute
+from cfx.core.guest import guest
+from cfx.core.storage import is_url
+from cfx.data.base import Dataset
+from cfx.data.describe import dataset_of
+from cfx.data.pairs import PairSet
+from cfx.data.tidy import TidyDataset, TidySettings, frame_of, pairs_from_frame, write_tidy
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PairsLike = Any
+"""What `cfx.read` takes: `Pairs`, a `PairSet`, a data frame, or the path of a recording."""
+
+_TABLE = "the table"
+"""What messages call a data frame."""
+
+
+class FrameDataset(TidyDataset):
+    """Pairs of a data frame in the tidy layout.
+
+    Args:
+        settings: as for a file; `path` is not read.
+        frame: a row per pair and frame.
+    """
+
+    def __init__(self, settings: TidySettings, frame: pd.DataFrame) -> None:
+        super().__init__(settings)
+        self._frame = frame
+
+    def read(self) -> PairSet:
+        return pairs_from_frame(self._frame, _TABLE, self.settings.own_layout())
+
+
+@dataclass(frozen=True, repr=False)
+class Pairs:
+    """Leader-follower pairs, and the settings of the dataset that read them.
+
+    Attributes:
+        selected: the pairs themselves.
+        node: the dataset's node of the configuration: its name and settings.
+        in_file: whether `node` reads these pairs from a file; not if they were a data frame.
+    """
+
+    selected: PairSet
+    node: Mapping[str, Any] = field(default_factory=dict)
+    in_file: bool = True
+
+    @classmethod
+    def of(cls, node: Mapping[str, Any]) -> Pairs:
+        """Reads what a dataset's node says."""
+        return cls(cast(Dataset, registry.create("dataset", node)).load(), node)
+
+    @cached_property
+    def frame(self) -> pd.DataFrame:
+        """A row per pair and frame, in the tidy layout, SI units."""
+        return frame_of(self.selected)
+
+    @cached_property
+    def summary(self) -> pd.DataFrame:
+        """A row per pair: pair_id, driver, frames, duration_s, mean_speed (m/s), mean_gap (m)."""
+        rows = []
+        for pair in self.selected:
+            rows.append(
+                {
+                    "pair_id": pair.pair_id,
+                    "driver": pair.driver,
+                    "frames": len(pair),
+                    "duration_s": (len(pair) - 1) * pair.dt,
+                    "mean_speed": float(np.mean(pair.follower_speed)),
+                    "mean_gap": float(np.mean(pair.gap)),
+                }
+            )
+        return pd.DataFrame(rows).set_index("pair_id")
+
+    @property
+    def dropped(self) -> pd.DataFrame:
+        """What was left out: a row per reason, with its count and what was counted."""
+        rows = [(one.reason, one.count, one.unit) for one in self.selected.dropped]
+        return pd.DataFrame(rows, columns=["reason", "count", "unit"])
+
+    def select(self, pair_ids: Sequence[str]) -> Pairs:
+        """Returns some of the pairs.
+
+        Raises:
+            DataError: there is no pair of such an id.
+        """
+        wanted = set(pair_ids)
+        unknown = sorted(wanted - {pair.pair_id for pair in self.selected})
+        if unknown:
+            raise DataError(f"{self.selected.source}: there is no pair '{unknown[0]}'")
+        keep = [pair.pair_id in wanted for pair in self.selected]
+        chosen = self.selected.select(keep, "not selected")
+        node = {**self.node, "pair_ids": [pair.pair_id for pair in chosen]}
+        return replace(self, selected=chosen, node=node)
+
+    def save(self, path: str | Path) -> Pairs:
+        """Writes the pairs in the tidy layout; returns them as they are read from there.
+
+        Args:
+            path: ends in .parquet, .csv or .csv.gz.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        write_tidy(self.selected, path)
+        settings = {"data": "tidy", "data.path": absolute(path), "data.min_frames": 2}
+        return Pairs.of(config_of({**settings, "data.accelerations": "recorded"}).data)
+
+    def plot(self, pair_ids: Sequence[str] | None = None) -> Figure:
+        """Draws speeds and gap of some pairs over time; returns the figure.
+
+        Args:
+            pair_ids: which; None: the first three.
+        """
+        from cfx.api.figures import draw_pairs, for_notebooks
+
+        chosen = self.selected[:3] if pair_ids is None else self.select(pair_ids).selected
+        return for_notebooks(draw_pairs(list(chosen)))
+
+    def require_a_file(self) -> None:
+        """Refuses pairs that no command can read.
+
+        Raises:
+            DataError: they come from a data frame.
+        """
+        if not self.in_file:
+            raise DataError(
+                "these pairs come from a data frame, which no command can read; save them first:"
+                " pairs = pairs.save('pairs.parquet')"
+            )
+
+    def __len__(self) -> int:
+        return len(self.selected)
+
+    def __repr__(self) -> str:
+        drivers = self.summary["driver"].nunique()
+        seconds = self.summary["duration_s"].sum()
+        return (
+            f"Pairs({len(self)} pairs of {drivers} drivers, {seconds:.0f} s in steps of"
+            f" {self.selected.dt:g} s, from {self.selected.source})"
+        )
+
+    def _repr_html_(self) -> str:
+        from cfx.api.figures import as_html
+
+        return as_html(repr(self), self.summary)
+
+
+@guest()
+def read(source: Any = None, *, dataset: str | None = None, **settings: Any) -> Pairs:
+    """Reads leader-follower pairs, as `data=DATASET data.path=SOURCE` on the command line.
+
+    Args:
+        source: the path or URL of a recording, a pattern, a list of them; or a data frame in the
+            tidy layout (pandas, or whatever has an Arrow interface, such as polars). None for a
+            dataset that reads no file.
+        dataset: the dataset that reads it, as after `data=`; None: found from the file itself.
+        settings: of the dataset: `min_frames=300`, `time_step=0.1`, `max_pairs=20` and so on; a
+            table's own names and units: `columns={"speed": "v"}`, `units={"speed": "km/h"}`.
+
+    Raises:
+        DataError: the recording cannot be read, with file, row and column.
+        ConfigError: a setting is wrong.
+
+    Examples:
+        >>> import cfx
+        >>> pairs = cfx.read(dataset="synthetic", pairs=3, frames=200)
+        >>> len(pairs), pairs.frame.shape[0]
+        (3, 600)
+        >>> cfx.read(pairs.frame, min_frames=2)
+        Pairs(3 pairs of 3 drivers, 60 s in steps of 0.1 s, from the table)
+    """
+    if isinstance(source, Pairs):
+        raise ConfigError("these pairs have been read already; give a file or a data frame")
+    given = {f"data.{key}": value for key, value in settings.items()}
+    if source is None:
+        if dataset is None:
+            raise ConfigError("give a file or a data frame, or dataset=NAME")
+        return Pairs.of(config_of({"data": dataset, **given}).data)
+    frame = _data_frame(source)
+    if frame is not None:
+        given["data.path"] = _TABLE
+        node = config_of({"data": dataset or "tidy", **given}).data
+        values = {key: value for key, value in node.items() if key != "name"}
+        made = validate(TidySettings, values, where="data")
+        return Pairs(FrameDataset(made, frame).load(), node, in_file=False)
+    paths = [source] if isinstance(source, str | Path) else list(source)
+    paths = [one if is_url(str(one)) else str(absolute(one)) for one in paths]
+    name = dataset or dataset_of(Path(str(paths[0])))
+    given["data.path"] = paths[0] if len(paths) == 1 else paths
+    return Pairs.of(config_of({"data": name, **given}).data)
+
+
+def pairs_from(given: PairsLike) -> Pairs:
+    """Returns pairs of whatever `cfx.read` takes."""
+    if isinstance(given, Pairs):
+        return given
+    if isinstance(given, PairSet):
+        return Pairs(given, {"name": "tidy", "path": _TABLE}, in_file=False)
+    return read(given)
+
+
+def _data_frame(source: Any) -> pd.DataFrame | None:
+    """Returns a table as a pandas data frame; None for what is no table."""
+    if isinstance(source, pd.DataFrame):
+        return source
+    if hasattr(source, "__arrow_c_stream__"):  # polars, pyarrow, DuckDB and others
+        frame: pd.DataFrame = pa.table(source).to_pandas()
+        return frame
+    if hasattr(source, "to_dataframe"):  # xarray
+        return cast(pd.DataFrame, source.to_dataframe().reset_index())
+    return None

@@ -1,0 +1,261 @@
+"""Simulation from Python: followers behind recorded or given leaders, as a data frame.
+
+Shapes: P followers, T frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import pandas as pd
+
+from cfx.api.fit import Fit
+from cfx.api.pairs import Pairs, PairsLike, pairs_from
+from cfx.app.overrides import config_of
+from cfx.core import registry
+from cfx.core.errors import ConfigError, DataError, listed, nearest
+from cfx.core.guest import visit
+from cfx.data.pairs import Pair, PairBatch, PairSet
+from cfx.data.series import accelerations, driven
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from cfx.models.base import DrivingModel
+    from cfx.simulation.trajectory import Trajectory
+
+_STANDSTILL_M, _TIME_GAP_S = 2.0, 1.5
+"""Where a follower begins behind a given leader: so far, and so many seconds of their speed."""
+
+Parameters = Fit | Mapping[str, float] | pd.Series | pd.DataFrame | None
+"""Parameters of followers: a fit's, one set for all, or a row for each."""
+
+
+def simulate(
+    model: str,
+    parameters: Parameters = None,
+    pairs: PairsLike | None = None,
+    *,
+    leader: pd.DataFrame | pd.Series | None = None,
+    at: float = 0.0,
+    gap: float | None = None,
+    speed: float | None = None,
+    **settings: Any,
+) -> pd.DataFrame:
+    """Simulates followers behind recorded leaders, or behind one given leader.
+
+    Args:
+        model: as after `model=`.
+        parameters: a `Fit` (each driver's own), a mapping or a series of values by name for all
+            followers, or a frame with a row for each, whose index are pair ids; SI units. What is
+            left out is at its default; None: all is.
+        pairs: recorded leaders and the followers' starts, as `cfx.read` takes them.
+        leader: in place of `pairs`: a leader's speed over time, as columns `time_s` and `speed`
+            (m/s), or as a series of it whose index is the time. The step must be constant.
+        at: s after a pair's first frame, from whose measured state the follower is simulated.
+        gap: behind a given leader: the first bumper-to-bumper gap, m; None: 2 m and 1.5 s.
+        speed: behind a given leader: the follower's first speed, m/s; None: the leader's.
+        settings: of the command line: `**{"model.limits": None}`.
+
+    Returns:
+        A row per follower and frame: pair_id, time_s, leader_speed (m/s), position (m), speed
+        (m/s), acceleration (m/s2), gap (m; negative after a collision). The first row of each is
+        where it starts from.
+
+    Raises:
+        CfxError: a parameter is unknown or outside its bounds, or the leader is no time series.
+
+    Examples:
+        >>> import cfx
+        >>> import numpy as np
+        >>> import pandas as pd
+        >>> leader = pd.DataFrame({"time_s": np.arange(0, 60, 0.1), "speed": 15.0})
+        >>> drive = cfx.simulate("idm", {"T": 1.2}, leader=leader)
+        >>> list(drive.columns)
+        ['pair_id', 'time_s', 'leader_speed', 'position', 'speed', 'acceleration', 'gap']
+        >>> round(float(drive["speed"].iloc[-1]), 1)
+        15.0
+    """
+    with visit():
+        from cfx.models.base import DrivingModel
+
+        if isinstance(parameters, Fit) and parameters.model != model:
+            raise ConfigError(
+                f"the parameters are of model={parameters.model}, not of model={model}; simulate"
+                " that model, or give others"
+            )
+        made = cast(
+            DrivingModel, registry.create("model", config_of({"model": model, **settings}).model)
+        )
+        if made.needs_simulator:
+            raise ConfigError(
+                f"model={model} has equations in {made.needs_simulator} alone and cannot be"
+                " simulated here; run a job with it"
+            )
+        recording = _recording(parameters, pairs, leader, gap, speed)
+        batch = PairBatch.of(recording)
+        first = round(at / batch.dt)
+        if not 0 <= first < int(batch.lengths.min()) - 1:
+            raise ConfigError(
+                f"at={at:g}: the shortest pair has {int(batch.lengths.min())} frames of"
+                f" {batch.dt:g} s; give a time within it"
+            )
+        given = _values(parameters, [pair.pair_id for pair in recording], made)
+        found = _simulated(made, given, batch, first)
+        return _table(recording, batch, found, first)
+
+
+def _recording(
+    parameters: Parameters,
+    pairs: PairsLike | None,
+    leader: pd.DataFrame | pd.Series | None,
+    gap: float | None,
+    speed: float | None,
+) -> PairSet:
+    """Returns the leaders, and where their followers start."""
+    if leader is not None:
+        if pairs is not None:
+            raise ConfigError("give pairs or leader, not both")
+        names = ["follower"]
+        if isinstance(parameters, pd.DataFrame):
+            names = [str(name) for name in parameters.index]
+        return _behind(leader, names, gap, speed)
+    if gap is not None or speed is not None:
+        raise ConfigError("gap and speed say where a follower of leader=... starts; give a leader")
+    if pairs is None and isinstance(parameters, Fit):
+        return parameters.pairs.selected
+    if pairs is None:
+        raise ConfigError("give recorded pairs, or leader=FRAME with columns time_s and speed")
+    found: Pairs = pairs_from(pairs)
+    return found.selected
+
+
+def _behind(
+    leader: pd.DataFrame | pd.Series, names: list[str], gap: float | None, speed: float | None
+) -> PairSet:
+    """Returns a pair for each name, behind one leader."""
+    time, speeds = _leader_columns(leader)
+    steps = np.diff(time)
+    dt = float(np.mean(steps)) if len(steps) else 0.0
+    if len(time) < 2 or not np.allclose(steps, dt, rtol=0.05, atol=0) or dt <= 0:
+        raise DataError("leader: time_s must advance by a constant step, over two rows or more")
+    if not (np.isfinite(speeds).all() and (speeds >= 0).all()):
+        raise DataError("leader: speed must be finite and 0 or more, in m/s")
+    dt = round(dt, 9)
+    start = float(speeds[0]) if speed is None else speed
+    ahead = _STANDSTILL_M + _TIME_GAP_S * start if gap is None else gap
+    still = np.zeros(len(time))
+    pairs = []
+    for name in names:
+        pair = Pair(
+            pair_id=name,
+            recording="given",
+            leader_id="leader",
+            follower_id=name,
+            first_frame=0,
+            dt=dt,
+            leader_length=0.0,
+            leader_position=ahead + driven(speeds, dt),
+            leader_speed=speeds,
+            leader_acceleration=accelerations(speeds, dt),
+            follower_position=still,
+            follower_speed=still + start,
+            follower_acceleration=still,
+        )
+        pairs.append(pair)
+    return PairSet(tuple(pairs), "the given leader")
+
+
+def _leader_columns(leader: pd.DataFrame | pd.Series) -> tuple[Any, Any]:
+    """Returns a leader's times, s, and speeds, m/s."""
+    if isinstance(leader, pd.Series):
+        leader = leader.rename("speed").rename_axis("time_s").reset_index()
+    for name in ("time_s", "speed"):
+        if name not in leader:
+            columns = [str(one) for one in leader.columns]
+            raise DataError(
+                f"leader: column {name} is missing.{nearest(name, columns)} Columns found:"
+                f" {listed(columns, 20)}."
+            )
+    try:
+        return (leader["time_s"].to_numpy(np.float64), leader["speed"].to_numpy(np.float64))
+    except ValueError as error:
+        raise DataError(f"leader: time_s and speed must be numbers ({error})") from None
+
+
+def _values(parameters: Parameters, ids: list[str], model: DrivingModel) -> dict[str, Tensor]:
+    """Returns values `(P,)` by name.
+
+    Raises:
+        ConfigError: a parameter is unknown, or a follower has none.
+    """
+    import torch
+
+    if isinstance(parameters, Fit):
+        parameters = parameters.parameters
+    if parameters is None:
+        parameters = {}
+    if isinstance(parameters, pd.DataFrame):
+        table = parameters.set_axis(parameters.index.astype(str))
+        missing = [name for name in ids if name not in table.index]
+        if missing:
+            raise ConfigError(
+                f"parameters: there is no row for pair '{missing[0]}' ({len(missing)} such pairs);"
+                " give a row for each, or one set for all"
+            )
+        table = table.loc[ids]
+    else:
+        table = pd.DataFrame([dict(parameters)] * len(ids), ids)
+    values = {}
+    for name in table.columns.astype(str):
+        model.space[name]  # says that it is unknown
+        values[name] = torch.tensor(table[name].to_numpy(np.float64))
+    return values
+
+
+def _simulated(
+    model: DrivingModel, values: Mapping[str, Tensor], batch: PairBatch, first: int
+) -> Trajectory:
+    """Returns the followers from frame `first` on."""
+    from cfx.models.base import Leader
+    from cfx.simulation.rollout import simulate as rollout
+    from cfx.simulation.trajectory import Start
+
+    leader = Leader(
+        batch.leader_position[:, first:],
+        batch.leader_speed[:, first:],
+        batch.leader_acceleration[:, first:],
+        batch.leader_length,
+    )
+    start = Start(
+        batch.follower_position[:, first],
+        batch.follower_speed[:, first],
+        batch.follower_acceleration[:, first],
+    )
+    return rollout(model, dict(values), leader, start, batch.dt)
+
+
+def _table(pairs: PairSet, batch: PairBatch, found: Trajectory, first: int) -> pd.DataFrame:
+    """Returns a row per follower and frame."""
+    acceleration = batch.follower_acceleration[:, first:].clone()
+    acceleration[:, 1:] = (found.speed[:, 1:] - found.speed[:, :-1]) / batch.dt
+    parts = []
+    for number, pair in enumerate(pairs):
+        count = len(pair) - first
+        signals = {
+            "position": found.position,
+            "speed": found.speed,
+            "acceleration": acceleration,
+            "gap": found.gap,
+        }
+        columns: dict[str, Any] = {
+            "pair_id": pair.pair_id,
+            "time_s": (first + np.arange(count)) * pair.dt,
+            "leader_speed": np.asarray(pair.leader_speed)[first:],
+        }
+        for name, values in signals.items():
+            columns[name] = values[number, :count].numpy()
+        parts.append(pd.DataFrame(columns))
+    return pd.concat(parts, ignore_index=True)

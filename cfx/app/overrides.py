@@ -1,0 +1,122 @@
+"""Overrides as Hydra's grammar reads them, and those that make a configuration once more."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from cfx.app import hydra_source
+from cfx.app.user_errors import explain, is_user_error
+from cfx.core import registry
+from cfx.core.errors import CfxError, ConfigError
+from cfx.core.files import quoted
+from cfx.results.config import JobConfig
+
+
+def override(key: str, value: Any) -> str:
+    """Returns the override that gives a setting a value.
+
+    Args:
+        key: with its path: `data.min_frames`.
+        value: plain data: None, a truth value, a number, a text, a path, or lists and mappings of
+            these.
+    """
+    return f"{key}={_text(value)}"
+
+
+def config_of(settings: Mapping[str, Any]) -> JobConfig:
+    """Composes the configuration of settings, as the command line does.
+
+    Args:
+        settings: values by their keys; those that are None stay as they are.
+
+    Raises:
+        CfxError: a name or a value is wrong.
+    """
+    overrides = []
+    for key, value in settings.items():
+        if value is not None:
+            overrides.append(override(key, value))
+    try:
+        values = hydra_source.plain(hydra_source.composed(overrides))
+    except Exception as error:
+        if is_user_error(error) and not isinstance(error, CfxError):
+            raise ConfigError(explain(error, overrides)) from None
+        raise
+    return JobConfig.of(values)
+
+
+def command_of(config: JobConfig) -> str:
+    """Returns the command line that runs a configuration."""
+    return shlex.join(["python", "-m", "cfx", *overrides_of(config)])
+
+
+def overrides_of(config: JobConfig) -> tuple[str, ...]:
+    """Returns overrides that compose a configuration.
+
+    They name the experiment, the model, the components and settings that differ from the usual.
+    """
+    values = config.model_dump(mode="json")
+    chosen = []
+    if config.preset:
+        chosen.append(f"experiment={config.preset}")
+    usual = _composed(chosen)
+    for group in registry.GROUPS:
+        node = values.get(group)
+        is_usual = (usual.get(group) or {}).get("name") == (node or {}).get("name")
+        if node is not None and (group == "model" or not is_usual):
+            chosen.append(f"{group}={node.get('name')}")
+    usual = _composed(chosen)
+    for key in ("preset", *[key for key in values if values[key] == usual.get(key)]):
+        values.pop(key, None)
+    chosen += _differences("", values, usual)
+    return tuple(chosen)
+
+
+def _composed(overrides: Sequence[str]) -> dict[str, Any]:
+    """Returns the configuration that overrides compose, as it is written to files."""
+    plain = hydra_source.plain(hydra_source.composed(overrides))
+    return JobConfig.of(plain).model_dump(mode="json")
+
+
+def _differences(prefix: str, values: Mapping[str, Any], usual: Mapping[str, Any]) -> Iterator[str]:
+    """Yields the overrides of values that differ from the usual ones."""
+    for name, value in values.items():
+        key = f"{prefix}{name}"
+        if name not in usual:
+            yield override(f"++{key}", value)
+            continue
+        before = usual[name]
+        if value == before:
+            continue
+        if isinstance(value, Mapping) and isinstance(before, Mapping) and before:
+            yield from _differences(f"{key}.", value, before)
+        else:
+            yield override(key, value)
+
+
+def _text(value: Any) -> str:
+    """Returns a value in Hydra's grammar."""
+    if isinstance(value, str | Path):
+        return _word(value)
+    if isinstance(value, Mapping):
+        pairs = [f"{_text(key)}: {_text(item)}" for key, item in value.items()]
+        return "{" + ", ".join(pairs) + "}"
+    if isinstance(value, Sequence):
+        return "[" + ", ".join(_text(item) for item in value) + "]"
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    return repr(value)
+
+
+def _word(text: str | Path) -> str:
+    """Returns a text in Hydra's grammar: in quotes where it would be a number or a truth value."""
+    if isinstance(text, Path):
+        return quoted(str(text))
+    is_word = re.fullmatch(r"\w+", text, re.ASCII) and isinstance(yaml.safe_load(text), str)
+    return quoted(text, always=not is_word and "/" not in text)

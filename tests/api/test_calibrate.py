@@ -1,0 +1,243 @@
+"""Calibration and simulation from Python are those of the command line, and refuse as it does."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pytest
+from torch import Tensor
+
+import cfx
+from cfx.app.overrides import override
+from cfx.calibration.calibrator import Calibrator
+from cfx.core.errors import CfxError, ConfigError, DataError, ParameterError
+from cfx.results.table import read_tables
+
+LEADER = pd.DataFrame({"time_s": np.arange(600) * 0.1, "speed": 15.0})
+
+
+class Job(NamedTuple):
+    """A job of the command line.
+
+    Attributes:
+        found: driver-specific parameters as calibration found them.
+        fits: its table of errors.
+    """
+
+    found: Tensor
+    fits: pd.DataFrame
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory: pytest.TempPathFactory) -> cfx.Pairs:
+    """Three pairs that were written to a file."""
+    made = cfx.read(dataset="synthetic", pairs=3, frames=300)
+    return made.save(tmp_path_factory.mktemp("a recording") / "pairs.parquet")
+
+
+@pytest.fixture(scope="module")
+def fit(pairs: cfx.Pairs) -> cfx.Fit:
+    return cfx.calibrate(pairs, "idm", objective="gap_rmse", seed=3, optimizer="random")
+
+
+@pytest.fixture(scope="module")
+def job(fit: cfx.Fit, tmp_path_factory: pytest.TempPathFactory) -> Job:
+    """The job of the fit's command."""
+    found = []
+    calibrated = Calibrator.fixed
+
+    def recorded(self: Calibrator, *given: Any) -> Tensor:
+        found.append(calibrated(self, *given))
+        return found[-1]
+
+    off = ["tracking.enabled=false", "figures.enabled=false", "cache.enabled=false"]
+    folder = tmp_path_factory.mktemp("job") / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Calibrator, "fixed", recorded)
+        cfx.run([*shlex.split(fit.command)[3:], *off, f"hydra.run.dir={folder}"])
+    return Job(found[0], read_tables(folder, "fits")["fits"])
+
+
+def test_parameters_are_those_of_the_command_to_the_last_bit(fit: cfx.Fit, job: Job) -> None:
+    assert fit.parameters.to_numpy().tolist() == job.found.tolist()
+
+
+def test_errors_are_those_of_the_command(fit: cfx.Fit, job: Job) -> None:
+    for method in ("default", "fixed"):
+        own = fit.losses[fit.losses["method"] == method].reset_index(drop=True)
+        its = job.fits[job.fits["method"] == method].reset_index(drop=True)
+        assert own["test_rmse_speed"].tolist() == its["test_rmse_speed"].tolist()
+        assert own["test_rmse_gap"].tolist() == its["test_rmse_gap"].tolist()
+        # A job takes these parameters out of its table of means over frames.
+        pd.testing.assert_frame_equal(own, its[own.columns], rtol=1e-6, check_dtype=False)
+
+
+def test_driver_specific_parameters_have_the_lowest_loss(fit: cfx.Fit) -> None:
+    train = fit.losses.groupby("method")["train_rmse_gap"].mean()
+    assert train["fixed"] <= train["population"] <= train["default"]
+
+
+def test_a_summary_has_units_defaults_and_pooled_values(fit: cfx.Fit) -> None:
+    table = fit.summary()
+    assert table.loc["T", ["unit", "default"]].tolist() == ["s", 1.6]
+    assert table["pooled"].tolist() == fit.pooled.tolist()
+    assert table["at_bound"].between(0, 1).all()
+    assert "parameter" in fit._repr_html_()
+    assert "fixed" in repr(fit)
+
+
+def test_figures_show_themselves_in_notebooks(fit: cfx.Fit, pairs: cfx.Pairs) -> None:
+    for figure in (fit.plot(), pairs.plot()):
+        assert vars(figure)["_repr_png_"]().startswith(b"\x89PNG")
+
+
+def test_nothing_is_written(
+    pairs: cfx.Pairs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    fit = cfx.calibrate(pairs, "krauss", optimizer="random")
+    cfx.simulate("krauss", fit)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_data_frames_of_other_libraries_are_read(pairs: cfx.Pairs) -> None:
+    table = pa.Table.from_pandas(pairs.frame)
+    read = cfx.read(table, min_frames=2, accelerations="recorded")
+    assert [one.content for one in read.selected] == [one.content for one in pairs.selected]
+
+
+def test_a_recording_says_its_layout_itself(pairs: cfx.Pairs) -> None:
+    read = cfx.read(pairs.node["path"], min_frames=2, max_pairs=2)
+    assert read.node["name"] == "tidy"
+    assert read.dropped["count"].tolist() == [1]
+
+
+def test_columns_and_units_of_ones_own_are_mapped(pairs: cfx.Pairs) -> None:
+    frame = pairs.frame.rename(columns={"follower_speed_mps": "v"})
+    frame["v"] *= 3.6
+    own = {"columns": {"speed": "v"}, "units": {"speed": "km/h"}}
+    read = cfx.read(frame, min_frames=2, accelerations="recorded", **own)
+    for one, other in zip(read.selected, pairs.selected, strict=True):
+        np.testing.assert_allclose(one.follower_speed, other.follower_speed, rtol=1e-12)
+    with pytest.raises(ConfigError, match="cannot be turned into m/s"):
+        cfx.read(frame, min_frames=2, columns={"speed": "v"}, units={"speed": "km"})
+
+
+def test_pairs_are_counted_selected_and_shown(pairs: cfx.Pairs) -> None:
+    assert pairs.summary["frames"].tolist() == [300, 300, 300]
+    some = pairs.select(pairs.summary.index[:1])
+    assert len(some) == 1
+    assert some.dropped["count"].sum() == 2
+    assert "duration_s" in pairs._repr_html_()
+    assert cfx.config(some, model="idm").command.count("pair_ids") == 1
+    with pytest.raises(DataError, match="there is no pair 'x'"):
+        pairs.select(["x"])
+
+
+def test_pairs_of_a_data_frame_have_no_command(pairs: cfx.Pairs) -> None:
+    fit = cfx.calibrate(cfx.read(pairs.frame, min_frames=2), "idm", optimizer="random")
+    with pytest.raises(DataError, match="save them first"):
+        _ = fit.command
+
+
+def test_a_recorded_leader_is_followed_from_a_measured_state(
+    fit: cfx.Fit, pairs: cfx.Pairs
+) -> None:
+    drive = cfx.simulate("idm", fit, pairs, at=10.0)
+    assert list(drive["pair_id"].unique()) == list(fit.parameters.index)
+    first = drive.groupby("pair_id").first()
+    for pair in pairs.selected:
+        assert first.loc[pair.pair_id, "time_s"] == pytest.approx(10.0)
+        assert first.loc[pair.pair_id, "speed"] == pair.follower_speed[100]
+        assert first.loc[pair.pair_id, "gap"] == pytest.approx(pair.gap[100])
+    assert drive.groupby("pair_id").size().tolist() == [200, 200, 200]
+
+
+def test_a_simulation_has_the_errors_that_a_fit_says(fit: cfx.Fit, pairs: cfx.Pairs) -> None:
+    split = int(fit._last[0])
+    drive = cfx.simulate("idm", fit, pairs, at=split * 0.1)
+    own = fit.losses[fit.losses["method"] == "fixed"].set_index("pair_id")
+    for pair in pairs.selected:
+        speed = drive.loc[drive["pair_id"] == pair.pair_id, "speed"].to_numpy()[1:]
+        error = np.sqrt(np.mean((speed - pair.follower_speed[split + 1 :]) ** 2))
+        assert error == pytest.approx(own.loc[pair.pair_id, "test_rmse_speed"], rel=1e-6)
+
+
+def test_one_leader_is_followed_by_each_row_of_parameters() -> None:
+    rows = pd.DataFrame({"T": [1.0, 2.0]}, index=["near", "far"])
+    drive = cfx.simulate("idm", rows, leader=LEADER, gap=30.0, speed=14.0)
+    first, last = drive.groupby("pair_id").first(), drive.groupby("pair_id").last()
+    assert first["gap"].tolist() == [30.0, 30.0]
+    assert first["speed"].tolist() == [14.0, 14.0]
+    assert last.loc["near", "gap"] < last.loc["far", "gap"]
+    as_series = cfx.simulate("idm", leader=LEADER.set_index("time_s")["speed"])
+    assert as_series["gap"].iloc[0] == pytest.approx(2.0 + 1.5 * 15.0)
+
+
+REFUSED: list[tuple[type[CfxError], str, dict[str, Any]]] = [
+    (ParameterError, "T=9 is outside its bounds", {"parameters": {"T": 9.0}, "leader": LEADER}),
+    (ParameterError, "unknown parameter", {"parameters": {"tau": 1.0}, "leader": LEADER}),
+    (DataError, "column speed is missing", {"leader": LEADER.rename(columns={"speed": "v"})}),
+    (DataError, "constant step", {"leader": LEADER.iloc[[0, 1, 5]]}),
+    (DataError, "0 or more", {"leader": LEADER.assign(speed=-1.0)}),
+    (ConfigError, "give recorded pairs", {}),
+    (ConfigError, "give a leader", {"gap": 3.0}),
+    (ConfigError, "at=1000", {"leader": LEADER, "at": 1000.0}),
+]
+
+
+@pytest.mark.parametrize(("error", "said", "given"), REFUSED)
+def test_a_simulation_refuses(error: type[CfxError], said: str, given: dict[str, Any]) -> None:
+    with pytest.raises(error, match=said):
+        cfx.simulate("idm", **given)
+
+
+def test_a_fit_of_another_model_is_refused(fit: cfx.Fit, pairs: cfx.Pairs) -> None:
+    with pytest.raises(ConfigError, match="parameters are of model=idm"):
+        cfx.simulate("krauss", fit, pairs)
+    others = fit.parameters.iloc[:1]
+    with pytest.raises(ConfigError, match="there is no row for pair"):
+        cfx.simulate("idm", others, pairs)
+
+
+def test_a_wrong_setting_is_answered_as_on_the_command_line(pairs: cfx.Pairs) -> None:
+    with pytest.raises(ConfigError, match="objective=gap_rmes"):
+        cfx.calibrate(pairs, objective="gap_rmes")
+    with pytest.raises(ConfigError, match="seed"):
+        cfx.calibrate(pairs, seed=-1)
+
+
+TEXTS = ("idm", "1", "true", "null", "", "a b", "it's", "a=b", "x: y", r"c:\d")
+VALUES = (0.1, 3, None, True, [1, 2.5], {"T": {"low": 0.5}}, ["a", "b c"], Path("/a b/c"))
+
+
+@pytest.mark.parametrize("value", [*TEXTS, *VALUES])
+def test_an_override_means_its_value(value: Any) -> None:
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    (found,) = OverridesParser.create().parse_overrides([override("key", value)])
+    expected = str(value) if isinstance(value, Path) else value
+    assert found.value() == expected
+
+
+def test_a_job_is_found_again_by_its_configuration(tmp_path: Path) -> None:
+    experiment = cfx.config(
+        model="krauss",
+        policy="fixed",
+        experiment="unseen_drivers",
+        **{"protocol.base": "default", "windows.length": 7, "model.parameters.t_r.high": 4.0},
+    )
+    (tmp_path / "config.yaml").write_text(experiment.config.model_dump_json(), encoding="utf-8")
+    again = cfx.from_config(tmp_path / "config.yaml")
+    assert again.config == experiment.config
+    assert "experiment=unseen_drivers" in again.command
+    overrides = shlex.split(again.command)[3:]
+    changed = dict(one.split("=", 1) for one in overrides)
+    assert changed["windows.length"] == "7"
+    with pytest.raises(DataError, match="cannot be read"):
+        cfx.from_config(tmp_path / "nothing.yaml")
