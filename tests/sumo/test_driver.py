@@ -66,6 +66,7 @@ class Road:
     def __init__(self, dt: float = 0.1, **cars: Car) -> None:
         self.cars = dict(cars)
         self.time, self.dt = 0.0, dt
+        self.departed: list[str] = []
         self.vehicle = self.simulation = self
 
     def advance(self) -> None:
@@ -79,6 +80,9 @@ class Road:
 
     def getIDList(self) -> tuple[str, ...]:  # noqa: N802
         return tuple(self.cars)
+
+    def getDepartedIDList(self) -> tuple[str, ...]:  # noqa: N802
+        return tuple(self.departed)
 
     def getLeader(self, name: str, distance: float) -> tuple[str, float] | None:  # noqa: N802
         if name not in self.cars:
@@ -248,6 +252,31 @@ def test_a_change_of_leader_begins_nothing_and_a_missed_step_begins_anew() -> No
     road.advance()
     driver.step(road, ["v0"])
     assert driver.parameters("v0") == pytest.approx(first)
+
+
+def test_a_vehicle_that_takes_the_id_of_one_that_has_gone_begins_anew() -> None:
+    road = platoon(1)
+    fleet = Fleet(
+        {"calm": Driver(adaptive({"name": "krauss"})), "hasty": Driver(adaptive({"name": "w99"}))}
+    )
+    fleet.step(road)
+    first = fleet.driver("v0").parameters("v0")
+    road.advance()
+    road.cars["lead"].speed = 3.0
+    fleet.step(road)
+    road.advance()
+    road.cars["lead"] = Car()
+    road.cars["v0"] = Car(speed=8.0, gap=15.0, leader="lead", mode=7)
+    road.departed = ["v0"]
+    fleet.step(road)
+    fleet.step(road)  # once an instant
+    assert fleet.driver("v0").parameters("v0") == pytest.approx(first), "the slow leader is not its"
+    fleet.driver("v0").release(road, "v0")
+    assert road.cars["v0"].mode == 7
+    road.advance()
+    road.cars["v0"] = Car(speed=8.0, gap=15.0, leader="lead", kind="hasty")
+    fleet.step(road)
+    assert fleet.vehicles["v0"] == "hasty"
 
 
 def test_stepping_twice_at_one_instant_is_stepping_once() -> None:

@@ -183,6 +183,68 @@ def _not_found(name: str) -> str:
     raise PackageNotFoundError(name)
 
 
+def test_a_distribution_is_driven_and_far_positions_are_exact(scenario: Path) -> None:
+    """And a simulation that the caller has open is left alone, as is the environment."""
+    demand = DEMAND.replace(
+        "</routes>",
+        """<vTypeDistribution id="mixed" vTypes="calm hasty"/>
+        <vTypeDistribution id="own"><vType id="own1"/><vType id="own2"/></vTypeDistribution>
+        <flow id="d" type="own" route="whole" begin="0" end="20" vehsPerHour="900"/></routes>""",
+    )
+    (scenario / "mixed.rou.xml").write_text(demand)
+    text = (scenario / "motorway.sumocfg").read_text()
+    (scenario / "mixed.sumocfg").write_text(
+        text.replace(str(scenario / "demand.rou.xml"), "mixed.rou.xml")
+    )
+    found = python(
+        """
+        import sys
+        sys.modules["pyarrow"] = None
+        import csv, json, os
+        from pathlib import Path
+        from cfx.core.errors import CfxError
+        from cfx_sumo.drive.run import run_scenario
+        mixed = Path("mixed.sumocfg")
+        runs = {"mixed": "calm", "own": "hasty"}
+        run = run_scenario(mixed, runs, end=15.0, output=Path("rows.csv"))
+        counts = {name: len(tally.vehicles) for name, tally in run.tallies.items()}
+        said = []
+        try:
+            run_scenario(mixed, {"mixed": "calm", "hasty": "calm"}, end=15.0)
+        except CfxError as error:
+            said.append(str(error))
+        environment = dict(os.environ)
+        os.environ["LIBSUMO_AS_TRACI"] = "quiet"
+        import libsumo
+        del os.environ["LIBSUMO_AS_TRACI"]
+        libsumo.start(["sumo", "-c", "motorway.sumocfg", "--no-step-log"])
+        libsumo.simulationStep()
+        try:
+            run_scenario(mixed, runs, end=15.0)
+        except CfxError as error:
+            said.append(str(error))
+        libsumo.simulationStep()
+        now = libsumo.simulation.getTime()
+        libsumo.close()
+        same = environment == dict(os.environ)
+        with open("rows.csv") as file:
+            rows = list(csv.DictReader(file))
+        print(json.dumps([counts, said, now, same, rows]))
+        """,
+        scenario,
+    )
+    counts, said, now, same, rows = found
+    assert counts["mixed"] > 20
+    assert counts["own"] > 2
+    assert {row["type"] for row in rows} == {"mixed", "own"}
+    assert "vType 'hasty' is a member of the vTypeDistribution 'mixed', and --drivers" in said[0]
+    assert said[1].startswith("a simulation is open in this process, and libsumo has room for one")
+    assert now == pytest.approx(0.2), "and goes on"
+    assert same
+    digits = [len(row["x_m"].partition(".")[2]) for row in rows]
+    assert max(digits) == 6
+
+
 def test_a_vehicle_that_collides_teleports_or_changes_lanes_is_counted_and_ends_nothing(
     scenario: Path,
 ) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import math
 import os
+import secrets
 import shutil
 import tempfile
 import time
@@ -23,6 +24,7 @@ import numpy as np
 from cfx.core.errors import ConfigError, DataError, OutputError, SumoError, nearest
 from cfx.core.files import atomic_write
 from cfx.core.progress import Task
+from cfx_sumo.drive.distributions import members_of
 from cfx_sumo.drive.scenarios import SCENARIOS
 from cfx_sumo.installed import require_sumo
 from cfx_sumo.live.driver import DriverOptions
@@ -37,6 +39,9 @@ Actor = Callable[[Any], None]
 _QUANTILES = (0.05, 0.5, 0.95)
 """Quantiles by which live traffic is compared with the recording."""
 
+
+_DECIMALS = 6
+"""Of the output's numbers: micrometres, however far a vehicle is from the origin."""
 
 _LISTED = 10
 """Collisions that the report lists."""
@@ -207,8 +212,8 @@ def run_scenario(
     Args:
         scenario: SUMO's configuration (`.sumocfg`), or the name of a scenario that comes with cfx
             (`cfx_sumo.drive.scenarios`).
-        runs: vType -> a job's output folder, the id of its MLflow run, or a ready-made policy
-            (`cfx://NAME`).
+        runs: vType or vTypeDistribution -> a job's output folder, the id of its MLflow run, or a
+            ready-made policy (`cfx://NAME`).
         end: s of simulated time.
         output: a CSV file with a row for each driven vehicle and step.
         gui: show SUMO's window, slowly enough to watch.
@@ -274,11 +279,11 @@ def started(scenario: Path, command: Sequence[str], gui: bool) -> Iterator[Any]:
         gui: whether it is that of SUMO's window.
 
     Raises:
-        SumoError: SUMO refuses the scenario, or stops in the block.
+        SumoError: a simulation is open in this process, which is left as it is; SUMO refuses the
+            scenario, or stops in the block.
     """
-    sumo = _traci() if gui else _libsumo()
     try:
-        sumo.start(list(command))
+        sumo = _window(command) if gui else _in_process(command)
     except Exception as error:
         if not _is_sumos(error):
             raise
@@ -296,7 +301,8 @@ def started(scenario: Path, command: Sequence[str], gui: bool) -> Iterator[Any]:
 _QUIET = "LIBSUMO_AS_TRACI"
 
 
-def _libsumo() -> Any:
+def _in_process(command: Sequence[str]) -> Any:
+    """Starts SUMO in this process; returns libsumo, which has room for one simulation."""
     before = os.environ.get(_QUIET)
     # No word about pyarrow, which is not loaded here.
     os.environ.setdefault(_QUIET, "quiet")
@@ -305,13 +311,26 @@ def _libsumo() -> Any:
     finally:
         if before is None:
             del os.environ[_QUIET]
+    if libsumo.isLoaded():
+        raise SumoError(
+            "a simulation is open in this process, and libsumo has room for one; close it first"
+            " (libsumo.close()), or run this in a process of its own"
+        )
+    try:
+        libsumo.start(list(command))
+    except Exception:
+        _close(libsumo)  # what it refuses stays loaded otherwise
+        raise
     return libsumo
 
 
-def _traci() -> Any:
+def _window(command: Sequence[str]) -> Any:
+    """Starts SUMO's window; returns a connection beside those that the caller may have."""
     import traci  # type: ignore[import-untyped]  # SUMO brings no types
 
-    return traci
+    label = f"cfx-{secrets.token_hex(4)}"
+    traci.start(list(command), label=label, doSwitch=False)
+    return traci.getConnection(label)
 
 
 def _close(sumo: Any) -> None:
@@ -391,21 +410,35 @@ class _Run:
         self._steps = 0
         self._others = 0
         self._most = 0
-        for name in self._checked():
-            self._decel[name] = float(sumo.vehicletype.getDecel(name))
+        self._check_types()
+        self._name_members()
 
-    def _checked(self) -> Sequence[str]:
-        """Returns the vTypes, all of which are in the scenario."""
+    def _check_types(self) -> None:
+        """Checks that all vTypes are in the scenario."""
         known = self._sumo.vehicletype.getIDList()
         for name in self._fleet.drivers:
             if name not in known:
                 own = [one for one in known if not one.startswith("DEFAULT_")]
                 raise SumoError(
                     f"{self._scenario} has no vType '{name}'.{nearest(name, own)} It has:"
-                    f" {', '.join(own) or 'none of its own'}. (A vTypeDistribution has members:"
-                    " name them. A vType must stand ahead of the first vehicle.)"
+                    f" {', '.join(own) or 'none of its own'}. (A vType must stand ahead of the"
+                    " first vehicle.)"
                 )
-        return list(self._fleet.drivers)
+
+    def _name_members(self) -> None:
+        """Lets the driver of a vTypeDistribution drive the vTypes that are its members."""
+        get_option = self._sumo.simulation.getOption
+        files = []
+        for option in ("additional-files", "route-files"):
+            files += [Path(name.strip()) for name in get_option(option).split(",") if name.strip()]
+        for name, members in members_of(self._fleet.drivers, files).items():
+            for member in members:
+                if member in self._fleet.drivers:
+                    raise SumoError(
+                        f"{self._scenario}: vType '{member}' is a member of the vTypeDistribution"
+                        f" '{name}', and --drivers names both; name one of them"
+                    )
+            self._fleet.add_members(name, members)
 
     def go(self, end: float | None) -> ScenarioRun:
         """Runs the scenario to its end."""
@@ -494,11 +527,18 @@ class _Run:
         self._lanes[name] = lane
         acceleration = vehicle.getAcceleration(name)
         tally.hardest_braking = max(tally.hardest_braking, -acceleration)
-        if acceleration >= -self._decel[kind] - 1e-6:
+        if acceleration >= -self._own_decel(name) - 1e-6:
             self._braking.discard(name)
         elif name not in self._braking:
             self._braking.add(name)
             tally.hard_brakings += 1
+
+    def _own_decel(self, name: str) -> float:
+        """Returns the `decel` of a vehicle's vType, m/s2, whatever drivers make of it meanwhile."""
+        if name not in self._decel:
+            kind = self._sumo.vehicle.getTypeID(name).partition("@")[0]
+            self._decel[name] = float(self._sumo.vehicletype.getDecel(kind))
+        return self._decel[name]
 
     def _count_motions(self) -> None:
         """Notes speeds, accelerations and time gaps of all vehicles of the fleet."""
@@ -618,10 +658,10 @@ class _Rows:
         speed, acceleration = vehicle.getSpeed(name), vehicle.getAcceleration(name)
         row = [f"{sumo.simulation.getTime():.10g}", name, kind, *lane]
         for value in (vehicle.getLanePosition(name), x, y, speed, acceleration):
-            row.append(f"{value:.6g}")
+            row.append(repr(round(value, _DECIMALS)))
         for parameter in self._parameters:
             value = parameters.get(parameter)
-            row.append("" if value is None else f"{value:.6g}")
+            row.append("" if value is None else repr(round(value, _DECIMALS)))
         return row
 
 

@@ -427,6 +427,7 @@ class Driver:
         if now < self._now:
             self._forget_all()
         self._now = now
+        self._forget_departed(connection, now)
         self._forget_gone(connection, names, now)
         following, leaders, seen, alone = look(
             connection, self._not_yet(names, now), self.look_ahead
@@ -629,6 +630,13 @@ class Driver:
                 f"the simulation steps by {dt:g} s, the policy of {self.source} was trained at"
                 f" {self.policy.dt:g} s; start SUMO with --step-length {self.policy.dt:g}"
             )
+
+    def _forget_departed(self, connection: Connection, now: float) -> None:
+        """Drops vehicles that have just departed: another vehicle had that id a step ago."""
+        for name in connection.simulation.getDepartedIDList():
+            slot = self._slots.get(name)
+            if slot is not None and float(self._store.time[slot]) != now:
+                self.forget(name)
 
     def _forget_gone(self, connection: Connection, names: list[str], now: float) -> None:
         """Drops vehicles that have left.

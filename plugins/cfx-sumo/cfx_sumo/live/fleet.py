@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Unpack
 
@@ -42,6 +42,17 @@ class Fleet:
             )
         self.drivers = dict(drivers)
         self._type_of: dict[str, str] = {}
+        self._member_of: dict[str, str] = {}
+
+    def add_members(self, name: str, vtypes: Iterable[str]) -> None:
+        """Lets vehicles of further vTypes count as those of a name that the fleet has.
+
+        Args:
+            name: one of `drivers`, as of a vTypeDistribution.
+            vtypes: its members.
+        """
+        for vtype in vtypes:
+            self._member_of[vtype] = name
 
     @classmethod
     def load(
@@ -80,10 +91,12 @@ class Fleet:
             SumoError: the simulation's step is not the policies'.
         """
         types: dict[str, str] = {}
+        departed = set(connection.simulation.getDepartedIDList())
         for vehicle in connection.vehicle.getIDList():
             known = self._type_of.get(vehicle)
-            if known is None:
-                known = connection.vehicle.getTypeID(vehicle).partition("@")[0]
+            if known is None or vehicle in departed:
+                vtype = connection.vehicle.getTypeID(vehicle).partition("@")[0]
+                known = self._member_of.get(vtype, vtype)
             types[vehicle] = known
         self._type_of = types
         vehicles: dict[int, list[str]] = {id(driver): [] for driver in self._each_driver()}

@@ -1,0 +1,60 @@
+"""vTypeDistributions of a scenario: which vTypes they have as members.
+
+TraCI lists distributions among the vTypes and does not say which are which, nor their members. So
+they are read where SUMO read them: in the scenario's route files and additional files.
+"""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Collection, Iterable, Iterator
+from pathlib import Path
+from typing import BinaryIO
+from xml.etree import ElementTree
+
+_KINDS = ("vType", "vTypeDistribution")
+
+
+def members_of(names: Collection[str], files: Iterable[Path]) -> dict[str, tuple[str, ...]]:
+    """Returns the members of those names that are vTypeDistributions.
+
+    Args:
+        names: of vTypes and vTypeDistributions.
+        files: XML, perhaps compressed (`.gz`), in the order in which SUMO reads them; no more of
+            them is read than it takes to find the names.
+    """
+    wanted = set(names)
+    found: dict[str, tuple[str, ...]] = {}
+    for file in files:
+        for element in _types_in(file):
+            name = element.get("id", "")
+            if name in wanted:
+                wanted.discard(name)
+                if element.tag == "vTypeDistribution":
+                    own = [one.get("id", "") for one in element.iter("vType")]
+                    found[name] = (*element.get("vTypes", "").split(), *own)
+            if not wanted:
+                return found
+    return found
+
+
+def _types_in(file: Path) -> Iterator[ElementTree.Element]:
+    """Yields vTypes and their distributions as they end; all else is dropped as it is read."""
+    depth = 0
+    with _opened(file) as stream:
+        # S314: it is the user's own file, and SUMO has read it already.
+        for event, element in ElementTree.iterparse(stream, ("start", "end")):  # noqa: S314
+            if event == "start":
+                depth += 1
+                continue
+            depth -= 1
+            if element.tag in _KINDS:
+                yield element
+            if depth == 1:
+                element.clear()
+
+
+def _opened(file: Path) -> BinaryIO | gzip.GzipFile:
+    if file.suffix == ".gz":
+        return gzip.open(file)
+    return file.open("rb")
