@@ -15,8 +15,8 @@ import pytest
 import cfx
 from cfx.app import cli
 from cfx.report.runs import read_runs
+from cfx.report.section import formatted
 from cfx.report.sections import calibration
-from cfx.report.tables import formatted
 from cfx_sumo.export import export
 
 JOB = [

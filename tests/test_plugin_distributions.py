@@ -23,13 +23,10 @@ READERS = {"cfx.data.files", "cfx.data.series", "cfx.data.table", "cfx.data.trac
 REPORTS = {
     "cfx.report.figures.canvas",
     "cfx.report.figures.figure",
-    "cfx.report.figures.results",
-    "cfx.report.figures.values",
     "cfx.report.figures.text",
     "cfx.report.job",
     "cfx.report.runs",
     "cfx.report.section",
-    "cfx.report.tables",
     "cfx.results.look",
 }
 PROTOCOLS = {
@@ -193,13 +190,13 @@ def test_the_check_of_imports_sees_what_is_private(tmp_path: Path) -> None:
     path = tmp_path / "plugin.py"
     path.write_text(
         "import cfx\nimport cfx.core.registry\nfrom cfx import nodes, Settings\n"
-        "from cfx.models.safe_math import safe_sqrt\nfrom cfx.models.base import DrivingModel, _x\n"
+        "from cfx.models.regimes import safe_sqrt\nfrom cfx.models.base import DrivingModel, _x\n"
         "from cfx.contracts.models import ModelContract\ncfx.job\ncfx.get\n"
     )
     assert [text.partition(": ")[2] for text in private_uses(path)] == [
         "cfx.core.registry",
         "cfx nodes",
-        "cfx.models.safe_math safe_sqrt",
+        "cfx.models.regimes safe_sqrt",
         "cfx.models.base _x",
         "cfx job",
     ]

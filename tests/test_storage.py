@@ -12,8 +12,8 @@ import pytest
 
 import cfx
 from cfx.app import cli
-from cfx.app.job.upload import place_of
-from cfx.app.sweep.fingerprint import fingerprint
+from cfx.app.job.output import place_of
+from cfx.app.sweep.folder import fingerprint
 from cfx.calibration.cache import Cache
 from cfx.core import registry, storage
 from cfx.core.errors import CfxError, DataError, OutputError

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from torch import Tensor
 
-    from cfx.app.job.parts import Parts
+    from cfx.app.job.steps import Parts
     from cfx.evaluation.protocols.base import ProtocolContext
 
 METHODS = ("default", "population", "fixed")
@@ -121,7 +121,7 @@ class Fit:
             draw_calibration,
             parameter_spreads,
         )
-        from cfx.report.figures.results import ParameterAxis
+        from cfx.report.figures.figure import ParameterAxis
 
         tables = []
         for method in METHODS:

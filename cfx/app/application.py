@@ -45,7 +45,7 @@ from cfx.core.errors import CfxError, ConfigError, Terminated, printable, withou
 from cfx.core.guest import guest, visit
 from cfx.core.memory import is_out_of_memory
 from cfx.core.plugin_errors import blame
-from cfx.core.signals import raise_if_terminated, signal_behind, terminable
+from cfx.core.processes import raise_if_terminated, signal_behind, terminable
 from cfx.core.storage import is_url
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn, cast
 
 from cfx.core.errors import CfxError, ConfigError, Terminated
-from cfx.core.signals import ignore_signals, raise_if_terminated, signal_behind, terminable
+from cfx.core.processes import ignore_signals, raise_if_terminated, signal_behind, terminable
 
 if TYPE_CHECKING:
     from cfx.core.command import Command

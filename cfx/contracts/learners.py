@@ -23,8 +23,7 @@ from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingPairs, TrainingResult
 from cfx.models.krauss import Krauss
 from cfx.policies.agent import Agent
-from cfx.policies.core import AgentCore, features_read
-from cfx.policies.ensemble import Ensemble
+from cfx.policies.core import AgentCore, Ensemble, features_read
 from cfx.policies.features import measured_history
 from cfx.policies.gru import GruPolicy
 from cfx.policies.heads import head_class, head_name

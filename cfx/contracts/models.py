@@ -302,7 +302,7 @@ def gradients_are_finite_at_every_extreme(model: DrivingModel) -> None:
             f"the gradient with respect to {name} is not finite, for instance at"
             f" {_describe(extreme, wrong)}: replace the "
             "argument of a root or a division in the branch that is not taken (see"
-            " cfx.models.safe_math)"
+            " cfx.models.regimes)"
         )
 
 

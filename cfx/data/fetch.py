@@ -29,7 +29,7 @@ from filelock import FileLock, Timeout
 from cfx.core.errors import ConfigError, DataError, OutputError
 from cfx.core.files import atomic_write
 from cfx.core.progress import Task
-from cfx.data.ngsim_rows import MOTORWAY
+from cfx.data.ngsim import MOTORWAY
 
 if TYPE_CHECKING:
     from requests import Response, Session

@@ -10,19 +10,354 @@ from __future__ import annotations
 import logging
 import re
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
+import pandas as pd
 from pydantic import Field
 
 from cfx.core.component import Settings
-from cfx.core.errors import DataError
+from cfx.core.errors import DataError, listed, nearest
 from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
-from cfx.data.files import FileStart, stem
-from cfx.data.ngsim_rows import Rows, read_ngsim
-from cfx.data.pairs import PairSet
+from cfx.data.files import FileStart, Floats, Ints, stem
+from cfx.data.pairs import Dropped, PairSet
+from cfx.data.table import Column, Labels, Layout, Table, read_table
+from cfx.data.tracks import Tracks, changes, extract_pairs
+
+FOOT = 0.3048
+"""Metres; exact by definition."""
+
+DT = 0.1
+"""Seconds between two frames of every NGSIM recording."""
+
+_BOUNDARY_S = 3.0
+"""How far from both ends of a vehicle's rows I-80's published speeds have artefacts."""
+
+_ARTEFACT_MPS2 = 0.5
+"""From this mean acceleration on, beyond that of the rows between, the ends have artefacts."""
+
+
+_BEFORE_ZONES = (
+    "Vehicle_ID",
+    "Frame_ID",
+    "Total_Frames",
+    "Global_Time",
+    "Local_X",
+    "Local_Y",
+    "Global_X",
+    "Global_Y",
+    "v_Length",
+    "v_Width",
+    "v_Class",
+    "v_Vel",
+    "v_Acc",
+    "Lane_ID",
+)
+_ZONES = ("O_Zone", "D_Zone", "Int_ID", "Section_ID", "Direction", "Movement")
+_AFTER_ZONES = ("Preceding", "Following", "Space_Headway", "Time_Headway")
+
+MOTORWAY = (*_BEFORE_ZONES, *_AFTER_ZONES)
+"""Columns of a file of a motorway, in the order in which they are published."""
+
+_CLOCK, _LOCATION = "Global_Time", "Location"
+"""Columns that are used where they are there."""
+
+_SPELLINGS = {
+    "preceeding": "preceding",
+    "precedingvehicle": "preceding",
+    "velocity": "vvel",
+    "vehiclevelocity": "vvel",
+    "acceleration": "vacc",
+    "vehicleacceleration": "vacc",
+    "length": "vlength",
+    "vehiclelength": "vlength",
+    "laneidentification": "laneid",
+    "lane": "laneid",
+}
+"""Other names of columns that exports have, as `_plain` writes them."""
+
+_NEW_RECORDING_MS = 60_000.0
+"""Two recordings of a place start at least this far apart.
+
+Within one recording the clock and the frame count agree far better.
+"""
+
+_FRAME_MS = 1000 * DT
+
+_DRIVING_MPS = 1.0
+"""Below it, noise of positions hides how far a vehicle moves in a frame."""
+
+
+def _plain(name: str) -> str:
+    """Returns a column's name in lower case without separators, in one of its spellings."""
+    plain = re.sub(r"[^a-z0-9]", "", name.lower())
+    return _SPELLINGS.get(plain, plain)
+
+
+def _count(name: str) -> Column:
+    return Column(name, whole=True, least=0, wrong="is no whole number; correct it")
+
+
+_LAYOUT = Layout(
+    name="NGSIM",
+    columns=(
+        _count("Vehicle_ID"),
+        _count("Frame_ID"),
+        Column("Local_Y", "ft"),
+        Column("v_Length", "ft", above=0, wrong="is no vehicle length; correct it"),
+        Column("v_Vel", "ft/s", least=0, wrong="is negative: a speed cannot be; correct it"),
+        Column("v_Acc", "ft/s2"),
+        _count("Lane_ID"),
+        _count("Preceding"),
+        Column(_CLOCK, "ms", needed=False),
+        Column(_LOCATION, is_name=True, needed=False),
+    ),
+    elsewhere={"pairid": "This is the tidy pair layout: use data=tidy."},
+    headerless={18: MOTORWAY, 24: (*_BEFORE_ZONES, *_ZONES, *_AFTER_ZONES)},
+    spaces=True,
+    plain=_plain,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rows(Tracks):
+    """Rows of an NGSIM file.
+
+    Attributes:
+        rows_read: rows of the file.
+    """
+
+    rows_read: int
+
+    def trimmed(self, seconds: float) -> Rows:
+        """Leaves out the rows within so many seconds of their vehicle's first or last one."""
+        since, until = self._since_and_until()
+        near = np.minimum(since, until) < round(seconds / DT)
+        if not near.any():
+            return self
+        reason = f"within {seconds:g} s of their vehicle's first or last row"
+        lost = Dropped(reason, int(near.sum()), "rows")
+        return replace(self.take(np.flatnonzero(~near)), dropped=(*self.dropped, lost))
+
+    def boundary_artefacts(self) -> str:
+        """Says that smoothing left artefacts at the ends of vehicles' rows; "" if it did not.
+
+        See `NgsimDataset`.
+        """
+        since, until = self._since_and_until()
+        edge = round(_BOUNDARY_S / DT)
+        is_first = since < edge
+        is_last = until < edge
+        is_between = ~is_first & ~is_last
+        if not (is_first.any() and is_last.any() and is_between.any()):
+            return ""
+        first = float(self.acceleration[is_first].mean())
+        last = float(self.acceleration[is_last].mean())
+        between = float(self.acceleration[is_between].mean())
+        if max(abs(first - between), abs(last - between)) < _ARTEFACT_MPS2:
+            return ""
+        return (
+            f"in the first and last {_BOUNDARY_S:g} s of their rows vehicles accelerate by"
+            f" {first:+.1f} and {last:+.1f} m/s2 on average ({between:+.1f} between): these are"
+            " boundary artefacts of smoothing;"
+            f" leave them out with data.trim={_BOUNDARY_S:g}"
+        )
+
+    def pairs(self) -> PairSet:
+        """Cuts the rows into pairs: see `NgsimDataset`."""
+        return extract_pairs(self)
+
+    def _since_and_until(self) -> tuple[Ints, Ints]:
+        """Returns frames since the first and until the last row of each row's vehicle, `(N,)`."""
+        starts = np.flatnonzero(changes(self.recording, self.vehicle))
+        sizes = np.diff(np.append(starts, len(self)))
+        first = np.repeat(self.frame[starts], sizes)
+        last = np.repeat(self.frame[starts + sizes - 1], sizes)
+        return self.frame - first, last - self.frame
+
+
+def read_ngsim(path: Path, location: str | None = None) -> Rows:
+    """Reads an NGSIM file.
+
+    Args:
+        location: keep the rows of this location alone.
+
+    Raises:
+        DataError: see `NgsimDataset`; the message names file, row and column.
+    """
+    table = read_table(path, _LAYOUT)
+    numbers, count = table.numbers, len(table)
+    where = table.labels.get(_LOCATION) or Labels(np.zeros(count, np.int64), [stem(path)])
+    dropped = []
+    row = np.arange(count)
+    if location is not None:
+        row = np.flatnonzero(where.codes == _location_code(table, where, location))
+        if len(row) < count:
+            reason = f"other locations than '{location}'"
+            dropped.append(Dropped(reason, count - len(row), "rows"))
+    columns = {name: values[row] for name, values in numbers.items()}
+    recording, names = _recordings(columns, where.codes[row], where.names)
+    order, again = _sorted(table, columns, recording, row)
+    if again:
+        dropped.append(Dropped("the same row again", again, "rows"))
+    ordered = {name: values[order] for name, values in columns.items()}
+    rows = _rows(str(path), names, recording[order], ordered, count, dropped)
+    _check_units(rows)
+    return rows
+
+
+def _rows(
+    source: str,
+    names: tuple[str, ...],
+    recording: Ints,
+    columns: Mapping[str, Floats],
+    count: int,
+    dropped: Sequence[Dropped],
+) -> Rows:
+    """Returns columns in feet, which are in order already, as rows in SI units."""
+    vehicle = columns["Vehicle_ID"].astype(np.int64)
+    return Rows(
+        source=source,
+        dt=DT,
+        recordings=names,
+        recording=recording,
+        vehicle=vehicle,
+        frame=columns["Frame_ID"].astype(np.int64),
+        lane=columns["Lane_ID"].astype(np.int64),
+        leader=columns["Preceding"].astype(np.int64),
+        position=columns["Local_Y"] * FOOT,
+        speed=columns["v_Vel"] * FOOT,
+        acceleration=columns["v_Acc"] * FOOT,
+        length=_lengths(columns["v_Length"], recording, vehicle) * FOOT,
+        rows_read=count,
+        dropped=tuple(dropped),
+    )
+
+
+def _location_code(table: Table, where: Labels, location: str) -> int:
+    """Returns the index of a location in `where.names`."""
+    for code, name in enumerate(where.names):
+        if name.lower() == location.lower():
+            return code
+    raise DataError(
+        f"data.location={location}: {table.source} has no such location."
+        f"{nearest(location, where.names)} Known: {listed(where.names)}."
+    )
+
+
+def _recordings(
+    columns: Mapping[str, Floats], location: Ints, names: Sequence[str]
+) -> tuple[Ints, tuple[str, ...]]:
+    """Returns the recording of each row and the recordings' names: see `NgsimDataset`.
+
+    Args:
+        columns: of the file.
+        location: of each row `(N,)`, an index into `names`.
+        names: of the locations.
+
+    Returns:
+        An index `(N,)` into the names of recordings, and these names.
+    """
+    start = np.zeros(len(location))
+    if _CLOCK in columns and _clock_ticks(columns, location):
+        start = columns[_CLOCK] - _FRAME_MS * columns["Frame_ID"]
+    order = np.lexsort((start, location))
+    begins = np.zeros(len(order), dtype=bool)
+    begins[1:] = np.diff(location[order]) != 0
+    begins[1:] |= np.diff(start[order]) > _NEW_RECORDING_MS
+    recording = np.empty(len(order), dtype=np.int64)
+    recording[order] = np.cumsum(begins)
+
+    begins[:1] = True
+    locations = location[order][begins]  # of each recording
+    counts = np.bincount(locations, minlength=len(names))
+    numbers = np.zeros(len(names), dtype=np.int64)
+    recordings = []
+    for code in locations.tolist():
+        numbers[code] += 1
+        name = names[code]
+        if counts[code] > 1:
+            name = f"{name}-{numbers[code]}"
+        recordings.append(name)
+    return recording, tuple(recordings)
+
+
+def _clock_ticks(columns: Mapping[str, Floats], location: Ints) -> bool:
+    """Says whether `Global_Time` advances by 100 ms from one frame of a vehicle to its next."""
+    clock, frame, vehicle = columns[_CLOCK], columns["Frame_ID"], columns["Vehicle_ID"]
+    order = np.lexsort((frame, clock, vehicle, location))
+    successive = (
+        (np.diff(vehicle[order]) == 0)
+        & (np.diff(location[order]) == 0)
+        & (np.diff(frame[order]) == 1)
+    )
+    ticks = np.diff(clock[order])[successive]
+    return bool(len(ticks)) and abs(float(np.median(ticks)) - _FRAME_MS) < 0.1 * _FRAME_MS
+
+
+def _sorted(
+    table: Table, columns: Mapping[str, Floats], recording: Ints, row: Ints
+) -> tuple[Ints, int]:
+    """Returns the order by recording, vehicle and frame, and how many duplicates it leaves out.
+
+    Raises:
+        DataError: a vehicle has two different rows at a frame.
+    """
+    order = np.lexsort((columns["Frame_ID"], columns["Vehicle_ID"], recording))
+    is_same = ~changes(recording[order], columns["Vehicle_ID"][order], columns["Frame_ID"][order])
+    again = np.flatnonzero(is_same)
+    before, after = order[again - 1], order[again]
+    differs = np.zeros(len(again), dtype=bool)
+    for values in columns.values():
+        differs |= values[before] != values[after]
+    if differs.any():
+        first, second = before[differs][0], after[differs][0]
+        a, b = sorted((row[first], row[second]))
+        vehicle, frame = columns["Vehicle_ID"][second], columns["Frame_ID"][second]
+        raise DataError(
+            f"{table.source}, rows {table.row(a)} and {table.row(b)}: vehicle {vehicle:.0f} has two"
+            f" different rows at frame {frame:.0f} ({int(differs.sum())} such pairs of rows); keep"
+            " one of them, or, if the file holds several recordings, give it Global_Time in"
+            " milliseconds so that they can be told apart"
+        )
+    return order[~is_same], len(again)
+
+
+def _lengths(length: Floats, recording: Ints, vehicle: Ints) -> Floats:
+    """Returns each vehicle's median length at each of its rows."""
+    group = np.cumsum(changes(recording, vehicle))
+    medians: Floats = pd.Series(length).groupby(group).transform("median").to_numpy()
+    return medians
+
+
+def _check_units(rows: Rows) -> None:
+    """Raises DataError if lengths, or positions and speeds, seem not to be in feet."""
+    typical = float(np.median(rows.length)) / FOOT
+    if typical < 8:
+        raise DataError(
+            f"{rows.source}, column v_Length: vehicles are typically {typical:.1f} long, which"
+            " looks like metres; NGSIM's files are in feet. Convert the file back, or write its"
+            " pairs in the tidy layout (SI units) and use data=tidy"
+        )
+    is_step = (
+        ~changes(rows.recording, rows.vehicle)[1:]
+        & (np.diff(rows.frame) == 1)
+        & (rows.speed[1:] > _DRIVING_MPS)
+    )
+    if not is_step.any():
+        return
+    moved = np.abs(np.diff(rows.position)[is_step])
+    ratio = float(np.median(moved / (rows.speed[1:][is_step] * DT)))
+    if not 0.8 < ratio < 1.25:
+        raise DataError(
+            f"{rows.source}, columns Local_Y and v_Vel: from frame to frame vehicles typically"
+            f" advance by {ratio:.3g} times their speed times 0.1 s; both columns must be in feet"
+            " (ft and ft/s)"
+        )
+
 
 log = logging.getLogger(__name__)
 

@@ -48,6 +48,8 @@ _TOGETHER = 1024
 class Pair:
     """One follower behind one leader over consecutive frames; the arrays are `(T,)` float64.
 
+    A field is a column of the tidy layout, so that there are as many fields as columns.
+
     Attributes:
         pair_id: unique within a `PairSet`.
         recording: name of the recording; vehicle ids are unique only within one.

@@ -24,6 +24,8 @@ SINGLE_FRAME = "a single frame makes no pair"
 class Tracks:
     """Rows of vehicles, sorted by recording, vehicle and frame, without duplicates.
 
+    A field is a column that readers give, so that there are as many fields as columns.
+
     Shapes: every array is `(N,)`, in SI units.
 
     Attributes:

@@ -21,7 +21,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from cfx.data.pairs import PairBatch, PairSet
-from cfx.evaluation.forecast_paths import Origins, Paths
+from cfx.evaluation.forecasts import Origins, Paths
 
 Array = NDArray[np.float64]
 

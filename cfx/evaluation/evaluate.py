@@ -19,9 +19,16 @@ from cfx.core.parameters import ParameterSpace
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.style import CLUSTERS, StyleResult
 from cfx.evaluation.closed_loop import ClosedLoop
-from cfx.evaluation.metrics.base import RECORDED, MetricInfo, Trajectories
+from cfx.evaluation.metrics.base import (
+    RECORDED,
+    LeftOut,
+    MeasuredMetric,
+    MetricInfo,
+    MetricSet,
+    Trajectories,
+    leave_out,
+)
 from cfx.evaluation.metrics.errors import RmseGap, RmseSpeed
-from cfx.evaluation.metrics.installed import LeftOut, MeasuredMetric, MetricSet, leave_out
 from cfx.evaluation.result import METHODS, Array, Evaluation
 from cfx.evaluation.statistics import Improvement, improvement_statistics
 from cfx.evaluation.tables import long_table, values_of

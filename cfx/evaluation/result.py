@@ -19,8 +19,7 @@ from cfx.calibration.flatness import with_flat_shares
 from cfx.core.parameters import Parameter
 from cfx.evaluation.forecasts import forecast_columns
 from cfx.evaluation.headline import improvement_key
-from cfx.evaluation.metrics.base import SCOPES, MetricInfo
-from cfx.evaluation.metrics.installed import LeftOut
+from cfx.evaluation.metrics.base import SCOPES, LeftOut, MetricInfo
 from cfx.evaluation.statistics import Improvement
 from cfx.evaluation.tables import in_text, summaries, values_of, wide_table
 

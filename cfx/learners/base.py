@@ -26,7 +26,7 @@ from cfx.core.errors import ConfigError
 from cfx.data.pairs import PairBatch
 from cfx.models.base import DrivingModel
 from cfx.policies.base import Policy, PolicyNetwork
-from cfx.policies.scaler import Scaler
+from cfx.policies.features import Scaler
 from cfx.policies.valid_range import ValidRange
 from cfx.simulation.base import Stepper
 

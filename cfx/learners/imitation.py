@@ -21,11 +21,11 @@ from cfx.core.component import Settings
 from cfx.core.progress import Task
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.learners.curves import warn_of_nothing_learned
-from cfx.learners.grid import Grid
 from cfx.learners.imitation_data import ImitationDataset, ImitationSettings
 from cfx.learners.situations import learned_range
 from cfx.policies.base import Policy
 from cfx.policies.heads import head_class
+from cfx.policies.placement import Grid
 
 log = logging.getLogger(__name__)
 

@@ -15,12 +15,11 @@ from torch import Tensor, nn
 from cfx.core.component import Settings
 from cfx.core.errors import DataError
 from cfx.learners.base import TrainingData
-from cfx.learners.grid import Grid
 from cfx.policies.base import Policy
-from cfx.policies.features import measured_history, tokens
+from cfx.policies.features import Scaler, measured_history, tokens
 from cfx.policies.heads import trained_head
 from cfx.policies.heads.base import ParameterHead
-from cfx.policies.scaler import Scaler
+from cfx.policies.placement import Grid
 from cfx.simulation.rollout import Compile
 
 

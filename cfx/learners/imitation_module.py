@@ -19,7 +19,7 @@ from cfx.learners.batched import BatchedModule
 from cfx.learners.imitation_data import ImitationDataset, ImitationSettings
 from cfx.policies.base import PolicyNetwork
 from cfx.policies.heads.base import ParameterHead
-from cfx.simulation.compiling import torch_compiled
+from cfx.simulation.kernel.compiler import torch_compiled
 from cfx.simulation.rollout import can_compile
 
 _WORTH_COMPILING = 20_000

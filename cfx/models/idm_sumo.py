@@ -12,8 +12,7 @@ from torch import Tensor
 
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
-from cfx.models.sumo_step import sumo_speed
-from cfx.models.vtype import VType
+from cfx.models.vtype import VType, sumo_speed
 
 _SUMO = "default: SUMO's passenger car"
 _BOUNDS = f"{_SUMO}; bounds: about those of Kesting and Treiber (2008), Transp. Res. Rec. 2088"

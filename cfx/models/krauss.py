@@ -18,9 +18,8 @@ from cfx.core.component import Settings
 from cfx.core.errors import ConfigError
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.models.base import DrivingModel, Follower, Leader, ModelSettings, bumper_gap
-from cfx.models.safe_math import safe_sqrt
-from cfx.models.sumo_step import sumo_speed
-from cfx.models.vtype import VType
+from cfx.models.regimes import safe_sqrt
+from cfx.models.vtype import VType, sumo_speed
 
 _PAPER = "Yang et al. (2021); bounds: wide enough for drivers who stay far behind"
 _SUMO = "SUMO's default passenger car"

@@ -12,9 +12,8 @@ from torch import Tensor
 
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
-from cfx.models.safe_math import safe_divisor, safe_sqrt
-from cfx.models.sumo_step import sumo_speed
-from cfx.models.vtype import VType
+from cfx.models.regimes import safe_divisor, safe_sqrt
+from cfx.models.vtype import VType, sumo_speed
 
 _SUMO = "default: SUMO's passenger car"
 _BOUNDS = f"{_SUMO}; bounds: wide enough for drivers who stay far behind"

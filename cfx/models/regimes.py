@@ -6,6 +6,10 @@ jump. Gradient descent cannot see that a shorter time gap would have ended the b
 training, a model can be asked for its smoothed self (`DrivingModel.at_temperature`). Each case then
 counts with a weight between 0 and 1, a logistic function of the distance from its threshold.
 Simulation, calibration and evaluation always take the exact choice.
+
+`safe_sqrt` and `safe_divisor` keep the branch of a `torch.where` that is not taken finite, in value
+and in gradient: autograd multiplies its slope by 0, and 0 times infinity is NaN. They replace the
+argument before the operation, not the result after it.
 """
 
 from __future__ import annotations
@@ -65,3 +69,19 @@ def up_to(
     if exact(temperature):
         return torch.where(value <= threshold, yes, no)
     return below(value, threshold, yes, no, scale=scale, temperature=temperature)
+
+
+def safe_sqrt(value: Tensor) -> Tensor:
+    """Returns `sqrt(value)` where `value > 0`, and 0 with slope 0 elsewhere."""
+    positive = value > 0
+    return torch.where(positive, torch.sqrt(torch.where(positive, value, 1.0)), 0.0)
+
+
+def safe_divisor(value: Tensor, used: Tensor) -> Tensor:
+    """Returns `value` where `used`, 1 elsewhere: a divisor for the branch that `used` selects.
+
+    Args:
+        value: `(*batch,)`.
+        used: bool, `(*batch,)`; True only where `value` is not 0.
+    """
+    return torch.where(used, value, 1.0)

@@ -41,8 +41,7 @@ from cfx.core.component import content_key, folder_hash
 from cfx.core.errors import ConfigError
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
-from cfx.models.regimes import Temperature
-from cfx.models.safe_math import safe_sqrt
+from cfx.models.regimes import Temperature, safe_sqrt
 
 TIME = Parameter(
     "residual_time",

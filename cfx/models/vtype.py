@@ -1,4 +1,4 @@
-"""SUMO's vehicle type for a driving model."""
+"""SUMO around a driving model: its vehicle type, and its Euler step."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
+import torch
 from torch import Tensor
 
 
@@ -41,3 +42,35 @@ class InSumo(Protocol):
         Raises:
             ConfigError: as the model is set up, SUMO has none that drives so; says what to set.
         """
+
+
+def sumo_speed(
+    v: Tensor,
+    wanted: Tensor,
+    *,
+    accel: Tensor,
+    decel: Tensor,
+    emergency_decel: Tensor,
+    v_max: Tensor,
+    dt: float,
+) -> Tensor:
+    """Returns the speed `(*batch,)`, m/s, that SUMO realises when a model wants `wanted`.
+
+    With `top = min(v + accel dt, v_max)` the plan is `min(top, wanted)`; it is bounded by 0 and by
+    `v - emergency_decel dt`, so that `emergency_decel` is the brake cap, not `decel`, unless that
+    is the larger one. Speeds below 1e-5 m/s become 0. The lane's limit is taken to be above
+    `v_max`.
+
+    Args:
+        v: speed now, m/s.
+        wanted: speed that the model asks for, m/s; may be negative.
+        accel, decel, emergency_decel: m/s2, positive.
+        v_max: m/s.
+        dt: time step, s.
+    """
+    top = torch.minimum(v + accel * dt, v_max)
+    comfortable = (v - decel * dt).clamp(min=0.0)
+    plan = torch.minimum(top, wanted)
+    hardest = torch.minimum(comfortable, (v - emergency_decel * dt).clamp(min=0.0))
+    speed = torch.maximum(plan, hardest)
+    return torch.where(speed.abs() < 1e-5, 0.0, speed)

@@ -20,8 +20,7 @@ from torch import Tensor
 
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.models.base import DrivingModel, Follower, Leader
-from cfx.models.regimes import SPACING, SPEED, below, exact, up_to
-from cfx.models.safe_math import safe_sqrt
+from cfx.models.regimes import SPACING, SPEED, below, exact, safe_sqrt, up_to
 
 _NEAREST_ROOM = 1e-3
 """m: bounds quotients, and their gradients, beside a threshold; the brake cap acts long before."""

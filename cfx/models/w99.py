@@ -19,10 +19,8 @@ from cfx.core.component import Settings
 from cfx.core.errors import ConfigError
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.models.base import DrivingModel, Follower, Leader, ModelSettings, bumper_gap
-from cfx.models.regimes import SPACING, SPEED, below, exact, up_to
-from cfx.models.safe_math import safe_divisor, safe_sqrt
-from cfx.models.sumo_step import sumo_speed
-from cfx.models.vtype import VType
+from cfx.models.regimes import SPACING, SPEED, below, exact, safe_divisor, safe_sqrt, up_to
+from cfx.models.vtype import VType, sumo_speed
 
 _VISSIM = "default: Vissim and SUMO; bounds: the ranges used in the calibration literature"
 _SUMO = "SUMO's default passenger car"

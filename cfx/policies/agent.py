@@ -30,11 +30,10 @@ from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.context import UNSEEN, ContextRule, DriverContext
 from cfx.policies.core import AgentCore
 from cfx.policies.driver_features import measure
-from cfx.policies.features import History, measured_history
+from cfx.policies.features import History, Scaler, measured_history
 from cfx.policies.heads.base import ParameterHead
 from cfx.policies.heads.offset import blended, shrunk
 from cfx.policies.placement import ALL, driver_places
-from cfx.policies.scaler import Scaler
 from cfx.policies.valid_range import SIGNALS, ValidRange, situation_of, weight_of_answer
 from cfx.simulation.base import Stepper
 

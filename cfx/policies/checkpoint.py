@@ -26,9 +26,9 @@ from cfx.policies.agent import Agent, TrainedOn
 from cfx.policies.base import Policy
 from cfx.policies.context import ContextRule
 from cfx.policies.core import AgentCore, features_read, network_with_weights
+from cfx.policies.features import Scaler
 from cfx.policies.heads import head_class
 from cfx.policies.heads.base import ParameterHead
-from cfx.policies.scaler import Scaler
 from cfx.policies.valid_range import SIGNALS, ValidRange
 
 _FORMAT = 3
@@ -83,7 +83,7 @@ def load(folder: Path | str) -> Agent:
 
 
 class _Description(BaseModel):
-    """Schema of `policy.json`."""
+    """Schema of `policy.json`: a field for each of its keys."""
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 

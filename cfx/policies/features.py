@@ -1,7 +1,7 @@
-"""Inputs of policies: the recent states of leader and follower, one token per window.
+"""Inputs of policies: recent states of leader and follower, one token per window; normalisation.
 
 The token of a window holds the last `length` frames up to and including the window's first, so it
-never looks ahead. Shapes: f features of a token.
+never looks ahead. Shapes: f features of a token, N networks, B drivers of each, W windows.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from cfx.core.errors import ConfigError, nearest
 from cfx.data.pairs import PairBatch
@@ -262,3 +262,38 @@ def measured_history(batch: PairBatch, pair: Tensor, frame: Tensor, length: int)
         batch.follower_acceleration[rows, index],
         batch.gap[rows, index],
     )
+
+
+_LEAST_SCALE = 1e-6
+"""A feature whose standard deviation is not above this counts as constant and keeps scale 1."""
+
+
+class Scaler(nn.Module):
+    """Brings features to mean 0 and standard deviation 1 over each network's training windows."""
+
+    def __init__(self, mean: Tensor, scale: Tensor) -> None:
+        """Takes `(N, f)` each."""
+        super().__init__()
+        self.mean: Tensor
+        self.scale: Tensor
+        self.register_buffer("mean", mean)
+        self.register_buffer("scale", scale)
+
+    @classmethod
+    def of(cls, values: Tensor, mask: Tensor) -> Scaler:
+        """Measures features.
+
+        Args:
+            values: `(N, B, W, f)`.
+            mask: which windows count, bool `(N, B, W)`.
+        """
+        weight = mask[..., None].to(values.dtype)
+        total = weight.sum((1, 2)).clamp(min=1.0)
+        mean = (values * weight).sum((1, 2)) / total
+        variance = ((values - mean[:, None, None]).square() * weight).sum((1, 2)) / total
+        scale = variance.sqrt()
+        return cls(mean, torch.where(scale > _LEAST_SCALE, scale, 1.0))
+
+    def forward(self, values: Tensor) -> Tensor:
+        """Returns normalised features `(N, B, W, f)`."""
+        return (values - self.mean[:, None, None]) / self.scale[:, None, None]

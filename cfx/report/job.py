@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
@@ -15,13 +15,12 @@ import pandas as pd
 
 from cfx.data.style import StyleResult
 from cfx.evaluation.headline import improvement_key
-from cfx.evaluation.metrics.base import MetricInfo, key_of
+from cfx.evaluation.metrics.base import SUMMARIES, MetricInfo, key_of
 from cfx.evaluation.result import METHODS, PairTrajectory, Purpose
 from cfx.evaluation.statistics import STATISTICS, Improvement
 from cfx.evaluation.tables import scope_label
-from cfx.report.figures.results import ParameterAxis, Results
-from cfx.report.figures.text import TEST
-from cfx.report.metrics import known_metrics
+from cfx.report.figures.figure import ParameterAxis, Results
+from cfx.report.figures.text import TEST, pretty_unit
 from cfx.simulation.trajectory import TRANSIENT_S
 
 
@@ -389,3 +388,53 @@ def _parameter_names(trajectories: pd.DataFrame, methods: list[str]) -> list[str
 
 def _number(value: object) -> float | None:
     return float(value) if isinstance(value, int | float) else None
+
+
+def known_metrics(data: Mapping[str, Any], metrics: Mapping[str, float]) -> tuple[MetricInfo, ...]:
+    """Returns the metrics of a job, each with the scopes of which `metrics.json` has something.
+
+    Args:
+        data: what `data.json` holds.
+        metrics: what `metrics.json` holds.
+    """
+    listed = data.get("metrics")
+    known = []
+    for one in listed if isinstance(listed, list) else []:
+        if not isinstance(one, Mapping) or "name" not in one:
+            continue
+        metric = _metric_info(one)
+        scopes = []
+        for scope in metric.scopes:
+            if _is_measured(metric.name, scope, metrics):
+                scopes.append(scope)
+        if scopes:
+            known.append(replace(metric, scopes=tuple(scopes)))
+    return tuple(known)
+
+
+def metric_title(metric: MetricInfo) -> str:
+    """Returns a heading with the unit: "RMSE speed (m/s)"."""
+    heading = metric.heading[:1].upper() + metric.heading[1:]
+    return f"{heading} ({pretty_unit(metric.unit)})" if metric.unit else heading
+
+
+def _metric_info(values: Mapping[str, Any]) -> MetricInfo:
+    """Returns a metric as `data.json` describes it."""
+    scopes = values.get("scopes")
+    summary = str(values.get("summary", "mean"))
+    return MetricInfo(
+        name=str(values["name"]),
+        unit=str(values.get("unit", "")),
+        direction=str(values.get("direction", "none")),
+        summary=summary if summary in SUMMARIES else "mean",
+        heading=str(values.get("heading") or values["name"]),
+        meaning=str(values.get("meaning", "")),
+        scopes=tuple(map(str, scopes)) if isinstance(scopes, list) else (TEST,),
+        headline=bool(values.get("headline", True)),
+        distribution=str(values.get("distribution", "")),
+    )
+
+
+def _is_measured(name: str, scope: str, metrics: Mapping[str, float]) -> bool:
+    prefix = f"{name}/" if scope == TEST else f"{scope}/{name}/"
+    return any(key.startswith(prefix) for key in metrics)

@@ -12,9 +12,9 @@ import pandas as pd
 
 from cfx.calibration.flatness import NEAR
 from cfx.core.files import write_output
+from cfx.core.job_folder import without_folders
 from cfx.evaluation.result import Purpose
 from cfx.report.figures.text import short_label
-from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs
 from cfx.report.names import Row, any_adapts, baselines_of, methods_of, rows_of
 from cfx.report.sections.calibration import sheet, slices_of, spreads_of

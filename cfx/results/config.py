@@ -100,7 +100,10 @@ class FigureSettings(Settings):
 
 
 class JobConfig(Settings):
-    """Everything that one job needs to know; `conf/config.yaml` says the same in YAML."""
+    """Everything that one job needs to know; `conf/config.yaml` says the same in YAML.
+
+    A field is a key or a group of the command line, so that there are as many fields as these.
+    """
 
     preset: str | None = Field(
         None, description="the experiment that these settings come from; a report reads it"

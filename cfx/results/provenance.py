@@ -106,7 +106,7 @@ def metric_distributions(values: Mapping[str, Any]) -> dict[str, str]:
         PluginError: there is no metric of that name.
     """
     from cfx.core import registry
-    from cfx.evaluation.metrics.installed import entries_of
+    from cfx.evaluation.metrics.base import entries_of
 
     found = {}
     for entry in entries_of(values.get("metrics", "all")):

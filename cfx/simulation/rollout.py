@@ -30,8 +30,8 @@ from cfx.core.guest import same_environment
 from cfx.core.threads import one_thread
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.simulation.base import Stepper
-from cfx.simulation.compiling import torch_compiled
 from cfx.simulation.kernel import run as kernel
+from cfx.simulation.kernel.compiler import torch_compiled
 from cfx.simulation.kernel.keys import ComponentKey
 from cfx.simulation.step import advance_vehicle
 from cfx.simulation.tiles import Tile, tile_size, tiles

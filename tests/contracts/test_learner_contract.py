@@ -13,8 +13,7 @@ from torch import Tensor
 from cfx.contracts import learners as checks
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.policies.base import Policy, PolicyNetwork
-from cfx.policies.features import measured_history, tokens
-from cfx.policies.scaler import Scaler
+from cfx.policies.features import Scaler, measured_history, tokens
 
 EPOCHS = 12
 

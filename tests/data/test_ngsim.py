@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 
 from cfx.core.errors import DataError
 from cfx.data.describe import describe
-from cfx.data.ngsim import NgsimDataset
-from cfx.data.ngsim_rows import FOOT, read_ngsim
+from cfx.data.ngsim import FOOT, NgsimDataset, read_ngsim
 from cfx.data.pairs import PairSet
 from cfx.data.tidy import TidyDataset
 

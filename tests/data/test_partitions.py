@@ -11,7 +11,7 @@ import pyarrow.dataset
 import pyarrow.parquet as pq
 import pytest
 
-from cfx.app.sweep.fingerprint import fingerprint
+from cfx.app.sweep.folder import fingerprint
 from cfx.core.errors import DataError
 from cfx.data import tidy
 from cfx.data.describe import describe

@@ -19,10 +19,10 @@ from cfx.models.w99 import W99
 from cfx.policies.agent import Agent
 from cfx.policies.base import ConstantNetwork, Policy
 from cfx.policies.core import AgentCore
+from cfx.policies.features import Scaler
 from cfx.policies.fixed import FixedPolicy
 from cfx.policies.gru import GruPolicy
 from cfx.policies.heads.direct import DirectHead
-from cfx.policies.scaler import Scaler
 from cfx.simulation.rollout import MemoryStepper, simulate
 from cfx.simulation.trajectory import Start
 from tests.drives import wavy_pairs

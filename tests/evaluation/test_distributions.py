@@ -18,7 +18,7 @@ from cfx.evaluation.distributions import (
     score_distributions,
     summarize_distributions,
 )
-from cfx.evaluation.forecast_paths import Origins, Paths
+from cfx.evaluation.forecasts import Origins, Paths
 
 DT = 0.1
 STEPS = 20

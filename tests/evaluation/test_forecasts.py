@@ -11,20 +11,18 @@ import torch
 from torch import Tensor
 
 from cfx.data.pairs import PairBatch
-from cfx.evaluation import forecast_paths
+from cfx.evaluation import forecasts
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
-from cfx.evaluation.forecast_paths import (
+from cfx.evaluation.forecasts import (
     LeaderFuture,
     Origins,
-    kinematic_paths,
-    measured_paths,
-    simulate_from_origins,
-)
-from cfx.evaluation.forecasts import (
     errors_by,
     forecast_errors,
     forecast_metrics,
     forecast_values,
+    kinematic_paths,
+    measured_paths,
+    simulate_from_origins,
     summarize_forecasts,
 )
 from cfx.models.krauss import Krauss
@@ -76,7 +74,7 @@ def test_each_origin_is_a_closed_loop_of_its_own(
     batch: PairBatch, chunk_bytes: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A batch of origins, in chunks of any size, is what each origin alone gives."""
-    monkeypatch.setattr(forecast_paths, "_CHUNK_BYTES", chunk_bytes)
+    monkeypatch.setattr(forecasts, "_CHUNK_BYTES", chunk_bytes)
     agent, stepper = policy(), MemoryStepper(MODEL, 0.1)
     origins = Origins(torch.tensor([0, 2, 2]), torch.tensor([33, 100, 250]))
     network = torch.tensor([2, 0, 1])

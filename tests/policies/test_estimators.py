@@ -20,7 +20,7 @@ from cfx.contracts import check_contract
 from cfx.core.errors import ConfigError
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
-from cfx.evaluation.forecast_paths import Origins, simulate_from_origins
+from cfx.evaluation.forecasts import Origins, simulate_from_origins
 from cfx.models.base import DrivingModel
 from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
@@ -28,12 +28,11 @@ from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
 from cfx.policies.core import AgentCore
 from cfx.policies.estimator import EstimatorPolicy
-from cfx.policies.features import token_width
+from cfx.policies.features import Scaler, token_width
 from cfx.policies.heads import head_class
 from cfx.policies.heads.direct import DirectHead
 from cfx.policies.particle_filter import ParticleFilterPolicy, reweighted
 from cfx.policies.recalibrate import RecalibratePolicy
-from cfx.policies.scaler import Scaler
 from cfx.policies.ukf import UkfPolicy, unscented_update
 from cfx.simulation.rollout import MemoryStepper
 from cfx_sumo.vtype import SumoVType

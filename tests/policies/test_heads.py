@@ -8,7 +8,7 @@ import torch
 from cfx.core import registry
 from cfx.core.component import validate
 from cfx.core.errors import ConfigError, PluginError
-from cfx.learners.imitation_data import ImitationSettings
+from cfx.learners.imitation import ImitationSettings
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.models.w99 import W99
 from cfx.policies.heads import head_class

@@ -14,18 +14,15 @@ import pandas as pd
 import pytest
 
 from cfx.evaluation.result import Purpose
-from cfx.report.page import render
+from cfx.report.page import render, summary
 from cfx.report.runs import read_runs
-from cfx.report.sections import clusters as clusters_section
-from cfx.report.sections import paper
+from cfx.report.sections import improvements, paper
 from cfx.report.sections.calibration import sheet, spreads_of
-from cfx.report.sections.clusters import cluster_series
 from cfx.report.sections.comparison import absolute
-from cfx.report.sections.drivers import pairs_of, per_driver
+from cfx.report.sections.figures import chosen_pairs, pair_of
+from cfx.report.sections.improvements import cluster_series, pairs_of, per_driver
 from cfx.report.sections.results import overview
 from cfx.report.sections.run import duration
-from cfx.report.sections.trajectories import chosen_pairs, pair_of
-from cfx.report.summary import summary
 from tests.report.folders import ACROSS, write_job
 
 HOSTILE = "</script><img src=x onerror=alert(1)>&\"'"
@@ -374,8 +371,8 @@ def test_a_calibration_is_none_of_the_policies_that_adapt(tmp_path: Path) -> Non
     assert "Improvement of every pair" not in page.words
     assert "policy" not in alone[0].meaningful_methods, "a constant set is shown once"
     (moves,) = [job for job in runs.jobs if job.purpose is Purpose.ADAPTATION]
-    sheet = clusters_section.clusters(cluster_series([moves]), "fixed")
-    found = clusters_section.ClustersSection().context(runs)
+    sheet = improvements.clusters(cluster_series([moves]), "fixed")
+    found = improvements.ClustersSection().context(runs)
     assert found is not None
     assert found["sheets"]["driver-specific calibration"].rows == sheet.rows
     assert "over driver-specific calibration" not in page.words.split("Trajectories")[-1]

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from cfx.app.cli import main
-from cfx.report.files import without_folders
+from cfx.core.job_folder import without_folders
 from cfx.report.runs import read_runs
 from tests.report.folders import ACROSS, write_job
 

@@ -14,8 +14,7 @@ from cfx.report import page
 from cfx.report.figures.canvas import canvas
 from cfx.report.job import Runs
 from cfx.report.runs import read_runs
-from cfx.report.section import Section, View
-from cfx.report.tables import Column, Sheet, number
+from cfx.report.section import Column, Section, Sheet, View, number
 from tests.report.folders import write_job
 from tests.report.test_page import HOSTILE, Page
 

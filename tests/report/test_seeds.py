@@ -7,9 +7,9 @@ import pytest
 
 from cfx.report.job import Runs
 from cfx.report.names import rows_over_seeds
+from cfx.report.page import summary
 from cfx.report.runs import read_runs
-from cfx.report.sections.seeds import SeedsSection, over_seeds
-from cfx.report.summary import summary
+from cfx.report.sections.comparison import SeedsSection, over_seeds
 from tests.report.folders import ACROSS, write_job
 
 SEEDS = (0, 1, 2)

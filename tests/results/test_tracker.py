@@ -29,10 +29,9 @@ from cfx.models.krauss import Krauss
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
 from cfx.policies.core import AgentCore
-from cfx.policies.features import token_width
+from cfx.policies.features import Scaler, token_width
 from cfx.policies.gru import GruPolicy
 from cfx.policies.heads.direct import DirectHead
-from cfx.policies.scaler import Scaler
 from cfx.results import provenance
 from cfx.results.config import JobConfig
 from cfx.results.store import download_run, quiet, translate_errors

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from cfx.simulation import compiling
+from cfx.simulation.kernel import compiler
 
 SUM = """
 import torch
-from cfx.simulation.compiling import torch_compiled
+from cfx.simulation.kernel.compiler import torch_compiled
 
 def steps(x, y):
     return (x.exp() * y).sum(-1) + torch.where(x > 0, x.log1p(), y).sum(-1)
@@ -27,7 +27,7 @@ print(torch.backends.cpu.get_cpu_capability())
 
 
 def folder() -> str:
-    compiling.separate_cache()
+    compiler.separate_cache()
     return os.environ["TORCHINDUCTOR_CACHE_DIR"]
 
 
@@ -42,7 +42,7 @@ def test_each_kind_of_processor_has_its_own_cache(
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "another")
     second = folder()
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(compiling, "processor", lambda: "flags: fewer")
+    monkeypatch.setattr(compiler, "processor", lambda: "flags: fewer")
     assert len({first, second, folder()}) == 3
 
 
@@ -51,7 +51,7 @@ def test_without_a_wish_the_cache_lies_where_this_user_alone_writes(
 ) -> None:
     # monkeypatch gives the variable back that `folder` sets.
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", "")
-    assert Path(folder()).parent == compiling.cache_folder() / "torch"
+    assert Path(folder()).parent == compiler.cache_folder() / "torch"
 
 
 @pytest.mark.slow

@@ -24,10 +24,10 @@ from cfx.policies.base import ConstantNetwork
 from cfx.policies.context import ContextRule
 from cfx.policies.core import AgentCore
 from cfx.policies.default import DefaultPolicy
+from cfx.policies.features import Scaler
 from cfx.policies.fixed import FixedPolicy
 from cfx.policies.heads.direct import DirectHead
 from cfx.policies.heads.offset import shrunk
-from cfx.policies.scaler import Scaler
 from cfx.policies.valid_range import ValidRange
 from cfx.simulation.rollout import MemoryStepper
 from cfx_sumo.demo.motorway import read_motorway

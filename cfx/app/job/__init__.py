@@ -3,7 +3,7 @@
 A dataset gives pairs. An optimizer calibrates a driving model on them. A learner trains a policy
 on the result. A protocol evaluates it. Tracking keeps what came out.
 
-`parts` makes the components, `run` takes the steps, `output` writes the folder, `results` reads it
+`steps` makes the components, `run` takes the steps, `output` writes the folder, `results` reads it
 back, and `console` prints the table. This module imports none of them before a name is used.
 """
 

@@ -1,9 +1,11 @@
-"""What a job prints when it is done: tables of methods and improvements, then some sentences."""
+"""What a job prints when it is done, and the lines that MLflow shows as its description."""
 
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -11,6 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from cfx.calibration.flatness import NEAR, flat_for
+from cfx.core.errors import without_passwords
 from cfx.evaluation.demo import PAGE
 from cfx.evaluation.headline import headline
 from cfx.evaluation.metrics.base import MetricInfo, key_of
@@ -18,6 +21,7 @@ from cfx.evaluation.result import Evaluation, Purpose
 from cfx.evaluation.statistics import Improvement
 from cfx.evaluation.tables import scope_label
 from cfx.report.figures.text import few_drivers
+from cfx.results.config import JobConfig
 from cfx.results.table import Findings, Kept
 from cfx.simulation.trajectory import TRANSIENT_S
 
@@ -225,3 +229,37 @@ def _methods_above(
         if value >= least:
             found.append(f"{method} {value:{form}}")
     return ", ".join(found)
+
+
+_CHOSEN = ("model", "policy", "learner", "optimizer", "objective", "protocol")
+
+
+def described(config: JobConfig, findings: Findings, metrics: Mapping[str, float]) -> str:
+    """Returns what the job is, its result, its recordings, and the command that was typed.
+
+    Args:
+        config: of the job.
+        findings: of the job.
+        metrics: its results.
+    """
+    pairs = findings.pairs
+    chosen = []
+    for group in _CHOSEN:
+        if group == "learner" and findings.evaluation.purpose is Purpose.CALIBRATION:
+            continue
+        chosen.append(f"{group} **{getattr(config, group)['name']}**")
+    drivers = len({pair.driver for pair in pairs})
+    _, result = headline(metrics)
+    source = Path(pairs.source).name
+    lines = [
+        f"{result[:1].upper()}{result[1:]}.",
+        "",
+        ", ".join(chosen) + ".",
+        "",
+        f"{len(pairs)} pairs of {drivers} drivers from {source} (data **{config.data['name']}**),"
+        f" in steps of {pairs.dt:g} s; seed {config.seed}.",
+    ]
+    typed = [without_passwords(one) for one in sys.argv[1:]]
+    if typed and Path(sys.argv[0]).name in {"cfx", "__main__.py"}:
+        lines += ["", "```", f"cfx {' '.join(typed)}", "```"]
+    return "\n".join(lines)

@@ -1,7 +1,8 @@
-"""The files of a job's folder; each appears whole or not at all."""
+"""The files of a job's folder, each whole or not at all, and the folder's copy behind a URL."""
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -14,6 +15,7 @@ import yaml
 
 from cfx.core.errors import OutputError
 from cfx.core.files import atomic_write, remove_leftovers, write_json
+from cfx.core.storage import RemoteFolder
 from cfx.data.tidy import write_tidy
 from cfx.policies import checkpoint
 from cfx.results.config import JobConfig
@@ -22,8 +24,9 @@ from cfx.results.table import Findings, Kept, WrittenTable, file_of, installed, 
 from cfx.simulation.trajectory import TRANSIENT_S
 
 if TYPE_CHECKING:
-    from cfx.app.job.parts import Parts
+    from cfx.app.job.steps import Parts
     from cfx.evaluation.demo import Demo
+
 
 METRICS = "metrics.json"
 """The file that is written last: a folder that has it is complete."""
@@ -138,7 +141,7 @@ def _write_figures(
     tables: list[WrittenTable],
     metrics: Mapping[str, float],
 ) -> list[Path]:
-    from cfx.report.figures.results import Results
+    from cfx.report.figures.figure import Results
     from cfx.report.figures.write import write_figures
 
     rows = {table.about.name: table.rows for table in tables if table.rows is not None}
@@ -186,3 +189,108 @@ def _description(findings: Findings, objective: Mapping[str, str]) -> dict[str, 
         "cfx": version(),
         "commit": commit(Path.cwd()),
     }
+
+
+log = logging.getLogger(__name__)
+
+_CONFIG = "config.yaml"
+
+_LEFT_OUT = frozenset({".lock", ".lock.lease"})
+"""Files that mean something on this machine alone."""
+
+
+class Upload:
+    """Copies a job's folder.
+
+    Args:
+        url: what `output.url` says.
+        folder: of the job.
+
+    Raises:
+        CfxError: nobody knows such URLs, or what they need is not installed.
+    """
+
+    def __init__(self, url: str, folder: Path) -> None:
+        self.url = f"{url.rstrip('/')}/{place_of(folder)}"
+        self._folder = folder
+        self._remote = RemoteFolder(self.url)
+
+    @classmethod
+    def of(cls, url: str | None, folder: Path) -> Upload | None:
+        """Returns the copy that has begun; None without a URL.
+
+        Raises:
+            CfxError: nobody knows such URLs, or the store cannot be read or written.
+        """
+        if url is None:
+            return None
+        upload = cls(url, folder)
+        upload.begin()
+        return upload
+
+    def begin(self) -> None:
+        """Copies the configuration, so that a store that cannot be written is known at once.
+
+        Results of an earlier job there stay as they are until the new ones come.
+
+        Raises:
+            OutputError: the store cannot be read or written.
+        """
+        try:
+            if self._remote.read(METRICS) is None:
+                self._remote.put(_CONFIG, self._folder / _CONFIG)
+        except OSError as error:
+            raise OutputError(
+                f"cannot write to {self.url} ({error}); set output.url to a place"
+                " that can be written"
+            ) from error
+
+    def finish(self) -> None:
+        """Copies all files of the job; those that an earlier job left there go.
+
+        Raises:
+            OutputError: the store cannot be written.
+        """
+        try:
+            self._copy()
+            log.info("The job's folder was copied to %s", self.url)
+        except OSError as error:
+            raise OutputError(
+                f"the job's results lie in {self._folder}, but cannot be copied to"
+                f" {self.url} ({error}); the calibration is cached, so run again"
+            ) from error
+
+    def _copy(self) -> None:
+        names = self._names()
+        there = self._remote.names()
+        if {METRICS, _CONFIG} <= set(there):  # a job's; anything else is not ours to remove
+            self._remote.remove(METRICS)
+            for name in set(there) - set(names):
+                self._remote.remove(name)
+        for name in names:
+            if name != METRICS:
+                self._remote.put(name, self._folder / name)
+        self._remote.put(METRICS, self._folder / METRICS)
+
+    def _names(self) -> list[str]:
+        """Returns the names of the job's files, without those that are being written."""
+        names = []
+        for path in sorted(self._folder.rglob("*")):
+            is_temporary = path.name.startswith(".") and "@" in path.name
+            if path.is_file() and path.name not in _LEFT_OUT and not is_temporary:
+                names.append(path.relative_to(self._folder).as_posix())
+        return names
+
+
+def place_of(folder: Path) -> str:
+    """Returns where a job's folder is copied to, below the URL: its path from `outputs/` on.
+
+    Elsewhere it is its name, in a sweep after the sweep's.
+    """
+    parts = folder.absolute().parts
+    if "outputs" in parts[:-1]:
+        last = len(parts) - 1 - parts[::-1].index("outputs")
+        return "/".join(parts[last + 1 :])
+    if (folder.parent / "sweep.json").is_file():
+        return "/".join(parts[-2:])
+    return parts[-1]

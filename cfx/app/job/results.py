@@ -9,14 +9,13 @@ import pandas as pd
 
 from cfx.core.errors import DataError
 from cfx.core.guest import guest
-from cfx.core.job_folder import examine
+from cfx.core.job_folder import examine, read_metrics
 from cfx.data.style import StyleResult
 from cfx.evaluation.headline import headline
 from cfx.evaluation.result import Evaluation
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
 from cfx.policies.ready import is_ready_made
-from cfx.report.files import read_metrics
 from cfx.results.store import folder_of
 from cfx.results.table import read_tables
 

@@ -44,10 +44,9 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
     from rich.console import Console
 
     from cfx.app.job import output, steps
-    from cfx.app.job.console import report
-    from cfx.app.job.description import described
+    from cfx.app.job.console import described, report
+    from cfx.app.job.output import Upload
     from cfx.app.job.results import JobResult
-    from cfx.app.job.upload import Upload
     from cfx.results.tracker import Tracker
 
     data = config.data

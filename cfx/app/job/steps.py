@@ -1,30 +1,227 @@
-"""The steps of one job, in the order in which `run_job` calls them."""
+"""The steps of one job, in the order in which `run_job` calls them, and its components."""
 
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
+import numpy as np
+import pandas as pd
 import torch
+from torch import Tensor
 
-from cfx.app.job.calibration_tables import calibration_tables
-from cfx.app.job.parts import Parts, choose_device, complete, make_protocol, reported_objectives
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
+from cfx.calibration.identifiability import slices, training_errors
+from cfx.calibration.objectives.base import Objective
+from cfx.calibration.optimizers.base import Optimizer
 from cfx.calibration.prior import prior_weight
 from cfx.calibration.settings import WindowSettings
 from cfx.calibration.shards import Solver
+from cfx.calibration.windows import Split
 from cfx.core import registry
-from cfx.core.errors import PluginError
+from cfx.core.engine.base import Engine
+from cfx.core.errors import ConfigError, PluginError
 from cfx.core.memory import require_memory
+from cfx.core.storage import is_url
 from cfx.core.threads import limit_cores, set_threads
+from cfx.data.base import Dataset
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.style import StyleResult, measure_style, select_cluster
-from cfx.evaluation.protocols.base import ProtocolContext, ProtocolResult
-from cfx.evaluation.result import Purpose
+from cfx.evaluation.demo import Demo
+from cfx.evaluation.metrics.base import MetricSet
+from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
+from cfx.evaluation.result import Evaluation, Purpose
+from cfx.learners.base import Learner
+from cfx.models.base import DrivingModel
+from cfx.policies.base import Policy
+from cfx.policies.ready import is_ready_made
 from cfx.results.config import JobConfig
+from cfx.results.store import folder_of, is_run_id
 from cfx.results.table import Findings
+from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.simulator import Simulator
+
+_CONSTANT = ("default", "population", "fixed")
+
+
+def calibration_tables(context: ProtocolContext, evaluation: Evaluation) -> dict[str, pd.DataFrame]:
+    """Returns the tables `slices` and `fits` of a calibration of driver-specific parameters.
+
+    There are none where nothing was calibrated per driver, nor where another program simulates
+    (`simulator=sumo`): it would take minutes.
+
+    Returns:
+        slices: see `cfx.calibration.identifiability.slices`.
+        fits: a row per pair and method: pair_id, driver, method, and train_rmse_speed,
+            test_rmse_speed (m/s), train_rmse_gap, test_rmse_gap (m): on the part that
+            driver-specific parameters were calibrated on, and on the test part.
+    """
+    if "fixed" not in evaluation.methods or not evaluation.names:
+        return {}
+    if not isinstance(context.simulator, MemoryStepper):
+        return {}
+    number = {pair.pair_id: index for index, pair in enumerate(context.pairs)}
+    ids = evaluation.about["pair_id"].drop_duplicates().astype(str).tolist()
+    chosen = torch.tensor([number[name] for name in ids])
+    batch = context.batch[chosen.to(context.batch.lengths.device)]
+    last = Split.of(context.pairs, context.windows, context.split).frame[chosen]
+    fits = []
+    for method in evaluation.methods:
+        if method in _CONSTANT:
+            parameters = _parameters(evaluation, method, ids, batch.leader_length)
+            found = training_errors(context.calibrator, batch, last, parameters)
+            fits.append(_fits(evaluation, method, found))
+    best = _parameters(evaluation, "fixed", ids, batch.leader_length)
+    table = slices(context.calibrator, batch, last, best, ids)
+    return {"slices": table, "fits": pd.concat(fits, ignore_index=True)}
+
+
+def _parameters(evaluation: Evaluation, method: str, ids: list[str], like: Tensor) -> Tensor:
+    """Returns a method's constant parameters `(P, n)`, SI units."""
+    rows = evaluation.about[evaluation.about["method"] == method].set_index("pair_id")
+    columns = [f"parameter_{name}" for name in evaluation.names]
+    values = np.array(rows.loc[ids, columns], dtype=np.float64)
+    return torch.as_tensor(values, dtype=like.dtype, device=like.device)
+
+
+def _fits(evaluation: Evaluation, method: str, train: dict[str, Tensor]) -> pd.DataFrame:
+    rows = evaluation.table[evaluation.table["method"] == method]
+    found = rows[["pair_id", "driver"]].reset_index(drop=True)
+    found["method"] = method
+    for name, values in train.items():
+        found[f"train_{name}"] = values.cpu().numpy()
+        found[f"test_{name}"] = rows[name].to_numpy(dtype=np.float64)
+    return found
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The components of a job; making them checks the whole configuration before any work begins.
+
+    The registry has checked that each is what its kind promises.
+    """
+
+    dataset: Dataset
+    model: DrivingModel
+    simulator: Simulator
+    optimizer: Optimizer
+    objective: Objective
+    policy: Policy
+    learner: Learner
+    protocol: Protocol
+    metrics: MetricSet
+    engine: Engine
+    demo: Demo | None = None
+
+    @classmethod
+    def of(cls, config: JobConfig, protocol: Protocol) -> Parts:
+        """Makes the components of a configuration around a protocol that is there already.
+
+        Raises:
+            ConfigError: a setting is wrong, or two components do not fit each other.
+            PluginError: a component cannot be loaded.
+            CfxError: the simulator needs what is not installed, such as SUMO.
+        """
+        model = cast(DrivingModel, registry.create("model", config.model))
+        if "model" not in protocol.determines():  # else the policy has been trained already
+            model.refuse_unused()
+        simulator = cast(Simulator, registry.create("simulator", config.simulator))
+        simulator.require(model)
+        learner = cast(Learner, registry.create("learner", config.learner))
+        policy = cast(Policy, registry.create("policy", config.policy))
+        if policy.adapts:
+            learner.require_gradients(model, simulator.differentiable)
+        if "policy" not in protocol.determines():  # else the policy has been trained already
+            learner.require_no_driver_features(policy)
+        demo = None
+        if config.demo is not None:
+            demo = cast(Demo, registry.create("demo", config.demo))
+        return cls(
+            dataset=cast(Dataset, registry.create("dataset", config.data)),
+            model=model,
+            simulator=simulator,
+            optimizer=cast(Optimizer, registry.create("optimizer", config.optimizer)),
+            objective=cast(Objective, registry.create("objective", config.objective)),
+            policy=policy,
+            learner=learner,
+            protocol=protocol,
+            metrics=MetricSet.of(config.metrics),
+            engine=cast(Engine, registry.create("engine", config.engine)),
+            demo=demo,
+        )
+
+
+def reported_objectives(config: JobConfig, objective: Objective) -> dict[str, Objective]:
+    """Returns the objectives whose values a calibration reports: cfx's own and the chosen one.
+
+    Args:
+        config: names the chosen objective.
+        objective: the chosen objective.
+    """
+    reported = {}
+    for entry in registry.entries("objective"):
+        if entry.distribution == registry.OWN:
+            made = registry.create("objective", {"name": entry.name})
+            reported[entry.name] = cast(Objective, made)
+    reported[config.objective["name"]] = objective
+    return reported
+
+
+def make_protocol(config: JobConfig) -> Protocol:
+    """Returns the protocol, for which ids of MLflow runs, and URLs, have become folders.
+
+    Raises:
+        ConfigError: a setting is wrong.
+        TrackingError: there is no such run.
+    """
+    node = dict(config.protocol)
+    name = node.get("name")
+    if isinstance(name, str):
+        protocol = cast(type[Protocol], registry.get("protocol", name))
+        for setting in protocol.jobs:
+            given = str(node.get(setting))
+            if is_run_id(given) or is_ready_made(given) or is_url(given):
+                node[setting] = folder_of(given, config.tracking.uri)
+    return cast(Protocol, registry.create("protocol", node))
+
+
+def complete(config: JobConfig, protocol: Protocol) -> JobConfig:
+    """Returns the configuration with the nodes that the protocol determines."""
+    determined = protocol.determines()
+    if not determined:
+        return config
+    named = []
+    for key, value in determined.items():
+        if "name" in value:
+            named.append(f"{key}={value['name']}")
+        else:
+            named.append(key)
+    log.info("The protocol determines %s", ", ".join(named))
+    return JobConfig.of({**config.model_dump(), **determined})
+
+
+def choose_device(name: str) -> torch.device:
+    """Returns the device that `device=NAME` asks for.
+
+    Raises:
+        ConfigError: the machine has no such device.
+    """
+    if name == "auto":
+        if torch.cuda.is_available():
+            return torch.device("cuda")
+        return torch.device("cpu")
+    device = torch.device(name)
+    found = torch.cuda.device_count()
+    if device.type == "cuda" and (device.index or 0) >= found:
+        raise ConfigError(
+            f"device={name}: PyTorch finds {found} CUDA devices here;"
+            " write device=cpu or device=auto"
+        )
+    return device
+
 
 log = logging.getLogger(__name__)
 

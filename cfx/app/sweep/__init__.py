@@ -8,14 +8,10 @@ well with the same configuration, versions and data is not run again.
 
 from __future__ import annotations
 
-from cfx.app.sweep.callback import Refused, SweepFolder
-from cfx.app.sweep.fingerprint import fingerprint
-from cfx.app.sweep.folder import only_one
-from cfx.app.sweep.record import RECORD, Record
-from cfx.app.sweep.running import Sweep
-from cfx.app.sweep.status import STATUS, JobStatus, metrics_of
+from cfx.app.sweep.folder import fingerprint, only_one
+from cfx.app.sweep.record import RECORD, STATUS, JobStatus, Record, metrics_of
+from cfx.app.sweep.running import Refused, Sweep, SweepFolder, worker_of
 from cfx.app.sweep.summary import SUMMARY
-from cfx.app.sweep.worker import worker_of
 
 __all__ = [
     "RECORD",

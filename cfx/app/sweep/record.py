@@ -1,14 +1,87 @@
-"""What a sweep is: the file in its folder that says so, and the jobs that belong to it."""
+"""What a sweep is and how its jobs ended: the files in their folders that say so."""
 
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Self
 
-from cfx.app.sweep.status import STATUS, JobStatus
+from cfx.core.errors import DataError
 from cfx.core.files import write_json
+
+STATUS = "outcome.json"
+"""The marker in a job's folder; written whole and last."""
+
+
+@dataclass(frozen=True)
+class JobStatus:
+    """How a job of a sweep ended.
+
+    Attributes:
+        code: exit code: 0; 2 for a user's mistake; 1 for a bug.
+        message: one sentence for people; empty if all went well.
+        detail: the traceback of a bug.
+        overrides: what was asked for.
+        multirun: the start of the sweep that last saw this job.
+        command: the sweep's command, see `Record.command_hash`.
+        fingerprint: of everything that the results depend on, see `fingerprint`.
+        number: the job's place in the sweep.
+        seconds: how long it took, s.
+        before: an earlier start of the sweep did it.
+    """
+
+    code: int
+    message: str
+    detail: str
+    overrides: tuple[str, ...]
+    multirun: str = ""
+    command: str = ""
+    fingerprint: str = ""
+    number: int = 0
+    seconds: float = 0.0
+    before: bool = False
+
+    @classmethod
+    def read(cls, folder: Path) -> Self | None:
+        """Returns how the job in `folder` ended; None if it left no marker that can be read."""
+        try:
+            values = json.loads((folder / STATUS).read_text(encoding="utf-8"))
+            return cls(**{**values, "overrides": tuple(values["overrides"])})
+        except (OSError, ValueError, TypeError, KeyError):
+            return None
+
+    def write(self, folder: Path) -> None:
+        """Writes it, whole, into the job's folder."""
+        write_json(folder / STATUS, asdict(self))
+
+    @property
+    def state(self) -> str:
+        """For people: done, done before or failed."""
+        if self.code:
+            return "failed"
+        if self.before:
+            return "done before"
+        return "done"
+
+
+def metrics_of(folder: Path) -> dict[str, float]:
+    """Returns the finite metrics of a finished job; empty if there are none."""
+    from cfx.core.job_folder import read_metrics
+
+    try:
+        found = read_metrics(folder / "metrics.json")
+    except DataError:
+        return {}
+    return {name: value for name, value in found.items() if math.isfinite(value)}
+
+
+def worst(*codes: int) -> int:
+    """Returns the exit code that weighs most: a signal, then a bug, then a user's mistake."""
+    weights = {0: 0, 2: 1, 1: 2}
+    return max(codes, key=lambda code: weights.get(code, 3))
+
 
 RECORD = "sweep.json"
 """Says in a sweep's folder what the sweep is."""

@@ -5,23 +5,28 @@ from __future__ import annotations
 import contextlib
 import copy
 import logging
+import os
 import shlex
 import sys
+import threading
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, ClassVar, Self, cast
 
 from filelock import BaseFileLock
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.utils import JobReturn
+from hydra.experimental.callback import Callback
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from cfx.app.hydra_source import resolving
-from cfx.app.sweep.fingerprint import command_of
-from cfx.app.sweep.folder import LOCK, find_folder
-from cfx.app.sweep.record import RECORD, Record
-from cfx.app.sweep.status import JobStatus, worst
+from cfx.app.sweep.folder import LOCK, command_of, find_folder
+from cfx.app.sweep.record import RECORD, JobStatus, Record, worst
 from cfx.app.sweep.summary import SUMMARY, metric_columns, rows, summary_table, write_summary
 from cfx.core.console import put
 
@@ -229,3 +234,75 @@ def _tracking(config: DictConfig) -> dict[str, Any]:
 
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="microseconds")
+
+
+class Refused(BaseException):
+    """A sweep cannot start; the cause says why.
+
+    It is no `Exception`, because Hydra swallows those in a callback.
+    """
+
+
+class SweepFolder(Callback):
+    """Chooses the folder when Hydra starts a multirun; `conf/config.yaml` names this class."""
+
+    _current: ClassVar[Sweep | None] = None
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        try:
+            SweepFolder._current = Sweep.open(config)
+            SweepFolder._current.lead(config)
+        except Exception as error:
+            raise Refused from error
+
+    def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
+        """Lets go of a job's configurations, which Hydra would keep until the sweep ends.
+
+        They take half a megabyte for each job; what a sweeper asks for is the returned value.
+        """
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            job_return.cfg = None
+            job_return.hydra_cfg = None
+
+    @classmethod
+    def take(cls) -> Sweep | None:
+        """Returns the sweep that was started, if one was, and forgets it."""
+        sweep = cls._current
+        cls._current = None
+        return sweep
+
+
+_AT_WORK = threading.Lock()
+"""Held while this process runs a job."""
+
+_WATCHED: set[int] = set()
+"""Processes of sweeps whose end this worker watches for."""
+
+_WATCH_S = 1.0
+"""Seconds between two looks."""
+
+
+@contextlib.contextmanager
+def worker_of(process: int) -> Iterator[None]:
+    """Runs a job; a worker whose sweep was killed ends when its job does.
+
+    joblib's workers would wait for the next job for ever.
+
+    Args:
+        process: the one that runs the sweep.
+    """
+    is_its_worker = os.getpid() != process and os.getppid() == process
+    if is_its_worker and process not in _WATCHED:
+        _WATCHED.add(process)
+        threading.Thread(target=_end_with, args=(process,), daemon=True).start()
+    elif process in _WATCHED and os.getppid() != process:
+        os._exit(1)  # the next start of the sweep runs a job that was handed over already
+    with _AT_WORK:
+        yield
+
+
+def _end_with(process: int) -> None:
+    while os.getppid() == process:
+        time.sleep(_WATCH_S)
+    with _AT_WORK:
+        os._exit(1)

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cfx.app.sweep.status import JobStatus, metrics_of
+from cfx.app.sweep.record import JobStatus, metrics_of
 from cfx.core.console import blank_table
 from cfx.core.errors import DataError
 from cfx.core.files import atomic_write
@@ -32,8 +32,8 @@ _AFTER_OVERRIDES = "improvement_over"
 
 def metric_columns(folders: Sequence[Path]) -> list[MetricInfo]:
     """Returns the metrics that any of these jobs has measured, besides the RMSE of speed."""
-    from cfx.report.files import optional, read_json, read_metrics
-    from cfx.report.metrics import known_metrics
+    from cfx.core.job_folder import optional, read_json, read_metrics
+    from cfx.report.job import known_metrics
 
     found: dict[str, MetricInfo] = {}
     for folder in folders:

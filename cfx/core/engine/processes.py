@@ -1,4 +1,4 @@
-"""Work in processes of this machine (`cfx.core.workers`), one shard in each at a time."""
+"""Work in processes of this machine (`cfx.core.processes`), one shard in each at a time."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from loky.process_executor import BrokenProcessPool
 
 from cfx.core.engine.base import Report, ResultT, ShardT, Work
 from cfx.core.errors import EngineError
+from cfx.core.processes import worker_pool
 from cfx.core.threads import limit_cores, one_core, one_thread
-from cfx.core.workers import worker_pool
 
 _LOOK = 0.5
 """Seconds between looks at the workers' progress."""

@@ -14,7 +14,16 @@ import torch
 from torch import Tensor
 
 from cfx.evaluation.metrics.base import Metric, Trajectories
-from cfx.evaluation.metrics.masked import masked_mean, root_mean_square
+
+
+def masked_mean(values: Tensor, counted: Tensor) -> Tensor:
+    """Returns the mean of `(P, K)` over the counted frames, `(P,)`; NaN where none counts."""
+    return torch.where(counted, values, 0.0).sum(1) / counted.sum(1)
+
+
+def root_mean_square(values: Tensor, counted: Tensor) -> Tensor:
+    """Returns the root mean square of `(P, K)` over them, `(P,)`; NaN where none counts."""
+    return (torch.where(counted, values, 0.0).square().sum(1) / counted.sum(1)).sqrt()
 
 
 class RmseSpeed(Metric):

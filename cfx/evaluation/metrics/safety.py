@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from cfx.evaluation.metrics.base import Metric, Trajectories
+from cfx.evaluation.metrics.errors import masked_mean, root_mean_square
 
 HARD_BRAKING = -8.0
 """m/s2: an acceleration below it is hard braking; tyres on a dry road give little more."""
@@ -141,3 +142,48 @@ def hard_braking_frames(speed: Tensor, counted: Tensor, dt: float) -> Tensor:
         `(*batch,)` int64.
     """
     return ((speed.diff(dim=-1) / dt < HARD_BRAKING) & counted[..., 1:]).sum(-1)
+
+
+class Jerk(Metric):
+    """Root mean square jerk; NaN where fewer than two frames count.
+
+    The jerk is the difference of successive accelerations over the time step. The acceleration at
+    the start is the recorded driver's own and does not count: the jump from it is no act of the
+    model.
+    """
+
+    unit = "m/s3"
+    direction = "none"
+    heading = "RMS jerk"
+    meaning = "root mean square jerk; that of the recorded drivers says what is usual"
+    is_of_recording = True
+    headline = False
+    order = 24
+
+    def compute(self, trajectories: Trajectories) -> Tensor:
+        counted = trajectories.counted
+        jerk = trajectories.speed.diff(n=2, dim=-1) / trajectories.dt**2
+        return root_mean_square(jerk, counted[:, 2:] & counted[:, 1:-1])
+
+
+NEAR_BOUND = 0.01
+"""A value is at a bound within this share of the parameter's range."""
+
+
+class AtBounds(Metric):
+    """Share of the tuned parameters' values within 1 % of their range of a bound (`NEAR_BOUND`).
+
+    A policy that drives at its bounds would like to leave them.
+    """
+
+    unit = ""
+    direction = "none"
+    heading = "at bounds"
+    meaning = "share of the tuned parameters' values within 1 % of their range of a bound"
+    headline = False
+    order = 31
+
+    def compute(self, trajectories: Trajectories) -> Tensor:
+        unit = trajectories.space.to_unit(trajectories.parameters)
+        at_bound = (unit <= NEAR_BOUND) | (unit >= 1 - NEAR_BOUND)
+        return masked_mean(at_bound.double().mean(-1), trajectories.counted)

@@ -24,19 +24,18 @@ from cfx.core.errors import PluginError
 from cfx.core.parameters import ParameterSpace
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.style import StyleResult
-from cfx.evaluation.metrics.installed import MetricSet
+from cfx.evaluation.metrics.base import MetricSet
 from cfx.evaluation.result import Evaluation
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingResult
 from cfx.models.residual import TIME
 from cfx.policies.agent import Agent, TrainedOn
 from cfx.policies.base import ConstantNetwork, Policy
 from cfx.policies.core import AgentCore, features_read
-from cfx.policies.features import token_width
+from cfx.policies.features import Scaler, token_width
 from cfx.policies.fixed import FixedPolicy
 from cfx.policies.heads import head_class, head_name
 from cfx.policies.heads.base import ParameterHead
 from cfx.policies.heads.stochastic import SCALE, StochasticHead
-from cfx.policies.scaler import Scaler
 from cfx.policies.valid_range import recorded_quantiles
 from cfx.simulation.base import Stepper
 

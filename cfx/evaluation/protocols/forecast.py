@@ -17,15 +17,16 @@ from cfx.core.component import Settings
 from cfx.core.errors import ConfigError, DataError
 from cfx.evaluation.closed_loop import Followers
 from cfx.evaluation.distributions import Recorded, score_distributions
-from cfx.evaluation.forecast_paths import (
+from cfx.evaluation.forecasts import (
     LeaderFuture,
     Origins,
     Paths,
+    forecast_errors,
+    forecast_values,
     kinematic_paths,
     measured_paths,
     sample_from_origins,
 )
-from cfx.evaluation.forecasts import forecast_errors, forecast_values
 from cfx.evaluation.protocols.base import ProtocolContext, ProtocolResult
 from cfx.evaluation.protocols.finished import FoldsOrFinished, FoldsOrFinishedSettings
 from cfx.evaluation.protocols.held_out import HeldOut

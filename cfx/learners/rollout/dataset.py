@@ -20,14 +20,13 @@ from cfx.calibration.prior import squashed
 from cfx.core import scratch
 from cfx.data.pairs import SIGNALS, PairBatch
 from cfx.learners.base import TrainingData
-from cfx.learners.grid import Grid
 from cfx.learners.rollout.inputs import RolloutBatch
 from cfx.policies.base import Policy
 from cfx.policies.driver_features import measure
-from cfx.policies.features import measured_history, tokens
+from cfx.policies.features import Scaler, measured_history, tokens
 from cfx.policies.heads.base import ParameterHead
 from cfx.policies.heads.offset import OffsetHead
-from cfx.policies.scaler import Scaler
+from cfx.policies.placement import Grid
 
 _FEW_DRIVERS = 5
 """A network with fewer drivers keeps the end of each trajectory for validation, not drivers."""

@@ -42,10 +42,10 @@ from cfx.learners.rollout.shard import (
 )
 from cfx.learners.situations import learned_range
 from cfx.policies.base import Policy, PolicyNetwork
-from cfx.policies.ensemble import Ensemble
+from cfx.policies.core import Ensemble
+from cfx.policies.features import Scaler
 from cfx.policies.heads import head_class
 from cfx.policies.heads.base import ParameterHead
-from cfx.policies.scaler import Scaler
 
 log = logging.getLogger(__name__)
 

@@ -28,7 +28,7 @@ from cfx.calibration.windows import WindowSettings
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.policies.core import AgentCore
 from cfx.policies.features import History
-from cfx.simulation.compiling import torch_compiled
+from cfx.simulation.kernel.compiler import torch_compiled
 from cfx.simulation.step import advance_vehicle
 
 

@@ -17,11 +17,19 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from cfx.report.figures.text import label, percent
-from cfx.report.figures.values import Array
 from cfx.results.look import EDGE, INK, PALE, colour_of
+
+Array = NDArray[np.float64]
+
+
+def finite(values: Sequence[float] | Array) -> Array:
+    """Returns the finite ones of some values."""
+    array: Array = np.asarray(values, dtype=np.float64).ravel()
+    return array[np.isfinite(array)]
+
 
 P = ParamSpec("P")
 

@@ -15,7 +15,16 @@ from matplotlib.ticker import FuncFormatter
 from cfx.data.style import CLUSTERS
 from cfx.evaluation.statistics import Improvement
 from cfx.report.figures.calibration import spread_offsets
-from cfx.report.figures.canvas import canvas, draw_points, hover, legend_above, percent_tick, styled
+from cfx.report.figures.canvas import (
+    Array,
+    canvas,
+    draw_points,
+    finite,
+    hover,
+    legend_above,
+    percent_tick,
+    styled,
+)
 from cfx.report.figures.improvements import (
     ImprovementAxis,
     ImprovementBars,
@@ -30,7 +39,6 @@ from cfx.report.figures.text import (
     plural,
     short,
 )
-from cfx.report.figures.values import Array, finite
 from cfx.results.look import INK, JOB_COLOURS, colour_of
 
 _WIDE = 1.6

@@ -8,10 +8,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter
 
 from cfx.learners.curves import first_sampled_epoch, over_networks
-from cfx.report.figures.canvas import canvas, legend_above, plain_tick, say, styled
-from cfx.report.figures.figure import JobFigure
-from cfx.report.figures.results import Results
-from cfx.report.figures.values import Array
+from cfx.report.figures.canvas import Array, canvas, legend_above, plain_tick, say, styled
+from cfx.report.figures.figure import JobFigure, Results
 from cfx.results.look import EDGE, TRAIN_COLOUR, VALIDATION_COLOUR
 
 LOSS_TITLE = "loss (as the learner defines it)"

@@ -12,11 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from cfx.evaluation.metrics.base import key_of
-from cfx.report.figures.canvas import canvas, legend_above, styled
-from cfx.report.figures.figure import JobFigure
-from cfx.report.figures.results import Results
+from cfx.report.figures.canvas import Array, canvas, finite, legend_above, styled
+from cfx.report.figures.figure import JobFigure, Results
 from cfx.report.figures.text import label, number
-from cfx.report.figures.values import Array, finite
 from cfx.results.look import COLLISION_COLOUR, COLOURS, vehicle_colour
 
 TIME_TITLE = "time from the braking of the leader (s)"

@@ -10,11 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from cfx.data.style import CLUSTERS, StyleResult
-from cfx.report.figures.canvas import canvas, styled
-from cfx.report.figures.figure import JobFigure
-from cfx.report.figures.results import Results
+from cfx.report.figures.canvas import Array, canvas, finite, styled
+from cfx.report.figures.figure import JobFigure, Results
 from cfx.report.figures.text import plural
-from cfx.report.figures.values import Array, finite
 from cfx.results.look import CLUSTER_COLOURS, INK
 
 INDICATORS = {

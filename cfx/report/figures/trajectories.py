@@ -14,15 +14,23 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.gridspec import GridSpec
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 
 from cfx.core.errors import ConfigError, nearest
 from cfx.evaluation.result import PairTrajectory
-from cfx.report.figures.canvas import HIDDEN, Line, canvas, draw_lines, method_legend, styled
-from cfx.report.figures.figure import JobFigure
+from cfx.report.figures.canvas import (
+    HIDDEN,
+    Array,
+    Line,
+    canvas,
+    draw_lines,
+    finite,
+    method_legend,
+    styled,
+)
+from cfx.report.figures.figure import JobFigure, ParameterAxis, Results
 from cfx.report.figures.improvements import improvement_title
-from cfx.report.figures.results import ParameterAxis, Results
 from cfx.report.figures.text import label, number, percent, short, short_label, unit_label
-from cfx.report.figures.values import Array, RankedPair, finite, rank_pairs
 from cfx.results.look import BAND, EDGE, INK, colour_of
 
 TIME_TITLE = "time from the start of the pair (s)"
@@ -510,3 +518,74 @@ def _errors_text(results: Results, pair_id: str, signal: str, unit: str) -> str:
             value = f"{error:.2f}" if np.isfinite(error) else "none"
             listed.append(f"{short_label(method)} {value}")
     return f"RMSE of {signal} ({unit}): {', '.join(listed)}"
+
+
+@dataclass(frozen=True)
+class RankedPair:
+    """A pair worth a look.
+
+    Attributes:
+        pair_id: which pair.
+        rank: "best", "median", "worst", "3 of 12"; "" where there is nothing to rank.
+        improvement: of the RMSE of speed over driver-specific calibration, a fraction; NaN where
+            it is not defined.
+    """
+
+    pair_id: str
+    rank: str
+    improvement: float
+
+    @property
+    def title(self) -> str:
+        """How a figure names it: "best pair, i80-11-1"."""
+        return f"{self.rank} pair, {self.pair_id}" if self.rank else f"pair {self.pair_id}"
+
+
+def rank_pairs(
+    pair_ids: Sequence[str], improvements: NDArray[np.floating], count: int = 3
+) -> tuple[RankedPair, ...]:
+    """Returns `count` pairs from the best to the worst improvement; of one the median.
+
+    Pairs whose improvement is not defined do not take part, unless no pair has a defined one: then
+    the first pairs come without a rank.
+
+    Args:
+        pair_ids: of P pairs.
+        improvements: `(P,)`, fractions.
+        count: at most so many.
+    """
+    values = np.asarray(improvements, dtype=np.float64)
+    order = np.argsort(-np.where(np.isfinite(values), values, -np.inf), kind="stable")
+    defined = int(np.isfinite(values).sum())
+    if not defined:
+        return tuple(RankedPair(str(pair), "", float("nan")) for pair in pair_ids[:count])
+    chosen = []
+    for place in evenly_spread(defined, count):
+        index = int(order[place])
+        rank = _rank(place, defined, count)
+        chosen.append(RankedPair(str(pair_ids[index]), rank, float(values[index])))
+    return tuple(chosen)
+
+
+def evenly_spread(available: int, count: int) -> list[int]:
+    """Returns up to `count` places from the first to the last of `available`; of one the middle."""
+    if count == 1 or available == 1:
+        return [available // 2]
+    wanted = min(count, available)
+    places = []
+    for k in range(wanted):
+        # The exact middle of an even number is the later one, as for a single place.
+        places.append((2 * k * (available - 1) + wanted - 1) // (2 * (wanted - 1)))
+    return places
+
+
+def _rank(place: int, available: int, count: int) -> str:
+    if available == 1:
+        return ""
+    if count == 1:
+        return "median"
+    if place == 0:
+        return "best"
+    if place == available - 1:
+        return "worst"
+    return "median" if count == 3 else f"{place + 1} of {available}"

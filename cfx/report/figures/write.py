@@ -20,8 +20,7 @@ from cfx.core import registry
 from cfx.core.errors import OutputError
 from cfx.core.files import atomic_write
 from cfx.report.figures.canvas import DPI, WIDTH, figure_style, hover_text
-from cfx.report.figures.figure import draw
-from cfx.report.figures.results import Results
+from cfx.report.figures.figure import Results, draw
 
 _METADATA: dict[str, dict[str, None]] = {
     "png": {"Software": None},

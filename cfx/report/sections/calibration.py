@@ -10,13 +10,19 @@ import numpy as np
 
 from cfx.calibration.flatness import NEAR
 from cfx.evaluation.result import Purpose
-from cfx.report.figures.calibration import AT_BOUND, ParameterSpread, parameter_spreads
-from cfx.report.figures.identifiability import SlicePanel, draw_labels, labels_of, slice_panels
+from cfx.report.figures.calibration import (
+    AT_BOUND,
+    ParameterSpread,
+    SlicePanel,
+    draw_labels,
+    labels_of,
+    parameter_spreads,
+    slice_panels,
+)
 from cfx.report.figures.text import number as shown
 from cfx.report.figures.text import short, unit_label
 from cfx.report.job import Job, Runs, of_purpose
-from cfx.report.section import Section, View
-from cfx.report.tables import Cell, Column, Sheet, formatted, job_names, number
+from cfx.report.section import Cell, Column, Section, Sheet, View, formatted, job_names, number
 
 
 class CalibrationSection(Section):

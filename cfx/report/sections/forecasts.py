@@ -14,8 +14,16 @@ from cfx.evaluation.forecasts import SCOPE, forecast_methods, metric_name
 from cfx.evaluation.metrics.base import key_of
 from cfx.report.figures.forecasts import sampled_name
 from cfx.report.job import Job, Runs
-from cfx.report.section import Section
-from cfx.report.tables import Cell, Column, Sheet, formatted, method_cell, methods_explained, number
+from cfx.report.section import (
+    Cell,
+    Column,
+    Section,
+    Sheet,
+    formatted,
+    method_cell,
+    methods_explained,
+    number,
+)
 
 _LEADERS = {
     "given": "The leader's future is given: the errors are the follower's alone.",

@@ -14,11 +14,10 @@ from importlib import resources
 from operator import itemgetter
 from typing import Any
 
+from cfx.core.job_folder import without_folders
 from cfx.report.figures.text import percent_or_undefined, plural
-from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs
-from cfx.report.section import Section
-from cfx.report.tables import Cell, Column, Sheet, number, text
+from cfx.report.section import Cell, Column, Section, Sheet, number, text
 
 
 class PaperSection(Section):

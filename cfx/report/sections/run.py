@@ -10,12 +10,11 @@ from typing import Any
 import pandas as pd
 import yaml
 
+from cfx.core.job_folder import without_folders
 from cfx.evaluation.result import Purpose
 from cfx.report.figures.text import NOTHING
-from cfx.report.files import without_folders
 from cfx.report.job import Job, Runs
-from cfx.report.section import Section
-from cfx.report.tables import Column, Sheet
+from cfx.report.section import Column, Section, Sheet
 
 _TOGETHER = {"platoon": " of whole platoons", "recording": " of whole recordings"}
 

@@ -11,11 +11,17 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from cfx.evaluation.metrics.base import RECORDED
-from cfx.report.figures.canvas import Line, canvas, draw_lines, mark_points, method_legend, styled
-from cfx.report.figures.figure import JobFigure
-from cfx.report.figures.results import Results
+from cfx.report.figures.canvas import (
+    Array,
+    Line,
+    canvas,
+    draw_lines,
+    mark_points,
+    method_legend,
+    styled,
+)
+from cfx.report.figures.figure import JobFigure, Results
 from cfx.report.figures.text import label
-from cfx.report.figures.values import Array
 from cfx.results.look import BAND, EDGE
 from cfx_traffic.summary import binned, mean_growth, ring_means, traffic_methods
 

@@ -11,8 +11,7 @@ import pandas as pd
 
 from cfx.evaluation.metrics.base import RECORDED, key_of
 from cfx.report.job import Job, Runs
-from cfx.report.section import Section
-from cfx.report.tables import Cell, Column, Sheet, method_cell, methods_explained, number
+from cfx.report.section import Cell, Column, Section, Sheet, method_cell, methods_explained, number
 from cfx_traffic.summary import traffic_methods
 
 _COLUMNS = (

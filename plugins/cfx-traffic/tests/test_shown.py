@@ -10,8 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cfx.report.figures.figure import draw, figure_named
-from cfx.report.figures.results import Results
+from cfx.report.figures.figure import Results, draw, figure_named
 from cfx.report.figures.text import MINUS, label
 from cfx.report.runs import read_runs
 from cfx_traffic.figures import draw_paths, draw_traffic, path_panels, traffic_panels

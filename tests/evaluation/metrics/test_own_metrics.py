@@ -11,7 +11,6 @@ import torch
 
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.evaluation.metrics.base import Trajectories
-from cfx.evaluation.metrics.comfort import Jerk
 from cfx.evaluation.metrics.errors import (
     FinalPositionError,
     MaeGap,
@@ -23,8 +22,14 @@ from cfx.evaluation.metrics.errors import (
     RmseSpeed,
     TheilU,
 )
-from cfx.evaluation.metrics.parameters import AtBounds
-from cfx.evaluation.metrics.safety import Collisions, HardBraking, HardBrakingShare, MinTtc
+from cfx.evaluation.metrics.safety import (
+    AtBounds,
+    Collisions,
+    HardBraking,
+    HardBrakingShare,
+    Jerk,
+    MinTtc,
+)
 
 SPACE = ParameterSpace.of(
     Parameter("t", "s", 0.0, 10.0, 1.0, "time"),

@@ -14,10 +14,10 @@ from rich.console import Console
 
 import cfx
 from cfx.app.job.console import methods_table
-from cfx.app.sweep.status import JobStatus
+from cfx.app.sweep.record import JobStatus
 from cfx.app.sweep.summary import metric_columns, rows, summary_table, write_summary
 from cfx.core.errors import PluginError
-from cfx.evaluation.metrics.installed import ALWAYS, MetricSet
+from cfx.evaluation.metrics.base import ALWAYS, MetricSet
 from tests.broken_plugins import QUICK
 from tests.conftest import Installer
 

@@ -28,7 +28,7 @@ from cfx.learners.base import TrainingData, TrainingResult
 from cfx.learners.rollout import RolloutLearner
 from cfx.models.krauss import Krauss
 from cfx.policies.base import Policy
-from cfx.policies.ensemble import Ensemble
+from cfx.policies.core import Ensemble
 from cfx.policies.features import History
 from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper

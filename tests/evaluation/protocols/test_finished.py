@@ -16,7 +16,7 @@ from cfx.contracts import check_contract
 from cfx.core.errors import CfxError, DataError
 from cfx.data.pairs import PairBatch
 from cfx.evaluation.closed_loop import Followers
-from cfx.evaluation.forecast_paths import Origins, simulate_from_origins
+from cfx.evaluation.forecasts import Origins, simulate_from_origins
 from cfx.evaluation.protocols.forecast import Forecast
 from cfx.policies import checkpoint
 from cfx.simulation.rollout import MemoryStepper

@@ -21,7 +21,7 @@ from cfx.learners.rollout import RolloutLearner
 from cfx.learners.rollout.module import RolloutModule
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
-from cfx.policies.ensemble import Ensemble
+from cfx.policies.core import Ensemble
 from cfx.policies.gru import GruPolicy
 from cfx.policies.lstm import LstmPolicy
 from cfx.simulation.rollout import MemoryStepper

@@ -10,7 +10,7 @@ import torch
 
 import cfx
 from cfx.app import cli
-from cfx.app.job.parts import Parts, complete, make_protocol
+from cfx.app.job.steps import Parts, complete, make_protocol
 from cfx.core.errors import DataError
 from cfx.policies import checkpoint, ready
 from cfx.policies.features import History

@@ -17,15 +17,14 @@ from cfx.core.errors import ConfigError, OutputError
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.evaluation.result import Evaluation, Purpose
 from cfx.learners.curves import over_networks
-from cfx.report.figures.errors import errors_over_time
-from cfx.report.figures.figure import draw, figure_named
-from cfx.report.figures.history import amounts_of
+from cfx.report.figures.figure import Results, draw, figure_named
+from cfx.report.figures.forecasts import errors_over_time
+from cfx.report.figures.improvements import amounts_of
 from cfx.report.figures.learning import SAMPLED
 from cfx.report.figures.platoon import braking_time, worst_platoon
-from cfx.report.figures.results import Results
 from cfx.report.figures.text import percent, pretty_unit, short, unit_label
 from cfx.report.figures.trajectories import drives
-from cfx.report.figures.write import write_figures
+from cfx.report.figures.write import write_figure, write_figures
 from cfx.results.look import COLOURS
 from tests.made_up import GAINS, MadeUp, make_history, make_platoon, make_results
 
@@ -372,13 +371,14 @@ def test_a_policy_that_does_not_adapt_has_no_figure_of_improvements() -> None:
 
 
 def test_figures_for_a_paper_are_vector_graphics_without_dates(tmp_path: Path) -> None:
-    results = make_results(pairs=2, frames=10)
-    every = all_of(results)
-    paths = write_figures(tmp_path / "a", every, formats=("pdf", "svg"))
-    again = write_figures(tmp_path / "b", every, formats=("pdf", "svg"))
-    assert {path.suffix for path in paths} == {".pdf", ".svg"}
-    by_name = {path.name: path.read_bytes() for path in paths}
-    assert {path.name: path.read_bytes() for path in again} == by_name
-    assert by_name["speeds.pdf"].startswith(b"%PDF-")
-    assert b"<svg" in by_name["speeds.svg"]
-    assert b"TrueType" in by_name["speeds.pdf"] or b"CIDFontType2" in by_name["speeds.pdf"]
+    every = all_of(make_results(pairs=2, frames=10))
+    written = []
+    for folder in (tmp_path / "a", tmp_path / "b"):
+        paths = write_figures(folder, every, formats=("svg",))
+        paths.append(write_figure(drawn("speeds", every), folder / "speeds.pdf"))
+        written.append({path.name: path.read_bytes() for path in paths})
+    first, again = written
+    assert again == first
+    assert b"<svg" in first["speeds.svg"]
+    assert first["speeds.pdf"].startswith(b"%PDF-")
+    assert b"TrueType" in first["speeds.pdf"] or b"CIDFontType2" in first["speeds.pdf"]

@@ -13,8 +13,7 @@ from matplotlib import pyplot as plt
 
 from cfx.core import registry
 from cfx.report.figures.canvas import canvas, hover
-from cfx.report.figures.figure import JobFigure, draw
-from cfx.report.figures.results import Results
+from cfx.report.figures.figure import JobFigure, Results, draw
 from cfx.report.figures.write import PLACE, inline_svg, write_figure, write_figures
 from cfx.report.page import render
 from cfx.report.runs import read_runs

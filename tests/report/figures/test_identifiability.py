@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cfx.report.figures.identifiability import (
+from cfx.report.figures.calibration import (
     draw_fits,
     draw_labels,
     draw_slices,
@@ -16,7 +16,7 @@ from cfx.report.figures.identifiability import (
     labels_of,
     slice_panels,
 )
-from cfx.report.figures.results import ParameterAxis
+from cfx.report.figures.figure import ParameterAxis
 from cfx.report.page import render
 from cfx.report.runs import read_runs
 from cfx.report.sections import calibration

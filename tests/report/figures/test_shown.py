@@ -15,18 +15,19 @@ from cfx.evaluation.forecasts import errors_by_history, forecast_methods, summar
 from cfx.evaluation.result import Evaluation
 from cfx.learners.curves import over_networks
 from cfx.report.figures.calibration import correlations, draw_calibration, parameter_spreads
-from cfx.report.figures.errors import draw_errors, errors_over_time
+from cfx.report.figures.figure import Results, parameter_axes
 from cfx.report.figures.forecasts import (
     draw_by_history,
     draw_by_horizon,
     draw_distributions,
+    draw_errors,
+    errors_over_time,
     pit_density,
 )
 from cfx.report.figures.improvements import draw_improvements, improvement_bars
 from cfx.report.figures.jobs import draw_every_pair
 from cfx.report.figures.learning import draw_learning, loss_quartiles
 from cfx.report.figures.platoon import braking_time, draw_platoons, worst_platoon
-from cfx.report.figures.results import Results, parameter_axes
 from cfx.report.figures.trajectories import (
     PairPanels,
     draw_pair,
@@ -34,10 +35,10 @@ from cfx.report.figures.trajectories import (
     draw_parameters,
     drives,
     pair_panels,
+    rank_pairs,
 )
-from cfx.report.figures.values import rank_pairs
 from cfx.report.runs import read_runs
-from cfx.report.sections.trajectories import chosen_pairs
+from cfx.report.sections.figures import chosen_pairs
 from cfx.results.look import colour_of
 from tests.made_up import (
     make_distributions,

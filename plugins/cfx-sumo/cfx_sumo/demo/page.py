@@ -12,9 +12,9 @@ import numpy as np
 from cfx.core.files import atomic_write
 from cfx.evaluation.result import Evaluation
 from cfx.policies.agent import Agent
-from cfx.report.figures.results import Results
+from cfx.report.figures.figure import Results
 from cfx.report.figures.text import label
-from cfx.report.scripts import embedded_json, inline_scripts, security_policy
+from cfx.report.page import embedded_json, inline_scripts, security_policy
 from cfx.results.look import COLOURS
 from cfx_sumo.demo.motorway import Motorway
 from cfx_sumo.demo.replay import CAR_LENGTH, FOLLOWERS

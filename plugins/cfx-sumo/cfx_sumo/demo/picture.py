@@ -13,7 +13,7 @@ from matplotlib.transforms import Affine2D
 
 from cfx.evaluation.result import Evaluation
 from cfx.report.figures.canvas import canvas, styled
-from cfx.report.figures.results import Results
+from cfx.report.figures.figure import Results
 from cfx.report.figures.text import label, short
 from cfx.report.figures.trajectories import drives
 from cfx.report.figures.write import write_figure

@@ -33,11 +33,10 @@ from cfx.policies.base import ConstantNetwork
 from cfx.policies.checkpoint import load as load_checkpoint
 from cfx.policies.context import DriverContext
 from cfx.policies.core import AgentCore
-from cfx.policies.features import History
+from cfx.policies.features import History, Scaler
 from cfx.policies.fixed import FixedPolicy
 from cfx.policies.heads.direct import DirectHead
 from cfx.policies.placement import ALL
-from cfx.policies.scaler import Scaler
 from cfx.policies.valid_range import share_in_words
 from cfx.results.store import folder_of
 from cfx.simulation.step import advance_vehicle
