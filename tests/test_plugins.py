@@ -404,7 +404,9 @@ GENERATED = [
 @pytest.mark.parametrize("kind", GENERATED)
 def test_a_new_package_installs_and_its_tests_pass(kind: str, tmp_path: Path, capsys) -> None:
     folder = create(kind, f"novel_{kind}", tmp_path / "package")
-    assert f"python -m cfx plugins check {kind} novel_{kind}" in capsys.readouterr().out
+    advice = capsys.readouterr().out
+    assert f"python -m cfx plugins check {kind} novel_{kind}" in advice
+    assert f"pip install --editable '{folder}[test]'" in advice, "with pytest"
     environment = installed(folder, tmp_path / "site")
     tests = run(
         [
@@ -586,3 +588,17 @@ def test_a_name_of_cfxs_own_always_means_cfxs_own(
         match=r"two distributions bring a model 'twin': twin-one 1\.0 .* and twin-two 2\.0",
     ):
         registry.get("model", "twin")
+
+
+def test_a_preset_that_no_longer_fits_its_model_is_named(
+    install: Installer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    preset = "defaults: [_mine, _self_]\nparameters: {gone: {default: 1.0}}\n"
+    files = {"preset_plugin/__init__.py": MODEL, "preset_plugin/conf/model/brisk.yaml": preset}
+    install("cfx-preset", {"cfx.models": {"mine": "preset_plugin:Mine"}}, files)
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["model=brisk", "debug=quick", "tracking.enabled=false"]) == 2
+    said = capsys.readouterr().err
+    assert "model.parameters.gone: the model has no such parameter" in said
+    assert "It is set in " in said
+    assert "brisk.yaml" in said

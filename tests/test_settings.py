@@ -14,7 +14,7 @@ from cfx.results.config import JobConfig
 ROOT = Path(__file__).resolve().parent.parent
 
 READ_OTHERWISE = {
-    "preset": "reports read it in a job's config.yaml, by its key",
+    "failed_value": "Hydra's sweepers are told of it, before there is a JobConfig",
 }
 """Settings that no code reads as an attribute, with the reason."""
 

@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 from filelock import FileLock
+from hydra.core.plugins import Plugins
 
 from cfx.app import application, sweep
 from cfx.app.sweep import SweepFolder
@@ -546,3 +547,49 @@ def statuses(folder: Path) -> list[str]:
     }
     assert json.loads((folder / sweep.RECORD).read_text())["completed"]
     return [one.info.status for one in children]
+
+
+SEARCH = """
+    from hydra.core.plugins import Plugins
+    from hydra.plugins.sweeper import Sweeper
+    from cfx.core.errors import CfxError
+
+    class Search(Sweeper):
+        told = []
+
+        def __init__(self, **_):
+            pass
+
+        def setup(self, **given):
+            self.launcher = Plugins.instance().instantiate_launcher(**given)
+
+        def sweep(self, arguments):
+            jobs = [(*arguments, f"seed={seed}") for seed in range(3)]
+            for returned in self.launcher.launch(jobs, initial_job_idx=0):
+                try:
+                    self.told.append(returned.return_value)
+                except CfxError as error:
+                    self.told.append(str(error))
+"""
+"""Runs jobs of three seeds, and keeps what each tells: an error, as sweepers that optimise do."""
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [([], "job 1 failed: drive 1 is broken"), (["failed_value=inf"], float("inf"))],
+)
+def test_a_sweeper_that_optimises_is_told_of_a_failed_job(
+    run: Run, install, given: list[str], told: float | str
+) -> None:
+    install("search-stub", {}, {"hydra_plugins/search_stub.py": SEARCH})
+    search = import_module("hydra_plugins.search_stub").Search
+    Plugins.instance().register(search)
+    Path("fail-1").touch()
+    sweeper = "hydra.sweeper._target_=hydra_plugins.search_stub.Search"
+    assert run("-m", sweeper, *given) == 2, "the summary counts the failed job"
+    assert search.told == [0.25, told, 2.25]
+
+
+def test_a_failed_value_is_a_number(run: Run, capsys) -> None:
+    assert run("failed_value=nan") == 2
+    assert "failed_value" in capsys.readouterr().err

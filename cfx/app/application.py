@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import re
 import sys
 import time
 import traceback
@@ -41,7 +42,14 @@ from cfx.app.sweep import (
 )
 from cfx.app.user_errors import explain, is_user_error
 from cfx.core import registry
-from cfx.core.errors import CfxError, ConfigError, Terminated, printable, without_passwords
+from cfx.core.errors import (
+    CfxError,
+    ConfigError,
+    JobFailedError,
+    Terminated,
+    printable,
+    without_passwords,
+)
 from cfx.core.guest import guest, visit
 from cfx.core.memory import is_out_of_memory
 from cfx.core.plugin_errors import blame
@@ -84,6 +92,9 @@ class JobFunction:
 
         Returns:
             The policy's RMSE of speed, m/s, for sweepers that optimise; NaN if the job failed.
+
+        Raises:
+            JobFailedError: it failed, and the sweeper optimises: it counts failures.
         """
         raise_if_terminated()
         hydra_config = HydraConfig.get()
@@ -118,6 +129,7 @@ class JobFunction:
             overrides = " ".join(blank.overrides)
             detail = _below(self.status.detail)
             log.error(text, blank.number, overrides, self.status.message, detail)
+            return _value_of_failed(config, hydra_config.sweeper, self.status)
         return metric
 
     def _attempt(
@@ -130,8 +142,9 @@ class JobFunction:
             sweep: the multirun's name, "" for a single job.
         """
         began = time.monotonic()
+        values: Any = {}
         try:
-            values: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+            values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
             if sweep:
                 if values.get("tracking", {}).get("sweep", "") is None:
                     values["tracking"]["sweep"] = sweep
@@ -146,6 +159,8 @@ class JobFunction:
                 result = (self.run_job or _own_job())(_job_config(values), folder)
         except (Exception, SystemExit) as error:
             status = self._failed(error, blank)
+            if status.code == CfxError.exit_code:
+                status = replace(status, message=status.message + _preset_behind(status, values))
             return float("nan"), replace(status, seconds=time.monotonic() - began)
         return _metric(result.metrics), replace(blank, seconds=time.monotonic() - began)
 
@@ -370,6 +385,36 @@ def _metric(metrics: Mapping[str, float]) -> float:
     from cfx.evaluation.headline import main_error
 
     return main_error(metrics)
+
+
+def _preset_behind(status: JobStatus, values: Mapping[str, Any]) -> str:
+    """Returns, to go after a message about a key, the preset that set it; "" if none did."""
+    key = re.match(r"\w+(\.\w+)+", status.message)
+    if key is None:
+        return ""
+    for override in status.overrides:
+        if override.lstrip("+").startswith(f"{key[0]}="):
+            return ""
+    choices = HydraConfig.get().runtime.choices
+    path = hydra_source.preset_behind(key[0], choices, values)
+    if path is None:
+        return ""
+    return f" It is set in {path}."
+
+
+def _value_of_failed(config: DictConfig, sweeper: DictConfig, status: JobStatus) -> float:
+    """Returns what Hydra's sweeper is told of a job that failed: `failed_value`, or NaN.
+
+    Raises:
+        JobFailedError: nothing else is to be said, and the sweeper optimises. NaN would end such a
+            sweep; what a job raises is counted by `hydra.sweeper.max_failure_rate`.
+    """
+    value = config.get("failed_value")
+    if isinstance(value, int | float):
+        return float(value)
+    if "BasicSweeper" in str(sweeper.get("_target_")):
+        return float("nan")
+    raise JobFailedError(f"job {status.number} failed: {status.message}")
 
 
 def _report(error: BaseException | None, overrides: Sequence[str], show_traceback: bool) -> int:

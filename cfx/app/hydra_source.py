@@ -15,7 +15,7 @@ from __future__ import annotations
 import importlib.util
 import logging
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -140,6 +140,25 @@ def plugin_conf_dirs() -> dict[str, Path]:
             if folder.is_dir():
                 found.setdefault(package, folder)
     return found
+
+
+def preset_behind(key: str, choices: Mapping[str, str], values: Mapping[str, Any]) -> Path | None:
+    """Returns the file of the preset that may have set a key; None if no preset was chosen there.
+
+    Args:
+        key: such as "model.parameters.T".
+        choices: the option that was chosen of each group.
+        values: the job's configuration.
+    """
+    group = key.partition(".")[0]
+    choice, node = choices.get(group), values.get(group)
+    if not isinstance(choice, str) or not isinstance(node, Mapping) or node.get("name") == choice:
+        return None
+    for folder in (nodes.conf_dir(), *plugin_conf_dirs().values()):
+        path = Path(folder) / group / f"{choice}.yaml"
+        if path.is_file():
+            return path
+    return None
 
 
 def register() -> None:

@@ -38,9 +38,13 @@ class ConsoleHandler(logging.Handler):
 
 
 @contextlib.contextmanager
-def console_logging() -> Iterator[None]:
-    """Prints cfx's own messages while a sub-command runs; jobs have their logging from Hydra."""
-    logger = logging.getLogger("cfx")
+def console_logging(name: str = "cfx") -> Iterator[None]:
+    """Prints cfx's own messages while a sub-command runs; jobs have their logging from Hydra.
+
+    Args:
+        name: of the package or module whose messages are printed.
+    """
+    logger = logging.getLogger(name)
     handler = ConsoleHandler()
     level = logger.level
     logger.addHandler(handler)

@@ -71,6 +71,10 @@ class NotInstalledError(CfxError):
     """A package that nothing else needs is not installed; says what installs it."""
 
 
+class JobFailedError(CfxError):
+    """A job of a multirun failed; its folder says why."""
+
+
 class EngineError(CfxError):
     """The workers of an engine cannot be reached, or were lost for good."""
 

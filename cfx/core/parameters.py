@@ -173,7 +173,10 @@ class ParameterSpace:
             if name in self._by_name:
                 continue
             if not self.open:
-                self[name]  # raises, and says which there are
+                raise ParameterError(
+                    f"model.parameters.{name}: the model has no such parameter."
+                    f"{nearest(name, self._by_name)} Known: {', '.join(self._by_name)}."
+                )
             merged.append(_added(name, given))
         space = ParameterSpace(tuple(merged))
         if not space.parameters:

@@ -165,12 +165,14 @@ class Contents(NamedTuple):
         rows: of the file.
         vehicles: how many there are, over all recordings.
         problem: a sentence on what a user should know before they use it; "" if there is none.
+        has_gaps: the file gives gaps, which do not depend on vehicles' lengths.
     """
 
     pairs: PairSet
     rows: int
     vehicles: int
     problem: str = ""
+    has_gaps: bool = False
 
 
 class Dataset(Component):

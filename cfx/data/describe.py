@@ -328,7 +328,7 @@ def _counts(counts: Sequence[Dropped]) -> list[str]:
 
 def _problems(contents: Contents, dataset: Dataset) -> list[str]:
     """Returns what a recording may hold but rarely should."""
-    found = list(_suspicions(contents.pairs, dataset.units()))
+    found = list(_suspicions(contents, dataset.units()))
     if contents.problem:
         found.append(contents.problem)
     if not found:
@@ -336,8 +336,9 @@ def _problems(contents: Contents, dataset: Dataset) -> list[str]:
     return ["Problems:", *(f"  {sentence}" for sentence in found)]
 
 
-def _suspicions(pairs: PairSet, units: Mapping[str, str] | None) -> Iterator[str]:
+def _suspicions(contents: Contents, units: Mapping[str, str] | None) -> Iterator[str]:
     """Yields a sentence for each kind of values that a recording rarely holds."""
+    pairs = contents.pairs
     if not len(pairs):
         yield "there is no leader-follower pair in it"
         return
@@ -350,11 +351,10 @@ def _suspicions(pairs: PairSet, units: Mapping[str, str] | None) -> Iterator[str
     if length > 11:
         yield f"leaders are typically {length:.1f} m long: feet, or lorries only?"
     without = sum(pair.leader_length == 0 for pair in pairs)
-    if without:
+    if without and not contents.has_gaps:
         yield (
             f"{without} pairs have leaders of length 0: their gaps are bumper to bumper if"
-            " a column gap_m was given or leader positions are those of rear bumpers, and too long"
-            " by a vehicle if not"
+            " leader positions are those of rear bumpers, and too long by a vehicle if not"
         )
     words = in_words(pairs, units)
     if words:

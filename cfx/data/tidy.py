@@ -44,13 +44,14 @@ from cfx.core import scratch
 from cfx.core.component import Settings
 from cfx.core.errors import OutputError, listed
 from cfx.core.files import atomic_write
-from cfx.data.base import Dataset, FileDatasetSettings, joined
+from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
 from cfx.data.files import (
     PARQUET,
     FileStart,
     Floats,
     Ints,
     are_partitions,
+    beginning,
     of_recording,
     partitions,
     recording_of,
@@ -166,13 +167,21 @@ class TidyDataset(Dataset):
             return True  # a damaged one: the reader says so
         return len(known & set(start.columns)) >= 3
 
-    def read(self) -> PairSet:
+    def contents(self) -> Contents:
+        own = self.settings.columns.gap or GAP
+        has_gaps = all(own in beginning(file).columns for file in self._files())
+        return super().contents()._replace(has_gaps=has_gaps)
+
+    def _files(self) -> list[Path]:
+        """Returns the files that are read: of a folder, those of the recording that is chosen."""
         files: list[Path] = []
         for path in self.settings.files():
             files += partitions(path)
-        files = of_recording(files, self.settings.recording)
+        return of_recording(files, self.settings.recording)
+
+    def read(self) -> PairSet:
         layout = self.settings.own_layout()
-        return joined(read_tidy(file, layout) for file in files)
+        return joined(read_tidy(file, layout) for file in self._files())
 
     def units(self) -> Mapping[str, str]:
         return written_units(self.settings.columns, self.settings.units)

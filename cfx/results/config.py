@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator
 
@@ -140,6 +140,11 @@ class JobConfig(Settings):
     cache: CacheSettings = Field(CacheSettings(), description="cache of calibrations")
     output: OutputSettings = Field(OutputSettings(), description="where results go")
     tracking: TrackingSettings = Field(TrackingSettings(), description="MLflow")
+    failed_value: Annotated[float, Field(ge=float("-inf"), allow_inf_nan=True)] | None = Field(
+        None,
+        description="what a sweeper that optimises is told if this job fails, such as inf; null:"
+        " that it failed",
+    )
     figures: FigureSettings = Field(FigureSettings(), description="figures")
     demo: Node | None = Field(None, description="the demonstration's node; null: there is none")
 

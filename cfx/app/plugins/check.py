@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from cfx.app import nodes
 from cfx.core import registry
 from cfx.core.component import API_VERSION
-from cfx.core.console import blank_table, put
+from cfx.core.console import blank_table, console_logging, put
 from cfx.core.errors import CfxError, ConfigError, NotInstalledError
 from cfx.core.progress import Task
 
@@ -51,7 +51,8 @@ def check(kind: str | None = None, name: str | None = None) -> int:
         )
     chosen = _chosen(kind, name)
     verdicts = []
-    with Task("Checking components", len(chosen)) as task:
+    # Of what the components say while they are tried, nothing is printed.
+    with console_logging(Task.__module__), Task("Checking components", len(chosen)) as task:
         for entry in chosen:
             verdicts.append(examine(entry))
             task.advance()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.util
 import keyword
 import re
+import shlex
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -139,10 +140,12 @@ def _next_steps(kind: registry.Kind, name: str, target: Path) -> str:
         job += " data.path=FILE.csv"
     if kind.name == "metric":
         job = "  # every job measures it"
+    folder = shlex.quote(str(target))
+    package = shlex.quote(f"{target}[test]")
     return (
         f"Wrote {target}, a package with the {kind.name} '{name}'. Next:\n"
-        f"  pip install --editable {target}\n"
-        f"  python -m pytest {target}\n"
+        f"  pip install --editable {package}\n"
+        f"  python -m pytest {folder}\n"
         f"  python -m cfx plugins check {kind.name} {name}\n"
         f"  python -m cfx {job}"
     )
