@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -19,7 +20,8 @@ from cfx.report.figures.jobs import ClusterGroup, draw_clusters, draw_every_pair
 from cfx.report.figures.text import explained, label, short_label
 from cfx.report.job import Job, Runs, any_baselines, of_purpose
 from cfx.report.names import SEPARATOR, differences
-from cfx.report.section import Cell, Column, Section, Sheet, View, formatted, interval, number
+from cfx.report.section import Cell, Column, Section, Sheet, View, formatted, number
+from cfx.report.sections.results import STATISTICS
 
 _STATISTICS = ("mean", "ci95_low", "ci95_high")
 
@@ -228,21 +230,10 @@ def clusters(series: Series, baseline: str) -> Sheet:
             lambda row: number(row.found.pairs, "d"),
             "Pairs of drivers of this cluster whose improvement is defined.",
         ),
-        Column(
-            "Mean",
-            lambda row: number(row.found.mean, "+.1%"),
-            f"Improvement over {explained(baseline)}.",
-        ),
-        Column(
-            "95 % interval",
-            lambda row: interval(row.found.ci95_low, row.found.ci95_high),
-            "Of the mean, as above.",
-        ),
-        Column("Trimmed mean", lambda row: number(row.found.trimmed_mean, "+.1%"), "As above."),
-        Column("Median", lambda row: number(row.found.median, "+.1%"), "As above."),
-        Column("Better for", lambda row: number(row.found.win_rate, ".0%"), "As above."),
     )
-    return Sheet.of(columns, rows)
+    shared = [replace(column, meaning="As above.") for column in STATISTICS[:5]]
+    shared[0] = replace(shared[0], meaning=f"Improvement over {explained(baseline)}.")
+    return Sheet.of([*columns, *shared], rows)
 
 
 def statistics(table: pd.DataFrame, baseline: str) -> Improvement:

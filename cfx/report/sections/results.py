@@ -172,7 +172,7 @@ def improvements(jobs: Sequence[Job]) -> Sheet:
             " frame on, of unseen drivers."
         )
         columns.append(Column("Frames", _frames, frames))
-    return Sheet.of([*columns, *_STATISTICS], rows)
+    return Sheet.of([*columns, *STATISTICS], rows)
 
 
 def _frames(row: _Compared) -> str:
@@ -180,13 +180,13 @@ def _frames(row: _Compared) -> str:
     return said.replace(" ", "\N{NO-BREAK SPACE}")
 
 
-def _p_value(row: _Compared) -> Cell:
+def _p_value(row: Any) -> Cell:
     value = row.found.p_value
     cell = number(value, ".2g")
     return replace(cell, text="< 0.0001") if value < 1e-4 else cell
 
 
-_STATISTICS: tuple[Column[_Compared], ...] = (
+STATISTICS: tuple[Column[Any], ...] = (
     Column(
         "Mean",
         lambda row: number(row.found.mean, "+.1%"),
@@ -227,6 +227,7 @@ _STATISTICS: tuple[Column[_Compared], ...] = (
         "Pairs that count. One does not if the baseline has no error or a simulation diverges.",
     ),
 )
+"""Of rows with an `Improvement`, `found`."""
 
 
 class SafetySection(Section):
