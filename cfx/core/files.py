@@ -65,12 +65,12 @@ def atomic_write(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
-def write_output(path: Path, text: str, what: str) -> None:
-    """Writes a text where the user's `--output` names it, whole; makes its folders.
+def write_output(path: Path, content: str | bytes, what: str) -> None:
+    """Writes a file where the user's `--output` names it, whole; makes its folders.
 
     Args:
-        path: the file; what was there is replaced once the new text is complete.
-        text: of the file.
+        path: the file; what was there is replaced once the new content is complete.
+        content: of the file; a text is written in UTF-8.
         what: it is, for the error: "the report".
 
     Raises:
@@ -81,7 +81,7 @@ def write_output(path: Path, text: str, what: str) -> None:
         if path.is_dir():
             raise IsADirectoryError(None, "it is a folder", str(path))
         with atomic_write(path) as partial:
-            partial.write_text(text, encoding="utf-8")
+            partial.write_bytes(content.encode() if isinstance(content, str) else content)
     except OSError as error:
         raise OutputError(
             f"{path}: {what} cannot be written ({error.strerror or error}); name another --output"

@@ -81,6 +81,8 @@ class Kind:
         """Returns what a user writes to ask for a component."""
         if self.name == "command":
             return f"cfx {component}"
+        if self.name == "export":
+            return f"cfx export --to {component}"
         return f"{self.group}={component}"
 
 
@@ -116,6 +118,7 @@ PARTS: dict[str, Kind] = {
         Kind("figure", "cfx.report.figures.figure:JobFigure", chosen=False),
         Kind("section", "cfx.report.section:Section", chosen=False),
         Kind("head", "cfx.policies.heads.base:ParameterHead", group="learner.head", chosen=False),
+        Kind("export", "cfx.core.export:ExportFormat", chosen=False),
     )
 }
 """Kinds of classes that come in the same way, are no components to configure, and have no suite."""

@@ -1,4 +1,4 @@
-"""The sub-commands `cfx drive` and `cfx export`; what they need is imported when they run."""
+"""The sub-command `cfx drive`; what it needs is imported when it runs."""
 
 from __future__ import annotations
 
@@ -81,41 +81,6 @@ class DriveCommand(Command):
 
     def run(self, options: argparse.Namespace) -> int:
         _drive(options)
-        return 0
-
-
-class ExportCommand(Command):
-    """Writes a job's fixed parameters for another program."""
-
-    summary = "a job's fixed parameters as SUMO's vehicle types"
-
-    def parser(self) -> argparse.ArgumentParser:
-        parser = argparse.ArgumentParser(
-            "cfx export", description="Writes a job's fixed parameters for another program."
-        )
-        parser.add_argument(
-            "run",
-            metavar="RUN",
-            help="output folder of a job, its URL (output.url), or id of its MLflow run",
-        )
-        parser.add_argument(
-            "--to",
-            choices=["sumo"],
-            required=True,
-            help="sumo: a vType distribution for each cluster (.add.xml)",
-        )
-        parser.add_argument(
-            "--output",
-            metavar="FILE",
-            help="default: drivers.add.xml in the job's folder; for a URL or an MLflow run: here",
-        )
-        return parser
-
-    def run(self, options: argparse.Namespace) -> int:
-        from cfx_sumo.export import export
-
-        for line in export(options.run, options.output):
-            print(line)
         return 0
 
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from cfx import DrivingModel
 from cfx.calibration.flatness import COLUMN
 from cfx.core.errors import ConfigError, DataError, listed
+from cfx.core.export import ExportFormat
 from cfx.core.files import write_output
 from cfx.core.job_folder import examine, parse_json, parse_yaml
 from cfx.core.registry import create
@@ -30,6 +31,13 @@ ALL_DRIVERS = "drivers"
 
 _WITHOUT_LAG = {"variant": "sumo", "leader_deceleration": None}
 """Settings with which krauss is SUMO's KraussOrig1, once its t_i is 0."""
+
+
+class VTypeExport(ExportFormat):
+    """Writes a job's fixed parameters as vTypes that SUMO loads: see `export`."""
+
+    def write(self, run: str, output: Path | None) -> list[str]:
+        return export(run, output)
 
 
 def export(run: str | Path, output: str | Path | None = None) -> list[str]:

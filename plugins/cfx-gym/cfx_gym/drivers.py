@@ -1,0 +1,29 @@
+"""What drives: the policy of a job, as one step of drivers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cfx.policies.agent import Agent
+from cfx.policies.checkpoint import load
+from cfx.policies.driver_step import DriverStep
+from cfx.results.store import folder_of
+
+
+def driver_step(driver: str | Path | Agent) -> DriverStep:
+    """Returns the step of a driver.
+
+    Args:
+        driver: a job's folder, its URL, the id of its MLflow run, a ready-made policy
+            (`cfx://NAME`), or an agent.
+
+    Raises:
+        DataError: there is no policy, or none for unseen drivers.
+        ConfigError: its driving model has equations in a simulator only.
+    """
+    if isinstance(driver, Agent):
+        return DriverStep(driver)
+    folder = folder_of(driver)
+    if not (folder / "policy.json").is_file():
+        folder = folder / "policy"
+    return DriverStep(load(folder))

@@ -1,0 +1,1 @@
+"""cfx's drivers as ONNX files: `cfx export --to onnx`."""

@@ -1,0 +1,173 @@
+"""One step of drivers as an ONNX graph, whose tensors have names, meanings and units."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import onnx
+import torch
+from torch import Tensor, nn
+
+import cfx
+from cfx.core.errors import ConfigError
+from cfx.policies.driver_step import DriverState, DriverStep, Motion
+
+OPSET = 20
+
+SIGNALS = {
+    "ego_speed": ("m/s", "speed of the vehicle"),
+    "ego_acceleration": ("m/s2", "its acceleration over the last step, (v(t) - v(t - dt)) / dt"),
+    "leader_speed": ("m/s", "speed of the vehicle ahead"),
+    "leader_acceleration": ("m/s2", "acceleration of the vehicle ahead"),
+    "gap": ("m", "to the vehicle ahead, bumper to bumper"),
+}
+NOISE = ("1", "standard normal, new in each step; a driver whose window begins draws of it")
+STATE = {
+    "steps": ("1", "steps since the driver began"),
+    "history": ("m/s, m/s2, m", "the signals at the last frames, the leader's first, then the gap"),
+    "parameters": ("as cfx.parameters says", "parameters that hold in this window"),
+    "memory": ("SI", "what the driving model remembers"),
+    "network": ("1", "what the network remembers"),
+    "latent": ("1", "random numbers that a driver keeps from window to window"),
+    "score": ("1", "how far outside what was learned the window began; up to 1 is inside"),
+}
+NEXT_SPEED = ("m/s", "speed one time step later")
+
+
+class _Step(nn.Module):
+    """The step with flat inputs and outputs; what is empty is left out."""
+
+    def __init__(self, step: DriverStep) -> None:
+        super().__init__()
+        self.step = step
+        self.network = step.agent.network  # so that its weights are the graph's
+        self.kept = kept_of(step)
+
+    def forward(self, signals: tuple[Tensor, ...], more: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        speed, acceleration, leader_speed, leader_acceleration, gap = signals
+        given = dict(zip(self.kept, more, strict=False))
+        columns = []
+        for name in DriverState._fields:
+            columns.append(given.get(name, gap.new_zeros((gap.shape[0], 0))))
+        noise = more[-1] if self.step.noise_width else None
+        after_speed, after = self.step.unbranched(
+            DriverState(*columns),
+            Motion(speed, acceleration),
+            Motion(leader_speed, leader_acceleration),
+            gap,
+            noise,
+        )
+        remembered = after._asdict()
+        return after_speed, *(remembered[name].clone() for name in self.kept)
+
+
+def kept_of(step: DriverStep) -> list[str]:
+    """Returns the names of what drivers of this policy remember: the state that is not empty."""
+    kept = []
+    for name, value in step.begin(1)._asdict().items():
+        if value.numel():
+            kept.append(name)
+    return kept
+
+
+def graph_of(step: DriverStep, run: str) -> onnx.ModelProto:
+    """Returns the graph of a step, for any number of drivers.
+
+    Args:
+        step: of the drivers.
+        run: where the policy comes from, for the graph's metadata.
+
+    Raises:
+        ConfigError: the policy computes with what ONNX does not have.
+    """
+    kept = kept_of(step)
+    signals, more = _example(step, kept)
+    inputs = [*SIGNALS, *kept]
+    if step.noise_width:
+        inputs.append("noise")
+    drivers = {0: torch.export.Dim("drivers")}
+    try:
+        with _quiet():
+            program = torch.onnx.export(
+                _Step(step),
+                (signals, more),
+                dynamo=True,
+                opset_version=OPSET,
+                input_names=inputs,
+                output_names=["next_speed", *(f"next_{name}" for name in kept)],
+                dynamic_shapes=((drivers,) * len(signals), (drivers,) * len(more)),
+                optimize=False,  # its optimizer loses bounds of clamps; runtimes have their own
+                verbose=False,
+            )
+    except Exception as error:  # whatever stops a trace
+        raise ConfigError(
+            f"{run}: policy={step.agent.policy_node['name']} cannot be written as ONNX"
+            f" ({type(error).__name__}); export a policy with a network, such as gru or lstm"
+        ) from error
+    assert program is not None
+    model = program.model_proto
+    _strip(model)
+    _describe(model, step, run)
+    onnx.checker.check_model(model)
+    return model
+
+
+def _example(step: DriverStep, kept: list[str]) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+    """Returns inputs of three drivers with which the step is traced, each a tensor of its own."""
+    signals = []
+    for number, _ in enumerate(SIGNALS):
+        signals.append(torch.full((3,), 1.0 + number, dtype=torch.float64))
+    more = [value for name, value in step.begin(3)._asdict().items() if name in kept]
+    if step.noise_width:
+        more.append(torch.zeros((3, step.noise_width), dtype=torch.float64))
+    return tuple(signals), tuple(more)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps back what the exporter says of itself and of libraries that are not there."""
+    exporter = logging.getLogger("torch.onnx")
+    level = exporter.level
+    exporter.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        exporter.setLevel(level)
+
+
+def _strip(model: onnx.ModelProto) -> None:
+    """Takes out what the exporter notes of each node, such as lines of source code."""
+    graph = model.graph
+    del model.metadata_props[:], graph.metadata_props[:], graph.value_info[:]
+    for part in (*graph.node, *graph.input, *graph.output, *graph.initializer):
+        del part.metadata_props[:]
+        part.doc_string = ""
+    for function in model.functions:
+        for node in function.node:
+            del node.metadata_props[:]
+            node.doc_string = ""
+
+
+def _describe(model: onnx.ModelProto, step: DriverStep, run: str) -> None:
+    """Writes meanings and units into the graph, and what it is into its metadata."""
+    known = {**SIGNALS, "noise": NOISE, **STATE, "next_speed": NEXT_SPEED}
+    about = {
+        "cfx.version": cfx.__version__,
+        "cfx.policy": run,
+        "cfx.model": str(step.agent.model_node["name"]),
+        "cfx.dt": f"{step.dt:g} s",
+        "cfx.parameters": ", ".join(f"{one.name} [{one.unit}]" for one in step.agent.space.tuned),
+    }
+    for tensor in (*model.graph.input, *model.graph.output):
+        name = tensor.name
+        unit, meaning = known[name if name in known else name.removeprefix("next_")]
+        tensor.doc_string = f"{meaning} [{unit}]"
+        about[f"unit.{name}"] = unit
+    onnx.helper.set_model_props(model, about)
+    model.doc_string = f"One step of {step.dt:g} s of drivers that cfx trained: {run}"
+    model.producer_name, model.producer_version = "cfx", cfx.__version__
