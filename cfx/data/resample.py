@@ -12,6 +12,10 @@ _ROUNDING = 1e-6
 """Share of a step by which a recording may end before a frame of the new step and still have it."""
 
 
+COARSE_S = 0.15
+"""Time step above which calibrated parameters are biased noticeably (docs/readers.md)."""
+
+
 def resampled(pairs: PairSet, step: float) -> PairSet:
     """Returns the same trajectories in frames `step` seconds apart.
 

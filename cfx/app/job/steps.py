@@ -29,6 +29,7 @@ from cfx.core.storage import is_url
 from cfx.core.threads import limit_cores, set_threads
 from cfx.data.base import Dataset
 from cfx.data.pairs import PairBatch, PairSet
+from cfx.data.resample import COARSE_S
 from cfx.data.style import StyleResult, measure_style, select_cluster
 from cfx.evaluation.demo import Demo
 from cfx.evaluation.metrics.base import MetricSet
@@ -225,9 +226,6 @@ def choose_device(name: str) -> torch.device:
 
 log = logging.getLogger(__name__)
 
-_COARSE_S = 0.15
-"""Time step above which calibrated parameters are biased noticeably (docs/readers.md)."""
-
 _WINDOW_S = 0.5
 """Length of a window in the paper, and with default settings at NGSIM's time step of 0.1 s."""
 
@@ -263,12 +261,12 @@ def select_pairs(pairs: PairSet, config: JobConfig) -> tuple[PairSet, StyleResul
     for drop in pairs.dropped:
         log.info("Left out: %d %s (%s)", drop.count, drop.unit, drop.reason)
     _check_window(config.windows.length, pairs.dt)
-    if pairs.dt > _COARSE_S:
+    if pairs.dt > COARSE_S:
         log.warning(
             "The time step is %.3g s: parameters calibrated in such steps are biased, since models"
             " are made for 0.1 s and less (at 1 s IDM's time gap comes out a quarter too short, s0"
-            " 72 %% too large); say data.time_step=0.1, or compare parameters of the same step"
-            " only",
+            " 72 %% too large); say data.time_step=0.1, or the step of the simulation that they are"
+            " for, or compare parameters of the same step only",
             pairs.dt,
         )
     return pairs, style

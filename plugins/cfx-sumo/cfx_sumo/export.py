@@ -20,6 +20,7 @@ from cfx.core.export import ExportFormat
 from cfx.core.files import write_output
 from cfx.core.job_folder import examine, parse_json, parse_yaml
 from cfx.core.registry import create
+from cfx.data.resample import COARSE_S
 from cfx.models.vtype import InSumo, VType
 from cfx.results.store import folder_of
 from cfx_sumo.limits import lost_limits
@@ -68,6 +69,11 @@ def export(run: str | Path, output: str | Path | None = None) -> list[str]:
         f"the parameters belong to steps of {step:g} s; SUMO's own step is 1 s unless it is told"
         " otherwise"
     )
+    if step > COARSE_S:
+        notes.append(
+            "calibrated in steps so coarse, parameters are biased (IDM's time gap at 1 s by a"
+            " quarter); data.time_step=0.1 calibrates in steps of 0.1 s"
+        )
     path = Path(output).expanduser() if output else home / NAME
     write_output(path, _xml(table, kind, notes), "the list of vTypes")
     first = quoteattr(str(table["cluster"].iloc[0]))

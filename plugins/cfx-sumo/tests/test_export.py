@@ -92,6 +92,10 @@ def test_what_parameters_belong_to_and_sumo_lacks_is_said(tmp_path: Path) -> Non
     assert "model.limits.response_time=0.3" in lost
     assert "emergency_deceleration=8" not in lost  # IDM's vType carries it
     assert any("the parameters belong to steps of 0.1 s" in line for line in lines)
+    assert not any("steps so coarse" in line for line in lines)
+    policy = folder / "policy" / "policy.json"
+    policy.write_text(policy.read_text().replace('"dt": 0.1', '"dt": 1.0'))
+    assert any("steps so coarse" in line for line in export(folder))
     assert "response_time=0.3" in (folder / "drivers.add.xml").read_text()
 
 
