@@ -18,8 +18,13 @@ if TYPE_CHECKING:
     from cfx.api.experiment import from_config as from_config
     from cfx.api.fit import Fit as Fit
     from cfx.api.fit import calibrate as calibrate
+    from cfx.api.forecasts import Forecast as Forecast
+    from cfx.api.forecasts import forecast as forecast
+    from cfx.api.models import model as model
     from cfx.api.pairs import Pairs as Pairs
     from cfx.api.pairs import read as read
+    from cfx.api.policies import evaluate as evaluate
+    from cfx.api.policies import train as train
     from cfx.api.simulation import simulate as simulate
     from cfx.app.application import run as run
     from cfx.app.job import JobResult as JobResult
@@ -74,6 +79,11 @@ _HOMES = {
     "calibrate": "cfx.api.fit",
     "Fit": "cfx.api.fit",
     "simulate": "cfx.api.simulation",
+    "train": "cfx.api.policies",
+    "evaluate": "cfx.api.policies",
+    "forecast": "cfx.api.forecasts",
+    "Forecast": "cfx.api.forecasts",
+    "model": "cfx.api.models",
     "config": "cfx.api.experiment",
     "from_config": "cfx.api.experiment",
     "Experiment": "cfx.api.experiment",

@@ -17,8 +17,10 @@ import cfx
 from cfx.app.hydra_source import composed
 from cfx.contracts import contract_for
 from cfx.core import registry
+from cfx.data.tidy import write_tidy
 from cfx.models.base import DrivingModel
 from cfx.simulation.rollout import simulate
+from cfx.simulation.synthetic import SyntheticDataset
 from tests.conftest import ROOT
 from tests.drives import straight_pairs
 from tests.printed import Reader, all_blocks, blocks
@@ -200,14 +202,17 @@ def test_the_readmes_python_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    write_tidy(SyntheticDataset(pairs=2, frames=720).load(), "pairs.csv")
     (block,) = blocks("README.md", "python")
     names: dict[str, object] = {}
     exec(block, names)  # noqa: S102 - it is our own README
-    again, result = names["again"], names["result"]
-    assert isinstance(again, cfx.JobResult)
+    fit, result = names["fit"], names["result"]
+    assert isinstance(fit, cfx.Fit)
     assert isinstance(result, cfx.JobResult)
-    assert again.metrics == result.metrics
-    assert "pair_id" in capsys.readouterr().out
+    assert "ci95_low" in capsys.readouterr().out
+    (command,) = [one for one in commands() if one.endswith("data=tidy data.path=pairs.csv")]
+    printed_config = cfx.config(**dict(word.split("=", 1) for word in shlex.split(command)[3:]))
+    assert printed_config.command == fit.command.replace(f"{tmp_path}/", "")
 
 
 def test_the_model_in_the_guide_can_be_simulated() -> None:

@@ -27,6 +27,7 @@ FLOORS = (
     ("report",),
     ("app", "contracts"),
     ("api",),
+    ("sklearn",),
 )
 """From the ground up; a room may use rooms on its own floor and below."""
 

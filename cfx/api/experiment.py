@@ -7,11 +7,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from cfx.api.pairs import Pairs, PairsLike, pairs_from
+from cfx.app.job.results import JobResult, read_config
+from cfx.app.job.run import compute
 from cfx.app.overrides import command_of, config_of
-from cfx.core.errors import ConfigError, DataError
 from cfx.core.guest import visit
 from cfx.results.config import JobConfig
 from cfx.results.store import folder_of
@@ -36,12 +35,20 @@ class Experiment:
         """The command line that runs the same.
 
         Raises:
-            DataError: the pairs come from a data frame, which no command can read.
+            DataError: it uses a data frame, or a policy that was not saved.
         """
-        if self.pairs is not None:
-            self.pairs.require_a_file()
         with visit():
             return command_of(self.config)
+
+    def run(self) -> JobResult:
+        """Runs it in this process; writes nothing (`JobResult.save` does).
+
+        Raises:
+            CfxError: whatever the command line would print and exit 2 for.
+        """
+        pairs = self.pairs or Pairs.of(self.config.data)
+        with visit():
+            return compute(self.config, pairs.selected)
 
     def __repr__(self) -> str:
         chosen = []
@@ -87,14 +94,7 @@ def from_config(job: str | Path) -> Experiment:
     path = Path(job)
     if path.suffix not in {".yaml", ".yml"}:
         path = folder_of(job) / "config.yaml"
-    try:
-        return Experiment(JobConfig.of(yaml.safe_load(path.read_text(encoding="utf-8"))))
-    except OSError as error:
-        raise DataError(
-            f"{path} cannot be read ({error.strerror}); give the output folder that a job printed"
-        ) from None
-    except (yaml.YAMLError, ConfigError) as error:
-        raise DataError(f"{path} is no configuration of this version of cfx: {error}") from None
+    return Experiment(read_config(path))
 
 
 def with_data(config: JobConfig, pairs: Pairs) -> JobConfig:

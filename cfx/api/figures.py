@@ -1,9 +1,7 @@
-"""What notebooks show of pairs and fits: figures, and tables as HTML."""
+"""Figures of pairs and forecasts."""
 
 from __future__ import annotations
 
-import html
-import io
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,32 +9,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from cfx.data.pairs import Pair
-from cfx.report.figures.canvas import Line, canvas, draw_lines, figure_style, method_legend, styled
-
-_ROWS = 10
-"""Most rows of a table that a notebook shows."""
-
-
-def as_html(text: str, table: pd.DataFrame) -> str:
-    """Returns a line and the beginning of a table as HTML."""
-    shown = table.head(_ROWS).to_html(float_format=lambda value: f"{value:.3g}", border=0)
-    more = ""
-    if len(table) > _ROWS:
-        more = f"<p>{len(table) - _ROWS} more rows</p>"
-    return f"<p>{html.escape(text)}</p>{shown}{more}"
-
-
-def for_notebooks(figure: Figure) -> Figure:
-    """Returns a figure that notebooks show by themselves; pyplot knows nothing of it."""
-
-    def as_png() -> bytes:
-        stream = io.BytesIO()
-        with figure_style():
-            figure.savefig(stream, format="png")
-        return stream.getvalue()
-
-    vars(figure)["_repr_png_"] = as_png
-    return figure
+from cfx.report.figures.canvas import Line, canvas, draw_lines, method_legend, styled
+from cfx.results.look import colour_of
 
 
 @styled
@@ -55,6 +29,45 @@ def draw_pairs(pairs: Sequence[Pair]) -> Figure:
         draw_lines(row[1], [Line("real", time, pair.gap)])
         row[0].set(title=pair.pair_id, ylabel="speed (m/s)")
         row[1].set(ylabel="gap (m)")
+    for panel in panels[-1]:
+        panel.set_xlabel("time (s)")
+    return figure
+
+
+@styled
+def draw_fans(pair_ids: Sequence[str], bands: pd.DataFrame, measured: pd.DataFrame) -> Figure:
+    """Draws quantiles of forecasts over time, with what happened, a row of panels per pair.
+
+    Args:
+        pair_ids: which pairs.
+        bands: index pair_id, time_s, quantile; columns speed and travelled.
+        measured: columns pair_id, time_s, speed, travelled.
+    """
+    figure = canvas(1.0 + 1.9 * len(pair_ids))
+    method_legend(figure, ("policy", "real"))
+    panels = figure.subplots(len(pair_ids), 2, squeeze=False)
+    levels = sorted(bands.index.get_level_values("quantile").unique())
+    for row, name in zip(panels, pair_ids, strict=True):
+        real = measured[measured["pair_id"] == name]
+        for panel, column, label in zip(
+            row, ("speed", "travelled"), ("speed (m/s)", "travelled (m)"), strict=True
+        ):
+            of_pair = bands.loc[name].reset_index()
+            table = of_pair.pivot_table(column, "time_s", "quantile")
+            time = table.index.to_numpy(dtype=np.float64)
+            colour = colour_of("policy")
+            panel.fill_between(
+                time, table[levels[0]], table[levels[-1]], color=colour, alpha=0.2, linewidth=0
+            )
+            middle = table[levels[len(levels) // 2]].to_numpy(dtype=np.float64)
+            happened = Line(
+                "real",
+                real["time_s"].to_numpy(dtype=np.float64),
+                real[column].to_numpy(dtype=np.float64),
+            )
+            draw_lines(panel, [Line("policy", time, middle), happened])
+            panel.set_ylabel(label)
+        row[0].set_title(name)
     for panel in panels[-1]:
         panel.set_xlabel("time (s)")
     return figure

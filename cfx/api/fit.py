@@ -115,13 +115,13 @@ class Fit:
 
     def plot(self) -> Figure:
         """Draws the parameters between their bounds, and how they go together."""
-        from cfx.api.figures import for_notebooks
         from cfx.report.figures.calibration import (
             correlations,
             draw_calibration,
             parameter_spreads,
         )
         from cfx.report.figures.figure import ParameterAxis
+        from cfx.report.notebook import for_notebooks
 
         tables = []
         for method in METHODS:
@@ -191,7 +191,7 @@ class Fit:
         )
 
     def _repr_html_(self) -> str:
-        from cfx.api.figures import as_html
+        from cfx.report.notebook import as_html
 
         return as_html(repr(self), self.summary())
 
@@ -253,9 +253,7 @@ def prepared(experiment: Experiment, pairs: Pairs) -> tuple[ProtocolContext, Par
         CfxError: a setting is wrong.
     """
     from cfx.app.job import steps
-    from cfx.results.config import JobConfig
 
     config, parts = steps.prepare(experiment.config)
     selected, style = steps.select_pairs(pairs.selected, config)
-    uncached = JobConfig.of({**config.model_dump(), "cache": {"enabled": False}})
-    return steps.compose(uncached, parts, selected, style), parts
+    return steps.compose(steps.uncached(config), parts, selected, style), parts

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from cfx.app.overrides import config_of
+from cfx.app.overrides import IN_MEMORY, config_of
 from cfx.core import registry
 from cfx.core.component import validate
 from cfx.core.errors import ConfigError, DataError
@@ -30,9 +30,6 @@ if TYPE_CHECKING:
 PairsLike = Any
 """What `cfx.read` takes: `Pairs`, a `PairSet`, a data frame, or the path of a recording."""
 
-_TABLE = "the table"
-"""What messages call a data frame."""
-
 
 class FrameDataset(TidyDataset):
     """Pairs of a data frame in the tidy layout.
@@ -47,7 +44,7 @@ class FrameDataset(TidyDataset):
         self._frame = frame
 
     def read(self) -> PairSet:
-        return pairs_from_frame(self._frame, _TABLE, self.settings.own_layout())
+        return pairs_from_frame(self._frame, "the table", self.settings.own_layout())
 
 
 @dataclass(frozen=True, repr=False)
@@ -57,12 +54,10 @@ class Pairs:
     Attributes:
         selected: the pairs themselves.
         node: the dataset's node of the configuration: its name and settings.
-        in_file: whether `node` reads these pairs from a file; not if they were a data frame.
     """
 
     selected: PairSet
     node: Mapping[str, Any] = field(default_factory=dict)
-    in_file: bool = True
 
     @classmethod
     def of(cls, node: Mapping[str, Any]) -> Pairs:
@@ -131,22 +126,11 @@ class Pairs:
         Args:
             pair_ids: which; None: the first three.
         """
-        from cfx.api.figures import draw_pairs, for_notebooks
+        from cfx.api.figures import draw_pairs
+        from cfx.report.notebook import for_notebooks
 
         chosen = self.selected[:3] if pair_ids is None else self.select(pair_ids).selected
         return for_notebooks(draw_pairs(list(chosen)))
-
-    def require_a_file(self) -> None:
-        """Refuses pairs that no command can read.
-
-        Raises:
-            DataError: they come from a data frame.
-        """
-        if not self.in_file:
-            raise DataError(
-                "these pairs come from a data frame, which no command can read; save them first:"
-                " pairs = pairs.save('pairs.parquet')"
-            )
 
     def __len__(self) -> int:
         return len(self.selected)
@@ -160,7 +144,7 @@ class Pairs:
         )
 
     def _repr_html_(self) -> str:
-        from cfx.api.figures import as_html
+        from cfx.report.notebook import as_html
 
         return as_html(repr(self), self.summary)
 
@@ -198,14 +182,15 @@ def read(source: Any = None, *, dataset: str | None = None, **settings: Any) -> 
         return Pairs.of(config_of({"data": dataset, **given}).data)
     frame = _data_frame(source)
     if frame is not None:
-        given["data.path"] = _TABLE
+        given["data.path"] = IN_MEMORY
         node = config_of({"data": dataset or "tidy", **given}).data
         values = {key: value for key, value in node.items() if key != "name"}
         made = validate(TidySettings, values, where="data")
-        return Pairs(FrameDataset(made, frame).load(), node, in_file=False)
+        return Pairs(FrameDataset(made, frame).load(), node)
     paths = [source] if isinstance(source, str | Path) else list(source)
     paths = [one if is_url(str(one)) else str(absolute(one)) for one in paths]
-    name = dataset or dataset_of(Path(str(paths[0])))
+    own_columns = {"columns", "units"} & settings.keys()
+    name = dataset or ("tidy" if own_columns else dataset_of(Path(str(paths[0]))))
     given["data.path"] = paths[0] if len(paths) == 1 else paths
     return Pairs.of(config_of({"data": name, **given}).data)
 
@@ -215,7 +200,7 @@ def pairs_from(given: PairsLike) -> Pairs:
     if isinstance(given, Pairs):
         return given
     if isinstance(given, PairSet):
-        return Pairs(given, {"name": "tidy", "path": _TABLE}, in_file=False)
+        return Pairs(given, {"name": "tidy", "path": IN_MEMORY})
     return read(given)
 
 

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import re
+import contextlib
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from cfx.app import hydra_source
 from cfx.app.user_errors import explain, is_user_error
 from cfx.core import registry
-from cfx.core.errors import CfxError, ConfigError
+from cfx.core.errors import CfxError, ConfigError, DataError
 from cfx.core.files import quoted
 from cfx.results.config import JobConfig
 
@@ -51,8 +49,26 @@ def config_of(settings: Mapping[str, Any]) -> JobConfig:
     return JobConfig.of(values)
 
 
+IN_MEMORY = "<in memory>"
+"""What a configuration calls a data frame, or a policy that was not saved, in place of its path."""
+
+
 def command_of(config: JobConfig) -> str:
-    """Returns the command line that runs a configuration."""
+    """Returns the command line that runs a configuration.
+
+    Raises:
+        DataError: it uses what is in the memory of a program alone.
+    """
+    if IN_MEMORY in str(config.data.get("path")):
+        raise DataError(
+            "these pairs come from a data frame, which no command can read; save them first:"
+            " pairs = pairs.save('pairs.parquet')"
+        )
+    if IN_MEMORY in str(config.protocol.get("run")):
+        raise DataError(
+            "this policy is in no folder, and no command can read it; save it first:"
+            " result.save('outputs/policy')"
+        )
     return shlex.join(["python", "-m", "cfx", *overrides_of(config)])
 
 
@@ -116,7 +132,8 @@ def _text(value: Any) -> str:
 
 def _word(text: str | Path) -> str:
     """Returns a text in Hydra's grammar: in quotes where it would be a number or a truth value."""
-    if isinstance(text, Path):
-        return quoted(str(text))
-    is_word = re.fullmatch(r"\w+", text, re.ASCII) and isinstance(yaml.safe_load(text), str)
-    return quoted(text, always=not is_word and "/" not in text)
+    is_other = str(text).lower() in {"true", "false", "null"}
+    with contextlib.suppress(ValueError):
+        float(str(text))
+        is_other = True
+    return quoted(str(text), always=is_other)

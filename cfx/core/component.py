@@ -69,6 +69,8 @@ class Component(ABC):
         deprecated: what to use instead of a component that goes; jobs that name it log a warning.
         trial: settings with which `plugins check` tries the component, where trying it with the
             default ones takes long.
+        process_code: stands for the code of a class that a program has added to the registry: no
+            file says what it does, and no other process shares results of it.
         schema: class of its settings.
         settings: the validated settings.
     """
@@ -76,6 +78,7 @@ class Component(ABC):
     kind: ClassVar[str]
     deprecated: ClassVar[str] = ""
     trial: ClassVar[Mapping[str, Any]] = {}
+    process_code: ClassVar[str] = ""
     schema: ClassVar[type[Settings]] = Settings
     settings: Settings
 
@@ -111,7 +114,7 @@ class Component(ABC):
         return {
             "class": f"{type(self).__module__}.{type(self).__qualname__}",
             "settings": self.settings.model_dump(mode="json"),
-            "code": folder_hash(inspect.getfile(type(self))),
+            "code": self.process_code or folder_hash(inspect.getfile(type(self))),
         }
 
 

@@ -186,8 +186,7 @@ def _torch() -> _Undo:
     threads, dtype = torch.get_num_threads(), torch.get_default_dtype()
     gradients, state = torch.is_grad_enabled(), torch.get_rng_state()
     of_gpus = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else None
-    deterministic = torch.are_deterministic_algorithms_enabled()
-    warns_only = torch.is_deterministic_algorithms_warn_only_enabled()
+    deterministic = _deterministic(torch)
     cudnn = torch.backends.cudnn
     flags = (cudnn.benchmark, cudnn.deterministic)
     precision = torch.get_float32_matmul_precision()
@@ -199,12 +198,20 @@ def _torch() -> _Undo:
         torch.set_rng_state(state)
         if of_gpus is not None:
             torch.cuda.set_rng_state_all(of_gpus)
-        torch.use_deterministic_algorithms(deterministic, warn_only=warns_only)
+        if _deterministic(torch) != deterministic:  # setting it imports PyTorch's compiler: seconds
+            torch.use_deterministic_algorithms(deterministic[0], warn_only=deterministic[1])
         cudnn.benchmark, cudnn.deterministic = flags
         if torch.get_float32_matmul_precision() != precision:
             torch.set_float32_matmul_precision(precision)
 
     return put_back
+
+
+def _deterministic(torch: Any) -> tuple[bool, bool]:
+    """Returns whether PyTorch keeps to deterministic algorithms, and whether it only warns."""
+    is_on: bool = torch.are_deterministic_algorithms_enabled()
+    only_warns: bool = torch.is_deterministic_algorithms_warn_only_enabled()
+    return is_on, only_warns
 
 
 def _mlflow() -> _Undo:

@@ -52,7 +52,7 @@ def _packages() -> dict[Path, registry.Entry]:
     found: dict[Path, registry.Entry] = {}
     for kind in (*registry.KINDS, *registry.PARTS):
         for entry in registry.entries(kind):
-            if entry.distribution == registry.OWN:
+            if entry.distribution in {registry.OWN, registry.THIS_PROCESS}:
                 continue
             place = _package_path(entry.target.partition(":")[0].partition(".")[0])
             if place is not None:

@@ -19,8 +19,10 @@ import functools
 import importlib
 import importlib.metadata
 import inspect
+import itertools
 import logging
 import sys
+import uuid
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from operator import attrgetter
@@ -42,6 +44,9 @@ R = TypeVar("R")
 
 OWN = "cfx-driving"
 """cfx's own distribution: no other can replace its components."""
+
+THIS_PROCESS = "this process"
+"""Stands for the distribution of a component that a program has added."""
 
 API_GROUP = "cfx.api"
 """Entry-point group in which a distribution says which version of the plugin API it needs."""
@@ -164,6 +169,12 @@ class Entry:
 _loaded: dict[Entry, type[Component]] = {}
 """Classes that were imported and passed their checks."""
 
+_additions = itertools.count(1)
+"""Numbers of what `add` adds: a class that is defined anew is another one."""
+
+_of_this_process: dict[tuple[str, str], Entry] = {}
+"""Entries that `add` made, by kind and name."""
+
 _tried: set[tuple[Entry, str]] = set()
 """Components that were tried, with their settings as JSON."""
 
@@ -190,7 +201,11 @@ def entries(kind: str) -> tuple[Entry, ...]:
     Raises:
         PluginError: there is no such kind.
     """
-    return _announced(_search_path())[kind_of(kind).name]
+    announced = _announced(_search_path())[kind_of(kind).name]
+    added = [one for one in _of_this_process.values() if one.kind == kind_of(kind).name]
+    if not added:
+        return announced
+    return tuple(sorted([*announced, *added], key=attrgetter("name", "distribution")))
 
 
 def names(kind: str) -> tuple[str, ...]:
@@ -245,6 +260,32 @@ def get(kind: str, name: str) -> type[Component]:
         _check(found, cls)
         _loaded[found] = cls
     return _loaded[found]
+
+
+def add(kind: str, name: str, cls: type[Component]) -> None:
+    """Makes a component known to this process, without a distribution, until it ends.
+
+    One that was added under the same name before is replaced.
+
+    Raises:
+        PluginError: an installed distribution brings a component of that name, or the class breaks
+            the contract of its kind.
+    """
+    about = kind_of(kind)
+    for other in _announced(_search_path())[about.name]:
+        if other.name == name:
+            raise PluginError(
+                f"{other} is installed, and {about.call(name)} means it; choose another name"
+            )
+    target = f"{cls.__module__}:{cls.__qualname__}"
+    found = Entry(about.name, name, target, THIS_PROCESS, str(next(_additions)), "")
+    _check(found, cls)
+    cls.process_code = uuid.uuid4().hex
+    before = _of_this_process.pop((about.name, name), None)
+    if before is not None:
+        _loaded.pop(before, None)
+    _of_this_process[about.name, name] = found
+    _loaded[found] = cls
 
 
 def create(kind: str, node: Mapping[str, Any]) -> Component:
@@ -450,6 +491,8 @@ def _try(found: Entry, component: Component, settings: BaseModel) -> None:
 
 
 def _remedy(found: Entry) -> str:
+    if found.distribution == THIS_PROCESS:
+        return "; repair it"
     return (
         f"; repair that distribution (cfx plugins check {found.kind} {found.name}),"
         f" or pip uninstall {found.distribution}"

@@ -9,8 +9,16 @@ import pkgutil
 import pytest
 
 import cfx.api
+from cfx.core import registry
 
 MODULES = [one.name for one in pkgutil.iter_modules(cfx.api.__path__, "cfx.api.")]
+MODULES.append("cfx.sklearn")
+
+
+@pytest.fixture(autouse=True)
+def _forgets_models(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lets no other test know the models that these define."""
+    monkeypatch.setattr(registry, "_of_this_process", {})
 
 
 @pytest.mark.parametrize("name", MODULES)
@@ -21,6 +29,7 @@ def test_examples_print_what_they_say(name: str) -> None:
 
 def test_every_function_has_an_example() -> None:
     finder = doctest.DocTestFinder()
-    for name in ("read", "calibrate", "simulate", "config"):
+    functions = ("read", "calibrate", "simulate", "train", "evaluate", "forecast", "model")
+    for name in (*functions, "config"):
         tests = finder.find(getattr(cfx, name), name)
         assert any(test.examples for test in tests), name

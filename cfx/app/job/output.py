@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -68,9 +68,7 @@ def write_job(folder: Path, config: JobConfig, parts: Parts, findings: Findings)
         (folder / METRICS).unlink(missing_ok=True)
         _write_config(folder, config)
         tables = write_tables(folder, findings)
-        metrics = findings.evaluation.metrics() | dict(result.calibration)
-        for table in tables:
-            metrics |= table.metrics(findings)
+        metrics = measured(findings, tables)
         checkpoint.save(result.policy, folder / "policy")
         figures: list[Path] = []
         if config.figures.enabled:
@@ -107,6 +105,24 @@ def _write_config(folder: Path, config: JobConfig) -> None:
     values = config.model_dump(mode="json")
     with atomic_write(folder / "config.yaml") as temporary:
         temporary.write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
+
+
+def tables_of(findings: Findings) -> list[WrittenTable]:
+    """Returns the tables of the results; of those that are large the rows are left out."""
+    tables = []
+    for about in installed():
+        parts = parts_of(about, findings)
+        if parts is not None:
+            tables.append(WrittenTable(about, None if about.part.large else pd.concat(list(parts))))
+    return tables
+
+
+def measured(findings: Findings, tables: Iterable[WrittenTable]) -> dict[str, float]:
+    """Returns all metrics of a job, those of its tables included."""
+    metrics = findings.evaluation.metrics() | dict(findings.protocol_result.calibration)
+    for table in tables:
+        metrics |= table.metrics(findings)
+    return metrics
 
 
 def write_tables(folder: Path, findings: Findings) -> list[WrittenTable]:

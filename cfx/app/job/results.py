@@ -2,22 +2,51 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from cfx.core.errors import DataError
-from cfx.core.guest import guest
-from cfx.core.job_folder import examine, read_metrics
+from cfx.app.job import output
+from cfx.app.overrides import command_of
+from cfx.core import registry
+from cfx.core.errors import ConfigError, DataError, listed, nearest
+from cfx.core.guest import guest, visit
+from cfx.core.job_folder import examine, parse_yaml, read_metrics
 from cfx.data.style import StyleResult
-from cfx.evaluation.headline import headline
-from cfx.evaluation.result import Evaluation
+from cfx.evaluation.headline import headline, improvement_key
+from cfx.evaluation.result import METHODS, Evaluation
+from cfx.evaluation.statistics import STATISTICS
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
 from cfx.policies.ready import is_ready_made
+from cfx.report.notebook import as_html
+from cfx.results.config import JobConfig
 from cfx.results.store import folder_of
-from cfx.results.table import read_tables
+from cfx.results.table import Findings, read_tables
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from cfx.app.job.steps import Parts
+    from cfx.report.figures.figure import Results
+
+
+@dataclass(frozen=True)
+class Computed:
+    """What a job has computed in this process.
+
+    Attributes:
+        config: its configuration, with what the protocol determined.
+        parts: its components.
+        findings: what it has found.
+    """
+
+    config: JobConfig
+    parts: Parts
+    findings: Findings
 
 
 @dataclass(frozen=True, repr=False)
@@ -29,20 +58,139 @@ class JobResult:
         pairs: a row per pair and method.
         policy: the policy of the job, ready for another trajectory.
         figures: the figures' files.
-        folder: the job's output folder.
+        folder: the job's output folder; None if nothing was written (`save` does).
         run_id: MLflow's id of the run; "" if it was not tracked.
-        evaluation: what was measured; None if the job was read back from its folder.
-        style: the driving style of each pair; None if the job was read back from its folder.
+        computed: all that was computed; None if the job was read back from its folder.
     """
 
     metrics: dict[str, float]
     pairs: pd.DataFrame
     policy: Agent
     figures: tuple[Path, ...]
-    folder: Path
+    folder: Path | None
     run_id: str = ""
-    evaluation: Evaluation | None = field(default=None, repr=False)
-    style: StyleResult | None = field(default=None, repr=False)
+    computed: Computed | None = field(default=None, repr=False)
+
+    @property
+    def evaluation(self) -> Evaluation | None:
+        """What was measured; None if the job was read back from its folder."""
+        return None if self.computed is None else self.computed.findings.evaluation
+
+    @property
+    def style(self) -> StyleResult | None:
+        """The driving style of each pair; None if the job was read back from its folder."""
+        return None if self.computed is None else self.computed.findings.style
+
+    @property
+    def config(self) -> JobConfig:
+        """The job's configuration.
+
+        Raises:
+            DataError: the folder holds none, as that of a ready-made policy.
+        """
+        if self.computed is not None:
+            return self.computed.config
+        assert self.folder is not None
+        return read_config(self.folder / "config.yaml")
+
+    @property
+    def command(self) -> str:
+        """The command line that runs the same.
+
+        Raises:
+            DataError: the job used what is in this process alone: a data frame, or a policy that
+                was not saved.
+        """
+        with visit():
+            return command_of(self.config)
+
+    def improvement(self, over: str = "fixed", scope: str = "test") -> pd.Series:
+        """Returns the policy's improvement of the RMSE of speed over a baseline (0.1 is 10 %).
+
+        Args:
+            over: the baseline: `fixed` (driver-specific), `population` (pooled) or `default`.
+            scope: `test`; `steady`, after its first seconds; or `full_trajectory`.
+
+        Returns:
+            mean, trimmed_mean, median, ci95_low, ci95_high, win_rate, p_value; see
+            `cfx.evaluation.statistics.Improvement`.
+
+        Raises:
+            DataError: they were not compared.
+        """
+        prefix = improvement_key(over, scope)
+        values = {name: self.metrics.get(f"{prefix}/{name}") for name in STATISTICS}
+        if values["mean"] is None:
+            known = [
+                one for one in METHODS if f"{improvement_key(one, scope)}/mean" in self.metrics
+            ]
+            raise DataError(
+                f"improvement(over={over!r}, scope={scope!r}): the policy was not compared with it;"
+                f" known there: {listed(known) or 'nothing'}"
+            )
+        return pd.Series(values, dtype=float, name=f"improvement over {over}")
+
+    def plot(self, name: str = "improvement_per_driver") -> Figure:
+        """Draws one of the job's figures.
+
+        Args:
+            name: as their files are called: `drives`, `error_over_time`, `chosen_parameters`, ...
+
+        Raises:
+            DataError: there is no such figure, or the job has nothing of what it shows.
+        """
+        from cfx.report.figures.figure import draw
+        from cfx.report.notebook import for_notebooks
+
+        known = {one.name: one for one in registry.installed("figure")}
+        if name not in known:
+            raise DataError(
+                f"there is no figure '{name}'.{nearest(name, known)} Known: {listed(list(known))}."
+            )
+        figure = draw(known[name], self._results)
+        if figure is None:
+            raise DataError(f"the job has nothing of what the figure '{name}' shows")
+        return for_notebooks(figure)
+
+    @cached_property
+    def _results(self) -> Results:
+        """What figures are drawn from."""
+        from cfx.report.figures.figure import Results
+        from cfx.report.job import Origin
+        from cfx.report.runs import read_job
+
+        if self.computed is None:
+            assert self.folder is not None
+            return read_job(self.folder, Origin(str(self.folder))).results
+        findings = self.computed.findings
+        rows = {}
+        for table in output.tables_of(findings):
+            if table.rows is not None:
+                rows[table.about.name] = table.rows
+        return Results.of(
+            findings.evaluation, style=findings.style, tables=rows, metrics=self.metrics
+        )
+
+    def save(self, folder: str | Path) -> JobResult:
+        """Writes the job's folder, as a job of the command line does; MLflow is not told.
+
+        Args:
+            folder: made if it is not there.
+
+        Returns:
+            The same result, with its folder and figures.
+
+        Raises:
+            DataError: the job was read back from a folder, which can be copied.
+            OutputError: it cannot be written.
+        """
+        if self.computed is None:
+            raise DataError(f"this job was read from {self.folder}; copy that folder")
+        config, parts, findings = vars(self.computed).values()
+        with visit():
+            output.begin(Path(folder), config)
+            kept = output.write_job(Path(folder), config, parts, findings)
+        return replace(self, folder=Path(folder), figures=tuple(kept.figures))
 
     def __repr__(self) -> str:
         """Returns two lines for people: what it is and how well it drives, and where it lies."""
@@ -54,7 +202,31 @@ class JobResult:
         _, words = headline(self.metrics)
         if words:
             said.append(words)
-        return f"JobResult({', '.join(said)},\n  folder={str(self.folder)!r})"
+        folder = "not saved" if self.folder is None else f"folder={str(self.folder)!r}"
+        return f"JobResult({', '.join(said)},\n  {folder})"
+
+    def _repr_html_(self) -> str:
+        rows = {}
+        for method in self.pairs["method"].unique() if "method" in self.pairs else ():
+            of_method = self.pairs[self.pairs["method"] == method]
+            rows[method] = of_method[["rmse_speed", "rmse_gap"]].mean()
+        return as_html(repr(self), pd.DataFrame(rows).T.rename_axis("mean over pairs"))
+
+
+def read_config(path: Path) -> JobConfig:
+    """Reads a job's configuration.
+
+    Raises:
+        DataError: there is none that this version knows.
+    """
+    try:
+        return JobConfig.of(parse_yaml(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise DataError(
+            f"{path} cannot be read ({error.strerror}); give the output folder that a job printed"
+        ) from None
+    except (ValueError, ConfigError) as error:
+        raise DataError(f"{path} is no configuration of this version of cfx: {error}") from None
 
 
 @guest()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -16,6 +15,7 @@ if TYPE_CHECKING:
 
     from cfx.app.job.results import JobResult
     from cfx.data.base import Dataset
+    from cfx.data.pairs import PairSet
 
 log = logging.getLogger(__name__)
 
@@ -46,7 +46,7 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
     from cfx.app.job import output, steps
     from cfx.app.job.console import described, report
     from cfx.app.job.output import Upload
-    from cfx.app.job.results import JobResult
+    from cfx.app.job.results import Computed, JobResult
     from cfx.results.tracker import Tracker
 
     data = config.data
@@ -60,11 +60,7 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
         if parts.demo is not None:
             parts.demo.check(pairs)
         tracker.set_tags(steps.tags_of(pairs))
-        context = steps.compose(config, parts, pairs, style)
-        with closing(context.simulator), closing(parts.engine):
-            # It splits the pairs, calibrates, has the learner train, and evaluates.
-            result = parts.protocol.run(context)
-            findings = steps.found(parts, context, result)
+        findings = steps.find(steps.compose(config, parts, pairs, style), parts)
         kept = output.write_job(folder, config, parts, findings)
         # After the folder, so that no failure of MLflow loses it.
         tracker.log_job(findings, kept, described(config, findings, kept.metrics))
@@ -80,6 +76,31 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
         figures=tuple(kept.figures),
         folder=folder,
         run_id=tracker.run_id,
-        evaluation=findings.evaluation,
-        style=findings.style,
+        computed=Computed(config, parts, findings),
+    )
+
+
+def compute(config: JobConfig, pairs: PairSet) -> JobResult:
+    """Runs a job on pairs that are read already; writes nothing, caches nothing, tracks nothing.
+
+    Args:
+        config: the validated configuration.
+        pairs: what its dataset reads.
+
+    Raises:
+        CfxError: as `run_job`.
+    """
+    from cfx.app.job import output, steps
+    from cfx.app.job.results import Computed, JobResult
+
+    config, parts = steps.prepare(config)
+    pairs, style = steps.select_pairs(pairs, config)
+    findings = steps.find(steps.compose(steps.uncached(config), parts, pairs, style), parts)
+    return JobResult(
+        metrics=output.measured(findings, output.tables_of(findings)),
+        pairs=findings.evaluation.table,
+        policy=findings.protocol_result.policy,
+        figures=(),
+        folder=None,
+        computed=Computed(config, parts, findings),
     )

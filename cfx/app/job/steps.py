@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -332,12 +333,26 @@ def compose(config: JobConfig, parts: Parts, pairs: PairSet, style: StyleResult)
     )
 
 
-def found(parts: Parts, context: ProtocolContext, result: object) -> Findings:
-    """Returns what a protocol has delivered, with tables of the calibration.
+def uncached(config: JobConfig) -> JobConfig:
+    """Returns a configuration that keeps no cache."""
+    return JobConfig.of({**config.model_dump(), "cache": {"enabled": False}})
+
+
+def find(context: ProtocolContext, parts: Parts) -> Findings:
+    """Runs the protocol: it splits the pairs, calibrates, has the learner train, and evaluates.
+
+    Returns:
+        What it has delivered, with tables of the calibration.
 
     Raises:
-        PluginError: it is no `ProtocolResult`.
+        PluginError: it delivers no `ProtocolResult`.
     """
+    with closing(context.simulator), closing(parts.engine):
+        return _found(parts, context, parts.protocol.run(context))
+
+
+def _found(parts: Parts, context: ProtocolContext, result: object) -> Findings:
+    """Returns what a protocol has delivered; see `find`."""
     if not isinstance(result, ProtocolResult):
         raise PluginError(
             f"{registry.origin(parts.protocol)}: run must return a cfx.ProtocolResult,"

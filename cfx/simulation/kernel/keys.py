@@ -61,7 +61,12 @@ class KernelKey(NamedTuple):
 
 
 def _code(component: type) -> list[str] | None:
-    """Returns the name and the code of a class and all that it inherits from."""
+    """Returns the name and the code of a class and all that it inherits from.
+
+    It is None where no file has it.
+    """
+    if getattr(component, "process_code", ""):
+        return None
     found = []
     for part in component.__mro__:
         if part.__module__ in {"abc", "builtins", "typing"}:

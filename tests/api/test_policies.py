@@ -1,0 +1,148 @@
+"""Policies from Python: the same bits as the command line, saved, tested and forecast with."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import cfx
+from cfx.core.errors import ConfigError, DataError
+
+SMALL = {
+    "optimizer": "random",
+    "learner.epochs": 1,
+    "policy.hidden_size": 4,
+    "protocol.folds": 2,
+    "learner.ensemble_size": 1,
+}
+QUIET = ["tracking.enabled=false", "figures.enabled=false", "cache.enabled=false"]
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory: pytest.TempPathFactory) -> cfx.Pairs:
+    made = cfx.read(dataset="synthetic", pairs=4, frames=300)
+    return made.save(tmp_path_factory.mktemp("recording") / "pairs.parquet")
+
+
+@pytest.fixture(scope="module")
+def others() -> cfx.Pairs:
+    """Pairs that no policy here has learned from."""
+    return cfx.read(dataset="synthetic", pairs=2, frames=300, seed=5)
+
+
+@pytest.fixture(scope="module")
+def trained(pairs: cfx.Pairs) -> cfx.JobResult:
+    return cfx.train(pairs, "idm", for_="unseen_drivers", seed=2, **SMALL)
+
+
+def same_metrics(one: dict[str, float], other: dict[str, float]) -> bool:
+    """Says whether metrics are equal to the last bit, NaN included."""
+    if one.keys() != other.keys():
+        return False
+    return all(other[k] == v or (math.isnan(v) and math.isnan(other[k])) for k, v in one.items())
+
+
+def run(result: cfx.JobResult, folder: Path) -> cfx.JobResult:
+    """Runs the command of a result."""
+    return cfx.run([*shlex.split(result.command)[3:], *QUIET, f"hydra.run.dir={folder}"])
+
+
+def test_training_is_that_of_the_command_to_the_last_bit(
+    trained: cfx.JobResult, tmp_path: Path
+) -> None:
+    assert "experiment=unseen_drivers" in trained.command
+    assert same_metrics(trained.metrics, run(trained, tmp_path / "out").metrics)
+
+
+def test_a_result_says_how_much_the_policy_improves(trained: cfx.JobResult) -> None:
+    found = trained.improvement(over="population")
+    assert found["mean"] == trained.metrics["rmse_improvement/population/mean"]
+    assert found["ci95_low"] <= found["mean"] <= found["ci95_high"]
+    with pytest.raises(DataError, match="known there: default, population, fixed"):
+        trained.improvement(over="defaults")
+    assert "rmse_speed" in trained._repr_html_()
+    assert "not saved" in repr(trained)
+
+
+def test_a_result_is_saved_loaded_tested_and_drawn(
+    trained: cfx.JobResult, others: cfx.Pairs, tmp_path: Path
+) -> None:
+    saved = trained.save(tmp_path / "mine")
+    again = cfx.load(saved.folder)
+    assert same_metrics(trained.metrics, again.metrics)
+    assert again.command == trained.command
+    assert cfx.from_config(tmp_path / "mine").config == trained.config
+    for result in (trained, again):
+        assert vars(result.plot("drives"))["_repr_png_"]().startswith(b"\x89PNG")
+    with pytest.raises(DataError, match="Did you mean 'drives'"):
+        again.plot("drive")
+    with pytest.raises(DataError, match="copy that folder"):
+        again.save(tmp_path / "other")
+    tested = cfx.evaluate(again, others, optimizer="random")
+    in_memory = cfx.evaluate(trained, others, optimizer="random")
+    assert same_metrics(tested.metrics, in_memory.metrics)
+    assert same_metrics(tested.metrics, run(tested, tmp_path / "out").metrics)
+    with pytest.raises(DataError, match="save it first"):
+        _ = in_memory.command
+
+
+def test_pairs_that_were_learned_from_are_refused(trained: cfx.JobResult, pairs: cfx.Pairs) -> None:
+    with pytest.raises(DataError, match="has learned from 4 of the 4 pairs"):
+        cfx.evaluate(trained, pairs)
+    with pytest.raises(DataError, match="has learned from 4 of the 4 pairs"):
+        cfx.forecast(trained, pairs, at=10.0)
+
+
+def test_a_forecast_reads_nothing_after_its_moment(others: cfx.Pairs) -> None:
+    frame = others.frame
+    after = frame["time_s"] > 10.0
+    changed = frame.assign(follower_speed_mps=np.where(after, 3.0, frame["follower_speed_mps"]))
+    settings = {"min_frames": 2, "accelerations": "recorded", "check": "off"}
+    found = []
+    for table in (frame, changed):
+        read = cfx.read(table, **settings)
+        found.append(cfx.forecast("cfx://i80-idm", read, at=10.0, horizon=3.0))
+    pd.testing.assert_frame_equal(found[0].paths, found[1].paths)
+    first = found[0].paths.groupby("pair_id").first()
+    assert (first["time_s"] == 10.0).all()
+    assert (first["travelled"] == 0.0).all()
+    assert found[0].paths.groupby("pair_id").size().tolist() == [31, 31]
+
+
+def test_a_forecast_ends_where_what_is_given_ends(others: cfx.Pairs) -> None:
+    given = cfx.forecast("cfx://i80-idm", others, at=28.0, horizon=5.0)
+    assert given.paths["time_s"].max() == pytest.approx(29.9)
+    settings: dict[str, Any] = {"leader": "constant_speed", "at": 28.0, "horizon": 5.0}
+    free = cfx.forecast("cfx://i80-idm", others, **settings)
+    assert free.paths["time_s"].max() == pytest.approx(33.0)
+    assert free.measured["time_s"].max() == pytest.approx(29.9)
+
+
+def test_sampled_paths_differ_by_seed_and_make_fans(others: cfx.Pairs) -> None:
+    settings: dict[str, Any] = {"at": 10.0, "horizon": 2.0, "samples": 4}
+    one, same, other = (
+        cfx.forecast("cfx://i80-idm-stochastic", others, seed=seed, **settings)
+        for seed in (0, 0, 1)
+    )
+    pd.testing.assert_frame_equal(one.paths, same.paths)
+    assert not one.paths.equals(other.paths)
+    ends = one.paths[one.paths["time_s"] == one.paths["time_s"].max()]
+    assert ends.groupby("pair_id")["speed"].nunique().tolist() == [4, 4]
+    bands = one.quantiles((0.1, 0.9))["speed"]
+    assert (bands.xs(0.1, level="quantile") <= bands.xs(0.9, level="quantile")).all()
+    assert vars(one.plot())["_repr_png_"]().startswith(b"\x89PNG")
+
+
+def test_a_forecast_refuses_what_it_cannot_do(others: cfx.Pairs) -> None:
+    with pytest.raises(ConfigError, match="leaves nothing to chance"):
+        cfx.forecast("cfx://i80-idm", others, at=10.0, samples=5)
+    with pytest.raises(ConfigError, match=r"pair .* lasts 29.9 s"):
+        cfx.forecast("cfx://i80-idm", others, at=40.0)
+    with pytest.raises(DataError, match="i80-idn"):
+        cfx.forecast("cfx://i80-idn", others, at=10.0)

@@ -1,0 +1,84 @@
+"""The scikit-learn estimator: its conventions, and the calibration behind it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from sklearn.exceptions import NotFittedError
+from sklearn.model_selection import GroupKFold, cross_val_score
+from sklearn.utils import estimator_checks
+
+import cfx
+from cfx.core.errors import ConfigError, DataError
+from cfx.sklearn import CarFollowingRegressor
+
+CHECKS = (
+    "check_do_not_raise_errors_in_init_or_set_params",
+    "check_mixin_order",
+    "check_estimator_cloneable",
+    "check_estimator_repr",
+    "check_estimator_tags_renamed",
+    "check_get_params_invariance",
+    "check_no_attributes_set_in_init",
+    "check_parameters_default_constructible",
+    "check_set_params",
+    "check_valid_tag_types",
+)
+"""Those that feed no arrays of random numbers."""
+
+
+@pytest.fixture(scope="module")
+def table() -> pd.DataFrame:
+    return cfx.read(dataset="synthetic", pairs=3, frames=150).frame
+
+
+@pytest.fixture(scope="module")
+def fitted(table: pd.DataFrame) -> CarFollowingRegressor:
+    return CarFollowingRegressor("idm", settings={"optimizer": "random"}).fit(table)
+
+
+@pytest.mark.parametrize("name", CHECKS)
+def test_it_keeps_the_conventions(name: str) -> None:
+    getattr(estimator_checks, name)("CarFollowingRegressor", CarFollowingRegressor())
+
+
+def test_speeds_are_predicted_in_the_order_of_the_rows(
+    fitted: CarFollowingRegressor, table: pd.DataFrame
+) -> None:
+    predicted = fitted.predict(table)
+    assert np.isfinite(predicted).all()
+    shuffled = table.sample(frac=1.0, random_state=1)
+    again = pd.Series(fitted.predict(shuffled), shuffled.index).sort_index()
+    np.testing.assert_array_equal(again, predicted)
+    first = table["frame"] == 0
+    np.testing.assert_array_equal(predicted[first], table.loc[first, "follower_speed_mps"])
+
+
+def test_its_score_is_the_loss_of_its_parameters(
+    fitted: CarFollowingRegressor, table: pd.DataFrame
+) -> None:
+    errors = (fitted.predict(table) - table["follower_speed_mps"]) ** 2
+    compared = table["frame"] > 0
+    losses = errors[compared].groupby(table["pair_id"]).mean() ** 0.5
+    assert fitted.score(table) == pytest.approx(-losses.mean(), rel=1e-9)
+    assert list(fitted.parameters_.index) == ["v0", "T", "s0", "a", "b"]
+
+
+def test_drivers_are_held_out_together(table: pd.DataFrame) -> None:
+    regressor = CarFollowingRegressor("idm", settings={"optimizer": "random"})
+    scores = cross_val_score(regressor, table, groups=table["pair_id"], cv=GroupKFold(3))
+    assert scores.shape == (3,)
+    assert (scores < 0).all()
+
+
+def test_what_is_no_table_is_refused(table: pd.DataFrame) -> None:
+    with pytest.raises(NotFittedError):
+        CarFollowingRegressor().predict(table)
+    given: Any = np.zeros((4, 3))
+    with pytest.raises(DataError, match="give a pandas data frame"):
+        CarFollowingRegressor().fit(given)
+    with pytest.raises(ConfigError, match="there is no model 'idn'"):
+        CarFollowingRegressor("idn").fit(table)
