@@ -1,4 +1,7 @@
-"""A finished job as a report knows it: what its files hold, nothing else."""
+"""A finished job as a report knows it: what its files hold, nothing else.
+
+A metric of a plugin that is not installed here is known from `data.json` alone.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page: one HTML file with its plots, tables, scripts and styles in it."""
+"""The page: one HTML file with its summary, plots, tables, scripts and styles in it."""
 
 from __future__ import annotations
 

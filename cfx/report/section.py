@@ -1,6 +1,7 @@
 """What a section of the report is: a template, and what the template shows of some jobs.
 
 An entry point of the group `cfx.sections` makes it known; its name becomes its anchor in the page.
+Its tables are `Sheet`s: columns that say what a row shows, and cells.
 """
 
 from __future__ import annotations

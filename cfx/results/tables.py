@@ -1,4 +1,4 @@
-"""The tables of results that cfx's own protocols deliver."""
+"""The tables of results that cfx's own protocols deliver, and that of results by site."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """The folder of a sweep: which one a command continues or makes, and the locks around it.
 
 A folder and a job are used by one process at a time. The operating system frees their locks when
-the process ends, however it ends.
+the process ends, however it ends. Hashes of what was asked for say when two commands are the same
+sweep, and two jobs the same job; importing this module makes `${cfx_job:}` known to OmegaConf.
 """
 
 from __future__ import annotations

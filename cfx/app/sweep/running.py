@@ -1,4 +1,8 @@
-"""A sweep that runs in this process: it finds its folder and leaves a summary there."""
+"""A sweep that runs in this process: it finds its folder and leaves a summary there.
+
+Hydra knows a sweep's folder in two ways: the master configuration, and the overrides from which
+each job is composed again, also in worker processes. `SweepFolder`, which Hydra calls, sets both.
+"""
 
 from __future__ import annotations
 

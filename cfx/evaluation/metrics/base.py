@@ -1,4 +1,4 @@
-"""What a metric is, and what it is given.
+"""What a metric is, what it is given, and which ones a job measures.
 
 Shapes: P pairs, K + 1 frames, n tuned parameters. Frame 0 is the measured state that the simulation
 starts from. SI units.

@@ -1,4 +1,7 @@
-"""How safe a simulated trajectory is. Shapes: P pairs, K + 1 frames."""
+"""How safe and smooth a simulated trajectory is, and how its parameters are used.
+
+Shapes: P pairs, K + 1 frames.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One pair over time: speed, gap and the parameters of each method."""
+"""Pairs over time, best to worst: speed, gap and the parameters of each method."""
 
 from __future__ import annotations
 
