@@ -291,7 +291,8 @@ class Agent:
         """As `act`, as a pure function of tensors that no value branches: it can be exported.
 
         Args:
-            history, state: as for `act`.
+            history: the last `windows.length` frames of D drivers, `(D, L)` each, SI units.
+            state: where they stand.
             noise: standard normal, `(D, k)`, for what a stochastic head leaves to chance; None:
                 nothing is drawn.
 

@@ -81,13 +81,12 @@ def as_recorded(outcome: Outcome) -> Array:
 class CarFollowingVectorEnv(VectorEnv[Array, Array, Array]):
     """E environments of one recording, of which each episode is one pair from its first frame on.
 
-    | observation | unit | |
+    | observation | unit | of |
     | --- | --- | --- |
-    | speed, acceleration | m/s, m/s2 | of the ego vehicle |
-    | gap | m | to the vehicle ahead, bumper to bumper |
-    | leader_speed, leader_acceleration | m/s, m/s2 | of the vehicle ahead |
-    | follower_gap, follower_speed, follower_acceleration | m, m/s, m/s2 | of the next vehicle
-    behind, where there is one |
+    | speed, acceleration | m/s, m/s2 | the ego vehicle |
+    | gap | m | the vehicle ahead, bumper to bumper |
+    | leader_speed, leader_acceleration | m/s, m/s2 | the vehicle ahead |
+    | follower_gap, follower_speed, follower_acceleration | m, m/s, m/s2 | the next one behind |
 
     The action is the ego's acceleration, m/s2, within what a vehicle can do (-9 to 2.6); it does
     not drive backwards. An episode is terminated by a collision and truncated at the recording's
