@@ -68,7 +68,7 @@ class IDM(DrivingModel):
     Differences from SUMO: with v0 = maxSpeed, T = tau, s0 = minGap, a = accel, b = decel it is
     SUMO's IDM wherever SUMO takes one sub-step, that is for steps up to 0.37 s unless its
     `stepping` is changed. Its limits are emergencyDecel and accel there, and `model.limits` here.
-    SUMO also rounds speeds below 1e-5 m/s to 0, and the road's limit lowers v0.
+    SUMO also rounds speeds below 1e-5 m/s (at steps of 0.1 s) to 0, and the road's limit lowers v0.
     """
 
     reference = "Treiber, Hennecke and Helbing (2000), Phys. Rev. E 62(2)"

@@ -44,6 +44,10 @@ class InSumo(Protocol):
         """
 
 
+_HALTING = 1e-4
+"""m/s2: SUMO stops a vehicle that is slower than what this reaches within a step."""
+
+
 def sumo_speed(
     v: Tensor,
     wanted: Tensor,
@@ -58,8 +62,8 @@ def sumo_speed(
 
     With `top = min(v + accel dt, v_max)` the plan is `min(top, wanted)`; it is bounded by 0 and by
     `v - emergency_decel dt`, so that `emergency_decel` is the brake cap, not `decel`, unless that
-    is the larger one. Speeds below 1e-5 m/s become 0. The lane's limit is taken to be above
-    `v_max`.
+    is the larger one. Speeds below `_HALTING dt` become 0: 1e-5 m/s at 0.1 s. The lane's limit is
+    taken to be above `v_max`.
 
     Args:
         v: speed now, m/s.
@@ -73,4 +77,4 @@ def sumo_speed(
     plan = torch.minimum(top, wanted)
     hardest = torch.minimum(comfortable, (v - emergency_decel * dt).clamp(min=0.0))
     speed = torch.maximum(plan, hardest)
-    return torch.where(speed.abs() < 1e-5, 0.0, speed)
+    return torch.where(speed.abs() < _HALTING * dt, 0.0, speed)

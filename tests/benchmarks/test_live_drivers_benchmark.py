@@ -28,7 +28,7 @@ sys.modules["pyarrow"] = None
 from pathlib import Path
 from cfx_sumo.drive.run import run_scenario
 driven = run_scenario(Path("motorway.sumocfg"), {"calm": "krauss", "hasty": "w99"}, end=float(sys.argv[1]))
-share = sum(tally.driven for tally in driven.tallies.values()) / sum(tally.steps for tally in
+share = sum(tally.behind for tally in driven.tallies.values()) / sum(tally.steps for tally in
 driven.tallies.values())
 print(json.dumps([driven.steps, driven.seconds, driven.real_time, driven.most, share]))
 """

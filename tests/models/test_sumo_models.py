@@ -6,6 +6,7 @@ import torch
 from cfx.core.errors import ConfigError
 from cfx.models.krauss import Krauss
 from cfx.models.krauss_sumo import KraussSumo
+from cfx.models.vtype import sumo_speed
 from cfx.models.w99 import W99
 
 
@@ -36,3 +37,13 @@ def test_krauss_sumo_keeps_its_time_gap_behind_a_steady_leader() -> None:
 def test_a_variant_that_sumo_does_not_have_says_what_it_has(model: Krauss | W99) -> None:
     with pytest.raises(ConfigError, match="simulator=sumo: SUMO has model="):
         model.sumo_vtype(model.space.unpack(model.space.defaults()))
+
+
+@pytest.mark.parametrize("dt", [0.1, 0.5, 1.0])
+def test_a_vehicle_stops_below_the_speed_at_which_sumo_stops_it(dt: float) -> None:
+    """SUMO's slowest speeds at these steps are just above 1e-4 m/s2 times the step."""
+    wanted = torch.tensor([0.9e-4, 1.1e-4], dtype=torch.float64) * dt
+    one = torch.ones_like(wanted)
+    limits = {"accel": 2.6 * one, "decel": 4.5 * one, "emergency_decel": 9.0 * one}
+    speed = sumo_speed(0.0 * one, wanted, v_max=50.0 * one, dt=dt, **limits)
+    assert speed.tolist() == [0.0, wanted[1].item()]

@@ -32,8 +32,9 @@ from cfx.policies.valid_range import ValidRange
 from cfx.simulation.rollout import MemoryStepper
 from cfx_sumo.demo.motorway import read_motorway
 from cfx_sumo.demo.simulated import FinishedJob, PolicyKnowledge, simulate_in_sumo
+from cfx_sumo.live.braking import needed_deceleration
 from cfx_sumo.live.draws import standard_normal
-from cfx_sumo.live.driver import Driver, needed_deceleration
+from cfx_sumo.live.driver import Driver
 from cfx_sumo.live.fleet import Fleet
 from cfx_sumo.live.surroundings import Seen
 from tests.agents import adaptive
@@ -54,6 +55,7 @@ class Car:
     told: list[float] = field(default_factory=list)
     mode: int = 31
     decel: float = 4.5
+    acts_every: float | None = None
 
 
 class TraCIException(Exception):  # noqa: N818 - SUMO's name
@@ -67,6 +69,7 @@ class Road:
         self.cars = dict(cars)
         self.time, self.dt = 0.0, dt
         self.departed: list[str] = []
+        self.options = {"step-method.ballistic": "false"}
         self.vehicle = self.simulation = self
 
     def advance(self) -> None:
@@ -80,6 +83,12 @@ class Road:
 
     def getIDList(self) -> tuple[str, ...]:  # noqa: N802
         return tuple(self.cars)
+
+    def getOption(self, name: str) -> str:  # noqa: N802
+        return self.options[name]
+
+    def getActionStepLength(self, name: str) -> float:  # noqa: N802
+        return self.cars[name].acts_every or self.dt
 
     def getDepartedIDList(self) -> tuple[str, ...]:  # noqa: N802
         return tuple(self.departed)
@@ -193,30 +202,64 @@ def test_a_vehicle_that_leaves_is_forgotten_and_its_place_is_used_again() -> Non
     assert driver.parameters("v3") == {}
 
 
-def test_without_a_leader_sumo_drives_and_a_new_leader_begins_anew() -> None:
+def test_without_a_leader_the_policys_own_model_drives_and_a_new_leader_begins_anew() -> None:
     road = platoon(1)
     car = road.cars["v0"]
     driver = Driver(adaptive({"name": "krauss"}), look_ahead=100, speed_mode=0)
     driver.step(road, "v0")
-    assert car.mode == 0
-    assert driver.drives("v0")
+    assert driver.follows("v0")
     before = driver.parameters("v0")
     road.advance()
     car.gap = 101.0
     driver.step(road, "v0")
-    assert car.told[-1] == -1
-    assert car.mode == 31
-    assert not driver.drives("v0")
-    assert driver.vehicles == ()
-    car.leader = None
+    assert driver.drives("v0")
+    assert not driver.follows("v0")
+    assert car.told[-1] == pytest.approx(8.0 + 0.26), "as fast as it may"
+    assert driver.parameters("v0") == pytest.approx(
+        dict(zip(Krauss().space.names, Krauss().space.defaults().tolist(), strict=True))
+    )
+    car.leader, car.speed, car.allowed = None, 13.8, 13.9
     road.advance()
     driver.step(road, "v0")
-    assert car.told[1:] == [-1], "SUMO is told once"
-    car.leader, car.gap = "lead", 15.0
+    assert car.told[-1] == 13.9, "to the lane's limit"
+    assert driver.counts.free == 2
+    assert driver.counts.steps == 1
+    car.leader, car.gap, car.speed, car.allowed = "lead", 15.0, 8.0, 60.0
     road.advance()
     driver.step(road, "v0")
     assert driver.parameters("v0") == pytest.approx(before), "as at the very first"
     assert car.mode == 0
+    driver.release(road, "v0")
+    assert car.told[-1] == -1
+    assert car.mode == 31
+
+
+def test_a_free_road_is_driven_with_the_base_that_a_vehicle_has() -> None:
+    policy = adaptive({"name": "idm"}, offsets=True)
+    driver = Driver(policy)
+    base = dict(zip(policy.space.names, policy.space.defaults().tolist(), strict=True))
+    driver.assign("v1", base=base | {"v0": 20.0})
+    road = Road(v0=Car(), v1=Car())
+    driver.step(road, ["v0", "v1"])
+    assert driver.parameters("v1")["v0"] == pytest.approx(20.0)
+    assert driver.parameters("v0") != driver.parameters("v1")
+    assert road.cars["v0"].told != road.cars["v1"].told
+    constant = Driver.constant(Krauss(), {"t_r": 2.0})
+    constant.step(road, "v0")
+    assert constant.parameters("v0")["t_r"] == pytest.approx(2.0)
+
+
+def test_nothing_jumps_where_a_leader_comes_within_sight() -> None:
+    """The acceleration with a residual head just within the look-ahead and just beyond."""
+    policy = adaptive({"name": "idm"}, residual=True)
+    accelerations = []
+    for gap in (199.0, 201.0):
+        road = Road(
+            lead=Car(speed=14.0), v0=Car(speed=14.0, acceleration=0.7, gap=gap, leader="lead")
+        )
+        Driver(policy).step(road, "v0")
+        accelerations.append((road.cars["v0"].told[0] - 14.0) / 0.1)
+    assert accelerations[0] == pytest.approx(accelerations[1], abs=0.2)
 
 
 def test_a_leader_that_traci_makes_up_is_none() -> None:
@@ -224,11 +267,11 @@ def test_a_leader_that_traci_makes_up_is_none() -> None:
     driver = Driver(adaptive({"name": "krauss"}), look_ahead=100, speed_mode=0)
     road.cars["v0"].gap = -1.8e308
     driver.step(road, "v0")
-    assert not driver.drives("v0")
+    assert not driver.follows("v0")
     road.advance()
     road.cars["v0"].gap = 20.0
     driver.step(road, "v0")
-    assert driver.drives("v0")
+    assert driver.follows("v0")
 
 
 @pytest.mark.parametrize("look_ahead", [-5.0, 0.0, float("nan")])
@@ -364,9 +407,18 @@ def test_what_cannot_be_driven_is_one_sentence(tmp_path: Path) -> None:
     driver = Driver(policy, source="outputs/job")
     with pytest.raises(
         SumoError,
-        match=r"steps by 1 s, the policy of outputs/job was trained at 0.1 s; start SUMO with",
+        match=r"steps by 2 s; the policy of outputs/job drives in steps of 0.01 to 1 s, and best in"
+        " the 0.1 s that it was trained at: start SUMO with --step-length 0.1",
     ):
-        driver.step(Road(dt=1.0), [])
+        driver.step(Road(dt=2.0), [])
+    ballistic = platoon(1)
+    ballistic.options["step-method.ballistic"] = "true"
+    with pytest.raises(SumoError, match=r"start SUMO without --step-method\.ballistic"):
+        Driver(policy).step(ballistic, "v0")
+    with pytest.raises(
+        SumoError, match=r"vehicle 'v0' acts every 1 s \(actionStepLength\) in steps of 0.1 s"
+    ):
+        Driver(policy).step(platoon(1, acts_every=1.0), "v0")
     with pytest.raises(
         SumoError, match=r"vehicle 'gone' cannot be driven \(Vehicle 'gone' is not known"
     ):
@@ -599,13 +651,6 @@ def test_a_fleet_drives_each_type_by_its_own_and_finds_who_comes(
     assert "v0" not in fleet.vehicles
     assert fleet.drivers["hasty"].drives("new")
     assert road.cars["v4"].told == road.cars["lead"].told == []
-    with pytest.raises(DataError, match=r"different time steps \(a 0.1 s, b 0.2 s\)"):
-        Fleet(
-            {
-                "a": Driver(adaptive({"name": "krauss"})),
-                "b": Driver(adaptive({"name": "krauss"}, dt=0.2)),
-            }
-        )
 
 
 def test_the_package_gives_the_driver_and_imports_no_sumo() -> None:

@@ -20,7 +20,7 @@ class DriveCommand(Command):
             "cfx drive",
             description="Runs a SUMO scenario in which policies drive the vehicles of some vTypes.",
             epilog="What follows -- goes to SUMO as it is:"
-            " cfx drive city.sumocfg --drivers calm=RUN -- --step-length 0.1",
+            " cfx drive city.sumocfg --drivers calm=RUN -- --time-to-teleport -1",
         )
         parser.add_argument(
             "scenario",
@@ -45,6 +45,13 @@ class DriveCommand(Command):
             help="of simulated time; default: the scenario's",
         )
         parser.add_argument(
+            "--step",
+            type=float,
+            metavar="SECONDS",
+            help="of the simulation, 0.01 to 1; default: the scenario's, or the policy's where it"
+            " has none",
+        )
+        parser.add_argument(
             "--seed",
             type=int,
             help="SUMO's, and that of stochastic policies; default: the scenario's, and 0",
@@ -59,7 +66,7 @@ class DriveCommand(Command):
             type=float,
             default=200.0,
             metavar="METRES",
-            help="farther is no leader; default: 200",
+            help="farther is no leader: the policy's own model drives freely; default: 200",
         )
         parser.add_argument(
             "--speed-mode",
@@ -109,7 +116,13 @@ def _drive(options: argparse.Namespace) -> None:
         if options.scenario == "stress":
             from cfx_sumo.drive.stress import report_stress, run_stress
 
-            result = run_stress(runs, seed=options.seed or 0, speed_mode=options.speed_mode)
+            result = run_stress(
+                runs,
+                seed=options.seed or 0,
+                speed_mode=options.speed_mode,
+                step=options.step,
+                sumo_options=options.sumo_options,
+            )
             report_stress(result, output)
             return
         scenario = options.scenario
@@ -119,6 +132,7 @@ def _drive(options: argparse.Namespace) -> None:
             scenario,
             runs,
             end=options.end,
+            step=options.step,
             seed=options.seed,
             output=output,
             look_ahead=options.look_ahead,

@@ -46,7 +46,7 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "lost.rou.xml").write_text(DEMAND.replace("1001 1002 1003", "1001 1002 9999"))
     for name, values in {
         "motorway": {"demand": demand, "step": 0.1},
-        "slow": {"demand": demand, "step": 0.5},
+        "slow": {"demand": demand, "step": 2},
         "lost": {"demand": folder / "lost.rou.xml", "step": 0.1},
     }.items():
         (folder / f"{name}.sumocfg").write_text(CONFIGURATION.format(net=SHIPPED, **values))
@@ -141,10 +141,7 @@ def test_what_cannot_be_driven_is_one_sentence_and_leaves_no_file(scenario: Path
     assert never.startswith(
         "no vehicle of vType 'ghost' was ever on the road in motorway.sumocfg (2 s)"
     )
-    assert (
-        "steps by 0.5 s, the policy of calm was trained at 0.1 s; start SUMO with --step-length 0.1"
-        in step
-    )
+    assert "the simulation steps by 2 s; the policy of calm drives in steps of 0.01 to 1 s" in step
     assert edge.startswith(
         "SUMO refuses lost.sumocfg: The edge '9999' within the route 'whole' is not known"
     )
@@ -306,7 +303,7 @@ def test_the_table_says_it_all(capsys: pytest.CaptureFixture[str]) -> None:
     tally = Tally(
         {"a", "b"},
         steps=200,
-        driven=150,
+        behind=150,
         metres=240.0,
         lane_changes=3,
         hard_brakings=2,
@@ -326,6 +323,7 @@ def test_the_table_says_it_all(capsys: pytest.CaptureFixture[str]) -> None:
         others=5,
         most=2,
         limited={"calm": 0.25},
+        changed={"calm": 0.5},
         outside={"calm": "3 % of steps outside what the policy has learned (speed above 18 m/s)"},
         recorded={"calm": recorded},
         collisions=[
@@ -337,7 +335,7 @@ def test_the_table_says_it_all(capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     rows = [line.split() for line in out.splitlines() if "calm" in line]
     assert rows[0] == ["calm", "2", "75%", "12.00", "3", "1", "8", "4"]
-    assert rows[1] == ["calm", "0.49", "4.99", "6.25", "2", "25.0%"]
+    assert rows[1] == ["calm", "0.49", "4.99", "6.25", "2", "25.0%", "50.0%"]
     assert rows[2] == ["calm", "10.05,", "12.05,", "14.05", *["nan,", "nan,", "nan"] * 2]
     assert rows[3][0] == "calm:"
     assert "3.10 s: a behind b on road_0 at 51.3 m: contact, gap -0.20 m" in out

@@ -18,6 +18,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, Unpack
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -82,7 +83,7 @@ class Tally:
     Attributes:
         vehicles: ids of all that were on the road.
         steps: vehicle steps.
-        driven: those of them that the model drove; in the others no vehicle was ahead.
+        behind: those of them behind a leader; in the others no vehicle was ahead.
         metres: the distance that all covered together.
         lane_changes: on the same edge.
         hard_brakings: times that a vehicle began to brake harder than its vType's `decel`.
@@ -90,7 +91,7 @@ class Tally:
         braking: decelerations of all steps, m/s2; 0 where a vehicle did not brake.
         speeds: of all steps, m/s.
         accelerations: of all steps, m/s2.
-        time_gaps: of the steps that the model drove faster than walking, s.
+        time_gaps: of the steps behind a leader faster than walking, s.
         collisions: of those that SUMO reported, the ones with contact (`Collision.contact`).
         below_min_gap: the others: the gap was below minGap, and nobody was touched.
         teleports: vehicles that SUMO reported; a vehicle may teleport more than once.
@@ -98,7 +99,7 @@ class Tally:
 
     vehicles: set[str] = field(default_factory=set)
     steps: int = 0
-    driven: int = 0
+    behind: int = 0
     metres: float = 0.0
     lane_changes: int = 0
     hard_brakings: int = 0
@@ -165,8 +166,9 @@ class ScenarioRun:
         seconds: how long it took.
         others: most vehicles of other types at one time.
         most: most vehicles of the driven types at one time.
-        limited: for each vType, the share of the steps that the model drove at a limit of
-            acceleration.
+        limited: for each vType, the share of the model's steps behind a leader that are at a limit
+            of acceleration.
+        changed: for each vType, the share of the speeds that SUMO's checks changed.
         outside: for each vType, how much was driven outside what its policy has learned, in words;
             "" where nothing was.
         recorded: for each vType, quantiles of the recording that its policy learned from, by
@@ -181,6 +183,7 @@ class ScenarioRun:
     others: int
     most: int
     limited: Mapping[str, float] = field(default_factory=dict)
+    changed: Mapping[str, float] = field(default_factory=dict)
     outside: Mapping[str, str] = field(default_factory=dict)
     recorded: Mapping[str, Mapping[str, Sequence[float]]] = field(default_factory=dict)
     collisions: Sequence[Collision] = ()
@@ -198,6 +201,7 @@ def run_scenario(
     runs: Mapping[str, str | Path],
     *,
     end: float | None = None,
+    step: float | None = None,
     output: Path | None = None,
     gui: bool = False,
     sumo_options: Sequence[str] = (),
@@ -215,6 +219,7 @@ def run_scenario(
         runs: vType or vTypeDistribution -> a job's output folder, the id of its MLflow run, or a
             ready-made policy (`cfx://NAME`).
         end: s of simulated time.
+        step: of the simulation, s; None: the scenario's, or that of the policies where it has none.
         output: a CSV file with a row for each driven vehicle and step.
         gui: show SUMO's window, slowly enough to watch.
         sumo_options: more of SUMO's own options.
@@ -232,9 +237,10 @@ def run_scenario(
         seed = options.get("seed")
         options["seed"] = seed or 0
         fleet = Fleet.load(runs, **options)
-        connection = stack.enter_context(
-            started(path, command_line(path, seed, gui, sumo_options), gui)
-        )
+        if step is None and not _sets_step(path, sumo_options):
+            step = min(driver.policy.dt for driver in fleet.drivers.values())
+        command = command_line(path, sumo_options, step=step, seed=seed, gui=gui)
+        connection = stack.enter_context(started(path, command, gui))
         rows = _Rows.opened(stack, output, fleet) if output is not None else None
         try:
             return _Run(connection, fleet, path, rows, actor, _name(scenario)).go(end)
@@ -358,10 +364,34 @@ def _gui_program() -> str:
     return program
 
 
+def _sets_step(scenario: Path, options: Sequence[str]) -> bool:
+    """Says whether SUMO's configuration or the user's own options say how long a step is."""
+    if any(option.partition("=")[0] == "--step-length" for option in options):
+        return True
+    try:
+        # S314: it is the user's own file, which SUMO reads next.
+        return next(ElementTree.parse(scenario).iter("step-length"), None) is not None  # noqa: S314
+    except ElementTree.ParseError:
+        return True  # SUMO says what is wrong with it
+
+
 def command_line(
-    scenario: Path, seed: int | None = None, gui: bool = False, options: Sequence[str] = ()
+    scenario: Path,
+    options: Sequence[str] = (),
+    *,
+    step: float | None = None,
+    seed: int | None = None,
+    gui: bool = False,
 ) -> list[str]:
-    """Returns SUMO's command line; the user's own options come last and win."""
+    """Returns SUMO's command line; the user's own options come last and win.
+
+    Args:
+        scenario: SUMO's configuration.
+        options: the user's own.
+        step: of the simulation, s; None: the configuration's.
+        seed: SUMO's; None: the configuration's.
+        gui: whether SUMO's window is shown.
+    """
     command = ["sumo", "-c", str(scenario)]
     if gui:
         command[0] = _gui_program()
@@ -369,6 +399,8 @@ def command_line(
     for name in ("--no-step-log", "--duration-log.disable", "--no-warnings"):
         if name not in options:
             command += [name, "true"]
+    if step is not None:
+        command += ["--step-length", f"{step:g}"]
     if seed is not None:
         command += ["--seed", str(seed)]
     return command + list(options)
@@ -470,9 +502,10 @@ class _Run:
                 self._tallies[collision.kind].collisions += 1
             else:
                 self._tallies[collision.kind].below_min_gap += 1
-        limited, outside, recorded = {}, {}, {}
+        limited, changed, outside, recorded = {}, {}, {}, {}
         for name, driver in self._fleet.drivers.items():
             limited[name] = driver.counts.limited / max(1, driver.counts.steps)
+            changed[name] = driver.counts.changed / max(1, driver.counts.told)
             outside[name] = driver.outside_in_words()
             recorded[name] = driver.policy.trained_on.quantiles
         return ScenarioRun(
@@ -483,6 +516,7 @@ class _Run:
             self._others,
             self._most,
             limited,
+            changed,
             outside,
             recorded,
             self._collisions,
@@ -518,8 +552,8 @@ class _Run:
         tally.vehicles.add(name)
         tally.steps += 1
         tally.metres += vehicle.getSpeed(name) * dt
-        if self._fleet.drivers[kind].drives(name):
-            tally.driven += 1
+        if self._fleet.drivers[kind].follows(name):
+            tally.behind += 1
         lane = vehicle.getRoadID(name), vehicle.getLaneIndex(name)
         before = self._lanes.get(name, lane)
         if before[0] == lane[0] and before[1] != lane[1]:
@@ -714,7 +748,7 @@ def _what_happened(run: ScenarioRun) -> Table:
     table = _table(
         "vType",
         "vehicles",
-        "model drove",
+        "behind a leader",
         "mean speed [m/s]",
         "lane changes",
         "collisions",
@@ -725,7 +759,7 @@ def _what_happened(run: ScenarioRun) -> Table:
         table.add_row(
             name,
             str(len(tally.vehicles)),
-            f"{tally.driven / tally.steps:.0%}",
+            f"{tally.behind / tally.steps:.0%}",
             f"{tally.metres / (tally.steps * run.dt):.2f}",
             str(tally.lane_changes),
             str(tally.collisions),
@@ -744,6 +778,7 @@ def _braking(run: ScenarioRun) -> Table:
         "hardest",
         "times above decel",
         "steps at limits",
+        "changed by SUMO",
     )
     for name, tally in run.tallies.items():
         table.add_row(
@@ -753,6 +788,7 @@ def _braking(run: ScenarioRun) -> Table:
             f"{tally.hardest_braking:.2f}",
             str(tally.hard_brakings),
             f"{run.limited.get(name, 0.0):.1%}",
+            f"{run.changed.get(name, 0.0):.1%}",
         )
     return table
 

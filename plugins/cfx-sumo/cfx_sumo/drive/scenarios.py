@@ -19,7 +19,7 @@ from cfx_sumo.demo.motorway import SHIPPED as MOTORWAY
 ASSETS = Path(__file__).resolve().parent.parent / "assets"
 
 STEP_S = 0.1
-"""Time step of all scenarios, as that of the recordings."""
+"""Time step of all scenarios, as that of the recordings, unless the user says otherwise."""
 
 CAR = (
     '<vType id="car" accel="2.6" decel="4.5" emergencyDecel="9" sigma="0" tau="1" minGap="2.5"'
@@ -88,6 +88,7 @@ class Waves:
 
     def __call__(self, connection: Any) -> None:
         now, vehicle = connection.simulation.getTime(), connection.vehicle
+        step = connection.simulation.getDeltaT()
         every, lasts = _WAVE_S
         for name in vehicle.getIDList():
             if not name.startswith("wave"):
@@ -95,13 +96,13 @@ class Waves:
             begins = self._next.setdefault(name, now + every / 2)
             if now >= begins:
                 needed = max(0.0, vehicle.getSpeed(name) - _WAVE_MPS) / _WAVE_DECELERATION
-                vehicle.slowDown(name, _WAVE_MPS, needed + STEP_S)
+                vehicle.slowDown(name, _WAVE_MPS, needed + step)
                 self._until[name] = now + needed + lasts
                 self._next[name] = now + needed + lasts + every
             elif self._until.get(name, now + 1.0) <= now:
                 allowed = vehicle.getAllowedSpeed(name)
                 needed = max(0.0, allowed - vehicle.getSpeed(name)) / _WAVE_ACCELERATION
-                vehicle.slowDown(name, allowed, needed + STEP_S)
+                vehicle.slowDown(name, allowed, needed + step)
                 del self._until[name]
 
 

@@ -9,7 +9,7 @@ survive it with less.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -63,6 +63,13 @@ class Event(NamedTuple):
     headway: float | None = None
 
 
+class _Command(NamedTuple):
+    """How SUMO is started: its step, s (None: 0.1 s), and more of its options."""
+
+    step: float | None
+    options: tuple[str, ...]
+
+
 @dataclass
 class EventResult:
     """What happened in all events of a kind.
@@ -106,6 +113,8 @@ def run_stress(
     seed: int = 0,
     cut_ins: int = 1000,
     speed_mode: int = OBEYS_ALL,
+    step: float | None = None,
+    sumo_options: Sequence[str] = (),
 ) -> StressResult:
     """Drives all events with the policy of the vType `car`.
 
@@ -114,6 +123,8 @@ def run_stress(
         seed: of the events.
         cut_ins: how many; of the other kinds a fifth as many.
         speed_mode: as in `Driver`.
+        step: of the simulation, s; None: 0.1 s.
+        sumo_options: more of SUMO's own options.
 
     Raises:
         SumoError: SUMO is missing, or another vType than `car` is given.
@@ -129,13 +140,14 @@ def run_stress(
         "leaders braking at 9 m/s2": [_braking_leader(rng) for _ in range(few)],
         "standing vehicles": [_standing_vehicle(rng) for _ in range(few)],
     }
+    command = _Command(step, tuple(sumo_options))
     found = []
     with Task("Driving stress", len(kinds) + 2) as task:
         for kind, events in kinds.items():
-            found.append(_run_events(kind, events, _fleet(runs, speed_mode)))
+            found.append(_run_events(kind, events, _fleet(runs, speed_mode), command))
             task.advance()
         for kind, routes, end in _TOWN:
-            found.append(_run_town(kind, routes, end, _fleet(runs, speed_mode)))
+            found.append(_run_town(kind, routes, end, _fleet(runs, speed_mode), command))
             task.advance()
     return StressResult(tuple(found))
 
@@ -199,17 +211,15 @@ def _standing_vehicle(rng: np.random.Generator) -> Event:
     return Event(speed, 150.0 + _SETTLE_S * speed, 0.0)
 
 
-def _run_events(kind: str, events: list[Event], fleet: Fleet) -> EventResult:
+def _run_events(kind: str, events: list[Event], fleet: Fleet, command: _Command) -> EventResult:
     """Runs events side by side, each on a road of its own."""
     roads = network(len(events), 2, length=_ROAD_M, speed=_LANE_MPS, apart=_APART_M)
-    events_at = round(_SETTLE_S / STEP_S)
-    steps = events_at + round(_LASTS_S / STEP_S)
     result = EventResult(kind, len(events))
 
     def act(sumo: Any, step: int) -> None:
         if step == 0:
             _take_hold(sumo, events)
-        if step == events_at:
+        if step == round(_SETTLE_S / sumo.simulation.getDeltaT()):
             headways = _happen(sumo, events)
             if headways is not None:
                 result.number = len(headways)
@@ -218,7 +228,8 @@ def _run_events(kind: str, events: list[Event], fleet: Fleet) -> EventResult:
     with tempfile.TemporaryDirectory(prefix="cfx-") as folder:
         net = Path(folder, "stress.net.xml")
         net.write_text(roads, encoding="utf-8")
-        _drive(Scenario(kind, _placed(events), net, _ENDLESS_S), fleet, steps, result, act)
+        scenario = Scenario(kind, _placed(events), net, _ENDLESS_S)
+        _drive(scenario, fleet, _SETTLE_S + _LASTS_S, result, act, command)
     return result
 
 
@@ -250,6 +261,7 @@ def _happen(sumo: Any, events: list[Event]) -> list[float] | None:
         None where nobody acts.
     """
     vehicle = sumo.vehicle
+    reaction = max(sumo.simulation.getDeltaT(), STEP_S)
     acting: dict[int, str] = {}
     for number, event in enumerate(events):
         car, leader, cutter = f"{_KIND}.{number}", f"leader.{number}", f"cutter.{number}"
@@ -257,7 +269,7 @@ def _happen(sumo: Any, events: list[Event]) -> list[float] | None:
         if event.slower is not None:
             cutter_speed = min((1.0 - event.slower) * speed, event.leader_speed)
             closing = speed - cutter_speed
-            gap = 1.0 + closing * STEP_S + closing**2 / (2.0 * _BEARABLE) + event.margin
+            gap = 1.0 + closing * reaction + closing**2 / (2.0 * _BEARABLE) + event.margin
             front = position + gap + _LENGTH_M
             # The leader goes on ahead of whoever cuts in, and never slower.
             room = front + _LENGTH_M + 2.0 + event.leader_speed
@@ -292,14 +304,17 @@ def _headways(vehicle: Any, acting: Mapping[int, str]) -> list[float]:
 def _drive(
     scenario: Scenario,
     fleet: Fleet,
-    steps: int,
+    seconds: float,
     result: EventResult,
     act: Callable[[Any, int], None],
+    command: _Command,
 ) -> None:
     """Runs a scenario; `act` is given each step, and notes what the driven vehicles do."""
     with tempfile.TemporaryDirectory(prefix="cfx-") as folder:
         configuration = scenario.write(Path(folder))
-        with started(configuration, command_line(configuration), gui=False) as sumo:
+        line = command_line(configuration, command.options, step=command.step)
+        with started(configuration, line, gui=False) as sumo:
+            steps = round(seconds / sumo.simulation.getDeltaT())
             _take_steps(sumo, fleet, steps, result, act)
 
 
@@ -376,7 +391,7 @@ _TOWN = (
 """Kind, demand and duration, s, of the events in `assets/town.net.xml`."""
 
 
-def _run_town(kind: str, routes: str, end: float, fleet: Fleet) -> EventResult:
+def _run_town(kind: str, routes: str, end: float, fleet: Fleet, command: _Command) -> EventResult:
     """Runs one of the scenarios with a flow of cars; an event is a car."""
     result = EventResult(kind, 0)
     seen: set[str] = set()
@@ -386,6 +401,6 @@ def _run_town(kind: str, routes: str, end: float, fleet: Fleet) -> EventResult:
 
     text = f"<routes>{CAR}{routes}</routes>"
     town = Scenario(kind, text, ASSETS / "town.net.xml", _ENDLESS_S)
-    _drive(town, fleet, round(end / STEP_S), result, act)
+    _drive(town, fleet, end, result, act, command)
     result.number = len(seen)
     return result

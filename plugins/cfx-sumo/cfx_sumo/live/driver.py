@@ -40,22 +40,21 @@ from cfx.policies.placement import ALL
 from cfx.policies.valid_range import share_in_words
 from cfx.results.store import folder_of
 from cfx.simulation.step import advance_vehicle
+from cfx_sumo.live.braking import hardest_braking
+from cfx_sumo.live.clock import Clock
 from cfx_sumo.live.draws import standard_normal
 from cfx_sumo.live.saved import DriverRecord, read_state, write_state
-from cfx_sumo.live.surroundings import Connection, Seen, look
+from cfx_sumo.live.surroundings import Connection, Seen, View, look
 from cfx_sumo.live.vehicles import VehicleTable
 
 _BOUNDS_BRAKING = 4
 """Bit of SUMO's speed mode with which a vehicle brakes no harder than its `decel`."""
 
-_MARGIN = 1.5
-"""How much harder than needed a vehicle may brake: it cannot know what its leader does next."""
+_OBEYED_MPS = 1e-3
+"""A speed this close to what SUMO was told is what it was told."""
 
 _WALKING_MPS = 1.5
 """Speed below which a time gap means nothing."""
-
-_NEAR_M = 0.2
-"""Room to brake in counts as this at least, m."""
 
 OBEYS_ALL = 31
 """Speed mode with all of SUMO's checks: lights, stops, yielding, its safe gap."""
@@ -65,7 +64,8 @@ class DriverOptions(TypedDict, total=False):
     """How vehicles are driven, whoever drives them.
 
     Attributes:
-        look_ahead: m; a vehicle farther ahead (bumper to bumper) is no leader.
+        look_ahead: m; a vehicle farther ahead (bumper to bumper) is no leader: then the policy's
+            own model drives freely.
         speed_mode: SUMO's bit set of `vehicle.setSpeedMode` while a vehicle is driven: 31 obeys
             lights, stops and junctions and keeps SUMO's safe gap; 0 does none of it.
         seed: of what a stochastic policy leaves to chance: what is drawn for a vehicle depends on
@@ -82,13 +82,19 @@ class DriveCounts:
     """What a driver did over all steps of all its vehicles.
 
     Attributes:
-        steps: vehicle steps that the model drove.
+        steps: steps of the model behind a leader.
         outside: those of them that began outside what the policy has learned from.
         limited: those at a limit of acceleration.
         beyond: in how many each signal alone was too low, then too high; None before the first.
+        free: steps of the model without a leader.
+        told: speeds that SUMO was told and whose result was seen.
+        changed: those of them that SUMO changed, by the checks that the speed mode leaves it.
     """
 
     steps: int = 0
+    free: int = 0
+    told: int = 0
+    changed: int = 0
     outside: int = 0
     limited: int = 0
     beyond: Tensor | None = None
@@ -102,25 +108,16 @@ class DriveCounts:
         self.beyond = found if self.beyond is None else self.beyond + found
 
 
-def needed_deceleration(seen: Seen) -> Tensor:
-    """Returns how hard vehicles must brake at least to keep their `minGap` behind their leaders.
+_LEADER_SPEED, _LEADER_ACCELERATION, _SPEED, _ACCELERATION, _GAP = range(len(History._fields))
+"""Rows of a history."""
 
-    The leader goes on as it is, or brakes on to a standstill: the harder of both counts. With the
-    room s, which is the gap less `minGap` (for SUMO a shorter gap is a collision, and where its own
-    models end), the speeds v and v_l and the leader's deceleration b_l,
 
-        b = (v - v_l)^2 / (2 s)  if v > v_l        b = v^2 / (2 (s + v_l^2 / (2 b_l)))
-
-    Returns:
-        `(D,)`, m/s2, not negative.
-    """
-    room = (seen.gap - seen.min_gap).clamp(min=_NEAR_M)
-    closing = (seen.speed - seen.leader_speed).clamp(min=0.0)
-    steady = closing.square() / (2.0 * room)
-    braking = (-seen.leader_acceleration).clamp(min=0.0)
-    path = seen.leader_speed.square() / (2.0 * braking.clamp(min=1e-3))
-    stopping = torch.where(braking > 0, seen.speed.square() / (2.0 * (room + path)), 0.0)
-    return torch.maximum(steady, stopping)
+def _frame(seen: Seen) -> Tensor:
+    """Returns one frame of a history, `(D, 5)`."""
+    history = History(
+        seen.leader_speed, seen.leader_acceleration, seen.speed, seen.acceleration, seen.gap
+    )
+    return torch.stack(list(history), 1)
 
 
 def _is_limited(model: DrivingModel, before: Tensor, after: Tensor, dt: float) -> Tensor:
@@ -135,22 +132,27 @@ class Driver:
         connection.simulationStep()
         driver.step(connection, vehicle_ids)
 
-    Life cycle of a vehicle: it is driven from the first `step` that names it and finds a leader.
-    The policy sees the last L frames of that vehicle and of its leader, the first frame standing
-    for those before, and chooses parameters every `windows.stride` steps *of that vehicle*.
-    Vehicles whose window begins are one batch. That is the closed loop in which cfx evaluates a
-    policy, to the last bits. A vehicle that was not stepped one time step ago, or had no leader,
-    begins anew.
+    Life cycle of a vehicle: it is driven from the first `step` that names it. Behind a leader the
+    policy sees the last L frames of that vehicle and of its leader, the first frame standing for
+    those before, and chooses parameters every `windows.stride` steps *of that vehicle*. Vehicles
+    whose window begins are one batch. That is the closed loop in which cfx evaluates a policy, to
+    the last bits. A vehicle that was not stepped one time step ago, or had no leader, begins anew.
 
-    Without a leader within `look_ahead`, SUMO's own model drives the vehicle (the vType's
-    `carFollowModel`, to the lane's limit), since a car-following policy has never seen a free road.
-    After a change of leader the vehicle goes on: the policy sees the new leader from then on.
+    Without a leader within `look_ahead` the policy's own model drives with the parameters to which
+    the policy fades outside what it has learned, to the lane's limit: a car-following policy has
+    never seen a free road. After a change of leader the vehicle goes on: the policy sees the new
+    leader from then on.
+
+    The simulation may step by 0.01 to 1 s, whatever the policy's time step is. In a longer step the
+    model takes several, behind a leader that goes on as it accelerates; histories are corrected as
+    soon as it is known what the leader did. In shorter steps each acceleration is held until a
+    time step of the policy has passed.
 
     The lane's limit and the vehicle's `maxSpeed` hold as they do around SUMO's own models. With the
     default `speed_mode` 31 SUMO's checks bound each speed: red lights, stops, who yields at
     junctions, and SUMO's own safe gap. With `speed_mode=0` nothing else of SUMO's changes the
-    speed: what the model says is driven to the last bits, so vehicles behind a leader run red
-    lights, pass their stops and do not yield. That is meant for replays of recordings and roads
+    speed: what the model says is driven to the last bits, so vehicles run red lights, pass their
+    stops and do not yield. That is meant for replays of recordings and roads
     without junctions. Lane changes are SUMO's.
 
     The model's limits of acceleration hold always (`model.limits`). Where SUMO bounds braking too
@@ -224,10 +226,11 @@ class Driver:
         self.counts = DriveCounts()
         self._leaders: dict[str, str] = {}
         self._slots: dict[str, int] = {}
-        self._free: list[int] = []
+        self._unused: list[int] = []
         self._store = VehicleTable.empty(policy, self._driven, 0)
         self._swept = math.nan
         self._now = -math.inf
+        self._clock: Clock | None = None
 
     @classmethod
     def load(
@@ -274,7 +277,7 @@ class Driver:
         Args:
             model: the driving model.
             parameters: name -> value, SI units; the others at their defaults.
-            dt: time step of the simulation, s.
+            dt: time step of the model, s.
             options: as in `DriverOptions`.
 
         Raises:
@@ -297,6 +300,7 @@ class Driver:
             windows=WindowSettings(),
             dt=dt,
             names=(ALL,),
+            population=values[None],
         )
         return cls(policy, model=model, source="the constant driver", **options)
 
@@ -373,6 +377,10 @@ class Driver:
         """Says whether the model drives a vehicle now; a watched vehicle is not driven."""
         return vehicle in self._speed_modes
 
+    def follows(self, vehicle: str) -> bool:
+        """Says whether the model drives a vehicle now behind a leader."""
+        return vehicle in self._speed_modes and vehicle in self._leaders
+
     def outside_in_words(self) -> str:
         """Returns how much was driven outside what the policy has learned, in words; or ""."""
         valid_range, counts = self.policy.valid_range, self.counts
@@ -382,7 +390,7 @@ class Driver:
 
     def time_gaps(self, vehicles: Iterable[str]) -> Tensor:
         """Returns the time gaps of those that the model drives faster than walking, `(d,)`, s."""
-        slots = [self._slots[name] for name in vehicles if self.drives(name)]
+        slots = self._slots_of(name for name in vehicles if self.follows(name))
         history = self._store.history[slots, :, -1]
         gap = history[:, History._fields.index("gap")]
         speed = history[:, History._fields.index("follower_speed")]
@@ -417,53 +425,126 @@ class Driver:
                 takes over from another driver.
 
         Raises:
-            SumoError: a vehicle is not in the simulation, or the simulation's step is not the
-                policy's.
+            SumoError: a vehicle is not in the simulation or acts less often than it steps, the
+                simulation steps by less than 0.01 s or more than 1 s, or integrates ballistically.
         """
         names = [vehicles] if isinstance(vehicles, str) else list(vehicles)
         now = connection.simulation.getTime()
-        self._check_step(connection)
+        clock = self._clock_of(connection)
         if now < self._now:
             self._forget_all()
         self._now = now
         self._forget_departed(connection, now)
         self._forget_gone(connection, names, now)
-        following, leaders, seen, alone = look(
-            connection, self._not_yet(names, now), self.look_ahead
-        )
-        self._leaders.update(zip(following, leaders, strict=True))
-        for name in alone:
-            self.release(connection, name)
-        if not following:
-            return
-        slots = torch.tensor([self._slot(name) for name in following])
-        self._remember(slots, following, seen, now)
+        due, between = self._due(names, now, clock)
+        view = look(connection, due, self.look_ahead)
         if drive:
-            self._take_over(connection, following, slots)
-        store = self._store
-        due = store.steps[slots] % self.policy.windows.stride == 0
-        if drive:
-            beginning = [following[index] for index in due.nonzero().flatten().tolist()]
-            self._choose(slots[due], beginning, now)
+            self._hold(connection, between, now, clock)
+            self._drive(connection, view, now, clock)
         else:
-            self._observe(slots[due])
-        store.steps[slots] += 1
-        if drive:
-            self.counts.add(store.score[slots], store.beyond[slots])
-            speeds = self._speeds(connection, following, slots, seen).tolist()
-            for name, speed in zip(following, speeds, strict=True):
-                connection.vehicle.setSpeed(name, speed)
-            store.told[slots] = torch.tensor(speeds, dtype=torch.float64)
+            self._watch(connection, view, now, clock)
 
-    def _not_yet(self, names: list[str], now: float) -> list[str]:
-        """Returns the vehicles that were not stepped at this instant before."""
+    def _due(self, names: list[str], now: float, clock: Clock) -> tuple[list[str], list[str]]:
+        """Returns the vehicles whose model takes a step now, and those that hold the last one.
+
+        Vehicles that were stepped at this instant before are neither.
+        """
         times = self._store.time.tolist()
-        wanted = []
+        due, between = [], []
         for name in names:
             slot = self._slots.get(name)
-            if slot is None or times[slot] != now:
-                wanted.append(name)
-        return wanted
+            if slot is None:
+                due.append(name)
+            elif now - times[slot] < clock.period - 0.5 * clock.dt:
+                if times[slot] != now:
+                    between.append(name)
+            else:
+                due.append(name)
+        return due, between
+
+    def _hold(self, connection: Connection, names: list[str], now: float, clock: Clock) -> None:
+        """Lets vehicles go on as they accelerate, in the steps between two of the model."""
+        driven = [name for name in names if self.drives(name)]
+        if not driven:
+            return
+        store, slots = self._store, self._slots_of(driven)
+        passed = now + clock.dt - store.time[slots]
+        store.told[slots] = store.start[slots] + store.ramp[slots] * passed
+        for name, speed in zip(driven, store.told[slots].tolist(), strict=True):
+            connection.vehicle.setSpeed(name, speed)
+
+    def _drive(self, connection: Connection, view: View, now: float, clock: Clock) -> None:
+        """Lets the model take its steps until the next look, and tells SUMO where they lead."""
+        names = [*view.following, *view.alone]
+        if not names:
+            return
+        store, count = self._store, len(view.following)
+        slots = torch.tensor([self._slot(name) for name in names])
+        store = self._store
+        following = slots[:count]
+        self._count_changed(slots, view.seen, now, clock)
+        seen = self._remember(following, view, now, clock)
+        self._begin_free(slots[count:], view.alone, now, clock)
+        self._take_over(connection, names, slots, seen, clock)
+        first, hardest = seen.speed, torch.zeros_like(seen.speed)
+        for number in range(clock.substeps):
+            if number > 0:
+                self._append(following, seen.rows(slice(count)))
+            due = store.steps[following] % self._stride(clock) == 0
+            beginning = [view.following[index] for index in due.nonzero().flatten().tolist()]
+            self._choose(following[due], beginning, now + number * clock.step)
+            store.steps[following] += 1
+            self.counts.add(store.score[following], store.beyond[following])
+            speed, bound = self._speeds(connection, names, slots, seen, clock.step)
+            limited = _is_limited(self.model, seen.speed[:count], speed[:count], clock.step)
+            self.counts.limited += int(limited.sum())
+            hardest = torch.maximum(hardest, bound)
+            seen = seen.one_step_later(speed, clock.step)
+        self.counts.free += clock.substeps * len(view.alone)
+        store.expected[slots] = _frame(seen)
+        store.start[slots], store.ramp[slots] = first, (seen.speed - first) / clock.period
+        told = seen.speed
+        if clock.held > 1:
+            told = first + store.ramp[slots] * clock.dt
+        store.told[slots] = told
+        for name, bound, speed in zip(names, hardest.tolist(), told.tolist(), strict=True):
+            self._set_decel(connection, name, bound)
+            connection.vehicle.setSpeed(name, speed)
+
+    def _watch(self, connection: Connection, view: View, now: float, clock: Clock) -> None:
+        """Lets the policy see vehicles that somebody else drives."""
+        for name in view.alone:
+            self.release(connection, name)
+        if not view.following:
+            return
+        count = len(view.following)
+        slots = torch.tensor([self._slot(name) for name in view.following])
+        seen = self._remember(slots, view, now, clock).rows(slice(count))
+        store = self._store
+        for number in range(clock.substeps):
+            if number > 0:
+                self._append(slots, seen)
+            self._observe(slots[store.steps[slots] % self._stride(clock) == 0])
+            store.steps[slots] += 1
+            speed = (seen.speed + seen.acceleration * clock.step).clamp(min=0.0)
+            seen = seen.one_step_later(speed, clock.step)
+        store.expected[slots] = _frame(seen)
+
+    def _count_changed(self, slots: Tensor, seen: Seen, now: float, clock: Clock) -> None:
+        """Counts the vehicles that do not drive as SUMO was told."""
+        store = self._store
+        obliged = self._goes_on(slots, now, clock) & ~store.told[slots].isnan()
+        changed = (seen.speed - store.told[slots]).abs() > _OBEYED_MPS
+        self.counts.told += int(obliged.sum())
+        self.counts.changed += int((obliged & changed).sum())
+
+    def _stride(self, clock: Clock) -> int:
+        """Returns how many steps of the model a window of the policy takes."""
+        return clock.steps_in(self.policy.windows.stride * self.policy.dt)
+
+    def _goes_on(self, slots: Tensor, now: float, clock: Clock) -> Tensor:
+        """Says which vehicles were looked at one period ago, bool `(D,)`."""
+        return (now - self._store.time[slots] - clock.period).abs() < 0.5 * clock.dt
 
     def save_state(self, path: str | Path) -> None:
         """Writes what is known of all vehicles, for a simulation that goes on from here.
@@ -578,13 +659,14 @@ class Driver:
         self._raised.pop(vehicle, None)
         slot = self._slots.pop(vehicle, None)
         if slot is not None:
-            self._free.append(slot)
+            self._unused.append(slot)
 
     def _forget_all(self) -> None:
         """Drops all vehicles: time went back, so this is another simulation or an earlier state."""
         for vehicle in self.vehicles:
             self.forget(vehicle)
         self._swept = math.nan
+        self._clock = None
 
     def release(self, connection: Connection, vehicle: str) -> None:
         """Hands a vehicle back to SUMO's own model and drops what is known of it."""
@@ -622,13 +704,21 @@ class Driver:
             )
         return number
 
-    def _check_step(self, connection: Connection) -> None:
+    def _clock_of(self, connection: Connection) -> Clock:
+        """Returns how the model's steps fit into the simulation's.
+
+        Raises:
+            SumoError: they do not, or SUMO integrates otherwise than the model does.
+        """
         dt = connection.simulation.getDeltaT()
-        if abs(dt - self.policy.dt) > 1e-6:
-            raise SumoError(
-                f"the simulation steps by {dt:g} s, the policy of {self.source} was trained at"
-                f" {self.policy.dt:g} s; start SUMO with --step-length {self.policy.dt:g}"
-            )
+        if self._clock is None or self._clock.dt != dt:
+            if connection.simulation.getOption("step-method.ballistic") == "true":
+                raise SumoError(
+                    "the simulation integrates ballistically, the driving models do not; start SUMO"
+                    " without --step-method.ballistic"
+                )
+            self._clock = Clock.of(dt, self.policy.dt, self.source)
+        return self._clock
 
     def _forget_departed(self, connection: Connection, now: float) -> None:
         """Drops vehicles that have just departed: another vehicle had that id a step ago."""
@@ -655,41 +745,101 @@ class Driver:
     def _slot(self, name: str) -> int:
         """Returns the row of a vehicle; a new vehicle gets one."""
         if name not in self._slots:
-            if not self._free:
+            if not self._unused:
                 taken = len(self._slots)
                 more = VehicleTable.empty(self.policy, self._driven, max(16, taken))
                 self._store = self._store.with_rows(more)
-                self._free = list(range(taken, len(self._store.time)))
-            self._slots[name] = slot = self._free.pop()
+                self._unused = list(range(taken, len(self._store.time)))
+            self._slots[name] = slot = self._unused.pop()
             self._store.time[slot] = torch.nan  # it has no frame yet
         return self._slots[name]
 
-    def _remember(self, slots: Tensor, names: list[str], seen: Seen, now: float) -> None:
-        """Puts this instant into the vehicles' histories; begins vehicles that are new."""
-        store, dt = self._store, self.policy.dt
-        history = History(
-            seen.leader_speed,
-            seen.leader_acceleration,
-            seen.speed,
-            seen.acceleration,
-            seen.gap,
+    def _remember(self, slots: Tensor, view: View, now: float, clock: Clock) -> Seen:
+        """Puts this instant into the histories of followers; begins those that are new.
+
+        Args:
+            slots: of the F followers, who stand first in the view.
+            view: all D vehicles.
+            now: s.
+            clock: of the simulation.
+
+        Returns:
+            What all D vehicles do, with accelerations as over a step of the model.
+        """
+        store, count = self._store, len(slots)
+        going = self._goes_on(slots, now, clock) & ~store.free[slots]
+        frame = _frame(view.seen)
+        if clock.substeps > 1 or clock.held > 1:
+            frame[:count] = self._in_model_steps(slots, view, frame[:count], going, clock)
+        self._leaders.update(zip(view.following, view.leaders, strict=True))
+        seen = view.seen._replace(
+            acceleration=frame[:, _ACCELERATION], leader_acceleration=frame[:, _LEADER_ACCELERATION]
         )
-        frame = torch.stack(list(history), 1)
-        going = (now - store.time[slots] - dt).abs() < 0.5 * dt
-        earlier = store.history[slots[going], :, 1:]
-        store.history[slots[going]] = torch.cat([earlier, frame[going, :, None]], -1)
+        self._append(slots[going], seen.rows(slice(count)).rows(going))
         store.time[slots] = now
         if not bool(going.all()):
             index = (~going).nonzero().flatten()
-            new = [names[number] for number in index.tolist()]
-            self._begin(slots[index], new, frame[index])
+            new = [view.following[number] for number in index.tolist()]
+            self._begin(slots[index], new)
+            store.history[slots[index]] = frame[index, :, None]
+            begun = self._begun(slots[index])
+            store.state[slots[index]] = begun.state[begun.network, begun.place]
+            store.latent[slots[index]] = begun.latent
+        return seen
 
-    def _begin(self, slots: Tensor, names: list[str], frame: Tensor) -> None:
-        """Begins vehicles anew: the first frame `(D, 5)` stands for those before it."""
+    def _in_model_steps(
+        self, slots: Tensor, view: View, frame: Tensor, going: Tensor, clock: Clock
+    ) -> Tensor:
+        """Returns frames `(F, 5)` with accelerations as they are over a step of the model.
+
+        SUMO's are over its own step. In a long one the frames of the model's steps were expected;
+        what happened instead is spread over them evenly. A leader that is new was not expected.
+        """
+        store, frame = self._store, frame.clone()
+        same = []
+        for name, leader in zip(view.following, view.leaders, strict=True):
+            same.append(self._leaders.get(name) == leader)
+        known = going & torch.tensor(same, dtype=torch.bool)
+        before = store.history[slots, :, -1]
+        if clock.held > 1:
+            mean = (frame - before) / clock.period
+            for speed, acceleration, is_known in (
+                (_SPEED, _ACCELERATION, going),
+                (_LEADER_SPEED, _LEADER_ACCELERATION, known),
+            ):
+                frame[:, acceleration] = torch.where(
+                    is_known, mean[:, speed], frame[:, acceleration]
+                )
+            return frame
+        error = frame - store.expected[slots]
+        error[:, _ACCELERATION] = error[:, _SPEED] / clock.dt
+        error[:, _LEADER_ACCELERATION] = error[:, _LEADER_SPEED] / clock.dt
+        own = torch.zeros(len(History._fields), dtype=torch.bool)
+        own[[_SPEED, _ACCELERATION]] = True
+        used = going[:, None] & (own | known[:, None])
+        error = torch.where(used, error, 0.0)
+        steps = min(clock.substeps - 1, store.history.shape[-1])
+        share = torch.arange(clock.substeps - steps, clock.substeps) / clock.substeps
+        spread = error[:, :, None] * share
+        for row in (_ACCELERATION, _LEADER_ACCELERATION):
+            spread[:, row] = error[:, row, None]
+        store.history[slots, :, -steps:] += spread
+        expected = store.expected[slots] + error
+        for row in (_ACCELERATION, _LEADER_ACCELERATION):
+            frame[:, row] = torch.where(used[:, row], expected[:, row], frame[:, row])
+        return frame
+
+    def _append(self, slots: Tensor, seen: Seen) -> None:
+        """Puts a frame of vehicles `(D,)` into their histories, in place of the oldest one."""
+        earlier = self._store.history[slots, :, 1:]
+        self._store.history[slots] = torch.cat([earlier, _frame(seen)[:, :, None]], -1)
+
+    def _begin(self, slots: Tensor, names: list[str]) -> None:
+        """Begins vehicles anew, with what is known of them from elsewhere."""
         store = self._store
-        store.history[slots] = frame[:, :, None]
         store.steps[slots] = 0
-        store.driven[slots] = False
+        store.driven[slots] = store.free[slots] = False
+        store.told[slots] = torch.nan
         store.network[slots] = torch.tensor([self._network_of(name) for name in names])
         if self.policy.base is not None:
             store.base[slots] = self.policy.base[store.network[slots]].to(store.base)
@@ -700,9 +850,33 @@ class Driver:
             if name in self._driver_features:
                 features = torch.tensor(self._driver_features[name], dtype=torch.float64)
                 store.driver_features[slot] = features
-        begun = self._begun(slots)
-        store.state[slots] = begun.state[begun.network, begun.place]
-        store.latent[slots] = begun.latent
+
+    def _begin_free(self, slots: Tensor, names: list[str], now: float, clock: Clock) -> None:
+        """Begins vehicles that have no leader any more, or have just come."""
+        store = self._store
+        index = (~(self._goes_on(slots, now, clock) & store.free[slots])).nonzero().flatten()
+        store.time[slots] = now
+        if len(index) == 0:
+            return
+        new, beginning = slots[index], [names[number] for number in index.tolist()]
+        for name in beginning:
+            self._leaders.pop(name, None)
+        self._begin(new, beginning)
+        store.free[new] = True
+        store.parameters[new] = self._free_parameters(new)
+
+    def _free_parameters(self, slots: Tensor) -> Tensor:
+        """Returns the parameters of vehicles without a leader, `(D, n)`, SI units.
+
+        The policy has not learned to choose any. They are those to which it fades outside what it
+        has learned: its base or its pooled parameters; or else the model's defaults.
+        """
+        policy, network = self.policy, self._store.network[slots]
+        if policy.base is not None:
+            return self._store.base[slots]
+        if policy.population is not None:
+            return policy.head.completed(policy.population[network].double())
+        return policy.space.defaults().double().expand(len(slots), -1)
 
     def _begun(self, slots: Tensor) -> AgentState:
         """Returns the state of vehicles before their first window."""
@@ -711,15 +885,23 @@ class Driver:
         context = DriverContext(base, store.driver_features[slots])
         return self.policy.begin(store.network[slots], context)
 
-    def _take_over(self, connection: Connection, names: list[str], slots: Tensor) -> None:
-        """Drives from here on the vehicles that were only watched, with a new window and memory."""
+    def _take_over(
+        self, connection: Connection, names: list[str], slots: Tensor, seen: Seen, clock: Clock
+    ) -> None:
+        """Drives from here on the vehicles that begin, with a new window and memory."""
         store = self._store
-        speed = History._fields.index("follower_speed")
         for index in (~store.driven[slots]).nonzero().flatten().tolist():
             name, slot = names[index], int(slots[index])
+            acts = connection.vehicle.getActionStepLength(name)
+            if acts > clock.dt + 1e-6:
+                raise SumoError(
+                    f"vehicle '{name}' acts every {acts:g} s (actionStepLength) in steps of"
+                    f" {clock.dt:g} s, and a driver acts in each; leave actionStepLength out of its"
+                    f" vType, or start SUMO with --step-length {acts:g}"
+                )
             store.driven[slot] = True
             store.steps[slot] = 0
-            store.memory[slot] = self._driven.initial_memory(store.history[slot, speed, -1])
+            store.memory[slot] = self._driven.initial_memory(seen.speed[index])
             self._speed_modes.setdefault(name, connection.vehicle.getSpeedMode(name))
             connection.vehicle.setSpeedMode(name, self.speed_mode)
 
@@ -728,23 +910,16 @@ class Driver:
         if len(slots) == 0:
             return
         store = self._store
-        chosen, after = self.policy.act(*self._known(slots))
+        history, state = self._known(slots)
         if self._seed is not None and self.policy.is_stochastic:
             noise = standard_normal(self._seed, names, now, self.policy.head.noise_width)
-            chosen, after = self._drawn(chosen, after, noise)
+            chosen, after = self.policy.choose(history, state, noise)
+        else:
+            chosen, after = self.policy.act(history, state)
         store.parameters[slots] = chosen
         store.score[slots], store.beyond[slots] = after.score, after.beyond
         store.latent[slots] = after.latent
         store.state[slots] = after.state[after.network, after.place]
-
-    def _drawn(self, chosen: Tensor, state: AgentState, noise: Tensor) -> tuple[Tensor, AgentState]:
-        """Draws parameters `(D, n)` around those that were chosen, from noise `(D, k)`."""
-        policy = self.policy
-        if policy.dispersion is not None:
-            noise = noise * policy.dispersion[state.network, None].to(noise)
-        window_s = policy.windows.stride * policy.dt
-        drawn, latent = policy.head.sampled(chosen, noise, state.latent.to(chosen), window_s)
-        return drawn, state._replace(latent=latent.to(state.latent))
 
     def _observe(self, slots: Tensor) -> None:
         """Lets the policy see windows of vehicles that somebody else drives."""
@@ -764,10 +939,15 @@ class Driver:
         return History(*store.history[slots].unbind(1)), now
 
     def _speeds(
-        self, connection: Connection, names: list[str], slots: Tensor, seen: Seen
-    ) -> Tensor:
-        """Returns the model's next speeds `(D,)`, within the limits that SUMO puts around it."""
-        store, dt = self._store, self.policy.dt
+        self, connection: Connection, names: list[str], slots: Tensor, seen: Seen, dt: float
+    ) -> tuple[Tensor, Tensor]:
+        """Takes a step of the model.
+
+        Returns:
+            The next speeds `(D,)`, within the limits that SUMO puts around them; and how hard
+            vehicles must be able to brake for them, m/s2, 0 where comfortably is enough.
+        """
+        store = self._store
         follower = Follower(
             torch.zeros_like(seen.speed), seen.speed, seen.acceleration, store.memory[slots]
         )
@@ -780,23 +960,18 @@ class Driver:
         p = self.policy.space.unpack(store.parameters[slots])
         after = advance_vehicle(self._driven, follower, leader, p, dt)
         store.memory[slots] = after.memory
-        speed = after.speed
+        speed, bound = after.speed, torch.zeros_like(seen.speed)
         limits = self.model.limits
         if limits is not None and self.speed_mode & _BOUNDS_BRAKING:
-            needed = _MARGIN * needed_deceleration(seen)
-            hardest = needed.clamp(limits.comfortable_deceleration, limits.emergency_deceleration)
+            hardest = hardest_braking(seen, limits)
             speed = torch.maximum(speed, (seen.speed - hardest * dt).clamp(min=0.0))
-            is_needed = hardest > limits.comfortable_deceleration
-            bounds = torch.where(is_needed, hardest, 0.0).tolist()
-            for name, bound in zip(names, bounds, strict=True):
-                self._set_decel(connection, name, bound)
-        self.counts.limited += int(_is_limited(self.model, seen.speed, speed, dt).sum())
+            bound = torch.where(hardest > limits.comfortable_deceleration, hardest, 0.0)
         limit = seen.allowed.clone()
         # For a limit no vehicle brakes harder than its `decel`.
         for index in (seen.speed > seen.allowed).nonzero().flatten().tolist():
             slowest = seen.speed[index] - connection.vehicle.getDecel(names[index]) * dt
             limit[index] = max(limit[index], slowest)
-        return torch.minimum(speed, limit)
+        return torch.minimum(speed, limit), bound
 
     def _set_decel(self, connection: Connection, name: str, bound: float) -> None:
         """Lets SUMO brake a vehicle by `bound`, m/s2, where that is more than its own `decel`.

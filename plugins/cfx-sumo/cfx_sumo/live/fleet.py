@@ -29,17 +29,10 @@ class Fleet:
         """Takes a driver for each vType.
 
         Raises:
-            DataError: there is none, or their time steps differ.
+            DataError: there is none.
         """
         if not drivers:
             raise DataError("a fleet needs a driver for at least one vType")
-        steps = {name: driver.policy.dt for name, driver in drivers.items()}
-        if max(steps.values()) - min(steps.values()) > 1e-6:
-            listed = ", ".join(f"{name} {dt:g} s" for name, dt in steps.items())
-            raise DataError(
-                f"the policies were trained at different time steps ({listed}); a simulation has"
-                " one"
-            )
         self.drivers = dict(drivers)
         self._type_of: dict[str, str] = {}
         self._member_of: dict[str, str] = {}
@@ -88,7 +81,7 @@ class Fleet:
         Call it after each.
 
         Raises:
-            SumoError: the simulation's step is not the policies'.
+            SumoError: as `Driver.step` does.
         """
         types: dict[str, str] = {}
         departed = set(connection.simulation.getDepartedIDList())

@@ -36,20 +36,53 @@ class Seen(NamedTuple):
     allowed: Tensor
     min_gap: Tensor
 
+    def rows(self, index: Tensor | slice) -> Seen:
+        """Returns some of the vehicles."""
+        return Seen(*(signal[index] for signal in self))
 
-def look(
-    connection: Connection, names: list[str], look_ahead: float
-) -> tuple[list[str], list[str], Seen, list[str]]:
+    def one_step_later(self, speed: Tensor, dt: float) -> Seen:
+        """Returns what is to be expected one step of a model later.
+
+        Leaders go on as they accelerate, and brake to a standstill at most.
+
+        Args:
+            speed: of the followers then, `(D,)`, m/s.
+            dt: the step, s.
+        """
+        leader_speed = (self.leader_speed + self.leader_acceleration * dt).clamp(min=0.0)
+        return self._replace(
+            speed=speed,
+            acceleration=(speed - self.speed) / dt,
+            gap=self.gap + (leader_speed - speed) * dt,
+            leader_speed=leader_speed,
+            leader_acceleration=(leader_speed - self.leader_speed) / dt,
+        )
+
+
+class View(NamedTuple):
+    """Vehicles and who is ahead of them.
+
+    Attributes:
+        following: vehicles with a leader, F of them.
+        leaders: their leaders.
+        alone: vehicles without a leader.
+        seen: what all of them do, those with a leader first. The others have a leader that is as
+            fast as they are, a thousand kilometres ahead.
+    """
+
+    following: list[str]
+    leaders: list[str]
+    alone: list[str]
+    seen: Seen
+
+
+def look(connection: Connection, names: list[str], look_ahead: float) -> View:
     """Reads vehicles and their leaders.
 
     Args:
         connection: to the simulation.
         names: the vehicles.
         look_ahead: m; a vehicle farther ahead is no leader.
-
-    Returns:
-        The vehicles that have a leader, their leaders, what both do, and the vehicles without a
-        leader.
 
     Raises:
         SumoError: a vehicle is not in the simulation.
@@ -64,8 +97,9 @@ def look(
             following.append(name)
             leaders.append(leader[0])
             rows.append(reader.row(name, *leader))
+    rows += [reader.row_alone(name) for name in alone]
     table = torch.tensor(rows, dtype=torch.float64).reshape(-1, len(Seen._fields))
-    return following, leaders, Seen(*table.unbind(1)), alone
+    return View(following, leaders, alone, Seen(*table.unbind(1)))
 
 
 _FARTHEST = 1e6
@@ -115,6 +149,12 @@ class _Reader:
         allowed = self._vehicle.getAllowedSpeed(name)
         min_gap = self._vehicle.getMinGap(name)
         return speed, acceleration, gap, leader_speed, leader_acceleration, length, allowed, min_gap
+
+    def row_alone(self, name: str) -> tuple[float, ...]:
+        """Returns the fields of `Seen` for a vehicle without a leader."""
+        speed, acceleration = self._motion(name)
+        allowed = self._vehicle.getAllowedSpeed(name)
+        return speed, acceleration, _FARTHEST, speed, 0.0, 0.0, allowed, 0.0
 
     def _motion(self, name: str) -> tuple[float, float]:
         if name not in self._motions:

@@ -30,12 +30,16 @@ class VehicleTable:
         network: `(C,)` int64, which of the agent's networks drives.
         base: `(C, n)`, SI units, the base parameters; NaN where the agent needs none.
         driver_features: `(C, k)`; NaN for unseen drivers.
-        steps: `(C,)` int64, since the vehicle's first window.
+        steps: `(C,)` int64, of the model since the vehicle's first window.
         time: `(C,)` s, of the last frame; NaN before the first.
         driven: `(C,)` bool; the others are watched.
         score: `(C,)`, how far outside what was learned each was when its window began.
         beyond: `(C, 2 f)` bool, which signals alone were unusual then.
+        free: `(C,)` bool; these drive without a leader.
+        start: `(C,)` m/s, speed at the last frame.
+        ramp: `(C,)` m/s2, acceleration until the next frame.
         told: `(C,)` m/s, the speed that SUMO was last told to drive; NaN before the first.
+        expected: `(C, 5)`, the next frame where the model has taken several steps until then.
     """
 
     history: Tensor
@@ -51,7 +55,11 @@ class VehicleTable:
     driven: Tensor
     score: Tensor
     beyond: Tensor
+    free: Tensor
+    start: Tensor
+    ramp: Tensor
     told: Tensor
+    expected: Tensor
 
     @classmethod
     def empty(cls, agent: Agent, model: DrivingModel, count: int) -> VehicleTable:
@@ -74,7 +82,11 @@ class VehicleTable:
             driven=torch.zeros(count, dtype=torch.bool),
             score=torch.zeros(count, dtype=torch.float64),
             beyond=torch.zeros((count, begun.beyond.shape[-1]), dtype=torch.bool),
+            free=torch.zeros(count, dtype=torch.bool),
+            start=_unknown(count),
+            ramp=_unknown(count),
             told=_unknown(count),
+            expected=_unknown(count, len(History._fields)),
         )
 
     def columns_of(self, rows: Tensor) -> dict[str, Tensor]:
