@@ -20,6 +20,20 @@ class CalibrationSettings(Settings):
         description="weak: parameters that a recording does not determine stay near the model's"
         " default; none: as in the paper",
     )
+    posterior: Literal["none", "laplace"] = Field(
+        "none",
+        description="laplace: intervals of each driver's parameters beside the point estimate;"
+        " none: the point estimate alone",
+    )
+    noise_step_s: float = Field(
+        1.0,
+        gt=0,
+        description="s: errors of the posterior are taken this far apart; closer ones say little"
+        " more, and make intervals too narrow",
+    )
+    noise_order: int = Field(
+        1, ge=1, le=5, description="order of the posterior's autoregressive noise, in such steps"
+    )
 
 
 class WindowSettings(Settings):

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Mapping
 
 import pandas as pd
+from rich.console import RenderableType
 from rich.markup import escape
 from rich.table import Table
 
@@ -22,6 +23,7 @@ from cfx.evaluation.result import METHODS
 from cfx.evaluation.sites import ALL, BASELINES
 from cfx.evaluation.tables import scope_label
 from cfx.learners.curves import best_losses
+from cfx.results.known import KnownParameters
 from cfx.results.table import Column, Findings, ResultTable, metrics_table
 
 PAIR = Column("pair_id", "", "the pair of leader and follower", "text")
@@ -348,10 +350,11 @@ class Slices(ResultTable):
 
 
 class Fits(ResultTable):
-    """Errors of constant parameters, a row per pair and method."""
+    """Errors of constant parameters, a row per pair and method; intervals of `fixed`."""
 
     meaning = (
-        "errors of constant parameters on the part that was calibrated on, and on the test part"
+        "errors of constant parameters on the part that was calibrated on, and on the test part;"
+        " how well driver-specific ones are known"
     )
     order = 210
     columns = (
@@ -362,7 +365,27 @@ class Fits(ResultTable):
         Column("test_rmse_speed", "m/s", "on the test part"),
         Column("train_rmse_gap", "m", "on the part that was calibrated on", required=False),
         Column("test_rmse_gap", "m", "on the test part", required=False),
+        Column("median_NAME", "as of the parameter", "its median a posteriori, of `fixed`"),
+        Column("low_NAME", "as of the parameter", "the lower end of its 90 % interval"),
+        Column("high_NAME", "as of the parameter", "the upper end"),
+        Column(
+            "contraction_NAME",
+            "1",
+            "by which share the interval is narrower than a priori; below 0.3 the recording does"
+            " not determine the parameter",
+        ),
+        Column("noise_scale", "m/s or m", "what each step of the noise adds", required=False),
+        Column("noise_correlation", "1", "of the noise, one step later", required=False),
+        Column("noise_left", "1", "the same of what its model leaves; 0: all", required=False),
     )
+
+    def metrics(self, findings: Findings) -> dict[str, float]:
+        known = KnownParameters.of(findings)
+        return {} if known is None else known.metrics()
+
+    def console(self, findings: Findings, metrics: Mapping[str, float]) -> Iterable[RenderableType]:
+        known = KnownParameters.of(findings)
+        return [] if known is None else known.printed()
 
 
 def history_metrics(history: pd.DataFrame) -> dict[str, float]:

@@ -88,6 +88,27 @@ class Stepper(ABC):
         """
         return None
 
+    def frame_terms(
+        self,
+        segments: Segments,
+        p: Mapping[str, Tensor],
+        terms: Terms,
+        key: ComponentKey | str,
+        every: int,
+    ) -> tuple[Tensor, ...] | None:
+        """Simulates segments and returns what single frames add, not summed up.
+
+        Args:
+            segments: P segments.
+            p, terms, key: as for `accumulate`.
+            every: each so many-th frame is returned.
+
+        Returns:
+            Each term of frames `every`, `2 every` and so on, `(K // every, P, q)`, 0 where a frame
+            does not count; None where trajectories have to be simulated by `advance`.
+        """
+        return None
+
     def for_work(self, steps: int) -> Stepper:
         """Returns what takes a number of vehicle steps that belong together.
 

@@ -150,6 +150,20 @@ class MemoryStepper(Stepper):
             return None
         return kernel.accumulate(self.model, self.dt, segments, p, terms, key=key)
 
+    def frame_terms(
+        self,
+        segments: Segments,
+        p: Mapping[str, Tensor],
+        terms: Terms,
+        key: ComponentKey | str,
+        every: int,
+    ) -> tuple[Tensor, ...] | None:
+        candidates = max(math.prod(value.shape[1:]) for value in p.values())
+        steps = segments.counted.numel() * candidates
+        if segments.speed.device.type != "cpu" or not self._pays(steps, _WORTH_A_KERNEL):
+            return None
+        return kernel.accumulate(self.model, self.dt, segments, p, terms, key=key, every=every)
+
     def _compiles(self, steps: int, like: Tensor) -> bool:
         return self._pays(steps * like.numel(), _WORTH_COMPILING) and can_compile(like.device)
 

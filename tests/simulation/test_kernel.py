@@ -421,3 +421,19 @@ def test_a_class_made_in_a_function_is_known_to_its_process_alone() -> None:
 
     assert key_of(Here).lasting() is None
     assert key_of(Krauss)._replace(terms="a name").lasting() is None
+
+
+@pytest.mark.parametrize("every", [1, 7])
+def test_terms_of_single_frames_are_those_of_trajectories(every: int) -> None:
+    model, segments = Krauss(), made_up_segments()
+    p, terms = candidates_of(model), terms_of(SpeedRmse())
+    stepper = MemoryStepper(model, DT, compile="always")
+    found = stepper.frame_terms(segments, p, terms, "SpeedRmse", every)
+    sums = stepper.accumulate(segments, p, terms, "SpeedRmse")
+    assert found is not None
+    assert sums is not None
+    assert found[0].shape == (STEPS // every, PROBLEMS, CANDIDATES)
+    single = stepper.frame_terms(segments, p, terms, "SpeedRmse", 1)
+    assert single is not None
+    torch.testing.assert_close(found[0], single[0][every - 1 :: every], rtol=0, atol=0)
+    torch.testing.assert_close(single[0].sum(0), sums[0], rtol=1e-12, atol=1e-12)

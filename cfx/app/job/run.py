@@ -60,7 +60,8 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
         if parts.demo is not None:
             parts.demo.check(pairs)
         tracker.set_tags(steps.tags_of(pairs))
-        findings = steps.find(steps.compose(config, parts, pairs, style), parts)
+        context = steps.compose(config, parts, pairs, style)
+        findings = steps.find(context, parts, config.calibration)
         kept = output.write_job(folder, config, parts, findings)
         # After the folder, so that no failure of MLflow loses it.
         tracker.log_job(findings, kept, described(config, findings, kept.metrics))
@@ -95,7 +96,8 @@ def compute(config: JobConfig, pairs: PairSet) -> JobResult:
 
     config, parts = steps.prepare(config)
     pairs, style = steps.select_pairs(pairs, config)
-    findings = steps.find(steps.compose(steps.uncached(config), parts, pairs, style), parts)
+    context = steps.compose(steps.uncached(config), parts, pairs, style)
+    findings = steps.find(context, parts, config.calibration)
     return JobResult(
         metrics=output.measured(findings, output.tables_of(findings)),
         pairs=findings.evaluation.table,

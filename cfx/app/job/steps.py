@@ -19,7 +19,7 @@ from cfx.calibration.identifiability import slices, training_errors
 from cfx.calibration.objectives.base import Objective
 from cfx.calibration.optimizers.base import Optimizer
 from cfx.calibration.prior import prior_weight
-from cfx.calibration.settings import WindowSettings
+from cfx.calibration.settings import CalibrationSettings, WindowSettings
 from cfx.calibration.shards import Solver
 from cfx.calibration.windows import Split
 from cfx.core import registry
@@ -43,13 +43,16 @@ from cfx.policies.ready import is_ready_made
 from cfx.results.config import JobConfig
 from cfx.results.store import folder_of, is_run_id
 from cfx.results.table import Findings
+from cfx.simulation.memory import MemorySimulator
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.simulator import Simulator
 
 _CONSTANT = ("default", "population", "fixed")
 
 
-def calibration_tables(context: ProtocolContext, evaluation: Evaluation) -> dict[str, pd.DataFrame]:
+def calibration_tables(
+    context: ProtocolContext, evaluation: Evaluation, settings: CalibrationSettings
+) -> dict[str, pd.DataFrame]:
     """Returns the tables `slices` and `fits` of a calibration of driver-specific parameters.
 
     There are none where nothing was calibrated per driver, nor where another program simulates
@@ -59,11 +62,17 @@ def calibration_tables(context: ProtocolContext, evaluation: Evaluation) -> dict
         slices: see `cfx.calibration.identifiability.slices`.
         fits: a row per pair and method: pair_id, driver, method, and train_rmse_speed,
             test_rmse_speed (m/s), train_rmse_gap, test_rmse_gap (m): on the part that
-            driver-specific parameters were calibrated on, and on the test part.
+            driver-specific parameters were calibrated on, and on the test part. With a posterior
+            the rows of `fixed` have its columns (`ParameterIntervals.columns`) for that part too.
     """
-    if "fixed" not in evaluation.methods or not evaluation.names:
-        return {}
-    if not isinstance(context.simulator, MemoryStepper):
+    calibrated = "fixed" in evaluation.methods and bool(evaluation.names)
+    if not calibrated or not isinstance(context.simulator, MemoryStepper):
+        if settings.posterior != "none":
+            log.warning(
+                "calibration.posterior=%s has nothing to say: this job has calibrated no"
+                " driver-specific parameters",
+                settings.posterior,
+            )
         return {}
     number = {pair.pair_id: index for index, pair in enumerate(context.pairs)}
     ids = evaluation.about["pair_id"].drop_duplicates().astype(str).tolist()
@@ -75,10 +84,25 @@ def calibration_tables(context: ProtocolContext, evaluation: Evaluation) -> dict
         if method in _CONSTANT:
             parameters = _parameters(evaluation, method, ids, batch.leader_length)
             found = training_errors(context.calibrator, batch, last, parameters)
-            fits.append(_fits(evaluation, method, found))
+            rows = _fits(evaluation, method, found)
+            if method == "fixed" and settings.posterior != "none":
+                known = _intervals(context.calibrator.solver, batch, last, parameters, settings)
+                rows = rows.join(known.set_axis(ids), on="pair_id")
+            fits.append(rows)
     best = _parameters(evaluation, "fixed", ids, batch.leader_length)
     table = slices(context.calibrator, batch, last, best, ids)
     return {"slices": table, "fits": pd.concat(fits, ignore_index=True)}
+
+
+def _intervals(
+    solver: Solver, batch: PairBatch, last: Tensor, best: Tensor, settings: CalibrationSettings
+) -> pd.DataFrame:
+    """Returns the posterior's columns, a row per pair, in the order of the batch."""
+    # SciPy's interpolation is imported for that alone.
+    from cfx.calibration.posterior.intervals import parameter_intervals
+
+    known = parameter_intervals(solver, batch, last, best, settings)
+    return pd.DataFrame(known.columns())
 
 
 def _parameters(evaluation: Evaluation, method: str, ids: list[str], like: Tensor) -> Tensor:
@@ -252,7 +276,13 @@ def prepare(config: JobConfig) -> tuple[JobConfig, Parts]:
         set_threads(config.threads)
     protocol = make_protocol(config)
     config = complete(config, protocol)
-    return config, Parts.of(config, protocol)
+    parts = Parts.of(config, protocol)
+    if config.calibration.posterior != "none" and not isinstance(parts.simulator, MemorySimulator):
+        raise ConfigError(
+            f"calibration.posterior={config.calibration.posterior} simulates each trajectory"
+            " thousands of times, which simulator=memory alone can; leave one of them out"
+        )
+    return config, parts
 
 
 def select_pairs(pairs: PairSet, config: JobConfig) -> tuple[PairSet, StyleResult]:
@@ -338,7 +368,7 @@ def uncached(config: JobConfig) -> JobConfig:
     return JobConfig.of({**config.model_dump(), "cache": {"enabled": False}})
 
 
-def find(context: ProtocolContext, parts: Parts) -> Findings:
+def find(context: ProtocolContext, parts: Parts, calibration: CalibrationSettings) -> Findings:
     """Runs the protocol: it splits the pairs, calibrates, has the learner train, and evaluates.
 
     Returns:
@@ -348,10 +378,12 @@ def find(context: ProtocolContext, parts: Parts) -> Findings:
         PluginError: it delivers no `ProtocolResult`.
     """
     with closing(context.simulator), closing(parts.engine):
-        return _found(parts, context, parts.protocol.run(context))
+        return _found(parts, context, parts.protocol.run(context), calibration)
 
 
-def _found(parts: Parts, context: ProtocolContext, result: object) -> Findings:
+def _found(
+    parts: Parts, context: ProtocolContext, result: object, calibration: CalibrationSettings
+) -> Findings:
     """Returns what a protocol has delivered; see `find`."""
     if not isinstance(result, ProtocolResult):
         raise PluginError(
@@ -360,7 +392,7 @@ def _found(parts: Parts, context: ProtocolContext, result: object) -> Findings:
         )
     purpose = Purpose.of(parts.model, parts.policy)
     evaluation = replace(result.evaluation, purpose=purpose).distinct_methods()
-    tables = calibration_tables(context, evaluation)
+    tables = calibration_tables(context, evaluation, calibration)
     if "slices" in tables:
         evaluation = evaluation.with_slices(tables["slices"])
     evaluation = replace(evaluation, tables={**evaluation.tables, **tables})

@@ -33,6 +33,7 @@ class KernelKey(NamedTuple):
         dt: time step, s.
         parameters: names of the model's parameters, and whether candidates differ in each.
         dtype: of all values.
+        summed: whether terms are summed up over frames.
     """
 
     model: ComponentKey
@@ -41,6 +42,7 @@ class KernelKey(NamedTuple):
     dt: float
     parameters: tuple[tuple[str, bool], ...]
     dtype: torch.dtype
+    summed: bool = True
 
     def lasting(self) -> str | None:
         """Returns a key that other processes agree on; None if there is none.
@@ -56,7 +58,8 @@ class KernelKey(NamedTuple):
             if code is None:
                 return None
             described.append([code, key.settings])
-        described += [self.temperature, self.dt, self.parameters, self.dtype, torch.__version__]
+        described += [self.temperature, self.dt, self.parameters, self.dtype, self.summed]
+        described.append(torch.__version__)
         return content_key(described)
 
 

@@ -53,8 +53,9 @@ def accumulate(
     terms: Terms,
     *,
     key: ComponentKey | str,
+    every: int | None = None,
 ) -> tuple[Tensor, ...] | None:
-    """Simulates segments in closed loop and sums up the terms of their frames that count.
+    """Simulates segments in closed loop and computes the terms of their frames that count.
 
     The work is shared among threads; the result does not depend on their number.
 
@@ -65,18 +66,27 @@ def accumulate(
         p: one tensor per parameter, `()`, or broadcasting to `(P, q)`.
         terms: what a frame adds to each sum.
         key: what the terms depend on; equal keys share a kernel.
+        every: the terms of each so many-th frame, instead of sums.
 
     Returns:
-        Each sum, `(P, q)`; None where no kernel can be made of this model.
+        Each sum, `(P, q)`, or each term of frames `every`, `2 every` and so on, `(K // every, P,
+        q)`, 0 where a frame does not count; None where no kernel can be made of this model.
     """
-    kernel = _kernel(model, dt, p, terms, key)
+    kernel = _kernel(model, dt, p, terms, key, summed=every is None)
     if kernel is None:
         return None
     allocator.keep_freed_memory()
     shape = common_shape([(len(segments.speed), 1), *[value.shape for value in p.values()]])
-    sums = segments.speed.new_empty((kernel.terms, *shape))
     memory = model.initial_memory(segments.speed).contiguous()
-    _run(kernel, segments, list(p.values()), memory, sums)
+    if every is None:
+        sums = segments.speed.new_empty((kernel.terms, *shape))
+        rows = ctypes.c_long(0), ctypes.c_long(1)
+    else:
+        # Not all segments last K steps.
+        count = len(segments.counted) // every
+        sums = segments.speed.new_zeros((kernel.terms, count, *shape))
+        rows = ctypes.c_long(count), ctypes.c_long(every)
+    _run(kernel, segments, list(p.values()), memory, sums, rows)
     return tuple(sums)
 
 
@@ -103,6 +113,8 @@ def _kernel(
     p: Mapping[str, Tensor],
     terms: Terms,
     key: ComponentKey | str,
+    *,
+    summed: bool = True,
 ) -> _Kernel | None:
     """Returns the kernel for a model and an objective, made at the first call."""
     parameters = tuple((name, value.dim() > 0) for name, value in p.items())
@@ -113,6 +125,7 @@ def _kernel(
         dt=dt,
         parameters=parameters,
         dtype=next(iter(p.values())).dtype,
+        summed=summed,
     )
     with _MAKING:
         if whole_key not in _KERNELS:
@@ -139,7 +152,8 @@ def _source(model: DrivingModel, terms: Terms, key: KernelKey) -> str:
         name = type(model).__name__
         log.info("%s has no compiled kernel (%s); PyTorch simulates it", name, reason)
         return ""
-    return write(program, [varied for _, varied in key.parameters], key.dtype)
+    varied = [varied for _, varied in key.parameters]
+    return write(program, varied, key.dtype, summed=key.summed)
 
 
 def _run(
@@ -148,8 +162,9 @@ def _run(
     parameters: Sequence[Tensor],
     memory: Tensor,
     sums: Tensor,
+    rows: tuple[ctypes.c_long, ctypes.c_long],
 ) -> None:
-    _, problems, candidates = sums.shape
+    problems, candidates = sums.shape[-2:]
     ends = _ends(segments.counted)
     signals = []
     for name in SIGNALS:
@@ -171,6 +186,7 @@ def _run(
             ctypes.c_void_p(sums.data_ptr()),
             ctypes.c_long(problems),
             ctypes.c_long(candidates),
+            *rows,
             ctypes.c_long(first),
             ctypes.c_long(min(first + _UNITS_AT_ONCE, units)),
         )

@@ -69,7 +69,8 @@ static inline int column(real number, int last) {{
 struct View {{ const real* data; long problem; long other; }};
 extern "C" void accumulate(
     const View* signals, const View* parameters, const View* counted, const long* ends,
-    const View* memory, real* sums, long problems, long candidates, long first, long last) {{
+    const View* memory, real* sums, long problems, long candidates, long rows, long every,
+    long first, long last) {{
   const long blocks = (candidates + BLOCK - 1) / BLOCK;
   for (long unit = first; unit < last; ++unit) {{
     const long i = unit / blocks, begin = (unit % blocks) * BLOCK;
@@ -92,21 +93,25 @@ _CONSTANT_SIGNALS = ("leader_length", "position", "speed", "acceleration")
 SIGNALS = (*_SIGNALS, *_CONSTANT_SIGNALS)
 
 
-def write(program: StepProgram, varied: Sequence[bool], dtype: torch.dtype) -> str:
+def write(
+    program: StepProgram, varied: Sequence[bool], dtype: torch.dtype, *, summed: bool = True
+) -> str:
     """Returns the C++ source of a kernel.
 
     Args:
         program: the step.
         varied: for each parameter, whether candidates differ in it; the others are numbers.
         dtype: float64 or float32.
+        summed: whether terms are summed up over frames; else those of single frames are written.
     """
     lines = [_HEAD.format(type=_TYPES[dtype], block=BLOCK)]
     shift = _shift(program.memory)
     lines += _begin(varied, len(program.terms), len(program.memory), shift)
-    lines += _loop(program, varied, shift)
-    for k in range(len(program.terms)):
-        target = f"sums[({k} * problems + i) * candidates + begin + j]"
-        lines.append(f"    for (long j = 0; j < width; ++j) {target} = S{k}[j];")
+    lines += _loop(program, varied, shift, summed=summed)
+    if summed:
+        for k in range(len(program.terms)):
+            target = f"sums[({k} * problems + i) * candidates + begin + j]"
+            lines.append(f"    for (long j = 0; j < width; ++j) {target} = S{k}[j];")
     lines += ["  }", "}"]
     lines.append(f'extern "C" long terms() {{ return {len(program.terms)}; }}')
     return "\n".join(lines) + "\n"
@@ -165,7 +170,7 @@ def _begin(varied: Sequence[bool], terms: int, width: int, shift: int) -> list[s
     return lines
 
 
-def _loop(program: StepProgram, varied: Sequence[bool], shift: int) -> list[str]:
+def _loop(program: StepProgram, varied: Sequence[bool], shift: int, *, summed: bool) -> list[str]:
     """Returns the loop over time, with the loop over candidates inside."""
     lines = ["    for (long t = 0; t < ends[i]; ++t) {"]
     lines += _turned(len(program.memory), shift)
@@ -191,15 +196,33 @@ def _loop(program: StepProgram, varied: Sequence[bool], shift: int) -> list[str]
     for array, value in zip(("next_x", "next_v", "next_a"), program.state, strict=True):
         lines.append(f"        const real {array} = {value};")
     lines.append("        X[j] = next_x; V[j] = next_v; A[j] = next_a;")
-    for k in range(len(program.terms)):
-        lines.append(f"        S{k}[j] += added{k} * weight;")
+    lines += _added(len(program.terms), summed=summed)
     for k, value in enumerate(program.memory):
         if k < shift or value != names[k - shift]:
             lines.append(f"        N[{k}][j] = {value};")
     lines.append("      }")
+    if not summed:
+        lines += _written(len(program.terms))
     if program.memory:
         lines.append("      M = N;")
     lines.append("    }")
+    return lines
+
+
+def _added(terms: int, *, summed: bool) -> list[str]:
+    """Returns what adds the terms of a frame to their sums, or keeps them alone."""
+    sign = "+=" if summed else "="
+    return [f"        S{k}[j] {sign} added{k} * weight;" for k in range(terms)]
+
+
+def _written(terms: int) -> list[str]:
+    """Returns what writes the terms of single frames."""
+    lines = ["      if ((t + 1) % every == 0) {"]
+    for k in range(terms):
+        row = f"{k} * rows + (t + 1) / every - 1"
+        target = f"sums + (({row}) * problems + i) * candidates + begin"
+        lines.append(f"        std::memcpy({target}, S{k}, sizeof(real) * width);")
+    lines.append("      }")
     return lines
 
 

@@ -1,0 +1,1 @@
+"""What a calibration knows: posterior distributions of parameters, beside the point estimates."""

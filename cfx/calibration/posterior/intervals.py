@@ -1,0 +1,145 @@
+"""Intervals of drivers' parameters: what their recordings say, and what they leave open.
+
+Shapes: P drivers, n tuned parameters.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cfx.calibration.losses import SegmentLosses
+from cfx.calibration.posterior.density import ParameterPrior, Posterior
+from cfx.calibration.posterior.laplace import (
+    Normal,
+    bytes_of_marginals,
+    laplace,
+    marginal_quantiles,
+)
+from cfx.calibration.posterior.levels import LEVEL
+from cfx.calibration.prior import squashed
+from cfx.calibration.settings import CalibrationSettings
+from cfx.calibration.shards import Solver
+from cfx.data.pairs import PairBatch
+from cfx.simulation.trajectory import Segments
+
+_SHARES = (0.5 - 0.5 * LEVEL, 0.5, 0.5 + 0.5 * LEVEL)
+
+_WORK = 10**8
+"""Vehicle steps that belong together: enough for a compiled kernel."""
+
+
+@dataclass(frozen=True)
+class ParameterIntervals:
+    """What P recordings say of parameters.
+
+    Attributes:
+        names: of the parameters.
+        low, median, high: quantiles, `(P, n)`, SI units.
+        contraction: `(P, n)`, 1 minus the width of the interval over that of the prior's, of
+            logits: 0 where a recording says nothing, 1 where it leaves no doubt.
+        noise_scale: `(P,)`, what each step of the noise adds, as the signal: m/s or m.
+        noise_correlation: `(P,)`, of the noise with itself one step later.
+        noise_left: `(P,)`, the same correlation of what the noise's model leaves of it; near 0
+            where the model is right.
+    """
+
+    names: tuple[str, ...]
+    low: Tensor
+    median: Tensor
+    high: Tensor
+    contraction: Tensor
+    noise_scale: Tensor
+    noise_correlation: Tensor
+    noise_left: Tensor
+
+    def columns(self) -> dict[str, NDArray[np.float64]]:
+        """Returns columns for a row per driver: `median_NAME`, `noise_scale` and so on."""
+        found = {}
+        for kind in ("median", "low", "high", "contraction"):
+            for number, name in enumerate(self.names):
+                found[f"{kind}_{name}"] = getattr(self, kind)[:, number].numpy()
+        for kind in ("noise_scale", "noise_correlation", "noise_left"):
+            found[kind] = getattr(self, kind).numpy()
+        return found
+
+
+def parameter_intervals(
+    solver: Solver,
+    batch: PairBatch,
+    last: Tensor,
+    best: Tensor,
+    settings: CalibrationSettings,
+) -> ParameterIntervals:
+    """Returns the intervals of each driver's parameters.
+
+    Args:
+        solver: whose model, time step and objective count, and which bounds the memory.
+        batch: P pairs.
+        last: `(P,)`, the last frame that is compared; simulated from frame 0 in one closed loop.
+        best: `(P, n)`, the point estimates, SI units: searches start there too.
+        settings: prior, method and noise.
+    """
+    posterior = posterior_of(solver, batch, last, settings)
+    space = solver.space
+    best = squashed(space.to_unit(best.to("cpu", torch.float64)))
+    starts = torch.stack([best, squashed(space.to_unit(space.defaults())).expand_as(best)], dim=1)
+    size = max(1, solver.memory // (4 * bytes_of_marginals(posterior)))
+    parts = []
+    for drivers in torch.split(torch.arange(len(best)), size):
+        parts.append(_intervals(posterior.take(drivers), starts[drivers]))
+    joined = []
+    for values in zip(*parts, strict=True):
+        joined.append(torch.cat(values))
+    return ParameterIntervals(space.names, *joined)
+
+
+def posterior_of(
+    solver: Solver, batch: PairBatch, last: Tensor, settings: CalibrationSettings
+) -> Posterior:
+    """Returns the posterior of drivers on their recordings up to a last frame, on the CPU.
+
+    Args:
+        solver: whose model, time step and objective count.
+        batch: P pairs.
+        last: `(P,)`, the last frame that is compared; simulated from frame 0 in one closed loop.
+        settings: prior and noise.
+    """
+    pair = torch.arange(len(batch), device=batch.lengths.device)
+    last = last.to(pair.device)
+    cut = SegmentLosses.of_segments(
+        solver.simulator.for_work(_WORK), solver.objective, batch, pair, pair * 0, last
+    )
+    measured = Segments(*(values.to("cpu", torch.float64) for values in cut.segments))
+    stride = max(1, round(settings.noise_step_s / solver.simulator.dt))
+    return Posterior(
+        SegmentLosses(cut.simulator, cut.objective, measured),
+        ParameterPrior.of(solver.space, settings.prior),
+        settings.noise_order,
+        min(stride, cut.steps),
+    )
+
+
+def _intervals(posterior: Posterior, starts: Tensor) -> tuple[Tensor, ...]:
+    """Returns the attributes of `ParameterIntervals`, but for the names, of some drivers."""
+    normal = laplace(posterior, starts)
+    space = posterior.space
+    shares = torch.tensor(_SHARES, dtype=torch.float64)
+    quantiles = marginal_quantiles(posterior, normal, shares)
+    prior = posterior.prior.quantiles(shares, len(space))
+    width = (quantiles[:, 2] - quantiles[:, 0]) / (prior[2] - prior[0])
+    values = space.from_unit(torch.sigmoid(quantiles))
+    return (*values.unbind(1), 1.0 - width, *_noise(posterior, normal))
+
+
+def _noise(posterior: Posterior, normal: Normal) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns scale, correlation and what is left of it at the mode, `(P,)` each."""
+    n = len(posterior.space)
+    residual = posterior.residual(normal.mode[:, None])[..., 0]
+    left = (residual[1:] * residual[:-1]).sum(0) / residual.square().sum(0).clamp(min=1e-300)
+    noise = normal.mode[:, n:]
+    return noise[:, -1].exp(), noise[:, 0].tanh(), left

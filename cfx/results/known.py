@@ -1,0 +1,94 @@
+"""What is said of how well drivers' parameters are known: metrics, a table and some sentences."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pandas as pd
+from rich.console import RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from cfx.calibration.posterior.levels import DETERMINED, LEVEL
+from cfx.core.parameters import Parameter
+from cfx.results.table import Findings
+
+_CORRELATED = 0.3
+"""Correlation that noise may keep before the job says so."""
+
+
+@dataclass(frozen=True)
+class KnownParameters:
+    """The posterior's columns of a job's fits.
+
+    Attributes:
+        rows: a row per pair.
+        parameters: those that were calibrated.
+    """
+
+    rows: pd.DataFrame
+    parameters: tuple[Parameter, ...]
+
+    @classmethod
+    def of(cls, findings: Findings) -> KnownParameters | None:
+        """Returns them; None where the job asked for no posterior."""
+        evaluation = findings.evaluation
+        fits = evaluation.tables.get("fits")
+        if fits is None or "noise_scale" not in fits:
+            return None
+        tuned = tuple(one for one in evaluation.parameters if f"median_{one.name}" in fits)
+        return cls(fits[fits["method"] == "fixed"], tuned)
+
+    def determined(self, name: str) -> int:
+        """Returns how many pairs' recordings determine a parameter."""
+        return int((self.rows[f"contraction_{name}"] >= DETERMINED).sum())
+
+    def metrics(self) -> dict[str, float]:
+        """Returns `posterior/determined/NAME`, the share of pairs, and `posterior/noise_left`."""
+        found = {}
+        for one in self.parameters:
+            found[f"posterior/determined/{one.name}"] = self.determined(one.name) / len(self.rows)
+        found["posterior/noise_left"] = float(self.rows["noise_left"].median())
+        return found
+
+    def printed(self) -> list[RenderableType]:
+        """Returns the table of parameters, then what is not determined, then a warning if due."""
+        pairs = len(self.rows)
+        words = "" if pairs == 1 else f", median of {pairs} pairs"
+        table = Table(
+            title=f"What the recordings say of parameters{words}: {LEVEL:.0%} intervals",
+            title_justify="left",
+        )
+        table.add_column("parameter")
+        table.add_column("interval", justify="right")
+        table.add_column("determined for", justify="right")
+        for one in self.parameters:
+            middle = float(self.rows[f"median_{one.name}"].median())
+            low = float(self.rows[f"low_{one.name}"].median())
+            high = float(self.rows[f"high_{one.name}"].median())
+            unit = "" if one.unit == "1" else f" {one.unit}"
+            interval = f"{middle:.3g}{unit} ({low:.3g} to {high:.3g})"
+            table.add_row(one.name, interval, f"{self.determined(one.name)} of {pairs}")
+        return [table, *map(Text, self._sentences())]
+
+    def _sentences(self) -> list[str]:
+        sentences = []
+        pairs = len(self.rows)
+        open_ones = []
+        for one in self.parameters:
+            if self.determined(one.name) < pairs:
+                open_ones.append(f"{one.name} for {pairs - self.determined(one.name)}")
+        if open_ones:
+            sentences.append(
+                f"Hardly known after these recordings: {', '.join(open_ones)} of {pairs} pairs"
+                f" (intervals less than {DETERMINED:.0%} narrower than the prior's;"
+                " contraction_NAME in fits.parquet)."
+            )
+        left = float(self.rows["noise_left"].median())
+        if abs(left) > _CORRELATED:
+            sentences.append(
+                f"What the noise's model leaves is still correlated ({left:.2f} from step to step):"
+                " intervals may be too narrow; try calibration.noise_order=2 or longer steps"
+                " (calibration.noise_step_s)."
+            )
+        return sentences

@@ -1,0 +1,57 @@
+"""Jobs with `calibration.posterior`: what they say of parameters, and what they leave as it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+import cfx
+from cfx.core.errors import ConfigError
+
+QUICK = [
+    "debug=quick",
+    "policy=fixed",
+    "data.pairs=3",
+    "data.platoon_size=1",
+    "data.frames=400",
+    "data.max_pairs=null",
+    "figures.enabled=false",
+    "tracking.enabled=false",
+]
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def test_intervals_stand_beside_the_same_point_estimates(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    plain = cfx.run([*QUICK, "hydra.run.dir=plain"])
+    capsys.readouterr()
+    known = cfx.run([*QUICK, "hydra.run.dir=known", "calibration.posterior=laplace"])
+    for name, value in plain.metrics.items():
+        assert known.metrics[name] == value
+    pd.testing.assert_frame_equal(plain.pairs, known.pairs)
+    printed = capsys.readouterr().out
+    assert "What the recordings say of parameters" in printed
+    fits = pd.read_parquet("known/fits.parquet")
+    rows, others = fits[fits["method"] == "fixed"], fits[fits["method"] != "fixed"]
+    assert len(rows) == 3
+    for name in known.evaluation.names:
+        assert (rows[f"low_{name}"] < rows[f"median_{name}"]).all()
+        assert (rows[f"median_{name}"] < rows[f"high_{name}"]).all()
+        assert (rows[f"contraction_{name}"] < 1).all()
+        assert others[f"median_{name}"].isna().all()
+        share = float((rows[f"contraction_{name}"] >= 0.3).mean())
+        assert known.metrics[f"posterior/determined/{name}"] == share
+    assert "noise_scale" not in pd.read_parquet("plain/fits.parquet")
+
+
+def test_another_simulator_is_refused() -> None:
+    pytest.importorskip("libsumo")
+    with pytest.raises(ConfigError, match="simulator=memory alone"):
+        cfx.run([*QUICK, "model=krauss_sumo", "simulator=sumo", "calibration.posterior=laplace"])
