@@ -24,7 +24,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-NAMES = ("calibrate", "policy", "sumo")
+NAMES = ("calibrate", "frames", "own_model", "policy", "sumo")
 
 
 def cells(text: str) -> Iterator[tuple[bool, str]]:
