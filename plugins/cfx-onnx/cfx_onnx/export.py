@@ -24,8 +24,9 @@ from cfx_onnx.graph import graph_of
 
 NAME = "driver.onnx"
 
-MOST_DIFFERENCE = 1e-6
-"""m/s, by which speeds after one step in ONNX Runtime may differ from cfx's."""
+MOST_DIFFERENCE = 1e-4
+"""m/s, by which speeds after one step in ONNX Runtime may differ from cfx's. Networks are in single
+precision, whose rounding moves a speed of IDM by 1e-7 and one of Wiedemann 99 by 2e-6 m/s."""
 
 
 class OnnxExport(ExportFormat):
