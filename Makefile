@@ -4,6 +4,7 @@
 #   make test                                 set up .venv, then ruff, mypy and the fast tests: what CI runs
 #   make test-slow | make bench               the tests that take minutes | the benchmarks
 #   make golden | make golden-write           compare the results of small jobs, bit for bit, with recorded ones | record them anew
+#   make settings [EVERY=20]                  each setting of each option changes what a job writes, or is refused (every 20th alone)
 #   make fuzz [EXAMPLES=5000]                 bad configurations, recordings, policies and caches; each file of a job fails once
 #   make kills [KILLS=100]                    kill a sweep at random moments, with each launcher
 #   make policies                             train the ready-made policies anew from ../shared/data (an hour)
@@ -26,7 +27,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 TORCH = $(shell sed -n 's/^torch==//p' constraints.txt)
 
-.PHONY: run test test-slow golden golden-write fuzz kills bench policies docs tutorials dist conf lock clean
+.PHONY: run test test-slow golden golden-write settings fuzz kills bench policies docs tutorials dist conf lock clean
 
 run: $(VENV)/.ready
 	$(BIN)/python -m cfx $(ARGS)
@@ -42,6 +43,9 @@ test-slow: $(VENV)/.ready-test
 
 golden golden-write: $(VENV)/.ready-test
 	OMP_NUM_THREADS=1 CFX_GOLDEN=$(if $(filter golden-write,$@),write) $(BIN)/python -m pytest -m slow tests/golden
+
+settings: $(VENV)/.ready-test
+	OMP_NUM_THREADS=1 CFX_SETTINGS_EVERY=$(or $(EVERY),1) $(BIN)/python -m pytest -m slow tests/settings -s
 
 fuzz: $(VENV)/.ready-test
 	CFX_FUZZ_EXAMPLES=$(or $(EXAMPLES),5000) CFX_FAULTS_STRIDE=1 $(BIN)/python -m pytest tests/fuzz --timeout 0 -n auto

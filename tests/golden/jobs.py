@@ -13,7 +13,7 @@ import yaml
 
 import cfx
 
-_SMALL = (
+SMALL = (
     "debug=quick",
     "data.pairs=4",
     "data.frames=200",
@@ -115,14 +115,14 @@ def run(name: str, folder: Path) -> Path:
             before, brace, rest = override.partition("{")
             if brace:
                 overrides[k] = before + str(run(rest.removesuffix("}"), folder))
-        cfx.run([*_SMALL, *overrides, *_places(target, "run")])
+        cfx.run([*SMALL, *overrides, *_places(target, "run")])
     return target
 
 
 def run_sweep(folder: Path) -> dict[str, Path]:
     """Runs the multirun in a process of its own; returns the folder of each of its jobs."""
     target = folder / "sweep"
-    command = [sys.executable, "-m", "cfx", "-m", *_SMALL, *SWEEP, *_places(target, "sweep")]
+    command = [sys.executable, "-m", "cfx", "-m", *SMALL, *SWEEP, *_places(target, "sweep")]
     subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL)
     return {f"sweep/{_choices(file.parent)}": file.parent for file in target.glob("*/metrics.json")}
 
