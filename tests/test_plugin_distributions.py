@@ -19,7 +19,14 @@ from cfx.core import registry
 
 ROOT = Path(__file__).resolve().parent.parent
 PLUGINS = sorted(path.parent for path in (ROOT / "plugins").glob("*/pyproject.toml"))
-READERS = {"cfx.data.files", "cfx.data.series", "cfx.data.table", "cfx.data.tracks"}
+READERS = {
+    "cfx.data.files",
+    "cfx.data.pairs",
+    "cfx.data.resample",
+    "cfx.data.series",
+    "cfx.data.table",
+    "cfx.data.tracks",
+}
 REPORTS = {
     "cfx.report.figures.canvas",
     "cfx.report.figures.figure",
