@@ -9,6 +9,7 @@ import pytest
 
 import cfx
 from cfx.core.errors import ConfigError
+from cfx.models.krauss import Krauss
 
 QUICK = [
     "debug=quick",
@@ -49,6 +50,17 @@ def test_intervals_stand_beside_the_same_point_estimates(
         share = float((rows[f"contraction_{name}"] >= 0.3).mean())
         assert known.metrics[f"posterior/determined/{name}"] == share
     assert "noise_scale" not in pd.read_parquet("plain/fits.parquet")
+
+
+def test_a_population_as_the_prior_leaves_less_doubt() -> None:
+    doubt = {}
+    for kind in ("laplace", "hierarchical"):
+        cfx.run([*QUICK, f"hydra.run.dir={kind}", f"calibration.posterior={kind}"])
+        fits = pd.read_parquet(f"{kind}/fits.parquet")
+        rows = fits[fits["method"] == "fixed"]
+        width = [rows[f"high_{name}"] - rows[f"low_{name}"] for name in Krauss().space.names]
+        doubt[kind] = pd.concat(width, axis=1).mean()
+    assert (doubt["hierarchical"] < doubt["laplace"]).all()
 
 
 def test_another_simulator_is_refused() -> None:

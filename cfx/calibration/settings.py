@@ -20,10 +20,11 @@ class CalibrationSettings(Settings):
         description="weak: parameters that a recording does not determine stay near the model's"
         " default; none: as in the paper",
     )
-    posterior: Literal["none", "laplace"] = Field(
+    posterior: Literal["none", "laplace", "hierarchical"] = Field(
         "none",
-        description="laplace: intervals of each driver's parameters beside the point estimate;"
-        " none: the point estimate alone",
+        description="intervals of each driver's parameters beside the point estimate. laplace: each"
+        " driver alone; hierarchical: with a prior that all drivers of the job give; none: the"
+        " point estimate alone",
     )
     noise_step_s: float = Field(
         1.0,

@@ -21,6 +21,7 @@ from cfx.calibration.posterior.laplace import (
     marginal_quantiles,
 )
 from cfx.calibration.posterior.levels import LEVEL
+from cfx.calibration.posterior.population import fit_population
 from cfx.calibration.prior import squashed
 from cfx.calibration.settings import CalibrationSettings
 from cfx.calibration.shards import Solver
@@ -88,14 +89,23 @@ def parameter_intervals(
     space = solver.space
     best = squashed(space.to_unit(best.to("cpu", torch.float64)))
     starts = torch.stack([best, squashed(space.to_unit(space.defaults())).expand_as(best)], dim=1)
+    if settings.posterior == "hierarchical":
+        _, posterior, normal = fit_population(posterior, starts)
+    else:
+        normal = laplace(posterior, starts)
     size = max(1, solver.memory // (4 * bytes_of_marginals(posterior)))
+    shares = torch.tensor(_SHARES, dtype=torch.float64)
     parts = []
     for drivers in torch.split(torch.arange(len(best)), size):
-        parts.append(_intervals(posterior.take(drivers), starts[drivers]))
-    joined = []
-    for values in zip(*parts, strict=True):
-        joined.append(torch.cat(values))
-    return ParameterIntervals(space.names, *joined)
+        own = Normal(*(values[drivers] for values in normal))
+        parts.append(marginal_quantiles(posterior.take(drivers), own, shares))
+    quantiles = torch.cat(parts)
+    prior = posterior.prior.quantiles(shares, len(space))
+    width = (quantiles[:, 2] - quantiles[:, 0]) / (prior[2] - prior[0])
+    values = space.from_unit(torch.sigmoid(quantiles))
+    low, median, high = values.unbind(1)
+    scale, correlation, left = _noise(posterior, normal)
+    return ParameterIntervals(space.names, low, median, high, 1.0 - width, scale, correlation, left)
 
 
 def posterior_of(
@@ -122,18 +132,6 @@ def posterior_of(
         settings.noise_order,
         min(stride, cut.steps),
     )
-
-
-def _intervals(posterior: Posterior, starts: Tensor) -> tuple[Tensor, ...]:
-    """Returns the attributes of `ParameterIntervals`, but for the names, of some drivers."""
-    normal = laplace(posterior, starts)
-    space = posterior.space
-    shares = torch.tensor(_SHARES, dtype=torch.float64)
-    quantiles = marginal_quantiles(posterior, normal, shares)
-    prior = posterior.prior.quantiles(shares, len(space))
-    width = (quantiles[:, 2] - quantiles[:, 0]) / (prior[2] - prior[0])
-    values = space.from_unit(torch.sigmoid(quantiles))
-    return (*values.unbind(1), 1.0 - width, *_noise(posterior, normal))
 
 
 def _noise(posterior: Posterior, normal: Normal) -> tuple[Tensor, Tensor, Tensor]:

@@ -12,6 +12,7 @@ from cfx.calibration.losses import SegmentLosses
 from cfx.calibration.objectives.rmse import GapRmse, SpeedRmse
 from cfx.calibration.posterior import noise
 from cfx.calibration.posterior.density import ParameterPrior, Posterior
+from cfx.calibration.posterior.population import Population
 from cfx.data.pairs import PairBatch
 from cfx.models.base import DrivingModel
 from cfx.simulation.rollout import MemoryStepper
@@ -35,15 +36,16 @@ def draw_recordings(
     frames: int = 600,
     signal: Literal["speed", "gap"] = "speed",
     seed: int = 0,
+    population: Population | None = None,
 ) -> Drawn:
     """Draws parameters, noise and errors, and adds the errors to what the drivers did."""
     generator = torch.Generator().manual_seed(seed)
     space = model.space
     prior = ParameterPrior.of(space, "weak")
     assert prior.center is not None
-    deviation = torch.linalg.inv(prior.precision).diagonal().sqrt()
+    among = population or Population(space, prior.center, torch.linalg.inv(prior.precision))
     normal = torch.randn((drivers, len(space)), generator=generator).double()
-    logits = prior.center + deviation * normal
+    logits = among.mean + normal @ torch.linalg.cholesky(among.covariance).mT
     correlation = torch.rand((drivers, 1), generator=generator).double() * 2.0 - 1.0
     gamma = -torch.log(torch.rand((drivers, 1), generator=generator).double())  # of shape 1
     scale = (noise.RATE / gamma).sqrt()
