@@ -56,7 +56,7 @@ kills: $(VENV)/.ready-test
 bench: $(VENV)/.ready-test
 	$(BIN)/python -m pytest tests/benchmarks -m "" --override-ini addopts="--import-mode=importlib" --benchmark-only
 
-DATA ?= ../shared/data/i80_reconstructed_pairs.parquet
+DATA ?= ../shared/data
 
 policies: $(VENV)/.ready-test
 	$(BIN)/python -m cfx policies make --data $(DATA)

@@ -18,12 +18,30 @@ from torch import Tensor
 from cfx.core.threads import one_thread
 from cfx.data.pairs import PairBatch
 from cfx.models.base import Leader
+from cfx.models.combined import Combined, for_both
 from cfx.models.limits import at_limits
 from cfx.policies.agent import Agent, AgentState
 from cfx.policies.context import DriverContext
 from cfx.policies.features import History
 from cfx.simulation.base import Stepper
 from cfx.simulation.trajectory import Start
+
+
+@dataclass(frozen=True)
+class OwnParameters:
+    """Constant parameters of P drivers that drive beside an agent (`cfx.models.combined`).
+
+    Attributes:
+        values: of the driving model, `(P, n)`, SI units.
+        weight: the agent's share of the acceleration, `(P,)`, 0 to 1.
+    """
+
+    values: Tensor
+    weight: Tensor
+
+    def __getitem__(self, index: Tensor) -> OwnParameters:
+        """Selects drivers by their numbers."""
+        return OwnParameters(self.values[index], self.weight[index])
 
 
 @dataclass(frozen=True)
@@ -36,12 +54,14 @@ class Followers:
         base: `(P, n)` in SI units, the drivers' base parameters; None: the agent's own base.
         history: seconds of measured history before a simulation that the agent observes, and in
             which driver features are measured; None: all there is.
+        own: constant parameters that drive beside the agent; None: it drives alone.
     """
 
     batch: PairBatch
     network: Tensor
     base: Tensor | None = None
     history: float | None = None
+    own: OwnParameters | None = None
 
 
 class ClosedLoop(NamedTuple):
@@ -92,7 +112,9 @@ def simulate_closed_loop(
         generator: draws, on the CPU, what a stochastic agent leaves to chance; None: nothing is
             drawn.
     """
-    simulator = agent.stepper(simulator)
+    model, simulator = simulator.model, agent.stepper(simulator)
+    if followers.own is not None:
+        simulator = simulator.for_model(Combined(simulator.model, model))
     if state is None:
         state = burnt_in(agent, followers, first, simulator.dt)
     track = _Track(followers.batch, first, agent.windows.length)
@@ -107,6 +129,8 @@ def simulate_closed_loop(
         end = min(begin + agent.windows.stride, track.steps)
         chosen, state = agent.act(track.history(begin), state, generator)
         p = agent.space.unpack(chosen)
+        if followers.own is not None:
+            p = for_both(p, model.space.unpack(followers.own.values), followers.own.weight)
         follower, positions, speeds = simulator.advance(follower, track.leader(begin, end), p)
         track.write(begin, end, positions.T, speeds.T, simulator.dt)
         simulated = slice(begin + 1, end + 1)

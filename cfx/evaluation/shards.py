@@ -88,7 +88,8 @@ def _cut(whole: ClosedLoopShard) -> Iterator[ClosedLoopShard]:
             agent = agent.only(used)
         if followers.base is not None:
             base = followers.base[part]
-        some = Followers(followers.batch[part].trimmed(), network, base, followers.history)
+        own = None if followers.own is None else followers.own[part]
+        some = Followers(followers.batch[part].trimmed(), network, base, followers.history, own)
         yield ClosedLoopShard(whole.simulator, agent, some, whole.first[part])
 
 

@@ -30,6 +30,7 @@ from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.context import UNSEEN, ContextRule, DriverContext
 from cfx.policies.core import AgentCore
 from cfx.policies.driver_features import measure
+from cfx.policies.expected_error import ExpectedError
 from cfx.policies.features import History, Scaler, measured_history
 from cfx.policies.heads.base import ParameterHead
 from cfx.policies.heads.offset import blended, shrunk
@@ -93,16 +94,18 @@ class AgentState(NamedTuple):
 
 @dataclass(frozen=True)
 class TrainedOn:
-    """Training data of a policy, as far as it is known.
+    """Training data of a policy, and how it did on drivers left out of them, as far as known.
 
     Attributes:
         pairs: those that were learned from or calibrated on: `Pair.likeness` and the driver's name.
         quantiles: 5, 50 and 95 % of speed (m/s), acceleration (m/s2) and time gap (s) of the
             drivers; empty if they are not known.
+        expected_error: how errors grew on left-out drivers; None if that was not measured.
     """
 
     pairs: Mapping[str, str] = field(default_factory=dict)
     quantiles: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    expected_error: ExpectedError | None = None
 
 
 @dataclass(frozen=True)

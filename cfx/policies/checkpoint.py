@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from cfx.policies.agent import Agent, TrainedOn
 from cfx.policies.base import Policy
 from cfx.policies.context import ContextRule
 from cfx.policies.core import AgentCore, features_read, network_with_weights
+from cfx.policies.expected_error import ExpectedError
 from cfx.policies.features import Scaler
 from cfx.policies.heads import head_class
 from cfx.policies.heads.base import ParameterHead
@@ -98,8 +100,10 @@ class _Description(BaseModel):
     own: bool
     shrinkage: float = Field(ge=0, le=1)
     history: float | None = Field(ge=0)
+    combines: bool = False
     learned_from: dict[str, str]
     recorded: dict[str, tuple[float, ...]]
+    expected_error: ExpectedError | None = None
 
 
 def _validated(folder: Path, written: Mapping[str, Any]) -> _Description:
@@ -161,9 +165,12 @@ def _agent(
             driver_specific=description.own,
             shrinkage=description.shrinkage,
             history_s=description.history,
+            combines=description.combines,
         ),
         population=weights.get("population"),
-        trained_on=TrainedOn(description.learned_from, description.recorded),
+        trained_on=TrainedOn(
+            description.learned_from, description.recorded, description.expected_error
+        ),
         valid_range=_valid_range(weights),
         dispersion=weights.get("dispersion"),
     )
@@ -209,7 +216,7 @@ def _valid_range(weights: Mapping[str, Tensor]) -> ValidRange | None:
 
 
 def _description(agent: Agent) -> dict[str, Any]:
-    rule = agent.context_rule
+    rule, expected = agent.context_rule, agent.trained_on.expected_error
     return {
         "format": _FORMAT,
         "policy": dict(agent.policy_node),
@@ -223,7 +230,9 @@ def _description(agent: Agent) -> dict[str, Any]:
         "shrinkage": rule.shrinkage,
         "own": rule.driver_specific,
         "history": rule.history_s,
+        "combines": rule.combines,
         "learned_from": dict(agent.trained_on.pairs),
+        "expected_error": None if expected is None else asdict(expected),
         "recorded": {name: list(values) for name, values in agent.trained_on.quantiles.items()},
     }
 

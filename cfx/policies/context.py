@@ -38,8 +38,11 @@ class ContextRule:
             otherwise it is the agent's base for every driver.
         shrinkage: how far these parameters are shrunk towards the model's default, 0 to 1.
         history_s: measured history that the agent observes before a test, s; None: all there is.
+        combines: the driver's own calibrated parameters drive beside the agent, where they are
+            known (`cfx.evaluation.combination`).
     """
 
     driver_specific: bool = True
     shrinkage: float = 0.0
     history_s: float | None = None
+    combines: bool = False

@@ -5,10 +5,10 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
 import pandas as pd
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor
 
 from cfx.calibration.calibrator import Labels
@@ -18,6 +18,8 @@ from cfx.data.pairs import PairSet
 from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.evaluation.protocols.folds import Together, assign_folds, describe_folds, learned_from
 from cfx.evaluation.protocols.held_out import HeldOut
+from cfx.evaluation.protocols.past import expected_error
+from cfx.evaluation.result import Evaluation
 from cfx.learners.base import TrainingData, TrainingPairs, TrainingResult
 from cfx.policies.agent import Agent
 from cfx.policies.context import ContextRule
@@ -69,10 +71,24 @@ class AcrossDriversSettings(Settings):
         description="s of measured history before the test part that the policy observes; null: all"
         " there is",
     )
+    combine: bool = Field(
+        False,
+        description="the driver's own parameters drive beside the policy in the test part, each"
+        " with the share that their errors in the driver's past give it; needs history: null",
+    )
     histories: tuple[float, ...] = Field(
         (0.0, 10.0, 30.0),
         description="s: other amounts of history to compare, for policies of offsets; empty: none",
     )
+
+    @model_validator(mode="after")
+    def _past_is_known(self) -> Self:
+        if self.combine and self.history is not None:
+            raise ValueError(
+                "combine: the driver's own parameters are calibrated on all of their past; leave"
+                " history: null, or set combine: false"
+            )
+        return self
 
 
 @dataclass(frozen=True)
@@ -111,6 +127,14 @@ class Trained:
     notes: Mapping[str, Any]
     calibration: Mapping[str, float]
 
+    def policy_after(self, evaluation: Evaluation) -> Agent:
+        """Returns the policy, which knows of its test what error to expect of it."""
+        policy = self.test.policy
+        if self.fold is None or "past" not in evaluation.tables:
+            return policy
+        expected = expected_error(evaluation.tables["past"], self.fold.cpu().numpy())
+        return replace(policy, trained_on=replace(policy.trained_on, expected_error=expected))
+
 
 class AcrossDrivers(Protocol):
     """The paper's experiment on clusters: a policy is trained on some drivers and tested on others.
@@ -146,7 +170,7 @@ class AcrossDrivers(Protocol):
         evaluation = test.evaluation(self.settings.histories, fold=trained.fold)
         return ProtocolResult(
             evaluation,
-            test.policy,
+            trained.policy_after(evaluation),
             trained.curves,
             trained.labels,
             trained.notes,
@@ -222,7 +246,10 @@ class AcrossDrivers(Protocol):
         policy = context.ready(context.policy, training_result, names)
         shrinkage = s.shrinkage if s.base == "own" else 0.0
         rule = ContextRule(
-            driver_specific=s.base == "own", shrinkage=shrinkage, history_s=s.history
+            driver_specific=s.base == "own",
+            shrinkage=shrinkage,
+            history_s=s.history,
+            combines=s.combine,
         )
         policy = replace(policy, context_rule=rule, population=found.population)
         return policy, training_result

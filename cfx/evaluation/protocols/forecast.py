@@ -128,7 +128,7 @@ class Forecast(FoldsOrFinished):
                 values=pd.concat(values, ignore_index=True),
                 tables={**evaluation.tables, **tables},
             ),
-            test.policy,
+            trained.policy_after(evaluation),
             trained.curves,
             trained.labels,
             {**trained.notes, "forecasts": self._described(tables["forecasts"])},

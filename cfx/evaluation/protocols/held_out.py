@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import pandas as pd
@@ -19,6 +20,12 @@ from cfx.evaluation.evaluate import ComparedPairs, closed_loop_errors, evaluate
 from cfx.evaluation.outside import outside_of_scopes
 from cfx.evaluation.platoon import measure_platoons
 from cfx.evaluation.protocols.base import ProtocolContext
+from cfx.evaluation.protocols.past import (
+    PastErrors,
+    past_errors,
+    with_bounds,
+    with_bounds_of_other_folds,
+)
 from cfx.evaluation.result import Evaluation, Platoon
 from cfx.evaluation.shards import simulate_in_shards
 from cfx.policies.agent import Agent
@@ -59,6 +66,24 @@ class HeldOut:
         """The driver of each pair, Q of them."""
         return [pair.driver for pair in self.pairs]
 
+    @property
+    def combines(self) -> bool:
+        """Whether the drivers' own parameters drive beside the policy in the test part."""
+        return self.policy.context_rule.combines
+
+    @cached_property
+    def past(self) -> PastErrors:
+        """What the drivers' pasts say of the policy and of their own parameters."""
+        return past_errors(
+            self.context,
+            self.policy,
+            self.pairs,
+            self.batch,
+            self.network,
+            self.unseen_base,
+            self.first,
+        )
+
     def evaluation(
         self, histories: Sequence[float] = (), *, fold: Tensor | None = None
     ) -> Evaluation:
@@ -74,6 +99,8 @@ class HeldOut:
         tables = {}
         if self.policy.base is not None and histories:
             tables["history"] = self.history(histories, loops["fixed"])
+        if self.combines:
+            tables["past"] = self._past_table(loops, fold)
         scopes = {"test": loops, "full_trajectory": self._full_trajectory(methods)}
         evaluation = evaluate(
             ComparedPairs(self.pairs, self.batch, self.first, context.style, fold),
@@ -105,20 +132,54 @@ class HeldOut:
     def _test_part(self, methods: Mapping[str, Agent]) -> dict[str, ClosedLoop]:
         """Simulates the test part by all methods."""
         context, rule = self.context, self.policy.context_rule
-        base = self.unseen_base if self.base is None else self.base
         loops = {}
         for name, agent in methods.items():
+            followers = self._followers(rule.history_s)
+            if name == "policy" and self.combines:
+                followers = replace(followers, own=self.past.together_with(self.fixed))
             loops[name] = simulate_in_shards(
-                context.engine,
-                context.simulator,
-                agent,
-                Followers(self.batch, self.network, base, rule.history_s),
-                self.first,
+                context.engine, context.simulator, agent, followers, self.first
             )
         loops["fixed"] = self._constant(self.fixed)
         if self.base is not None and self.policy.base is not None and rule.shrinkage > 0:
             loops["shrunk"] = self._constant(self.base)
         return loops
+
+    def _followers(self, history: float | None) -> Followers:
+        """Returns the drivers of whom this much history is known, s; None: all there is."""
+        base = self.unseen_base if self.base is None else self.base
+        return Followers(self.batch, self.network, base, history)
+
+    def _past_table(self, loops: Mapping[str, ClosedLoop], fold: Tensor | None) -> pd.DataFrame:
+        """Returns a row per driver: what their past says, and what came of it.
+
+        Args:
+            loops: of the test part, by method.
+            fold: in which fold each pair is tested; None: the policy says what to expect.
+        """
+        context, past = self.context, self.past
+        loops = {
+            "fixed": loops["fixed"],
+            "alone": simulate_in_shards(
+                context.engine, context.simulator, self.policy, self._followers(None), self.first
+            ),
+            "policy": loops["policy"],
+        }
+        table = pd.DataFrame(
+            {
+                "pair_id": [pair.pair_id for pair in self.pairs],
+                "driver": self.drivers,
+                "share": past.weight,
+                "past_rmse_speed_fixed": past.own,
+                "past_rmse_speed_alone": past.policy,
+                "past_rmse_speed_policy": past.both,
+            }
+        )
+        for name, loop in loops.items():
+            table[f"rmse_speed_{name}"], _ = closed_loop_errors(self.batch, self.first, loop)
+        if fold is None:
+            return with_bounds(table, self.policy.trained_on.expected_error)
+        return with_bounds_of_other_folds(table, fold.cpu().numpy())
 
     def _constant(self, parameters: Tensor) -> ClosedLoop:
         """Simulates the test part with constant parameters of each driver, `(Q, n)`."""

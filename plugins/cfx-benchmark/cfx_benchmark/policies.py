@@ -22,7 +22,7 @@ class MakePolicies(Command):
         made.add_argument(
             "names", nargs="*", help=f"of {', '.join(RECIPES)}; all of them if left out"
         )
-        made.add_argument("--data", type=Path, required=True, help="the recordings, a tidy table")
+        made.add_argument("--data", type=Path, required=True, help="the folder with the recordings")
         made.add_argument(
             "--work",
             type=Path,

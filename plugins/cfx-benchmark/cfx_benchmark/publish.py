@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -12,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import torch
 
 from cfx.core.errors import ConfigError, DataError, nearest
@@ -20,14 +22,34 @@ from cfx.policies.agent import Agent
 from cfx.policies.checkpoint import load, save
 from cfx.policies.ready import FOLDER
 from cfx.policies.valid_range import FADED, SIGNALS
-from cfx_benchmark.recipes import RECIPES, SHARED_OVERRIDES
+from cfx_benchmark.recipes import I80, RECIPES
 
-_TRAINING_DATA = (
-    "NGSIM I-80 (U.S. Department of Transportation, public domain), 4:00-4:15 and 5:00-5:15 pm,"
-    " reconstructed trajectories"
-)
+_SOURCES = {
+    "i80": "NGSIM I-80 (U.S. Department of Transportation, public domain), 4:00-4:15 and"
+    " 5:00-5:15 pm, reconstructed trajectories",
+    "openacc": "OpenACC (Joint Research Centre of the European Commission, CC BY 4.0): ZalaZone,"
+    " Vicolungo, Ispra; resampled to 0.1 s",
+}
+"""Who recorded a file, by how its name begins."""
 
 _LICENCE = "MIT, as cfx; the recordings that it was trained on are in the public domain"
+_LICENCE_OF_OPENACC = "MIT, as cfx; made with OpenACC's recordings, which are CC BY 4.0"
+
+_SITE_COLUMNS = (
+    "scope",
+    "site",
+    "driver_type",
+    "drivers",
+    "rmse_speed_fixed",
+    "rmse_speed_population",
+    "rmse_speed_policy",
+    "over_fixed",
+    "over_fixed_low",
+    "over_fixed_high",
+    "over_population",
+    "over_population_low",
+    "over_population_high",
+)
 
 
 def make(names: Sequence[str], data: Path, work: Path) -> None:
@@ -35,7 +57,7 @@ def make(names: Sequence[str], data: Path, work: Path) -> None:
 
     Args:
         names: of recipes; empty: all.
-        data: the recordings.
+        data: the folder with the recordings.
         work: where the jobs run.
 
     Raises:
@@ -70,6 +92,8 @@ def publish(name: str, job: Path) -> None:
     save(agent, folder / "policy")
     write_json(folder / "metrics.json", metrics)
     card = _card(name, agent, metrics, data)
+    if (job / "sites.csv").is_file():
+        card["sites"] = _sites(pd.read_csv(job / "sites.csv"))
     card["size_kb"] = _kilobytes(folder)
     card["stress"] = _stress(folder)
     write_json(folder / "card.json", card)
@@ -80,13 +104,20 @@ def publish(name: str, job: Path) -> None:
 
 def command_of(name: str) -> str:
     """Returns the command that trains a policy."""
-    overrides = " ".join((*RECIPES[name].overrides, *SHARED_OVERRIDES))
-    return f"python -m cfx {overrides} data.path=i80_reconstructed_pairs.parquet"
+    recipe = RECIPES[name]
+    files = ",".join(recipe.recordings)
+    path = f"data.path={files}" if len(recipe.recordings) == 1 else f"'data.path=[{files}]'"
+    return f"python -m cfx {' '.join(recipe.overrides)} {path}"
 
 
 def _train(name: str, data: Path, job: Path) -> None:
-    command = [sys.executable, "-m", "cfx", *RECIPES[name].overrides, *SHARED_OVERRIDES]
-    command.append(path_override("data.path", data.absolute()))
+    recipe = RECIPES[name]
+    command = [sys.executable, "-m", "cfx", *recipe.overrides]
+    paths = [
+        path_override("data.path", data.absolute() / file).removeprefix("data.path=")
+        for file in recipe.recordings
+    ]
+    command.append(f"data.path={paths[0]}" if len(paths) == 1 else f"data.path=[{','.join(paths)}]")
     command.append(path_override("hydra.run.dir", job.absolute()))
     # Our own command, no shell.
     done = subprocess.run(command, check=False)  # noqa: S603
@@ -102,15 +133,15 @@ def _card(name: str, agent: Agent, metrics: dict[str, Any], data: dict[str, Any]
         "summary": RECIPES[name].summary,
         "model": agent.model_node["name"],
         "policy": agent.policy_node["name"],
-        "licence": _LICENCE,
+        "licence": _LICENCE if RECIPES[name].recordings == (I80,) else _LICENCE_OF_OPENACC,
         "command": command_of(name),
         "training_data": {
-            "source": _TRAINING_DATA,
+            "source": _source(RECIPES[name].recordings),
             "pairs": len(agent.trained_on.pairs),
             "drivers": len(set(agent.trained_on.pairs.values())),
             "fingerprint": data.get("fingerprint", ""),
         },
-        "evaluation": "5 folds over drivers: nothing of a tested driver was learned from",
+        "evaluation": _evaluation(RECIPES[name].recordings),
         "errors_on_unseen_drivers": {
             "rmse_speed": metrics["full_trajectory/rmse_speed/policy"],
             "rmse_speed_pooled": metrics["full_trajectory/rmse_speed/population"],
@@ -134,6 +165,37 @@ def _card(name: str, agent: Agent, metrics: dict[str, Any], data: dict[str, Any]
         "valid_range": _range(agent),
         "base_parameters": _base(agent),
     }
+
+
+def _source(recordings: Sequence[str]) -> str:
+    """Returns who recorded the files."""
+    found = []
+    for begins, source in _SOURCES.items():
+        if any(file.startswith(begins) for file in recordings):
+            found.append(source)
+    return "; ".join(found)
+
+
+def _evaluation(recordings: Sequence[str]) -> str:
+    if len(recordings) == 1:
+        return "5 folds over drivers: nothing of a tested driver was learned from"
+    return (
+        "each site is left out once: nothing of a tested driver's road was learned from. Errors are"
+        " means over pairs, those by site below"
+    )
+
+
+def _sites(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """Returns the rows of `sites.csv` for a card; what is not known is left out."""
+    rows = []
+    for row in table.to_dict("records"):
+        known = {}
+        for name in _SITE_COLUMNS:
+            value = row.get(name)
+            if isinstance(value, str) or (value is not None and math.isfinite(value)):
+                known[name] = value
+        rows.append(known)
+    return rows
 
 
 def _distributions(metrics: dict[str, Any]) -> list[dict[str, float]]:
@@ -231,6 +293,7 @@ def card_text(card: dict[str, Any]) -> str:
         f"- **Base parameters**, far outside the valid range: {_pairs(card['base_parameters'])}",
         f"- **Licence**: {card['licence']}",
         "",
+        *_site_lines(card.get("sites", ())),
         "Made by",
         "",
         "```",
@@ -253,6 +316,53 @@ def _distribution_lines(rows: Sequence[dict[str, float]]) -> list[str]:
         "- **Sampled forecasts** (CRPS of speed; coverage of the central 90 %):"
         f" {', '.join(scores)}. Errors above are those of its centre, where nothing is drawn"
     ]
+
+
+def _site_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Returns a table by site: each left out, people and cars with cruise control apart."""
+    if not rows:
+        return []
+    lines = [
+        "| left out | drivers | last 20 %: own / policy, m/s | over own | full trajectories: pooled"
+        " / policy, m/s | over pooled |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    full = {
+        (row["site"], row["driver_type"]): row for row in rows if row["scope"] == "full_trajectory"
+    }
+    for row in rows:
+        key = row["site"], row["driver_type"]
+        if row["scope"] != "test":
+            continue
+        name = (
+            row["site"] if row["driver_type"] == "all" else f"{row['site']}, {row['driver_type']}"
+        )
+        whole = full.get(key, {})
+        cells = [
+            name,
+            f"{row['drivers']:.0f}",
+            _errors(row, "fixed"),
+            _gain(row, "over_fixed"),
+            _errors(whole, "population"),
+            _gain(whole, "over_population"),
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return [*lines, ""]
+
+
+def _errors(row: dict[str, Any], baseline: str) -> str:
+    if f"rmse_speed_{baseline}" not in row:
+        return ""
+    return f"{row[f'rmse_speed_{baseline}']:.3f} / **{row['rmse_speed_policy']:.3f}**"
+
+
+def _gain(row: dict[str, Any], name: str) -> str:
+    if name not in row:
+        return ""
+    text = f"{row[name]:+.1%}"
+    if f"{name}_low" in row:
+        text += f" ({row[f'{name}_low']:+.1%} to {row[f'{name}_high']:+.1%})"
+    return text
 
 
 def _stress_lines(stress: dict[str, Any]) -> list[str]:

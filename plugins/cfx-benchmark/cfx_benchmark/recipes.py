@@ -4,6 +4,30 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+I80 = "i80_reconstructed_pairs.parquet"
+EVERY_ROAD = (
+    I80,
+    "openacc_zalazone_pairs.parquet",
+    "openacc_vicolungo_pairs.parquet",
+    "openacc_ispra_low_speed_pairs.parquet",
+)
+"""Recordings, as they are called in the folder that `make policies` is given."""
+
+_LONG = ("data=tidy", "data.min_frames=300", "protocol.min_test_frames=700")
+_I80 = ("optimizer=random", *_LONG)
+"""I-80's policies start from constants that were found by random search."""
+
+_UNSEEN = (
+    "learner.head=offset",
+    "learner.cold_start_fraction=1.0",
+    "policy.driver_features=[]",
+    "policy.acting_bias=false",
+    "protocol.history=0.0",
+    "protocol.histories=[]",
+    "protocol.combine=false",
+)
+"""What `every_road` is for drivers of whom nothing is known."""
+
 
 class Recipe(NamedTuple):
     """One policy.
@@ -11,27 +35,32 @@ class Recipe(NamedTuple):
     Attributes:
         overrides: of the job that trains it and tests it on unseen drivers.
         summary: one sentence for people.
+        recordings: files that it learns from.
     """
 
     overrides: tuple[str, ...]
     summary: str
+    recordings: tuple[str, ...] = (I80,)
 
-
-SHARED_OVERRIDES = (
-    "optimizer=random",  # by which the constants that they start from were found
-    "data=tidy",
-    "data.min_frames=300",
-    "protocol.min_test_frames=700",
-)
-"""What all jobs share; `data.path` is added."""
 
 RECIPES = {
+    "idm": Recipe(
+        ("experiment=every_road", *_UNSEEN),
+        "Intelligent Driver Model for unseen drivers of any road; the one to begin with.",
+        EVERY_ROAD,
+    ),
+    "idm-history": Recipe(
+        ("experiment=every_road", "protocol.histories=[]"),
+        "Intelligent Driver Model for drivers with history on any road: it observes a driver, then"
+        " drives as they do, beside their own parameters.",
+        EVERY_ROAD,
+    ),
     "i80-idm": Recipe(
-        ("experiment=unseen_drivers", "model=idm"),
+        ("experiment=unseen_drivers", "model=idm", *_I80),
         "Intelligent Driver Model for unseen drivers; the smoothest, and the one to begin with.",
     ),
     "i80-krauss": Recipe(
-        ("experiment=unseen_drivers_smooth", "model.limits.response_time=0.3"),
+        ("experiment=unseen_drivers_smooth", "model.limits.response_time=0.3", *_I80),
         "Krauss's model for unseen drivers, SUMO's own family.",
     ),
     "i80-w99": Recipe(
@@ -40,6 +69,7 @@ RECIPES = {
             "model=w99_wide",
             "learner=rollout_distilled",
             "model.limits.response_time=0.1",
+            *_I80,
         ),
         "Wiedemann 99 for unseen drivers, Vissim's family.",
     ),
@@ -51,12 +81,13 @@ RECIPES = {
             "learner.cold_start_fraction=1.0",
             "protocol.base=population",
             "protocol.history=0.0",
+            *_I80,
         ),
         "Intelligent Driver Model for unseen drivers who vary as people do: each draws their own"
         " parameters and noise, with a seed.",
     ),
     "i80-idm-history": Recipe(
-        ("experiment=conditioned", "model=idm"),
+        ("experiment=conditioned", "model=idm", *_I80),
         "Intelligent Driver Model for drivers with history: it observes a driver, then drives as"
         " they do.",
     ),

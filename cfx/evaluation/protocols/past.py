@@ -1,0 +1,167 @@
+"""What drivers' pasts say of a policy and of the drivers' own parameters.
+
+The past of each driver, up to the test part, is split once more. On the first 60 % of it the
+driver's own parameters are calibrated, and the policy observes it; the rest is simulated with each
+of the two. Neither has seen it, so its errors say which of the two comes closer to this driver:
+
+    w = e_own^2 / (e_own^2 + e_policy^2)
+
+is the policy's share where both drive together (`cfx.models.combined`). It is the best weight where
+the errors of the two are independent and stay as large as they were (J. M. Bates and C. W. J.
+Granger, 1969). In the test, own parameters are those calibrated on all of the past.
+
+Shapes: D drivers, n tuned parameters.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cfx.data.pairs import PairBatch, PairSet
+from cfx.evaluation.closed_loop import Followers, OwnParameters
+from cfx.evaluation.evaluate import closed_loop_errors
+from cfx.evaluation.protocols.base import ProtocolContext
+from cfx.evaluation.result import Array
+from cfx.evaluation.shards import simulate_in_shards
+from cfx.policies.agent import Agent
+from cfx.policies.expected_error import ExpectedError, growth_bound
+from cfx.policies.fixed import FixedPolicy
+
+EARLIER = 0.6
+"""Share of the past on which own parameters are calibrated, to be tested on the rest."""
+
+SHORTEST_S = 3.0
+"""s: a past of which either part is shorter says nothing."""
+
+
+@dataclass(frozen=True)
+class PastErrors:
+    """RMSE of speed over the last part of D drivers' pasts, m/s; NaN where the past is too short.
+
+    Attributes:
+        own: of parameters calibrated on the part before, `(D,)`.
+        policy: of the policy that has observed the part before, `(D,)`.
+    """
+
+    own: Array
+    policy: Array
+
+    @property
+    def weight(self) -> Array:
+        """The policy's share, `(D,)`; 1 where the past says nothing."""
+        own, policy = np.square(self.own), np.square(self.policy)
+        total = own + policy
+        share = np.divide(own, total, out=np.full_like(total, 0.5), where=total != 0)
+        return np.where(np.isfinite(total), share, 1.0)
+
+    @property
+    def both(self) -> Array:
+        """What both together err if their errors are independent, `(D,)`, m/s."""
+        weight = self.weight
+        return np.hypot(weight * self.policy, (1.0 - weight) * self.own)
+
+    def together_with(self, values: Tensor) -> OwnParameters:
+        """Returns the own parameters that drive beside the policy.
+
+        Args:
+            values: calibrated on all of the past, `(D, n)`, SI units.
+        """
+        return OwnParameters(values, torch.as_tensor(self.weight).to(values))
+
+
+def past_errors(
+    context: ProtocolContext,
+    policy: Agent,
+    pairs: PairSet,
+    batch: PairBatch,
+    network: Tensor,
+    base: Tensor,
+    first: Tensor,
+) -> PastErrors:
+    """Simulates the last part of D drivers' pasts with the policy and with their own parameters.
+
+    Args:
+        context: what the protocol composes.
+        policy: the policy.
+        pairs, batch: the drivers' D pairs.
+        network: which of the policy's networks drives each, `(D,)`.
+        base: base parameters of drivers of whom nothing is known, `(D, n)`.
+        first: the last frame of each driver's past, `(D,)`.
+    """
+    stride = context.windows.stride
+    cut = (EARLIER * first).long() // stride * stride
+    shortest = round(SHORTEST_S / batch.dt)
+    known = (cut >= shortest) & (first - cut >= shortest)
+    own, of_policy = np.full((2, len(first)), np.nan)
+    if bool(known.any()):
+        rows = known.nonzero()[:, 0]
+        numbers = rows.tolist()
+        pairs = replace(pairs, pairs=tuple(pairs[number] for number in numbers))
+        first, cut, network, base = first[rows], cut[rows], network[rows], base[rows]
+        batch = _until(batch[rows], first)
+        early = context.calibrator.fixed(pairs, batch, cut.cpu()).to(base)
+        if policy.base is not None and policy.context_rule.driver_specific:
+            base = policy.base_of(early)[:, : early.shape[1]]
+        each = torch.arange(len(rows), device=rows.device)
+        agents = {
+            "own": (context.constant(FixedPolicy(), early), Followers(batch, each)),
+            "policy": (policy, Followers(batch, network, base)),
+        }
+        errors = {}
+        for name, (agent, followers) in agents.items():
+            loop = simulate_in_shards(context.engine, context.simulator, agent, followers, cut)
+            errors[name], _ = closed_loop_errors(batch, cut, loop)
+        own[numbers], of_policy[numbers] = errors["own"], errors["policy"]
+    return PastErrors(own, of_policy)
+
+
+def expected_error(table: pd.DataFrame, fold: NDArray[np.int64]) -> ExpectedError:
+    """Returns by what factors errors in the past bound those of the test.
+
+    Args:
+        table: a row per driver, with `rmse_speed_METHOD` and `past_rmse_speed_METHOD`, m/s, of
+            `policy` and `fixed`.
+        fold: in which fold each was tested, `(D,)`; each fold counts once.
+    """
+    factors = []
+    for method in ("policy", "fixed"):
+        past = table[f"past_rmse_speed_{method}"]
+        growth = table[f"rmse_speed_{method}"] / past.where(past > 0)
+        factors.append(growth_bound(growth.to_numpy(dtype=np.float64), fold))
+    return ExpectedError(*factors)
+
+
+def with_bounds(table: pd.DataFrame, expected: ExpectedError | None) -> pd.DataFrame:
+    """Adds `bound_policy` and `bound_fixed`: what 90 % of drivers' errors stay below, m/s.
+
+    Args:
+        table: as of `expected_error`.
+        expected: of the policy; None: it is not known.
+    """
+    policy, own = (math.nan, math.nan) if expected is None else (expected.policy, expected.own)
+    return table.assign(
+        bound_policy=policy * table["past_rmse_speed_policy"],
+        bound_fixed=own * table["past_rmse_speed_fixed"],
+    )
+
+
+def with_bounds_of_other_folds(table: pd.DataFrame, fold: NDArray[np.int64]) -> pd.DataFrame:
+    """Adds bounds to each driver that errors of the other folds' drivers give."""
+    parts = []
+    for number in np.unique(fold):
+        others = fold != number
+        parts.append(with_bounds(table[~others], expected_error(table[others], fold[others])))
+    return pd.concat(parts).sort_index()
+
+
+def _until(batch: PairBatch, last: Tensor) -> PairBatch:
+    """Returns pairs without what comes after a frame of each, `(D,)`."""
+    frames = torch.arange(batch.mask.shape[1], device=last.device)
+    return replace(batch, lengths=last + 1, mask=batch.mask & (frames <= last[:, None])).trimmed()

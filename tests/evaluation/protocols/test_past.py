@@ -1,0 +1,110 @@
+"""What drivers' pasts say: shares of the policy, and bounds of errors to come."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import cfx
+from cfx.core.errors import ConfigError
+from cfx.evaluation.protocols.past import PastErrors, with_bounds_of_other_folds
+from cfx.policies.checkpoint import load
+from cfx.policies.expected_error import growth_bound
+
+QUICK = [
+    "debug=quick",
+    "protocol=across_drivers",
+    "protocol.folds=2",
+    "protocol.histories=[]",
+    "data.max_pairs=null",
+    "data.pairs=16",
+    "data.platoon_size=1",
+    "data.frames=200",
+    "figures.enabled=false",
+    "tracking.enabled=false",
+]
+
+
+def test_the_share_is_that_of_the_smallest_variance() -> None:
+    past = PastErrors(own=np.array([1.0, 2.0, 0.0, np.nan]), policy=np.array([1.0, 1.0, 0.0, 3.0]))
+    np.testing.assert_allclose(past.weight, [0.5, 0.8, 0.5, 1.0])
+    # The variance of the best mean of independent errors: 1 / (1 / a + 1 / b).
+    np.testing.assert_allclose(past.both[:2], [0.5**0.5, (1 / (1 / 4 + 1 / 1)) ** 0.5])
+    assert np.isnan(past.both[3])
+
+
+def test_a_bound_holds_for_nine_in_ten_new_drivers() -> None:
+    generator = np.random.default_rng(0)
+    below = []
+    for _ in range(400):
+        growth = np.exp(generator.normal(size=51))
+        bound = growth_bound(growth[:50], np.zeros(50, dtype=np.int64))
+        below.append(growth[50] <= bound)
+    assert 0.86 < np.mean(below) < 0.95
+
+
+def test_each_fold_counts_once_and_few_drivers_bound_nothing() -> None:
+    growth = np.concatenate([np.full(90, 1.0), np.full(10, 3.0)])
+    fold = np.repeat([0, 1], [90, 10])
+    assert growth_bound(growth, fold) == 3.0
+    assert growth_bound(growth, np.zeros(100, dtype=np.int64)) == 3.0
+    assert growth_bound(growth[:92], np.zeros(92, dtype=np.int64)) == 1.0
+    assert np.isnan(growth_bound(np.ones(8), np.zeros(8, dtype=np.int64)))
+    assert growth_bound(np.array([*np.ones(9), np.nan]), np.zeros(10, dtype=np.int64)) == 1.0
+
+
+def test_bounds_know_nothing_of_the_driver_that_they_are_for() -> None:
+    columns = ["past_rmse_speed_policy", "past_rmse_speed_fixed"]
+    table = pd.DataFrame({name: np.ones(24) for name in columns})
+    fold = np.repeat([0, 1], 12)
+    for method, growth in (("policy", 2.0), ("fixed", 3.0)):
+        table[f"rmse_speed_{method}"] = np.where(fold == 0, growth, 10.0 * growth)
+    bounds = with_bounds_of_other_folds(table, fold)
+    assert set(bounds["bound_policy"][fold == 0]) == {20.0}
+    assert set(bounds["bound_policy"][fold == 1]) == {2.0}
+    assert set(bounds["bound_fixed"][fold == 1]) == {3.0}
+
+
+def test_a_policy_that_combines_does_so_wherever_it_is_tested(tmp_path: Path) -> None:
+    folder = tmp_path / "job"
+    learned = cfx.run([*QUICK, "protocol.combine=true", f"hydra.run.dir={folder}"])
+    past = pd.read_csv(folder / "past.csv")
+    assert len(past) == 16
+    assert past["share"].between(0.0, 1.0).all()
+    own = past["past_rmse_speed_fixed"] ** 2
+    share = own / (own + past["past_rmse_speed_alone"] ** 2)
+    np.testing.assert_allclose(past["share"], share)
+    pairs = learned.pairs.set_index(["pair_id", "method"])["rmse_speed"]
+    for method in ("policy", "fixed"):
+        found = pairs.xs(method, level="method")[past["pair_id"]]
+        np.testing.assert_allclose(found, past[f"rmse_speed_{method}"])
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["past/share"] == pytest.approx(past["share"].mean())
+    agent = load(folder / "policy")
+    assert agent.context_rule.combines
+    expected = agent.trained_on.expected_error
+    assert expected is not None
+    growth = past["rmse_speed_policy"] / past["past_rmse_speed_policy"]
+    assert expected.policy == pytest.approx(growth.max())
+    other = tmp_path / "other"
+    cfx.run(
+        [
+            *(one for one in QUICK if not one.startswith("protocol")),
+            "data.seed=7",
+            "protocol=transfer",
+            f"protocol.run={folder}",
+            f"hydra.run.dir={other}",
+        ]
+    )
+    elsewhere = pd.read_csv(other / "past.csv")
+    bounds = expected.policy * elsewhere["past_rmse_speed_policy"]
+    np.testing.assert_allclose(elsewhere["bound_policy"], bounds)
+
+
+def test_a_driver_without_a_past_has_no_own_parameters() -> None:
+    with pytest.raises(ConfigError, match=r"combine: .*leave history: null"):
+        cfx.run([*QUICK, "protocol.combine=true", "protocol.history=0.0"])
