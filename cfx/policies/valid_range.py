@@ -104,6 +104,23 @@ class ValidRange:
         """Returns the ranges of some of the N networks, `(M,)` int64."""
         return ValidRange(*(value[numbers.to(value.device)] for value in self._tensors()))
 
+    def joined(self, other: ValidRange) -> ValidRange:
+        """Returns one range for what lies in either, by their means and spreads.
+
+        Args:
+            other: of one network, which each of these N learned from before.
+        """
+        mean = (self.mean + other.mean) / 2.0
+        apart = ((self.mean - other.mean) / 2.0)[..., None]
+        spread = (torch.linalg.inv(self.precision) + torch.linalg.inv(other.precision)) / 2.0
+        return ValidRange(
+            mean,
+            torch.linalg.inv(spread + apart @ apart.mT),
+            torch.maximum(self.distance, other.distance),
+            torch.minimum(self.low, other.low),
+            torch.maximum(self.high, other.high),
+        )
+
     def to(self, device: torch.device) -> ValidRange:
         """Returns the same on a device."""
         return ValidRange(*(value.to(device) for value in self._tensors()))

@@ -40,6 +40,7 @@ from cfx.learners.rollout.shard import (
     shard_checkpoints,
     untrained,
 )
+from cfx.learners.rollout.start import begun, check_start, start_policy
 from cfx.learners.situations import learned_range
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.core import Ensemble
@@ -108,6 +109,11 @@ class RolloutLearner(Learner):
             training_data, policy, s.validation, generator, s.ensemble_size, head, s.balance
         )
         network = untrained(policy, dataset, head, generator)
+        start = None
+        if s.start is not None:
+            start = start_policy(s.start).to(training_data.device)
+            check_start(s.start, start, policy, training_data, head)
+            network, dataset = begun(start, network, dataset)
         if not any(parameter.requires_grad for parameter in network.parameters()):
             curves = pd.DataFrame(columns=CURVE_COLUMNS)
             return self._result(network.eval(), dataset, training_data, curves)
@@ -122,6 +128,8 @@ class RolloutLearner(Learner):
                 file.unlink(missing_ok=True)
                 expert_checkpoint(file).unlink(missing_ok=True)
         found = self._result(network.eval(), dataset, training_data, curves)
+        if start is not None and start.valid_range is not None and found.valid_range is not None:
+            found = replace(found, valid_range=found.valid_range.joined(start.valid_range))
         return replace(found, dispersion=dispersion)
 
     def _train(

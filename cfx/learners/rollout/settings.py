@@ -49,6 +49,12 @@ class EnsembleSettings(Settings):
 class OptimisationSettings(Settings):
     """Optimisation and validation."""
 
+    start: str | None = Field(
+        None,
+        description="the folder of a finished job, or cfx://NAME: networks begin as its network for"
+        " unseen drivers, or as the one named behind it (FOLDER#NETWORK), and learn on from there;"
+        " null: untrained",
+    )
     epochs: int = Field(
         16, ge=1, description="epochs at most; after each, every network is validated"
     )
