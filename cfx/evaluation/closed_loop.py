@@ -9,6 +9,7 @@ Shapes: P pairs, K simulated frames, L frames of a token, T = L + K columns, n t
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -30,6 +31,9 @@ from cfx.simulation.trajectory import Start
 @dataclass(frozen=True)
 class OwnParameters:
     """Constant parameters of P drivers that drive beside an agent (`cfx.models.combined`).
+
+    They drive the model as the agent does: with its residual, if it has one, they start with the
+    acceleration that the driver has.
 
     Attributes:
         values: of the driving model, `(P, n)`, SI units.
@@ -112,9 +116,10 @@ def simulate_closed_loop(
         generator: draws, on the CPU, what a stochastic agent leaves to chance; None: nothing is
             drawn.
     """
-    model, simulator = simulator.model, agent.stepper(simulator)
+    simulator = agent.stepper(simulator)
+    model = simulator.model
     if followers.own is not None:
-        simulator = simulator.for_model(Combined(simulator.model, model))
+        simulator = simulator.for_model(Combined(model, model))
     if state is None:
         state = burnt_in(agent, followers, first, simulator.dt)
     track = _Track(followers.batch, first, agent.windows.length)
@@ -125,12 +130,16 @@ def simulate_closed_loop(
     outside = torch.zeros(parameters.shape[:2], dtype=torch.bool, device=parameters.device)
     beyond = torch.zeros(state.beyond.shape[1], dtype=torch.float64, device=parameters.device)
     _, _, counted = track.result()
+    own: Mapping[str, Tensor] = {}
+    if followers.own is not None:
+        complete = agent.head.completed(followers.own.values)
+        own = agent.space.unpack(agent.head.measured(complete, track.history(0), agent.dt))
     for begin in range(0, track.steps, agent.windows.stride):
         end = min(begin + agent.windows.stride, track.steps)
         chosen, state = agent.act(track.history(begin), state, generator)
         p = agent.space.unpack(chosen)
         if followers.own is not None:
-            p = for_both(p, model.space.unpack(followers.own.values), followers.own.weight)
+            p = for_both(p, own, followers.own.weight)
         follower, positions, speeds = simulator.advance(follower, track.leader(begin, end), p)
         track.write(begin, end, positions.T, speeds.T, simulator.dt)
         simulated = slice(begin + 1, end + 1)

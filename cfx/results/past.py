@@ -17,8 +17,9 @@ _WORSE = 1.1
 class Past(ResultTable):
     """What each driver's past says of the policy and of their own parameters, and what came of it.
 
-    METHOD is `fixed`, the driver's own parameters; `alone`, the policy alone; or `policy`, as it
-    was tested: beside the driver's own parameters.
+    METHOD is `fixed`, the driver's own parameters (in the past they start, as the policy does, with
+    the driver's acceleration); `alone`, the policy alone; or `policy`, as it was tested: beside the
+    driver's own parameters.
     """
 
     meaning = "what each driver's past says of the policy (`protocol.combine`)"

@@ -110,8 +110,10 @@ def past_errors(
         if policy.base is not None and policy.context_rule.driver_specific:
             base = policy.base_of(early)[:, : early.shape[1]]
         each = torch.arange(len(rows), device=rows.device)
+        model = context.simulator.model
+        constant = FixedPolicy(residual=policy.head.driven_model(model) is not model)
         agents = {
-            "own": (context.constant(FixedPolicy(), early), Followers(batch, each)),
+            "own": (context.constant(constant, early), Followers(batch, each)),
             "policy": (policy, Followers(batch, network, base)),
         }
         errors = {}
