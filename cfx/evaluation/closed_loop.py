@@ -132,8 +132,7 @@ def simulate_closed_loop(
     _, _, counted = track.result()
     own: Mapping[str, Tensor] = {}
     if followers.own is not None:
-        complete = agent.head.completed(followers.own.values)
-        own = agent.space.unpack(agent.head.measured(complete, track.history(0), agent.dt))
+        own = agent.space.unpack(agent.head.completed(followers.own.values))
     for begin in range(0, track.steps, agent.windows.stride):
         end = min(begin + agent.windows.stride, track.steps)
         chosen, state = agent.act(track.history(begin), state, generator)

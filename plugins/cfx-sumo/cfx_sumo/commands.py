@@ -32,10 +32,10 @@ class DriveCommand(Command):
         parser.add_argument(
             "--drivers",
             nargs="+",
-            default=["car=cfx://i80-idm"],
+            default=["car=cfx://idm"],
             metavar="TYPE=RUN",
             help="a vType, and who drives it: a job, a ready-made policy (cfx policies lists them),"
-            " or RUN#NETWORK for one of its networks; default: car=cfx://i80-idm",
+            " or RUN#NETWORK for one of its networks; default: car=cfx://idm",
         )
         parser.add_argument("--gui", action="store_true", help="show SUMO's window")
         parser.add_argument(

@@ -49,7 +49,9 @@ def test_each_drives_an_unseen_driver(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_each_card_says_what_a_user_must_know(name: str) -> None:
     card = ready.card_of(name)
-    assert card["errors_on_unseen_drivers"]["rmse_speed"] < 0.61
+    # Pairs on test tracks and motorways last minutes, and their errors are larger.
+    most = 0.8 if "sites" in card else 0.61
+    assert card["errors_on_unseen_drivers"]["rmse_speed"] < most
     assert card["errors_on_unseen_drivers"]["improvement_over_pooled"] > 0
     assert card["safety"]["collisions"] == 0
     assert card["safety"]["jerk"] < 1.5
@@ -62,6 +64,10 @@ def test_each_card_says_what_a_user_must_know(name: str) -> None:
         assert event["hardest_acceleration"] <= 2.6 + 1e-6
     text = (ready.FOLDER / name / "CARD.md").read_text(encoding="utf-8")
     assert card["command"] in text
+    for row in card.get("sites", ()):
+        assert row["site"] in text
+    if "sites" in card:
+        assert "CC BY 4.0" in text
     assert "Valid range" in text
 
 
