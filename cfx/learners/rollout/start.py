@@ -19,9 +19,9 @@ from cfx.learners.rollout.dataset import RolloutDataset
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
 from cfx.policies.base import Policy, PolicyNetwork
+from cfx.policies.features import Scaler
 from cfx.policies.heads.base import ParameterHead
 from cfx.policies.ready import folder_of_ready_made, is_ready_made
-from cfx.policies.scaler import Scaler
 
 
 def start_policy(start: str) -> Agent:
@@ -56,7 +56,7 @@ def check_start(
         ConfigError: the policy, the model, the head, windows or the time step are others.
     """
     model, windows = training_data.simulator.model, training_data.windows
-    unlike = []
+    unlike: list[tuple[str, object]] = []
     if agent.policy.identity() != policy.identity():
         unlike.append(("policy", agent.policy_node))
     is_other = not isinstance(model, registry.get("model", str(agent.model_node.get("name"))))
