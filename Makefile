@@ -7,7 +7,7 @@
 #   make settings [EVERY=20]                  each setting of each option changes what a job writes, or is refused (every 20th alone)
 #   make fuzz [EXAMPLES=5000]                 bad configurations, recordings, policies and caches; each file of a job fails once
 #   make kills [KILLS=100]                    kill a sweep at random moments, with each launcher
-#   make policies                             train the ready-made policies anew from ../shared/data (an hour)
+#   make policies                             train the ready-made policies anew from ../shared/data (two hours)
 #   make dist                                 build cfx and the plugins into dist/, install them into a clean environment, try them
 #   make docs                                 build the site from docs/ and the docstrings into site/; warnings are errors
 #   make tutorials                            run the tutorials and write their pages anew (a quarter of an hour)

@@ -490,12 +490,11 @@ _WORSE = 1.1
 class Past(ResultTable):
     """What each driver's past says of the policy and of their own parameters, and what came of it.
 
-    METHOD is `fixed`, the driver's own parameters (in the past they start, as the policy does, with
-    the driver's acceleration); `alone`, the policy alone; or `policy`, as it was tested: beside the
-    driver's own parameters.
+    METHOD is `fixed`, the driver's own parameters; `alone`, the policy alone; or `policy`, as it
+    was tested: beside the driver's own parameters, if it combines.
     """
 
-    meaning = "what each driver's past says of the policy (`protocol.combine`)"
+    meaning = "what each driver's past says of the policy (`protocol.combine`, `protocol=transfer`)"
     suffix = ".csv"
     order = 115
     columns = (
@@ -534,11 +533,12 @@ class Past(ResultTable):
     def console(self, findings: Findings, metrics: Mapping[str, float]) -> Iterable[str]:
         """Returns how the two drove together, what error to expect, and a warning."""
         table = findings.evaluation.tables["past"]
-        yield (
-            "The policy drives beside each driver's own parameters, with a share of"
-            f" {metrics['past/share']:.2f} on average, as their errors in the driver's past give"
-            f" it; alone its RMSE of speed is {metrics['past/rmse_speed/alone']:.3f} m/s."
-        )
+        if float(table["share"].min()) < 1:
+            yield (
+                "The policy drives beside each driver's own parameters, with a share of"
+                f" {metrics['past/share']:.2f} on average, as their errors in the driver's past"
+                f" give it; alone its RMSE of speed is {metrics['past/rmse_speed/alone']:.3f} m/s."
+            )
         if "past/bound/policy" in metrics:
             yield (
                 f"Expected of {EXPECTED_LEVEL:.0%} of drivers, from their past: RMSE of speed below"

@@ -99,7 +99,9 @@ class HeldOut:
         tables = {}
         if self.policy.base is not None and histories:
             tables["history"] = self.history(histories, loops["fixed"])
-        if self.combines:
+        # A policy from elsewhere may know no drivers like these; their pasts say so.
+        is_from_elsewhere = fold is None and self.policy.context_rule.history_s is None
+        if self.combines or (is_from_elsewhere and self.policy.policy.trainable):
             tables["past"] = self._past_table(loops, fold)
         scopes = {"test": loops, "full_trajectory": self._full_trajectory(methods)}
         evaluation = evaluate(
@@ -158,21 +160,21 @@ class HeldOut:
             fold: in which fold each pair is tested; None: the policy says what to expect.
         """
         context, past = self.context, self.past
-        loops = {
-            "fixed": loops["fixed"],
-            "alone": simulate_in_shards(
+        alone, share, expected = loops["policy"], np.ones_like(past.policy), past.policy
+        if self.combines:
+            share, expected = past.weight, past.both
+            alone = simulate_in_shards(
                 context.engine, context.simulator, self.policy, self._followers(None), self.first
-            ),
-            "policy": loops["policy"],
-        }
+            )
+        loops = {"fixed": loops["fixed"], "alone": alone, "policy": loops["policy"]}
         table = pd.DataFrame(
             {
                 "pair_id": [pair.pair_id for pair in self.pairs],
                 "driver": self.drivers,
-                "share": past.weight,
-                "past_rmse_speed_fixed": past.own,
+                "share": share,
+                "past_rmse_speed_fixed": past.fixed,
                 "past_rmse_speed_alone": past.policy,
-                "past_rmse_speed_policy": past.both,
+                "past_rmse_speed_policy": expected,
             }
         )
         for name, loop in loops.items():

@@ -46,12 +46,15 @@ class PastErrors:
     """RMSE of speed over the last part of D drivers' pasts, m/s; NaN where the past is too short.
 
     Attributes:
-        own: of parameters calibrated on the part before, `(D,)`.
+        own: of parameters calibrated on the part before, which start as the policy does: with the
+            driver's acceleration if its head has a residual, `(D,)`.
         policy: of the policy that has observed the part before, `(D,)`.
+        fixed: of the same parameters without that start, as the method `fixed`, `(D,)`.
     """
 
     own: Array
     policy: Array
+    fixed: Array
 
     @property
     def weight(self) -> Array:
@@ -99,7 +102,7 @@ def past_errors(
     cut = (EARLIER * first).long() // stride * stride
     shortest = round(SHORTEST_S / batch.dt)
     known = (cut >= shortest) & (first - cut >= shortest)
-    own, of_policy = np.full((2, len(first)), np.nan)
+    found = np.full((3, len(first)), np.nan)
     if bool(known.any()):
         rows = known.nonzero()[:, 0]
         numbers = rows.tolist()
@@ -110,18 +113,16 @@ def past_errors(
         if policy.base is not None and policy.context_rule.driver_specific:
             base = policy.base_of(early)[:, : early.shape[1]]
         each = torch.arange(len(rows), device=rows.device)
-        model = context.simulator.model
-        constant = FixedPolicy(residual=policy.head.driven_model(model) is not model)
-        agents = {
-            "own": (context.constant(constant, early), Followers(batch, each)),
-            "policy": (policy, Followers(batch, network, base)),
-        }
-        errors = {}
-        for name, (agent, followers) in agents.items():
+        residual = policy.head.driven_model(context.simulator.model) is not context.simulator.model
+        agents = (
+            (context.constant(FixedPolicy(residual=residual), early), Followers(batch, each)),
+            (policy, Followers(batch, network, base)),
+            (context.constant(FixedPolicy(), early), Followers(batch, each)),
+        )
+        for row, (agent, followers) in zip(found, agents, strict=True):
             loop = simulate_in_shards(context.engine, context.simulator, agent, followers, cut)
-            errors[name], _ = closed_loop_errors(batch, cut, loop)
-        own[numbers], of_policy[numbers] = errors["own"], errors["policy"]
-    return PastErrors(own, of_policy)
+            row[numbers], _ = closed_loop_errors(batch, cut, loop)
+    return PastErrors(*found)
 
 
 def expected_error(table: pd.DataFrame, fold: NDArray[np.int64]) -> ExpectedError:

@@ -30,7 +30,8 @@ QUICK = [
 
 
 def test_the_share_is_that_of_the_smallest_variance() -> None:
-    past = PastErrors(own=np.array([1.0, 2.0, 0.0, np.nan]), policy=np.array([1.0, 1.0, 0.0, 3.0]))
+    own, policy = np.array([1.0, 2.0, 0.0, np.nan]), np.array([1.0, 1.0, 0.0, 3.0])
+    past = PastErrors(own=own, policy=policy, fixed=own)
     np.testing.assert_allclose(past.weight, [0.5, 0.8, 0.5, 1.0])
     # The variance of the best mean of independent errors: 1 / (1 / a + 1 / b).
     np.testing.assert_allclose(past.both[:2], [0.5**0.5, (1 / (1 / 4 + 1 / 1)) ** 0.5])
