@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from cfx.evaluation.sites import ALL
-from cfx.report.figures.canvas import canvas, hover, percent_tick, styled
+from cfx.report.figures.canvas import canvas, hover, percent_tick
 from cfx.report.figures.figure import JobFigure, Results
 from cfx.report.figures.text import label, percent
 from cfx.results.look import COLOURS, INK
@@ -21,7 +21,6 @@ _WORST = -1.0
 """Ends of intervals beyond this are cut."""
 
 
-@styled
 def draw_sites(sites: pd.DataFrame) -> Figure | None:
     """Draws the policy's mean improvement of each site, with its 95 % interval.
 
