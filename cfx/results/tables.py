@@ -505,7 +505,7 @@ class Past(ResultTable):
             "past_rmse_speed_METHOD",
             "m/s",
             "RMSE of speed over the last 40 % of the past, of which nothing was known; of `policy`"
-            " if the two errors are independent",
+            " that of the mean of both simulations",
         ),
         Column("rmse_speed_METHOD", "m/s", "RMSE of speed over the test part"),
         Column(

@@ -160,7 +160,7 @@ class HeldOut:
             fold: in which fold each pair is tested; None: the policy says what to expect.
         """
         context, past = self.context, self.past
-        alone, share, expected = loops["policy"], np.ones_like(past.policy), past.policy
+        alone, share, expected = loops["policy"], np.ones_like(past.policy), np.sqrt(past.policy)
         if self.combines:
             share, expected = past.weight, past.both
             alone = simulate_in_shards(
@@ -172,8 +172,8 @@ class HeldOut:
                 "pair_id": [pair.pair_id for pair in self.pairs],
                 "driver": self.drivers,
                 "share": share,
-                "past_rmse_speed_fixed": past.fixed,
-                "past_rmse_speed_alone": past.policy,
+                "past_rmse_speed_fixed": np.sqrt(past.fixed),
+                "past_rmse_speed_alone": np.sqrt(past.policy),
                 "past_rmse_speed_policy": expected,
             }
         )

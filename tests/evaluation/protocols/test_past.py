@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.optimize import minimize_scalar
 
 import cfx
 from cfx.core.errors import ConfigError
 from cfx.evaluation.protocols.past import PastErrors, with_bounds_of_other_folds
+from cfx.evaluation.result import Array
 from cfx.policies.checkpoint import load
 from cfx.policies.expected_error import growth_bound
 
@@ -29,13 +31,31 @@ QUICK = [
 ]
 
 
-def test_the_share_is_that_of_the_smallest_variance() -> None:
-    own, policy = np.array([1.0, 2.0, 0.0, np.nan]), np.array([1.0, 1.0, 0.0, 3.0])
-    past = PastErrors(own=own, policy=policy, fixed=own)
-    np.testing.assert_allclose(past.weight, [0.5, 0.8, 0.5, 1.0])
-    # The variance of the best mean of independent errors: 1 / (1 / a + 1 / b).
-    np.testing.assert_allclose(past.both[:2], [0.5**0.5, (1 / (1 / 4 + 1 / 1)) ** 0.5])
-    assert np.isnan(past.both[3])
+def test_the_share_is_the_least_squares_one_drawn_to_a_half() -> None:
+    """Against SciPy's minimum of the sum that the share is said to minimise."""
+    draw = np.random.default_rng(0).normal(size=(2, 40, 300))
+    own, policy = draw[0] + 0.5 * draw[1], 0.7 * draw[1]
+    past = PastErrors(
+        (own**2).mean(1), (policy**2).mean(1), (own * policy).mean(1), (own**2).mean(1)
+    )
+    for driver in range(40):
+        o, p = own[driver], policy[driver]
+        pull = ((o**2).mean() + (p**2).mean()) / 2
+
+        def cost(w: float, o: Array = o, p: Array = p, pull: float = pull) -> float:
+            return float(((w * p + (1 - w) * o) ** 2).mean() + pull * (w - 0.5) ** 2)
+
+        best = minimize_scalar(cost, bounds=(0.0, 1.0), method="bounded", options={"xatol": 1e-9})
+        assert past.weight[driver] == pytest.approx(best.x, abs=1e-5)
+        mean = past.weight[driver] * p + (1 - past.weight[driver]) * o
+        assert past.both[driver] == pytest.approx((mean**2).mean() ** 0.5)
+
+
+def test_a_past_without_errors_or_too_short_says_what_it_can() -> None:
+    own, policy = np.array([0.0, np.nan, 1.0]), np.array([0.0, np.nan, 1.0])
+    past = PastErrors(own, policy, own, own)
+    np.testing.assert_allclose(past.weight, [0.5, 1.0, 0.5])
+    assert np.isnan(past.both[1])
 
 
 def test_a_bound_holds_for_nine_in_ten_new_drivers() -> None:
@@ -76,9 +96,6 @@ def test_a_policy_that_combines_does_so_wherever_it_is_tested(tmp_path: Path) ->
     past = pd.read_csv(folder / "past.csv")
     assert len(past) == 16
     assert past["share"].between(0.0, 1.0).all()
-    own = past["past_rmse_speed_fixed"] ** 2
-    share = own / (own + past["past_rmse_speed_alone"] ** 2)
-    np.testing.assert_allclose(past["share"], share)
     pairs = learned.pairs.set_index(["pair_id", "method"])["rmse_speed"]
     for method in ("policy", "fixed"):
         found = pairs.xs(method, level="method")[past["pair_id"]]
