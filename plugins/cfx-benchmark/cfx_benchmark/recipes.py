@@ -48,11 +48,6 @@ RECIPES = {
         " drives as they do, beside their own parameters.",
         EVERY_ROAD,
     ),
-    "krauss": Recipe(
-        ("experiment=every_road", "model=krauss", "protocol.histories=[]", "protocol.combine=false"),
-        "Krauss's model, SUMO's own family, for drivers with or without history on any road.",
-        EVERY_ROAD,
-    ),
     "i80-idm": Recipe(
         ("experiment=unseen_drivers", "model=idm", *_I80),
         "Intelligent Driver Model for unseen drivers; the smoothest, and the one to begin with.",
