@@ -48,18 +48,21 @@ def test_the_motorway_has_waves_and_lane_changes(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_stress_finds_no_collision_and_no_step_outside_the_limits(tmp_path: Path) -> None:
+@pytest.mark.parametrize("step", [0.05, 0.1, 0.5, 1.0])
+def test_stress_finds_no_collision_and_no_step_outside_the_limits(
+    step: float, tmp_path: Path
+) -> None:
     """A few events of each kind; the cards hold those of a thousand."""
-    script = """
+    script = f"""
 import sys
 sys.modules["pyarrow"] = None
 import json
 from cfx_sumo.drive.stress import run_stress
-result = run_stress({"car": "cfx://i80-idm"}, seed=3, cut_ins=30)
+result = run_stress({{"car": "cfx://i80-idm"}}, seed=3, cut_ins=30, step={step})
 print(json.dumps(result.to_json()))
 """
     done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=280
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=1800
     )
     assert done.returncode == 0, done.stderr
     events = json.loads(done.stdout.splitlines()[-1])["events"]

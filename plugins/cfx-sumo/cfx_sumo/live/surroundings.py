@@ -5,6 +5,7 @@ Shapes: D vehicles.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import torch
@@ -59,6 +60,15 @@ class Seen(NamedTuple):
         )
 
 
+_SPEED, _ACCELERATION, _LENGTH = 0x40, 0x72, 0x44
+_ALLOWED_SPEED, _MIN_GAP, _LEADER = 0xB7, 0x4C, 0x68
+"""Numbers of the variables in TraCI's protocol: `traci.constants` would load traci, which none but
+its own users need."""
+
+_SUBSCRIBED = (_SPEED, _ACCELERATION, _LENGTH, _ALLOWED_SPEED, _MIN_GAP)
+"""What is subscribed to, besides the leader."""
+
+
 class View(NamedTuple):
     """Vehicles and who is ahead of them.
 
@@ -87,36 +97,29 @@ def look(connection: Connection, names: list[str], look_ahead: float) -> View:
     Raises:
         SumoError: a vehicle is not in the simulation.
     """
-    reader = _Reader(connection)
-    following, leaders, alone, rows = [], [], [], []
-    for name in names:
-        leader = leader_of(connection, name, look_ahead)
-        if leader is None:
-            alone.append(name)
-        else:
-            following.append(name)
-            leaders.append(leader[0])
-            rows.append(reader.row(name, *leader))
-    rows += [reader.row_alone(name) for name in alone]
-    table = torch.tensor(rows, dtype=torch.float64).reshape(-1, len(Seen._fields))
-    return View(following, leaders, alone, Seen(*table.unbind(1)))
+    reader: DirectReader | SubscribedReader
+    if type(connection.vehicle).__module__.startswith("traci"):
+        reader = SubscribedReader(connection.vehicle, look_ahead, ("d", look_ahead))
+    else:
+        reader = DirectReader(connection.vehicle, look_ahead)
+    return view_of(reader, names)
 
 
-_FARTHEST = 1e6
-"""m: no gap is larger."""
-
-
-def leader_of(connection: Connection, name: str, look_ahead: float) -> tuple[str, float] | None:
-    """Returns the vehicle ahead and the gap from bumper to bumper, m.
-
-    Returns:
-        None if no vehicle is within `look_ahead`.
-
-    Raises:
-        SumoError: the vehicle is not in the simulation.
-    """
+def view_of(reader: DirectReader | SubscribedReader, names: list[str]) -> View:
+    """Reads vehicles and their leaders in one of the two ways; as `look`."""
+    following, leaders, alone = [], [], []
+    rows: list[tuple[float, ...]] = []
+    rows_alone: list[tuple[float, ...]] = []
     try:
-        leader = connection.vehicle.getLeader(name, look_ahead)
+        for name in names:
+            leader, row = reader.row(name)
+            if leader is None:
+                alone.append(name)
+                rows_alone.append(row)
+            else:
+                following.append(name)
+                leaders.append(leader)
+                rows.append(row)
     except Exception as error:
         # libsumo's and traci's are two classes of this name.
         if type(error).__name__ != "TraCIException":
@@ -125,39 +128,104 @@ def leader_of(connection: Connection, name: str, look_ahead: float) -> tuple[str
             f"vehicle '{name}' cannot be driven ({error}); step only vehicles of"
             " connection.vehicle.getIDList()"
         ) from error
-    # At some junctions TraCI answers a leader at -1.8e308 m, which is none.
+    table = torch.tensor(rows + rows_alone, dtype=torch.float64).reshape(-1, len(Seen._fields))
+    return View(following, leaders, alone, Seen(*table.unbind(1)))
+
+
+_FARTHEST = 1e6
+"""m: no gap is larger."""
+
+
+def _gap_to(leader: tuple[str, float] | None, min_gap: float, look_ahead: float) -> float | None:
+    """Returns the gap from bumper to bumper, m; None without a leader within `look_ahead`.
+
+    SUMO's own gap leaves `minGap` out. At some junctions TraCI answers a leader at -1.8e308 m,
+    which is none.
+    """
     if not leader or not leader[0] or abs(leader[1]) > _FARTHEST:
         return None
-    gap = leader[1] + connection.vehicle.getMinGap(name)  # SUMO's own gap leaves minGap out
-    if gap > look_ahead:
-        return None
-    return leader[0], gap
+    gap = leader[1] + min_gap
+    return gap if gap <= look_ahead else None
 
 
-class _Reader:
-    """Reads each vehicle's motion once: a follower is the next one's leader, and TraCI is slow."""
+class DirectReader:
+    """Reads by calls, a value each, and each vehicle's motion once: a follower is often a leader.
 
-    def __init__(self, connection: Connection) -> None:
-        self._vehicle = connection.vehicle
+    In libsumo a call costs less than what SUMO does to serve a subscription.
+    """
+
+    def __init__(self, vehicle: Any, look_ahead: float) -> None:
+        self._vehicle = vehicle
+        self._look_ahead = look_ahead
         self._motions: dict[str, tuple[float, float]] = {}
 
-    def row(self, name: str, leader: str, gap: float) -> tuple[float, ...]:
-        """Returns the fields of `Seen` for one vehicle."""
+    def row(self, name: str) -> tuple[str | None, tuple[float, ...]]:
+        """Returns a vehicle's leader, and the fields of `Seen`."""
+        vehicle = self._vehicle
+        leader = vehicle.getLeader(name, self._look_ahead)
+        min_gap = vehicle.getMinGap(name)
         speed, acceleration = self._motion(name)
-        leader_speed, leader_acceleration = self._motion(leader)
-        length = self._vehicle.getLength(leader)
-        allowed = self._vehicle.getAllowedSpeed(name)
-        min_gap = self._vehicle.getMinGap(name)
-        return speed, acceleration, gap, leader_speed, leader_acceleration, length, allowed, min_gap
-
-    def row_alone(self, name: str) -> tuple[float, ...]:
-        """Returns the fields of `Seen` for a vehicle without a leader."""
-        speed, acceleration = self._motion(name)
-        allowed = self._vehicle.getAllowedSpeed(name)
-        return speed, acceleration, _FARTHEST, speed, 0.0, 0.0, allowed, 0.0
+        allowed = vehicle.getAllowedSpeed(name)
+        gap = _gap_to(leader, min_gap, self._look_ahead)
+        if gap is None:
+            return None, (speed, acceleration, _FARTHEST, speed, 0.0, 0.0, allowed, 0.0)
+        ahead = leader[0]
+        length = vehicle.getLength(ahead)
+        return ahead, (speed, acceleration, gap, *self._motion(ahead), length, allowed, min_gap)
 
     def _motion(self, name: str) -> tuple[float, float]:
-        if name not in self._motions:
-            speed = self._vehicle.getSpeed(name)
-            self._motions[name] = speed, self._vehicle.getAcceleration(name)
-        return self._motions[name]
+        motion = self._motions.get(name)
+        if motion is None:
+            motion = self._vehicle.getSpeed(name), self._vehicle.getAcceleration(name)
+            self._motions[name] = motion
+        return motion
+
+
+class SubscribedReader:
+    """Reads what SUMO sends with each of its steps: no call for a value, as each is a message.
+
+    A vehicle is subscribed to as it is first read, and its leader too. What was changed after the
+    last step of the simulation is seen after the next one.
+    """
+
+    def __init__(self, vehicle: Any, look_ahead: float, distance: object) -> None:
+        """Takes what SUMO has sent.
+
+        Args:
+            vehicle: of the connection.
+            look_ahead: m; a vehicle farther ahead is no leader.
+            distance: the same as the connection takes it: traci a type and a number, libsumo a
+                number.
+        """
+        self._vehicle = vehicle
+        self._look_ahead = look_ahead
+        self._distance = distance
+        self._known: Mapping[str, Mapping[int, Any]] = vehicle.getAllSubscriptionResults()
+        self._new: dict[str, Mapping[int, Any]] = {}
+
+    def row(self, name: str) -> tuple[str | None, tuple[float, ...]]:
+        """Returns a vehicle's leader, and the fields of `Seen`."""
+        own = self._values(name, _LEADER)
+        leader, min_gap = own[_LEADER], own[_MIN_GAP]
+        speed, acceleration = own[_SPEED], own[_ACCELERATION]
+        allowed = own[_ALLOWED_SPEED]
+        gap = _gap_to(leader, min_gap, self._look_ahead)
+        if gap is None:
+            return None, (speed, acceleration, _FARTHEST, speed, 0.0, 0.0, allowed, 0.0)
+        ahead = self._values(leader[0], _LENGTH)
+        motion = ahead[_SPEED], ahead[_ACCELERATION]
+        length = ahead[_LENGTH]
+        return leader[0], (speed, acceleration, gap, *motion, length, allowed, min_gap)
+
+    def _values(self, name: str, needed: int) -> Mapping[int, Any]:
+        """Returns what is subscribed to of a vehicle, in which `needed` must be."""
+        values = self._new.get(name) or self._known.get(name, {})
+        if needed not in values:
+            if needed == _LEADER:
+                variables = (*_SUBSCRIBED, _LEADER)
+                self._vehicle.subscribe(name, variables, parameters={_LEADER: self._distance})
+            else:
+                self._vehicle.subscribe(name, _SUBSCRIBED)
+            values = self._vehicle.getSubscriptionResults(name)
+            self._new[name] = values
+        return values
