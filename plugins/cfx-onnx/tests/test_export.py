@@ -120,3 +120,10 @@ def test_a_policy_that_is_no_graph_is_refused() -> None:
     core = AgentCore(core.policy, Branching(), core.scaler, core.head)
     with pytest.raises(ConfigError, match="policy=gru cannot be written as ONNX"):
         graph_of(DriverStep(replace(agent, core=core)), "here")
+
+
+def test_an_unknown_format_is_answered_with_the_nearest(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["export", "cfx://i80-idm", "--to", "onxx"]) == 2
+    assert "there is no export 'onxx'. Did you mean 'onnx'?" in capsys.readouterr().err
