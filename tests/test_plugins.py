@@ -178,6 +178,12 @@ def test_check_exits_with_1_only_if_something_is_broken(
     )
 
 
+def test_check_says_how_far_it_is(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    monkeypatch.setattr("cfx.core.progress._LINE_EVERY", 0.0)
+    assert cli.main(["plugins", "check", "objective", "gap_rmse"]) == 0
+    assert "Checking components: 100 % after" in capsys.readouterr().out
+
+
 def test_check_names_the_extra_that_is_not_installed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
