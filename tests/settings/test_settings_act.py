@@ -38,6 +38,7 @@ EXCEPTIONS = {
     "model.limits.comfortable_deceleration": "live drivers alone brake by it, in SUMO",
     "demo": "shows the results, on a page beside them; tests of demonstrations write it",
     "model.parameters.emergencyDecel.default": "no driver here has to brake so hard",
+    "model.parameters.cc9.*": "used by W99's variant of VISSIM alone; to tune it elsewhere is refused",
     "data.check": "recordings that contradict themselves are refused; these do not",
     "data.min_frames": "all of these pairs are longer",
     "data.site": "a name",
