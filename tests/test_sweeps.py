@@ -342,7 +342,7 @@ def test_the_summary_compares_jobs_by_what_differs(run: Run, capsys) -> None:
     assert table[2]["message"] == "drive 2 is broken"
     assert {row["folder"] for row in table} == {path.name for path in jobs(folder)}
     printed = capsys.readouterr().out
-    assert "improvement over fixed" in printed
+    assert "improvement over driver-specific" in printed
     assert "+50.0%" in printed
     assert f"python -m cfx report {folder}" in printed
 

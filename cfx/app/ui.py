@@ -65,7 +65,7 @@ _WIDTHS = {
 }
 """Pixels of columns that need more or less than MLflow gives them."""
 
-_CHARTS = f"{PERCENT}|{SPEED_ERROR}|rmse_(improvement/mean|speed)"
+_CHARTS = f"{PERCENT}|{SPEED_ERROR}|rmse_improvement/mean|rmse_speed/"
 """Metrics that MLflow's charts show, a regular expression."""
 
 _SECTION = "cfx"

@@ -37,6 +37,18 @@ def factor(unit: str, si: str) -> float:
     return float(registry.Quantity(Fraction(1), known).to(si).magnitude)
 
 
+def length_mm(text: str) -> float:
+    """Returns a length such as "88mm" or "3.5 in" in mm.
+
+    Raises:
+        ValueError: it is none.
+    """
+    try:
+        return float(_registry().Quantity(text).to("mm").magnitude)
+    except Exception:  # as in `factor`
+        raise ValueError("give a length with its unit, such as 88mm or 3.5in") from None
+
+
 @functools.cache
 def _registry() -> Any:
     """Returns cfx's own units: those of a program that uses pint stay as they are."""

@@ -13,7 +13,10 @@ RESULT = "result"
 
 PERCENT = "improvement_percent"
 SPEED_ERROR = "rmse_speed_mps"
-"""Metrics that charts show first: they have no group, and MLflow puts such metrics first."""
+"""The two that charts begin with. No metric of the headline has a group: MLflow puts such first."""
+
+_JUDGED = {"rmse_gap_m": "rmse_gap", "collisions": "collisions"}
+"""Further metrics of the method that a job is judged by."""
 
 _CONSTANT = {"fixed": "driver-specific", "population": "pooled", "default": "default"}
 """Constant parameters, the first of which is a calibration's number."""
@@ -98,9 +101,47 @@ def headline(metrics: Mapping[str, float]) -> tuple[dict[str, float], str]:
     Returns:
         Metrics, rounded; and the result in words.
     """
-    values: dict[str, float] = {}
     if key_of("rmse_speed", "policy") not in metrics and main_comparison(metrics) is None:
-        return _of_calibration(metrics)
+        values, said = _of_calibration(metrics)
+    else:
+        values, said = _of_policy(metrics)
+    return {**values, **_further(metrics)}, said
+
+
+def fitted_errors(errors: Mapping[str, float]) -> dict[str, float]:
+    """Returns the headline's errors on the part that was calibrated on.
+
+    Args:
+        errors: mean `rmse_speed` (m/s) and `rmse_gap` (m) of driver-specific parameters there.
+    """
+    names = {"rmse_speed": "rmse_speed_fitted_mps", "rmse_gap": "rmse_gap_fitted_m"}
+    found = {}
+    for metric, name in names.items():
+        if math.isfinite(errors.get(metric, math.nan)):
+            found[name] = round(errors[metric], 3)
+    return found
+
+
+def _further(metrics: Mapping[str, float]) -> dict[str, float]:
+    """Returns the error of each constant set, and what else is first asked of the judged method."""
+    found: dict[str, float] = {}
+    judged = ""
+    for method in ("policy", *_CONSTANT):
+        error = metrics.get(key_of("rmse_speed", method), math.nan)
+        if not math.isfinite(error):
+            continue
+        judged = judged or method
+        if method in _CONSTANT:
+            found[f"rmse_speed_{_CONSTANT[method].replace('-', '_')}_mps"] = round(error, 3)
+    for name, metric in _JUDGED.items():
+        value = metrics.get(key_of(metric, judged), math.nan)
+        if math.isfinite(value):
+            found[name] = round(value, 3)
+    return found
+
+
+def _of_policy(metrics: Mapping[str, float]) -> tuple[dict[str, float], str]:
+    values: dict[str, float] = {}
     words = []
     compared = main_comparison(metrics)
     if compared is not None:

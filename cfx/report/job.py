@@ -26,6 +26,9 @@ from cfx.report.figures.figure import ParameterAxis, Results
 from cfx.report.figures.text import TEST, pretty_unit
 from cfx.simulation.trajectory import TRANSIENT_S
 
+OUTSIDE = "outside_range"
+"""A metric that says nothing of constant parameters."""
+
 
 @dataclass(frozen=True)
 class Job:
@@ -114,6 +117,17 @@ class Job:
         return "default"
 
     @property
+    def errors(self) -> pd.DataFrame:
+        """A row per pair, by the method that the job is judged by: `pair_id`, `driver`, `frames`.
+
+        `error` is its RMSE of speed on the test part, m/s.
+        """
+        rows = self.pairs[self.pairs["method"] == self.judged]
+        return rows[["pair_id", "driver", "frames", "rmse_speed"]].rename(
+            columns={"rmse_speed": "error"}
+        )
+
+    @property
     def purpose(self) -> Purpose:
         """What its numbers say."""
         found = self.data.get("purpose")
@@ -134,7 +148,10 @@ class Job:
     @cached_property
     def known_metrics(self) -> tuple[MetricInfo, ...]:
         """What the job measured, in the order in which it is shown."""
-        return known_metrics(self.data, self.metrics)
+        found = known_metrics(self.data, self.metrics)
+        if self.purpose is Purpose.CALIBRATION:
+            return tuple(one for one in found if one.name != OUTSIDE)
+        return found
 
     @cached_property
     def _summaries(self) -> dict[tuple[str, str, str], float]:
@@ -356,6 +373,11 @@ class Origin:
 def of_purpose(jobs: Iterable[Job], *purposes: Purpose) -> list[Job]:
     """Returns the jobs that have one of these purposes."""
     return [job for job in jobs if job.purpose in purposes]
+
+
+def are_calibrations(jobs: Iterable[Job]) -> bool:
+    """Says whether none of the jobs has a policy that adapts: nothing is said of policies then."""
+    return all(job.purpose is Purpose.CALIBRATION for job in jobs)
 
 
 def any_baselines(jobs: Iterable[Job], scope: str = TEST) -> list[str]:

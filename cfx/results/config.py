@@ -99,6 +99,10 @@ class FigureSettings(Settings):
     )
 
 
+_CONSTANT = ("fixed", "default")
+"""Policies of cfx that keep parameters constant: such a job is a calibration."""
+
+
 class JobConfig(Settings):
     """Everything that one job needs to know; `conf/config.yaml` says the same in YAML.
 
@@ -161,6 +165,20 @@ class JobConfig(Settings):
         if isinstance(metrics, str) and metrics != "all":
             return (metrics,)
         return metrics
+
+    @property
+    def is_calibration(self) -> bool:
+        """Whether its policy is one of cfx's that keep parameters constant."""
+        return self.policy.get("name") in _CONSTANT
+
+    def in_words(self) -> str:
+        """Returns which components the job is made of, "Model idm, policy gru, ..."."""
+        groups = ("model", "policy", "learner", "protocol", "data")
+        if self.is_calibration:
+            groups = ("model", "objective", "optimizer", "protocol", "data")
+        named = [f"{group} {getattr(self, group).get('name')}" for group in groups]
+        text = ", ".join(named)
+        return f"{text[:1].upper()}{text[1:]}"
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> JobConfig:

@@ -22,7 +22,7 @@ import pandas as pd
 
 from cfx.core.errors import CfxError, TrackingError
 from cfx.data.pairs import SIGNALS, PairSet
-from cfx.evaluation.headline import RESULT, headline
+from cfx.evaluation.headline import RESULT, fitted_errors, headline
 from cfx.evaluation.result import Purpose
 from cfx.learners.curves import over_networks
 from cfx.results import provenance
@@ -219,7 +219,7 @@ class MlflowTracker(Tracker):
 
     def log_job(self, findings: Findings, kept: Kept, description: str) -> None:
         values, result = headline(kept.metrics)
-        self.log_metrics({**values, **kept.metrics})
+        self.log_metrics({**values, **_fitted(findings), **kept.metrics})
         tags = {RESULT: result, "mlflow.note.content": description}
         if findings.evaluation.purpose is Purpose.CALIBRATION:
             tags["learner"] = "none"
@@ -227,7 +227,10 @@ class MlflowTracker(Tracker):
         self.log_data(findings.pairs)
         self.log_curves(findings.protocol_result.curves)
         self.log_files(kept.figures, "figures")
-        self.log_policy(kept.folder / "policy", findings.pairs)
+        if findings.evaluation.purpose is Purpose.CALIBRATION:
+            self.log_files(sorted((kept.folder / "policy").iterdir()), "policy")
+        else:
+            self.log_policy(kept.folder / "policy", findings.pairs)
         files = list(kept.files)
         for table in kept.tables:
             if table.about.part.tracked:
@@ -393,12 +396,23 @@ class MlflowTracker(Tracker):
                     _settle(self.store, self._parent_id, _safe(self._sweep))
 
 
+def _fitted(findings: Findings) -> dict[str, float]:
+    """Returns the errors of driver-specific parameters where they were calibrated, if known."""
+    fits = findings.evaluation.tables.get("fits")
+    if fits is None:
+        return {}
+    own = fits[fits["method"] == "fixed"].mean(numeric_only=True)
+    return fitted_errors({str(name).removeprefix("train_"): value for name, value in own.items()})
+
+
 def _run_name(config: JobConfig, names: Mapping[str, str]) -> str:
     """Returns what a run is called: its components; in a sweep, whose jobs have many, its seed.
 
     What differs most often comes first: MLflow's tables cut names off.
     """
-    parts = [names["model"], names["policy"]]
+    parts = [names["model"]]
+    if not config.is_calibration:
+        parts.append(names["policy"])
     if config.tracking.sweep is not None:
         parts.append(f"seed{config.seed}")
     return "-".join([*parts, names["optimizer"], names["data"]])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from cfx.evaluation.headline import headline, main_error
+from cfx.evaluation.headline import fitted_errors, headline, main_error
 
 METRICS = {
     "rmse_improvement/mean": 0.21584,
@@ -28,6 +28,8 @@ def test_an_improvement_is_in_percent_with_its_interval() -> None:
         "improvement_low_percent": 16.9,
         "improvement_high_percent": 26.2,
         "rmse_speed_mps": 0.584,
+        "rmse_speed_driver_specific_mps": 0.735,
+        "rmse_speed_pooled_mps": 0.686,
     }
 
 
@@ -55,9 +57,29 @@ def test_a_calibration_is_known_by_the_drivers_own_parameters() -> None:
     metrics = {"rmse_speed/fixed": 0.7351, "rmse_speed/population": 0.6861}
     values, words = headline(metrics)
     assert words == "calibration; driver-specific 0.735 m/s; pooled 0.686 m/s"
-    assert values == {"rmse_speed_mps": 0.735}
+    assert values == {
+        "rmse_speed_mps": 0.735,
+        "rmse_speed_driver_specific_mps": 0.735,
+        "rmse_speed_pooled_mps": 0.686,
+    }
     assert main_error(metrics) == 0.7351
     assert main_error(METRICS) == 0.58432
+
+
+def test_what_is_asked_first_of_the_judged_method_has_no_group() -> None:
+    of_all = {}
+    for method, value in (("policy", 1.0), ("fixed", 2.0)):
+        of_all |= {f"rmse_gap/{method}": value, f"collisions/{method}": value}
+    values, _ = headline({**METRICS, **of_all})
+    assert (values["rmse_gap_m"], values["collisions"]) == (1.0, 1.0)
+    assert len(values) <= 10
+    del of_all["rmse_gap/policy"]
+    calibrated = {name: value for name, value in of_all.items() if "policy" not in name}
+    values, _ = headline({"rmse_speed/fixed": 0.7, **calibrated})
+    assert (values["rmse_gap_m"], values["collisions"]) == (2.0, 2.0)
+    assert fitted_errors({"rmse_speed": 0.41234, "rmse_gap": math.nan}) == {
+        "rmse_speed_fitted_mps": 0.412
+    }
 
 
 def test_what_is_not_defined_is_not_said() -> None:

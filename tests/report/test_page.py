@@ -369,6 +369,9 @@ def test_a_calibration_is_none_of_the_policies_that_adapt(tmp_path: Path) -> Non
     assert "with constant parameters?" in summary(alone)[0]
     page = page_of(tmp_path / "still")
     assert "Improvement of every pair" not in page.words
+    assert "The numbers are those of driver-specific calibration" in page.words
+    for said_of_policies in ("The numbers are the policy", "policy has learned", "is learned"):
+        assert said_of_policies not in page.words
     assert "policy" not in alone[0].meaningful_methods, "a constant set is shown once"
     (moves,) = [job for job in runs.jobs if job.purpose is Purpose.ADAPTATION]
     sheet = improvements.clusters(cluster_series([moves]), "fixed")

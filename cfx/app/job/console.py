@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import pandas as pd
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -20,7 +21,7 @@ from cfx.evaluation.metrics.base import MetricInfo, key_of
 from cfx.evaluation.result import Evaluation, Purpose
 from cfx.evaluation.statistics import Improvement
 from cfx.evaluation.tables import scope_label
-from cfx.report.figures.text import few_drivers
+from cfx.report.figures.text import few_drivers, short_label
 from cfx.results.config import JobConfig
 from cfx.results.table import Findings, Kept
 from cfx.simulation.trajectory import TRANSIENT_S
@@ -50,10 +51,6 @@ def report(
     if "full_trajectory" in evaluation.improvements:
         console.print(methods_table(evaluation, kept.metrics, "full_trajectory"))
     if evaluation.purpose is Purpose.CALIBRATION:
-        text = (
-            "The policy keeps its parameters constant: this is a calibration, without adaptation."
-        )
-        console.print(text, soft_wrap=True)
         _print_headline(kept.metrics, console)
     elif evaluation.purpose is Purpose.ADAPTATION:
         _print_improvements(evaluation, console)
@@ -94,10 +91,13 @@ def methods_table(
     plural = "" if count == 1 else "s"
     title = f"{count} pair{plural}, {scope_label(scope)} in closed loop"
     table = Table(title=title, title_justify="left")
-    table.add_column("method")
+    table.add_column("method", no_wrap=True)
     shown = [one for one in evaluation.measured if one.headline and scope in one.scopes]
+    fitted = _fitted(evaluation) if scope == "test" else pd.DataFrame()
     for metric in shown:
         table.add_column(escape(metric.title), justify="right")
+        if metric.name in fitted:
+            table.add_column("where\nfitted", justify="right")
     for method in evaluation.methods:
         values = [metrics.get(key_of(metric.name, method, scope)) for metric in shown]
         if all(value is None for value in values):
@@ -105,8 +105,22 @@ def methods_table(
         cells = []
         for metric, value in zip(shown, values, strict=True):
             cells.append(_cell(metric, value))
-        table.add_row(method, *cells)
+            if metric.name in fitted:
+                cells.append(_cell(metric, fitted[metric.name].get(method)))
+        table.add_row(short_label(method), *cells)
     return table
+
+
+def _fitted(evaluation: Evaluation) -> pd.DataFrame:
+    """Returns a calibration's mean errors on the part that was calibrated on, methods by metrics.
+
+    It is empty where they are not known, and of a job that adapts: its table compares methods.
+    """
+    fits = evaluation.tables.get("fits")
+    if fits is None or evaluation.purpose is not Purpose.CALIBRATION:
+        return pd.DataFrame()
+    means = fits.groupby("method").mean(numeric_only=True).filter(regex="^train_")
+    return means.rename(columns=lambda name: name.removeprefix("train_"))
 
 
 def _cell(metric: MetricInfo, value: float | None) -> str:
@@ -128,13 +142,13 @@ def _print_improvements(evaluation: Evaluation, console: Console) -> None:
     console.print(improvements_table(compared))
     for over, one in compared.items():
         if one.undefined:
-            console.print(
-                f"Over {over}: {one.undefined} of {one.pairs + one.undefined} pairs have no"
-                f" improvement: a simulation diverged, or {over.partition(',')[0]} has no error at"
-                " all.",
-                soft_wrap=True,
-                highlight=False,
+            baseline = over.partition(",")[0]
+            text = (
+                f"Over {' '.join(over.split())}: {one.undefined} of {one.pairs + one.undefined}"
+                f" pairs have no improvement: a simulation diverged, or {baseline} has no error at"
+                " all."
             )
+            console.print(text, soft_wrap=True, highlight=False)
     drivers = max(one.drivers for one in compared.values())
     warning = few_drivers(drivers)
     if warning:
@@ -151,17 +165,17 @@ def _print_headline(metrics: Mapping[str, float], console: Console) -> None:
 def _comparisons(evaluation: Evaluation) -> dict[str, Improvement]:
     """Returns what the table compares, by what it says in its first column."""
     candidates = [
-        ("test", "fixed", "fixed"),
-        ("steady", "fixed", f"fixed, after {TRANSIENT_S:g} s"),
-        ("test", "shrunk", "shrunk"),
-        ("test", "population", "population"),
-        ("full_trajectory", "population", "population, full"),
+        ("test", "fixed", ""),
+        ("steady", "fixed", f",\nafter {TRANSIENT_S:g} s"),
+        ("test", "shrunk", ""),
+        ("test", "population", ""),
+        ("full_trajectory", "population", ", full"),
     ]
     found = {}
-    for scope, baseline, words in candidates:
+    for scope, baseline, part in candidates:
         improvements = evaluation.improvements.get(scope, {})
         if baseline in improvements:
-            found[words] = improvements[baseline]
+            found[f"{short_label(baseline)}{part}"] = improvements[baseline]
     return found
 
 
@@ -227,7 +241,7 @@ def _methods_above(
     for method in evaluation.methods:
         value = metrics.get(key_of(name, method), 0.0)
         if value >= least:
-            found.append(f"{method} {value:{form}}")
+            found.append(f"{short_label(method)} {value:{form}}")
     return ", ".join(found)
 
 

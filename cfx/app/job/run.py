@@ -31,11 +31,7 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
     Raises:
         CfxError: the user's mistake, in one sentence; nothing half-written is left.
     """
-    chosen = (config.model, config.policy, config.learner, config.protocol, config.data)
-    log.info(
-        "Model %s, policy %s, learner %s, protocol %s, data %s: starting",
-        *[node.get("name") for node in chosen],
-    )
+    log.info("%s: starting", config.in_words())
     # An engine that is not installed is named at once too; it connects to nothing yet.
     registry.create("engine", config.engine)
     pairs = load_pairs(cast("Dataset", registry.create("dataset", config.data)))

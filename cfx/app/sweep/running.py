@@ -31,7 +31,14 @@ from omegaconf.errors import OmegaConfBaseException
 from cfx.app.hydra_source import resolving
 from cfx.app.sweep.folder import LOCK, command_of, find_folder
 from cfx.app.sweep.record import RECORD, JobStatus, Record, worst
-from cfx.app.sweep.summary import SUMMARY, metric_columns, rows, summary_table, write_summary
+from cfx.app.sweep.summary import (
+    SUMMARY,
+    errors_of,
+    metric_columns,
+    rows,
+    summary_table,
+    write_summary,
+)
 from cfx.core.console import put
 
 log = logging.getLogger(__name__)
@@ -132,10 +139,15 @@ class Sweep:
 
     def _finish(self, statuses: Mapping[Path, JobStatus], code: int) -> int:
         """Writes and prints the summary, and says how to go on; returns the exit code."""
+        from cfx.evaluation.comparison import against_the_best, verdict  # imports NumPy
+
         lines = self._close_runs()
         table = rows(statuses)
         write_summary(self.folder / SUMMARY, table)
         put(summary_table(table, metric_columns(list(statuses))))
+        said = verdict(against_the_best(errors_of(statuses)))
+        if said:
+            print(said)
         code = self._count(statuses, code)
         if any(status.code == 0 for status in statuses.values()):
             for line in lines:

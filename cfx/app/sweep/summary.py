@@ -14,8 +14,10 @@ from cfx.core.console import blank_table
 from cfx.core.errors import DataError
 from cfx.core.files import atomic_write
 from cfx.evaluation.headline import main_comparison, ratio_of_means
+from cfx.report.figures.text import short_label
 
 if TYPE_CHECKING:
+    import pandas as pd
     from rich.table import Table
 
     from cfx.evaluation.metrics.base import MetricInfo
@@ -25,9 +27,12 @@ SUMMARY = "summary.csv"
 
 _STATISTICS = ("mean", "ci95_low", "ci95_high")
 _OF_MEANS = "of_means"
+_COMPARED = ["pair_id", "driver", "frames", "method", "rmse_speed"]
 _METHODS = ("default", "fixed", "population", "policy")
-_SHOWN = ("default", "fixed", "policy")
-_AFTER_OVERRIDES = "improvement_over"
+_SHOWN = ("default", "population", "fixed", "policy")
+_OVER = "improvement_over"
+_AFTER_OVERRIDES = (_OVER, "rmse_speed_default")
+"""The columns behind the overrides: the second, where no job has a policy."""
 
 
 def metric_columns(folders: Sequence[Path]) -> list[MetricInfo]:
@@ -46,38 +51,78 @@ def metric_columns(folders: Sequence[Path]) -> list[MetricInfo]:
     return list(found.values())
 
 
-def _column(metric: MetricInfo) -> str:
-    """Returns the column of `summary.csv` with a metric of the policy."""
-    return f"{metric.name}_policy"
+def _column(metric: MetricInfo, judged: str) -> str:
+    """Returns the column of `summary.csv` with a metric of the method that jobs are judged by."""
+    return f"{metric.name}_{judged}"
 
 
 def rows(statuses: Mapping[Path, JobStatus]) -> list[dict[str, Any]]:
     """Returns a row per job of the summary.
 
     Columns: folder, the overrides that differ, the improvement, the RMSE of speed, other metrics of
-        the policy, seconds and state.
+        the policy, seconds and state. Where all jobs are calibrations, the improvement is left out,
+        and the other metrics are those of driver-specific parameters.
     """
     given = [_as_mapping(status.overrides) for status in statuses.values()]
     differing = _differing(given)
     columns = metric_columns(list(statuses))
+    measured = []
+    for folder, status in statuses.items():
+        measured.append({} if status.code else metrics_of(folder))
+    judged = "fixed" if _are_calibrations(measured) else "policy"
     table = []
-    for (folder, status), own in zip(statuses.items(), given, strict=True):
-        found: dict[str, float] = {}
-        if not status.code:
-            found = metrics_of(folder)
+    for (folder, status), own, found in zip(statuses.items(), given, measured, strict=True):
         row: dict[str, Any] = {"folder": folder.name}
         for key in differing:
             row[key] = own.get(key, "")
-        row |= _improvement(found)
+        if judged == "policy":
+            row |= _improvement(found)
         for method in _METHODS:
-            row[f"rmse_speed_{method}"] = found.get(f"rmse_speed/{method}")
+            if method != "policy" or judged == "policy":
+                row[f"rmse_speed_{method}"] = found.get(f"rmse_speed/{method}")
         for column in columns:
-            row[_column(column)] = found.get(f"{column.name}/policy")
+            row[_column(column, judged)] = found.get(f"{column.name}/{judged}")
         row["seconds"] = round(status.seconds, 1)
         row["state"] = status.state
         row["message"] = status.message
         table.append(row)
     return table
+
+
+def _are_calibrations(measured: Sequence[Mapping[str, float]]) -> bool:
+    """Says whether no job has a policy that adapts, and one at least is a calibration."""
+    if any("rmse_speed/policy" in found for found in measured):
+        return False
+    return any("rmse_speed/fixed" in found for found in measured)
+
+
+def errors_of(statuses: Mapping[Path, JobStatus]) -> dict[str, pd.DataFrame]:
+    """Returns the errors of each job's pairs, by what differs between the jobs.
+
+    Those of jobs that differ in the seed alone are averaged. Of a job with a policy they are the
+    policy's, of a calibration those of driver-specific parameters.
+
+    Returns:
+        A row per pair: `pair_id`, `driver`, `frames` and `error` (RMSE of speed, m/s).
+    """
+    import pandas as pd
+
+    done = {folder: status for folder, status in statuses.items() if not status.code}
+    given = [_as_mapping(status.overrides) for status in done.values()]
+    differing = [key for key in _differing(given) if key != "seed"]
+    alike: dict[str, list[pd.DataFrame]] = {}
+    for folder, own in zip(done, given, strict=True):
+        name = " ".join(f"{key}={own.get(key, '')}" for key in differing)
+        with suppress(OSError, ValueError):  # a job's files may have gone, or be damaged
+            table = pd.read_csv(folder / "pairs.csv", usecols=_COMPARED)
+            own_method = "policy" if (table["method"] == "policy").any() else "fixed"
+            rows_of_it = table[table["method"] == own_method]
+            alike.setdefault(name, []).append(rows_of_it.rename(columns={"rmse_speed": "error"}))
+    found = {}
+    for name, tables in alike.items():
+        together = pd.concat(tables).groupby(["pair_id", "driver", "frames"])
+        found[name] = together[["error"]].mean().reset_index()
+    return found
 
 
 def write_summary(path: Path, table: Sequence[Mapping[str, Any]]) -> None:
@@ -94,32 +139,46 @@ def summary_table(table: Sequence[Mapping[str, Any]], columns: Sequence[MetricIn
     Args:
         columns: what else than the RMSE of speed was measured; those that are headlines are shown.
     """
-    over = {row["improvement_over"] for row in table} - {""}
-    several = len(over) > 1
     first = list(table[0])
-    overrides = first[1 : first.index(_AFTER_OVERRIDES)]
+    end = next(first.index(name) for name in _AFTER_OVERRIDES if name in first)
+    overrides = first[1:end]
+    adapts = _OVER in first
+    over = {row[_OVER] for row in table if adapts} - {""}
+    methods = []
+    for method in _SHOWN:
+        if any(row.get(f"rmse_speed_{method}") is not None for row in table):
+            methods.append(method)
+    judged = "policy" if adapts else "fixed"
     headlines = [column for column in columns if column.headline]
     shown = blank_table(*(overrides or ["job"]), title="The sweep")
-    heading = "improvement"
-    if len(over) == 1:
-        heading = f"improvement over {min(over)}"
-    shown.add_column(f"{heading}\n(95 % interval)", justify="right")
-    for method in _SHOWN:
-        shown.add_column(f"RMSE speed [m/s]\n{method}", justify="right")
+    if adapts:
+        heading = "improvement"
+        if len(over) == 1:
+            heading = f"improvement over {_in_words(min(over))}"
+        shown.add_column(f"{heading}\n(95 % interval)", justify="right")
+    for method in methods:
+        shown.add_column(f"RMSE speed [m/s]\n{short_label(method)}", justify="right")
     for column in headlines:
         title = f"{column.heading} [{column.unit}]" if column.unit else column.heading
-        shown.add_column(f"{title}\npolicy", justify="right")
+        shown.add_column(f"{title}\n{short_label(judged)}", justify="right")
     shown.add_column("time [s]", justify="right")
     shown.add_column("state")
     for row in table:
         cells = [str(row[key]) for key in overrides] or [row["folder"]]
-        cells.append(_improvement_said(row, named=several))
-        for method in _SHOWN:
+        if adapts:
+            cells.append(_improvement_said(row, named=len(over) > 1))
+        for method in methods:
             cells.append(_number(row[f"rmse_speed_{method}"]))
         for column in headlines:
-            cells.append(_number(row[_column(column)]))
+            cells.append(_number(row[_column(column, judged)]))
         shown.add_row(*cells, f"{row['seconds']:.1f}", row["state"])
     return shown
+
+
+def _in_words(over: str) -> str:
+    """Returns how a baseline is named, with the part of trajectories behind it."""
+    baseline, comma, part = over.partition(",")
+    return f"{short_label(baseline)}{comma}{part}"
 
 
 def _as_mapping(overrides: Sequence[str]) -> dict[str, str]:
@@ -145,13 +204,13 @@ def _differing(given: Sequence[Mapping[str, str]]) -> list[str]:
 def _improvement(found: Mapping[str, float]) -> dict[str, Any]:
     """Returns the improvement over the baseline that counts, None where it was not measured."""
     compared = main_comparison(found)
-    row: dict[str, Any] = {_AFTER_OVERRIDES: ""}
+    row: dict[str, Any] = {_OVER: ""}
     row |= dict.fromkeys(f"improvement_{name}" for name in (*_STATISTICS, _OF_MEANS))
     if compared is None:
         return row
-    row[_AFTER_OVERRIDES] = compared.baseline
+    row[_OVER] = compared.baseline
     if compared.scope != "test":
-        row[_AFTER_OVERRIDES] += ", full"
+        row[_OVER] += ", full"
     for name in _STATISTICS:
         row[f"improvement_{name}"] = found.get(f"{compared.key}/{name}")
     ratio = ratio_of_means(found, compared)
@@ -172,7 +231,7 @@ def _improvement_said(row: Mapping[str, Any], *, named: bool) -> str:
     if ratio is not None and mean * ratio < 0:
         said += f"\nof the mean RMSE {ratio:+.1%}"
     if named:
-        said += f" over {row['improvement_over']}"
+        said += f" over {_in_words(row[_OVER])}"
     return said
 
 

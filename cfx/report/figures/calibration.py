@@ -13,7 +13,17 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
 from cfx.calibration.flatness import NEAR, flat_shares
-from cfx.report.figures.canvas import Array, canvas, draw_points, legend_above, styled
+from cfx.report.figures.canvas import (
+    Array,
+    canvas,
+    draw_points,
+    legend_above,
+    most_across,
+    points,
+    side_by_side,
+    styled,
+    wrapped,
+)
 from cfx.report.figures.figure import JobFigure, ParameterAxis, Results
 from cfx.report.figures.text import label, number, percent, plural, short, unit_label
 from cfx.report.figures.trajectories import TIME_TITLE
@@ -118,7 +128,7 @@ def draw_calibration(spreads: Sequence[ParameterSpread], table: pd.DataFrame) ->
         table: as `correlations` returns it.
     """
     figure = canvas(1.7 + 0.42 * max(len(spreads), 4))
-    left, right = figure.subplots(1, 2, width_ratios=(2.0, 1.0))
+    left, right = side_by_side(figure, (2.0, 1.0))
     _values(left, spreads)
     _correlations(right, table)
     legend_above(figure, left.get_legend_handles_labels()[0], handlelength=1.2)
@@ -152,7 +162,7 @@ def _values(axes: Axes, spreads: Sequence[ParameterSpread]) -> None:
     axes.grid(visible=False, axis="y")
     axes.tick_params(axis="y", length=0)
     axes.set_xlabel(
-        "place between the bounds; at the ends: the bound, and the share of pairs at it"
+        wrapped("place between the bounds; at the ends: the bound, and the share of pairs at it")
     )
 
 
@@ -165,7 +175,7 @@ def _ends(axes: Axes, spread: ParameterSpread, row: float) -> None:
         text = number(bound)
         if share > 0:
             text += f"\n{percent(share).lstrip('+')}"
-        axes.text(place, row, text, ha=side, va="center", fontsize=8.5, color=INK)
+        axes.text(place, row, text, ha=side, va="center", fontsize=points(8.5), color=INK)
 
 
 def _correlations(axes: Axes, table: pd.DataFrame) -> None:
@@ -180,7 +190,9 @@ def _correlations(axes: Axes, table: pd.DataFrame) -> None:
         for row, column in np.argwhere(np.isfinite(values)):
             value = values[row, column]
             colour = "white" if abs(value) > 0.6 else INK
-            axes.text(column, row, f"{value:.1f}", ha="center", va="center", color=colour, size=9)
+            axes.text(
+                column, row, f"{value:.1f}", ha="center", va="center", color=colour, size=points(9)
+            )
     axes.set_title("rank correlation over drivers")
 
 
@@ -337,7 +349,7 @@ _MARKERS = {"fixed": "o", "population": "D", "default": "|"}
 @styled
 def draw_slices(panels: Sequence[SlicePanel]) -> Figure:
     """Draws the loss along each parameter: a line per pair, and their median."""
-    across = min(_ACROSS, len(panels))
+    across = min(most_across(_ACROSS), len(panels))
     rows = -(-len(panels) // across)
     figure = canvas(0.9 + 2.3 * rows)
     grid = figure.subplots(rows, across, squeeze=False, sharey=True)
@@ -352,13 +364,15 @@ def draw_slices(panels: Sequence[SlicePanel]) -> Figure:
         place.set_ylim(0.97, HIGHEST)
     for unused in grid.flat[len(panels) :]:
         unused.set_visible(False)
-    figure.supylabel(RATIO_TITLE, fontsize=10.5, color=INK)
+    figure.supylabel(RATIO_TITLE, fontsize=points(10.5), color=INK)
     drivers = plural(len(panels[0].ratios), "pair")
     figure.supxlabel(
-        f"one parameter moved from bound to bound, the others held; {drivers} and their median."
-        " Percentages: the range on which\na pair's loss is within"
-        f" {percent(NEAR).lstrip('+')} of its best (dashed), median over pairs",
-        fontsize=10.5,
+        wrapped(
+            f"one parameter moved from bound to bound, the others held; {drivers} and their median."
+            " Percentages: the range on which\na pair's loss is within"
+            f" {percent(NEAR).lstrip('+')} of its best (dashed), median over pairs"
+        ),
+        fontsize=points(10.5),
         color=INK,
     )
     return figure
@@ -378,13 +392,15 @@ def draw_fits(fits: Mapping[str, pd.DataFrame]) -> Figure:
         medians = f"median {np.median(train):.2f} and {np.median(test):.2f} m/s"
         size, above, filled = (4.5, 3, colour) if own else (5.5, 2, "none")
         drawn = draw_points(axes, train, test, _MARKERS[method], colour, size, alpha=0.65)
-        drawn.set(label=f"{label(method)}: {medians}", zorder=above, markerfacecolor=filled)
+        drawn.set(
+            label=wrapped(f"{label(method)}: {medians}"), zorder=above, markerfacecolor=filled
+        )
     end = 1.15 * highest
     axes.plot([0, end], [0, end], color=EDGE, linewidth=1, zorder=1)
     axes.set_xlim(0, end)
     axes.set_ylim(0, end)
     axes.set_aspect("equal")
-    axes.set_xlabel("RMSE of speed on the part calibrated on (m/s)")
+    axes.set_xlabel(wrapped("RMSE of speed on the part calibrated on (m/s)"))
     axes.set_ylabel("RMSE of speed on the test part (m/s)")
     legend_above(figure, columns=1, handlelength=1.0)
     return figure
@@ -414,18 +430,20 @@ def draw_labels(pair_id: str, labels: pd.DataFrame, axes: Sequence[ParameterAxis
         )
         fixed = float(labels[f"fixed_{axis.name}"].iloc[0])
         place.axhline(fixed, color=colour_of("fixed"), linewidth=1.6)
-        place.set_ylabel(unit_label(axis.name, axis.unit).replace(" ", "\n"), fontsize=9)
+        place.set_ylabel(unit_label(axis.name, axis.unit).replace(" ", "\n"), fontsize=points(9))
         if axis.low is not None and axis.high is not None:
             room = 0.06 * (axis.high - axis.low)
             place.set_ylim(axis.low - room, axis.high + room)
     grid[-1].plot(times, labels["sensitivity"].to_numpy(dtype=float), color=INK, linewidth=1.2)
-    grid[-1].set_ylabel("sensi-\ntivity", fontsize=9)
+    grid[-1].set_ylabel("sensi-\ntivity", fontsize=points(9))
     grid[-1].set_ylim(bottom=0)
     grid[-1].set_xlabel(TIME_TITLE)
     figure.suptitle(
-        f"{short(pair_id)}: per-window calibrated parameters; the paler, the less the choice"
-        " mattered; line: driver-specific",
-        fontsize=10.5,
+        wrapped(
+            f"{short(pair_id)}: per-window calibrated parameters; the paler, the less the choice"
+            " mattered; line: driver-specific"
+        ),
+        fontsize=points(10.5),
         color=INK,
     )
     return figure

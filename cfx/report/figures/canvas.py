@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import functools
+import textwrap
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any, Literal, ParamSpec
 from weakref import WeakKeyDictionary
@@ -36,6 +38,42 @@ P = ParamSpec("P")
 DPI = 150
 WIDTH = 10.5
 """Inches: at 150 dpi twice the width of a README column, with text that is still read there."""
+
+_FONT = 10.5
+"""Points: the size of the text of axes on the usual paper."""
+
+_NARROW = 0.75
+"""Room below which panels stand one below the other."""
+
+_LINE = 120
+"""Characters that fit into the usual width."""
+
+
+@dataclass(frozen=True)
+class Paper:
+    """Paper that figures are drawn on: sizes of fonts, lines and margins follow.
+
+    Attributes:
+        width: inches.
+        font_size: of the text of axes, points; other text is larger or smaller in proportion.
+    """
+
+    width: float = WIDTH
+    font_size: float = _FONT
+
+    @property
+    def scale(self) -> float:
+        """How large text and lines are, compared with the usual paper."""
+        return self.font_size / _FONT
+
+    @property
+    def room(self) -> float:
+        """How much text fits beside each other, compared with the usual paper."""
+        return self.width / WIDTH / self.scale
+
+
+_USUAL = Paper()
+_PAPER: ContextVar[Paper] = ContextVar("paper", default=_USUAL)
 
 Dash = Literal["solid"] | tuple[float, tuple[float, ...]]
 
@@ -85,6 +123,12 @@ _STYLE: dict[str, Any] = {
     "ytick.color": INK,
     "xtick.labelsize": 9.5,
     "ytick.labelsize": 9.5,
+    "xtick.major.size": 3.5,
+    "xtick.major.width": 0.8,
+    "xtick.major.pad": 3.5,
+    "ytick.major.size": 3.5,
+    "ytick.major.width": 0.8,
+    "ytick.major.pad": 3.5,
     "legend.frameon": False,
     "legend.fontsize": 10.0,
     "legend.title_fontsize": 10.5,
@@ -95,6 +139,8 @@ _STYLE: dict[str, Any] = {
     # A pair id may hold a dollar sign: it is text, never a formula.
     "text.parse_math": False,
 }
+_SIZES = ("size", "width", "pad")
+"""Endings of settings that are lengths in points."""
 
 
 @dataclass(frozen=True)
@@ -124,10 +170,62 @@ class Line:
 
 
 @contextmanager
+def on_paper(paper: Paper) -> Iterator[None]:
+    """Draws the figures of the block on this paper."""
+    before = _PAPER.set(paper)
+    try:
+        yield
+    finally:
+        _PAPER.reset(before)
+
+
+def points(size: float) -> float:
+    """Returns a size of text or lines in points: `size` on the usual paper."""
+    return size * _PAPER.get().scale
+
+
+def most_across(panels: int) -> int:
+    """Returns how many panels stand beside each other where `panels` do on the usual paper."""
+    return max(1, min(panels, round(panels * _PAPER.get().room)))
+
+
+def wrapped(text: str) -> str:
+    """Returns a text in lines that fit the width of the paper; on the usual one as it is."""
+    room = _PAPER.get().room
+    if room >= 1:
+        return text
+    return "\n".join(textwrap.wrap(text, max(20, round(_LINE * room))))
+
+
+def side_by_side(figure: Figure, widths: Sequence[float], **more: Any) -> list[Axes]:
+    """Returns panels beside each other; on narrow paper each is as wide as the figure.
+
+    Args:
+        figure: an empty one; it becomes higher where panels stand one below the other.
+        widths: of the panels, relative.
+        more: as of `Figure.subplots`.
+    """
+    count = len(widths)
+    if count == 1 or _PAPER.get().room >= _NARROW:
+        return list(figure.subplots(1, count, width_ratios=widths, squeeze=False, **more)[0])
+    figure.set_figheight(count * figure.get_figheight())
+    return list(figure.subplots(count, 1, squeeze=False, **more)[:, 0])
+
+
+def _style() -> dict[str, Any]:
+    """Returns Matplotlib's settings for the paper: its sizes are those of `_STYLE`, scaled."""
+    scale = _PAPER.get().scale
+    if scale == 1:
+        return _STYLE
+    scaled = {key: _STYLE[key] * scale for key in _STYLE if key.endswith(_SIZES)}
+    return {**_STYLE, **scaled}
+
+
+@contextmanager
 def figure_style() -> Iterator[None]:
     """Draws in this look, without warnings of names and values; the reader's settings come back."""
     with (
-        mpl.rc_context(_STYLE),  # type: ignore[arg-type]  # the stubs want literal keys
+        mpl.rc_context(_style()),  # type: ignore[arg-type]  # the stubs want literal keys
         warnings.catch_warnings(),
     ):
         # A name in a script that the font lacks shows boxes; the names are in pairs.csv.
@@ -159,8 +257,16 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
 
 
 def canvas(height: float, width: float = WIDTH) -> Figure:
-    """Returns an empty figure; sizes in inches. It belongs to no pyplot state and no window."""
-    return Figure(figsize=(width, height), dpi=DPI, layout="constrained")
+    """Returns an empty figure that belongs to no pyplot state and no window.
+
+    Args:
+        height: on the usual paper, inches; on another it grows with the text.
+        width: on the usual paper, inches; on a narrow one it is as wide as the text needs.
+    """
+    paper = _PAPER.get()
+    share = width / WIDTH / min(1.0, paper.room)
+    size = (paper.width * min(1.0, share), height * paper.scale)
+    return Figure(figsize=size, dpi=DPI, layout="constrained")
 
 
 def draw_lines(axes: Axes, lines: Sequence[Line]) -> None:
@@ -175,7 +281,7 @@ def draw_lines(axes: Axes, lines: Sequence[Line]) -> None:
             line.values,
             color=colour_of(method),
             linestyle=DASHES.get(method, "solid"),
-            linewidth=_WIDTHS.get(method, 1.6),
+            linewidth=points(_WIDTHS.get(method, 1.6)),
             drawstyle="steps-post" if line.steps else "default",
             zorder=2.0 + 0.05 * above,
         )
@@ -187,7 +293,13 @@ def draw_points(
     axes: Axes, x: ArrayLike, y: ArrayLike, marker: str, colour: str, size: float, **more: Any
 ) -> Line2D:
     """Draw points without a line between them; `more` as of `Line2D`."""
-    style = {"marker": marker, "color": colour, "markersize": size, "linestyle": "none", **more}
+    style = {
+        "marker": marker,
+        "color": colour,
+        "markersize": points(size),
+        "linestyle": "none",
+        **more,
+    }
     (drawn,) = axes.plot(x, y, **style)
     return drawn
 
@@ -196,7 +308,7 @@ def mark_points(axes: Axes) -> None:
     """Puts a point where each value of the lines stands."""
     for line in axes.lines:
         line.set_marker("o")
-        line.set_markersize(3.5)
+        line.set_markersize(points(3.5))
 
 
 def logarithmic(axes: Axes) -> None:
@@ -216,7 +328,7 @@ def method_handles(methods: Iterable[str]) -> list[Line2D]:
     """Returns legend entries."""
     handles = []
     for method in methods:
-        width = _WIDTHS.get(method, 1.6) + 0.4
+        width = points(_WIDTHS.get(method, 1.6) + 0.4)
         handles.append(
             Line2D(
                 [],
@@ -232,9 +344,9 @@ def method_handles(methods: Iterable[str]) -> list[Line2D]:
 
 def method_legend(figure: Figure, methods: Sequence[str], title: str | None = None) -> None:
     """Puts a legend of methods above a figure, in one row; many take two."""
-    rows = 1 if len(methods) <= _LEGEND_ROW else 2
+    rows = -(-len(methods) // _LEGEND_ROW)
     columns = -(-len(methods) // rows)
-    spacing = {"columnspacing": 1.4, "handlelength": 2.2, "title_fontsize": 11}
+    spacing = {"columnspacing": 1.4, "handlelength": 2.2, "title_fontsize": points(11)}
     legend_above(figure, method_handles(methods), columns, title=title, **spacing)
 
 
@@ -251,6 +363,9 @@ def legend_above(
     """
     if handles is not None:
         columns = min(columns, max(len(handles), 1))
+    columns = most_across(columns)
+    if more.get("title"):
+        more["title"] = wrapped(more["title"])
     figure.legend(handles=handles, loc="outside upper center", ncols=columns, **more)
 
 

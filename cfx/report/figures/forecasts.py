@@ -27,6 +27,7 @@ from cfx.report.figures.canvas import (
     logarithmic,
     mark_points,
     method_legend,
+    side_by_side,
     styled,
 )
 from cfx.report.figures.figure import JobFigure, Results
@@ -49,7 +50,7 @@ def draw_by_horizon(summary: pd.DataFrame, methods: Sequence[str]) -> Figure:
         methods: those to show.
     """
     figure = canvas(4.4)
-    for axes, (error, title) in zip(figure.subplots(1, len(_ERRORS)), _ERRORS, strict=True):
+    for axes, (error, title) in zip(side_by_side(figure, [1] * len(_ERRORS)), _ERRORS, strict=True):
         _draw_panel(axes, _lines(summary, methods, "horizon_s", error), title, HORIZON_TITLE)
         logarithmic(axes)
     method_legend(figure, methods)
@@ -67,7 +68,7 @@ def draw_by_history(by_history: pd.DataFrame, methods: Sequence[str]) -> Figure:
     horizons = sorted(by_history["horizon_s"].unique())
     chosen = sorted({horizons[0], horizons[len(horizons) // 2], horizons[-1]})[:_PANELS]
     figure = canvas(4.4)
-    grid = figure.subplots(1, len(chosen), squeeze=False)[0]
+    grid = side_by_side(figure, [1] * len(chosen))
     for axes, horizon in zip(grid, chosen, strict=True):
         rows = by_history[by_history["horizon_s"] == horizon]
         title = f"RMSE of speed after {horizon:g} s (m/s)"
@@ -120,7 +121,7 @@ def draw_distributions(table: pd.DataFrame, forecasts: pd.DataFrame) -> Figure:
             its absolute error.
     """
     figure = canvas(4.2)
-    crps, coverage, pit = figure.subplots(1, 3)
+    crps, coverage, pit = side_by_side(figure, (1, 1, 1))
     summary = summarize_distributions(table)
     summary["method"] = summary["method"].astype(str).map(sampled_name)
     sampled = sampled_methods(table)
@@ -260,7 +261,7 @@ def draw_errors(
     """
     figure = canvas(3.9)
     for axes, (signal, unit) in zip(
-        figure.subplots(1, 2), (("speed", "m/s"), ("gap", "m")), strict=True
+        side_by_side(figure, (1, 1)), (("speed", "m/s"), ("gap", "m")), strict=True
     ):
         lines = []
         for method in methods:

@@ -21,6 +21,7 @@ from cfx.report.figures.canvas import (
     hover,
     legend_above,
     percent_axis,
+    points,
     say,
     styled,
 )
@@ -215,7 +216,7 @@ def draw_improvements(bars: ImprovementBars, summary: Improvement) -> Figure:
     axes.set_xlim(middle - half, middle + half)
     axes.grid(visible=False, axis="x")
     if named:
-        axes.set_xticks(np.arange(count), ticks, rotation=90, fontsize=8.5)
+        axes.set_xticks(np.arange(count), ticks, rotation=90, fontsize=points(8.5))
         axes.tick_params(axis="x", length=0)
     else:
         axes.set_xticks([])
@@ -247,7 +248,7 @@ def _bars(axes: Axes, series: ImprovementSeries, low: float) -> None:
                 va="bottom",
                 rotation=90,
                 color="white",
-                fontsize=9,
+                fontsize=points(9),
                 fontweight="bold",
                 zorder=5,
             )

@@ -23,6 +23,7 @@ from cfx.report.figures.canvas import (
     hover,
     legend_above,
     percent_tick,
+    points,
     styled,
 )
 from cfx.report.figures.improvements import (
@@ -248,7 +249,7 @@ def draw_every_pair(bars: ImprovementBars, pair_ids: Sequence[str]) -> Figure:
         arrows.set(markeredgecolor="black")
     axes.axhline(0, color=INK, linewidth=0.9)
     axes.set_xlim(-0.7, max(len(pair_ids), 8) - 0.3)
-    axes.set_xticks(range(len(ticks)), ticks, rotation=90, fontsize=8.5)
+    axes.set_xticks(range(len(ticks)), ticks, rotation=90, fontsize=points(8.5))
     axes.grid(visible=False, axis="x")
     of_what = f" of {short(prefix.rstrip('_-/:.'), 30)}" if prefix else ""
     axes.set_xlabel(f"{plural(len(pair_ids), 'pair')} of a leader and a follower{of_what}")

@@ -12,7 +12,15 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from cfx.evaluation.metrics.base import key_of
-from cfx.report.figures.canvas import Array, canvas, finite, legend_above, styled
+from cfx.report.figures.canvas import (
+    Array,
+    canvas,
+    finite,
+    legend_above,
+    points,
+    side_by_side,
+    styled,
+)
 from cfx.report.figures.figure import JobFigure, Results
 from cfx.report.figures.text import label, number
 from cfx.results.look import COLLISION_COLOUR, COLOURS, vehicle_colour
@@ -91,7 +99,7 @@ def draw_platoons(
             is left out of the titles.
     """
     figure = canvas(4.3, width=10.5 if len(methods) > 1 else 6.5)
-    grid = figure.subplots(1, len(methods), sharey=True, sharex=True, squeeze=False)[0]
+    grid = side_by_side(figure, [1] * len(methods), sharey=True, sharex=True)
     speeds = [np.empty(0)]
     for axes, method in zip(grid, methods, strict=True):
         of_method = table[table["method"] == method]
@@ -101,9 +109,9 @@ def draw_platoons(
             title.append(_stability(stable[method], int(of_method["network"].nunique())))
         title.append(f"last follower: {_slowing(rows)}")
         speeds += _draw_vehicles(axes, rows)
-        axes.set_title("\n".join(title), fontsize=9.5 if len(methods) < 4 else 7.5)
+        axes.set_title("\n".join(title), fontsize=points(9.5 if len(methods) < 4 else 7.5))
         axes.margins(x=0.01)
-    figure.supxlabel(TIME_TITLE, fontsize=10.5)
+    figure.supxlabel(TIME_TITLE, fontsize=points(10.5))
     grid[0].set_ylabel("speed (m/s)")
     grid[0].set_ylim(*_speed_range(finite(np.concatenate(speeds))))
     legend_above(figure, _handles(), 4, columnspacing=1.8)

@@ -10,7 +10,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from cfx.data.style import CLUSTERS, StyleResult
-from cfx.report.figures.canvas import Array, canvas, finite, styled
+from cfx.report.figures.canvas import (
+    Array,
+    canvas,
+    finite,
+    points,
+    side_by_side,
+    styled,
+)
 from cfx.report.figures.figure import JobFigure, Results
 from cfx.report.figures.text import plural
 from cfx.results.look import CLUSTER_COLOURS, INK
@@ -43,7 +50,7 @@ def draw_style(style: StyleResult) -> Figure:
     if not style.weights:
         _histogram(figure.subplots(), style)
         return figure
-    left, right = figure.subplots(1, 2, width_ratios=(2.3, 1.0))
+    left, right = side_by_side(figure, (2.3, 1.0))
     _histogram(left, style)
     _weights(right, style.weights)
     return figure
@@ -95,7 +102,9 @@ def _weights(axes: Axes, weights: Mapping[str, float]) -> None:
     axes.set_yticks(places, [INDICATORS.get(name, name) for name in names])
     axes.invert_yaxis()
     for place, value in zip(places, values, strict=True):
-        axes.text(value, place, f" {value:.2f}", va="center", ha="left", color=INK, fontsize=9.5)
+        axes.text(
+            value, place, f" {value:.2f}", va="center", ha="left", color=INK, fontsize=points(9.5)
+        )
     axes.set_xlim(0, 1.22 * max([*values, 1e-6]))
     axes.grid(visible=False)
     axes.spines["bottom"].set_visible(False)

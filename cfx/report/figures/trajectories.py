@@ -26,6 +26,8 @@ from cfx.report.figures.canvas import (
     draw_lines,
     finite,
     method_legend,
+    most_across,
+    points,
     styled,
 )
 from cfx.report.figures.figure import JobFigure, ParameterAxis, Results
@@ -201,7 +203,7 @@ def draw_pairs(
         explained: what percentages in the titles mean; stands above the legend.
     """
     figure = canvas(0.75 + 2.35 * len(pairs))
-    grid = figure.subplots(len(pairs), 2, squeeze=False, sharex="row", width_ratios=(1.12, 1.0))
+    grid = _rows_of_two(figure, len(pairs))
     for (speed_axes, gap_axes), pair, title in zip(grid, pairs, titles, strict=True):
         draw_panel(speed_axes, pair.speed)
         draw_panel(gap_axes, pair.gap)
@@ -211,6 +213,15 @@ def draw_pairs(
         axes.set_xlabel(TIME_TITLE)
     _legend(figure, methods, explained)
     return figure
+
+
+def _rows_of_two(figure: Figure, rows: int) -> list[list[Axes]]:
+    """Returns two panels a row; on narrow paper each below the other."""
+    if most_across(2) == 2:
+        grid = figure.subplots(rows, 2, squeeze=False, sharex="row", width_ratios=(1.12, 1.0))
+        return [list(row) for row in grid]
+    figure.set_figheight(2 * figure.get_figheight())
+    return [list(row) for row in figure.subplots(2 * rows, 1).reshape(rows, 2)]
 
 
 @styled
@@ -230,7 +241,7 @@ def draw_speeds(
         simulated = {method: trajectory.speed[method]}
         draw_lines(axes, _lines(trajectory.time, trajectory.real_speed, simulated, [method]))
         title = f"{label(method)}: RMSE of speed {errors[method]:.3f} m/s"
-        axes.set_title(title, fontsize=9.5, color=INK)
+        axes.set_title(title, fontsize=points(9.5), color=INK)
         axes.set_ylabel("speed (m/s)")
     grid[-1].set_xlabel(TIME_TITLE)
     title = f"pair {short(trajectory.pair_id, 60)}, test part"
@@ -246,7 +257,7 @@ def draw_parameters(pair: PairPanels, methods: Sequence[str]) -> Figure:
     outside a parameter's bounds is shaded, and its bounds and its meaning stand in the title.
     """
     count = len(pair.parameters)
-    columns = _columns(count)
+    columns = min(_columns(count), most_across(4))
     rows = -(-(count + 1) // columns)
     figure = canvas(1.0 + (1.75 if columns == 1 else 2.0) * rows)
     grid = figure.add_gridspec(rows, columns)
@@ -273,9 +284,9 @@ def draw_pair(results: Results, pair_id: str) -> Figure:
     Raises:
         ConfigError: the pair id is not in the results.
     """
-    ((_, trajectory),) = _chosen(results, pair_id, 1)
+    ((_, trajectory),) = chosen_pairs(results, pair_id, 1)
     pair = pair_panels(trajectory, results.methods, results.parameters)
-    columns = 2 if len(pair.parameters) <= 4 else 4
+    columns = max(2, most_across(2 if len(pair.parameters) <= 4 else 4))
     rows = -(-len(pair.parameters) // columns)
     figure = canvas(3.4 + 1.75 * rows)
     grid = figure.add_gridspec(rows + 1, columns, height_ratios=(1.6, *[1.0] * rows))
@@ -305,7 +316,7 @@ def _draw_parameters(
 
 def _finish(figure: Figure, methods: Sequence[str], title: str | None = None) -> None:
     """Says below all panels what time they share, and above them who drives."""
-    figure.supxlabel(TIME_TITLE, fontsize=10.5, color=INK)
+    figure.supxlabel(TIME_TITLE, fontsize=points(10.5), color=INK)
     _legend(figure, methods, title)
 
 
@@ -333,7 +344,7 @@ def draw_panel(axes: Axes, panel: Panel) -> None:
             (6, 6),
             textcoords="offset points",
             color=colour,
-            fontsize=9,
+            fontsize=points(9),
             annotation_clip=True,
         )
         axes.axhline(0, color=INK, linewidth=0.8)
@@ -361,14 +372,15 @@ def _titles_of_parameter(axes: Axes, panel: Panel, length: int) -> None:
     if panel.bounds is not None:
         title += f", {number(panel.bounds[0])} to {number(panel.bounds[1])}"
     lines = textwrap.wrap(panel.meaning, length, max_lines=2, placeholder=" …")
-    axes.set_title("\n".join(lines), fontsize=8, color=INK)
-    _above(axes, title, 6 + 11 * len(lines), fontsize=10.5)
+    axes.set_title("\n".join(lines), fontsize=points(8), color=INK)
+    _above(axes, title, points(6 + 11 * len(lines)), fontsize=points(10.5))
 
 
 def _two_line_title(axes: Axes, strong: str, fine: str) -> None:
-    axes.set_title(fine, fontsize=7.6, color=INK)  # several methods' errors beside each other
+    # Several methods' errors stand beside each other.
+    axes.set_title(fine, fontsize=points(7.6), color=INK)
     if strong:
-        _above(axes, strong, 20, fontsize=11, fontweight="bold")
+        _above(axes, strong, points(20), fontsize=points(11), fontweight="bold")
 
 
 def _above(axes: Axes, text: str, points: float, **font: Any) -> None:
@@ -394,7 +406,7 @@ def _write_note(axes: Axes, text: str, *, above: bool) -> None:
         ha="right",
         va=aligned,
         color=colour_of("default"),
-        fontsize=9,
+        fontsize=points(9),
         bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5},
         zorder=5,
     )
@@ -414,7 +426,7 @@ def drives(results: Results, pair_id: str | Sequence[str] | None = None, count: 
     """
     titles, panels = [], []
     explained: str | None = None
-    for ranked, trajectory in _chosen(results, pair_id, count):
+    for ranked, trajectory in chosen_pairs(results, pair_id, count):
         name = RankedPair(short(ranked.pair_id), ranked.rank, ranked.improvement).title
         if np.isfinite(ranked.improvement):
             name += f":  {percent(ranked.improvement)}"
@@ -450,7 +462,7 @@ class Speeds(JobFigure):
         """Draws it where trajectories are known."""
         if not len(results.trajectories):
             return None
-        ((_, trajectory),) = _chosen(results, None, 1)
+        ((_, trajectory),) = chosen_pairs(results, None, 1)
         errors = _errors(results, trajectory.pair_id, "speed")
         return draw_speeds(trajectory, results.methods, errors)
 
@@ -466,14 +478,24 @@ class ChosenParameters(JobFigure):
         """Draws it where trajectories are known."""
         if not len(results.trajectories):
             return None
-        ((_, trajectory),) = _chosen(results, None, 1)
+        ((_, trajectory),) = chosen_pairs(results, None, 1)
         pair = pair_panels(trajectory, results.methods, results.parameters)
         return draw_parameters(pair, results.methods)
 
 
-def _chosen(
+def chosen_pairs(
     results: Results, pair_id: str | Sequence[str] | None, count: int
 ) -> list[tuple[RankedPair, PairTrajectory]]:
+    """Returns the pairs that a figure shows, with their test parts.
+
+    Args:
+        results: of a job.
+        pair_id: their ids; None for `count` pairs, as `drives` takes them.
+        count: how many.
+
+    Raises:
+        ConfigError: a pair id is not in the results.
+    """
     by_id = {trajectory.pair_id: trajectory for trajectory in results.trajectories}
     is_calibration = "policy" not in results.methods
     judged = "policy"

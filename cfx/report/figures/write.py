@@ -7,10 +7,13 @@ import io
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.artist import Artist
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
@@ -19,7 +22,11 @@ from matplotlib.lines import Line2D
 from cfx.core import registry
 from cfx.core.errors import OutputError
 from cfx.core.files import atomic_write
-from cfx.report.figures.canvas import DPI, WIDTH, figure_style, hover_text
+from cfx.report.figures.canvas import (
+    WIDTH,
+    figure_style,
+    hover_text,
+)
 from cfx.report.figures.figure import Results, draw
 
 _METADATA: dict[str, dict[str, None]] = {
@@ -40,7 +47,11 @@ PLACE = "\ue000"
 
 
 def write_figures(
-    folder: Path, results: Results, *, formats: Sequence[str] = ("png",)
+    folder: Path,
+    results: Results,
+    *,
+    formats: Sequence[str] = ("png",),
+    names: Sequence[str] | None = None,
 ) -> list[Path]:
     """Draws and writes all figures that the results allow; returns their paths.
 
@@ -48,12 +59,15 @@ def write_figures(
         folder: made if it is not there.
         results: of a job.
         formats: files of each figure: `png`, `pdf`, `svg`.
+        names: of the figures; None: all.
 
     Raises:
         OutputError: a file cannot be written.
     """
     paths = []
     for one in registry.installed("figure"):
+        if names is not None and one.name not in names:
+            continue
         figure = draw(one, results)
         if figure is not None:
             for form in formats:
@@ -76,14 +90,28 @@ def write_figure(figure: Figure, path: Path) -> Path:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as unfinished, figure_style():
-            form = path.suffix.removeprefix(".")
-            figure.savefig(unfinished, format=form, dpi=DPI, metadata=_METADATA[form])
+            _print(figure, unfinished, path.suffix.removeprefix("."))
     except OSError as error:
         raise OutputError(
             f"{path}: this figure cannot be written ({error.strerror or error});"
             " free the path or choose another folder"
         ) from error
     return path
+
+
+def _print(figure: Figure, path: Path, form: str) -> None:
+    """Draws a figure into a file; `savefig` would draw twice, once for the layout alone."""
+    metadata: Any = _METADATA[form]
+    paper: Any
+    if form == "png":
+        paper = FigureCanvasAgg(figure)
+        paper.print_png(path, metadata=metadata)
+    elif form == "pdf":
+        paper = FigureCanvasPdf(figure)
+        paper.print_pdf(path, metadata=metadata)
+    else:
+        paper = FigureCanvasSVG(figure)
+        paper.print_svg(path, metadata=metadata)
 
 
 def inline_svg(figure: Figure) -> str:

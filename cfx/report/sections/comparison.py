@@ -16,7 +16,15 @@ from cfx.evaluation.result import METHODS, Purpose
 from cfx.report.figures.canvas import finite
 from cfx.report.figures.jobs import draw_error_dots, error_limit
 from cfx.report.figures.text import FULL_TRAJECTORY, STEADY, TEST, explained, percent, short_label
-from cfx.report.job import Job, Runs, any_baselines, any_has_metric, metric_title, of_purpose
+from cfx.report.job import (
+    Job,
+    Runs,
+    any_baselines,
+    any_has_metric,
+    are_calibrations,
+    metric_title,
+    of_purpose,
+)
 from cfx.report.names import Row, any_adapts, baselines_of, methods_of, rows_over_seeds
 from cfx.report.section import (
     Cell,
@@ -89,8 +97,8 @@ class ComparisonSection(Section):
     entry = "Side by side"
     order = 200
     template = """
-<p>Errors in m/s and m compare across driving models and learners; lower is closer to the real
-driver.
+<p>Errors in m/s and m compare across driving models{{ " and learners" if adapts }}; lower is closer
+to the real driver.
 {% if runs.jobs | length > 1 %}
 The best of a column is bold where all jobs are tested on the same pairs.
 {% endif %}
@@ -103,11 +111,11 @@ upper reference for the models that follow.</p>
 {% endif %}
 {{ figure(errors, "Errors of every job and method", "RMSE of") }}
 <h3>Is it safe, and smooth?</h3>
-<p>The numbers are the policy's; the smaller line below is a baseline's.</p>
+<p>{{ numbers }}{{ "; the smaller line below is a baseline's" if adapts }}.</p>
 {{ table(safety, compact=true, explain=true) }}
 {% if every_metric %}
 {% call fold("Every metric of every job, test part") %}
-<p>The numbers are the policy's; the smaller line: driver-specific calibration.</p>
+<p>{{ numbers }}{{ "; the smaller line: driver-specific calibration" if adapts }}.</p>
 {{ table(every_metric, compact=true, explain=true) }}
 {% endcall %}
 {% endif %}
@@ -116,7 +124,11 @@ upper reference for the models that follow.</p>
     def context(self, runs: Runs) -> Mapping[str, Any]:
         """Return the comparison of all jobs."""
         jobs = runs.jobs
+        adapts = not are_calibrations(jobs)
+        whose = "the policy's" if adapts else "those of driver-specific calibration"
         return {
+            "adapts": adapts,
+            "numbers": f"The numbers are {whose}",
             "closeness": closeness(jobs),
             "unconditional": job_names(of_purpose(jobs, Purpose.POLICY)),
             "errors": absolute(jobs),
@@ -161,7 +173,8 @@ def safety(jobs: Sequence[Job]) -> Sheet:
     for metric, scope, baseline, form, heading in _SAFETY:
         if any(job.has_metric(metric, job.judged, scope) for job in jobs):
             meaning = _MEANINGS[metric] if scope == TEST else "The same over full trajectories."
-            meaning += f" Below it the same for {explained(baseline)}."
+            if not are_calibrations(jobs):
+                meaning += f" Below it the same for {explained(baseline)}."
             group = _IN_PLATOON if metric.startswith("platoon/") else _RECORDED
             cell = partial(_with_baseline, metric=metric, scope=scope, baseline=baseline, form=form)
             columns.append(Column(heading, cell, meaning, group))
@@ -230,7 +243,7 @@ def _gain(job: Job, baseline: str, scope: str) -> Cell:
 def _with_baseline(job: Job, metric: str, scope: str, baseline: str, form: str) -> Cell:
     """Returns the policy's number, and below it the baseline's."""
     second = ""
-    if job.has_metric(metric, baseline, scope):
+    if baseline != job.judged and job.has_metric(metric, baseline, scope):
         second = formatted(job.metric(metric, baseline, scope), form)
     return number(job.metric(metric, job.judged, scope), form, second)
 

@@ -12,7 +12,12 @@ from cfx.evaluation.result import Purpose
 from cfx.report.figures.improvements import BASE_LABELS, history_curves
 from cfx.report.figures.text import percent, plural, short_label
 from cfx.report.figures.trajectories import RankedPair, draw_pair, rank_pairs
-from cfx.report.job import Job, Runs, of_purpose
+from cfx.report.job import (
+    Job,
+    Runs,
+    are_calibrations,
+    of_purpose,
+)
 from cfx.report.section import MOST, Column, Section, Sheet, View, interval, job_names, number
 
 
@@ -65,7 +70,7 @@ class LearningSection(Section):
 {{ missing("curves.parquet", "the learning curves") }}
 """
 
-    def context(self, runs: Runs) -> Mapping[str, Any]:
+    def context(self, runs: Runs) -> Mapping[str, Any] | None:
         """Return the jobs that learned something with the number of networks, and the others."""
         learned, without = [], []
         for job in runs.jobs:
@@ -75,6 +80,8 @@ class LearningSection(Section):
                 learned.append((job.name, f"({networks})", job))
             elif table is not None:
                 without.append(job)
+        if not learned and are_calibrations(runs.jobs):
+            return None
         names = job_names(without) if len(without) <= MOST else f"{len(without)} jobs"
         return {"learned": learned, "without": names}
 

@@ -13,7 +13,15 @@ from cfx.evaluation.result import Purpose
 from cfx.evaluation.statistics import Improvement
 from cfx.report.figures.jobs import draw_overview, statistics_axis
 from cfx.report.figures.text import FULL_TRAJECTORY, MINUS, TEST, explained, label, short_label
-from cfx.report.job import Job, Runs, any_baselines, metric_title, of_purpose
+from cfx.report.job import (
+    OUTSIDE,
+    Job,
+    Runs,
+    any_baselines,
+    are_calibrations,
+    metric_title,
+    of_purpose,
+)
 from cfx.report.section import (
     Cell,
     Column,
@@ -116,6 +124,21 @@ def errors(jobs: Sequence[Job]) -> Sheet:
             "Pairs in which the simulated gap becomes negative on these frames.",
         ),
     ]
+    if any("fits" in job.tables for job in jobs):
+        columns += [
+            Column(
+                "Where calibrated: RMSE of speed (m/s)",
+                partial(_fitted, "rmse_speed"),
+                "The same over the part that driver-specific parameters were calibrated on. Where"
+                " the test part's error is much larger, they were fitted to more than the driver's"
+                " style.",
+            ),
+            Column(
+                "Where calibrated: RMSE of gap (m)",
+                partial(_fitted, "rmse_gap"),
+                "The same for the gap.",
+            ),
+        ]
     if any_baselines(jobs, FULL_TRAJECTORY):
         columns += [
             Column(
@@ -135,6 +158,14 @@ def errors(jobs: Sequence[Job]) -> Sheet:
 
 def _metric(name: str, row: _Tested, form: str = ".3f", scope: str = TEST) -> Cell:
     return number(row.job.metric(name, row.method, scope), form)
+
+
+def _fitted(name: str, row: _Tested) -> Cell:
+    """Returns a method's mean error where it was calibrated."""
+    fits = row.job.tables.get("fits")
+    if fits is None or f"train_{name}" not in fits:
+        return number(math.nan, ".3f")
+    return number(float(fits.loc[fits["method"] == row.method, f"train_{name}"].mean()), ".3f")
 
 
 class _Compared(NamedTuple):
@@ -243,8 +274,8 @@ class SafetySection(Section):
 <p>Slowing down of the last follower divided by that of the leader, and by that of the first
 follower; shares of the networks whose platoons are string stable, and had settled before the leader
 braked. Hard braking counts frames below \N{MINUS SIGN}8 m/s². At limits: share of frames at a limit
-of acceleration, where the guard steps in. Outside: share of frames outside what the policy has
-learned from.</p>
+of acceleration, where the guard steps in.
+{% if adapts %}Outside: share of frames outside what the policy has learned from.{% endif %}</p>
 {{ table(safety, compact=true) }}
 {% endcall %}
 {% else %}
@@ -265,7 +296,8 @@ learned from.</p>
 
     def context(self, runs: Runs) -> Mapping[str, Any]:
         """Return a table of all methods."""
-        return {"safety": safety_of_methods(runs.jobs)}
+        adapts = not are_calibrations(runs.jobs)
+        return {"safety": safety_of_methods(runs.jobs), "adapts": adapts}
 
 
 class _Driven(NamedTuple):
@@ -279,7 +311,7 @@ _SAFETY = (
     ("Jerk (m/s³)", "jerk", ".2f"),
     ("At bounds", "at_bounds", ".1%"),
     ("At limits", "at_limits", ".1%"),
-    ("Outside", "outside_range", ".1%"),
+    ("Outside", OUTSIDE, ".1%"),
     ("last / leader", "platoon/head_to_tail", ".2f"),
     ("last / first", "platoon/amplification", ".2f"),
     ("Stable", "platoon/string_stable", ".0%"),
@@ -302,6 +334,8 @@ def safety_of_methods(jobs: Sequence[Job]) -> Sheet:
         ),
     ]
     for heading, metric, form in _SAFETY:
+        if metric == OUTSIDE and are_calibrations(jobs):
+            continue
         recorded = "Behind recorded leaders, test part"
         group = "Platoon" if metric.startswith("platoon/") else recorded
         cell = partial(_measure, metric=metric, form=form)

@@ -13,7 +13,11 @@ import yaml
 from cfx.core.job_folder import without_folders
 from cfx.evaluation.result import Purpose
 from cfx.report.figures.text import NOTHING
-from cfx.report.job import Job, Runs
+from cfx.report.job import (
+    Job,
+    Runs,
+    are_calibrations,
+)
 from cfx.report.section import Column, Section, Sheet
 
 _TOGETHER = {"platoon": " of whole platoons", "recording": " of whole recordings"}
@@ -134,7 +138,7 @@ def _facts(job: Job, jobs: Sequence[Job]) -> dict[str, str]:
         "Drivers by style": str(job.setting("style.cluster") or NOTHING),
         "Protocol": _protocol(job),
         "Driving model": job.component("model") or NOTHING,
-        "Policy": f"{job.component('policy')}, {_learned(job)}",
+        **_policy(job, jobs),
         "Calibrated by": _calibration(job),
         "Seed": str(job.config.get("seed", NOTHING)),
         "cfx": job.version or "version not recorded",
@@ -195,6 +199,13 @@ def _range(values: pd.Series[Any]) -> str:
     return str(low) if low == high else f"{low} to {high}"
 
 
+def _policy(job: Job, jobs: Sequence[Job]) -> dict[str, str]:
+    """Returns which policy a job has; nothing where all jobs are calibrations."""
+    if are_calibrations(jobs):
+        return {}
+    return {"Policy": f"{job.component('policy')}, {_learned(job)}"}
+
+
 def _learned(job: Job) -> str:
     """Says how the policy was learned."""
     learner = job.component("learner")
@@ -213,9 +224,8 @@ def _protocol(job: Job) -> str:
         f" part is the last {test}"
     )
     if name == "within_driver":
-        said = (
-            f"calibrated and learned on the first {train} of each pair, tested on the last {test}"
-        )
+        used = "calibrated" if job.purpose is Purpose.CALIBRATION else "calibrated and learned"
+        said = f"{used} on the first {train} of each pair, tested on the last {test}"
     elif job.setting("protocol.folds") and not job.setting("protocol.run"):
         folds = f"{job.setting('protocol.folds')} folds"
         apart = _TOGETHER.get(str(job.setting("protocol.together")), "")

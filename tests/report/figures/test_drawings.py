@@ -66,13 +66,13 @@ def with_improvement(results: MadeUp, gains: dict[int, float]) -> Evaluation:
 @pytest.mark.parametrize(
     ("options", "files"),
     [
-        ({}, 8),
-        ({"space": TEN}, 8),
-        ({"pairs": 1, "epochs": 1}, 8),
-        ({"pairs": 94, "frames": 40, "space": TEN}, 8),
-        ({"pairs": 2, "frames": 1}, 8),
-        ({"pairs": 3, "networks": 0}, 7),
-        ({"pairs": 3, "methods": ("default", "population", "fixed", "policy")}, 8),
+        ({}, 11),
+        ({"space": TEN}, 11),
+        ({"pairs": 1, "epochs": 1}, 10),
+        ({"pairs": 94, "frames": 40, "space": TEN}, 11),
+        ({"pairs": 2, "frames": 1}, 10),
+        ({"pairs": 3, "networks": 0}, 10),
+        ({"pairs": 3, "methods": ("default", "population", "fixed", "policy")}, 11),
     ],
     ids=[
         "krauss",
@@ -217,7 +217,7 @@ def test_names_are_text_and_never_formulas(tmp_path: Path) -> None:
         trajectories=(dataclasses.replace(results.evaluation.trajectories[0], pair_id=name),),
     )
     odd = Results.of(evaluation, style=results.style, tables={"curves": results.curves})
-    assert len(write_figures(tmp_path, odd)) == 8
+    assert len(write_figures(tmp_path, odd)) == 10
 
 
 def test_cuts_and_cluster_sizes_stand_in_the_style_figure() -> None:
@@ -345,7 +345,7 @@ def test_platoon_and_history_are_written_where_a_protocol_delivered_them(tmp_pat
     every = Results.of(results.evaluation, style=results.style, tables=tables)
     names = {path.name for path in write_figures(tmp_path, every)}
     assert {"platoon.png", "history.png"} <= names
-    assert len(names) == 10
+    assert len(names) == 13
 
 
 def test_a_policy_that_does_not_adapt_has_no_figure_of_improvements() -> None:

@@ -1,0 +1,89 @@
+"""`cfx calibrate FILE`: a job that calibrates and trains nothing, in one word."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from cfx.core.command import Command
+from cfx.core.errors import ConfigError
+from cfx.core.files import path_override
+
+_CHOSEN = {"policy": "fixed", "protocol": "within_driver"}
+"""What a calibration chooses in place of the usual options; the command line may choose others."""
+
+_OWN_COLUMNS = ("data.columns", "data.units")
+
+
+class CalibrateCommand(Command):
+    """Calibrates a driving model to recordings."""
+
+    summary = "calibrate a model to recordings: cfx calibrate pairs.csv model=idm"
+
+    def parser(self) -> argparse.ArgumentParser:
+        parser = argparse.ArgumentParser(
+            "cfx calibrate",
+            description="Calibrates a driving model to each driver of recordings, on the first part"
+            " of their trajectories, and tests it on the rest (split=1: on the whole).",
+        )
+        parser.add_argument(
+            "words",
+            nargs="+",
+            metavar="FILE|KEY=VALUE",
+            help="recordings of one layout, and settings of the job: model=idm"
+            " objective=gap_rmse protocol=across_drivers (pooled parameters too) split=1",
+        )
+        parser.add_argument(
+            "-m", "--multirun", action="store_true", help="a job for each of model=idm,krauss"
+        )
+        return parser
+
+    def parse(self, arguments: Sequence[str]) -> argparse.Namespace:
+        return self.parser().parse_intermixed_args(list(arguments))
+
+    def run(self, options: argparse.Namespace) -> int:
+        from cfx.app import application
+
+        arguments = overrides_of(options.words)
+        if options.multirun:
+            arguments = ["--multirun", *arguments]
+        return application.start(arguments)
+
+
+def overrides_of(words: Sequence[str]) -> list[str]:
+    """Returns the overrides of the job that calibrates a model to files.
+
+    Args:
+        words: files and overrides.
+
+    Raises:
+        ConfigError: an override chooses a policy that is trained.
+        DataError: a file cannot be read, or no dataset knows its layout.
+    """
+    given = [word for word in words if "=" in word]
+    files = [Path(word).expanduser() for word in words if "=" not in word]
+    keys = {word.partition("=")[0] for word in given}
+    for word in given:
+        if word.startswith("policy=") and word.partition("=")[2] not in {"fixed", "default"}:
+            raise ConfigError(
+                f"cfx calibrate trains no policy: leave {word} out, or write cfx {word}"
+            )
+    found = [f"{key}={value}" for key, value in _CHOSEN.items() if key not in keys]
+    if files and "data" not in keys:
+        found.append(f"data={_dataset_of(files[0], given)}")
+    if len(files) == 1:
+        found.append(path_override("data.path", files[0]))
+    elif files:
+        listed = [path_override("", file).removeprefix("=") for file in files]
+        found.append(f"data.path=[{','.join(listed)}]")
+    return [*found, *given]
+
+
+def _dataset_of(file: Path, given: Sequence[str]) -> str:
+    """Returns which dataset reads a file: with columns of its own, the tidy one."""
+    from cfx.data.describe import dataset_of
+
+    if any(word.startswith(_OWN_COLUMNS) for word in given):
+        return "tidy"
+    return dataset_of(file)
