@@ -100,7 +100,7 @@ def test_the_edges_of_what_is_recorded(
     undefined = {name.split("/")[0] for name, value in metrics.items() if value is None}
     assert undefined <= {"nrmse_speed", "theil_u", "min_ttc", "rmse_improvement", "steady"}
     if metrics["rmse_improvement/mean"] is None:
-        assert "Over fixed: 3 of 3 pairs have no improvement" in out
+        assert "Over driver-specific: 3 of 3 pairs have no improvement" in out
 
 
 def test_the_precision_is_no_part_of_the_result(tmp_path: Path) -> None:

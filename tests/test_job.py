@@ -115,7 +115,7 @@ def test_the_terminal_says_what_matters(finished: cfx.JobResult) -> None:
     text = (finished.folder.parent / "stdout.txt").read_text()
     for word in (
         "default",
-        "fixed",
+        "driver-specific",
         "policy",
         "RMSE speed",
         "95 % interval",

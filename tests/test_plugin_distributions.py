@@ -45,6 +45,7 @@ PROTOCOLS = {
     "cfx.models.limits",
     "cfx.models.speed_limit",
     "cfx.policies.features",
+    "cfx.simulation.rollout",
 }
 POLICIES = {"cfx.policies.checkpoint", "cfx.policies.ready", "cfx.policies.valid_range"}
 PUBLIC_MODULES = {"cfx", "cfx.core.errors", *READERS, *REPORTS, *PROTOCOLS, *POLICIES} | {

@@ -258,7 +258,12 @@ class Agent:
 
     @torch.no_grad()
     def act(
-        self, history: History, state: AgentState, generator: torch.Generator | None = None
+        self,
+        history: History,
+        state: AgentState,
+        generator: torch.Generator | None = None,
+        *,
+        noise: Tensor | None = None,
     ) -> tuple[Tensor, AgentState]:
         """Chooses the parameters of the next window.
 
@@ -269,6 +274,7 @@ class Agent:
             state: where they stand.
             generator: draws, on the CPU, what a stochastic head leaves to chance; None: nothing is
                 drawn.
+            noise: what was drawn already, as for `choose`.
 
         Returns:
             Parameters `(D, n)` in SI units, in the dtype of the history, and the state afterwards.
@@ -282,7 +288,6 @@ class Agent:
                 f"{registry.origin(self.policy)}: its networks answer numbers that are not finite;"
                 " train with a smaller learner.learning_rate, or repair that policy"
             )
-        noise = None
         if generator is not None and self.is_stochastic:
             shape = (len(answer), self.head.noise_width)
             noise = torch.randn(shape, generator=generator, dtype=torch.float64)

@@ -25,14 +25,14 @@ class CalibrateCommand(Command):
         parser = argparse.ArgumentParser(
             "cfx calibrate",
             description="Calibrates a driving model to each driver of recordings, on the first part"
-            " of their trajectories, and tests it on the rest (split=1: on the whole).",
+            " of their trajectories, and tests it on the rest.",
         )
         parser.add_argument(
             "words",
             nargs="+",
             metavar="FILE|KEY=VALUE",
             help="recordings of one layout, and settings of the job: model=idm"
-            " objective=gap_rmse protocol=across_drivers (pooled parameters too) split=1",
+            " objective=gap_rmse protocol=across_drivers (pooled parameters too) split=0.5",
         )
         parser.add_argument(
             "-m", "--multirun", action="store_true", help="a job for each of model=idm,krauss"

@@ -8,7 +8,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from cfx import DrivingModel, Follower, Leader, Start, simulate
+from cfx import DrivingModel, Follower, Leader, Start
+from cfx.simulation.rollout import simulate
 
 LENGTH = 5.0
 

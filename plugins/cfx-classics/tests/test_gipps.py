@@ -10,8 +10,9 @@ import torch
 from scipy.optimize import brentq
 from torch import Tensor
 
-from cfx import Leader, Start, simulate
+from cfx import Leader, Start
 from cfx.contracts.models import keeps_its_equilibrium
+from cfx.simulation.rollout import simulate
 from cfx_classics.gipps import Gipps
 
 from .steps import next_speed, number

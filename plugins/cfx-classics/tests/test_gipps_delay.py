@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 import cfx
-from cfx import DrivingModel, Follower, Leader, Start, simulate
+from cfx import DrivingModel, Follower, Leader, Start
 from cfx.contracts.models import keeps_its_equilibrium
 from cfx.core.errors import ConfigError
+from cfx.simulation.rollout import simulate
 from cfx_classics.gipps import Gipps
 from cfx_classics.gipps_delay import GippsDelay
 

@@ -9,8 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx import Leader, Start, simulate
+from cfx import Leader, Start
 from cfx.contracts.models import keeps_its_equilibrium
+from cfx.simulation.rollout import simulate
 from cfx_classics.newell import Newell
 
 from .steps import LENGTH, gain, next_speed, number

@@ -12,9 +12,10 @@ from scipy.integrate import solve_ivp
 from torch import Tensor
 
 import cfx
-from cfx import DrivingModel, Leader, Start, simulate
+from cfx import DrivingModel, Leader, Start
 from cfx.contracts import check_contract
 from cfx.contracts.models import keeps_its_equilibrium
+from cfx.simulation.rollout import simulate
 from cfx_classics.fvdm import FVDM
 from cfx_classics.ovm import OVM
 

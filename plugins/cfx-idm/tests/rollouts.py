@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from scipy.integrate import solve_ivp
 
-from cfx import DrivingModel, Leader, Start, simulate
+from cfx import DrivingModel, Leader, Start
+from cfx.simulation.rollout import simulate
 
 LENGTH = 5.0
 MEAN, SWING, PACE = 14.0, 3.0, 0.25  # the leader's speed is MEAN + SWING sin(PACE t), m/s

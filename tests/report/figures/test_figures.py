@@ -43,7 +43,13 @@ def everything() -> Results:
     )
     fits = pd.DataFrame({"pair_id": ids, "method": "fixed"})
     labels = pd.DataFrame({"pair_id": ids[0], "time_s": [0.0, 0.5], "sensitivity": [0.1, 0.2]})
+    sites = pd.DataFrame(
+        [("test", "A", "all"), ("test", "A", "acc"), ("full_trajectory", "A", "all")],
+        columns=["scope", "site", "driver_type"],
+    )
+    gains = {"over_fixed": 0.1, "over_fixed_low": -0.1, "over_fixed_high": 0.2}
     tables = {
+        "sites": sites.assign(**gains),
         "platoon": make_platoon({"policy": 2}).table,
         "history": make_history(made.evaluation.trajectories, GAINS),
         "forecasts": forecasts,

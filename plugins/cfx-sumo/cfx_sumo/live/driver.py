@@ -911,11 +911,10 @@ class Driver:
             return
         store = self._store
         history, state = self._known(slots)
+        noise = None
         if self._seed is not None and self.policy.is_stochastic:
             noise = standard_normal(self._seed, names, now, self.policy.head.noise_width)
-            chosen, after = self.policy.choose(history, state, noise)
-        else:
-            chosen, after = self.policy.act(history, state)
+        chosen, after = self.policy.act(history, state, noise=noise)
         store.parameters[slots] = chosen
         store.score[slots], store.beyond[slots] = after.score, after.beyond
         store.latent[slots] = after.latent
