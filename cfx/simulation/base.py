@@ -100,7 +100,9 @@ class Stepper(ABC):
 
         Args:
             segments: P segments.
-            p, terms, key: as for `accumulate`.
+            p: as for `accumulate`.
+            terms: as for `accumulate`.
+            key: as for `accumulate`.
             every: each so many-th frame is returned.
 
         Returns:
