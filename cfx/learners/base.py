@@ -7,6 +7,7 @@ may learn from the same; N networks, W windows of the longest training part, n t
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
@@ -151,6 +152,11 @@ class Learner(Component):
     needs_labels: ClassVar[bool] = False
     needs_gradients: ClassVar[bool] = False
     uses_driver_features: ClassVar[bool] = False
+
+    @property
+    def learned_before(self) -> Mapping[str, str]:
+        """The pairs that networks have learned from before they begin (`TrainedOn.pairs`)."""
+        return {}
 
     @property
     def reads_history(self) -> bool:

@@ -186,6 +186,7 @@ class AcrossDrivers(Protocol):
         split = Split.of(pairs, context.windows, context.split)
         tested = fold >= 0
         of_tested = pairs.select(tested.tolist(), "not tested")
+        context.check_start(of_tested)
         split[tested].check_test_parts(of_tested, context.windows, context.split)
         full = Split.none(pairs, context.windows)
         calibrator, batch = context.calibrator, context.batch

@@ -20,9 +20,9 @@ from cfx.calibration.windows import Windows, WindowSettings
 from cfx.core import registry
 from cfx.core.component import Component
 from cfx.core.engine.base import Engine
-from cfx.core.errors import PluginError
+from cfx.core.errors import DataError, PluginError
 from cfx.core.parameters import ParameterSpace
-from cfx.data.pairs import PairBatch, PairSet
+from cfx.data.pairs import LearnedFrom, PairBatch, PairSet
 from cfx.data.style import StyleResult
 from cfx.evaluation.metrics.base import MetricSet
 from cfx.evaluation.result import Evaluation
@@ -140,6 +140,23 @@ class ProtocolContext:
         """
         losses = self.calibrator.losses(self.batch, last, parameters, members)
         return {f"calibration/{name}/{method}": loss for name, loss in losses.items()}
+
+    def check_start(self, tested: PairSet) -> None:
+        """Checks that networks begin with nothing learned from the pairs that are tested.
+
+        Raises:
+            DataError: they have learned from some.
+        """
+        if not self.policy.trainable:
+            return
+        learned_from = LearnedFrom(self.learner.learned_before)
+        known = [pair.pair_id for pair in tested if pair in learned_from]
+        if known:
+            raise DataError(
+                f"learner.start: that policy has learned from {len(known)} of the {len(tested)}"
+                f" pairs that are tested here, the first of them '{known[0]}'; test on others"
+                " (data.recording, data.pair_ids)"
+            )
 
     def constant(self, policy: Policy, parameters: Tensor) -> Agent:
         """Returns an agent of a policy as built, without training: the baselines.

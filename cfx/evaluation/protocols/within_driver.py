@@ -49,6 +49,7 @@ class WithinDriver(Protocol):
 
     def run(self, context: ProtocolContext) -> ProtocolResult:
         pairs, batch = context.pairs, context.batch
+        context.check_start(context.pairs)
         split = Split.of(pairs, context.windows, context.split)
         split.check_test_parts(pairs, context.windows, context.split)
         fixed = context.calibrator.fixed(pairs, batch, split.frame)

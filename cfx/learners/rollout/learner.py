@@ -90,6 +90,14 @@ class RolloutLearner(Learner):
     def reads_history(self) -> bool:
         return self.settings.cold_start_fraction < 1.0
 
+    @property
+    def learned_before(self) -> Mapping[str, str]:
+        # Of one network among several nobody knows which pairs it was kept from.
+        start = self.settings.start
+        if start is None or "#" in start:
+            return {}
+        return start_policy(start).trained_on.pairs
+
     def fit(self, policy: Policy, training_data: TrainingData) -> TrainingResult:
         """As `Learner.fit`.
 

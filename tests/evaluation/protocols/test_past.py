@@ -11,7 +11,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 import cfx
-from cfx.core.errors import ConfigError
+from cfx.core.errors import ConfigError, DataError
 from cfx.evaluation.protocols.past import PastErrors, with_bounds_of_other_folds
 from cfx.evaluation.result import Array
 from cfx.policies.checkpoint import load
@@ -126,3 +126,11 @@ def test_a_policy_that_combines_does_so_wherever_it_is_tested(tmp_path: Path) ->
 def test_a_driver_without_a_past_has_no_own_parameters() -> None:
     with pytest.raises(ConfigError, match=r"combine: .*leave history: null"):
         cfx.run([*QUICK, "protocol.combine=true", "protocol.history=0.0"])
+
+
+def test_networks_do_not_begin_with_what_is_tested(tmp_path: Path) -> None:
+    folder = tmp_path / "job"
+    few = [*QUICK, "data.pairs=4"]
+    cfx.run([*few, f"hydra.run.dir={folder}"])
+    with pytest.raises(DataError, match=r"learner\.start: .* has learned from 4 of the 4 pairs"):
+        cfx.run([*few, "learner=rollout", f"learner.start={folder}"])
