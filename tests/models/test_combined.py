@@ -8,7 +8,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.contracts import models
 from cfx.models.base import DrivingModel, Leader
 from cfx.models.combined import Combined, for_both
 from cfx.models.idm import IDM
@@ -17,18 +16,9 @@ from cfx.models.residual import WithResidual
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.trajectory import Start
+from tests.models.wrapped import CHECKS
 
 DT = 0.1
-
-CHECKS = (
-    models.every_parameter_says_what_it_is,
-    models.keeps_shape_dtype_and_device,
-    models.is_pure,
-    models.a_batch_equals_the_loop_over_it,
-    models.speeds_are_finite_and_not_negative_at_every_extreme,
-    models.a_bad_neighbour_does_no_harm,
-    models.no_rollout_leaves_what_is_finite,
-)
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=[check.__name__ for check in CHECKS])

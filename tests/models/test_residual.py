@@ -9,7 +9,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.contracts import models
 from cfx.core.errors import ConfigError
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.models.base import DrivingModel, Follower, Leader
@@ -21,6 +20,7 @@ from cfx.simulation.kernel.run import model_key
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.trajectory import Start
 from cfx_sumo.vtype import SumoVType
+from tests.models.wrapped import CHECKS
 
 DT = 0.1
 
@@ -53,18 +53,6 @@ def speeds(model: DrivingModel, start: Start, leader: Leader, *parameters: float
 def start(speed: float, acceleration: float) -> Start:
     values = (0.0, speed, acceleration)
     return Start(*(torch.tensor([value], dtype=torch.float64) for value in values))
-
-
-CHECKS = (
-    models.every_parameter_says_what_it_is,
-    models.keeps_shape_dtype_and_device,
-    models.is_pure,
-    models.a_batch_equals_the_loop_over_it,
-    models.speeds_are_finite_and_not_negative_at_every_extreme,
-    models.a_bad_neighbour_does_no_harm,
-    models.no_rollout_leaves_what_is_finite,
-)
-"""What of the contract of models can hold: a first step asks nobody for the leader."""
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=[check.__name__ for check in CHECKS])
