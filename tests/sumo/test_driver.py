@@ -145,9 +145,9 @@ def counted(policy: Agent, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     calls: list[int] = []
     original = Agent.act
 
-    def act(self: Agent, history: Any, state: Any) -> tuple[Tensor, Any]:
+    def act(self: Agent, history: Any, state: Any, **options: Any) -> tuple[Tensor, Any]:
         calls.append(len(history.gap))
-        return original(self, history, state)
+        return original(self, history, state, **options)
 
     monkeypatch.setattr(Agent, "act", act)
     return calls
