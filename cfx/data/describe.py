@@ -24,7 +24,8 @@ from cfx.data.files import Floats, beginning, partitions
 from cfx.data.kinematics import in_words
 from cfx.data.pairs import Dropped, Pair, PairSet
 from cfx.data.resample import frames_in_steps
-from cfx.data.style import STANDING_MPS
+from cfx.data.site_styles import ALL, NOT_KNOWN, style_distances, styles_by_site
+from cfx.data.style import INDICATORS, STANDING_MPS, StyleResult, name_of_indicator
 
 log = logging.getLogger(__name__)
 
@@ -48,13 +49,34 @@ _TYPES = {"driver_type": "followers", "leader_driver_type": "leaders"}
 """Labels of a pair, and the questions that they answer."""
 
 _WIDTH = 110
+_WIDE = 150
+"""Characters in a line, and in one of the table of styles."""
 
 _ROUND = 50
 """Frames; a least length that is advised is a multiple of it, if pairs are that long."""
 
 
+class Description(NamedTuple):
+    """What a recording holds.
+
+    Attributes:
+        text: for people.
+        pairs: all of the file; none of a folder, whose files are read one after the other.
+    """
+
+    text: str
+    pairs: PairSet | None
+
+
 def describe(path: Path, settings: Mapping[str, Any] | None = None, options: str = "") -> str:
-    """Says what a recording holds.
+    """Says what a recording holds; arguments and errors are those of `described`."""
+    return described(path, settings, options).text
+
+
+def described(
+    path: Path, settings: Mapping[str, Any] | None = None, options: str = ""
+) -> Description:
+    """Reads a recording and says what it holds.
 
     These are its rows, recordings and pairs, their motion, what was left out and why, and what
     looks wrong. Without settings the layout is found from the file itself: each dataset says
@@ -73,7 +95,7 @@ def describe(path: Path, settings: Mapping[str, Any] | None = None, options: str
         settings = {"name": dataset_of(path)}
     reader = _Reader(settings, options)
     if reader.name == "tidy" and path.is_dir():
-        return _describe_partitions(path, reader)
+        return Description(_describe_partitions(path, reader), None)
     dataset = reader.of(path)
     contents = dataset.contents()
     pieces: list[RenderableType] = [str(path), "", _overview(dataset.layout, contents)]
@@ -85,7 +107,96 @@ def describe(path: Path, settings: Mapping[str, Any] | None = None, options: str
     pieces += ["", *_problems(contents, dataset)]
     more, kept = _advice(_lengths(contents.pairs), dataset.settings.min_frames)
     pieces += ["", reader.use(path) + more, *kept]
-    return _text(pieces)
+    return Description(_text(pieces), contents.pairs)
+
+
+def describe_sites(pairs: PairSet) -> str:
+    """Compares the sites of pairs: a row for each, and for its types of drivers."""
+    table = Table(title="By site: medians over frames (5 % to 95 %)", title_justify="left")
+    table.box = None
+    table.add_column("site")
+    for heading in ("pairs", "drivers", "minutes", "speed, m/s", "time headway, s", "gap, m"):
+        table.add_column(heading, justify="right")
+    of_site: dict[str, list[Pair]] = {}
+    for pair in pairs:
+        of_site.setdefault(pair.site or pair.recording, []).append(pair)
+    for site, some in of_site.items():
+        table.add_row(site, *_site_cells(some))
+        kinds = dict.fromkeys(pair.driver_type for pair in some)
+        for kind in kinds if len(kinds) > 1 else ():
+            mine = [pair for pair in some if pair.driver_type == kind]
+            table.add_row(f"  {kind or NOT_KNOWN}", *_site_cells(mine))
+    return _text([table], _WIDE)
+
+
+def _site_cells(pairs: Sequence[Pair]) -> Iterator[str]:
+    """Yields the cells of some pairs' row: counts, then how they drive."""
+    yield f"{len(pairs):,}"
+    yield f"{len({pair.driver for pair in pairs}):,}"
+    yield f"{sum(len(pair) * pair.dt for pair in pairs) / 60:,.0f}"
+    speed = np.concatenate([pair.follower_speed for pair in pairs])
+    headway = np.concatenate([pair.leader_position - pair.follower_position for pair in pairs])
+    moving = speed >= STANDING_MPS
+    gap = np.concatenate([pair.gap for pair in pairs])
+    for values in (speed, headway[moving] / speed[moving], gap):
+        if not len(values):
+            yield "-"
+            continue
+        low, middle, high = np.quantile(values, [0.05, 0.5, 0.95])
+        yield f"{middle:.1f} ({low:.1f} to {high:.1f})"
+
+
+def describe_style(style: StyleResult) -> str:
+    """Says how the driving styles of sites differ, and in which indicator.
+
+    Args:
+        style: of drivers of at least two sites.
+    """
+    sites, distances = styles_by_site(style), style_distances(style)
+    if sites is None:
+        return "Driving style: there is one site alone; give the files of several"
+    table = Table(
+        title="Driving style, 0 conservative to 1 aggressive: medians over drivers",
+        title_justify="left",
+        box=None,
+        padding=(0, 1, 0, 0),
+    )
+    table.add_column("site", no_wrap=True)
+    for heading in ("drivers", "score", "95 %"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for one in INDICATORS:
+        words = name_of_indicator(one.name).replace(" ", "\n")
+        table.add_column(f"{words}\n{one.unit}", justify="right", no_wrap=True)
+    weights = [f"{style.weights[one.name]:.2f}" for one in INDICATORS]
+    table.add_row("entropy weight", "", "", "", *weights)
+    for row in sites.to_dict("records"):
+        is_whole = row["driver_type"] == ALL
+        interval = "-"
+        if np.isfinite(row["score_low"]):
+            interval = f"{row['score_low']:.3f} to {row['score_high']:.3f}"
+        values = [f"{row[one.name]:.2f}" for one in INDICATORS]
+        name = row["site"] if is_whole else f"  {row['driver_type']}"
+        score = f"{row['score_median']:.3f}"
+        table.add_row(str(name), str(row["drivers"]), score, interval, *values)
+    pieces: list[RenderableType] = [table]
+    if distances is not None:
+        apart = Table(title="How far apart: energy distance of the scores", title_justify="left")
+        apart.box = None
+        for heading in ("", "", "distance", "p", "differ most in"):
+            apart.add_column(heading, justify="right" if heading in ("distance", "p") else "left")
+        for row in distances.to_dict("records"):
+            ends = [
+                _of_group(row["site"], row["driver_type"]),
+                _of_group(row["other_site"], row["other_driver_type"]),
+            ]
+            most = name_of_indicator(str(row["most"]))
+            apart.add_row(*ends, f"{row['distance']:.3f}", f"{row['p_value']:.3f}", most)
+        pieces += ["", apart]
+    return _text(pieces, _WIDE)
+
+
+def _of_group(site: object, kind: object) -> str:
+    return str(site) if kind == ALL else f"{site}, {kind}"
 
 
 class _Reader(NamedTuple):
@@ -150,10 +261,10 @@ def _describe_partitions(folder: Path, reader: _Reader) -> str:
     )
 
 
-def _text(pieces: Sequence[RenderableType]) -> str:
+def _text(pieces: Sequence[RenderableType], width: int = _WIDTH) -> str:
     """Returns paragraphs and tables as one text."""
     text = io.StringIO()
-    console = Console(file=text, width=_WIDTH, highlight=False, markup=False, emoji=False)
+    console = Console(file=text, width=width, highlight=False, markup=False, emoji=False)
     for piece in pieces:
         console.print(piece, soft_wrap=isinstance(piece, str))
     return "\n".join(line.rstrip() for line in text.getvalue().splitlines())

@@ -42,16 +42,23 @@ class Indicator(NamedTuple):
 
     name: str
     sign: int
+    unit: str
 
 
 INDICATORS = (
-    Indicator("mean_speed", 1),
-    Indicator("variance_speed", 1),
-    Indicator("mean_acceleration", 1),
-    Indicator("variance_acceleration", 1),
-    Indicator("mean_space_headway", -1),
-    Indicator("mean_time_headway", -1),
+    Indicator("mean_speed", 1, "m/s"),
+    Indicator("variance_speed", 1, "m2/s2"),
+    Indicator("mean_acceleration", 1, "m/s2"),
+    Indicator("variance_acceleration", 1, "m2/s4"),
+    Indicator("mean_space_headway", -1, "m"),
+    Indicator("mean_time_headway", -1, "s"),
 )
+
+
+def name_of_indicator(name: str) -> str:
+    """Returns an indicator's name in words: "variance of speed"."""
+    return name.replace("variance_", "variance of ").replace("_", " ")
+
 
 CLUSTERS = ("conservative", "normal", "aggressive")
 """Names of the clusters 0, 1, 2: the bottom quarter, the middle half, the top quarter of scores."""
@@ -90,9 +97,10 @@ class StyleResult:
     """Driving style of every driver.
 
     Attributes:
-        table: a row per driver: driver, score, cluster (0, 1, 2), cluster_name, and the six raw
+        table: a row per driver: driver, score, cluster (0, 1, 2), cluster_name, the six raw
             indicators `mean_speed`, `variance_speed`, `mean_acceleration`, `variance_acceleration`,
-            `mean_space_headway`, `mean_time_headway` (SI units).
+            `mean_space_headway`, `mean_time_headway` (SI units), and where they are known `site`
+            (those of a driver of several are joined by "; ") and `driver_type`.
         weights: entropy weight of each indicator; they are not negative and sum to 1.
         cuts: the two scores that separate the clusters.
     """
@@ -130,8 +138,20 @@ def measure_style(pairs: PairSet, settings: StyleSettings) -> StyleResult:
     table.insert(1, "score", score)
     table.insert(2, "cluster", cluster)
     table.insert(3, "cluster_name", [CLUSTERS[number] for number in cluster])
+    if any(pair.site for pair in pairs):
+        table["site"], table["driver_type"] = _whereabouts(pairs, table["driver"].tolist())
     by_name = dict(zip(names, weights.tolist(), strict=True))
     return StyleResult(table, by_name, (float(low), float(high)))
+
+
+def _whereabouts(pairs: PairSet, drivers: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Returns the sites and the type of each driver."""
+    sites: dict[str, dict[str, None]] = {}
+    kinds: dict[str, str] = {}
+    for pair in pairs:
+        sites.setdefault(pair.driver, {})[pair.site] = None
+        kinds[pair.driver] = pair.driver_type
+    return ["; ".join(sites[name]) for name in drivers], [kinds[name] for name in drivers]
 
 
 def select_cluster(pairs: PairSet, style: StyleResult, cluster: str) -> PairSet:

@@ -12,6 +12,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from cfx.calibration.flatness import flat_for
+from cfx.data.site_styles import style_distances, styles_by_site
+from cfx.data.style import INDICATORS
 from cfx.evaluation.distributions import (
     LEVEL,
     centre_errors,
@@ -174,6 +176,8 @@ class Style(ResultTable):
         Column("mean_time_headway", "s", "an indicator", required=False),
         Column("frames", "1", "frames of the driver", "int", required=False),
         Column("standing_frames", "1", "frames in which the driver stands", "int", required=False),
+        Column("site", "", "the road or area; several are joined by `; `", "text", required=False),
+        Column("driver_type", "", "what drives", "text", required=False),
     )
 
     def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
@@ -481,6 +485,52 @@ def _sites_printed(rows: pd.DataFrame, scope: str) -> Table:
 
 def _is_there(rows: pd.DataFrame, name: str) -> bool:
     return name in rows and bool(rows[name].notna().any())
+
+
+class SiteStyles(ResultTable):
+    """Driving style by site, where pairs are of several sites."""
+
+    meaning = "driving style by site and type of driver, where there are several sites"
+    suffix = ".csv"
+    order = 51
+    columns = (
+        Column("site", "", "the road or area", "text"),
+        Column("driver_type", "", "what drives, `all` for all of them", "text"),
+        Column("drivers", "1", "its drivers", "int"),
+        Column("score_median", "1", "median of their style scores"),
+        Column("score_low", "1", "lower end of the median's 95 % interval over drivers"),
+        Column("score_high", "1", "its upper end"),
+        Column("score_q25", "1", "lower quartile of the scores"),
+        Column("score_q75", "1", "upper quartile of the scores"),
+        *(Column(one.name, one.unit, "median of an indicator") for one in INDICATORS),
+    )
+
+    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
+        return [styles_by_site(findings.style)]
+
+
+class StyleDistances(ResultTable):
+    """How far apart the driving styles of sites are, and of types of drivers within a site."""
+
+    meaning = "energy distances between the style scores of sites, and of types of drivers there"
+    suffix = ".csv"
+    order = 52
+    columns = (
+        Column("site", "", "the road or area", "text"),
+        Column("driver_type", "", "what drives, `all` for all of them", "text"),
+        Column("other_site", "", "what it is compared with", "text"),
+        Column("other_driver_type", "", "likewise", "text"),
+        Column("distance", "1", "energy distance of the scores"),
+        Column("p_value", "1", "of a permutation of drivers, corrected for all comparisons"),
+        Column("most", "", "the indicator that differs most", "text"),
+        *(
+            Column(f"distance_{one.name}", "1", "of a normalised indicator times its weight")
+            for one in INDICATORS
+        ),
+    )
+
+    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
+        return [style_distances(findings.style)]
 
 
 _WORSE = 1.1

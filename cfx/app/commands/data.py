@@ -6,10 +6,13 @@ import argparse
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cfx.core.command import Command
-from cfx.core.errors import CfxError, ConfigError
+from cfx.core.errors import CfxError, ConfigError, DataError
+
+if TYPE_CHECKING:
+    from cfx.data.style import StyleResult
 
 
 class DataCommand(Command):
@@ -27,6 +30,16 @@ class DataCommand(Command):
             metavar="FILE",
             help="a recording; and settings of the reader, such as data.columns.speed=v_kmh"
             " data.units.speed=km/h (of data=tidy unless data=NAME is among them)",
+        )
+        describe.add_argument(
+            "--style",
+            action="store_true",
+            help="compare the driving styles of several files' sites too",
+        )
+        describe.add_argument(
+            "--figure",
+            metavar="FILE",
+            help="draw the driving styles of the sites into a file (.png, .svg, .pdf)",
         )
         fetch = actions.add_parser(
             "fetch",
@@ -52,22 +65,80 @@ class DataCommand(Command):
         if options.action == "fetch":
             _fetch(options)
             return 0
-        from cfx.data.describe import describe
-
-        overrides = [word for word in options.files if _is_setting(word)]
-        files = [word for word in options.files if not _is_setting(word)]
-        if not files:
-            raise ConfigError("cfx data describe: name the file to look at")
-        settings = None
-        if overrides:
-            settings = _settings(overrides)
-        own = [word for word in overrides if not word.startswith("data=")]
-        words = "".join(f" {shlex.quote(word)}" for word in own)
-        for number, file in enumerate(files):
-            if number:
-                print()
-            print(describe(Path(file), settings, words))
+        _describe(options)
         return 0
+
+
+def _describe(options: argparse.Namespace) -> None:
+    """Prints what each file holds, and compares their sites if there are several.
+
+    Raises:
+        ConfigError: no file is named, or `--style` or `--figure` has nothing to compare.
+        DataError: a file cannot be used; or a pair stands in two of those that are compared.
+    """
+    from cfx.data.base import joined
+    from cfx.data.describe import describe_sites, describe_style, described
+    from cfx.data.sites import with_sites, with_vehicles
+    from cfx.data.style import StyleSettings, measure_style
+
+    overrides = [word for word in options.files if _is_setting(word)]
+    files = [word for word in options.files if not _is_setting(word)]
+    if not files:
+        raise ConfigError("cfx data describe: name the file to look at")
+    settings = _settings(overrides) if overrides else None
+    own = [word for word in overrides if not word.startswith("data=")]
+    words = "".join(f" {shlex.quote(word)}" for word in own)
+    read = []
+    for file in files:
+        description = described(Path(file), settings, words)
+        print(description.text, end="\n\n" if len(files) > 1 else "\n")
+        if description.pairs is not None and len(description.pairs):
+            read.append(description.pairs)
+    compares = options.style or options.figure is not None
+    try:
+        pairs = joined(read) if read else None
+    except DataError as error:  # the files overlap
+        if compares:
+            raise
+        print(f"Problem: {error}")
+        return
+    settings = settings or {}
+    if pairs is not None:
+        pairs = with_vehicles(with_sites(pairs, settings.get("site")), settings.get("vehicle"))
+    if pairs is None or len({pair.site for pair in pairs}) < 2:
+        if compares:
+            raise ConfigError(
+                "cfx data describe: --style and --figure compare sites, and there is one alone;"
+                " name the files of several, or say which recordings are of which site (data.site)"
+            )
+        return
+    print(describe_sites(pairs))
+    if compares:
+        style = measure_style(pairs, StyleSettings())
+        print(f"\n{describe_style(style)}")
+        if options.figure:
+            _draw(style, Path(options.figure).expanduser())
+
+
+def _draw(style: StyleResult, path: Path) -> None:
+    """Draws the driving styles of sites into a file.
+
+    Raises:
+        ConfigError: its ending is none of a figure.
+    """
+    from cfx.core.files import atomic_write
+    from cfx.data.site_styles import style_distances
+    from cfx.report.figures.site_styles import draw_site_styles
+
+    if path.suffix not in _FIGURES:
+        raise ConfigError(f"--figure {path}: its name must end in {', '.join(_FIGURES)}")
+    figure = draw_site_styles(style, style_distances(style))
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, format=path.suffix[1:])
+    print(f"\nFigure: {path}")
+
+
+_FIGURES = (".png", ".svg", ".pdf")
 
 
 def _is_setting(word: str) -> bool:

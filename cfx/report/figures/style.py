@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from cfx.data.style import CLUSTERS, StyleResult
+from cfx.data.style import CLUSTERS, StyleResult, name_of_indicator
 from cfx.report.figures.canvas import (
     Array,
     canvas,
@@ -21,15 +21,6 @@ from cfx.report.figures.canvas import (
 from cfx.report.figures.figure import JobFigure, Results
 from cfx.report.figures.text import plural
 from cfx.results.look import CLUSTER_COLOURS, INK
-
-INDICATORS = {
-    "mean_speed": "mean speed",
-    "variance_speed": "variance of speed",
-    "mean_acceleration": "mean acceleration",
-    "variance_acceleration": "variance of acceleration",
-    "mean_space_headway": "mean space headway",
-    "mean_time_headway": "mean time headway",
-}
 
 
 def score_bins(scores: Array) -> Array:
@@ -99,7 +90,7 @@ def _weights(axes: Axes, weights: Mapping[str, float]) -> None:
     names, values = list(weights), list(weights.values())
     places = np.arange(len(names), dtype=float)
     axes.barh(places, values, height=0.62, color="#b5b5b5")
-    axes.set_yticks(places, [INDICATORS.get(name, name) for name in names])
+    axes.set_yticks(places, [name_of_indicator(name) for name in names])
     axes.invert_yaxis()
     for place, value in zip(places, values, strict=True):
         axes.text(

@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from cfx.core import registry
+from cfx.data.site_styles import ALL
+from cfx.data.style import name_of_indicator
 from cfx.evaluation.result import Purpose
 from cfx.report.figures.improvements import BASE_LABELS, history_curves
 from cfx.report.figures.text import percent, plural, short_label
@@ -36,10 +38,15 @@ class StyleSection(Section):
     title = "Driving style"
     entry = "Driving style"
     order = 1500
-    figures = ("style_distribution",)
+    figures = ("style_distribution", "site_styles")
     template = """
 <p>{{ caption("style_distribution") }}</p>
 {{ cards("style_distribution", scorings) }}
+{% if by_site %}
+<p>{{ caption("site_styles") }}</p>
+{{ cards("site_styles", by_site) }}
+{{ table(distances) }}
+{% endif %}
 {{ missing("style.csv", "the distribution of the style scores") }}
 """
 
@@ -53,7 +60,40 @@ class StyleSection(Section):
                 jobs.setdefault(scoring, []).append(job)
         named = len(jobs) > 1
         scorings = [(job_names(one) if named else "", "", one[0]) for one in jobs.values()]
-        return {"scorings": scorings}
+        by_site = [one for one in scorings if "style_distances" in one[2].tables]
+        rows: list[dict[str, Any]] = []
+        for name, _, job in by_site:
+            for row in job.tables["style_distances"].to_dict("records"):
+                rows.append({"jobs": name, **{str(key): row[key] for key in row}})
+        distances = Sheet.of(_DISTANCES if named else _DISTANCES[1:], rows)
+        return {"scorings": scorings, "by_site": by_site, "distances": distances}
+
+
+def _group(row: Mapping[str, Any], prefix: str) -> str:
+    site, kind = row[f"{prefix}site"], row[f"{prefix}driver_type"]
+    return str(site) if kind == ALL else f"{site}, {kind}"
+
+
+_DISTANCES: tuple[Column[dict[str, Any]], ...] = (
+    Column("Jobs", lambda row: row["jobs"]),
+    Column("Drivers", lambda row: _group(row, "")),
+    Column("Compared with", lambda row: _group(row, "other_")),
+    Column(
+        "Distance",
+        lambda row: number(row["distance"], ".3f"),
+        "Energy distance between the distributions of their style scores.",
+    ),
+    Column(
+        "p",
+        lambda row: number(row["p_value"], ".3f"),
+        "Of a permutation of the drivers, corrected for all comparisons.",
+    ),
+    Column(
+        "Differ most in",
+        lambda row: name_of_indicator(str(row["most"])),
+        "The indicator whose normalised values, times its weight, are furthest apart.",
+    ),
+)
 
 
 class LearningSection(Section):

@@ -35,7 +35,10 @@ def everything() -> Results:
     made = make_results(pairs=5, frames=60)
     forecasts = make_forecasts()
     evaluation = made.evaluation
-    results = Results.of(evaluation, style=made.style, tables={"curves": made.curves})
+    at_sites = made.style.table.assign(driver_type="", site="")
+    at_sites["site"] = [("A", "B")[number % 2] for number in range(len(at_sites))]
+    style = dataclasses.replace(made.style, table=at_sites)
+    results = Results.of(evaluation, style=style, tables={"curves": made.curves})
     ids, axis = evaluation.table["pair_id"].unique(), results.parameters[0]
     slices = pd.DataFrame(
         [(ids[0], axis.name, place, place, 1 + place, 1.0) for place in (0.0, 0.5, 1.0)],
