@@ -222,6 +222,20 @@ class Agent:
             since = torch.zeros_like(until)
         return measure(batch, self.core.driver_features, self.dt, since, until)
 
+    def unlikeness(self, features: Tensor, network: Tensor) -> Tensor:
+        """Returns how far driver features are from those of the drivers that were learned from.
+
+        Args:
+            features: `(D, k)`, as `driver_features_of` returns them.
+            network: which network's drivers each is compared with, `(D,)`.
+
+        Returns:
+            `(D, k)`, in standard deviations from their mean; NaN where a feature is unknown.
+        """
+        count = features.shape[1]
+        mean, scale = self.scaler.mean[network, -count:], self.scaler.scale[network, -count:]
+        return (features - mean.to(features)) / scale.to(features)
+
     def begin(self, network: Tensor, context: DriverContext = UNSEEN) -> AgentState:
         """Returns the state of D drivers before their first window.
 

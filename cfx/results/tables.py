@@ -533,6 +533,12 @@ class StyleDistances(ResultTable):
         return [style_distances(findings.style)]
 
 
+_UNLIKE = 3.0
+"""Standard deviations from which on a driver is unlike those that were learned from."""
+
+_FEW = 0.1
+"""Share of such drivers that is not worth a word; of those learned from it is 0.01 to 0.04."""
+
 _WORSE = 1.1
 """From this ratio of errors on, the policy is said to be worse than drivers' own parameters."""
 
@@ -563,6 +569,14 @@ class Past(ResultTable):
             "m/s",
             f"what {EXPECTED_LEVEL:.0%} of drivers' RMSE of speed is expected below",
         ),
+        Column(
+            "unlike",
+            "1",
+            "how far the driver is from those that the policy learned from: the driver feature that"
+            " is furthest from their mean, in standard deviations",
+            required=False,
+        ),
+        Column("unlike_in", "", "which driver feature that is", "text", required=False),
     )
 
     def metrics(self, findings: Findings) -> Mapping[str, float]:
@@ -578,6 +592,8 @@ class Past(ResultTable):
                 below = table.loc[bound.index, f"rmse_speed_{method}"] <= bound
                 found[f"past/bound/{method}"] = float(bound.mean())
                 found[f"past/coverage/{method}"] = float(below.mean())
+        if "unlike" in table and table["unlike"].notna().any():
+            found["past/unlike"] = float((table["unlike"].dropna() > _UNLIKE).mean())
         return found
 
     def console(self, findings: Findings, metrics: Mapping[str, float]) -> Iterable[str]:
@@ -595,6 +611,13 @@ class Past(ResultTable):
                 f" {metrics['past/bound/policy']:.3f} m/s (own parameters alone"
                 f" {metrics['past/bound/fixed']:.3f} m/s); so it is for"
                 f" {metrics['past/coverage/policy']:.0%} of them (bound_policy in past.csv)."
+            )
+        if metrics.get("past/unlike", 0.0) > _FEW:
+            unlike = table[table["unlike"] > _UNLIKE]
+            most = str(unlike["unlike_in"].mode()[0]).replace("_", " ")
+            yield (
+                f"[yellow]{len(unlike)} of {table['unlike'].notna().sum()} drivers drive unlike"
+                f" those that it learned from, most often in their {most} (unlike in past.csv)."
             )
         ratio = _ratio(table["past_rmse_speed_alone"], table)
         if ratio > _WORSE:

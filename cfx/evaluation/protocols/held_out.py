@@ -179,6 +179,14 @@ class HeldOut:
         )
         for name, loop in loops.items():
             table[f"rmse_speed_{name}"], _ = closed_loop_errors(self.batch, self.first, loop)
+        features = self.policy.driver_features_of(self.batch, self.first)
+        if features is not None:
+            away = self.policy.unlikeness(features, self.network).abs()
+            names = np.array(self.policy.core.driver_features)
+            table["unlike"] = away.max(1).values.cpu().numpy()
+            table["unlike_in"] = np.where(
+                table["unlike"].notna(), names[away.argmax(1).cpu().numpy()], ""
+            )
         if fold is None:
             return with_bounds(table, self.policy.trained_on.expected_error)
         return with_bounds_of_other_folds(table, fold.cpu().numpy())

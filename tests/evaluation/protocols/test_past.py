@@ -4,18 +4,26 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from scipy.optimize import minimize_scalar
 
 import cfx
 from cfx.core.errors import ConfigError, DataError
+from cfx.data.pairs import PairBatch
+from cfx.data.tidy import TidyDataset
 from cfx.evaluation.protocols.past import PastErrors, with_bounds_of_other_folds
 from cfx.evaluation.result import Array
 from cfx.policies.checkpoint import load
 from cfx.policies.expected_error import growth_bound
+from cfx.policies.ready import folder_of_ready_made
+from cfx.results.table import Findings
+from cfx.results.tables import Past
 
 QUICK = [
     "debug=quick",
@@ -121,6 +129,50 @@ def test_a_policy_that_combines_does_so_wherever_it_is_tested(tmp_path: Path) ->
     elsewhere = pd.read_csv(other / "past.csv")
     bounds = expected.policy * elsewhere["past_rmse_speed_policy"]
     np.testing.assert_allclose(elsewhere["bound_policy"], bounds)
+
+
+def test_drivers_are_unlike_those_learned_from_by_standard_deviations() -> None:
+    agent = load(folder_of_ready_made("cfx://i80-idm-history") / "policy").for_unseen_drivers()
+    count = len(agent.core.driver_features)
+    mean, scale = agent.scaler.mean[0, -count:].double(), agent.scaler.scale[0, -count:].double()
+    away = torch.tensor([0.0, 1.0, -2.0, 5.0, 0.5, float("nan")], dtype=torch.float64)
+    network = torch.zeros(1, dtype=torch.int64)
+    found = agent.unlikeness((mean + away * scale)[None], network)
+    torch.testing.assert_close(found[0], away, equal_nan=True)
+
+
+def test_drivers_unlike_those_learned_from_are_counted() -> None:
+    errors = {"share": 1.0, "rmse_speed_alone": 1.0, "past_rmse_speed_alone": 1.0}
+    errors |= {f"{part}_{method}": 1.0 for part in _PARTS for method in ("policy", "fixed")}
+    table = pd.DataFrame(errors, index=range(5)).assign(
+        unlike=[0.5, 3.5, 4.0, 2.9, np.nan],
+        unlike_in=["acceleration", "time_gap", "time_gap", "acceleration", ""],
+    )
+    findings = cast(Findings, SimpleNamespace(evaluation=SimpleNamespace(tables={"past": table})))
+    metrics = Past().metrics(findings)
+    assert metrics["past/unlike"] == 0.5
+    words = " ".join(Past().console(findings, metrics))
+    assert (
+        "2 of 4 drivers drive unlike those that it learned from, most often in their time gap"
+        in words
+    )
+
+
+_PARTS = ("past_rmse_speed", "rmse_speed", "bound")
+
+
+def test_a_motorway_is_unlike_the_congestion_that_was_learned_from(shared_data: Path) -> None:
+    agent = load(folder_of_ready_made("cfx://i80-idm-history") / "policy").for_unseen_drivers()
+    unlike = {}
+    for name in ("i80_reconstructed", "openacc_vicolungo"):
+        pairs = TidyDataset(path=str(shared_data / f"{name}_pairs.parquet"), min_frames=300).load()
+        batch = PairBatch.of(pairs)
+        features = agent.driver_features_of(batch, (0.8 * batch.lengths).long())
+        assert features is not None
+        away = agent.unlikeness(features, torch.zeros(len(pairs), dtype=torch.int64)).abs()
+        unlike[name] = float((away.max(1).values > 3).double().mean())
+    assert unlike["i80_reconstructed"] < 0.05
+    assert unlike["openacc_vicolungo"] > 0.75
 
 
 def test_a_driver_without_a_past_has_no_own_parameters() -> None:
