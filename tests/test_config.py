@@ -70,7 +70,7 @@ def test_a_job_config_cannot_be_changed() -> None:
     [
         ("seed=-1", r"^seed=-1: should be greater than or equal to 0"),
         ("seed=1.5", r"^seed=1\.5: "),
-        ("split=1", r"^split=1: should be less than 1"),
+        ("split=1.1", r"^split=1\.1: should be less than or equal to 1"),
         ("device=gpu", r"^device='gpu': choose auto, cpu, cuda or cuda:N"),
         ("dtype=float16", r"^dtype='float16': should be 'float32' or 'float64'"),
         ("threads=0", r"^threads=0: "),

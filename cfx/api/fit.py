@@ -84,7 +84,8 @@ class Fit:
         """Errors of each pair and method: pair_id, driver, method, and RMSE of speed and gap.
 
         `train_rmse_speed` (m/s) and `train_rmse_gap` (m) are of the part that was calibrated on,
-        `test_...` of the rest, simulated in closed loop from the last measured state before it.
+        `test_...` of the rest, simulated in closed loop from the last measured state before it;
+        with `split=1` there is no rest.
         `method` is `default`, `population` (pooled) or `fixed` (driver-specific).
         """
         tables = []
@@ -164,29 +165,30 @@ class Fit:
         batch = context.batch
         first = self._last.to(batch.lengths.device)
         train = training_errors(context.calibrator, batch, first, parameters)
-        agent = context.constant(FixedPolicy(), parameters)
-        each = torch.arange(len(batch), device=batch.lengths.device)
-        loop = simulate_in_shards(
-            context.engine, context.simulator, agent, Followers(batch, each), first
-        )
-        speed, gap = closed_loop_errors(batch, first, loop)
-        return pd.DataFrame(
-            {
-                "pair_id": [pair.pair_id for pair in context.pairs],
-                "driver": [pair.driver for pair in context.pairs],
-                "method": method,
-                "train_rmse_speed": train["rmse_speed"].cpu().numpy(),
-                "test_rmse_speed": speed,
-                "train_rmse_gap": train["rmse_gap"].cpu().numpy(),
-                "test_rmse_gap": gap,
-            }
-        )
+        errors = {
+            "pair_id": [pair.pair_id for pair in context.pairs],
+            "driver": [pair.driver for pair in context.pairs],
+            "method": method,
+            "train_rmse_speed": train["rmse_speed"].cpu().numpy(),
+            "train_rmse_gap": train["rmse_gap"].cpu().numpy(),
+        }
+        if context.split < 1:
+            agent = context.constant(FixedPolicy(), parameters)
+            each = torch.arange(len(batch), device=batch.lengths.device)
+            loop = simulate_in_shards(
+                context.engine, context.simulator, agent, Followers(batch, each), first
+            )
+            speed, gap = closed_loop_errors(batch, first, loop)
+            errors |= {"test_rmse_speed": speed, "test_rmse_gap": gap}
+        return pd.DataFrame(errors)
 
     def __repr__(self) -> str:
-        found = self.losses.groupby("method")["test_rmse_speed"].mean()
+        part = "test" if self._context.split < 1 else "train"
+        found = self.losses.groupby("method")[f"{part}_rmse_speed"].mean()
+        where = "the test part" if part == "test" else "what was calibrated on"
         means = [f"{method} {found[method]:.3f}" for method in METHODS]
         return (
-            f"Fit({self.model}, {len(self.parameters)} pairs; RMSE of speed on the test part, m/s:"
+            f"Fit({self.model}, {len(self.parameters)} pairs; RMSE of speed on {where}, m/s:"
             f" {', '.join(means)})"
         )
 
@@ -206,8 +208,8 @@ def calibrate(
 ) -> Fit:
     """Calibrates a model to each driver, as `python -m cfx model=MODEL policy=fixed` does.
 
-    The first part of each trajectory (`split`, 80 %) is calibrated on, the rest tests. The
-    parameters are those of the command with the same settings, to the last bit. Nothing is
+    The first part of each trajectory (`split`, 80 %; 1 is all) is calibrated on, the rest tests.
+    The parameters are those of the command with the same settings, to the last bit. Nothing is
     written.
 
     Args:

@@ -40,11 +40,13 @@ class Split:
 
     @classmethod
     def of(cls, pairs: PairSet, settings: WindowSettings, share: float) -> Split:
-        """Splits each pair so that `share` of its windows come first.
+        """Splits each pair so that `share` of its windows come first; 1 gives it whole to training.
 
         Raises:
             DataError: a pair is too short for two windows of training and one of testing.
         """
+        if share == 1:
+            return cls.none(pairs, settings)
         frames, windows = [], []
         for pair in pairs:
             count = settings.count(len(pair))
@@ -86,6 +88,11 @@ class Split:
         lasts = middle * pairs.dt
         if lasts >= TRANSIENT_S:
             return
+        if share == 1:
+            raise DataError(
+                "split=1 leaves nothing to be tested; it is for a calibration of drivers' own"
+                " parameters alone (policy=fixed protocol=within_driver). Lower split"
+            )
         said = (
             f"split={share:g} leaves {sum(tested):,} frames of {len(tested)} pairs to be tested,"
             f" {lasts:.2g} s of the median pair"

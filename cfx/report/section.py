@@ -221,6 +221,8 @@ def tested(jobs: Iterable[Job]) -> str:
     splits = sorted({job.split for job in jobs if math.isfinite(job.split)})
     if not splits:
         return "the test part of each pair's frames"
+    if splits == [1.0]:
+        return "all of each pair's frames, which were calibrated on"
     parts = " or ".join(f"{100 * (1 - split):.3g}" for split in splits)
     return f"the last {parts} % of each pair's frames"
 

@@ -134,7 +134,11 @@ class JobConfig(Settings):
     )
     threads: int | None = Field(1, ge=1, description="torch's threads; null: torch's own choice")
     split: float = Field(
-        0.8, gt=0, lt=1, description="share of each pair that is calibrated and learned on"
+        0.8,
+        gt=0,
+        le=1,
+        description="share of each pair that is calibrated and learned on; 1: all of it, of a"
+        " calibration alone",
     )
     windows: WindowSettings = Field(WindowSettings(), description="how trajectories are cut")
     calibration: CalibrationSettings = Field(

@@ -367,7 +367,7 @@ class Fits(ResultTable):
         Column("driver", "", "the follower of the pair", "text", required=False),
         METHOD,
         Column("train_rmse_speed", "m/s", "on the part that was calibrated on"),
-        Column("test_rmse_speed", "m/s", "on the test part"),
+        Column("test_rmse_speed", "m/s", "on the test part", required=False),
         Column("train_rmse_gap", "m", "on the part that was calibrated on", required=False),
         Column("test_rmse_gap", "m", "on the test part", required=False),
         Column("median_NAME", "as of the parameter", "its median a posteriori, of `fixed`"),

@@ -89,7 +89,10 @@ def methods_table(
     """Returns the metrics of one scope that are headlines: a row per method that has any."""
     count = len(evaluation.trajectories)
     plural = "" if count == 1 else "s"
-    title = f"{count} pair{plural}, {scope_label(scope)} in closed loop"
+    fits = evaluation.tables.get("fits")
+    is_whole = scope == "test" and fits is not None and "test_rmse_speed" not in fits
+    part = "all of what was calibrated on," if is_whole else scope_label(scope)
+    title = f"{count} pair{plural}, {part} in closed loop"
     table = Table(title=title, title_justify="left")
     table.add_column("method", no_wrap=True)
     shown = [one for one in evaluation.measured if one.headline and scope in one.scopes]
@@ -118,6 +121,8 @@ def _fitted(evaluation: Evaluation) -> pd.DataFrame:
     """
     fits = evaluation.tables.get("fits")
     if fits is None or evaluation.purpose is not Purpose.CALIBRATION:
+        return pd.DataFrame()
+    if "test_rmse_speed" not in fits:  # nothing was tested: both would be the same
         return pd.DataFrame()
     means = fits.groupby("method").mean(numeric_only=True).filter(regex="^train_")
     return means.rename(columns=lambda name: name.removeprefix("train_"))

@@ -62,7 +62,8 @@ def calibration_tables(
         slices: see `cfx.calibration.identifiability.slices`.
         fits: a row per pair and method: pair_id, driver, method, and train_rmse_speed,
             test_rmse_speed (m/s), train_rmse_gap, test_rmse_gap (m): on the part that
-            driver-specific parameters were calibrated on, and on the test part. With a posterior
+            driver-specific parameters were calibrated on, and on the test part, if there is one
+            (`split`). With a posterior
             the rows of `fixed` have its columns (`ParameterIntervals.columns`) for that part too.
     """
     calibrated = "fixed" in evaluation.methods and bool(evaluation.names)
@@ -85,6 +86,8 @@ def calibration_tables(
             parameters = _parameters(evaluation, method, ids, batch.leader_length)
             found = training_errors(context.calibrator, batch, last, parameters)
             rows = _fits(evaluation, method, found)
+            if context.split == 1:  # nothing was tested
+                rows = rows.drop(columns=["test_rmse_speed", "test_rmse_gap"])
             if method == "fixed" and settings.posterior != "none":
                 known = _intervals(context.calibrator.solver, batch, last, parameters, settings)
                 rows = rows.join(known.set_axis(ids), on="pair_id")

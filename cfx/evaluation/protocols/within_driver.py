@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from typing import ClassVar, Literal
 
@@ -24,6 +25,8 @@ from cfx.policies.default import DefaultPolicy
 from cfx.policies.fixed import FixedPolicy
 from cfx.policies.placement import ALL, group_by
 
+log = logging.getLogger(__name__)
+
 
 class WithinDriverSettings(Settings):
     """Settings of `within_driver`."""
@@ -41,7 +44,8 @@ class WithinDriver(Protocol):
     The first 80 % of each pair's windows serve to calibrate and train, the last 20 % to test. The
     fixed parameters come from one closed-loop simulation of the training part. The test starts from
     the last measured state of the training part. No frame of the test part is read before the
-    evaluation.
+    evaluation. With `split=1` constant parameters are calibrated on whole trajectories, and errors
+    are those of the same trajectories.
     """
 
     schema: ClassVar[type[Settings]] = WithinDriverSettings
@@ -51,7 +55,14 @@ class WithinDriver(Protocol):
         pairs, batch = context.pairs, context.batch
         context.check_start(context.pairs)
         split = Split.of(pairs, context.windows, context.split)
-        split.check_test_parts(pairs, context.windows, context.split)
+        whole = context.split == 1 and not context.policy.trainable
+        if whole:
+            log.warning(
+                "split=1: whole trajectories are calibrated on, and errors are those of the same"
+                " trajectories: they say how well the parameters fit, not how well they predict"
+            )
+        else:
+            split.check_test_parts(pairs, context.windows, context.split)
         fixed = context.calibrator.fixed(pairs, batch, split.frame)
         labels = context.labels(split.windows, fixed)
         network, names = self._networks(context)
@@ -79,7 +90,7 @@ class WithinDriver(Protocol):
         else:
             training_result = context.untrained(context.policy, fixed)
         policy = context.ready(context.policy, training_result, names)
-        first = split.frame.to(batch.lengths.device)
+        first = (split.frame * (not whole)).to(batch.lengths.device)
         scopes = {"test": _test_part(context, policy, network, first, fixed)}
         evaluation = evaluate(
             ComparedPairs(pairs, batch, first, context.style),

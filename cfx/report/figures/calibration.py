@@ -297,10 +297,12 @@ def fits_of(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
 
     Args:
         table: columns pair_id, method, train_rmse_speed, test_rmse_speed (m/s): on the part that
-            was calibrated on and on the test part.
+            was calibrated on and on the test part, without which there is nothing to show.
     """
     errors = ["train_rmse_speed", "test_rmse_speed"]
-    found = {}
+    found: dict[str, pd.DataFrame] = {}
+    if "test_rmse_speed" not in table:
+        return found
     for method in ("fixed", "population", "default"):
         rows = table[table["method"] == method]
         known = np.isfinite(rows[errors].to_numpy(dtype=float)).all(axis=1)

@@ -55,6 +55,8 @@ def write_figures(
 ) -> list[Path]:
     """Draws and writes all figures that the results allow; returns their paths.
 
+    Of all figures those are deleted that an earlier job has left in the folder.
+
     Args:
         folder: made if it is not there.
         results: of a job.
@@ -69,9 +71,12 @@ def write_figures(
         if names is not None and one.name not in names:
             continue
         figure = draw(one, results)
-        if figure is not None:
-            for form in formats:
-                paths.append(write_figure(figure, folder / f"{one.name}.{form}"))
+        for form in ("png", "pdf", "svg"):
+            path = folder / f"{one.name}.{form}"
+            if figure is not None and form in formats:
+                paths.append(write_figure(figure, path))
+            elif names is None:
+                path.unlink(missing_ok=True)  # of an earlier job in the same folder
     return paths
 
 

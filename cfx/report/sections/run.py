@@ -223,7 +223,9 @@ def _protocol(job: Job) -> str:
         f"driver-specific calibration uses the first {train} of a driver's own trajectory, the test"
         f" part is the last {test}"
     )
-    if name == "within_driver":
+    if name == "within_driver" and job.split == 1:
+        said = "calibrated on whole trajectories, of which the errors are"
+    elif name == "within_driver":
         used = "calibrated" if job.purpose is Purpose.CALIBRATION else "calibrated and learned"
         said = f"{used} on the first {train} of each pair, tested on the last {test}"
     elif job.setting("protocol.folds") and not job.setting("protocol.run"):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 
 from cfx.app import cli
@@ -72,3 +74,29 @@ def test_files_and_settings_become_the_job_that_the_command_line_runs(pairs: Pat
 def test_a_policy_to_train_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"trains no policy: leave policy=gru out"):
         overrides_of(["pairs.csv", "policy=gru"])
+
+
+def test_whole_trajectories_are_calibrated_on_and_nothing_is_called_a_test(
+    pairs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [str(pairs), "model=idm", "split=1", *QUICK, "hydra.run.dir=job"]
+    assert cli.main(["calibrate", *words]) == 0
+    printed = capsys.readouterr().out
+    assert "all of what was calibrated on" in printed
+    assert "fitted" not in printed
+    fits = pd.read_parquet("job/fits.parquet").query("method == 'fixed'")
+    assert not [name for name in fits if name.startswith("test_")]
+    table = pd.read_csv("job/pairs.csv").query("method == 'fixed'")
+    assert set(table["frames"]) == {299}
+    np.testing.assert_allclose(fits["train_rmse_speed"], table["rmse_speed"])
+
+
+@pytest.mark.parametrize(
+    "words", ["policy=fixed protocol=across_drivers protocol.folds=2", "protocol=within_driver"]
+)
+def test_what_tests_needs_a_test_part(
+    pairs: Path, capsys: pytest.CaptureFixture[str], words: str
+) -> None:
+    common = ["data=tidy", f"data.path={pairs}", "split=1", *QUICK]
+    assert cli.main([*common, *words.split()]) == 2
+    assert "split=1 leaves nothing to be tested" in capsys.readouterr().err
