@@ -27,6 +27,7 @@ EXTRAS: dict[tuple[str, str], str] = {
     ("command", "policies.make"): "cfx-benchmark",
     ("demo", "sumo"): "cfx-sumo",
     ("engine", "dask"): "cfx-dask",
+    ("export", "fmi"): "cfx-fmi",
     ("export", "onnx"): "cfx-onnx",
     ("export", "sumo"): "cfx-sumo",
     ("experiment", "sumo_demo"): "cfx-sumo",
