@@ -27,7 +27,7 @@ class DriveCommand(Command):
             nargs="?",
             default="ring",
             help="SUMO's configuration (.sumocfg), or a scenario that comes with cfx: ring"
-            " (default), motorway, stress",
+            " (default), motorway, town, stress",
         )
         parser.add_argument(
             "--drivers",

@@ -185,10 +185,14 @@ def test_a_distribution_is_driven_and_far_positions_are_exact(scenario: Path) ->
     demand = DEMAND.replace(
         "</routes>",
         """<vTypeDistribution id="mixed" vTypes="calm hasty"/>
-        <vTypeDistribution id="own"><vType id="own1"/><vType id="own2"/></vTypeDistribution>
+        <include href="own.add.xml"/>
         <flow id="d" type="own" route="whole" begin="0" end="20" vehsPerHour="900"/></routes>""",
     )
     (scenario / "mixed.rou.xml").write_text(demand)
+    (scenario / "own.add.xml").write_text(
+        '<additional><vTypeDistribution id="own"><vType id="own1"/><vType id="own2"/>'
+        "</vTypeDistribution></additional>"
+    )
     text = (scenario / "motorway.sumocfg").read_text()
     (scenario / "mixed.sumocfg").write_text(
         text.replace(str(scenario / "demand.rou.xml"), "mixed.rou.xml")

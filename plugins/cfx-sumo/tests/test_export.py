@@ -7,16 +7,33 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import numpy as np
 import pandas as pd
 import pytest
 import yaml
 
+import cfx
 from cfx.app.cli import main
 from cfx.core.errors import ConfigError, DataError, OutputError
 from cfx.core.registry import create
 from cfx.models.base import DrivingModel
 from cfx_sumo.demo.motorway import SHIPPED
 from cfx_sumo.export import export
+from cfx_sumo.simulation.network import network
+
+CALIBRATED = (
+    "policy=fixed",
+    "protocol=within_driver",
+    "data=synthetic",
+    "data.pairs=3",
+    "data.frames=150",
+    "optimizer=random",
+    "optimizer.samples=32",
+    "figures.enabled=false",
+    "tracking.enabled=false",
+    "hydra.run.dir=job",
+)
+"""A job that calibrates three drivers."""
 
 CLUSTERS = ("conservative", "normal", "normal", "aggressive")
 
@@ -180,6 +197,89 @@ print(json.dumps(answers))
         }
         assert seen["any"][0] in {"normal_0", "normal_1"}
         assert all(fastest > 5 for _, fastest in seen.values())
+
+
+BEHIND_RECORDED_LEADERS = """
+import json, sys
+import libsumo as sumo
+ahead = json.load(open("ahead.json"))
+sumo.start(["sumo", "-n", "road.net.xml", "-a", "job/drivers.add.xml", "-r", "drive.rou.xml",
+            "--step-length", "0.1", "--no-step-log", "--collision.action", "none"])
+vehicle, speeds = sumo.vehicle, {name: [] for name in ahead}
+sumo.simulationStep()
+for name, (start, position, speed) in ahead.items():
+    for one in ("leader." + name, name):
+        vehicle.setLaneChangeMode(one, 0)
+    vehicle.setSpeedMode("leader." + name, 0)
+    vehicle.setPreviousSpeed("leader." + name, speed[0])
+    vehicle.setPreviousSpeed(name, start)
+for k in range(1, max(len(position) for _, position, _ in ahead.values())):
+    there = {name: one for name, one in ahead.items() if k < len(one[1])}
+    for name, (_, position, speed) in there.items():
+        vehicle.setSpeed("leader." + name, (position[k] - position[k - 1]) / 0.1)
+    sumo.simulationStep()
+    for name, (_, position, speed) in there.items():
+        vehicle.setPreviousSpeed("leader." + name, speed[k])
+        speeds[name].append(vehicle.getSpeed(name))
+sumo.close()
+print(json.dumps(speeds))
+"""
+
+
+@pytest.mark.parametrize("model", ["idm", "krauss_sumo"])
+def test_vtypes_have_in_plain_sumo_the_error_that_the_job_says(
+    model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Behind the recorded leaders, from where the test part begins."""
+    pytest.importorskip("traci", reason="needs the extra sumo")
+    monkeypatch.chdir(tmp_path)
+    finished = cfx.run([f"model={model}", *CALIBRATED])
+    export(finished.folder)
+    drives = pd.read_parquet(finished.folder / "trajectories.parquet").groupby("pair_id")
+    data = pd.read_parquet(finished.folder / "data.parquet").set_index(["pair_id", "frame"])
+    kinds = {}
+    for one in ElementTree.parse(finished.folder / "drivers.add.xml").iter("vType"):  # noqa: S314
+        kinds[one[0].attrib["value"]] = one.attrib["id"]
+    vehicles: list[str] = []
+    ahead: dict[str, tuple[float, list[float], list[float]]] = {}
+    recorded: dict[str, list[float]] = {}
+    for number, (name, drive) in enumerate(drives):
+        seen = data.loc[name].loc[(drive["time_s"] / 0.1).round().astype(int)]
+        origin = seen["follower_position_m"].iloc[0] - 100.0
+        length = seen["leader_length_m"].iloc[0]
+        leader = (seen["leader_position_m"] - origin).tolist()
+        start, *recorded[name] = drive["real_speed"].tolist()
+        ahead[name] = (start, leader, seen["leader_speed_mps"].tolist())
+        vehicles.append(
+            f'<vType id="long{number}" length="{length}" maxSpeed="90" speedDev="0"/>'
+            f'<route id="r{number}" edges="road{number}"/>'
+        )
+        for one, kind, at in (
+            (f"leader.{name}", f"long{number}", leader[0]),
+            (name, kinds[name], 100.0),
+        ):
+            vehicles.append(
+                f'<vehicle id="{one}" type="{kind}" route="r{number}" depart="0" departPos="{at!r}"'
+                f' departSpeed="{start!r}" insertionChecks="none"/>'
+            )
+    Path("road.net.xml").write_text(network(len(ahead)))
+    Path("drive.rou.xml").write_text(f"<routes>{''.join(vehicles)}</routes>")
+    Path("ahead.json").write_text(json.dumps(ahead))
+    done = subprocess.run(
+        [sys.executable, "-c", BEHIND_RECORDED_LEADERS],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=100,
+    )
+    assert done.returncode == 0, done.stderr
+    speeds = json.loads(done.stdout.splitlines()[-1])
+    table = pd.read_csv(finished.folder / "pairs.csv").query("method == 'fixed'")
+    said = table.set_index("pair_id")["rmse_speed"]
+    assert len(said) == 3
+    for name, error in said.items():
+        difference = np.array(speeds[str(name)]) - recorded[name]
+        assert np.sqrt(np.mean(difference**2)) == pytest.approx(error, rel=0.01)
 
 
 def test_what_cannot_be_exported_is_one_sentence(

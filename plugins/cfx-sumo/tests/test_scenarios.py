@@ -47,6 +47,27 @@ def test_the_motorway_has_waves_and_lane_changes(tmp_path: Path) -> None:
     assert row[5] == "0"  # collisions
 
 
+def town(folder: Path, policy: str, end: int, step: float) -> None:
+    said = drive(
+        folder, "town", "--drivers", f"car={policy}", "--end", str(end), "--step", str(step)
+    )
+    row = next(line.split() for line in said.splitlines() if line.strip().startswith("car"))
+    assert int(row[1]) > 0.5 * end
+    assert row[5:8] == ["0", "0", "0"]  # contact, gaps below minGap, teleports
+
+
+def test_the_town_has_no_collisions(tmp_path: Path) -> None:
+    """At lights, where left turns give way, and at the roundabout; with SUMO's checks."""
+    town(tmp_path, "cfx://i80-w99", 100, 0.5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("policy", ["cfx://i80-w99", "cfx://idm"])
+@pytest.mark.parametrize("step", [0.05, 0.1, 0.5, 1.0])
+def test_the_town_has_no_collisions_at_any_step(policy: str, step: float, tmp_path: Path) -> None:
+    town(tmp_path, policy, 200, step)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("step", [0.05, 0.1, 0.5, 1.0])
 def test_stress_finds_no_collision_and_no_step_outside_the_limits(

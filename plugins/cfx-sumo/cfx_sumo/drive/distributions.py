@@ -39,7 +39,10 @@ def members_of(names: Collection[str], files: Iterable[Path]) -> dict[str, tuple
 
 
 def _types_in(file: Path) -> Iterator[ElementTree.Element]:
-    """Yields vTypes and their distributions as they end; all else is dropped as it is read."""
+    """Yields vTypes and their distributions as they end; all else is dropped as it is read.
+
+    Those of files that are included stand where the `include` stands.
+    """
     depth = 0
     with _opened(file) as stream:
         # S314: it is the user's own file, and SUMO has read it already.
@@ -50,6 +53,8 @@ def _types_in(file: Path) -> Iterator[ElementTree.Element]:
             depth -= 1
             if element.tag in _KINDS:
                 yield element
+            if element.tag == "include":
+                yield from _types_in(file.parent / element.get("href", ""))
             if depth == 1:
                 element.clear()
 

@@ -1,11 +1,13 @@
-"""Scenarios that come with cfx: `cfx drive ring`, `cfx drive motorway`.
+"""Scenarios that come with cfx: `cfx drive ring`, `cfx drive motorway`, `cfx drive town`.
 
 `ring` is a single lane of 239 m with 22 vehicles, as in the experiment of Y. Sugiyama et al.
 (2008), *Traffic jams without bottlenecks*, New Journal of Physics 10, 033001. `motorway` has six
-lanes, an on-ramp and vehicles that make waves. All vehicles to be driven have the vType `car`.
+lanes, an on-ramp and vehicles that make waves. `town` has nine junctions with lights, at which
+vehicles that turn left give way to those that come towards them, and a roundabout. All vehicles to
+be driven have the vType `car`.
 
 The networks lie in `assets/`. `ring.net.xml` and `town.net.xml` (for `cfx_sumo.drive.stress`) were
-made with SUMO's netconvert of a few nodes and edges.
+made with SUMO's netconvert of a few nodes and edges, `streets.net.xml` besides with netgenerate.
 """
 
 from __future__ import annotations
@@ -140,6 +142,40 @@ _MOTORWAY_ROUTES = f"""<routes>
   departLane="random" departSpeed="20"/>
 </routes>"""
 
+_ARMS = 4
+"""Of the roundabout."""
+
+_STREETS = 3
+"""Streets of the town in each direction."""
+
+
+def _town_routes() -> str:
+    lines = ["<routes>", CAR]
+    flows: list[tuple[str, str, int]] = []
+    for number in range(_STREETS):
+        last, row = chr(ord("A") + _STREETS - 1), chr(ord("A") + number)
+        west, east = (f"left{number}", f"A{number}"), (f"right{number}", f"{last}{number}")
+        south = (f"bottom{number}", f"{row}0")
+        north = (f"top{number}", f"{row}{_STREETS - 1}")
+        for (begin, enters), (end, leaves) in ((west, east), (south, north)):
+            flows.append((begin + enters, leaves + end, 300))
+            flows.append((end + leaves, enters + begin, 300))
+        flows.append((west[0] + west[1], north[1] + north[0], 60))
+        flows.append((east[0] + east[1], south[1] + south[0], 60))
+        flows.append((south[0] + south[1], west[1] + west[0], 60))
+        flows.append((north[0] + north[1], east[1] + east[0], 60))
+    for arm in range(_ARMS):
+        flows.append((f"in{arm}", f"out{(arm + 2) % _ARMS}", 240))
+        flows.append((f"in{arm}", f"out{(arm + 3) % _ARMS}", 80))
+    for number, (begin, end, rate) in enumerate(flows):
+        lines.append(
+            f'<flow id="car{number}" type="car" from="{begin}" to="{end}" begin="{number % 12}"'
+            f' end="100000" vehsPerHour="{rate}" departSpeed="desired"/>'
+        )
+    lines.append("</routes>")
+    return "\n".join(lines)
+
+
 SCENARIOS = {
     "ring": Scenario(
         f"{_CARS_ON_RING} vehicles on a ring of {sum(_RING_M):.0f} m",
@@ -153,6 +189,12 @@ SCENARIOS = {
         MOTORWAY,
         300.0,
         Waves,
+    ),
+    "town": Scenario(
+        "nine junctions with lights and crossing traffic, and a roundabout",
+        _town_routes(),
+        ASSETS / "streets.net.xml",
+        600.0,
     ),
 }
 """The scenarios by name."""
