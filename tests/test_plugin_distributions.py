@@ -45,6 +45,7 @@ PROTOCOLS = {
     "cfx.models.limits",
     "cfx.models.speed_limit",
     "cfx.policies.features",
+    "cfx.simulation.kernel.compiler",
     "cfx.simulation.rollout",
 }
 POLICIES = {"cfx.policies.checkpoint", "cfx.policies.ready", "cfx.policies.valid_range"}

@@ -1,4 +1,4 @@
-"""Over TraCI's connections values come by subscription: the same ones as by calls."""
+"""Values come by subscription over TraCI and by a compiled call in libsumo: those of its calls."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from cfx.simulation.kernel.compiler import find_compiler
 
 pytest.importorskip("traci", reason="needs the extra sumo")
 
@@ -21,30 +23,41 @@ import libsumo
 import torch
 from cfx.core.errors import SumoError
 from cfx_sumo.drive.scenarios import SCENARIOS
-from cfx_sumo.live.surroundings import DirectReader, SubscribedReader, view_of
+from cfx_sumo.live.bridge import bridge_of
+from cfx_sumo.live.surroundings import DirectReader, SubscribedReader, look, view_of
 scenario = SCENARIOS["motorway"].write(Path("."))
 libsumo.start(["sumo", "-c", str(scenario), "--no-step-log", "--no-warnings"])
 found = []
 for _ in range(300):
     libsumo.simulationStep()
     names = [name for name in libsumo.vehicle.getIDList() if name.startswith("car")]
-    calls = view_of(DirectReader(libsumo.vehicle, 100.0), names)
-    sent = view_of(SubscribedReader(libsumo.vehicle, 100.0, 100.0), names)
-    same = torch.equal(torch.stack(list(calls.seen)), torch.stack(list(sent.seen)))
-    found.append([calls[:3] == sent[:3] and same, len(calls.following), len(calls.alone)])
+    calls = view_of(DirectReader(libsumo.vehicle, 100.0), names, 100.0)
+    sent = view_of(SubscribedReader(libsumo.vehicle, 100.0), names, 100.0)
+    compiled = look(libsumo, names, 100.0)
+    same = all(
+        calls[:3] == other[:3]
+        and torch.equal(torch.stack(list(calls.seen)), torch.stack(list(other.seen)))
+        for other in (sent, compiled)
+    )
+    found.append([same, len(calls.following), len(calls.alone)])
 said = []
 vehicle = libsumo.vehicle
-for reader in (DirectReader(vehicle, 100.0), SubscribedReader(vehicle, 100.0, 100.0)):
+for reader in (DirectReader(vehicle, 100.0), SubscribedReader(vehicle, 100.0)):
     try:
-        view_of(reader, ["nobody"])
+        view_of(reader, ["nobody"], 100.0)
     except SumoError as error:
         said.append(str(error))
+try:
+    look(libsumo, ["nobody"], 100.0)
+except SumoError as error:
+    said.append(str(error))
+bridge = bridge_of(vehicle)
 libsumo.close()
-print(json.dumps([found, said]))
+print(json.dumps([found, said, bridge is not None]))
 """
 
 
-def test_subscriptions_say_what_calls_say(tmp_path: Path) -> None:
+def test_subscriptions_and_the_compiled_call_say_what_calls_say(tmp_path: Path) -> None:
     """In libsumo, which has both, while vehicles come and change lanes."""
     done = subprocess.run(
         [sys.executable, "-c", BOTH_WAYS],
@@ -55,10 +68,11 @@ def test_subscriptions_say_what_calls_say(tmp_path: Path) -> None:
         timeout=280,
     )
     assert done.returncode == 0, done.stderr
-    found, said = json.loads(done.stdout.splitlines()[-1])
+    found, said, is_compiled = json.loads(done.stdout.splitlines()[-1])
     assert all(same for same, _, _ in found)
     assert max(following for _, following, _ in found) > 10
     assert max(alone for _, _, alone in found) > 1
-    assert len(said) == 2
+    assert len(said) == 3
+    assert is_compiled == (find_compiler() is not None)
     for sentence in said:
         assert sentence.startswith("vehicle 'nobody' cannot be driven (")

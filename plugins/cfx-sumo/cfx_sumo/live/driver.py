@@ -43,12 +43,20 @@ from cfx.simulation.step import advance_vehicle
 from cfx_sumo.live.braking import hardest_braking
 from cfx_sumo.live.clock import Clock
 from cfx_sumo.live.draws import standard_normal
+from cfx_sumo.live.orders import set_speeds
 from cfx_sumo.live.saved import DriverRecord, read_state, write_state
 from cfx_sumo.live.surroundings import Connection, Seen, View, look
 from cfx_sumo.live.vehicles import VehicleTable
 
 _BOUNDS_BRAKING = 4
 """Bit of SUMO's speed mode with which a vehicle brakes no harder than its `decel`."""
+
+_NEVER = torch.tensor([torch.nan], dtype=torch.float64)
+"""Time of the last frame of a vehicle that is not known, s."""
+
+_BLOCK = 1024
+"""Vehicles for which the networks answer at once: what more of them need exceeds the processor's
+caches, and takes twice as long for each."""
 
 _OBEYED_MPS = 1e-3
 """A speed this close to what SUMO was told is what it was told."""
@@ -449,17 +457,19 @@ class Driver:
 
         Vehicles that were stepped at this instant before are neither.
         """
-        times = self._store.time.tolist()
+        slots = torch.tensor([self._slots.get(name, -1) for name in names], dtype=torch.int64)
+        times = torch.where(slots < 0, torch.nan, torch.cat([self._store.time, _NEVER])[slots])
+        early = now - times < clock.period - 0.5 * clock.dt
+        if not bool(early.any()):
+            return names, []
         due, between = [], []
-        for name in names:
-            slot = self._slots.get(name)
-            if slot is None:
+        for name, is_early, is_done in zip(
+            names, early.tolist(), (times == now).tolist(), strict=True
+        ):
+            if not is_early:
                 due.append(name)
-            elif now - times[slot] < clock.period - 0.5 * clock.dt:
-                if times[slot] != now:
-                    between.append(name)
-            else:
-                due.append(name)
+            elif not is_done:
+                between.append(name)
         return due, between
 
     def _hold(self, connection: Connection, names: list[str], now: float, clock: Clock) -> None:
@@ -470,16 +480,15 @@ class Driver:
         store, slots = self._store, self._slots_of(driven)
         passed = now + clock.dt - store.time[slots]
         store.told[slots] = store.start[slots] + store.ramp[slots] * passed
-        for name, speed in zip(driven, store.told[slots].tolist(), strict=True):
-            connection.vehicle.setSpeed(name, speed)
+        set_speeds(connection, driven, store.told[slots].tolist())
 
     def _drive(self, connection: Connection, view: View, now: float, clock: Clock) -> None:
         """Lets the model take its steps until the next look, and tells SUMO where they lead."""
         names = [*view.following, *view.alone]
         if not names:
             return
-        store, count = self._store, len(view.following)
-        slots = torch.tensor([self._slot(name) for name in names])
+        count = len(view.following)
+        slots = self._places(names)
         store = self._store
         following = slots[:count]
         self._count_changed(slots, view.seen, now, clock)
@@ -491,8 +500,7 @@ class Driver:
             if number > 0:
                 self._append(following, seen.rows(slice(count)))
             due = store.steps[following] % self._stride(clock) == 0
-            beginning = [view.following[index] for index in due.nonzero().flatten().tolist()]
-            self._choose(following[due], beginning, now + number * clock.step)
+            self._choose(following, view.following, due, now + number * clock.step)
             store.steps[following] += 1
             self.counts.add(store.score[following], store.beyond[following])
             speed, bound = self._speeds(connection, names, slots, seen, clock.step)
@@ -507,9 +515,12 @@ class Driver:
         if clock.held > 1:
             told = first + store.ramp[slots] * clock.dt
         store.told[slots] = told
-        for name, bound, speed in zip(names, hardest.tolist(), told.tolist(), strict=True):
-            self._set_decel(connection, name, bound)
-            connection.vehicle.setSpeed(name, speed)
+        brakes_hard = dict.fromkeys(self._raised.keys() & names, 0.0)
+        for index in hardest.nonzero().flatten().tolist():
+            brakes_hard[names[index]] = float(hardest[index])
+        for name, own in brakes_hard.items():
+            self._set_decel(connection, name, own)
+        set_speeds(connection, names, told.tolist())
 
     def _watch(self, connection: Connection, view: View, now: float, clock: Clock) -> None:
         """Lets the policy see vehicles that somebody else drives."""
@@ -518,7 +529,7 @@ class Driver:
         if not view.following:
             return
         count = len(view.following)
-        slots = torch.tensor([self._slot(name) for name in view.following])
+        slots = self._places(view.following)
         seen = self._remember(slots, view, now, clock).rows(slice(count))
         store = self._store
         for number in range(clock.substeps):
@@ -625,7 +636,7 @@ class Driver:
             )
         self._forget_all()
         self._now = now
-        slots = torch.tensor([self._slot(name) for name in names], dtype=torch.int64)
+        slots = self._places(names)
         self._store.put_columns(slots, rows)
         self._leaders = dict(described["leaders"])
         self._speed_modes = dict(described["speed_modes"])
@@ -742,9 +753,11 @@ class Driver:
             self._bases.pop(gone, None)
             self._driver_features.pop(gone, None)
 
-    def _slot(self, name: str) -> int:
-        """Returns the row of a vehicle; a new vehicle gets one."""
-        if name not in self._slots:
+    def _places(self, names: list[str]) -> Tensor:
+        """Returns the rows of vehicles, `(D,)` int64; a new vehicle gets one."""
+        for name in names:
+            if name in self._slots:
+                continue
             if not self._unused:
                 taken = len(self._slots)
                 more = VehicleTable.empty(self.policy, self._driven, max(16, taken))
@@ -752,7 +765,7 @@ class Driver:
                 self._unused = list(range(taken, len(self._store.time)))
             self._slots[name] = slot = self._unused.pop()
             self._store.time[slot] = torch.nan  # it has no frame yet
-        return self._slots[name]
+        return self._slots_of(names)
 
     def _remember(self, slots: Tensor, view: View, now: float, clock: Clock) -> Seen:
         """Puts this instant into the histories of followers; begins those that are new.
@@ -905,15 +918,24 @@ class Driver:
             self._speed_modes.setdefault(name, connection.vehicle.getSpeedMode(name))
             connection.vehicle.setSpeedMode(name, self.speed_mode)
 
-    def _choose(self, slots: Tensor, names: list[str], now: float) -> None:
-        """Lets the policy choose the parameters of vehicles whose window begins."""
+    def _choose(self, following: Tensor, names: list[str], due: Tensor, now: float) -> None:
+        """Lets the policy choose the parameters of those followers whose window begins."""
+        rows, seed = due.nonzero().flatten(), None
+        if self.policy.is_stochastic:
+            seed = self._seed
+        for block in rows.tensor_split(max(1, -(-len(rows) // _BLOCK))):
+            noise = None
+            if seed is not None:
+                drawn = [names[row] for row in block.tolist()]
+                noise = standard_normal(seed, drawn, now, self.policy.head.noise_width)
+            self._choose_together(following[block], noise)
+
+    def _choose_together(self, slots: Tensor, noise: Tensor | None) -> None:
+        """Lets the networks answer for vehicles at once."""
         if len(slots) == 0:
             return
         store = self._store
         history, state = self._known(slots)
-        noise = None
-        if self._seed is not None and self.policy.is_stochastic:
-            noise = standard_normal(self._seed, names, now, self.policy.head.noise_width)
         chosen, after = self.policy.act(history, state, noise=noise)
         store.parameters[slots] = chosen
         store.score[slots], store.beyond[slots] = after.score, after.beyond
@@ -931,9 +953,12 @@ class Driver:
     def _known(self, slots: Tensor) -> tuple[History, AgentState]:
         """Returns the last frames of vehicles, and where the policy stands with them."""
         store = self._store
-        begun = self._begun(slots)
-        state = begun.state.clone()
-        state[begun.network, begun.place] = store.state[slots]
+        begun, known = self._begun(slots), store.state[slots]
+        if len(self.policy.names) == 1:
+            state = known[None]
+        else:
+            state = begun.state.clone()
+            state[begun.network, begun.place] = known
         now = begun._replace(state=state, latent=store.latent[slots])
         return History(*store.history[slots].unbind(1)), now
 
@@ -950,12 +975,8 @@ class Driver:
         follower = Follower(
             torch.zeros_like(seen.speed), seen.speed, seen.acceleration, store.memory[slots]
         )
-        leader = Leader(
-            seen.gap + seen.leader_length,
-            seen.leader_speed,
-            seen.leader_acceleration,
-            seen.leader_length,
-        )
+        zero = torch.zeros_like(seen.gap)
+        leader = Leader(seen.gap, seen.leader_speed, seen.leader_acceleration, zero)
         p = self.policy.space.unpack(store.parameters[slots])
         after = advance_vehicle(self._driven, follower, leader, p, dt)
         store.memory[slots] = after.memory

@@ -8,10 +8,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from cfx.core.errors import SumoError
+from cfx_sumo.live.bridge import Read, bridge_of
 
 Connection = Any
 """The module `libsumo`, the module `traci`, or a connection that `traci.getConnection` gives."""
@@ -23,7 +26,7 @@ class Seen(NamedTuple):
     Attributes:
         speed, acceleration: the follower's.
         gap: bumper to bumper.
-        leader_speed, leader_acceleration, leader_length: of the vehicle ahead.
+        leader_speed, leader_acceleration: of the vehicle ahead.
         allowed: the speed limit that holds for the follower.
         min_gap: the follower's `minGap`, the gap that SUMO's own models keep at a standstill.
     """
@@ -33,7 +36,6 @@ class Seen(NamedTuple):
     gap: Tensor
     leader_speed: Tensor
     leader_acceleration: Tensor
-    leader_length: Tensor
     allowed: Tensor
     min_gap: Tensor
 
@@ -60,13 +62,19 @@ class Seen(NamedTuple):
         )
 
 
-_SPEED, _ACCELERATION, _LENGTH = 0x40, 0x72, 0x44
+_SPEED, _ACCELERATION = 0x40, 0x72
 _ALLOWED_SPEED, _MIN_GAP, _LEADER = 0xB7, 0x4C, 0x68
 """Numbers of the variables in TraCI's protocol: `traci.constants` would load traci, which none but
 its own users need."""
 
-_SUBSCRIBED = (_SPEED, _ACCELERATION, _LENGTH, _ALLOWED_SPEED, _MIN_GAP)
+_SUBSCRIBED = (_SPEED, _ACCELERATION, _ALLOWED_SPEED, _MIN_GAP)
 """What is subscribed to, besides the leader."""
+
+_FARTHEST = 1e6
+"""m: no gap is larger."""
+
+_ANOTHER = -1
+"""Row of a leader who is not among the vehicles that are read."""
 
 
 class View(NamedTuple):
@@ -97,59 +105,120 @@ def look(connection: Connection, names: list[str], look_ahead: float) -> View:
     Raises:
         SumoError: a vehicle is not in the simulation.
     """
-    reader: DirectReader | SubscribedReader
-    if type(connection.vehicle).__module__.startswith("traci"):
-        reader = SubscribedReader(connection.vehicle, look_ahead, ("d", look_ahead))
-    else:
-        reader = DirectReader(connection.vehicle, look_ahead)
-    return view_of(reader, names)
+    vehicle = connection.vehicle
+    if type(vehicle).__module__.startswith("traci"):
+        return view_of(SubscribedReader(vehicle, ("d", look_ahead)), names, look_ahead)
+    bridge = bridge_of(vehicle)
+    if bridge is not None:
+        read = bridge.read(names, look_ahead)
+        if read is not None:
+            return _view(
+                names, _columns_of(names, read), DirectReader(vehicle, look_ahead), look_ahead
+            )
+    return view_of(DirectReader(vehicle, look_ahead), names, look_ahead)
 
 
-def view_of(reader: DirectReader | SubscribedReader, names: list[str]) -> View:
+class Columns(NamedTuple):
+    """What SUMO says of D vehicles.
+
+    Attributes:
+        ahead: the next vehicle ahead of each; "" where there is none.
+        rows: places of those among the D vehicles, `(D,)`; below 0: they are others, or none.
+        values: gap to it without `minGap`, speed, acceleration, `minGap` and allowed speed,
+            `(5, D)`, SI units, as TraCI's getters answer.
+    """
+
+    ahead: list[str]
+    rows: NDArray[np.int64]
+    values: NDArray[np.float64]
+
+
+def view_of(reader: DirectReader | SubscribedReader, names: list[str], look_ahead: float) -> View:
     """Reads vehicles and their leaders in one of the two ways; as `look`."""
-    following, leaders, alone = [], [], []
-    rows: list[tuple[float, ...]] = []
-    rows_alone: list[tuple[float, ...]] = []
     try:
-        for name in names:
-            leader, row = reader.row(name)
-            if leader is None:
-                alone.append(name)
-                rows_alone.append(row)
-            else:
-                following.append(name)
-                leaders.append(leader)
-                rows.append(row)
+        rows = [reader.row(name) for name in names]
+        ahead = [leader[0] if leader else "" for leader, *_ in rows]
+        values = np.array([(leader[1] if leader else np.inf, *row) for leader, *row in rows])
+        places = {name: row for row, name in enumerate(names)}
+        at = np.array([places.get(name, -1) for name in ahead], dtype=np.int64)
+        columns = Columns(ahead, at, values.reshape(-1, 5).T)
+        return _view(names, columns, reader, look_ahead)
     except Exception as error:
         # libsumo's and traci's are two classes of this name.
         if type(error).__name__ != "TraCIException":
             raise
         raise SumoError(
-            f"vehicle '{name}' cannot be driven ({error}); step only vehicles of"
+            f"{_culprit(reader, names)} cannot be driven ({error}); step only vehicles of"
             " connection.vehicle.getIDList()"
         ) from error
-    table = torch.tensor(rows + rows_alone, dtype=torch.float64).reshape(-1, len(Seen._fields))
-    return View(following, leaders, alone, Seen(*table.unbind(1)))
 
 
-_FARTHEST = 1e6
-"""m: no gap is larger."""
+def _columns_of(names: list[str], read: Read) -> Columns:
+    """Returns columns of what the bridge has read."""
+    others = iter(read.others)
+    ahead = []
+    for row in read.rows.tolist():
+        if row >= 0:
+            ahead.append(names[row])
+        else:
+            ahead.append(next(others) if row == _ANOTHER else "")
+    return Columns(ahead, read.rows, read.values.T)
 
 
-def _gap_to(leader: tuple[str, float] | None, min_gap: float, look_ahead: float) -> float | None:
-    """Returns the gap from bumper to bumper, m; None without a leader within `look_ahead`.
+def _view(
+    names: list[str],
+    columns: Columns,
+    reader: DirectReader | SubscribedReader,
+    look_ahead: float,
+) -> View:
+    """Returns vehicles and their leaders, those with a leader first.
 
     SUMO's own gap leaves `minGap` out. At some junctions TraCI answers a leader at -1.8e308 m,
     which is none.
     """
-    if not leader or not leader[0] or abs(leader[1]) > _FARTHEST:
-        return None
-    gap = leader[1] + min_gap
-    return gap if gap <= look_ahead else None
+    ahead, rows = columns.ahead, columns.rows
+    raw, speed, acceleration, min_gap, allowed = columns.values
+    gap = raw + min_gap
+    follows = np.array([name != "" for name in ahead], dtype=bool)
+    follows &= (np.abs(raw) <= _FARTHEST) & (gap <= look_ahead)
+    leader_speed = np.where(follows, speed.take(rows, mode="clip"), speed)
+    leader_acceleration = np.where(follows, acceleration.take(rows, mode="clip"), 0.0)
+    for row in (follows & (rows < 0)).nonzero()[0].tolist():
+        leader_speed[row], leader_acceleration[row] = reader.motion(ahead[row])
+    signals = [
+        speed,
+        acceleration,
+        np.where(follows, gap, _FARTHEST),
+        leader_speed,
+        leader_acceleration,
+        allowed,
+        np.where(follows, min_gap, 0.0),
+    ]
+    order = np.argsort(~follows, kind="stable")
+    seen = Seen(*torch.from_numpy(np.stack(signals)[:, order]).unbind())
+    count = int(follows.sum())
+    placed = [names[row] for row in order.tolist()]
+    leaders = [ahead[row] for row in order[:count].tolist()]
+    return View(placed[:count], leaders, placed[count:], seen)
+
+
+def _culprit(reader: DirectReader | SubscribedReader, names: list[str]) -> str:
+    """Returns the first vehicle that SUMO does not know, in words."""
+    for name in names:
+        try:
+            reader.motion(name)
+        except Exception:
+            return f"vehicle '{name}'"
+    return "a vehicle"
+
+
+_Row = tuple[tuple[str, float] | None, float, float, float, float]
+"""The next vehicle ahead and the gap to it without `minGap`, m; speed, acceleration, `minGap` and
+allowed speed."""
 
 
 class DirectReader:
-    """Reads by calls, a value each, and each vehicle's motion once: a follower is often a leader.
+    """Reads by calls, a value each.
 
     In libsumo a call costs less than what SUMO does to serve a subscription.
     """
@@ -157,28 +226,21 @@ class DirectReader:
     def __init__(self, vehicle: Any, look_ahead: float) -> None:
         self._vehicle = vehicle
         self._look_ahead = look_ahead
-        self._motions: dict[str, tuple[float, float]] = {}
 
-    def row(self, name: str) -> tuple[str | None, tuple[float, ...]]:
-        """Returns a vehicle's leader, and the fields of `Seen`."""
+    def row(self, name: str) -> _Row:
+        """Returns what SUMO says of a vehicle."""
         vehicle = self._vehicle
-        leader = vehicle.getLeader(name, self._look_ahead)
-        min_gap = vehicle.getMinGap(name)
-        speed, acceleration = self._motion(name)
-        allowed = vehicle.getAllowedSpeed(name)
-        gap = _gap_to(leader, min_gap, self._look_ahead)
-        if gap is None:
-            return None, (speed, acceleration, _FARTHEST, speed, 0.0, 0.0, allowed, 0.0)
-        ahead = leader[0]
-        length = vehicle.getLength(ahead)
-        return ahead, (speed, acceleration, gap, *self._motion(ahead), length, allowed, min_gap)
+        return (
+            vehicle.getLeader(name, self._look_ahead),
+            vehicle.getSpeed(name),
+            vehicle.getAcceleration(name),
+            vehicle.getMinGap(name),
+            vehicle.getAllowedSpeed(name),
+        )
 
-    def _motion(self, name: str) -> tuple[float, float]:
-        motion = self._motions.get(name)
-        if motion is None:
-            motion = self._vehicle.getSpeed(name), self._vehicle.getAcceleration(name)
-            self._motions[name] = motion
-        return motion
+    def motion(self, name: str) -> tuple[float, float]:
+        """Returns a vehicle's speed, m/s, and acceleration, m/s2."""
+        return self._vehicle.getSpeed(name), self._vehicle.getAcceleration(name)
 
 
 class SubscribedReader:
@@ -188,34 +250,29 @@ class SubscribedReader:
     last step of the simulation is seen after the next one.
     """
 
-    def __init__(self, vehicle: Any, look_ahead: float, distance: object) -> None:
+    def __init__(self, vehicle: Any, distance: object) -> None:
         """Takes what SUMO has sent.
 
         Args:
             vehicle: of the connection.
-            look_ahead: m; a vehicle farther ahead is no leader.
-            distance: the same as the connection takes it: traci a type and a number, libsumo a
-                number.
+            distance: within which a leader counts, m, as the connection takes it: traci a type and
+                a number, libsumo a number.
         """
         self._vehicle = vehicle
-        self._look_ahead = look_ahead
         self._distance = distance
         self._known: Mapping[str, Mapping[int, Any]] = vehicle.getAllSubscriptionResults()
         self._new: dict[str, Mapping[int, Any]] = {}
 
-    def row(self, name: str) -> tuple[str | None, tuple[float, ...]]:
-        """Returns a vehicle's leader, and the fields of `Seen`."""
+    def row(self, name: str) -> _Row:
+        """Returns what SUMO says of a vehicle."""
         own = self._values(name, _LEADER)
-        leader, min_gap = own[_LEADER], own[_MIN_GAP]
-        speed, acceleration = own[_SPEED], own[_ACCELERATION]
-        allowed = own[_ALLOWED_SPEED]
-        gap = _gap_to(leader, min_gap, self._look_ahead)
-        if gap is None:
-            return None, (speed, acceleration, _FARTHEST, speed, 0.0, 0.0, allowed, 0.0)
-        ahead = self._values(leader[0], _LENGTH)
-        motion = ahead[_SPEED], ahead[_ACCELERATION]
-        length = ahead[_LENGTH]
-        return leader[0], (speed, acceleration, gap, *motion, length, allowed, min_gap)
+        motion = own[_SPEED], own[_ACCELERATION]
+        return (own[_LEADER], *motion, own[_MIN_GAP], own[_ALLOWED_SPEED])
+
+    def motion(self, name: str) -> tuple[float, float]:
+        """Returns a vehicle's speed, m/s, and acceleration, m/s2."""
+        values = self._values(name, _SPEED)
+        return values[_SPEED], values[_ACCELERATION]
 
     def _values(self, name: str, needed: int) -> Mapping[int, Any]:
         """Returns what is subscribed to of a vehicle, in which `needed` must be."""
@@ -225,7 +282,7 @@ class SubscribedReader:
                 variables = (*_SUBSCRIBED, _LEADER)
                 self._vehicle.subscribe(name, variables, parameters={_LEADER: self._distance})
             else:
-                self._vehicle.subscribe(name, _SUBSCRIBED)
+                self._vehicle.subscribe(name, (_SPEED, _ACCELERATION))
             values = self._vehicle.getSubscriptionResults(name)
             self._new[name] = values
         return values
