@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 import textwrap
 from collections.abc import Iterator
 from pathlib import Path
+
+# PyTorch's threads spin while they wait, and take the cores that other test processes want: small
+# tests cost ten times as much CPU time. PyTorch reads this when it is imported.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 from hypothesis import settings

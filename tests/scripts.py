@@ -8,8 +8,8 @@ from pathlib import Path
 
 from tests.conftest import ROOT
 
-ENVIRONMENT = {"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"}
-"""What a script knows of the tests' own environment: where cfx is."""
+ENVIRONMENT = {"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "OMP_NUM_THREADS": "1"}
+"""What a script knows of the tests' own environment: where cfx is, and that others use the cores."""
 
 
 def command_of(text: str, folder: Path) -> list[str]:

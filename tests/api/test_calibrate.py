@@ -18,6 +18,7 @@ from cfx.calibration.calibrator import Calibrator
 from cfx.core.errors import CfxError, ConfigError, DataError, ParameterError
 from cfx.results.table import read_tables
 
+RANDOM = {"optimizer": "random", "optimizer.samples": 256}
 LEADER = pd.DataFrame({"time_s": np.arange(600) * 0.1, "speed": 15.0})
 
 
@@ -42,7 +43,7 @@ def pairs(tmp_path_factory: pytest.TempPathFactory) -> cfx.Pairs:
 
 @pytest.fixture(scope="module")
 def fit(pairs: cfx.Pairs) -> cfx.Fit:
-    return cfx.calibrate(pairs, "idm", objective="gap_rmse", seed=3, optimizer="random")
+    return cfx.calibrate(pairs, "idm", objective="gap_rmse", seed=3, **RANDOM)
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +101,7 @@ def test_nothing_is_written(
     pairs: cfx.Pairs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    fit = cfx.calibrate(pairs, "krauss", optimizer="random")
+    fit = cfx.calibrate(pairs, "krauss", **RANDOM)
     cfx.simulate("krauss", fit)
     assert list(tmp_path.iterdir()) == []
 

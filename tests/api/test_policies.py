@@ -14,12 +14,14 @@ import pytest
 import cfx
 from cfx.core.errors import ConfigError, DataError
 
+RANDOM = {"optimizer": "random", "optimizer.samples": 64}
 SMALL = {
-    "optimizer": "random",
+    **RANDOM,
     "learner.epochs": 1,
     "policy.hidden_size": 4,
     "protocol.folds": 2,
     "learner.ensemble_size": 1,
+    "figures.enabled": False,
 }
 QUIET = ["tracking.enabled=false", "figures.enabled=false", "cache.enabled=false"]
 
@@ -84,8 +86,8 @@ def test_a_result_is_saved_loaded_tested_and_drawn(
         again.plot("drive")
     with pytest.raises(DataError, match="copy that folder"):
         again.save(tmp_path / "other")
-    tested = cfx.evaluate(again, others, optimizer="random")
-    in_memory = cfx.evaluate(trained, others, optimizer="random")
+    tested = cfx.evaluate(again, others, **RANDOM)
+    in_memory = cfx.evaluate(trained, others, **RANDOM)
     assert same_metrics(tested.metrics, in_memory.metrics)
     assert same_metrics(tested.metrics, run(tested, tmp_path / "out").metrics)
     with pytest.raises(DataError, match="save it first"):

@@ -30,6 +30,9 @@ CHECKS = (
 """Those that feed no arrays of random numbers."""
 
 
+SETTINGS = {"optimizer": "random", "optimizer.samples": 64}
+
+
 @pytest.fixture(scope="module")
 def table() -> pd.DataFrame:
     return cfx.read(dataset="synthetic", pairs=3, frames=150).frame
@@ -37,7 +40,7 @@ def table() -> pd.DataFrame:
 
 @pytest.fixture(scope="module")
 def fitted(table: pd.DataFrame) -> CarFollowingRegressor:
-    return CarFollowingRegressor("idm", settings={"optimizer": "random"}).fit(table)
+    return CarFollowingRegressor("idm", settings=SETTINGS).fit(table)
 
 
 @pytest.mark.parametrize("name", CHECKS)
@@ -68,7 +71,7 @@ def test_its_score_is_the_loss_of_its_parameters(
 
 
 def test_drivers_are_held_out_together(table: pd.DataFrame) -> None:
-    regressor = CarFollowingRegressor("idm", settings={"optimizer": "random"})
+    regressor = CarFollowingRegressor("idm", settings=SETTINGS)
     scores = cross_val_score(regressor, table, groups=table["pair_id"], cv=GroupKFold(3))
     assert scores.shape == (3,)
     assert (scores < 0).all()
