@@ -130,10 +130,11 @@ class BotorchOptimizer(Optimizer):
     settings: BotorchSettings
     trial: ClassVar[Mapping[str, Any]] = {
         "initial": 6,
-        "iterations": 7,
-        "first_fit_steps": 15,
+        "iterations": 3,
+        "screening": 200,
+        "first_fit_steps": 5,
         "fit_steps": 4,
-        "raw_samples": 128,
+        "raw_samples": 64,
         "restarts": 2,
         "climb_steps": 3,
     }

@@ -79,11 +79,11 @@ class RolloutLearner(Learner):
     uses_driver_features = True
     trial: ClassVar[Mapping[str, Any]] = {
         "ensemble_size": 2,
-        "distillation_epochs": 2,
-        "epochs": 4,
-        "steps": 12,
-        "horizon": 10,
-        "learning_rate": 0.02,
+        "distillation_epochs": 1,
+        "epochs": 3,
+        "steps": 6,
+        "horizon": 5,
+        "learning_rate": 0.1,
     }
 
     @property

@@ -7,22 +7,8 @@ from botorch.models import SingleTaskGP
 from cfx.calibration.optimizers import botorch
 from cfx.calibration.optimizers.botorch import BotorchOptimizer
 from cfx.calibration.optimizers.random import RandomSearch
-from cfx.contracts import check_contract
 from cfx.contracts.optimizers import Function, Problems, bowl, distance
 from cfx.core.errors import ConfigError
-
-
-def test_contract_with_screening() -> None:
-    optimizer = BotorchOptimizer(
-        initial=4,
-        iterations=2,
-        screening=200,
-        first_fit_steps=5,
-        raw_samples=64,
-        restarts=2,
-        climb_steps=3,
-    )
-    check_contract(optimizer, tolerance=0.1)
 
 
 @pytest.mark.parametrize("function", [distance, pytest.param(bowl, marks=pytest.mark.slow)])
