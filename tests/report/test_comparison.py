@@ -119,6 +119,7 @@ def test_constant_parameters_of_a_model_that_does_not_follow_are_compared_with_n
     assert {row[1].text for row in safety_of_methods([direct]).rows} == {"real", "policy"}
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_report_of_such_a_job_alone_has_no_comparison_with_fixed_parameters(
     tmp_path: Path,
 ) -> None:
@@ -148,6 +149,7 @@ def test_safety_is_told_of_the_policy_and_below_it_of_a_baseline(sweep: Path) ->
     assert cells(safety(jobs), "direct")["Hard braking"] == ["8"]
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_jobs_of_an_older_version_have_a_page_without_what_they_did_not_measure(
     tmp_path: Path,
 ) -> None:

@@ -19,18 +19,19 @@ from tests.report.folders import ACROSS, write_job
 SEEDS = (0, 1, 2)
 
 
-@pytest.fixture
-def sweep(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two models, each with three seeds."""
+    place = tmp_path_factory.mktemp("paper") / "sweep"
     for model in ("krauss", "w99"):
         for seed in SEEDS:
-            folder = tmp_path / "sweep" / f"{model}-{seed}"
+            folder = place / f"{model}-{seed}"
             write_job(folder, model=model, methods=ACROSS, seed=seed, settings={"seed": seed})
             hydra = folder / ".hydra"
             hydra.mkdir(exist_ok=True)
             typed = [f"model={model}", f"seed={seed}", "data.path=/home/ann/secret/pairs.parquet"]
             (hydra / "overrides.yaml").write_text(yaml.safe_dump(typed))
-    return tmp_path / "sweep"
+    return place
 
 
 def written(sweep: Path, *arguments: str) -> str:
@@ -144,7 +145,8 @@ def test_folders_of_absolute_paths_are_left_out(text: str, kept: str) -> None:
 
 @pytest.mark.usefixtures("blank_figures")
 def test_the_page_names_no_folder_of_this_machine(sweep: Path) -> None:
-    assert main(["report", str(sweep), "--output", str(sweep / "page.html")]) == 0
-    text = (sweep / "page.html").read_text(encoding="utf-8")
+    path = sweep.parent / "page.html"
+    assert main(["report", str(sweep), "--output", str(path)]) == 0
+    text = path.read_text(encoding="utf-8")
     assert str(sweep.parent) not in text
     assert "/home/ann" not in text

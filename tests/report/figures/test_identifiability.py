@@ -112,6 +112,7 @@ def test_what_was_chosen_is_drawn() -> None:
     assert drawn[0].lines[0].get_ydata()[0] == 1.15
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_report_shows_them(tmp_path: Path) -> None:
     folder = tmp_path / "job"
     write_job(folder, pairs=3)

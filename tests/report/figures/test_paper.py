@@ -68,8 +68,8 @@ def test_the_command_writes_a_jobs_figures_and_compares_several(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first, second = tmp_path / "a", tmp_path / "b"
-    write_job(first, model="idm")
-    write_job(second, seed=1)
+    write_job(first, model="idm", pairs=3)
+    write_job(second, pairs=3, seed=1)
     own = ["--width", "88mm", "--only", "drives", "--format", "svg"]
     assert cli.main(["figures", str(first), *own]) == 0
     (path,) = (first / "figures").iterdir()
