@@ -7,6 +7,7 @@ import os
 import sys
 import textwrap
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 # PyTorch's threads spin while they wait, and take the cores that other test processes want: small
@@ -17,6 +18,8 @@ import pytest
 from hypothesis import settings
 
 from cfx.data.pairs import PairSet
+from cfx.evaluation.platoon import Manoeuvre, measure_platoons
+from cfx.evaluation.protocols import held_out, within_driver
 from cfx.simulation.synthetic import SyntheticDataset
 
 pytest_plugins = ["tests.browser"]
@@ -52,6 +55,23 @@ def _simulates_anew(request: pytest.FixtureRequest, simulated_anew: list[bool]) 
     simulated_anew[0] = "synthetic" in request.node.nodeid
     yield
     simulated_anew[0] = False
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _short_platoons(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Lets the leader of a job's platoons brake after 6 s and not 60: half of a small job's time.
+
+    Jobs of slow tests, such as the golden ones, and `tests/evaluation/test_platoon.py` have the
+    standard manoeuvre.
+    """
+    if request.config.getoption("markexpr") != "not slow":
+        yield
+        return
+    short = partial(measure_platoons, manoeuvre=Manoeuvre(settle=6.0, hold=2.0, after=4.0))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(held_out, "measure_platoons", short)
+        patch.setattr(within_driver, "measure_platoons", short)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -412,6 +412,8 @@ def test_without_learning_the_policy_is_its_base(
     still = [
         "learner.epochs=1",
         "learner.steps=1",
+        "learner.horizon=2",
+        "learner.ensemble_size=1",
         "learner.learning_rate=1e-12",
         "learner.weight_decay=0",
     ]

@@ -26,6 +26,7 @@ FORECAST = [
     *HERE,
     "protocol=forecast",
     "protocol.horizons=[0.5,2]",
+    "protocol.stride=1",
     "protocol.histories=[]",
 ]
 
@@ -40,7 +41,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def forecast(drawn: Path) -> Forecast:
-    return Forecast(run=drawn, horizons=(0.5, 1.0), histories=())
+    return Forecast(run=drawn, horizons=(0.5, 1.0), stride=2.0, histories=())
 
 
 def test_contract(forecast: Forecast) -> None:
@@ -52,7 +53,7 @@ def job(base: list[str], run: Path, folder: Path, *overrides: str) -> cfx.JobRes
 
 
 def test_the_finished_policy_forecasts_from_every_moment(drawn: Path, tmp_path: Path) -> None:
-    result = job(FORECAST, drawn, tmp_path / "job", "protocol.samples=20", "model=w99")
+    result = job(FORECAST, drawn, tmp_path / "job", "protocol.samples=8", "model=w99")
     config = yaml.safe_load((result.folder / "config.yaml").read_text())
     assert config["model"]["name"] == "krauss"
     assert len(pd.read_parquet(result.folder / "curves.parquet")) == 0
