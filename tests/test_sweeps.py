@@ -113,29 +113,28 @@ def summary(folder: Path) -> list[dict[str, str]]:
 def test_an_interrupted_sweep_goes_on_whatever_the_order_of_its_overrides(
     run: Run, how: str, capsys
 ) -> None:
-    Path(f"{how}-2").touch()
-    assert run("-m", "seed=0,1,2,3", "model=w99") == 130
-    assert ran() == ["0", "1", "2"]
+    Path(f"{how}-1").touch()
+    assert run("-m", "seed=0,1,2", "model=w99") == 130
+    assert ran() == ["0", "1"]
     printed = capsys.readouterr()
-    assert "2 of 4 jobs done" in printed.out
+    assert "1 of 3 jobs done" in printed.out
     assert "The same command again" in printed.out
     assert "Traceback" not in printed.err
-    Path(f"{how}-2").unlink()
-    assert run("-m", "model=w99", "seed=3,2,1,0") == 0
-    assert ran() == ["3", "2"]
+    Path(f"{how}-1").unlink()
+    assert run("-m", "model=w99", "seed=2,1,0") == 0
+    assert ran() == ["2", "1"]
     (folder,) = sweeps()
     printed = capsys.readouterr()
-    assert f"continuing sweep {folder}: 2 of 4 jobs are done\n" in printed.out
-    assert "4 of 4 jobs done" in printed.out
-    assert len(jobs(folder)) == 4
+    assert f"continuing sweep {folder}: 1 of 3 jobs are done\n" in printed.out
+    assert "3 of 3 jobs done" in printed.out
+    assert len(jobs(folder)) == 3
     assert [(row["seed"], row["state"]) for row in summary(folder)] == [
-        ("3", "done"),
         ("2", "done"),
-        ("1", "done before"),
+        ("1", "done"),
         ("0", "done before"),
     ]
-    assert run("-m", "seed=0,1,2,3", "model=w99") == 0  # that one is complete: a fresh one
-    assert len(ran()) == 4
+    assert run("-m", "seed=0,1,2", "model=w99") == 0  # that one is complete: a fresh one
+    assert len(ran()) == 3
     assert len(sweeps()) == 2
 
 
@@ -207,7 +206,7 @@ def test_a_job_runs_again_if_anything_differs_that_its_results_depend_on(
     monkeypatch.setenv("CFX_FRAMES", "100")
     command = [
         "-m",
-        "seed=0,1",
+        "seed=0",
         "data=tidy",
         "data.path=drives.csv",
         "data.min_frames=${oc.env:CFX_FRAMES}",
@@ -218,35 +217,35 @@ def test_a_job_runs_again_if_anything_differs_that_its_results_depend_on(
         assert run(*command) == 0
         return len(ran())
 
-    assert runs() == 2
+    assert runs() == 1
     assert runs() == 0
     Path("drives.csv").write_text("ab")
-    assert runs() == 2
+    assert runs() == 1
     os.utime("drives.csv", ns=(1, 1))
-    assert runs() == 2
+    assert runs() == 1
     monkeypatch.setenv("CFX_FRAMES", "200")
-    assert runs() == 2
+    assert runs() == 1
     monkeypatch.setattr(provenance, "version", lambda: "99.0")
-    assert runs() == 2
+    assert runs() == 1
     monkeypatch.setattr(provenance, "distributions", lambda values: {"cfx-idm": "0.3"})
-    assert runs() == 2
+    assert runs() == 1
     assert runs() == 0
     (jobs(Path("s"))[0] / sweep.STATUS).write_text('{"code": 0')
     assert runs() == 1
-    assert len(jobs(Path("s"))) == 2
+    assert len(jobs(Path("s"))) == 1
 
 
 @pytest.mark.parametrize("path", ["[a.csv,b.csv]", "*.csv"])
 def test_a_job_runs_again_if_one_of_several_files_changed(run: Run, path: str) -> None:
     for name in ("a.csv", "b.csv"):
         Path(name).write_text("a")
-    command = ["-m", "seed=0,1", "data=tidy", f"data.path={path}", "hydra.sweep.dir=s"]
+    command = ["-m", "seed=0", "data=tidy", f"data.path={path}", "hydra.sweep.dir=s"]
     assert run(*command) == 0
     assert run(*command) == 0
-    assert len(ran()) == 2
+    assert len(ran()) == 1
     Path("b.csv").write_text("ab")
     assert run(*command) == 0
-    assert len(ran()) == 2
+    assert len(ran()) == 1
 
 
 def test_a_sweep_that_runs_is_left_alone(run: Run, capsys) -> None:
