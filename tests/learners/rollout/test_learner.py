@@ -210,13 +210,8 @@ def test_an_ensemble_learns_and_drives_as_one() -> None:
 @pytest.mark.parametrize(
     "options",
     [
-        {"tbptt_windows": 4},
-        {"drivers": 3},
-        {"gradient_clip": None, "patience": None},
-        {"validation": 0.0},
-        {"cold_start_fraction": 1.0},
-        {"temperature": 0.0},
-        {"distillation_epochs": 1},
+        {"tbptt_windows": 4, "drivers": 3, "gradient_clip": None, "patience": None},
+        {"validation": 0.0, "cold_start_fraction": 1.0, "temperature": 0.0},
         {"head": "residual", "time_weighting": "relative", "distillation_epochs": 1},
         {"head": "stochastic", "time_weighting": "relative", "jerk_weight": 0.01},
     ],

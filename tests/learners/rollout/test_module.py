@@ -41,7 +41,7 @@ def test_training_simulates_what_evaluation_simulates(
     """Training's closed loop and evaluation's give the same speeds and gaps after a burn-in."""
     policy = gru(driver_features=driver_features)
     data = training_data(model=model, networks=1)
-    options = QUICK | {"epochs": 1, "learning_rate": 0.05, "head": head}
+    options = QUICK | {"epochs": 1, "steps": 4, "learning_rate": 0.05, "head": head}
     result = RolloutLearner(**options).fit(policy, data)
     settings = RolloutSettings(**(QUICK | {"head": head}))
     dataset = placed(data, policy, settings.validation, head=head)
