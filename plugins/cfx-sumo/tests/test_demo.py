@@ -9,7 +9,6 @@ import pandas as pd
 import pytest
 
 import cfx
-from cfx.contracts import check_contract
 from cfx.core.errors import ConfigError, DataError, SumoError
 from cfx.policies.checkpoint import save
 from cfx_sumo.demo import motorway
@@ -31,10 +30,6 @@ SMALL = [
     "learner.epochs=3",
 ]
 OSM = SHIPPED.with_name("motorway.osm.xml")
-
-
-def test_contract() -> None:
-    check_contract(SumoDemo(pairs=2))
 
 
 @pytest.fixture(scope="module")
