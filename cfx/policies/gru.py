@@ -12,7 +12,7 @@ from torch import Tensor
 
 from cfx.core.component import Settings
 from cfx.policies.base import Policy, PolicyNetwork
-from cfx.policies.recurrent import RecurrentLayer, RecurrentNetwork, RecurrentSettings
+from cfx.policies.recurrent import RecurrentNetwork, RecurrentSettings
 
 
 class GruNetwork(RecurrentNetwork):
@@ -21,12 +21,12 @@ class GruNetwork(RecurrentNetwork):
     gates = 3
     states = 1
 
-    def cell(self, projected: Tensor, layer: RecurrentLayer, carried: Tensor) -> Tensor:
-        recurrent = layer.recur(carried)
-        h = self.hidden
-        gates = (projected[..., : 2 * h] + recurrent[..., : 2 * h]).sigmoid()
+    @staticmethod
+    def cell(projected: Tensor, recurrent: Tensor, carried: Tensor) -> Tensor:
+        two = 2 * (projected.shape[-1] // 3)
+        gates = (projected[..., :two] + recurrent[..., :two]).sigmoid()
         reset, update = gates.chunk(2, dim=-1)
-        new = torch.tanh(projected[..., 2 * h :] + reset * recurrent[..., 2 * h :])
+        new = torch.tanh(projected[..., two:] + reset * recurrent[..., two:])
         return torch.lerp(new, carried, update)
 
 

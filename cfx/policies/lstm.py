@@ -12,7 +12,7 @@ from torch import Tensor
 
 from cfx.core.component import Settings
 from cfx.policies.base import Policy, PolicyNetwork
-from cfx.policies.recurrent import RecurrentLayer, RecurrentNetwork, RecurrentSettings
+from cfx.policies.recurrent import RecurrentNetwork, RecurrentSettings
 
 
 class LstmNetwork(RecurrentNetwork):
@@ -21,10 +21,11 @@ class LstmNetwork(RecurrentNetwork):
     gates = 4
     states = 2
 
-    def cell(self, projected: Tensor, layer: RecurrentLayer, carried: Tensor) -> Tensor:
-        output, memory = carried.chunk(2, dim=-1)
-        h = self.hidden
-        gates = projected + layer.recur(output)
+    @staticmethod
+    def cell(projected: Tensor, recurrent: Tensor, carried: Tensor) -> Tensor:
+        memory = carried[..., carried.shape[-1] // 2 :]
+        h = projected.shape[-1] // 4
+        gates = projected + recurrent
         let_in, forget = gates[..., : 2 * h].sigmoid().chunk(2, dim=-1)
         memory = forget * memory + let_in * gates[..., 2 * h : 3 * h].tanh()
         return torch.cat([gates[..., 3 * h :].sigmoid() * memory.tanh(), memory], dim=-1)

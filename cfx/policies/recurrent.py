@@ -133,12 +133,22 @@ class RecurrentNetwork(PolicyNetwork):
                 projected = projected + self.b_acting
             outputs = []
             for k in range(tokens.shape[2]):
-                carried = self.cell(projected[:, :, k], layer, carried)
+                recurrent = layer.recur(carried[..., : self.hidden])
+                carried = self.cell(projected[:, :, k], recurrent, carried)
                 outputs.append(carried[..., : self.hidden])
             x = torch.stack(outputs, dim=2)
             last.append(carried)
         return x, torch.cat(last, dim=-1)
 
-    def cell(self, projected: Tensor, layer: RecurrentLayer, carried: Tensor) -> Tensor:
-        """Returns what a layer carries after a window, `(N, B, states * hidden)`, output first."""
+    @staticmethod
+    def cell(projected: Tensor, recurrent: Tensor, carried: Tensor) -> Tensor:
+        """Returns what a layer carries after a window, `(*batch, states * width)`, output first.
+
+        Elementwise over units: each reads its own column of every gate.
+
+        Args:
+            projected: input part of the gates, one behind the other, `(*batch, gates * width)`.
+            recurrent: their hidden part, of the same shape.
+            carried: before the window, `(*batch, states * width)`.
+        """
         raise NotImplementedError

@@ -1,10 +1,10 @@
 """A gradient step of closed-loop training, beside the same step in plain eager PyTorch.
 
 The case has I-80's size: six networks (five folds and one for everybody), or ensembles of four, of
-57 drivers, two trajectories of 15 s for each after a burn-in of 20 s. All ways run the same code in
-the same process: through `torch.compile`, as cfx does; eagerly, all networks in one batch; and
-eagerly a network at a time, as a training loop without batched networks would have to. `extra_info`
-holds the ratios of their times; nothing passes or fails by the clock.
+57 drivers, two trajectories of 15 s for each after a burn-in of 20 s. All ways run in the same
+process: a trajectory as compiled code, as cfx does; windows through `torch.compile`; eagerly, all
+networks in one batch; and eagerly a network at a time, as a training loop without batched networks
+would have to. `extra_info` holds the ratios of their times; nothing passes or fails by the clock.
 """
 
 from __future__ import annotations
@@ -97,16 +97,23 @@ def test_a_gradient_step(benchmark: Any, model: DrivingModel, ensemble_size: int
         Step(model, RolloutSettings(compile=how, ensemble_size=ensemble_size))
         for how in ("always", "never")
     )
+    windows = Step(model, RolloutSettings(compile="always", ensemble_size=ensemble_size))
+    windows.module.scans = {}
+    windows.module.training_window.compile()
     alone = Step(model, RolloutSettings(compile="never", ensemble_size=1), networks=1)
     began = time.perf_counter()
     compiled()
     benchmark.extra_info["seconds to compile"] = time.perf_counter() - began
+    began = time.perf_counter()
+    windows()
+    benchmark.extra_info["seconds for torch.compile"] = time.perf_counter() - began
     eager()
     alone()
-    for step in (compiled, eager, alone):
+    for step in (compiled, windows, eager, alone):
         step.number = 100
     benchmark.pedantic(compiled, rounds=5)
     took = benchmark.stats.stats.median
+    benchmark.extra_info["times faster than windows of torch.compile"] = _seconds(windows) / took
     benchmark.extra_info["times faster than eager"] = _seconds(eager) / took
     benchmark.extra_info["times faster than eager, a network at a time"] = (
         NETWORKS * ensemble_size * _seconds(alone) / took

@@ -26,7 +26,13 @@ from torch import Tensor
 
 from cfx.learners.rollout.dataset import Conditioning, RolloutDataset
 from cfx.learners.rollout.inputs import Measured, RolloutBatch, RolloutInputs
-from cfx.learners.rollout.window import GradientPath, LeaderWindow, LoopState, WindowStep
+from cfx.learners.rollout.scan import Observed, Scan
+from cfx.learners.rollout.window import (
+    GradientPath,
+    LeaderWindow,
+    LoopState,
+    WindowStep,
+)
 
 
 class ExpertState(NamedTuple):
@@ -144,19 +150,30 @@ def burn_in(
     Returns:
         The policy's state at the start of each trajectory, `(N, D, s)`.
     """
+    tokens, present = observed_windows(dataset, batch, conditioning, most)
+    state = step.core.network.initial_state(*conditioning.pair.shape)
+    if state.is_floating_point() and torch.is_grad_enabled():
+        # As all later states, so that one compiled function serves all windows.
+        state = state.detach().requires_grad_()
+    for token, own in zip(tokens, present, strict=True):
+        state = step.observe(token, conditioning.features, state, own)
+    return state
+
+
+def observed_windows(
+    dataset: RolloutDataset, batch: RolloutBatch, conditioning: Conditioning, most: int | None
+) -> tuple[Tensor, Tensor]:
+    """Returns the tokens of measured windows before trajectories begin; none before a cold start.
+
+    Returns:
+        Tokens `(B, N, D, f)`, and whether a trajectory has the window, bool `(B, N, D)`.
+    """
     start = torch.where(batch.cold_start, 0, batch.start)
     count = int(start.max())
     if most is not None:
         count = min(count, most)
     windows = start - count + torch.arange(count, device=start.device)[:, None, None]
-    tokens = dataset.recordings.tokens[conditioning.pair, windows.clamp(min=0)]
-    state = step.core.network.initial_state(*conditioning.pair.shape)
-    if state.is_floating_point() and torch.is_grad_enabled():
-        # As all later states, so that one compiled function serves all windows.
-        state = state.detach().requires_grad_()
-    for number in range(count):
-        state = step.observe(tokens[number], conditioning.features, state, windows[number] >= 0)
-    return state
+    return dataset.recordings.tokens[conditioning.pair, windows.clamp(min=0)], windows >= 0
 
 
 def simulate(
@@ -170,6 +187,7 @@ def simulate(
     expert: Expert | None = None,
     noise: Tensor | None = None,
     paths: int = 1,
+    scan: Scan | None = None,
 ) -> Iterator[Segment]:
     """Simulates trajectories in closed loop.
 
@@ -184,10 +202,15 @@ def simulate(
         noise: what a stochastic head draws from, `(H, N, paths D, k)`; None: nothing is drawn.
         paths: of each trajectory, all of them behind the ones before. What was measured is observed
             once for all.
+        scan: the window as compiled code, which simulates where no expert is asked and nothing is
+            drawn; None: none.
 
     Yields:
         What was simulated between two cuts of the gradients.
     """
+    if scan is not None and expert is None and noise is None:
+        yield from _scanned(scan, dataset, batch, windows, path, burn_in_windows)
+        return
     state = burn_in(step, dataset, batch, dataset.condition(batch), burn_in_windows)
     state = state.repeat(1, paths, 1)
     batch = batch.repeated(paths)
@@ -221,3 +244,25 @@ def simulate(
         speed, gap = torch.cat(speeds, -1), torch.cat(gaps, -1)
         yield Segment(speed, gap, measured, expert_speed, frames.start)
         now = path.after_segment(now)
+
+
+def _scanned(
+    scan: Scan,
+    dataset: RolloutDataset,
+    batch: RolloutBatch,
+    windows: int,
+    path: GradientPath,
+    most: int | None,
+) -> Iterator[Segment]:
+    """As `simulate`, by compiled code."""
+    conditioning = dataset.condition(batch)
+    pairs, step = dataset.recordings.batch, scan.step
+    inputs = RolloutInputs.of(pairs, conditioning.pair, batch, step, windows)
+    tokens, present = observed_windows(dataset, batch, conditioning, most)
+    known = conditioning.features.expand(len(tokens), -1, -1, -1)
+    observed = Observed(torch.cat([tokens, known], -1), present.to(tokens.dtype))
+    first = 0
+    for speed, gap in scan.simulate(inputs, observed, conditioning, windows, path):
+        measured = inputs.measured_at(slice(first, first + speed.shape[-1]))
+        yield Segment(speed, gap, measured, None, first)
+        first += speed.shape[-1]

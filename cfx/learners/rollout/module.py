@@ -5,6 +5,7 @@ Shapes: N networks (each member of an ensemble counts), D trajectories of each.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -23,6 +24,7 @@ from cfx.learners.rollout.inputs import Measured, RolloutBatch
 from cfx.learners.rollout.loop import Expert, simulate
 from cfx.learners.rollout.loss import BaseErrors, Divisors, FrameWeights, TrajectoryLoss
 from cfx.learners.rollout.sampling import TrajectorySampler
+from cfx.learners.rollout.scan import Scan
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.learners.rollout.window import (
     GradientPath,
@@ -34,7 +36,10 @@ from cfx.learners.rollout.window import (
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.core import AgentCore
 from cfx.policies.heads import head_class
+from cfx.simulation.kernel.columns import Unsupported
 from cfx.simulation.rollout import can_compile
+
+log = logging.getLogger(__name__)
 
 _WORTH_COMPILING = 5_000
 """Windows simulated in training, one after the other, from which compiling pays: some ten seconds
@@ -127,8 +132,9 @@ class RolloutModule(BatchedModule):
         if settings.temperature > 0:
             model = model.at_temperature(self.temperature)
         self.training_window = WindowStep(core, model, windows, dt)
+        self.scans: dict[WindowStep, Scan] = {}
         if self._is_worth_compiling():
-            self.training_window.compile()
+            self._compile()
         if errors is None:
             errors = BaseErrors.of(training_data, dataset, settings.horizon)
         self.errors = errors
@@ -237,6 +243,7 @@ class RolloutModule(BatchedModule):
             expert=expert,
             noise=noise,
             paths=1 + sampled,
+            scan=self.scans.get(step),
         )
         centre = slice(None, batch.place.shape[1])
         for segment in segments:
@@ -417,6 +424,22 @@ class RolloutModule(BatchedModule):
         total = self.settings.epochs * self.settings.steps
         warm_up = min(1.0, (step + 1) / _WARM_UP)
         return warm_up * 0.5 * (1.0 + math.cos(math.pi * min(1.0, step / total)))
+
+    def _compile(self) -> None:
+        """Compiles the windows of training and of validation."""
+        exact, window = self.exact_step, self.training_window
+        temperature = self.temperature if self.settings.temperature > 0 else None
+        if self.dataset.base.device.type == "cpu":
+            key = window.key()
+            try:
+                self.scans[window] = Scan(window, temperature, key, trains=True)
+                self.scans[exact] = Scan(exact, None, key, trains=False)
+            except Unsupported as reason:
+                log.info("Training has no compiled loop (%s); PyTorch compiles a window", reason)
+            else:
+                if not self.is_stochastic and not self.settings.distillation_epochs:
+                    return
+        window.compile()
 
     def _is_worth_compiling(self) -> bool:
         s = self.settings

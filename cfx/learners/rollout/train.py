@@ -126,4 +126,7 @@ def _expert(shard: TrainingShard, on_epoch: Callable[[], None]) -> Expert:
         checkpoint = expert_checkpoint(shard.checkpoint)
     _fit(module, checkpoint)
     module.network.requires_grad_(False)
+    if module.scans:
+        # Experts say one window at a time what they would do.
+        module.training_window.compile()
     return Expert(module.training_window, expert_dataset)

@@ -24,11 +24,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from cfx.calibration import prior
 from cfx.calibration.windows import WindowSettings
+from cfx.core import parameters
+from cfx.core.component import folder_hash
 from cfx.models.base import DrivingModel, Follower, Leader
+from cfx.policies import features
 from cfx.policies.core import AgentCore
 from cfx.policies.features import History
 from cfx.simulation.kernel.compiler import torch_compiled
+from cfx.simulation.kernel.keys import component_code
 from cfx.simulation.step import advance_vehicle
 
 
@@ -94,6 +99,19 @@ class WindowStep:
         self.observe = torch_compiled(self.observe, dynamic=False)  # type: ignore[method-assign]
         self.drive_window = torch_compiled(self.drive_window, dynamic=False)  # type: ignore[method-assign]
 
+    def key(self) -> object:
+        """Returns what the window depends on besides tensors; None if only this process knows."""
+        core = self.core
+        code = []
+        for component in (type(self.model), type(core.head), type(core.policy)):
+            code.append(component_code(component))
+        if None in code:
+            return None
+        settings = [self.model.equations_key(), repr(self.space), self.length, self.stride, self.dt]
+        read = [core.inputs, core.summary, core.scaler.mean.shape[-1]]
+        rooms = [folder_hash(module.__file__) for module in (features, parameters, prior)]
+        return [code, settings, read, rooms, folder_hash(__file__)]
+
     def observe(
         self, token: Tensor, conditioning: Tensor, state: Tensor, present: Tensor
     ) -> Tensor:
@@ -134,8 +152,38 @@ class WindowStep:
             Where the trajectories stand afterwards; speed (m/s) and gap (m) at the S frames,
             `(N, D, S)` each.
         """
+        features = self.features(now, leader, leader_length, conditioning)
+        answer, state = self.core.answer(features, now.state)
+        after, speed, gap = self.steer(answer, now, leader, leader_length, base, noise)
+        return after._replace(state=state), speed, gap
+
+    def features(
+        self, now: LoopState, leader: LeaderWindow, leader_length: Tensor, conditioning: Tensor
+    ) -> Tensor:
+        """Returns what networks read, `(*batch, f + c)`, not normalised; as for `drive_window`."""
         history = self._history(now, leader, leader_length)
-        unit, state = self.core.act(history, base, conditioning, now.state)
+        return torch.cat([self.core.encode(history), conditioning], -1)
+
+    def steer(
+        self,
+        answer: Tensor,
+        now: LoopState,
+        leader: LeaderWindow,
+        leader_length: Tensor,
+        base: Tensor,
+        noise: Tensor | None = None,
+    ) -> tuple[LoopState, Tensor, Tensor]:
+        """Takes the steps of a window, elementwise over trajectories.
+
+        Args:
+            answer: of the networks, `(*batch, n)`.
+            now, leader, leader_length, base, noise: as for `drive_window`.
+
+        Returns:
+            As `drive_window`; the policy's state is as before.
+        """
+        history = self._history(now, leader, leader_length)
+        unit = self.core.head.unit_parameters(answer, base)
         chosen = self.core.head.measured(self.low + unit * self.range, history, self.dt)
         latent = now.latent
         if noise is not None:
@@ -164,7 +212,7 @@ class WindowStep:
             self._shift(now.speed, speed),
             self._shift(now.acceleration, acceleration),
             follower.memory,
-            state,
+            now.state,
             latent,
         )
         gap = leader.position[..., self.length :] - leader_length[..., None] - position

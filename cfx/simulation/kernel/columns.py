@@ -139,6 +139,18 @@ def _slice(node: fx.Node, known: Known) -> Expressions:
     return np.asarray(known[source][tuple(cut)])
 
 
+def _split(node: fx.Node, known: Known) -> list[Expressions]:
+    source: Any = node.args[0]
+    size = node.args[1]
+    if not isinstance(size, int):
+        raise Unsupported("parts of several widths")
+    dimension = int(_given(node, 2, "dim", 0))
+    if source.meta["val"].shape[dimension] == VEHICLES:
+        raise Unsupported("an operation that is not elementwise")
+    cuts = range(size, known[source].shape[dimension], size)
+    return np.split(known[source], list(cuts), axis=dimension)
+
+
 def _unbind(node: fx.Node, known: Known) -> list[Expressions]:
     source: Any = node.args[0]
     return list(np.moveaxis(known[source], _columns(node, source), 0))
@@ -197,6 +209,7 @@ MOVES: dict[str, Callable[[fx.Node, Known], Any]] = {
     "getitem": _getitem,
     "select": _select,
     "slice": _slice,
+    "split": _split,
     "squeeze": _reshape,
     "stack": _stack,
     "unbind": _unbind,

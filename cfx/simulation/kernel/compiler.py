@@ -58,15 +58,21 @@ def find_compiler() -> str | None:
 
 
 @functools.lru_cache(maxsize=64)
-def build(source: str) -> ctypes.CDLL | None:
-    """Returns the library built from C++ source; None where it cannot be built."""
+def build(source: str, *options: str) -> ctypes.CDLL | None:
+    """Returns the library built from C++ source; None where it cannot be built.
+
+    Args:
+        source: the source.
+        options: of the compiler, behind `FLAGS`.
+    """
     compiler = find_compiler()
     if compiler is None:
         return None
-    path = cache_folder() / f"{_key(source, compiler)}.so"
+    flags = (*FLAGS, *options)
+    path = cache_folder() / f"{_key(source, compiler, flags)}.so"
     try:
         if not path.is_file():
-            _compile(compiler, source, path)
+            _compile([compiler, *flags], source, path)
         return ctypes.CDLL(str(path))
     except (OSError, subprocess.SubprocessError) as error:
         log.info("The C++ compiler made no kernel (%s); PyTorch simulates instead", error)
@@ -93,11 +99,11 @@ def remembered(key: str | None, make: Callable[[], str]) -> str:
     return text
 
 
-def _compile(compiler: str, source: str, path: Path) -> None:
+def _compile(compiler: list[str], source: str, path: Path) -> None:
     with tempfile.TemporaryDirectory() as folder, atomic_write(path) as temporary:
         text = Path(folder, "kernel.cpp")
         text.write_text(source, encoding="utf-8")
-        command = [compiler, *FLAGS, "-o", str(temporary), str(text)]
+        command = [*compiler, "-o", str(temporary), str(text)]
         try:
             _run([*command, *_VECTOR_MATH])
         except subprocess.CalledProcessError:
@@ -109,11 +115,11 @@ def _run(command: list[str]) -> None:
     subprocess.run(command, capture_output=True, check=True, timeout=_TIMEOUT_S)  # noqa: S603
 
 
-def _key(source: str, compiler: str) -> str:
+def _key(source: str, compiler: str, flags: tuple[str, ...]) -> str:
     """Returns what the library depends on, as a hash: source, compiler and processor."""
     real = Path(compiler).resolve()
     version = f"{real}:{real.stat().st_mtime_ns}"
-    parts = (source, " ".join((*FLAGS, *_VECTOR_MATH)), version, platform.machine(), processor())
+    parts = (source, " ".join((*flags, *_VECTOR_MATH)), version, platform.machine(), processor())
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 

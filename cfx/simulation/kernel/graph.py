@@ -7,7 +7,8 @@ model has a memory there are columns too, `(V, m)`; `columns` says how they are 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -53,11 +54,16 @@ def parameter_names(count: int) -> tuple[str, ...]:
 
 
 class Statement(NamedTuple):
-    """One operation: `name = expression`, a number or (`is_condition`) true or false."""
+    """One operation: `name = expression`, a number or (`is_condition`) true or false.
+
+    `cfx.simulation.kernel.adjoint` differentiates `operation` by its `operands`.
+    """
 
     name: str
     expression: str
     is_condition: bool
+    operation: str = ""
+    operands: tuple[str, ...] = ()
 
 
 class StepProgram(NamedTuple):
@@ -128,6 +134,59 @@ def record(
     return _Recording(names).program(graph, width)
 
 
+class Program(NamedTuple):
+    """An elementwise function, as C++ expressions over the columns of its inputs.
+
+    Attributes:
+        inputs: names of the columns of each input.
+        statements: in order.
+        outputs: expressions of the columns of each output.
+    """
+
+    inputs: tuple[tuple[str, ...], ...]
+    statements: tuple[Statement, ...]
+    outputs: tuple[tuple[str, ...], ...]
+
+
+def record_function(
+    function: Callable[..., Sequence[Tensor]], widths: Sequence[int], dtype: torch.dtype
+) -> Program:
+    """Records an elementwise function of tensors `(V, width)`.
+
+    Args:
+        function: pure; returns such tensors.
+        widths: of its arguments, at least 1 each.
+        dtype: of all values.
+
+    Raises:
+        Unsupported: as `record`.
+    """
+    from torch._decomp import get_decompositions
+    from torch.fx.experimental.proxy_tensor import make_fx
+
+    names: list[tuple[str, ...]] = []
+    for number, width in enumerate(widths):
+        names.append(tuple(f"in{number}_{column}" for column in range(width)))
+
+    def of_columns(*values: Tensor) -> Sequence[Tensor]:
+        arguments, first = [], 0
+        for width in widths:
+            arguments.append(torch.stack(values[first : first + width], -1))
+            first += width
+        return function(*arguments)
+
+    flat = list(itertools.chain(*names))
+    examples = [torch.full((VEHICLES,), 1.0 + number, dtype=dtype) for number in range(len(flat))]
+    wanted = (torch.ops.aten.logit, torch.ops.aten.lerp, torch.ops.aten.std)
+    simpler: Any = get_decompositions(wanted)
+    try:
+        graph = make_fx(of_columns, simpler)(*examples).graph
+    except Exception as error:
+        raise Unsupported(f"recording it failed ({type(error).__name__})") from error
+    statements, outputs = _Recording(flat).function(graph)
+    return Program(tuple(names), statements, outputs)
+
+
 class _Recording:
     """Turns a recorded graph into statements."""
 
@@ -138,6 +197,20 @@ class _Recording:
 
     def program(self, graph: fx.Graph, width: int) -> StepProgram:
         """Returns the whole step of a model whose memory has this width."""
+        statements, (position, speed, acceleration, memory, *terms) = self.function(graph)
+        if len(memory) != width:
+            raise Unsupported("a memory that changes its width")
+        return StepProgram(
+            statements=statements,
+            state=(position[0], speed[0], acceleration[0]),
+            memory=memory,
+            terms=tuple(term[0] for term in terms),
+        )
+
+    def function(
+        self, graph: fx.Graph
+    ) -> tuple[tuple[Statement, ...], tuple[tuple[str, ...], ...]]:
+        """Returns the statements, and the expressions of the columns of each result."""
         for node in graph.nodes:
             if node.op == "placeholder":
                 self._known[node] = array((1,), [next(self._inputs)])
@@ -146,21 +219,10 @@ class _Recording:
             elif node.op == "get_attr":
                 self._known[node] = _constant(graph, node)
             elif node.op == "output":
-                return self._finished(node, width)
+                returned: Any = node.args[0]
+                found = [tuple(map(str, self._known[value].flat)) for value in returned]
+                return tuple(self._statements), tuple(found)
         raise Unsupported("it returns nothing")
-
-    def _finished(self, node: fx.Node, width: int) -> StepProgram:
-        returned: Any = node.args[0]
-        found = [list(map(str, self._known[value].flat)) for value in returned]
-        position, speed, acceleration, memory, *terms = found
-        if len(memory) != width:
-            raise Unsupported("a memory that changes its width")
-        return StepProgram(
-            statements=tuple(self._statements),
-            state=(position[0], speed[0], acceleration[0]),
-            memory=tuple(memory),
-            terms=tuple(term[0] for term in terms),
-        )
 
     def _computed(self, node: fx.Node) -> Any:
         """Returns the expressions that an operation gives; several arrays if it gives several."""
@@ -184,21 +246,30 @@ class _Recording:
             else:
                 operands.append(broadcast(array((), [_number(one)]), shape))
         computed = []
+        is_condition = node.meta["val"].dtype == torch.bool
         for place in itertools.product(*map(range, shape)):
             arguments = [str(operand[place]) for operand in operands]
-            computed.append(_expression(node, arguments))
+            expression = _expression(node, list(arguments))
+            operation, arguments = _differentiated(node, arguments)
+            computed.append(self._name(expression, is_condition, operation, arguments))
         return array(shape, computed)
 
     def _named(self, computed: Expressions, value: Tensor) -> Expressions:
         """Returns the names of expressions; each that computes becomes a statement."""
-        names = []
-        for expression in map(str, computed.flat):
-            name = expression
-            if expression.startswith("("):
-                name = f"s{len(self._statements)}"
-                self._statements.append(Statement(name, expression, value.dtype == torch.bool))
-            names.append(name)
+        is_condition = value.dtype == torch.bool
+        names = [self._name(str(expression), is_condition) for expression in computed.flat]
         return array(computed.shape, names)
+
+    def _name(
+        self, expression: str, is_condition: bool, operation: str = "", operands: Sequence[str] = ()
+    ) -> str:
+        """Returns the name of an expression, which becomes a statement if it computes."""
+        if not expression.startswith("("):
+            return expression
+        name = f"s{len(self._statements)}"
+        statement = Statement(name, expression, is_condition, operation, tuple(operands))
+        self._statements.append(statement)
+        return name
 
 
 def _constant(graph: fx.Graph, node: fx.Node) -> Expressions:
@@ -288,10 +359,25 @@ def _expression(node: fx.Node, arguments: list[str]) -> str:
     if node.kwargs.get("alpha", 1) != 1:
         arguments[1] = f"({literal(float(str(node.kwargs['alpha'])))} * {arguments[1]})"
     if operation == "pow" and isinstance(node.args[1], int | float):
-        return _power(arguments[0], float(node.args[1]), arguments[1])
+        return power(arguments[0], float(node.args[1]), arguments[1])
     if operation == "nan_to_num" and len(arguments) > 1:
         raise Unsupported("other numbers than PyTorch's for NaN")
     return _TEMPLATES[operation].format(*arguments)
+
+
+def _differentiated(node: fx.Node, arguments: list[str]) -> tuple[str, list[str]]:
+    """Returns an operation and its operands as `adjoint` knows them; "" where it cannot."""
+    operation = operation_of(node)
+    if node.kwargs.get("alpha", 1) != 1:
+        return "", arguments
+    if operation == "clamp":
+        low, high = [*arguments[1:], "", ""][:2]
+        low = low or _number(node.kwargs.get("min")) or literal(-math.inf)
+        high = high or _number(node.kwargs.get("max")) or literal(math.inf)
+        arguments = [arguments[0], low, high]
+    if operation == "pow" and isinstance(node.args[1], int | float):
+        return f"pow {float(node.args[1])!r}", arguments[:1]
+    return operation, arguments
 
 
 def _passed_on(operation: str, arguments: list[str]) -> str:
@@ -352,7 +438,7 @@ def _huber(node: fx.Node, arguments: list[str]) -> str:
     return f"(huber({arguments[0]} - {arguments[1]}, {delta}))"
 
 
-def _power(base: str, exponent: float, given: str) -> str:
+def power(base: str, exponent: float, given: str) -> str:
     """Returns a power with a constant exponent, computed as PyTorch does."""
     simple = {
         0.5: f"(std::sqrt({base}))",

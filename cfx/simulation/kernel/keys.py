@@ -54,7 +54,7 @@ class KernelKey(NamedTuple):
         # The step itself, and how it is recorded and written.
         described: list[object] = [folder_hash(step.__file__), folder_hash(__file__)]
         for key in (self.model, self.terms):
-            code = _code(key.component)
+            code = component_code(key.component)
             if code is None:
                 return None
             described.append([code, key.settings])
@@ -63,7 +63,7 @@ class KernelKey(NamedTuple):
         return content_key(described)
 
 
-def _code(component: type) -> list[str] | None:
+def component_code(component: type) -> list[str] | None:
     """Returns the name and the code of a class and all that it inherits from.
 
     It is None where no file has it.

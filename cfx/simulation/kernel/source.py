@@ -66,17 +66,26 @@ static inline int column(real number, int last) {{
   return int(least < most ? least : most);
 }}
 #define RECALLED(first, last, number) M[(first) + column(number, last)][j]
-struct View {{ const real* data; long problem; long other; }};
+"""
+
+_ACCUMULATE = """\
+struct View { const real* data; long problem; long other; };
 extern "C" void accumulate(
     const View* signals, const View* parameters, const View* counted, const long* ends,
     const View* memory, real* sums, long problems, long candidates, long rows, long every,
-    long first, long last) {{
+    long first, long last) {
   const long blocks = (candidates + BLOCK - 1) / BLOCK;
-  for (long unit = first; unit < last; ++unit) {{
+  for (long unit = first; unit < last; ++unit) {
     const long i = unit / blocks, begin = (unit % blocks) * BLOCK;
     const long width = std::min(BLOCK, candidates - begin);
     real X[BLOCK], V[BLOCK], A[BLOCK];
 """
+
+
+def head(dtype: torch.dtype, block: int) -> str:
+    """Returns what stands before every kernel: mathematics, and a few functions of numbers."""
+    return _HEAD.format(type=_TYPES[dtype], block=block)
+
 
 _SIGNALS = (
     "leader_position",
@@ -104,7 +113,7 @@ def write(
         dtype: float64 or float32.
         summed: whether terms are summed up over frames; else those of single frames are written.
     """
-    lines = [_HEAD.format(type=_TYPES[dtype], block=BLOCK)]
+    lines = [head(dtype, BLOCK) + _ACCUMULATE]
     shift = _shift(program.memory)
     lines += _begin(varied, len(program.terms), len(program.memory), shift)
     lines += _loop(program, varied, shift, summed=summed)

@@ -1,0 +1,127 @@
+"""The closed loop as compiled code is the loop of PyTorch, in values and in gradients."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from cfx.learners.base import TrainingData
+from cfx.learners.rollout import RolloutSettings, scan, shard
+from cfx.learners.rollout.dataset import RolloutDataset
+from cfx.learners.rollout.module import RolloutModule
+from cfx.learners.rollout.window import NoGradients, ThroughMemory, ThroughTime
+from cfx.models.base import DrivingModel
+from cfx.models.idm import IDM
+from cfx.models.krauss import Krauss
+from cfx.models.w99 import W99
+from cfx.policies.base import Policy
+from cfx.policies.gru import GruPolicy
+from cfx.policies.heads import head_class
+from cfx.policies.lstm import LstmPolicy
+from cfx.simulation.kernel import compiler
+from tests.learners.made import INPUTS, QUICK, training_data
+
+pytestmark = pytest.mark.skipif(compiler.find_compiler() is None, reason="no C++ compiler")
+
+
+@pytest.fixture(autouse=True)
+def all_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lets gradients go back through all windows that are observed."""
+    monkeypatch.setattr(scan, "_REMEMBERED", 1_000)
+
+
+SETTINGS: dict[str, Any] = {"compile": "always", "horizon": 6, "draws": 3}
+
+
+def module(data: TrainingData, policy: Policy, **options: Any) -> RolloutModule:
+    """Returns a module whose networks answer something."""
+    settings = RolloutSettings(**(QUICK | options))
+    generator = torch.Generator().manual_seed(0)
+    head = head_class(settings.head).for_model(data.simulator.model)
+    dataset = RolloutDataset.of(data, policy, settings.validation, generator, 1, head)
+    network = shard.untrained(policy, dataset, head, generator)
+    return RolloutModule(network, dataset, policy, data, settings)
+
+
+def both(built: Any, path: Any) -> list[list[Tensor]]:
+    """Returns losses and gradients, without and with the compiled loop."""
+    step = built.training_window
+    batch = built.sampler.training(3)
+    divisors = built.errors.over_horizon(batch)
+    scans, found = built.scans, []
+    for used in ({}, scans):
+        built.scans = used
+        built.network.zero_grad()
+        losses = []
+        for loss in built.trajectory_losses(step, batch, 6, divisors, path):
+            if loss.requires_grad:
+                (loss * batch.weight).sum().backward()
+            losses.append(loss.detach())
+        gradients = []
+        for weight in built.network.parameters():
+            if weight.grad is not None:
+                gradients.append(weight.grad.clone())
+        found.append([*losses, *gradients])
+    built.scans = scans
+    return found
+
+
+CASES = [
+    (IDM(), GruPolicy, {}, {"head": "residual"}),
+    (Krauss(), GruPolicy, {"acting_bias": True, "layers": 2}, {}),
+    (W99(), LstmPolicy, {"layers": 2, "summary": "last"}, {}),
+]
+
+
+@pytest.mark.parametrize(("model", "kind", "options", "settings"), CASES)
+@pytest.mark.parametrize("path", [ThroughTime(0.8, 0.5), ThroughTime(0.9, 1.0, cut_after=4)])
+def test_losses_and_gradients_are_those_of_pytorch(
+    model: DrivingModel, kind: Any, options: Any, settings: Any, path: ThroughTime
+) -> None:
+    policy = kind(inputs=INPUTS, hidden_size=8, start="middle", **options)
+    data = training_data(model=model, networks=2)
+    built = module(data, policy, **(SETTINGS | settings))
+    assert built.training_window in built.scans
+    eager, compiled = both(built, path)
+    assert len(eager) == len(compiled) > len(list(built.network.parameters()))
+    for one, two in zip(eager, compiled, strict=True):
+        scale = float(one.abs().max())
+        torch.testing.assert_close(two, one, rtol=2e-3, atol=2e-3 * scale)
+
+
+@pytest.mark.parametrize("path", [ThroughMemory(0.8, 0.5), NoGradients()])
+def test_other_ways_back(path: Any) -> None:
+    policy = GruPolicy(inputs=INPUTS, hidden_size=8, start="middle")
+    built = module(training_data(networks=1), policy, **SETTINGS)
+    with torch.set_grad_enabled(not isinstance(path, NoGradients)):
+        eager, compiled = both(built, path)
+    assert len(eager) == len(compiled)
+    for one, two in zip(eager, compiled, strict=True):
+        torch.testing.assert_close(two, one, rtol=2e-3, atol=2e-3 * float(one.abs().max()))
+
+
+def test_validation_is_that_of_pytorch() -> None:
+    policy = GruPolicy(inputs=INPUTS, hidden_size=8, start="middle")
+    built = module(training_data(networks=2), policy, **(SETTINGS | {"validation": 0.3}))
+    with torch.no_grad():
+        compiled = built.validation_loss()
+        built.scans = {}
+        torch.testing.assert_close(compiled, built.validation_loss(), rtol=1e-4, atol=1e-5)
+
+
+def test_gradients_go_back_through_the_last_windows_observed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Losses are the same; gradients differ by as little as the network forgets."""
+    policy = GruPolicy(inputs=INPUTS, hidden_size=8, start="middle")
+    built = module(training_data(networks=1), policy, **SETTINGS)
+    path = ThroughTime(0.8, 0.5)
+    _, whole = both(built, path)
+    monkeypatch.setattr(scan, "_REMEMBERED", 10)
+    _, last = both(built, path)
+    assert torch.equal(whole[0], last[0])
+    for one, two in zip(whole[1:], last[1:], strict=True):
+        assert float((one - two).norm() / one.norm()) < 0.05
