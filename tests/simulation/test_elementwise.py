@@ -75,5 +75,7 @@ def test_a_result_without_gradient_counts_as_zero() -> None:
 def test_what_is_not_elementwise_is_refused() -> None:
     with pytest.raises(Unsupported):
         Elementwise(lambda x: [x - x.mean()], (2,), (0,))
+    with pytest.raises(Unsupported, match="a gradient that is cut"):
+        Elementwise(lambda x: [x * x.detach()], (2,), (0,))
     with pytest.raises(Unsupported, match="the derivative of"):
         Elementwise(lambda x, y: [huber_loss(x, y, reduction="none")], (2, 2), (0,))

@@ -183,6 +183,8 @@ def record_function(
         graph = make_fx(of_columns, simpler)(*examples).graph
     except Exception as error:
         raise Unsupported(f"recording it failed ({type(error).__name__})") from error
+    if any(operation_of(node) == "detach" for node in graph.nodes):
+        raise Unsupported("a gradient that is cut")
     statements, outputs = _Recording(flat).function(graph)
     return Program(tuple(names), statements, outputs)
 
