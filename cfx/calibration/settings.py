@@ -36,6 +36,18 @@ class CalibrationSettings(Settings):
         1, ge=1, le=5, description="order of the posterior's autoregressive noise, in such steps"
     )
 
+    @model_validator(mode="after")
+    def _noise_belongs_to_a_posterior(self) -> CalibrationSettings:
+        if self.posterior == "none":
+            for name in ("noise_step_s", "noise_order"):
+                value = getattr(self, name)
+                if value != type(self).model_fields[name].default:
+                    raise ValueError(
+                        f"calibration.{name}={value}: there is no posterior, so it does nothing;"
+                        " leave it out, or set calibration.posterior=laplace"
+                    )
+        return self
+
 
 class WindowSettings(Settings):
     """Settings of windows; both are 5 steps (0.5 s at NGSIM's 0.1 s) in the paper."""

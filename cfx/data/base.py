@@ -211,12 +211,12 @@ class Dataset(Component):
             vehicles.add((pair.recording, pair.follower_id))
         return Contents(pairs, rows, len(vehicles))
 
-    def units(self) -> Mapping[str, str] | None:
-        """Returns the units in which settings say that the source has its signals; None: none can.
+    def units(self) -> Mapping[str, str]:
+        """Returns the units that the source is said to have in place of SI units.
 
         `speed`, `position`, `acceleration`, `leader_speed` and so on, `gap` and `time` are keys.
         """
-        return None
+        return {}
 
     @abstractmethod
     def read(self) -> PairSet:
@@ -261,7 +261,12 @@ class Dataset(Component):
                 )
         selected = _select_first(_select_long(pairs, self.settings.min_frames), self.settings)
         used = tuple(recorded[pair.pair_id] for pair in selected.pairs)
-        check_kinematics(replace(selected, pairs=used), self.settings.check, self.units())
+        check_kinematics(
+            replace(selected, pairs=used),
+            self.settings.check,
+            self.units(),
+            can_say_units=hasattr(self.settings, "units"),
+        )
         if isinstance(self.settings, FileDatasetSettings):
             selected = with_usable_accelerations(selected, self.settings.accelerations)
         return scaled(selected, self.settings.scale)

@@ -6,12 +6,11 @@ import io
 import logging
 import shlex
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console, RenderableType
 from rich.table import Table
 
@@ -22,14 +21,13 @@ from cfx.core.registry import Entry
 from cfx.data.base import Contents, Dataset
 from cfx.data.files import Floats, beginning, partitions
 from cfx.data.kinematics import in_words
-from cfx.data.pairs import Dropped, Pair, PairSet
+from cfx.data.pairs import Dropped, PairSet
+from cfx.data.plausible import doubts, rare
 from cfx.data.resample import frames_in_steps
 from cfx.data.site_styles import ALL, NOT_KNOWN, style_distances, styles_by_site
 from cfx.data.style import INDICATORS, STANDING_MPS, StyleResult, name_of_indicator
 
 log = logging.getLogger(__name__)
-
-Marks = NDArray[np.bool_]
 
 _THRESHOLDS = (300, 500, 700)
 """Lengths in frames for which pairs are counted."""
@@ -447,7 +445,7 @@ def _problems(contents: Contents, dataset: Dataset) -> list[str]:
     return ["Problems:", *(f"  {sentence}" for sentence in found)]
 
 
-def _suspicions(contents: Contents, units: Mapping[str, str] | None) -> Iterator[str]:
+def _suspicions(contents: Contents, units: Mapping[str, str]) -> Iterator[str]:
     """Yields a sentence for each kind of values that a recording rarely holds."""
     pairs = contents.pairs
     if not len(pairs):
@@ -458,9 +456,6 @@ def _suspicions(contents: Contents, units: Mapping[str, str] | None) -> Iterator
             "the pairs have different time steps; a job needs one: set data.time_step, or split"
             " the file"
         )
-    length = float(np.median([pair.leader_length for pair in pairs]))
-    if length > 11:
-        yield f"leaders are typically {length:.1f} m long: feet, or lorries only?"
     without = sum(pair.leader_length == 0 for pair in pairs)
     if without and not contents.has_gaps:
         yield (
@@ -470,47 +465,5 @@ def _suspicions(contents: Contents, units: Mapping[str, str] | None) -> Iterator
     words = in_words(pairs, units)
     if words:
         yield f"{words}; a job that uses them is refused (data.check)"
-    for what, wrong in _CHECKS.items():
-        yield from _counted(pairs, what, wrong)
-
-
-def _is_close(pair: Pair) -> Marks:
-    return pair.gap < 0.5
-
-
-def _is_fast(pair: Pair) -> Marks:
-    return np.maximum(pair.leader_speed, pair.follower_speed) > 50
-
-
-def _is_harsh(pair: Pair) -> Marks:
-    return np.abs(pair.follower_acceleration) > 8
-
-
-def _jumps(pair: Pair) -> Marks:
-    moved = np.diff(pair.follower_position)
-    return np.abs(moved - pair.follower_speed[1:] * pair.dt) > 1.0
-
-
-def _reverses(pair: Pair) -> Marks:
-    return np.diff(pair.follower_position) < 0
-
-
-_CHECKS: dict[str, Callable[[Pair], Marks]] = {
-    "frames with a gap below 0.5 m": _is_close,
-    "frames with a speed above 50 m/s": _is_fast,
-    "frames with an acceleration or braking above 8 m/s2": _is_harsh,
-    "steps in which a position moves 1 m more or less than its speed says": _jumps,
-    "steps in which a vehicle moves backwards": _reverses,
-}
-"""What is counted, and which frames or steps of a pair count."""
-
-
-def _counted(pairs: PairSet, what: str, wrong: Callable[[Pair], Marks]) -> Iterator[str]:
-    """Yields how many frames are wrong and where most of them are; nothing if none is."""
-    counts = [int(np.count_nonzero(wrong(pair))) for pair in pairs]
-    if any(counts):
-        worst = pairs[int(np.argmax(counts))].pair_id
-        yield (
-            f"{sum(counts):,} {what}, in {np.count_nonzero(counts)} of {len(pairs)} pairs,"
-            f" most of them in '{worst}'"
-        )
+    yield from doubts(pairs)
+    yield from rare(pairs)

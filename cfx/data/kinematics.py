@@ -1,30 +1,37 @@
 """Position, speed, acceleration, gap and time of a pair must tell the same story.
 
 A signal must change as the integral of its rate says: positions as speeds, speeds as accelerations,
-the gap as the relative speed. For each pair the slope of the one on the other is measured; it is 1
-where all are in the units that they should be in. Integrals are compared, not differences of
-neighbouring frames, in which noise drowns everything; the gap over windows of `_WINDOW_S`, because
-a small bias of a speed adds up over minutes.
+the gap as the relative speed. Three things are measured for each pair:
 
-A slope is judged only where the signal changes enough, and both go together, for it to say
-something (`_Rule`). Noise and drift leave a pair much room; the median over many pairs has little
-(`_TYPICAL`), so that km/h are told from ft/s. What agrees with itself cannot be seen: a pair all of
-whose signals are in feet is a pair of fast vehicles far apart.
+- the slope of the signal on the integral, which is 1 where all are in the units that they should
+  be in. Integrals are compared, not differences of neighbouring frames, in which noise drowns
+  everything; over windows of `_WINDOW_S`, because a small bias of a speed adds up over minutes. The
+  less of the signal the integral explains, the more room the slope has (`_Rule`);
+- what the integral leaves over in most windows (`_LEFT_OVER`): another vehicle's signal, or one
+  that comes late, has the right slope;
+- jumps from one frame to the next that no vehicle makes.
+
+The medians over many pairs have little room (`_TYPICAL`). What agrees with itself cannot be seen: a
+pair all of whose signals are in feet is a pair of fast vehicles far apart
+(`cfx.data.plausible` asks about such).
 """
 
 from __future__ import annotations
 
 import logging
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
 
 import numpy as np
 
-from cfx.core.errors import DataError
+from cfx.core.errors import DataError, listed
 from cfx.data.files import Floats
 from cfx.data.pairs import Pair, PairSet
+from cfx.data.plausible import doubts
+from cfx.data.series import driven
 from cfx.data.units import factor
 
 log = logging.getLogger(__name__)
@@ -32,47 +39,90 @@ log = logging.getLogger(__name__)
 Check = Literal["refuse", "report", "off"]
 
 _WINDOW_S = 5.0
+
+_WINDOWS = 200
+"""Windows of a pair that are looked at, at least, where it has as many; they overlap."""
+
 _SHOWN = 3
 """Pairs that a message names."""
 
 _SAME = 0.08
 """How far a measured factor may be from one that is known."""
 
+_MOST = 0.75
+"""Share of the windows that count as most of them."""
+
 
 @dataclass(frozen=True)
 class _Rule:
-    """Rule of a slope: when it is checked, and its bounds.
+    """Rule of a signal and the integral of its rate: when it is checked, and its bounds.
 
     The bounds leave room for all pairs of the recordings that cfx was tried on; docs/readers.md
     has their slopes.
 
     Attributes:
-        spread: of `Slope` at least, in the signal's unit.
-        correlation: of signal and integral at least, without its sign.
-        low, high: bounds of the slope.
+        spread: of `Agreement` at least, in the signal's unit.
+        floor: how far the logarithm of the slope may always be from 0.
+        room: how much farther where the integral explains nothing of the signal.
+        left: bound of `Agreement.left`; half of it where another vehicle's signal, or another time,
+            leaves much less over.
+        typically_left: bound of its median over many pairs.
     """
 
     spread: float
-    correlation: float
-    low: float
-    high: float
+    floor: float
+    room: float
+    left: float = math.inf
+    typically_left: float = math.inf
+
+    def breaks_slope(self, found: Agreement) -> bool:
+        """Says whether a slope is out of its bounds; no if it says nothing."""
+        if found.spread < self.spread or found.unexplained > 0.95:
+            return False
+        if found.slope <= 0:
+            return True
+        return abs(math.log(found.slope)) > self.floor + self.room * found.unexplained
+
+    def leaves_over(self, found: Agreement) -> bool:
+        """Says whether the integral may leave too much of the signal over."""
+        return found.change >= 2 * self.spread and found.left > self.left / 2
 
 
-_POSITION = _Rule(spread=10.0, correlation=0.9, low=0.84, high=1.19)
-_SPEED = _Rule(spread=0.5, correlation=0.8, low=0.8, high=1.25)
-_GAP = _Rule(spread=1.0, correlation=0.9, low=0.6, high=1.65)
+_WHOLE = _Rule(spread=10.0, floor=0.17, room=0.0)
+"""Rule of the distance driven over the whole pair."""
 
-_TYPICAL = {"position": (0.96, 1.04), "gap": (0.8, 1.25)}
-"""Bounds of the median of slopes over `_MANY` pairs or more; docs/readers.md has medians."""
+_RULES = {
+    "position": _Rule(2.0, 0.08, 1.2, 0.6, 0.15),
+    "speed": _Rule(0.5, 0.08, 1.2, 0.45),
+    "gap": _Rule(1.0, 0.08, 1.2, 0.9, 0.4),
+}
+"""Rules of changes over windows."""
+
+_TYPICAL = 0.04
+"""How far the median slope of `_MANY` pairs or more may be from 1, beside its own error."""
 
 _MANY = 4
+
+_LATEST_S = 3.0
+"""Delays of one signal behind another that are looked for."""
+
+_LEAP_M = 50.0
+_LEAP_MPS, _LEAP_MPS2 = 5.0, 15.0
+"""Steps from frame to frame that no vehicle makes: of a position beside what its speed says, and of
+a speed, so much and so much more for each second of the step."""
+
+_MOST_MPS2 = 30.0
+"""An acceleration that no vehicle has."""
+
+_FEW = 0.05
+"""Share of the steps that are few: single frames are wrong, not a unit."""
 
 _SI = {"position": "m", "speed": "m/s", "acceleration": "m/s2", "gap": "m", "time": "s"}
 
 _LIKELY = {
     "position": ("m", "ft", "cm", "mm", "km"),
-    "gap": ("m", "ft"),
-    "speed": ("m/s", "km/h", "ft/s", "mph"),
+    "gap": ("m", "ft", "cm"),
+    "speed": ("m/s", "km/h", "ft/s", "mph", "kn", "cm/s"),
     "time": ("s", "ms"),
     "acceleration": ("m/s2", "g_0", "ft/s2", "km/h/s"),
 }
@@ -85,152 +135,324 @@ _ACCELERATION_FACTORS = {
 
 
 @dataclass(frozen=True)
-class Slope:
-    """Slope of one signal against the integral of its rate.
+class Agreement:
+    """How a signal changes beside the integral of its rate.
 
     Attributes:
         slope: change of the signal over that of the integral, with the sign of their correlation.
         correlation: -1 to 1.
         spread: standard deviation of the signal or of the integral, whichever is larger, in the
             signal's unit.
+        change: of the signal or of the integral in most windows.
+        left: what the integral leaves over of it, as a share.
     """
 
     slope: float
     correlation: float
     spread: float
+    change: float
+    left: float
 
-    def judged(self, rule: _Rule) -> float | None:
-        """Returns the slope; None where it says nothing."""
-        if self.spread < rule.spread or abs(self.correlation) < rule.correlation:
-            return None
-        return self.slope
+    @property
+    def unexplained(self) -> float:
+        """The part of the one's standard deviation that the other does not explain, 0 to 1."""
+        return math.sqrt(max(0.0, 1.0 - self.correlation**2))
 
 
-def slope_of(values: Floats, rates: Floats, dt: float, window: int | None = None) -> Slope:
-    """Measures the slope of a signal on the integral of its rate.
+def agreement(values: Floats, rates: Floats, dt: float, *, whole: bool = False) -> Agreement:
+    """Measures how a signal changes beside the integral of its rate.
 
     Args:
         values: the signal, `(T,)`.
         rates: its rate, `(T,)`, per second.
         dt: time step, s.
-        window: frames over which changes are compared; None: the whole.
+        whole: the course since the first frame is compared, not changes over windows.
     """
-    x = np.concatenate([[0.0], np.cumsum(0.5 * (rates[1:] + rates[:-1]) * dt)])
-    y = values
-    if window is not None and len(values) > window:
-        x, y = x[window:] - x[:-window], y[window:] - y[:-window]
-    x, y = x - np.median(x), y - np.median(y)
-    of_x, of_y = math.sqrt(float(np.mean(x * x))), math.sqrt(float(np.mean(y * y)))
-    if of_x == 0 or of_y == 0:
-        return Slope(math.nan, 0.0, max(of_x, of_y))
-    correlation = float(np.mean(x * y)) / (of_x * of_y)
-    return Slope(math.copysign(of_y / of_x, correlation), correlation, max(of_x, of_y))
+    x = np.zeros(len(rates))
+    np.cumsum(rates[1:] + rates[:-1], out=x[1:])
+    y, x = values, x * (0.5 * dt)
+    window = max(1, round(_WINDOW_S / dt))
+    if not whole and len(values) > 2 * window:
+        some = slice(None, None, max(1, (len(values) - window) // _WINDOWS))
+        y, x = (y[window:] - y[:-window])[some], (x[window:] - x[:-window])[some]
+    y, x = y - _quantile(y, 0.5), x - _quantile(x, 0.5)
+    of_x, of_y = math.sqrt(float(x @ x)), math.sqrt(float(y @ y))
+    spread = max(of_x, of_y) / math.sqrt(len(x))
+    change = max(_quantile(np.abs(x), _MOST), _quantile(np.abs(y), _MOST))
+    left = _quantile(np.abs(y - x), _MOST) / change if change > 0 else 0.0
+    if min(of_x, of_y) <= 1e-6 * max(of_x, of_y):
+        return Agreement(math.nan, 0.0, spread, change, left)
+    correlation = min(1.0, max(-1.0, float(x @ y) / (of_x * of_y)))
+    slope = math.copysign(of_y / of_x, correlation)
+    return Agreement(slope, correlation, spread, change, left)
+
+
+def _quantile(values: Floats, share: float) -> float:
+    """Returns a quantile, without interpolation, which is much faster than NumPy's own."""
+    at = int(share * (len(values) - 1))
+    return float(np.partition(values, at)[at])
 
 
 Units = Mapping[str, str]
 """Units that a file is said to have in place of SI units, by `Dataset.units`'s names."""
 
 
-def contradiction(pair: Pair, units: Units | None = None) -> str | None:
-    """Returns what of a pair contradicts what, and why probably; None if nothing does.
+@dataclass(frozen=True)
+class Contradiction:
+    """How two signals of a pair contradict each other.
+
+    Attributes:
+        signals: their names.
+        quantity: the one that is an integral: position, speed or gap.
+        slope: of it on the integral of the other; None where another thing is wrong.
+        words: what is wrong, where that does not follow from the slope and the file's units.
+        dt: time step, s.
+        other_slope: of the vehicle's other signal, where it is exact: with a position that of the
+            speed, with a speed that of the position.
+    """
+
+    signals: str
+    quantity: str
+    slope: float | None
+    words: str
+    dt: float
+    other_slope: float | None = None
+
+    def text(self, units: Units | None = None) -> str:
+        """Returns what contradicts what, and why probably.
+
+        Args:
+            units: those that the file is said to have in place of SI units.
+        """
+        if self.slope is None or self.words:
+            return f"{self.signals}: {self.words}"
+        own = _units_of(self.signals.partition("_")[0], units or {})
+        if self.quantity == "gap":
+            return f"{self.signals}: {_why_gap(self.slope, units or {})}"
+        if self.quantity == "speed":
+            why = _why_speed(self.slope, self.other_slope, self.dt, own)
+            return f"{self.signals}: {why}"
+        why = _why_position(self.slope, self.other_slope, self.dt, own)
+        return (
+            f"{self.signals}: the distance driven is {self.slope:.3g} times speed times time: {why}"
+        )
+
+
+class _Relation(NamedTuple):
+    """A signal and its rate, `(T,)` each."""
+
+    signals: str
+    quantity: str
+    values: Floats
+    rates: Floats
+
+    def measured(self, dt: float) -> Agreement:
+        """Returns how changes over windows agree."""
+        return agreement(self.values, self.rates, dt)
+
+
+def _relations(pair: Pair, who: str) -> tuple[_Relation, _Relation]:
+    """Returns position and speed, and speed and acceleration, of leader or follower."""
+    names = f"{who}_position", f"{who}_speed", f"{who}_acceleration"
+    position, speed, acceleration = (getattr(pair, name) for name in names)
+    return (
+        _Relation(f"{names[0]} and {names[1]}", "position", position, speed),
+        _Relation(f"{names[1]} and {names[2]}", "speed", speed, acceleration),
+    )
+
+
+def _gap_relation(pair: Pair) -> _Relation:
+    return _Relation("gap and speeds", "gap", pair.gap, pair.leader_speed - pair.follower_speed)
+
+
+def contradiction(pair: Pair, units: Units | None = None) -> Contradiction | None:
+    """Returns what of a pair contradicts what; None if nothing does.
 
     Args:
         units: those that its file is said to have; its signals are in SI units.
     """
-    for who in ("leader", "follower"):
-        own = _units_of(who, units or {})
-        speeds: Floats = getattr(pair, f"{who}_speed")
-        position = slope_of(getattr(pair, f"{who}_position"), speeds, pair.dt).judged(_POSITION)
-        of_speed = slope_of(speeds, getattr(pair, f"{who}_acceleration"), pair.dt)
-        speed = of_speed.judged(_SPEED)
-        if position is not None and not _POSITION.low <= position <= _POSITION.high:
-            return (
-                f"{who}_position and {who}_speed: the distance driven is {position:.3g} times speed"
-                f" times time: {_why_position(position, speed, pair.dt, own)}"
-            )
-        if speed is not None and not _SPEED.low <= speed <= _SPEED.high:
-            known = _ACCELERATION_FACTORS | _factors(own, faster=("acceleration",))
-            reason = _named(speed, known)
-            if reason is None:
-                reason = f"they are {1 / speed:.3g} times what the speeds say; write m/s2"
-            return (
-                f"{who}_speed and {who}_acceleration: speeds change {speed:.3g} times as much as"
-                f" the accelerations say: {reason}"
-            )
-        if of_speed.spread >= 2 * _SPEED.spread and abs(of_speed.correlation) < 0.5:
-            return (
-                f"{who}_speed and {who}_acceleration: speeds do not change as the accelerations"
-                f" say (correlation {of_speed.correlation:.2f}): are they of this vehicle, at this"
-                " time?"
-            )
-    gap = _gap_slope(pair)
-    if gap is not None and not _GAP.low <= gap <= _GAP.high:
-        return f"gap and speeds: {_why_gap(gap, units or {})}"
-    return None
+    for who, other in (("leader", "follower"), ("follower", "leader")):
+        of_position, of_speed = _relations(pair, who)
+        speed = of_speed.measured(pair.dt)
+        exact = speed.slope if speed.unexplained < 0.2 else None
+        found = _single_frames(of_position, pair) or _wrong_distance(of_position, pair, exact)
+        if found is None:
+            position = of_position.measured(pair.dt)
+            found = _over_windows(of_position, position, _relations(pair, other)[0], pair, exact)
+        if found is not None:
+            return _by_gap(found, pair, units or {})
+        found = _single_frames(of_speed, pair)
+        if found is None:
+            position = agreement(of_position.values, of_position.rates, pair.dt, whole=True)
+            also = position.slope if position.unexplained < 0.2 else None
+            found = _over_windows(of_speed, speed, _relations(pair, other)[1], pair, also)
+        if found is not None:
+            return found
+    relation = _gap_relation(pair)
+    found = _over_windows(relation, relation.measured(pair.dt), None, pair, None)
+    return None if found is None else _by_gap(found, pair, units or {})
 
 
-def _gap_slope(pair: Pair) -> float | None:
-    """Returns the slope of the gap on the integral of the relative speed; None: it says nothing."""
-    relative = pair.leader_speed - pair.follower_speed
-    window = max(1, round(_WINDOW_S / pair.dt))
-    return slope_of(pair.gap, relative, pair.dt, window).judged(_GAP)
+def _wrong_distance(
+    relation: _Relation, pair: Pair, other_slope: float | None
+) -> Contradiction | None:
+    """Returns that the distance driven over the whole pair is not what the speeds say."""
+    whole = agreement(relation.values, relation.rates, pair.dt, whole=True)
+    if not _WHOLE.breaks_slope(whole):
+        return None
+    return Contradiction(relation.signals, relation.quantity, whole.slope, "", pair.dt, other_slope)
 
 
-def _position_slopes(pair: Pair) -> list[float]:
-    """Returns the slopes of both vehicles' positions that say something."""
-    found = []
-    for who in ("leader", "follower"):
-        position, speed = getattr(pair, f"{who}_position"), getattr(pair, f"{who}_speed")
-        slope = slope_of(position, speed, pair.dt).judged(_POSITION)
-        if slope is not None:
-            found.append(slope)
-    return found
+def _over_windows(
+    relation: _Relation,
+    found: Agreement,
+    other: _Relation | None,
+    pair: Pair,
+    other_slope: float | None,
+) -> Contradiction | None:
+    """Returns that a signal's changes over windows are not what its rate says.
 
-
-def typical_contradiction(pairs: PairSet, units: Units | None = None) -> str | None:
-    """Returns what contradicts what over all pairs together, and why; None if nothing does.
-
-    Pairs in time steps of their own are compared too: a slope has no unit.
+    Args:
+        found: how they agree.
+        other: the same of the other vehicle.
+        other_slope: see `Contradiction`.
     """
-    own = _units_of("follower", units or {})
-    positions: list[float] = []
-    gaps: list[float] = []
-    for pair in pairs:
-        positions += _position_slopes(pair)
-        gap = _gap_slope(pair)
-        if gap is not None:
-            gaps.append(gap)
-    slope = _beyond(positions, "position")
-    if slope is not None:
-        return (
-            f"the distance driven is typically {slope:.3g} times speed times time:"
-            f" {_why_position(slope, None, 1.0, own)}"
+    rule = _RULES[relation.quantity]
+    slope, words = None, ""
+    if rule.breaks_slope(found):
+        slope = found.slope
+    elif rule.leaves_over(found):
+        why = _why_left_over(relation, other, pair.dt, found.left)
+        if not why and found.left < rule.left:
+            return None
+        words = (
+            f"over {_WINDOW_S:g} s the one changes otherwise than the other says, by"
+            f" {found.left:.0%} of the change:"
+            f" {why or 'are they of this vehicle, at this time?'}"
         )
-    slope = _beyond(gaps, "gap")
-    if slope is not None:
-        return f"typically, {_why_gap(slope, units or {})}"
-    return None
+    else:
+        return None
+    return Contradiction(relation.signals, relation.quantity, slope, words, pair.dt, other_slope)
 
 
-def _beyond(slopes: Sequence[float], quantity: str) -> float | None:
-    """Returns the median of many slopes where it is out of its bounds."""
-    if len(slopes) < _MANY:
+def _why_left_over(relation: _Relation, other: _Relation | None, dt: float, share: float) -> str:
+    """Returns why a signal does not go with its rate: another vehicle's, or late; "" if unknown."""
+    if other is not None and agreement(relation.values, other.rates, dt).left < share / 3:
+        return f"they go with {other.signals.partition(' and ')[2]}: are the columns swapped?"
+    late, rest = 0, share
+    for k in range(1, min(round(_LATEST_S / dt), len(relation.values) // 4) + 1):
+        for frames in (k, -k):
+            values, rates = relation.values, relation.rates
+            if frames > 0:
+                values, rates = values[:-k], rates[k:]
+            else:
+                values, rates = values[k:], rates[:-k]
+            again = agreement(values, rates, dt).left
+            if again < rest:
+                late, rest = frames, again
+    if rest < share / 2.5:
+        words = "later" if late > 0 else "earlier"
+        return f"they go together if the second is taken {abs(late) * dt:.3g} s {words}"
+    return ""
+
+
+def _single_frames(relation: _Relation, pair: Pair) -> Contradiction | None:
+    """Returns that a few frames, or all of a signal, hold what is no recording."""
+    return _leap(relation, pair) or _constant(relation, pair)
+
+
+def _leap(relation: _Relation, pair: Pair) -> Contradiction | None:
+    """Returns the first of a few steps from frame to frame that no vehicle makes.
+
+    Where there are many, a unit is wrong.
+    """
+    moved = np.diff(relation.values)
+    most, rate = _LEAP_MPS + _LEAP_MPS2 * pair.dt, _MOST_MPS2
+    if relation.quantity == "position":
+        moved = moved - 0.5 * (relation.rates[1:] + relation.rates[:-1]) * pair.dt
+        most, rate = _LEAP_M, math.inf
+    leaps = (np.abs(moved) > most) | (np.abs(relation.rates[1:]) > rate)
+    at = np.flatnonzero(leaps)
+    if not len(at) or len(at) > max(2.0, _FEW * len(moved)):
         return None
-    low, high = _TYPICAL[quantity]
-    median = float(np.median(slopes))
-    if low <= median <= high:
+    frame = pair.first_frame + int(at[0]) + 1
+    what = f"the {relation.quantity} leaps by {moved[at[0]]:.3g} {_SI[relation.quantity]}"
+    if abs(moved[at[0]]) <= most:
+        what = f"the acceleration is {relation.rates[at[0] + 1]:.3g} m/s2"
+    words = (
+        f"at frame {frame} {what} within a step of {pair.dt:.3g} s ({len(at)} such steps): cut the"
+        " pair there, or correct it"
+    )
+    return Contradiction(relation.signals, relation.quantity, None, words, pair.dt)
+
+
+def _constant(relation: _Relation, pair: Pair) -> Contradiction | None:
+    """Returns that one signal is the same in all frames although the other says otherwise."""
+    same = [bool((one == one[0]).all()) for one in (relation.values, relation.rates)]
+    if same[0] == same[1]:
         return None
-    return median
+    whole = agreement(relation.values, relation.rates, pair.dt, whole=True)
+    if same[1] and relation.quantity == "position":
+        # Positions grow at a constant speed, too.
+        whole = agreement(relation.values, relation.rates, pair.dt)
+    if whole.spread < 2 * _RULES[relation.quantity].spread or whole.left < 0.5:
+        return None
+    name = relation.signals.split(" and ")[same.index(True)]
+    value = (relation.values, relation.rates)[same.index(True)][0]
+    words = f"{name} is {value:.3g} in every frame, and the other changes"
+    return Contradiction(relation.signals, relation.quantity, None, words, pair.dt)
+
+
+def _by_gap(found: Contradiction, pair: Pair, units: Units) -> Contradiction:
+    """Returns a contradiction in the words of a file that has gaps in place of positions."""
+    own = _units_of("follower", units)
+    if found.quantity == "speed" or not _has_gaps_alone(pair):
+        return found
+    gap, leader, follower = pair.gap, pair.leader_speed, pair.follower_speed
+    swapped = "the leader's and the follower's speeds look swapped, or the gap's sign turned"
+    corrected = {swapped: (gap, follower, leader)}
+    corrected["the leader's speeds look relative to the follower's"] = (
+        gap,
+        leader + follower,
+        follower,
+    )
+    for unit in _LIKELY["gap"]:
+        scale = factor(unit, "m") / factor(own["gap"], "m")
+        corrected[f"the gaps look like {unit}, not {own['gap']}"] = (gap * scale, leader, follower)
+    for unit in _LIKELY["speed"]:
+        scale = factor(unit, "m/s") / factor(own["speed"], "m/s")
+        look = f"look like {unit}, not {own['speed']}"
+        corrected[f"the speeds {look}"] = (gap, leader * scale, follower * scale)
+        corrected[f"the leader's speeds {look}"] = (gap, leader * scale, follower)
+        corrected[f"the follower's speeds {look}"] = (gap, leader, follower * scale)
+    best, least, rule = found.words, 0.5, _RULES["gap"]
+    for words, (gaps, ahead, behind) in corrected.items():
+        after = agreement(gaps, ahead - behind, pair.dt)
+        if after.left < least and not rule.breaks_slope(after):
+            best, least = words, after.left
+    slope = _gap_relation(pair).measured(pair.dt).slope
+    return replace(found, signals="gap and speeds", quantity="gap", slope=slope, words=best)
+
+
+def _has_gaps_alone(pair: Pair) -> bool:
+    """Says whether positions follow from gaps and speeds, as where a file has none."""
+    left = pair.leader_position - pair.leader_length - driven(pair.leader_speed, pair.dt)
+    return bool(np.abs(left).max() < 1e-6)
 
 
 def _why_gap(gap: float, units: Units) -> str:
     """Returns why a gap does not change as the relative speed says."""
     own = _units_of("follower", units)
-    reason = _named(gap, _factors(own, slower=("gap",), faster=("speed",)), 0.15)
+    known = {-1.0: "the leader's and the follower's columns look swapped"}
+    known |= _factors(own, slower=("gap",), faster=("speed",))
+    reason = _named(gap, known, 0.15)
     return (
-        f"the gap changes {gap:.3g} times as the relative speed says:"
-        f" {reason or 'gaps must be in m, speeds in m/s'}"
+        f"the gap changes {gap:.3g} times as the relative speed says: {reason or _gap_units(own)}"
     )
+
+
+def _gap_units(own: Units) -> str:
+    return f"gaps must be in {own['gap']}, speeds in {own['speed']}, times in {own['time']}"
 
 
 def _units_of(who: str, units: Units) -> dict[str, str]:
@@ -281,7 +503,29 @@ def _why_position(position: float, speed: float | None, dt: float, own: Units) -
             f" {position * dt:.3g} s, not {dt:.3g} s"
         )
     reason = _named(position, _factors(own, faster=("speed", "time"), slower=("position",)))
-    return reason or "positions must be in m, speeds in m/s and times in s"
+    return reason or (
+        f"positions must be in {own['position']}, speeds in {own['speed']}, times in"
+        f" {own['time']}, and all of this vehicle"
+    )
+
+
+def _why_speed(slope: float, position: float | None, dt: float, own: Units) -> str:
+    """Returns why a speed does not change as the acceleration says.
+
+    Args:
+        position: slope of the position on the speed.
+    """
+    said = f"speeds change {slope:.3g} times as much as the accelerations say"
+    if position is not None and abs(position - 1) > _TYPICAL and abs(slope / position - 1) < _SAME:
+        return (
+            f"{said}, and positions as much more than the speeds say, so the time step looks like"
+            f" {slope * dt:.3g} s, not {dt:.3g} s"
+        )
+    known = _ACCELERATION_FACTORS | _factors(own, faster=("acceleration",), slower=("speed",))
+    reason = _named(slope, known)
+    if reason is None:
+        reason = f"they are {1 / slope:.2g} times what the speeds say; write m/s2"
+    return f"{said}: {reason}"
 
 
 def _named(factor: float, known: dict[float, str], room: float = _SAME) -> str | None:
@@ -292,35 +536,95 @@ def _named(factor: float, known: dict[float, str], room: float = _SAME) -> str |
     return None
 
 
-def contradictions(pairs: PairSet, units: Units | None = None) -> Iterator[tuple[str, str]]:
+def contradictions(
+    pairs: PairSet, units: Units | None = None
+) -> Iterator[tuple[str, Contradiction]]:
     """Yields the id of each pair that contradicts itself, and how."""
     for pair in pairs:
-        how = contradiction(pair, units)
-        if how is not None:
-            yield pair.pair_id, how
+        found = contradiction(pair, units)
+        if found is not None:
+            yield pair.pair_id, found
+
+
+def typical_contradiction(pairs: PairSet) -> Contradiction | None:
+    """Returns what contradicts what over all pairs together; None if nothing does.
+
+    Pairs in time steps of their own are compared too: a slope has no unit.
+    """
+    slopes: dict[tuple[str, str], list[float]] = {}
+    left: dict[tuple[str, str], list[float]] = {}
+    for pair in pairs:
+        relations = (*_relations(pair, "leader"), *_relations(pair, "follower"))
+        for one in (*relations, _gap_relation(pair)):
+            key = one.signals, one.quantity
+            found, rule = one.measured(pair.dt), _RULES[one.quantity]
+            if found.change >= 2 * rule.spread:
+                left.setdefault(key, []).append(found.left)
+            if one.quantity == "position":
+                found, rule = agreement(one.values, one.rates, pair.dt, whole=True), _WHOLE
+            if found.spread >= rule.spread and found.slope > 0:
+                slopes.setdefault(key, []).append(math.log(found.slope))
+    for key, logs in slopes.items():
+        median = float(np.median(logs))
+        error = float(np.median(np.abs(np.array(logs) - median))) / math.sqrt(len(logs))
+        if len(logs) >= _MANY and abs(median) > _TYPICAL + 4 * error:
+            return Contradiction(*key, math.exp(median), "", 1.0)
+    for key, shares in left.items():
+        share = float(np.median(shares))
+        if len(shares) >= _MANY and share > _RULES[key[1]].typically_left:
+            words = (
+                f"over {_WINDOW_S:g} s the one changes otherwise than the other says, typically by"
+                f" {share:.0%} of the change: are they of the same time?"
+            )
+            return Contradiction(*key, None, words, 1.0)
+    return None
+
+
+_NUMBERS = re.compile(r"[0-9.]+")
 
 
 def in_words(pairs: PairSet, units: Units | None = None) -> str:
-    """Returns which pairs contradict themselves, how and what to do; "" if none does."""
+    """Returns which pairs contradict themselves, how and what to do; "" if none does.
+
+    Args:
+        pairs: in SI units.
+        units: those that their file is said to have in place of SI units.
+    """
     found = list(contradictions(pairs, units))
     if not found:
-        typical = typical_contradiction(pairs, units)
+        typical = typical_contradiction(pairs)
         if typical is None:
             return ""
-        return f"{pairs.source}: the {len(pairs)} pairs together contradict themselves: {typical}"
-    named = "; ".join(f"pair '{name}': {how}" for name, how in found[:_SHOWN])
+        return (
+            f"{pairs.source}: the {len(pairs)} pairs together contradict themselves:"
+            f" {typical.text(units)}"
+        )
     count = f"{len(found)} of {len(pairs)} pairs contradict themselves"
     if len(found) == 1:
         count = f"one of {len(pairs)} pairs contradicts itself"
-    more = f" (and {len(found) - _SHOWN} more)" if len(found) > _SHOWN else ""
-    return f"{pairs.source}: {count}: {named}{more}"
+    alike: dict[str, list[tuple[str, Contradiction]]] = {}
+    for one in found:
+        alike.setdefault(_NUMBERS.sub("", one[1].text(units)), []).append(one)
+    parts = []
+    for group in sorted(alike.values(), key=len, reverse=True)[:_SHOWN]:
+        names = listed([f"'{name}'" for name, _ in group], _SHOWN)
+        parts.append(f"{_common([how for _, how in group]).text(units)} (pairs: {names})")
+    return f"{pairs.source}: {count}: {'; '.join(parts)}"
 
 
-def check_kinematics(pairs: PairSet, check: Check, units: Units | None = None) -> None:
-    """Refuses or reports pairs that contradict themselves, as `data.check` says.
+def _common(found: Sequence[Contradiction]) -> Contradiction:
+    """Returns the contradiction of the median slope, which stands for those of several pairs."""
+    return sorted(found, key=lambda one: one.slope or 0.0)[len(found) // 2]
+
+
+def check_kinematics(
+    pairs: PairSet, check: Check, units: Units | None = None, *, can_say_units: bool = False
+) -> None:
+    """Refuses or reports pairs that contradict themselves, as `data.check` says; warns of doubts.
 
     Args:
-        units: those that the file is said to have; None: there is nothing to say.
+        units: those that the file is said to have in place of SI units.
+        can_say_units: settings can say others.
 
     Raises:
         DataError: `check` is `refuse`, and some do.
@@ -328,12 +632,15 @@ def check_kinematics(pairs: PairSet, check: Check, units: Units | None = None) -
     if check == "off":
         return
     words = in_words(pairs, units)
-    if words and check == "refuse":
+    if not words:
+        for doubt in doubts(pairs):
+            log.warning("%s: %s", pairs.source, doubt)
+    elif check == "report":
+        log.warning("%s (data.check=report)", words)
+    else:
         remedy = "correct the file"
-        if units is not None:
+        if can_say_units:
             remedy += ", say which units it has (data.columns and data.units)"
         raise DataError(
             f"{words}; {remedy}, leave these pairs out, or say data.check=report to go on"
         )
-    if words:
-        log.warning("%s (data.check=report)", words)

@@ -87,8 +87,9 @@ Within one recording the clock and the frame count agree far better.
 
 _FRAME_MS = 1000 * DT
 
-_DRIVING_MPS = 1.0
-"""Below it, noise of positions hides how far a vehicle moves in a frame."""
+_UNITS = {"position": "ft", "speed": "ft/s", "acceleration": "ft/s2", "gap": "ft"}
+_UNITS |= {f"leader_{name}": unit for name, unit in _UNITS.items()}
+"""Units of the layout, by `Dataset.units`'s names."""
 
 
 def _plain(name: str) -> str:
@@ -334,28 +335,13 @@ def _lengths(length: Floats, recording: Ints, vehicle: Ints) -> Floats:
 
 
 def _check_units(rows: Rows) -> None:
-    """Raises DataError if lengths, or positions and speeds, seem not to be in feet."""
+    """Raises DataError if lengths seem not to be in feet."""
     typical = float(np.median(rows.length)) / FOOT
     if typical < 8:
         raise DataError(
             f"{rows.source}, column v_Length: vehicles are typically {typical:.1f} long, which"
             " looks like metres; NGSIM's files are in feet. Convert the file back, or write its"
             " pairs in the tidy layout (SI units) and use data=tidy"
-        )
-    is_step = (
-        ~changes(rows.recording, rows.vehicle)[1:]
-        & (np.diff(rows.frame) == 1)
-        & (rows.speed[1:] > _DRIVING_MPS)
-    )
-    if not is_step.any():
-        return
-    moved = np.abs(np.diff(rows.position)[is_step])
-    ratio = float(np.median(moved / (rows.speed[1:][is_step] * DT)))
-    if not 0.8 < ratio < 1.25:
-        raise DataError(
-            f"{rows.source}, columns Local_Y and v_Vel: from frame to frame vehicles typically"
-            f" advance by {ratio:.3g} times their speed times 0.1 s; both columns must be in feet"
-            " (ft and ft/s)"
         )
 
 
@@ -423,6 +409,9 @@ class NgsimDataset(Dataset):
     def recognises(cls, start: FileStart) -> bool:
         plain = {re.sub(r"[^a-z]", "", name.lower()) for name in start.columns}
         return len(plain & {"vehicleid", "frameid", "localy", "vvel"}) >= 2
+
+    def units(self) -> Mapping[str, str]:
+        return _UNITS
 
     def read(self) -> PairSet:
         return self._pairs(self._rows())

@@ -377,7 +377,7 @@ def _checked(here: _Columns, columns: Mapping[str, Any], names: Sequence[str]) -
     ignored = []
     for at, name in enumerate(names):
         if at not in used and name != _PANDAS_INDEX:
-            ignored.append(name)
+            ignored.append(name if name not in {"", "None"} else f"column {at + 1} without a name")
     titles = {}
     for name, one in here.found.items():
         if one.column.title != name:
@@ -430,10 +430,13 @@ def _require_numbers(table: Table, name: str, values: Floats, column: Column) ->
     table.refuse(name, wrong, column.wrong)
 
 
+_THOUSANDS = r"^[+-]?[1-9][0-9]{0,2}(,[0-9]{3})+(\.[0-9]*)?$"
+
+
 def _floats(here: _Columns, name: str, column: Any) -> Floats:
     """Returns an Arrow column as numbers `(N,)`.
 
-    "1,234" is read as 1234, and an empty cell as NaN.
+    "1,234" is read as 1234, "1,2" and "0,234" are no numbers, and an empty cell is NaN.
 
     Raises:
         DataError: a cell is no number, or the column holds something else.
@@ -448,7 +451,10 @@ def _floats(here: _Columns, name: str, column: Any) -> Floats:
             raise DataError(
                 f"{where}: holds {column.type}, not numbers; write it as numbers"
             ) from None
-    text = pc.replace_substring(pc.utf8_trim_whitespace(column), ",", "").to_pandas()
+    trimmed = pc.utf8_trim_whitespace(column)
+    grouped = pc.match_substring_regex(trimmed, _THOUSANDS)
+    plain = pc.if_else(grouped, pc.replace_substring(trimmed, ",", ""), trimmed)
+    text = plain.to_pandas()
     values: Floats = pd.to_numeric(text, errors="coerce").to_numpy(
         dtype=np.float64, na_value=np.nan
     )
@@ -456,9 +462,15 @@ def _floats(here: _Columns, name: str, column: Any) -> Floats:
     wrong = np.flatnonzero(np.isnan(values) & ~absent.to_numpy(dtype=bool))
     if len(wrong):
         row = int(wrong[0])
+        written = column[row].as_py()
+        remedy = "correct it"
+        if "," in written:
+            remedy = "write decimals with a point"
+        elif "-" in written[1:] and ":" in written:
+            remedy = "write the seconds since a frame of your choice"
         raise DataError(
-            f"{here.source}, row {row + here.first_row}, column {name}: '{column[row].as_py()}' is"
-            " not a number; correct it"
+            f"{here.source}, row {row + here.first_row}, column {name}: '{written}' is not a"
+            f" number; {remedy}"
         )
     return values
 
@@ -621,8 +633,8 @@ def _decoded(path: Path, head: bytes) -> str:
         text = head.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         # A character that the end of the block cuts in two is none of the file's faults.
-        if error.start < len(head) - 4:
-            is_binary = True
+        if error.start < len(head) - 4 and not is_binary:
+            raise DataError(f"{path}: is no text in UTF-8; write the file again in UTF-8") from None
         text = head.decode("utf-8-sig", errors="ignore")
     if is_binary:
         raise DataError(

@@ -59,7 +59,7 @@ from cfx.data.files import (
 from cfx.data.own_columns import OwnColumns, OwnUnits, own_layout, written_units
 from cfx.data.pairs import Dropped, Pair, PairSet
 from cfx.data.table import Column, Layout, Table, read_table, table_of
-from cfx.data.tidy_checks import GAP, LANE, LENGTH, TRUE, check, time_steps
+from cfx.data.tidy_checks import GAP, LANE, LENGTH, TRUE, check, check_gap, time_steps
 
 LABELS = ("recording", "pair_id", "leader_id", "follower_id")
 """Columns of names that every file has."""
@@ -222,7 +222,9 @@ def _pairs(table: Table) -> PairSet:
     if table.ignored:
         reason = f"not part of the layout: {listed(table.ignored)}"
         dropped = (Dropped(reason, len(table.ignored), "columns"),)
-    return PairSet(tuple(_build(table, order, starts)), table.source, dropped)
+    pairs = tuple(_build(table, order, starts))
+    check_gap(table, pairs)
+    return PairSet(pairs, table.source, dropped)
 
 
 def _build(table: Table, order: Ints, starts: Ints) -> list[Pair]:

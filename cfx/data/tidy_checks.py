@@ -5,7 +5,7 @@ What single cells may hold is declared in `cfx.data.tidy.LAYOUT`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from cfx.core.errors import DataError
 from cfx.data.files import Floats, Ints
+from cfx.data.kinematics import contradiction
+from cfx.data.pairs import Pair
 from cfx.data.series import accelerations, driven
 from cfx.data.table import Table
 
@@ -41,7 +43,6 @@ def check(table: Table) -> tuple[Table, Ints, Ints]:
     _check_pairs(table, order, starts)
     if GAP in table.numbers:
         table = with_positions(table, order, starts)
-    _check_gap(table)
     return table, order, starts
 
 
@@ -145,17 +146,26 @@ def _check_pairs(table: Table, order: Ints, starts: Ints) -> None:
             )
 
 
-def _check_gap(table: Table) -> None:
-    """Raises DataError if a leader is not ahead of its follower."""
-    rear = table.numbers["leader_position_m"] - table.numbers["leader_length_m"]
+def check_gap(table: Table, pairs: Sequence[Pair]) -> None:
+    """Raises DataError if a leader is not ahead of its follower.
+
+    Args:
+        pairs: those of the table; if one of them contradicts itself, that may be why.
+    """
+    rear = table.numbers["leader_position_m"] - table.numbers[LENGTH]
     gap = rear - table.numbers["follower_position_m"]
     at = np.flatnonzero(~(gap > 0))
-    if len(at):
-        raise DataError(
-            f"{table.at(at[0])}: the leader is behind its follower, or overlaps it: the gap is"
-            f" {gap[at[0]]:.2f} m ({len(at)} such rows); cut the pair there, or correct positions"
-            f" and {table.title(LENGTH)}"
-        )
+    if not len(at):
+        return
+    name = table.labels["pair_id"].at(int(at[0]))
+    why = next((contradiction(pair) for pair in pairs if pair.pair_id == name), None)
+    remedy = f"cut the pair there, or correct positions and {table.title(LENGTH)}"
+    if why is not None:
+        remedy = f"perhaps this is why: {why.text()}"
+    raise DataError(
+        f"{table.at(at[0])}: the leader is behind its follower, or overlaps it: the gap is"
+        f" {gap[at[0]]:.2f} m ({len(at)} such rows); {remedy}"
+    )
 
 
 # --- a column of gaps in place of lengths, positions and accelerations ---------------------------

@@ -137,23 +137,34 @@ class DrivingModel(Component):
         return ""
 
     def refuse_unused(self) -> None:
-        """Refuses to tune parameters that the model does not use with its settings.
+        """Refuses to tune or set parameters that the model does not use with its settings.
 
         A job asks for this. A saved policy that answers such a parameter still drives.
 
         Raises:
-            ConfigError: `model.parameters.NAME.tuned=true` of such a parameter.
+            ConfigError: a key of `model.parameters.NAME` of such a parameter says otherwise than
+                the model declares.
         """
-        for parameter in self.space.tuned:
-            if parameter.is_used(self.settings):
+        for declared in self.parameters:
+            if declared.is_used(self.settings):
                 continue
-            assert parameter.used_with is not None
-            setting, value = parameter.used_with
+            own = self.space[declared.name]
+            changed = []
+            for key in ("low", "high", "default"):
+                if getattr(own, key) != getattr(declared, key):
+                    changed.append(key)
+            if own.tuned:
+                changed.append("tuned")
+            if not changed:
+                continue
+            assert declared.used_with is not None
+            setting, value = declared.used_with
             chosen = getattr(self.settings, setting)
+            written = f"{getattr(own, changed[0])}".lower()
             raise ConfigError(
-                f"model.parameters.{parameter.name}.tuned=true: the model does not use"
-                f" {parameter.name} with model.{setting}={chosen}, so there is nothing to tune;"
-                f" leave it out, or set model.{setting}={value}"
+                f"model.parameters.{own.name}.{changed[0]}={written}: the model does not use"
+                f" {own.name} with model.{setting}={chosen}, so it does nothing; leave it out, or"
+                f" set model.{setting}={value}"
             )
 
     def equations_key(self) -> str:

@@ -462,8 +462,6 @@ def put(column: str, value: object, row: int = 3) -> Change:
             lambda r: r.assign(**{c: r[c] * 0.3048 for c in ("Local_Y", "v_Length", "v_Vel")}),
             ["v_Length", "4.6 long", "metres", "data=tidy"],
         ),
-        (lambda r: r.assign(v_Vel=r["v_Vel"] * 0.3048), ["Local_Y and v_Vel", "3.28 times"]),
-        (lambda r: r.assign(v_Vel=r["v_Vel"] / 1.4667), ["1.47 times"]),
         (
             lambda r: r.assign(Location=["x"] * 3 + [""] + ["x"] * 146),
             ["row 5", "Location", "empty"],
@@ -485,6 +483,18 @@ def test_refuses_what_no_recording_can_hold(
     assert "\n" not in message
     for words in said:
         assert words in message, message
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit"), [(0.3048, "m/s"), (1 / 1.46667, "mph"), (1.09728, "km/h")]
+)
+def test_a_unit_is_told_from_feet(
+    factor: float, unit: str, tmp_path: Path, shared_data: Path
+) -> None:
+    raw = pd.read_csv(shared_data / "i80_0400_raw_sample.csv.gz")
+    save(raw.assign(v_Vel=raw["v_Vel"] * factor), tmp_path / "f.csv")
+    with pytest.raises(DataError, match=f"the speeds look like {unit}, not ft/s"):
+        NgsimDataset(path=tmp_path / "f.csv", min_frames=300).load()
 
 
 def test_files_that_cannot_be_read(rows: pd.DataFrame, tmp_path: Path) -> None:

@@ -1,0 +1,153 @@
+"""What a recording may hold but rarely does: asked about in `data describe`, warned of by jobs.
+
+It is neither impossible nor a contradiction (`cfx.data.kinematics`), so nothing is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfx.data.files import Floats
+from cfx.data.pairs import Pair, PairSet
+from cfx.data.style import STANDING_MPS
+
+Marks = NDArray[np.bool_]
+
+_LONG_M = 11.0
+_HARSH_MPS2 = 3.0
+_STANDING_GAP_M = 6.0
+_FAR_M = 200.0
+"""Bounds of what is typical: a vehicle's length, accelerations, the gap to stand at, and a gap.
+
+In the recordings of docs/readers.md the typical length is 4.5 m, nine accelerations in ten are
+below 1.4 m/s2, and vehicles stand 3 to 4 m behind their leaders.
+"""
+
+_MANY = 4
+"""Pairs that say what is typical."""
+
+_FROZEN_S = 1.0
+
+
+def doubts(pairs: PairSet) -> Iterator[str]:
+    """Yields a sentence for each sign that signals are not what they are said to be."""
+    length = float(np.median([pair.leader_length for pair in pairs]))
+    if length > _LONG_M:
+        yield f"leaders are typically {length:.1f} m long: feet, or lorries only?"
+    if len(pairs) >= _MANY:
+        harsh = float(np.median([_ninth_tenth(pair.follower_acceleration) for pair in pairs]))
+        if harsh > _HARSH_MPS2:
+            yield (
+                f"accelerations are typically large (a tenth above {harsh:.1f} m/s2): are the"
+                " file's lengths, speeds and accelerations in feet, or its times wrong?"
+            )
+    standing = [_standing_gap(pair) for pair in pairs]
+    gaps = [gap for gap in standing if gap is not None]
+    if len(gaps) >= _MANY and np.median(gaps) > _STANDING_GAP_M:
+        yield (
+            f"vehicles that stand are typically {np.median(gaps):.1f} m behind their leaders: are"
+            " gaps from bumper to bumper, not from front to front or centre to centre?"
+        )
+    far = [float(np.median(pair.gap)) for pair in pairs]
+    beyond = sum(gap > _FAR_M for gap in far)
+    if beyond:
+        worst = pairs[int(np.argmax(far))].pair_id
+        yield (
+            f"{beyond} of {len(pairs)} pairs are typically more than {_FAR_M:g} m apart ('{worst}':"
+            f" {max(far):,.0f} m): is the leader the vehicle ahead, are positions in one unit?"
+        )
+    for what, wrong in _DOUBTFUL.items():
+        yield from _counted(pairs, what, wrong)
+
+
+def rare(pairs: PairSet) -> Iterator[str]:
+    """Yields a sentence for each kind of frames that recordings have, but few."""
+    for what, wrong in _RARE.items():
+        yield from _counted(pairs, what, wrong)
+
+
+def _ninth_tenth(values: Floats) -> float:
+    return float(np.quantile(np.abs(values), 0.9))
+
+
+def _standing_gap(pair: Pair) -> float | None:
+    """Returns the gap at which a follower stands; None if they never do."""
+    stands = pair.follower_speed < STANDING_MPS
+    return float(np.min(pair.gap[stands])) if stands.any() else None
+
+
+def _jumps(pair: Pair) -> Marks:
+    room = 1.0 + pair.dt**2  # m: a speed that changes within a step
+    jumps = np.zeros(len(pair) - 1, dtype=bool)
+    for who in ("leader", "follower"):
+        position, speed = getattr(pair, f"{who}_position"), getattr(pair, f"{who}_speed")
+        said = 0.5 * (speed[1:] + speed[:-1]) * pair.dt
+        jumps |= np.abs(np.diff(position) - said) > room
+    return jumps
+
+
+def _speed_jumps(pair: Pair) -> Marks:
+    most = 2.0 + 8.0 * pair.dt
+    return (np.abs(np.diff(pair.leader_speed)) > most) | (
+        np.abs(np.diff(pair.follower_speed)) > most
+    )
+
+
+def _is_frozen(pair: Pair) -> Marks:
+    """Marks steps in which a signal stays the same for long although its rate says otherwise."""
+    frozen = np.zeros(len(pair) - 1, dtype=bool)
+    run = max(2, round(_FROZEN_S / pair.dt))
+    for who in ("leader", "follower"):
+        for name, rate, least in (("position", "speed", 1.0), ("speed", "acceleration", 0.3)):
+            same = np.diff(getattr(pair, f"{who}_{name}")) == 0
+            same &= np.abs(getattr(pair, f"{who}_{rate}")[1:]) > least
+            if len(same) >= run:
+                full = np.convolve(same, np.ones(run), mode="valid") == run
+                frozen |= np.convolve(full, np.ones(run), mode="full") > 0
+    return frozen
+
+
+def _is_close(pair: Pair) -> Marks:
+    return pair.gap < 0.5
+
+
+def _is_fast(pair: Pair) -> Marks:
+    return np.maximum(pair.leader_speed, pair.follower_speed) > 50
+
+
+def _is_harsh(pair: Pair) -> Marks:
+    return np.abs(pair.follower_acceleration) > 8
+
+
+def _reverses(pair: Pair) -> Marks:
+    return np.diff(pair.follower_position) < 0
+
+
+_DOUBTFUL: Mapping[str, Callable[[Pair], Marks]] = {
+    "steps in which a position moves 1 m more or less than its speed says": _jumps,
+    "steps in which a speed jumps as no vehicle's does": _speed_jumps,
+    f"steps in which a signal stays the same for {_FROZEN_S:g} s although it should change": (
+        _is_frozen
+    ),
+}
+_RARE: Mapping[str, Callable[[Pair], Marks]] = {
+    "frames with a gap below 0.5 m": _is_close,
+    "frames with a speed above 50 m/s": _is_fast,
+    "frames with an acceleration or braking above 8 m/s2": _is_harsh,
+    "steps in which a vehicle moves backwards": _reverses,
+}
+"""What is counted, and which frames or steps of a pair count."""
+
+
+def _counted(pairs: PairSet, what: str, wrong: Callable[[Pair], Marks]) -> Iterator[str]:
+    """Yields how many frames are wrong and where most of them are; nothing if none is."""
+    counts = [int(np.count_nonzero(wrong(pair))) for pair in pairs]
+    if any(counts):
+        worst = pairs[int(np.argmax(counts))].pair_id
+        yield (
+            f"{sum(counts):,} {what}, in {np.count_nonzero(counts)} of {len(pairs)} pairs,"
+            f" most of them in '{worst}'"
+        )
