@@ -21,7 +21,7 @@ from cfx.core.registry import Entry
 from cfx.data.base import Contents, Dataset
 from cfx.data.files import Floats, beginning, partitions
 from cfx.data.kinematics import in_words
-from cfx.data.pairs import Dropped, PairSet
+from cfx.data.pairs import Dropped, Pair, PairSet
 from cfx.data.plausible import doubts, rare
 from cfx.data.resample import frames_in_steps
 from cfx.data.site_styles import ALL, NOT_KNOWN, style_distances, styles_by_site
