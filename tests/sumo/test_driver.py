@@ -466,7 +466,6 @@ def seen(**values: float) -> Seen:
         "gap": 30.0,
         "leader_speed": 20.0,
         "leader_acceleration": 0.0,
-        "leader_length": 5.0,
         "allowed": 60.0,
         "min_gap": 0.0,
     }
